@@ -6,7 +6,6 @@ Source: docs/mathematics.md, acknowledged references, schedules by holding time 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import final
@@ -22,6 +21,7 @@ from evedrop.model.reference_floor import reference_floor
 from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.slot.link_law import law_of
 from evedrop.model.theory import covariances as theory
+from evedrop.model.theory.closed_form import ClosedForm
 from evedrop.model.theory.closed_forms import (
     SensorChain,
     always_sent,
@@ -36,28 +36,6 @@ from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
 
 Split = tuple[float, float]
-
-
-class ClosedForm(ABC):
-    """One receiver's expected error covariance over the slots of a run."""
-
-    bound: bool = False
-    """Whether this is only a lower bound, in every slot; its limit is exact."""
-
-    @property
-    @abstractmethod
-    def traces(self) -> Floats:
-        """The traces of all slots, (slots,)."""
-
-    @property
-    @abstractmethod
-    def limit(self) -> float:
-        """Trace of the limit; inf if it is unbounded, NaN if it is too large to compute."""
-
-    @property
-    def infinite_variance(self) -> bool:
-        """Whether the variance of tr P over trials has no bound (docs/mathematics.md, heavy tails)."""
-        return math.isinf(self.limit)
 
 
 @final
@@ -149,7 +127,8 @@ def closed_of(scenario: Scenario, receiver: str) -> ClosedForm | None:
     """A receiver's closed form; None if scheme and strategy have none, or the links violate its assumptions."""
     if _kind_of(scenario, receiver) == "noise":
         return _takes_noise(scenario, receiver)
-    return acknowledged_form(scenario, receiver)
+    found = acknowledged_form(scenario, receiver)
+    return _of_scheme(scenario, receiver) if found is None else found
 
 
 def _kind_of(scenario: Scenario, receiver: str) -> str | None:
@@ -163,6 +142,15 @@ def _takes_noise(scenario: Scenario, receiver: str) -> TakesNoise | None:
     scheme, table = scheme_of(scenario.process.process, scenario.encoding.spec), scenario.eavesdroppers[receiver]
     found = noise_taken(scheme, table.strategy, table.parameters)
     return None if found is None else TakesNoise(found(scenario.quality[receiver]), scenario.slots)
+
+
+def _of_scheme(scenario: Scenario, receiver: str) -> ClosedForm | None:
+    """What the scheme itself knows of an eavesdropper's strategy; None for one that learns more than packets tell."""
+    if receiver == LEGITIMATE or receiver in scenario.leaks:
+        return None
+    scheme, table = scheme_of(scenario.process.process, scenario.encoding.spec), scenario.eavesdroppers[receiver]
+    received = scenario.quality[receiver] if _independent(scenario, receiver) else None
+    return scheme.closed_form(table.reads_as or table.strategy, received, scenario.slots)
 
 
 def acknowledged_form(scenario: Scenario, receiver: str) -> Closed | None:

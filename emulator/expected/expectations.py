@@ -9,7 +9,7 @@ from typing import Protocol, final
 
 import numpy as np
 
-from evedrop.expected.closed_forms import ClosedForm, ClosedStream, closed_of
+from evedrop.expected.closed_forms import ClosedStream, closed_of
 from evedrop.model import modulated
 from evedrop.model.acknowledgements import FORGING
 from evedrop.model.outcomes import eavesdropper_outcomes, legitimate_outcomes
@@ -19,6 +19,7 @@ from evedrop.model.schemes import scheme_of
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.slot.link_law import LinkLaw, law_of
 from evedrop.model.theory import covariances as theory
+from evedrop.model.theory.closed_form import ClosedForm
 from evedrop.model.theory.covariances import ExpectedCovariance, Outcomes, OutcomesAt, SlotOutcomes
 from evedrop.model.theory.rare_events import Streaks, streaks
 from evedrop.names import LEGITIMATE

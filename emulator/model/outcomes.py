@@ -22,33 +22,34 @@ def legitimate_outcomes(scheme: Scheme) -> OutcomesAt | None:
 
     Of a scheme whose μ_d differs from slot to slot: their mean over the slots. `Scheme.in_slot` has those of a slot.
     """
-
-    def at(quality: float) -> Outcomes:
-        found = scheme.outcomes(quality)
-        assert found is not None  # noqa: S101 - checked below
-        return found
-
-    return None if scheme.outcomes(0.5) is None else at
+    if scheme.outcomes(0.5) is None:
+        return None
+    return lambda quality: _known(scheme.outcomes(quality))
 
 
 def eavesdropper_outcomes(scheme: Scheme, strategy: str, parameters: Mapping[str, Any]) -> OutcomesAt | None:
     """The same for an eavesdropper's strategy with its parameters."""
     kind = STRATEGIES[strategy]
+    name = str(parameters["reads_as"]) if "reads_as" in kind.parameters else strategy
+    reader = READERS[name] if "reads_as" in kind.parameters else kind
+    if scheme.reader_outcomes(name, 0.5) is not None:
+        return lambda quality: _known(scheme.reader_outcomes(name, quality))
     if kind.outcomes(parameters, scheme.state_probability) is None:
         return None
-    reader = READERS[parameters["reads_as"]] if "reads_as" in kind.parameters else kind
     if type(scheme) is Innovation or reader is ConstantEstimate:
         return kind.outcomes(parameters, scheme.state_probability)
     if not issubclass(reader, PacketTaker):
         return None
     uses = reader.use_probabilities(parameters)
 
-    def at(quality: float) -> Outcomes:
-        found = scheme.eavesdropper_outcomes(quality, *uses)
-        assert found is not None  # noqa: S101 - checked below
-        return found
+    if scheme.eavesdropper_outcomes(0.5, *uses) is None:
+        return None
+    return lambda quality: _known(scheme.eavesdropper_outcomes(quality, *uses))
 
-    return None if scheme.eavesdropper_outcomes(0.5, *uses) is None else at
+
+def _known(found: Outcomes | None) -> Outcomes:
+    assert found is not None  # noqa: S101 - the same scheme knows those of another quality
+    return found
 
 
 def noise_taken(scheme: Scheme, strategy: str, parameters: Mapping[str, Any]) -> Callable[[float], NoiseTaken] | None:

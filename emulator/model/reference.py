@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.kernels.current import kernels
+from evedrop.model.error_factors import squares, triangular_solutions
 from evedrop.model.process import Floats, Process, product
 from evedrop.model.receiver import Action, Belief, Codes, Flags, Receiver, Reception
 from evedrop.model.reference_code import NONE, ReferenceCode, initial_factor
@@ -128,7 +129,7 @@ class ReferenceReceiver(Receiver):
         places = np.flatnonzero(read)
         if len(places):
             x_hat[:, places] = known.x[:, places]
-            P[:, :, places] = _squared(known.X[:, :, places])
+            P[:, :, places] = squares(known.X[:, :, places])
             exact = ~known.X[:, :, places].any(axis=(0, 1))
             action[places] = np.where(exact, np.uint8(Action.STATE), np.uint8(Action.INNOVATION))
         return Belief(x_hat, P, action, known)
@@ -175,7 +176,7 @@ class ReferenceReceiver(Receiver):
         joint = np.concatenate([np.concatenate([noise, top], axis=1), np.concatenate([0.0 * noise, R], axis=1)])
         joint = np.where(np.abs(joint) < self._negligible, 0.0, joint)
         factors = kernels.triangular_factors(joint.transpose(2, 0, 1).copy())
-        white = _solved(factors[:, :n, :n], z - shown)
+        white = triangular_solutions(factors[:, :n, :n], z - shown)
         r = r + product(factors[:, n:, :n].copy(), white.T[:, :, None].copy())[:, :, 0].T
         D = factors[:, n:, n:].transpose(1, 2, 0)
         # A coded packet shows x − r exactly, so that the errors of x and r are the same from here on.
@@ -224,22 +225,3 @@ class ReferenceReceiver(Receiver):
             grown = np.concatenate([product(self.process.A, self._noise[-1]), self.process.noise_factor], axis=1)
             self._noise.append(kernels.triangular_factors(grown[None])[0])
         return np.array([self._noise[m] for m in slots.tolist()]).transpose(1, 2, 0)
-
-
-def _solved(L: Floats, z: Floats) -> Floats:
-    """L⁻¹ z of many triangular matrices (R, n, n) and vectors (n, R); 0 where a row has no variance."""
-    y = np.zeros_like(z)
-    for i in range(len(z)):
-        rest = z[i]
-        for j in range(i):
-            rest = rest - L[:, i, j] * y[j]
-        pivot = L[:, i, i]
-        y[i] = np.where(pivot > 0.0, rest / np.where(pivot > 0.0, pivot, 1.0), 0.0)
-    return y
-
-
-def _squared(X: Floats) -> Floats:
-    """X Xᵀ of every trial, (n, n, R)."""
-    factors = X.transpose(2, 0, 1).copy()
-    squares: Floats = product(factors, factors.swapaxes(1, 2).copy()).transpose(1, 2, 0)
-    return squares

@@ -51,6 +51,7 @@ def test_built_in_classes_keep_every_rule(option: str, name: str) -> None:
     """On the same small problems as anybody's own."""
     schemes = {
         "reference": {"scheme": "acknowledged"},
+        "clear-states": {"scheme": "partial-encryption"},
         "selective": {"scheme": "encrypted-schedule"},
         "tracker": {"scheme": "twin-track"},
     }

@@ -190,6 +190,7 @@ def test_who_looks_at_packets_says_so(name: str) -> None:
     assert follows == (name in {*TAKERS, "colluding"})
     if name in {
         "bayesian",
+        "clear-states",
         "learning-em",
         "likelihood",
         "power-test",

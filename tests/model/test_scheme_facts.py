@@ -42,7 +42,11 @@ def test_the_built_in_classes_say_what_theory_knows() -> None:
         "quantised-schedule",
         "scheduled",
     }
-    assert {name for name in SCHEMES if SCHEMES[name].error_floor is not Scheme.error_floor} == {"cipher", "twin-track"}
+    assert {name for name in SCHEMES if SCHEMES[name].error_floor is not Scheme.error_floor} == {
+        "cipher",
+        "partial-encryption",
+        "twin-track",
+    }
     assert Acknowledged.closed_forms["legitimate"] == "reference"
     assert Plain(PROCESS).error_floor(3) is None
     floor, grows = Cipher(PROCESS).error_floor(3)
@@ -82,6 +86,7 @@ def test_the_bits_of_packets_and_secrets_are_counted() -> None:
         "innovation": (128, 192, 0),
         "noise": (128, 64, 0),
         "open-loop": (256, 0, 0),
+        "partial-encryption": (192, 64, 0),
         "plain": (128, 0, 0),
         "quantised-schedule": (17, 128, 0),  # levels of 8 bits, and one bit that says whether they are encrypted
         "random-code": (256, 0, 0),

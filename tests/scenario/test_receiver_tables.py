@@ -26,7 +26,7 @@ SPY = {"strategy": "replay-informed", "learns_at": 5, "reads_as": "bayesian", "l
                                                      "links.1.quality: is missing; expected quality = 0.9, or a loss"]),
         ({**POOL, "link": {"quality": 0.5}}, ["link: is set, but the strategy colluding has no such parameter; its ent"]),
         ({**POOL, "reads_as": None}, ['reads_as: is missing; the strategy colluding needs it; expected reads_as = "sm']),
-        ({**POOL, "reads_as": "colluding"}, ['reads_as: is "colluding"; expected bayesian, constant, genie, learning-em']),
+        ({**POOL, "reads_as": "colluding"}, ['reads_as: is "colluding"; expected bayesian, clear-states, constant, genie']),
         ({**POOL, "reads_as": "suspicious", "use_state": 0.5}, ["use_innovation: is missing; the strategy colluding ne"]),
         ({**SPY, "learns_at": None}, ["learns_at: is missing; the strategy replay-informed needs it; expected learns_at"]),
         ({**SPY, "learns_at": -1}, ["learns_at: is -1; expected a number at least 0, such as 40"]),
@@ -68,7 +68,8 @@ def test_who_needs_a_schedule_is_refused_where_there_is_none(strategy: str, entr
     (line,) = mistakes({"encoding": {"scheme": "plain"}, "eavesdroppers": {"eve": table}})
     assert line == (
         f'eavesdroppers.eve.{entry}: is "{strategy}", which is defined by its knowledge of the schedule, and the scheme '
-        "plain has none; expected bayesian, constant, learning-em, likelihood, naive, power-test, reference, selective or tracker"
+        "plain has none; expected bayesian, clear-states, constant, learning-em, likelihood, naive, power-test, reference, "
+        "selective or tracker"
     )
 
 

@@ -63,7 +63,7 @@ from tests.scenario.good import GOOD, mistakes
         ("legitimate.link.quality", -0.5, "legitimate.link.quality: is -0.5; expected a number from 0 to 1, such as 0.9"),
         ("legitimate.link.quality", "0.5", 'legitimate.link.quality: is "0.5"; expected a number, such as 0.9'),
         ("legitimate.link", 0.5, "legitimate.link: is 0.5; expected a table, such as { quality = 0.9 }"),
-        ("eavesdroppers.smart.strategy", "clever", "expected bayesian, colluding, constant, genie, learning-em, likel"),
+        ("eavesdroppers.smart.strategy", "clever", "expected bayesian, clear-states, colluding, constant, genie, learning"),
         ("eavesdroppers.smart.links", [{"quality": 0.5}, {"quality": 0.6}], "links: is set, but the strategy smart has no s"),
         ("eavesdroppers.smart.reads_as", "genie", "reads_as: is set, but the strategy smart has no such parameter; rem"),
         ("eavesdroppers.smart.learns_at", 3, "learns_at: is set, but the strategy smart has no such parameter"),

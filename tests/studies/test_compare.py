@@ -191,7 +191,7 @@ def test_what_each_scheme_needs(everything: Everything) -> None:
         **dict.fromkeys(SCHEMES, (128, 0)),
         "acknowledged": (128, 64),
         **dict.fromkeys(("open-loop", "random-code", "threshold-code"), (128, 128)),
-        "encrypted-schedule": (128, 64),
+        **dict.fromkeys(("encrypted-schedule", "partial-encryption"), (128, 64)),
         "quantised-schedule": (16, 1),
     }
     secret = {name: (one.secret_bits_per_slot, one.initial_secret_bits) for name, one in needs.items()}
@@ -201,6 +201,7 @@ def test_what_each_scheme_needs(everything: Everything) -> None:
         **dict.fromkeys(("encrypted-schedule", "quantised-schedule"), (128, 0)),
         "innovation": (192, 0),
         "noise": (64, 0),
+        "partial-encryption": (64, 0),
         "twin-track": (64, 256),
     }
     assert {name for name, one in needs.items() if one.acknowledgements} == {
@@ -225,7 +226,7 @@ def test_bits_and_energy_are_those_of_the_packets(everything: Everything) -> Non
         assert (one.standard_errors["bits_per_slot"] == 0.0) is (one.sent_fraction == 1.0)
     encrypted = {name: one.encrypted_fraction for name, one in needs.items()}
     assert {name for name, fraction in encrypted.items() if fraction} == {
-        *("cipher", "encrypted-schedule", "quantised-schedule"),
+        *("cipher", "encrypted-schedule", "partial-encryption", "quantised-schedule"),
     }
     assert encrypted["cipher"] == 1.0
     mu = load("bayesian").quality["legitimate"]

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from evedrop.model.answers import Answers
 from evedrop.model.eavesdroppers.bayesian import Bayesian
+from evedrop.model.eavesdroppers.clear_states import ClearStates
 from evedrop.model.eavesdroppers.constant import ConstantEstimate
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper
 from evedrop.model.eavesdroppers.genie import Genie
@@ -33,6 +34,7 @@ _BUILT_IN: Mapping[str, type[Eavesdropper]] = {
     "likelihood": Likelihood,
     "bayesian": Bayesian,
     "genie": Genie,
+    "clear-states": ClearStates,
     "power-test": PowerTest,
     "reference": Reference,
     "selective": Selective,

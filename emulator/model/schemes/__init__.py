@@ -13,6 +13,7 @@ from evedrop.model.schemes.encrypted_schedule import EncryptedSchedule
 from evedrop.model.schemes.innovation import Innovation
 from evedrop.model.schemes.noise import Noise
 from evedrop.model.schemes.open_loop import OpenLoop
+from evedrop.model.schemes.partial_encryption import PartialEncryption
 from evedrop.model.schemes.plain import Plain
 from evedrop.model.schemes.quantised_schedule import QuantisedSchedule
 from evedrop.model.schemes.random_code import RandomCode
@@ -29,6 +30,7 @@ _BUILT_IN: Mapping[str, type[Scheme]] = {
     "innovation": Innovation,
     "noise": Noise,
     "open-loop": OpenLoop,
+    "partial-encryption": PartialEncryption,
     "plain": Plain,
     "quantised-schedule": QuantisedSchedule,
     "random-code": RandomCode,

@@ -16,11 +16,13 @@ from evedrop.model.noise_law import NoiseLaw
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Flags, Receiver
 from evedrop.model.schedule import StateProbability, in_slot, mean_of
+from evedrop.model.theory.closed_form import ClosedForm
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.model.theory.quantisation import QuantisationError
 from evedrop.streams import Batch
 
 _WORD_BITS = 64
+_THEORY = ("error_floor", "revealed_bits", "bound_outcomes", "reader_outcomes", "closed_form")
 
 
 class Packet(NamedTuple):
@@ -181,7 +183,7 @@ class Scheme(ABC):
     def __init_subclass__(cls, **options: Any) -> None:
         """Reset the theory of the packets: a subclass may send others, and has to state again what holds of them."""
         super().__init_subclass__(**options)
-        for name in ("sends_states_and_innovations", "closed_forms", "error_floor", "revealed_bits", "bound_outcomes"):
+        for name in ("sends_states_and_innovations", "closed_forms", *_THEORY):
             if name not in vars(cls):
                 setattr(cls, name, getattr(Scheme, name))
 
@@ -309,6 +311,19 @@ class Scheme(ABC):
     def bound_outcomes(self, mu_e: float) -> Outcomes | None:
         """The outcomes at the best receiver without the secret but with the types of packets; None if no bound is known."""
         return Outcomes.genie(mu_e, self.state_probability) if self.sends_states_and_innovations else None
+
+    def reader_outcomes(self, reader: str, mu_e: float) -> Outcomes | None:
+        """The outcomes at a receiver that reads packets as this strategy does; None if there is no such closed form."""
+        del reader, mu_e
+        return None
+
+    def closed_form(self, reader: str, received: float | None, slots: int) -> ClosedForm | None:
+        """Theory of a strategy whose slots differ, over slots 0 … slots−1; None if there is none.
+
+        received: the probability that a packet is received, if it is the same and independent in all slots; else None.
+        """
+        del reader, received, slots
+        return None
 
     def eavesdropper_outcomes(self, mu_e: float, use_state: float, use_innovation: float) -> Outcomes | None:
         """The outcomes at a receiver that uses packets with P(b=1 | ν); None if there is no closed form."""
