@@ -7,7 +7,9 @@ import math
 import numpy as np
 
 from evedrop.expected.expectations import expectations_of
+from evedrop.model.acknowledgements import FORGING, rates_of
 from evedrop.model.local_filter import settled
+from evedrop.model.schemes import scheme_of
 from evedrop.model.theory.covariances import stability_bound
 from evedrop.names import LEGITIMATE
 from evedrop.plugins import sources_of
@@ -43,6 +45,7 @@ def warnings_of(scenario: Scenario) -> list[str]:
             f"link quality {mu:g} and spectral radius {process.spectral_radius:.6g} it must exceed {needed}"
             + ("; no state_probability can, the link must be better" if bound >= 1.0 else "")
         )
+    found += _reference_warnings(scenario, mu)
     found += _filter_warnings(scenario)
     size = written_bytes(scenario)
     if size > _LARGE_BYTES:
@@ -53,6 +56,25 @@ def warnings_of(scenario: Scenario) -> list[str]:
         if scenario.made_with.get(module, source) != source:
             found.append(f"the {module} is not the one these results were made with; its digests may differ")
     return found
+
+
+def _reference_warnings(scenario: Scenario, mu: float) -> list[str]:
+    """A warning if acknowledgements are forged and a user that lost the reference has it too late; mu: 0 if its link varies.
+
+    Source: docs/mathematics.md, flipped acknowledgements.
+    """
+    table = scenario.acknowledgements
+    if table is None or table.attack not in FORGING or mu == 0.0:
+        return []
+    rates = rates_of(table.attack, mu, 1.0, table.link.quality, table.flip or 0.0)
+    scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
+    lost = scheme.lost_reference(mu, rates.user)
+    if lost is None or rates.user[1] == 0.0 or lost.growth < 1.0:
+        return []
+    return [
+        f"the legitimate estimator's expected error grows without bound unless {lost.remedy}: acknowledgements of packets that "
+        f"it missed are forged, with link quality {mu:g} and spectral radius {scenario.process.process.spectral_radius:.6g}"
+    ]
 
 
 def _filter_warnings(scenario: Scenario) -> list[str]:

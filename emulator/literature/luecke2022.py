@@ -14,14 +14,15 @@ import numpy as np
 
 from evedrop.literature.paper import Paper, Progress
 from evedrop.literature.reproduction import NumberVerdict, PublishedNumber
-from evedrop.model.acknowledgements import AckChannel
+from evedrop.model.acknowledgements import AckChannel, rates_of
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Reception
 from evedrop.model.reference import ReferenceReceiver
 from evedrop.model.reference_code import ReferenceCode
 from evedrop.model.schemes.mixed_packets import MixedEncoder
-from evedrop.model.schemes.random_code import RandomCodeEncoder
-from evedrop.model.schemes.threshold_code import ThresholdCodeEncoder, forged_share
+from evedrop.model.schemes.random_code import RandomCode, RandomCodeEncoder
+from evedrop.model.schemes.scheme import Scheme
+from evedrop.model.schemes.threshold_code import ThresholdCode, ThresholdCodeEncoder, forged_share
 from evedrop.model.slot.link import link_of
 from evedrop.paper.deliveries import deliveries
 from evedrop.streams import Batch, root_of_seed, stream_key
@@ -51,6 +52,12 @@ class TransmissionPolicy:
     def __str__(self) -> str:
         """α or θ with its value."""
         return f"θ = {self.theta}" if self.alpha is None else f"α = {self.alpha}"
+
+    def scheme(self, process: Process) -> Scheme:
+        """The scheme of this project with the policy."""
+        if self.alpha is not None:
+            return RandomCode(process, self.alpha)
+        return ThresholdCode(process, float(self.theta or 0.0), MU, FLIP)
 
     def encoder(self, code: ReferenceCode, n: int, batch: Batch, key: bytes) -> MixedEncoder:
         """The sensor's side."""
@@ -145,8 +152,8 @@ def _by_quantiles(one: _Published, runs: Floats) -> Iterator[PublishedNumber]:
     """The rows of user and eavesdropper where no expectation is finite; runs: the mean of each run, (2, runs)."""
     ((mu_e, eavesdropper),) = one.eavesdropper.items()
     for name, theirs, factor, means in (
-        ("user", one.user[0], growth(UNSTABLE, one.policy, MU), runs[0]),
-        ("eavesdropper", eavesdropper, growth(UNSTABLE, one.policy, mu_e, user=False), runs[1]),
+        ("user", one.user[0], growth(one.policy, MU), runs[0]),
+        ("eavesdropper", eavesdropper, growth(one.policy, mu_e, user=False), runs[1]),
     ):
         low, middle, high = np.quantile(means, [0.05, 0.5, 0.95])
         reason = (
@@ -162,33 +169,15 @@ def _by_quantiles(one: _Published, runs: Floats) -> Iterator[PublishedNumber]:
         yield PublishedNumber.stated("solve_optim.py", what, theirs, math.inf, verdict, reason)
 
 
-def growth(process: Process, policy: TransmissionPolicy, quality: float, user: bool = True) -> float:
-    """The factor by which the expected error of a receiver that lacks the reference grows; from 1 on it has no bound.
+def growth(policy: TransmissionPolicy, quality: float, user: bool = True) -> float:
+    """The growth of the expected error of a receiver that lacks the reference, for the unstable process.
 
-    A factor for each slot with a random policy, and from one phase of states in clear to the next with a threshold. With L = A
-    coded packets tell such a receiver nothing about the reference, so only a state that it receives ends the growth. quality: of
-    its link; user: whether acknowledgements depend on what it receives.
-
-    Source: docs/papers/luecke2022.md, the unstable process.
+    quality: of its link; user: whether it is the one whose acknowledgements are flipped.
     """
-    square = max(abs(np.linalg.eigvals(process.A))) ** 2
-    if policy.alpha is not None:
-        return float(square * (1.0 - policy.alpha * quality))
-    arrives = MU * (1.0 - FLIP) + (1.0 - MU) * FLIP
-    # Jointly with a state in clear that it does not receive: acknowledged, and not.
-    acknowledged = (1.0 - MU) * FLIP if user else arrives * (1.0 - quality)
-    silent = 1.0 - quality - acknowledged
-    coded = square * arrives / (1.0 - square * (1.0 - arrives))
-    return float(coded ** _packets_until(float(policy.theta or 0.0)) * square * acknowledged / (1.0 - square * silent))
-
-
-def _packets_until(theta: float) -> int:
-    """The acknowledged coded packets between two phases of states in clear: b is c after the first, and must exceed θ."""
-    c = forged_share(MU, FLIP)
-    belief, count = c, 0
-    while belief <= theta:
-        belief, count = c + belief * (1.0 - c), count + 1
-    return count
+    rates = rates_of("flip", MU, quality, flip=FLIP)
+    found = policy.scheme(UNSTABLE).lost_reference(quality, rates.user if user else rates.eavesdropper)
+    assert found is not None  # noqa: S101 - both schemes have references
+    return found.growth
 
 
 def mean_traces(

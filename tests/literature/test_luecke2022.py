@@ -75,20 +75,16 @@ def test_coded_packets_tell_nothing_about_a_lost_reference() -> None:
 def test_where_the_expected_error_of_the_unstable_process_has_a_bound() -> None:
     """α above (1 − 1/ρ²)/μ; θ that up to six acknowledged coded packets reach. Their two policies are outside."""
     least = (1.0 - 1.0 / 1.44) / MU
-    assert growth(UNSTABLE, TransmissionPolicy(alpha=least), MU) == pytest.approx(1.0)
-    assert growth(UNSTABLE, TransmissionPolicy(alpha=0.305), MU) == pytest.approx(1.44 * 0.756)
+    assert growth(TransmissionPolicy(alpha=least), MU) == pytest.approx(1.0)
+    assert growth(TransmissionPolicy(alpha=0.305), MU) == pytest.approx(1.44 * 0.756)
     # One acknowledged coded packet: grown by Σ (1.44 · 0.26)^j 1.44 · 0.74; a state that is not received: acknowledged or not.
     coded = 1.44 * 0.74 / (1 - 1.44 * 0.26)
     missed = 1.44 * 0.02 / (1 - 1.44 * 0.18)
     for theta, packets in ((0.174, 6), (0.175, 7), (0.188, 7)):
-        assert growth(UNSTABLE, TransmissionPolicy(theta=theta), MU) == pytest.approx(coded**packets * missed)
-    assert (
-        growth(UNSTABLE, TransmissionPolicy(theta=0.174), MU)
-        < 1.0
-        < growth(UNSTABLE, TransmissionPolicy(theta=0.175), MU)
-    )
+        assert growth(TransmissionPolicy(theta=theta), MU) == pytest.approx(coded**packets * missed)
+    assert growth(TransmissionPolicy(theta=0.174), MU) < 1.0 < growth(TransmissionPolicy(theta=0.175), MU)
     unheard = 1.44 * 0.2 * 0.74 / (1 - 1.44 * 0.2 * 0.26)
-    assert growth(UNSTABLE, TransmissionPolicy(theta=0.0), MU, user=False) == pytest.approx(unheard)
+    assert growth(TransmissionPolicy(theta=0.0), MU, user=False) == pytest.approx(unheard)
 
 
 def test_trials_do_not_depend_on_their_batch() -> None:

@@ -25,6 +25,7 @@ def test_theory_of_packets_is_not_inherited(base: type[Scheme]) -> None:
     assert other.closed_forms == {}
     assert other.error_floor is Scheme.error_floor
     assert other.revealed_bits is Scheme.revealed_bits
+    assert other.lost_reference is Scheme.lost_reference
     claims = {"sends_states_and_innovations": True, "closed_forms": {"naive": "scheduled"}}
     again: type[Scheme] = type("Again", (other,), claims)
     assert again.sends_states_and_innovations

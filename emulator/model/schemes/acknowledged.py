@@ -13,6 +13,7 @@ from evedrop.model.reference import ReferenceReceiver
 from evedrop.model.reference_code import NONE, ReferenceCode
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
 from evedrop.model.theory.covariances import Outcomes
+from evedrop.model.theory.lost_reference import LostReference, growth_by_coin
 from evedrop.streams import Batch
 
 
@@ -77,3 +78,8 @@ class Acknowledged(Scheme):
     def outcomes(self, mu: float) -> Outcomes:
         """A state with every packet, whichever acknowledgements arrive."""
         return Outcomes.plain(mu)
+
+    def lost_reference(self, received: float, acknowledged: tuple[float, float]) -> LostReference:  # noqa: ARG002 - it lasts
+        """Nothing ends the growth: no later packet tells the reference."""
+        remedy = "random-code or threshold-code is used, which send the state now and then"
+        return LostReference(growth_by_coin(self.process, 0.0, received), remedy)

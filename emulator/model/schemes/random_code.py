@@ -13,6 +13,8 @@ from evedrop.model.reference import ReferenceReceiver
 from evedrop.model.reference_code import ReferenceCode
 from evedrop.model.schemes.mixed_packets import MIXED_HEADER, MixedEncoder
 from evedrop.model.schemes.scheme import NoInnovations, Scheme, Shared
+from evedrop.model.theory.covariances import radius
+from evedrop.model.theory.lost_reference import LostReference, growth_by_coin
 from evedrop.streams import Ahead, Batch, BlockReader
 
 
@@ -76,3 +78,11 @@ class RandomCode(Scheme):
 
     def outcomes(self, mu: float) -> None:
         """None: what a packet tells depends on the acknowledgements before it."""
+
+    def lost_reference(self, received: float, acknowledged: tuple[float, float]) -> LostReference:  # noqa: ARG002 - only states count
+        """A state in clear ends the growth: ρ²(1 − αμ) a slot."""
+        growth = growth_by_coin(self.process, self._alpha, received)
+        square = radius(self.process) ** 2
+        least = (square - 1.0) / square if square > 1.0 else 0.0
+        remedy = f"plain_probability exceeds {least / received:.6g}" if received > least else "the link is better"
+        return LostReference(growth, remedy)

@@ -18,11 +18,12 @@ from evedrop.model.receiver import Flags, Receiver
 from evedrop.model.schedule import StateProbability, in_slot, mean_of
 from evedrop.model.theory.closed_form import ClosedForm
 from evedrop.model.theory.covariances import Outcomes
+from evedrop.model.theory.lost_reference import LostReference
 from evedrop.model.theory.quantisation import QuantisationError
 from evedrop.streams import Batch
 
 _WORD_BITS = 64
-_THEORY = ("error_floor", "revealed_bits", "bound_outcomes", "reader_outcomes", "closed_form")
+_THEORY = ("error_floor", "revealed_bits", "bound_outcomes", "reader_outcomes", "closed_form", "lost_reference")
 
 
 class Packet(NamedTuple):
@@ -288,6 +289,15 @@ class Scheme(ABC):
 
         Acknowledgements, where they are needed, may be lost or blocked in any way, but not forged.
         """
+
+    def lost_reference(self, received: float, acknowledged: tuple[float, float]) -> LostReference | None:
+        """The growth of the expected error of a receiver that lacks the reference; None for a scheme without references.
+
+        received: the probability that it hears a packet; acknowledged: the probabilities that the packet is acknowledged to the
+        sensor and was heard by the receiver, and that it is acknowledged and was not heard.
+        """
+        del received, acknowledged
+        return None
 
     def error_floor(self, slots: int) -> tuple[Floats, bool] | None:
         """A lower bound on tr E[e_k e_kᵀ] of every receiver without the secret, (slots,), and whether it grows without bound.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, final
@@ -15,6 +16,7 @@ from evedrop.model.reference import ReferenceReceiver
 from evedrop.model.reference_code import ReferenceCode
 from evedrop.model.schemes.mixed_packets import MIXED_HEADER, MixedEncoder
 from evedrop.model.schemes.scheme import NoInnovations, Scheme, Shared
+from evedrop.model.theory.lost_reference import LostReference, growth_by_phases, most_coded
 from evedrop.streams import Batch
 
 
@@ -95,3 +97,14 @@ class ThresholdCode(Scheme):
 
     def outcomes(self, mu: float) -> None:
         """None: what a packet tells depends on the acknowledgements before it."""
+
+    def lost_reference(self, received: float, acknowledged: tuple[float, float]) -> LostReference:
+        """States in clear follow each other until one is acknowledged; then m coded packets are, until b exceeds θ again."""
+        if self._forged == 0.0:
+            coded, remedy = math.inf, "assumed_flip is above 0: the sensor never expects a lost reference"
+        else:
+            # b is 1 − (1−c)^{j+1} after the j-th of them.
+            coded = math.floor(math.log1p(-self._threshold) / math.log1p(-self._forged)) if self._forged < 1.0 else 0
+            below = 1.0 - (1.0 - self._forged) ** (most_coded(self.process, received, acknowledged) + 1.0)
+            remedy = f"lost_belief is below {below:.6g}" if below > 0.0 else "the link is better"
+        return LostReference(growth_by_phases(self.process, coded, received, acknowledged), remedy)
