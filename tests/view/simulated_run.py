@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -76,7 +77,7 @@ def simulate(
     arrivals = np.random.default_rng(seed)
     beliefs = {name: receiver.prior() for name, (_, receiver) in receivers.items()}
     truth, nus = [], []
-    seen: dict[str, list[tuple[Floats, ...]]] = {name: [] for name in receivers}
+    seen: dict[str, list[tuple[Any, ...]]] = {name: [] for name in receivers}
     for k in range(slots):
         x = trajectory.advance()
         z, nu, *_ = encoder.encode(k, x, trajectory.predicted)
