@@ -187,7 +187,7 @@ def _add(block: TrialBlock, mode: Mode, rows: slice, chunk: Chunk, expected: Map
             tally.conditional is not None and mode is not Mode.COVARIANCE_ONLY
         ):  # there, the error is its own expectation
             tally.conditional.add(action)
-        tally.add_traces(trace)
+        tally.add_traces(chunk.first, trace)
         account = _account(block, name, rows, chunk)
         tally.account(account.delivered, action, account.lost, account.unsent)
         tally.count(account)

@@ -83,7 +83,7 @@ class Scorekeeper:
                 tally.conditional.add(receiver.action)
             if tally.leak is not None:
                 tally.leak.add(receiver.action, slots.nu, self._revealed[name])
-            tally.add_traces(traces)
+            tally.add_traces(slots.first, traces)
             tally.account(receiver.delivered, receiver.action, receiver.lost, receiver.unsent)
             if slots.sent is not None:
                 tally.account_sent(slots.sent, receiver.delivered, receiver.unsent)

@@ -14,6 +14,7 @@ from evedrop.figures import figure
 from evedrop.figures.figure import ReceiverTotals, TotalsFigure, TrialTotals
 from evedrop.figures.standard_error import standard_error
 from evedrop.kernels.current import kernels
+from evedrop.model.block_sums import BlockSums
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Codes, Flags
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
@@ -120,8 +121,8 @@ class Tally(ReceiverTotals):
     """As in `Account`."""
     delays: NDArray[np.int64] = field(init=False)
     """As in `Account`; empty until something is counted."""
-    traces: Floats | None = field(init=False)
-    """Sum of tr P of each trial, (R,); None once slots were added whose tr P is not known trial by trial."""
+    cuts: Sequence[int] = ()
+    """Slots in which an outage of the receiver begins or ends."""
     packets: NDArray[np.int64] = field(init=False)
     """Counts of the packets that each trial received, and used, late ones included, (2, R)."""
 
@@ -129,7 +130,8 @@ class Tally(ReceiverTotals):
         self.window_errors = np.zeros((WINDOWS + 1, self.trials))
         self.bursts = np.zeros(COUNTED_BURSTS, np.int64)
         self.delays = np.zeros(0, np.int64)
-        self.traces = np.zeros(self.trials)
+        self._finished: Floats | None = np.zeros(self.trials)
+        self._unfinished = BlockSums(self.trials, self.slots, self.cuts)
         self.packets = np.zeros((2, self.trials), np.int64)
 
     def add(self, first: int, error: Floats, sums: SlotSums, expected: Floats) -> None:
@@ -148,12 +150,22 @@ class Tally(ReceiverTotals):
             if inside.size:
                 self.window_errors[window] += error[inside[0] : inside[-1] + 1].sum(axis=0)
 
-    def add_traces(self, traces: Floats | None) -> None:
-        """Add tr P of some slots and of every trial, (c, R); None if it is not known."""
+    def add_traces(self, first: int, traces: Floats | None) -> None:
+        """Add tr P of the slots from `first` on and of every trial, (c, R); None if it is not known."""
         if traces is None:
-            self.traces = None
-        elif self.traces is not None:
-            self.traces += traces.sum(axis=0)
+            self._finished = None
+        elif self._finished is not None:
+            for sums in self._unfinished.add(range(first, first + len(traces)), traces).values():
+                self._finished = self._finished + sums
+
+    def know_traces(self, traces: Floats) -> None:
+        """Set the sum of tr P over all slots of the run of every trial, (R,), which another process has computed."""
+        self._finished = traces
+
+    @property
+    def traces(self) -> Floats | None:
+        """Sum of tr P of each trial, (R,); None once slots were added whose tr P is not known trial by trial."""
+        return None if self._finished is None else self._finished + self._unfinished.unfinished
 
     def account(
         self,
@@ -275,5 +287,5 @@ def merged(parts: Sequence[Tally]) -> Tally:
     total.leak = LeakTally.merged(leaks) if leaks else None
     total.packets = np.concatenate([part.packets for part in parts], axis=1)
     traces = [part.traces for part in parts if part.traces is not None]
-    total.traces = np.concatenate(traces) if len(traces) == len(parts) else None
+    total._finished = np.concatenate(traces) if len(traces) == len(parts) else None
     return total

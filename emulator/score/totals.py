@@ -30,7 +30,10 @@ class Totals:
     def nothing(cls, scenario: Scenario, trials: int) -> Totals:
         """Empty totals with tallies only: of trials without slots, or in a mode without states."""
         watches = watches_of(scenario)
-        tallies = {name: Tally(scenario.slots, trials, Watched(one, trials)) for name, one in watches.items()}
+        tallies = {
+            name: Tally(scenario.slots, trials, Watched(one, trials), cuts=scenario.outage_bounds(name))
+            for name, one in watches.items()
+        }
         for name, tally in tallies.items():
             tally.conditional = conditional_error_of(scenario, name, trials)
             tally.leak = LeakTally(trials) if leak_is_known(scenario, name) else None

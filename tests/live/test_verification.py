@@ -15,6 +15,7 @@ from evedrop.errors import Contradiction, MalformedMessage
 from evedrop.live.observer.verification import Verifier
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.telemetry import Extent, Journal, Report, read_journal, read_report
+from evedrop.model.block_sums import BlockSums
 from evedrop.model.digest import BlockDigests, Blocks
 from evedrop.model.links.link import REASONS
 from evedrop.model.receiver import Belief
@@ -37,9 +38,11 @@ def beliefs(slots: int = SLOTS, trials: int = TRIALS) -> list[Belief]:
 def reports(batch: int, recorded: int = RECORDED, trials: int = TRIALS) -> list[Report]:
     """The reports of a receiver that ends them at the ends of batches and of blocks."""
     log, made, first = BlockDigests(trials, SLOTS, CUTS), [], 0
+    sums, ended = BlockSums(trials, SLOTS, CUTS), dict[int, np.ndarray]()
     found = beliefs(trials=trials)
     for k, belief in enumerate(found):
         digests = log.add(range(k, k + 1), one_slot(belief))
+        ended |= sums.add(range(k, k + 1), np.trace(belief.P)[None])
         if (k + 1) % batch and k + 1 < SLOTS and not digests:
             continue
         rows = found[first : k + 1]
@@ -53,9 +56,10 @@ def reports(batch: int, recorded: int = RECORDED, trials: int = TRIALS) -> list[
                 np.stack([traces.sum(axis=1), (traces**2).sum(axis=1)], axis=1),
                 None,
                 digests,
+                trace_sums=ended if recorded < trials else {},
             )
         )
-        first = k + 1
+        first, ended = k + 1, {}
     return made
 
 
@@ -266,3 +270,20 @@ def test_a_journal_that_does_not_add_up_is_refused(what: str) -> None:
     with pytest.raises(MalformedMessage, match=said) as found:
         read_journal(Reader("evedrop/r/journal", raw), 7, {"eve": 0}, EXTENT)
     assert found.value.at_fault == ("router",)
+
+
+@pytest.mark.parametrize(
+    ("trial", "said"),
+    [
+        (1, r"sum of tr P over slots 0 to 255 of trial 11 is .*, and what it reported of these slots gives"),
+        (3, r"sum of tr P over slots 0 to 255 of all trials is .*, and what it reported of these slots gives"),
+    ],
+)
+def test_wrong_sums_over_blocks(trial: int, said: str) -> None:
+    """Of a recorded trial, and of another one, by the sum over all trials; both values are named."""
+
+    def more(sums: dict[int, Any]) -> dict[int, Any]:
+        return {block: np.where(np.arange(TRIALS) == trial, 1.5 * one, one) for block, one in sums.items()}
+
+    with pytest.raises(Contradiction, match=said):
+        verified(changed(2, trace_sums=more))

@@ -158,6 +158,7 @@ class Estimator:
         self.belief: list[Belief] = [([0.0] * self.n, model["initial_covariance"]) for _ in range(self.R)]
         self.hashes = [xxh3_128() for _ in range(self.R)]
         self.blocks: dict[int, bytes] = {}
+        self.sums, self.block_sums = [0.0] * self.R, dict[int, bytes]()
         self.rows: list[tuple[int, list[list[float]], list[int], list[Matrix]]] = []
 
     def receive(self, payload: bytes) -> None:
@@ -190,9 +191,12 @@ class Estimator:
             self.hashes[r].update(struct.pack(f"<{self.n}d", *x))
             for i, row in enumerate(P):
                 self.hashes[r].update(struct.pack(f"<{self.n - i}d", *row[i:]))
+            self.sums[r] += sum(P[i][i] for i in range(self.n))
         if k % 256 == 255 or k == self.slots - 1:
             self.blocks[k - k % 256] = b"".join(one.digest() for one in self.hashes)
             self.hashes = [xxh3_128() for _ in range(self.R)]
+            self.block_sums[k - k % 256] = struct.pack(f"<{self.R}d", *self.sums)
+            self.sums = [0.0] * self.R
         self.rows.append((k, [x for x, _ in self.belief], actions, [P for _, P in self.belief]))
 
     def step(self, k: int, r: int, z: list[float] | None, noise_factor: Matrix) -> tuple[Belief, int]:
@@ -241,6 +245,9 @@ class Estimator:
             "trace": struct.pack(f"<{len(traces)}d", *traces),
             "digests": {b: d for b, d in self.blocks.items() if b + 255 >= rows[0][0]},
         }
+        ended = {b: s for b, s in self.block_sums.items() if b + 255 >= rows[0][0]}
+        if ended and self.recorded < self.R:
+            message["trace_sums"] = ended
         packed: bytes = msgpack.packb(message)
         return packed
 

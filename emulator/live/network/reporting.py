@@ -17,6 +17,7 @@ from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.closed_loop import Decisions
 from evedrop.live.protocol.codec import progress
 from evedrop.live.protocol.telemetry import Report, Truth
+from evedrop.model.block_sums import BlockSums
 from evedrop.model.digest import BlockDigests, Blocks, Digests, InputLog
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Beliefs, Flags
@@ -139,6 +140,8 @@ class BeliefReporter:
         self._blocks = Blocks(brief.slots, cuts)
         self._log = BlockDigests(brief.trials, brief.slots, cuts)
         self._digests: dict[int, Digests] = {}
+        self._sums = BlockSums(brief.trials, brief.slots, cuts) if brief.recorded < brief.trials else None
+        self._trace_sums: dict[int, Floats] = {}
         n, batch = len(brief.model.A), brief.flow.batch
         self._beliefs = Beliefs(
             np.empty((batch, n, brief.trials)),
@@ -174,6 +177,8 @@ class BeliefReporter:
         if self._late is not None and late is not None:
             self._late[:, rows] = late
         self._digests.update(self._log.add(slots, beliefs))
+        if self._sums is not None:
+            self._trace_sums.update(self._sums.add(slots, trace))
 
     def flush(self, end: int) -> None:
         """Report all slots below `end`, and the progress to there."""
@@ -199,6 +204,7 @@ class BeliefReporter:
             None if late is None else late[0],
             self._digests,
             None if late is None else late[1],
+            self._trace_sums,
         )
         self._put(end - 1, report.pack())
-        self._first, self._digests = end, {}
+        self._first, self._digests, self._trace_sums = end, {}, {}

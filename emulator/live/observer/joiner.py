@@ -49,6 +49,8 @@ class Joiner:
         """Receiver or controller → first slot of a block → its digests, (R, 16)."""
         if period is not None:
             self.digests[CONTROLLER] = DigestLog()
+        self.trace_sums: dict[str, Floats] = {}
+        """Receiver → sum of tr P of each trial over all finished blocks, (R,); only if not all trials are recorded."""
 
     @property
     def done(self) -> int:
@@ -96,6 +98,8 @@ class Joiner:
         self._check(name, message)
         column.add(message, message.count)
         self.digests[name].add(message.digests)
+        for block in sorted(message.trace_sums):
+            self.trace_sums[name] = self.trace_sums.get(name, 0.0) + message.trace_sums[block]
 
     def journal(self, journal: Reader) -> Mapping[str, Account]:
         """Take the router's journal; returns the accounts in it."""

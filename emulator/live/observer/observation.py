@@ -346,6 +346,9 @@ class ObservedRun:
     def _summary(self, how: str) -> Summary:
         """The summary; a shard also dumps its score, for the summary of the whole run."""
         folder = self.folder
+        if self._joiner.done == self._scenario.slots:
+            for name, sums in self._joiner.trace_sums.items():
+                self._keeper.totals.tallies[name].know_traces(sums)
         if self._brief.part.shard:
             dump_score(self._keeper.totals, folder)
         digests = {name: digest_of(self._scenario, name, blocks) for name, blocks in self._joiner.digests.items()}

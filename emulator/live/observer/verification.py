@@ -18,6 +18,7 @@ from evedrop.errors import Contradiction
 from evedrop.kernels.current import kernels
 from evedrop.live.protocol.telemetry import Extent, Report
 from evedrop.model.digest import Blocks, PartialDigests
+from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Belief
 from evedrop.names import ROUTER, SENSOR
 from evedrop.scenario import Scenario
@@ -32,6 +33,7 @@ class Verifier:
 
     def __init__(self, blocks: Mapping[str, Blocks], recorded: int, first_trial: int) -> None:
         """blocks: receiver → its digests' blocks; recorded: how many trials are reported in full; first_trial: their first."""
+        self._block_sums: dict[str, tuple[Floats, float]] = {}
         self._blocks, self._recorded, self._first_trial = blocks, recorded, first_trial
         self._digests: dict[str, PartialDigests] = {}
         self._leaving: dict[tuple[str, int], Belief] = {}
@@ -52,6 +54,10 @@ class Verifier:
             rows = slice(first - report.first, stop - report.first)
             partial = self._digests.setdefault(name, PartialDigests(self._recorded))
             partial.add(report.x_hat[rows, :, some], report.P[rows], report.action[rows, some])
+            if report.x_hat.shape[2] > self._recorded:
+                self._add_to_block(name, report, rows)
+                if stop == blocks.end(first):
+                    self._check_block_sums(name, report, blocks.start(first), stop)
             if stop == blocks.end(first):
                 self._check_digests(name, report, blocks.start(first), stop)
             first = stop
@@ -66,6 +72,30 @@ class Verifier:
                 name,
                 f"its digest of slots {start} to {stop - 1} of trial {self._first_trial + r} is {claimed[r].tobytes().hex()}, "
                 f"and what it reported of these slots gives {found[r].tobytes().hex()}",
+            )
+
+    def _add_to_block(self, name: str, report: Report, rows: slice) -> None:
+        """Add slots of one block to the sums of tr P of the recorded trials, and to the sum over all trials."""
+        before = self._block_sums.get(name, (np.zeros(self._recorded), 0.0))
+        with np.errstate(over="ignore", invalid="ignore"):  # a receiver may have made these numbers up
+            traces = kernels.traces(report.P[rows])
+            self._block_sums[name] = (before[0] + traces.sum(axis=0), before[1] + float(report.trace[rows, 0].sum()))
+
+    def _check_block_sums(self, name: str, report: Report, start: int, stop: int) -> None:
+        """Check that the sums of tr P of a block's trials are those of the recorded trials, and of all trials together."""
+        of_recorded, of_all = self._block_sums.pop(name)
+        claimed = report.trace_sums[start]
+        known = np.append(of_recorded, of_all)
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = np.append(claimed[: self._recorded], claimed.sum())
+            wrong = ~(np.abs(found - known) <= _ROUNDING * np.maximum(np.abs(known), np.abs(found)))
+        if wrong.any():
+            place = int(np.argmax(wrong))
+            which = "all trials" if place == self._recorded else f"trial {self._first_trial + place}"
+            raise Contradiction(
+                name,
+                f"its sum of tr P over slots {start} to {stop - 1} of {which} is {found[place]:.17g}, and what it reported of "
+                f"these slots gives {known[place]:.17g}",
             )
 
     def _check_traces(self, name: str, report: Report) -> None:

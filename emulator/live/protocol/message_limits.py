@@ -44,8 +44,9 @@ class Sizes:
         mask, state = (R + 7) // 8, 8 * n * R
         packet = state + 8 * self.header * R + mask + _NAME_BYTES
         # Blocks of the digest that end in a report: one may have begun before it, and the last may be short.
-        digests = (c // BLOCK_SLOTS + 2) * DIGEST_BYTES * R
-        report = c * (state + 5 * R + 8 * n * n * self.recorded + 16) + digests
+        blocks = c // BLOCK_SLOTS + 2
+        digests, sums = blocks * DIGEST_BYTES * R, blocks * 8 * R
+        report = c * (state + 5 * R + 8 * n * n * self.recorded + 16) + digests + sums
         truth = c * (2 * state + 8 * self.inputs * R + 4 * mask)
         leaving = state + 8 * n * n * R
         decisions = 8 * (c + self.period) + digests + self.period // BLOCK_SLOTS * DIGEST_BYTES * R

@@ -6,7 +6,7 @@ Source: docs/protocol.md, messages.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -153,6 +153,8 @@ class Report:
     """Block, by its first slot → digests, (R, 16), of the blocks that ended in these slots."""
     late_used: NDArray[np.uint16] | None = None
     """How many of the late packets were used, and not discarded, (c, R)."""
+    trace_sums: Mapping[int, Floats] = field(default_factory=dict)
+    """Block, by its first slot → sum of tr P over its slots, (R,), of the same blocks; none if all trials are recorded."""
 
     @property
     def count(self) -> int:
@@ -172,8 +174,31 @@ class Report:
                 **({} if self.late is None else {"late": self.late.astype("<u2").tobytes()}),
                 **({} if self.late_used is None else {"late_used": self.late_used.astype("<u2").tobytes()}),
                 "digests": {block: digests.tobytes() for block, digests in self.digests.items()},
+                **({"trace_sums": sums} if (sums := _packed_sums(self.trace_sums)) else {}),
             }
         )
+
+
+def _packed_sums(sums: Mapping[int, Floats]) -> dict[int, bytes]:
+    return {block: one.astype("<f8").tobytes() for block, one in sums.items()}
+
+
+def _read_sums(message: Reader, trials: int, blocks: list[int]) -> dict[int, Floats]:
+    """Decode sums of tr P: block, by its first slot → (R,); blocks: those that must be there."""
+    given = message.map("trace_sums") if message.has("trace_sums") else {}
+    if set(given) != set(blocks):
+        raise message.malformed(f"trace_sums of blocks {shown(list(given))}", f"those of {blocks}")
+    found = {}
+    for block in blocks:
+        value = given[block]
+        if not isinstance(value, bytes) or len(value) != 8 * trials:
+            raise message.malformed(f"trace_sums of block {block}", f"{8 * trials} bytes a block")
+        found[block] = np.frombuffer(value, "<f8").astype(np.float64)
+        if not (np.isfinite(found[block]).all() and (found[block] >= 0.0).all()):
+            raise message.malformed(
+                f"trace_sums of block {block} with a number below 0, or not finite", "sums of traces"
+            )
+    return found
 
 
 def read_report(message: Reader, first: int, extent: Extent, blocks: Blocks, window: int = 0) -> Report:
@@ -191,6 +216,7 @@ def read_report(message: Reader, first: int, extent: Extent, blocks: Blocks, win
     )
     if used is not None and (late is None or (used > late).any()):
         raise message.malformed("more in late_used than in late", "at most as many late packets used as arrived")
+    ended = blocks.ended(first, first + c)
     return Report(
         first,
         message.finite("x_hat", (c, n, trials)),
@@ -198,8 +224,9 @@ def read_report(message: Reader, first: int, extent: Extent, blocks: Blocks, win
         _covariances(message, (c, n, n, extent.recorded)),
         message.finite("trace", (c, 2)),
         late,
-        read_digests(message, trials, blocks.ended(first, first + c)),
+        read_digests(message, trials, ended),
         used,
+        _read_sums(message, trials, ended if extent.recorded < trials else []),
     )
 
 

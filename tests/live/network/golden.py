@@ -87,7 +87,8 @@ def encode_report(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
     x_hat, P, trace = (np.array(value[name], float) for name in ("x_hat", "P", "trace"))
     action = np.array(value["action"], np.uint8)
     late, used = (np.array(value[name], np.uint16) if name in value else None for name in ("late", "late_used"))
-    return telemetry.Report(value["k"], x_hat, action, P, trace, late, digests_of(value), used).pack()
+    sums = {int(block): np.array(one, float) for block, one in value.get("trace_sums", {}).items()}
+    return telemetry.Report(value["k"], x_hat, action, P, trace, late, digests_of(value), used, sums).pack()
 
 
 def decode_report(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
@@ -97,7 +98,9 @@ def decode_report(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> d
     columns = {name: getattr(report, name).tolist() for name in ("x_hat", "action", "P", "trace")}
     digests = {str(block): [bytes(one).hex() for one in rows] for block, rows in report.digests.items()}
     late = {name: column.tolist() for name in ("late", "late_used") if (column := getattr(report, name)) is not None}
-    return {"k": report.first, "c": report.count, **columns, **late, "digests": digests}
+    sums = {str(block): one.tolist() for block, one in report.trace_sums.items()}
+    more = {"trace_sums": sums} if sums else {}
+    return {"k": report.first, "c": report.count, **columns, **late, "digests": digests, **more}
 
 
 def encode_truth(shape: dict[str, Any], value: dict[str, Any]) -> bytes:

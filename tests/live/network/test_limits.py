@@ -64,6 +64,7 @@ def largest(sizes: Sizes) -> dict[str, bytes]:
         counts,
         digests,
         counts,
+        {block: np.ones(R) for block in digests} if recorded < R else {},
     )
     seconds = np.ones(c // sizes.period + 2)
     reports = [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
@@ -147,12 +148,18 @@ def test_report(data: st.DataObject, k: int, n: int, trials: int, count: int) ->
         late,
         {block: data.draw(arrays(np.uint8, (trials, 16))) for block in blocks.ended(k, k + count)},
         None if late is None else late // 2,
+        {block: np.abs(data.draw(arrays(float, trials, elements=FINITE))) for block in blocks.ended(k, k + count)}
+        if recorded < trials
+        else {},
     )
     of_run = replace(extent(n, trials, recorded), slots=slots)
     found = telemetry.read_report(Reader("r", report.pack()), k, of_run, blocks, window)
     for name in ("x_hat", "action", "P", "trace"):
         assert getattr(found, name).tobytes() == getattr(report, name).tobytes()
     assert {b: d.tobytes() for b, d in found.digests.items()} == {b: d.tobytes() for b, d in report.digests.items()}
+    assert {b: s.tobytes() for b, s in found.trace_sums.items()} == {
+        b: s.tobytes() for b, s in report.trace_sums.items()
+    }
     assert found.count == count
     for name in ("late", "late_used"):
         assert np.array_equal(getattr(found, name), getattr(report, name))
@@ -304,6 +311,27 @@ def test_unknown_actions_are_refused(value: int) -> None:
     )
     with pytest.raises(MalformedMessage, match=f"action {value}; expected actions from 0 to 3"):
         telemetry.read_report(Reader("key", report.pack()), 0, extent(1, 1), Blocks(9))
+
+
+@pytest.mark.parametrize(
+    ("sums", "recorded", "said"),
+    [
+        ({}, 1, "trace_sums of blocks []; expected those of [0]"),
+        ({0: np.ones(2)}, 2, "trace_sums of blocks [0]; expected those of []"),
+        ({4: np.ones(2)}, 1, "trace_sums of blocks [4]; expected those of [0]"),
+        ({0: np.ones(3)}, 1, "trace_sums of block 0; expected 16 bytes a block"),
+        ({0: np.array([1.0, -1.0])}, 1, "with a number below 0, or not finite; expected sums of traces"),
+        ({0: np.array([1.0, np.inf])}, 1, "with a number below 0, or not finite; expected sums of traces"),
+    ],
+)
+def test_wrong_sums_of_traces_are_refused(sums: dict[int, np.ndarray], recorded: int, said: str) -> None:
+    """They are of the blocks that end in the slots, if not all trials are recorded, and of every trial."""
+    P, digests = np.zeros((1, 1, 1, recorded)), {0: np.zeros((2, 16), np.uint8)}
+    report = telemetry.Report(
+        0, np.zeros((1, 1, 2)), np.zeros((1, 2), np.uint8), P, np.zeros((1, 2)), None, digests, trace_sums=sums
+    )
+    with pytest.raises(MalformedMessage, match=re.escape(said)):
+        telemetry.read_report(Reader("key", report.pack()), 0, replace(extent(1, 2, recorded), slots=1), Blocks(1))
 
 
 def test_a_journal_without_a_receiver_is_refused() -> None:

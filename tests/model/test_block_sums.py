@@ -1,0 +1,38 @@
+"""Sums over blocks: the same bits however slots are added, and by whichever process."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evedrop.model.block_sums import BlockSums
+
+SLOTS, CUTS = 700, (300, 310)
+STARTS = [0, 256, 300, 310, 512]
+
+
+@settings(deadline=None)
+@given(st.lists(st.integers(1, 400), max_size=8), st.integers(1, 3))
+def test_parts_do_not_change_the_sums(lengths: list[int], trials: int) -> None:
+    """Slot by slot from 0, to the bit, for a single trial as well; a block that has not ended is not among them."""
+    numbers = np.random.default_rng(3).lognormal(sigma=8.0, size=(SLOTS - 50, trials))
+    sums, found, k = BlockSums(trials, SLOTS, CUTS), dict[int, np.ndarray](), 0
+    for length in [*lengths, SLOTS]:
+        stop = min(k + length, len(numbers))
+        found |= sums.add(range(k, stop), numbers[k:stop])
+        k = stop
+    assert list(found) == STARTS[:-1]
+    for start, end in zip(STARTS, [*STARTS[1:], len(numbers)], strict=True):
+        expected = np.zeros(trials)
+        for row in numbers[start:end]:
+            expected = expected + row
+        assert np.array_equal(found.get(start, sums.unfinished), expected)
+
+
+def test_another_process_continues_with_a_block() -> None:
+    """From the slot after an outage on its sums are those of one process."""
+    numbers = np.random.default_rng(4).random((SLOTS, 2))
+    whole = BlockSums(2, SLOTS, CUTS).add(range(SLOTS), numbers)
+    later = BlockSums(2, SLOTS, CUTS).add(range(310, SLOTS), numbers[310:])
+    assert all(np.array_equal(later[start], whole[start]) for start in STARTS[3:])
