@@ -103,7 +103,7 @@ class _Size:
     """The trials that make up such a run."""
 
 
-FULL, QUICK = _Size((2000, 1000), 100, 250), _Size((200, 200), 5, 250)
+FULL, QUICK = _Size((2000, 1000), 100, 250), _Size((200, 100), 4, 500)
 
 
 @final

@@ -109,7 +109,7 @@ class PublishedNumber:
         """Our value with its standard error, or "exact", as text."""
         if not isinstance(self.ours, float):
             return _text(self.ours)
-        return f"{self.ours:.6g} exact" if self.standard_error is None else estimate(self.ours, self.standard_error)
+        return f"{_text(self.ours)} exact" if self.standard_error is None else estimate(self.ours, self.standard_error)
 
 
 def _strict(value: Any) -> Any:
@@ -120,7 +120,7 @@ def _strict(value: Any) -> Any:
 def _text(value: Value) -> str:
     if value is None:
         return "–"
-    return value if isinstance(value, str) else f"{value:g}"
+    return value if isinstance(value, str) else f"{value:.6g}".replace("inf", "∞")
 
 
 @dataclass(frozen=True)

@@ -126,6 +126,7 @@ def test_a_number_that_differs_fails_the_command(evedrop: Evedrop) -> None:
     """The exit status is 1, and the table says which."""
     with patch.dict(PAPERS, {"wrong": _Wrong}):
         done = evedrop("paper", "wrong", "--quick")
+        assert "∞ exact" in done.out
         assert json.loads(evedrop("paper", "wrong", "--json").out)["rows"][1]["ours"] == "inf"
     assert done.status == 1
     assert done.err == "quick: True\n"
