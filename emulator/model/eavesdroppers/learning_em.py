@@ -16,22 +16,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.kernels.elementary import cholesky
-from evedrop.kernels.factored import Factor, Factors, covariance
+from evedrop.kernels.factored import covariance
 from evedrop.kernels.mixtures import moments as moments_of
 from evedrop.model.checks import as_toml, number_mistakes
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
-from evedrop.model.learning.climb import NARROW, Course, Known, Learned, advanced, climbed, scale_of, unheard
+from evedrop.model.learning.climb import NARROW, Learned, climbed
+from evedrop.model.learning.course import Course, advanced, bounded, scale_of, unheard
+from evedrop.model.learning.known import knowing_mistakes, known
 from evedrop.model.learning.moments import Moments
 from evedrop.model.learning.posterior import Parameters
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Belief, Codes, Flags, Reception
 from evedrop.streams import Batch
 
-KNOWABLE = ("A", "Q", "mu_d", "initial_covariance")
-"""What it may be given."""
 _MOST_KEPT = 4096
-_FARTHEST = 4.0  # times the largest packet: no state and no deviation is taken to be larger, because A may be wrong
 _EACH = 8  # slots for each state before the first climb
 
 
@@ -128,11 +126,7 @@ class LearningEm(PacketReader):
         """The mean and covariance of the posterior, made smaller where they are out of all proportion to the packets."""
         x_hat, P = moments_of(memory.learned.course.mixture)
         if "A" not in self.known.names:
-            bound = np.where(memory.largest > 0.0, _FARTHEST * memory.largest, 1e100)
-            x_hat = np.clip(x_hat, -bound, bound)
-            deviation = np.sqrt(np.stack([P[i, i] for i in range(len(P))]))
-            share = np.where(deviation > bound, bound / np.maximum(deviation, bound), 1.0)
-            P = P * (share[:, None] * share[None])
+            x_hat, P = bounded(x_hat, P, memory.largest)
         return Belief(x_hat, P, action, memory.stored())
 
     def _small_step(self, k: int, learned: Learned, gamma: Flags, z: Floats, age: int) -> tuple[Learned, Floats]:
@@ -147,23 +141,6 @@ class LearningEm(PacketReader):
             moments = moments.faded(share).added(theta.A, z, gamma.astype(np.float64), after.last)
             moments, theta = moments.most_likely(theta, scale, self.known.names)
         return Learned(after.course, theta, moments, scale), after.state
-
-
-def known(knowledge: Knowledge) -> Known:
-    """What a strategy knows, by its parameter `knows`."""
-    process, names = knowledge.process, frozenset(knowledge.parameters["knows"])
-    one = np.eye(process.n)
-
-    def factors(name: str, M: Floats) -> Factors:
-        return Factors.alike(Factor.of_triangular(cholesky(M if name in names else one).tolist()), (1,))
-
-    return Known(
-        names,
-        process.A if "A" in names else one,
-        factors("Q", process.Q),
-        knowledge.state_probability if "mu_d" in names else 0.5,
-        factors("initial_covariance", process.initial_covariance),
-    )
 
 
 def climbing_slots(n: int, keeps: int) -> list[int]:
@@ -181,14 +158,6 @@ def learned_by(belief: Belief) -> tuple[Floats, Floats, Floats]:
     """A (n, n, R), Q (n, n, R) and μ_d (R,) as learned."""
     theta = Memory.read(belief.memory).learned.theta
     return theta.A, covariance(theta.noise), theta.mu_d
-
-
-def knowing_mistakes(given: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """A mistake in `knows`."""
-    names = given.get("knows", [])
-    if isinstance(names, (list, tuple)) and all(isinstance(name, str) and name in KNOWABLE for name in names):
-        return []
-    return [("knows", f"is {as_toml(names)}; expected a list of names among {as_toml(list(KNOWABLE))}, or []")]
 
 
 def kept_mistakes(given: Mapping[str, Any]) -> list[tuple[str, str]]:
