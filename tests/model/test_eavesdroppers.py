@@ -28,6 +28,7 @@ PARAMETERS: dict[str, dict[str, Any]] = {
     **{name: {} for name in STRATEGIES},
     "suspicious": {"use_state": USE_STATE, "use_innovation": USE_INNOVATION},
     "learning-em": {"knows": [], "keeps": 16},
+    "learning-particle": {"knows": [], "particles": 3},
     "colluding": {"reads_as": "smart"},
     "replay-informed": {"reads_as": "bayesian", "learns_at": LEARNS_AT},
 }
@@ -35,6 +36,7 @@ STREAMS = {
     **dict.fromkeys(STRATEGIES, ()),
     **dict.fromkeys(("smart", "genie", "colluding"), ("schedule",)),
     "suspicious": ("schedule", "coin"),
+    "learning-particle": ("coin",),
 }
 TAKERS = ("naive", "suspicious", "smart", "constant")
 
@@ -192,6 +194,7 @@ def test_who_looks_at_packets_says_so(name: str) -> None:
         "bayesian",
         "clear-states",
         "learning-em",
+        "learning-particle",
         "likelihood",
         "power-test",
         "reference",

@@ -11,12 +11,12 @@ import pytest
 from evedrop.kernels.factored import Factor, Factors, covariance
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.bayesian import Bayesian
-from evedrop.model.eavesdroppers.eavesdropper import Knowledge
-from evedrop.model.eavesdroppers.learning_em import LearningEm, climbing_slots, learned_by
+from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
+from evedrop.model.eavesdroppers.learning_em import LearningEm, climbing_slots
 from evedrop.model.learning.course import CAPACITY
 from evedrop.model.learning.moments import RIDGE, divided, factored
 from evedrop.model.process import Floats, Process, Trajectory
-from evedrop.model.receiver import Belief, Reception
+from evedrop.model.receiver import Belief, Receiver, Reception
 from evedrop.model.schemes.cipher import Cipher
 from evedrop.streams import Batch
 from tests.builders import MARGINAL, stream_keys
@@ -39,7 +39,14 @@ def relative(found: Floats, true: Floats) -> Floats:
     return error
 
 
-def last_of(one: LearningEm, heard: Sequence[Slot]) -> Belief:
+def learned_by(one: Receiver, belief: Belief) -> tuple[Floats, Floats, Floats]:
+    """A, Q and μ_d as learned."""
+    assert isinstance(one, Eavesdropper)
+    found = one.learned(belief)
+    return found["A"], found["Q"], found["mu_d"]
+
+
+def last_of(one: Receiver, heard: Sequence[Slot]) -> Belief:
     """Its belief after all slots."""
     belief = one.prior()
     for slot in heard:
@@ -69,7 +76,8 @@ def test_without_innovations_and_losses_it_is_least_squares(knows: list[str]) ->
     K, R = 16, 5
     batch = Batch(K, R)
     heard = list(slots(STABLE, 1.0, 1.0, batch))
-    A, Q, mu_d = learned_by(last_of(learner(STABLE, batch, knows, K, 1.0), heard))
+    one = learner(STABLE, batch, knows, K, 1.0)
+    A, Q, mu_d = learned_by(one, last_of(one, heard))
     x = np.array([slot.x for slot in heard])
     assert (mu_d == 1.0).all()
     for r in range(R):
@@ -92,7 +100,7 @@ def test_it_learns() -> None:
     }
     off, errors = {}, {name: np.zeros(40) for name in receivers}
     for slot, beliefs in followed(receivers, slots(STABLE, 0.6, 0.9, batch)):
-        A, Q, mu_d = learned_by(beliefs["learner"])
+        A, Q, mu_d = learned_by(receivers["learner"], beliefs["learner"])
         off[slot.k + 1] = [np.median(one) for one in (relative(A, STABLE.A), relative(Q, STABLE.Q), np.abs(mu_d - 0.6))]
         for name, belief in beliefs.items():
             errors[name] += ((belief.x_hat - slot.x) ** 2).sum(axis=0) * (slot.k >= 64)
@@ -118,7 +126,7 @@ def test_it_learns_nothing_from_masked_packets() -> None:
         error += float(((belief.x_hat - x) ** 2).sum())
         still += float((x**2).sum())
     assert error > still
-    assert np.median(relative(learned_by(belief)[0], STABLE.A)) > 0.5
+    assert np.median(relative(learned_by(one, belief)[0], STABLE.A)) > 0.5
 
 
 @pytest.mark.parametrize("process", [MARGINAL, Process(np.array([[0.9]]), np.array([[0.1]]), np.array([[1.0]]))])
@@ -126,12 +134,13 @@ def test_a_trial_has_the_same_bits_alone_and_among_others(process: Process) -> N
     """x̂, P, the action and what was learned, over climbs and the steps after them."""
     whole, K = Batch(24, 6), 24
     heard = list(slots(process, 0.5, 0.7, whole))
-    among = last_of(learner(process, whole, keeps=16), heard)
+    many, single = (learner(process, batch, keeps=16) for batch in (whole, Batch(K, 1)))
+    among = last_of(many, heard)
     for r in (0, 5):
         part = slice(r, r + 1)
         own = [slot._replace(z=slot.z[:, part], gamma=slot.gamma[part]) for slot in heard]
-        alone = last_of(learner(process, Batch(K, 1), keeps=16), own)
-        sets = [(one.x_hat, one.P, one.action, *learned_by(one)) for one in (among, alone)]
+        alone = last_of(single, own)
+        sets = [(of.x_hat, of.P, of.action, *learned_by(one, of)) for one, of in ((many, among), (single, alone))]
         assert all(one[..., part].tobytes() == two.tobytes() for one, two in zip(*sets, strict=True))
 
 
@@ -144,7 +153,7 @@ def test_it_stays_finite(process: Process, mu_e: float) -> None:
     belief = one.prior()
     for slot in slots(process, 0.5, mu_e, batch):
         belief = one.step(slot.k, belief, Reception(slot.gamma, slot.z))
-        assert all(np.isfinite(part).all() for part in (*belief[:2], *learned_by(belief)))
+        assert all(np.isfinite(part).all() for part in (*belief[:2], *learned_by(one, belief)))
         size = np.trace(belief.P)
         assert (np.linalg.eigvalsh(np.moveaxis(belief.P, -1, 0))[:, 0] >= -1e-9 * size).all()
 
@@ -158,7 +167,7 @@ def test_a_known_state_is_known() -> None:
     assert np.array_equal(told.x_hat, heard[-1].x)
     assert not told.P.any()
     after = one.step(30, told, Reception(np.zeros(4, bool), np.zeros((2, 4))))
-    assert np.allclose(after.x_hat, np.einsum("ijr,jr->ir", learned_by(told)[0], told.x_hat))
+    assert np.allclose(after.x_hat, np.einsum("ijr,jr->ir", learned_by(one, told)[0], told.x_hat))
 
 
 def test_one_that_joins_late_climbs_as_late() -> None:
@@ -169,7 +178,7 @@ def test_one_that_joins_late_climbs_as_late() -> None:
     for slot in slots(STABLE, 0.6, 1.0, batch):
         if slot.k >= 7:
             belief = one.step(slot.k, belief, Reception(slot.gamma, slot.z))
-            still = (learned_by(belief)[0] == np.eye(2)[:, :, None]).all()
+            still = (learned_by(one, belief)[0] == np.eye(2)[:, :, None]).all()
             assert still == (slot.k - 7 + 1 < age)
 
 

@@ -42,6 +42,10 @@ class Delegate(Eavesdropper):
         """The reader's prior."""
         return self.reader.prior(first)
 
+    def learned(self, belief: Belief) -> Mapping[str, Floats]:
+        """What the reader has learned."""
+        return self.reader.learned(belief)
+
     def act(self, k: int, gamma: Flags) -> Codes:
         """The reader's action."""
         return self.reader.act(k, gamma)

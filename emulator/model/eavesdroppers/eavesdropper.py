@@ -90,6 +90,11 @@ class Eavesdropper(Receiver):
         del parameters
         return None
 
+    def learned(self, belief: Belief) -> Mapping[str, Floats]:
+        """What it has learned of the process: `A` and `Q`, (n, n, R), and `mu_d`, (R,); empty if it does not learn."""
+        del belief
+        return {}
+
     def knowing(self, k: int, x: Floats, belief: Belief) -> Belief:  # noqa: ARG002 - overrides use both
         """The belief after slot k once that slot's true state x (n, R) is known as well."""
         n, trials = x.shape

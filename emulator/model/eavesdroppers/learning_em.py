@@ -74,7 +74,7 @@ class LearningEm(PacketReader):
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)
-        self.known = known(knowledge)
+        self.known = known(knowledge.process, knowledge.state_probability, knowledge.parameters["knows"])
         self._keeps = int(knowledge.parameters["keeps"])
         self._climbs = climbing_slots(knowledge.process.n, self._keeps)
 
@@ -122,6 +122,11 @@ class LearningEm(PacketReader):
         )
         return self._believed(action, memory._replace(learned=learned, largest=np.maximum(memory.largest, np.abs(z))))
 
+    def learned(self, belief: Belief) -> Mapping[str, Floats]:
+        """Its estimates."""
+        theta = Memory.read(belief.memory).learned.theta
+        return {"A": theta.A, "Q": covariance(theta.noise), "mu_d": theta.mu_d}
+
     def _believed(self, action: Codes, memory: Memory) -> Belief:
         """The mean and covariance of the posterior, made smaller where they are out of all proportion to the packets."""
         x_hat, P = moments_of(memory.learned.course.mixture)
@@ -152,12 +157,6 @@ def climbing_slots(n: int, keeps: int) -> list[int]:
     while 2 * found[-1] <= keeps:
         found.append(2 * found[-1])
     return found
-
-
-def learned_by(belief: Belief) -> tuple[Floats, Floats, Floats]:
-    """A (n, n, R), Q (n, n, R) and μ_d (R,) as learned."""
-    theta = Memory.read(belief.memory).learned.theta
-    return theta.A, covariance(theta.noise), theta.mu_d
 
 
 def kept_mistakes(given: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -11,6 +11,7 @@ from evedrop.model.eavesdroppers.constant import ConstantEstimate
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper
 from evedrop.model.eavesdroppers.genie import Genie
 from evedrop.model.eavesdroppers.learning_em import LearningEm
+from evedrop.model.eavesdroppers.learning_particle import LearningParticle
 from evedrop.model.eavesdroppers.likelihood import Likelihood
 from evedrop.model.eavesdroppers.naive import Naive
 from evedrop.model.eavesdroppers.power_test import PowerTest
@@ -40,6 +41,7 @@ _BUILT_IN: Mapping[str, type[Eavesdropper]] = {
     "selective": Selective,
     "tracker": Tracker,
     "learning-em": LearningEm,
+    "learning-particle": LearningParticle,
 }
 ANSWERS = Answers()
 """The answers of eavesdropper classes that are not built in, in this process."""

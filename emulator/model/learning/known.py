@@ -5,7 +5,7 @@ Source: docs/mathematics.md, eavesdroppers that learn.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,8 +14,8 @@ import numpy as np
 from evedrop.kernels.elementary import Floats, cholesky
 from evedrop.kernels.factored import Factor, Factors
 from evedrop.model.checks import as_toml
-from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.learning.posterior import Parameters
+from evedrop.model.process import Process
 
 KNOWABLE = ("A", "Q", "mu_d", "initial_covariance")
 """What it may be given."""
@@ -55,9 +55,9 @@ class Known:
         return Parameters(np.repeat(self.A[:, :, None], trials, axis=2), *noise, np.full(trials, self.mu_d))
 
 
-def known(knowledge: Knowledge) -> Known:
-    """What a strategy knows, by its parameter `knows`."""
-    process, names = knowledge.process, frozenset(knowledge.parameters["knows"])
+def known(process: Process, state_probability: float, knows: Iterable[str]) -> Known:
+    """What an eavesdropper is told; state_probability: μ_d; knows: names among `KNOWABLE`."""
+    names = frozenset(knows)
     one = np.eye(process.n)
 
     def factors(name: str, M: Floats) -> Factors:
@@ -67,7 +67,7 @@ def known(knowledge: Knowledge) -> Known:
         names,
         process.A if "A" in names else one,
         factors("Q", process.Q),
-        knowledge.state_probability if "mu_d" in names else 0.5,
+        state_probability if "mu_d" in names else 0.5,
         factors("initial_covariance", process.initial_covariance),
     )
 

@@ -42,13 +42,13 @@ class Moments(NamedTuple):
     """All packets, (R,)."""
 
     @classmethod
-    def imagined(cls, A: Floats, scale: Floats) -> Moments:
+    def imagined(cls, A: Floats, scale: Floats, ridge: float = RIDGE) -> Moments:
         """Those of one transition of little weight, in which the state stays, and of one packet of each type.
 
-        A (n, n, R); scale: the variance of the first packets, (R,).
+        A (n, n, R); scale: the variance of the first packets, (R,); ridge: the transition's weight.
         """
         n, _, trials = A.shape
-        weight, away = RIDGE * scale, np.eye(n)[:, :, None] - A
+        weight, away = ridge * scale, np.eye(n)[:, :, None] - A
         return cls(
             np.zeros((n * (n - 1) // 2, trials)),
             np.repeat(weight[None], n, axis=0),
@@ -137,11 +137,31 @@ def divided(M: Floats, P: Factors) -> Floats:
             for j in range(i):
                 rest = rest - U[i][j] * y[j]
             y.append(rest)
+        for i, value in enumerate(y):
+            found[r, i] = value / P.diagonal[i]
+    return backwards(found, P)
+
+
+def backwards(M: Floats, P: Factors) -> Floats:
+    """M U⁻¹ of every trial, (n, n, R), U of the factors P."""
+    n, U = len(M), P.unit()
+    found = np.empty_like(M)
+    for r, row in enumerate(M):
         for i in reversed(range(n)):
-            rest = y[i] / P.diagonal[i]
+            rest = row[i]
             for j in range(i + 1, n):
                 rest = rest - U[j][i] * found[r, j]
             found[r, i] = rest
+    return found
+
+
+def applied_factors(P: Factors, M: Floats) -> Floats:
+    """U D^½ M of every trial, (n, n, R), from the factors P."""
+    U, scaled = P.unit(), np.sqrt(P.diagonal)[:, None] * M
+    found = scaled.copy()
+    for i in range(len(M)):
+        for j in range(i):
+            found[i] = found[i] + U[i][j] * scaled[j]
     return found
 
 
