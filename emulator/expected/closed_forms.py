@@ -12,7 +12,7 @@ from typing import final
 
 import numpy as np
 
-from evedrop.model.acknowledgements import FORGING, rates_of
+from evedrop.model.acknowledgements import FORGING, Heeding, heeding_of, rates_of
 from evedrop.model.checks import is_number
 from evedrop.model.outcomes import noise_taken
 from evedrop.model.process import Floats, Process
@@ -26,6 +26,7 @@ from evedrop.model.theory.closed_forms import (
     SensorChain,
     always_sent,
     encrypted_schedule,
+    hijacked_schedule,
     reference_covariances,
     reference_limit,
     scheduled,
@@ -164,25 +165,56 @@ def acknowledged_form(scenario: Scenario, receiver: str) -> Closed | None:
     needed = {LEGITIMATE, receiver} | ({table.jammer} if table.jammer is not None else set())
     threshold = scenario.encoding.parameters.get("threshold", 1)
     long = is_number(threshold) and threshold > theory.LARGEST_OPERATOR  # the chain has one state for each slot of it
-    if long or not all(_independent(scenario, name) for name in needed):
+    kind, remembers = _kind_of(scenario, receiver), _remembers(scenario)
+    unknown = remembers and kind not in ("scheduled", "always sent")
+    if long or unknown or not all(_independent(scenario, name) for name in needed):
         return None
     process, quality = scenario.process.process, scenario.quality
     split = _split(scenario, receiver)
-    kind = _kind_of(scenario, receiver)
     # Unless acknowledgements are forged the user never misses a reference, so it knows more about each slot.
     told = receiver != LEGITIMATE or table.attack in FORGING
     if kind in ("reference", "open-loop") and told:
         bound = kind == "reference" and split[1] > 0.0 and ReferenceCode(process).decorrelates
         return Closed(process, scenario.slots, quality[receiver], split, None, bound)
     if kind == "scheduled":
-        chain = scheduled(threshold, quality[receiver], split)
-        return Closed(process, scenario.slots, quality[receiver], split, chain)
+        silent = _hijacked(scenario, receiver) if remembers else scheduled(threshold, quality[receiver], split)
+        return None if silent is None else Closed(process, scenario.slots, quality[receiver], split, silent)
     if kind in ("selective", "always sent"):
         heard = quality[receiver]
         chain = encrypted_schedule(threshold, heard, split) if kind == "selective" else always_sent(heard)
         quantisation = scheme_of(process, scenario.encoding.spec).quantisation
         return Closed(process, scenario.slots, heard, split, chain, quantisation=quantisation)
     return None
+
+
+def _remembers(scenario: Scenario) -> bool:
+    """Whether a hijacked sensor goes by more than the last packet: if α > μ_e, and some acknowledgements are lost."""
+    heeding = _heeding_of(scenario)
+    return heeding is not None and heeding.patience > 0
+
+
+def _heeding_of(scenario: Scenario) -> Heeding | None:
+    table = scenario.acknowledgements
+    if table is None or table.jammer is None:
+        return None
+    return heeding_of(table.attack, table.link.quality, scenario.quality[table.jammer])
+
+
+def _hijacked(scenario: Scenario, receiver: str) -> SensorChain | None:
+    """The chain of `scheduled` with a hijacked sensor that counts misses; None if it is too long."""
+    table, heeding, quality = scenario.acknowledgements, _heeding_of(scenario), scenario.quality
+    threshold, n = scenario.encoding.parameters["threshold"], scenario.process.process.n
+    if table is None or table.jammer is None or heeding is None:
+        return None
+    if threshold * (heeding.patience + 2) * n**2 > theory.LARGEST_OPERATOR:
+        return None
+
+    def hears(user: bool, served: bool) -> float:
+        if receiver == LEGITIMATE:
+            return float(user)
+        return float(served) if receiver == table.jammer else quality[receiver]
+
+    return hijacked_schedule(threshold, quality[LEGITIMATE], quality[table.jammer], heeding, hears)
 
 
 def _split(scenario: Scenario, receiver: str) -> Split:

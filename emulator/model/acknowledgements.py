@@ -5,11 +5,13 @@ Source: docs/mathematics.md, attacks on acknowledgements.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evedrop.model.receiver import Flags
 from evedrop.streams import Ahead, Batch, BlockReader
@@ -48,7 +50,7 @@ ATTACKS: Mapping[str, Attack] = {
 }
 """critical blocks acknowledgements where γ = 1 and γᵉ = 0; forge sends one in the user's name where γ = 0; flip does either.
 
-hijack leaves them as they are, and decides by γᵉ which ones the sensor heeds: see `heeded_shares`.
+hijack leaves them as they are, and decides which ones the sensor heeds: see `Heeding`.
 """
 OVERHEARING = frozenset({"critical", "hijack"})
 """The attacks that depend on what a jammer hears."""
@@ -56,19 +58,51 @@ FORGING = frozenset({"forge", "flip"})
 """The attacks that make a reference of a packet that the user has not heard."""
 
 
-def heeded_shares(attack: str, quality: float, overheard: float) -> tuple[float, float]:
-    """The shares of acknowledgements that the sensor heeds: of packets that the jammer heard, and of those that it missed.
+class Heeding(NamedTuple):
+    """Which acknowledgements a hijacked sensor heeds, by how many packets in a row its eavesdropper has missed."""
 
-    Both are `quality`, but for a hijacked sensor. It heeds as many in all, and those of packets that the jammer, which hears a
-    packet with the probability `overheard`, has heard first: (min(1, α/μ_e), max(0, (α − μ_e)/(1 − μ_e))).
+    patience: int
+    """Those of packets after fewer misses than this are heeded, those after more are not."""
+    share: float
+    """The share that is heeded of those after exactly as many."""
 
-    Source: Lu, Quevedo, Gupta, Dey (2020); docs/mathematics.md, the hijacked sensor.
-    """
-    if attack != "hijack":
-        return quality, quality
-    if quality <= overheard:
-        return (quality / overheard if overheard else 0.0), 0.0
-    return 1.0, (quality - overheard) / (1.0 - overheard)
+    @classmethod
+    def of(cls, quality: float, overheard: float) -> Heeding | None:
+        """The one that heeds the share `quality` in all, if the eavesdropper hears packets with the probability `overheard`.
+
+        1 − (1−μ_e)^J (1 − μ_e a) = α, with the patience J and the share a. None if there is no choice: where no acknowledgement
+        is lost, and where nothing is overheard.
+
+        Source: after Lu, Quevedo, Gupta, Dey (2020); docs/mathematics.md, the hijacked sensor.
+        """
+        if quality >= 1.0 or 1.0 - overheard == 1.0:
+            return None
+        patience = 0 if overheard >= 1.0 else max(0, int(math.log1p(-quality) / math.log1p(-overheard)) - 1)
+        # From here on only elementary operations, so that the share has the same bits on every machine.
+        while _power(1.0 - overheard, patience + 1) > 1.0 - quality:
+            patience += 1
+        left = _power(1.0 - overheard, patience)
+        return cls(patience, min(max((quality - (1.0 - left)) / (overheard * left), 0.0), 1.0))
+
+    def share_of(self, missed: int) -> float:
+        """The share that is heeded after this many misses."""
+        return 1.0 if missed < self.patience else self.share if missed == self.patience else 0.0
+
+
+def _power(base: float, exponent: int) -> float:
+    """A power by squaring."""
+    found = 1.0
+    while exponent:
+        if exponent & 1:
+            found *= base
+        base *= base
+        exponent >>= 1
+    return found
+
+
+def heeding_of(attack: str, quality: float, overheard: float) -> Heeding | None:
+    """What the sensor heeds under an attack; None if it heeds all that reach it."""
+    return Heeding.of(quality, overheard) if attack == "hijack" else None
 
 
 @dataclass(frozen=True)
@@ -108,8 +142,12 @@ class AckChannel:
         self._spans = spans
         # The first of two words is that of a reader of one.
         reader = BlockReader(key, batch, 2)
-        words, limits = [0, 1, 0, 0], np.array([quality, flip, *heeded_shares(attack, quality, overheard)])[:, None]
+        self._heeding = heeding_of(attack, quality, overheard)
+        share = 0.0 if self._heeding is None else self._heeding.share
+        words, limits = [0, 1, 0], np.array([quality, flip, share])[:, None]
         self._drawn = Ahead(reader.ahead, lambda slots: reader.uniforms(slots)[:, words] < limits)
+        self._missed: NDArray[np.int64] = np.zeros(batch.trials, np.int64)
+        self._counted = -1
 
     @classmethod
     def of(cls, spec: WayBackSpec, key: bytes, batch: Batch) -> AckChannel:
@@ -123,11 +161,22 @@ class AckChannel:
         gamma_e: what the jammer received.
         """
         attacked = self._spans is None or any(start <= k < stop for start, stop in self._spans)
-        through, flips, heeded, heeded_missed = self._drawn.at(k)
-        arrived: Flags = gamma & through
-        if attacked:
-            arrived = self._attack(gamma, gamma_e, flips) & np.where(gamma_e, heeded, heeded_missed)
+        through, flips, shared = self._drawn.at(k)
+        on_the_air = self._attack(gamma, gamma_e, flips) if attacked else gamma
+        arrived: Flags = on_the_air & through
+        if self._heeding is not None:
+            self._count(k, sent, gamma_e)
+            if attacked:
+                few, as_many = self._missed < self._heeding.patience, self._missed == self._heeding.patience
+                arrived = on_the_air & (few | (as_many & shared))
         return arrived if sent is None else arrived & sent
+
+    def _count(self, k: int, sent: Flags | None, gamma_e: Flags) -> None:
+        """Count the packets in a row that the jammer has missed; a slot counts once."""
+        if k > self._counted:
+            self._counted = k
+            missed = np.where(gamma_e, 0, self._missed + 1)
+            self._missed = missed if sent is None else np.where(sent, missed, self._missed)
 
 
 class AcknowledgementRates(NamedTuple):
@@ -144,13 +193,18 @@ class AcknowledgementRates(NamedTuple):
 def rates_of(attack: str, mu: float, mu_e: float, quality: float = 1.0, flip: float = 0.0) -> AcknowledgementRates:
     """The rates under an attack, for independent links of qualities μ and μ_e and an independent way back.
 
+    Under `hijack` those of a packet alone: what the sensor heeds then depends on earlier packets as well.
+
     flip: the probability of a flip.
 
     Source: docs/mathematics.md, attacks on acknowledgements.
     """
     gamma, gamma_e, flips = (np.arange(8) >> bit & 1 == 0 for bit in range(3))
     chances = np.where(gamma, mu, 1.0 - mu) * np.where(gamma_e, mu_e, 1.0 - mu_e) * np.where(flips, flip, 1.0 - flip)
-    heeded = np.where(gamma_e, *heeded_shares(attack, quality, mu_e))
+    heeding, heeded = heeding_of(attack, quality, mu_e), np.full(8, quality)
+    if heeding is not None:
+        share = heeding.share_of(0)
+        heeded = np.where(gamma_e, share, max(0.0, quality - mu_e * share) / max(1.0 - mu_e, np.finfo(float).tiny))
     arrives = heeded * chances * ATTACKS[attack](gamma, gamma_e, flips)
 
     def split(heard: Flags) -> tuple[float, float]:

@@ -217,6 +217,8 @@ def test_the_sensor_notices_what_it_cannot_miss() -> None:
         ("scheduled", "naive", "critical"),
         ("scheduled", "ref", "critical"),
         ("scheduled", "ref", "hijack"),
+        ("scheduled", "naive", "hijack"),
+        ("scheduled", "legitimate", "hijack"),
         ("scheduled", "legitimate", "forge"),
         ("encrypted-schedule", "sel", "critical"),
         ("encrypted-schedule", "legitimate", "none"),

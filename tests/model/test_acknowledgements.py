@@ -74,7 +74,8 @@ def test_attacks_on_state_secrecy_codes_cost_what_theory_says(attack: str) -> No
     """Mean believed trace after a few slots, user's and eavesdropper's, by the recursion, at 5 standard errors."""
     mu, mu_e, slots, trials = 0.8, 0.7, 6, 20_000
     batch = Batch(slots, trials)
-    way = AckChannel(attack, 0.9, KEY, batch, overheard=mu_e)
+    quality = 0.6 if attack == "hijack" else 0.9  # above μ_e a hijacked sensor has a memory, and theory another form
+    way = AckChannel(attack, quality, KEY, batch, overheard=mu_e)
     eve = STRATEGIES["reference"](Knowledge(UNSTABLE, 1.0, {}, {}), batch)
     played = play(
         Acknowledged(UNSTABLE),
@@ -83,7 +84,7 @@ def test_attacks_on_state_secrecy_codes_cost_what_theory_says(attack: str) -> No
         {"eve": eve},
         lambda k, sent, received: way.arrived(k, sent, received["legitimate"], received["eve"]),
     )
-    rates = rates_of(attack, mu, mu_e, 0.9)
+    rates = rates_of(attack, mu, mu_e, quality)
     for name, quality, acknowledged in (("legitimate", mu, rates.user), ("eve", mu_e, rates.eavesdropper)):
         expected = np.trace(reference_covariances(UNSTABLE, quality, acknowledged, slots), axis1=1, axis2=2)
         for found in (played.trace(name), played.squared_error(name)):

@@ -176,4 +176,5 @@ def test_thresholds_at_the_ends() -> None:
     """To encrypt all takes θ = 1; less is not possible if no acknowledgement arrives."""
     assert threshold_for(1.0, 0.5) == threshold_for(1.0, 0.0) == 1.0
     assert threshold_for(0.5, 0.0) == np.inf
+    assert threshold_for(0.4, 0.72) == pytest.approx(1.0 + 0.6 / 0.72)
     assert encrypted_fraction(threshold_for(0.25, 1.0), 1.0) == 0.25

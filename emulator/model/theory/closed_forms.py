@@ -8,9 +8,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
+from evedrop.model.acknowledgements import Heeding
 from evedrop.model.process import Floats, Process
 from evedrop.model.theory.covariances import LARGEST_OPERATOR, Outcomes, limit_trace, radius
 from evedrop.model.theory.quantisation import QuantisationError
@@ -93,6 +95,9 @@ def reference_limit(process: Process, received: float, acknowledged: tuple[float
     return float(np.trace(np.linalg.solve(np.eye(2 * n * n) - operator, source)[: n * n].reshape(n, n)))
 
 
+Hears = Callable[[bool, bool], float]
+
+
 @dataclass(frozen=True)
 class SensorChain:
     """The sensor's behaviour as a Markov chain, and its effect on one receiver's error.
@@ -173,6 +178,33 @@ def scheduled(threshold: int, received: float, acknowledged: tuple[float, float]
     for s in range(threshold - 1):
         carried[s, s + 1] = 1.0
     _hear(reset, carried, threshold - 1, threshold - 1, received, acknowledged)
+    return SensorChain(start, reset, carried)
+
+
+def hijacked_schedule(threshold: int, mu: float, mu_e: float, heeding: Heeding, hears: Hears) -> SensorChain:
+    """The chain for a receiver of the scheme `scheduled` whose sensor is hijacked.
+
+    A state is a holding time, as for `scheduled`, and how many packets in a row the eavesdropper has missed that the sensor
+    serves: 0 … patience, or more. hears: the probability that the receiver hears a packet, by whether the user and that
+    eavesdropper hear it.
+
+    Source: docs/mathematics.md, the hijacked sensor.
+    """
+    counts, top = heeding.patience + 2, threshold - 1
+    start, reset, carried = _blank(threshold * counts)
+    start[:] = 0.0
+    start[top * counts] = 1.0
+    for missed in range(counts):
+        for s in range(top):
+            carried[s * counts + missed, (s + 1) * counts + missed] = 1.0
+        before = top * counts + missed
+        for user, served in product((True, False), repeat=2):
+            now = 0 if served else min(missed + 1, counts - 1)
+            chance = (mu if user else 1.0 - mu) * (mu_e if served else 1.0 - mu_e)
+            heeded = heeding.share_of(now) if user else 0.0
+            for after, odds in ((now, heeded), (top * counts + now, 1.0 - heeded)):
+                reset[before, after] += chance * odds * hears(user, served)
+                carried[before, after] += chance * odds * (1.0 - hears(user, served))
     return SensorChain(start, reset, carried)
 
 
