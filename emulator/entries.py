@@ -163,11 +163,14 @@ def entry(check: Check, read: Callable[[Any], Any] | None = None, left_out: bool
     return {"check": check, "read": read or (lambda found: found), "left_out": left_out}
 
 
-def inner(kind: type[Any], or_null: bool = False) -> dict[str, Any]:
-    """The metadata of a field that is itself a table of entries: an object of this dataclass; or_null: or None."""
+def inner(kind: type[Any], or_null: bool = False, left_out: bool = False) -> dict[str, Any]:
+    """The metadata of a field that is itself a table of entries: an object of this dataclass.
+
+    or_null: or None; left_out: or None, which is not written.
+    """
     check = table_of(kind)
-    if or_null:
-        return entry(maybe(check), lambda found: None if found is None else read(kind, found))
+    if or_null or left_out:
+        return entry(maybe(check), lambda found: None if found is None else read(kind, found), left_out)
     return entry(check, partial(read, kind))
 
 

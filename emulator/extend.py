@@ -39,7 +39,16 @@ if TYPE_CHECKING:
         PanelCurve,
         PanelFeed,
     )
-    from evedrop.scenario.events.effects import Jamming, Leave, LinkCut, LinkHealed, LinkSettings, Nothing, Return
+    from evedrop.scenario.events.effects import (
+        Jamming,
+        Leave,
+        LinkCut,
+        LinkHealed,
+        LinkSettings,
+        Nothing,
+        Return,
+        Spoofing,
+    )
     from evedrop.scenario.events.event import Act, EventKind
     from evedrop.scenario.table import Table
     from evedrop.view.column import Column, scalars
@@ -111,6 +120,7 @@ __all__ = [
     "ScoredSlots",
     "Shared",
     "Shown",
+    "Spoofing",
     "Table",
     "ViewPanel",
     "colour",
@@ -144,6 +154,7 @@ _LATER = {
         "LinkSettings",
         "Nothing",
         "Return",
+        "Spoofing",
     ),
     "evedrop.scenario.events.event": ("Act", "EventKind"),
     "evedrop.scenario.table": ("Table",),

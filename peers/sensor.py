@@ -23,6 +23,7 @@ from evedrop.live.protocol.codec import Reader, read_progress
 from evedrop.live.protocol.commands import End, Go, Hold, Start
 from evedrop.live.protocol.packets import barrier, read_acknowledgement, resend, uplink
 from evedrop.live.protocol.telemetry import held
+from evedrop.model.integrity.monitor import Monitor
 from evedrop.model.local_filter import LocalFilter
 from evedrop.model.numeric.detection import CusumBatch
 from evedrop.model.process import Floats
@@ -172,7 +173,7 @@ class Sensing:
             self._steered = Steered(brief, inputs, part.controller, session)
         telemetry = session.kept(session.keys.telemetry(SENSOR), brief.flow.window + 1)
         self._reporter = TruthReporter(
-            brief, telemetry, scheme.may_be_silent, self._core.watches, inputs, self._core.filters
+            brief, telemetry, scheme.may_be_silent, self._core.watches, inputs, self._core.filters, self._core.monitors
         )
         self._barriers = Barriers(brief, session, self._window, telemetry, self._reporter.flush)
         self._betrayed = set(part.leaks.values())
@@ -254,9 +255,13 @@ def _core_of(brief: Brief[SensorPart], scheme: Scheme) -> SensorCore:
     plant = None if entry is None else entry.plant
     disturbances = None if entry is None else decoded(entry.disturbances, brief.slots)
     initial = scheme.initial_state(keys, brief.batch)
-    local = None
+    local, monitor, spoofing = None, None, None
+    if brief.part.monitor is not None:
+        plan = brief.part.monitor.plan
+        monitor = Monitor(plan, keys.get("watermark", b""), brief.batch)
+        spoofing = plan.spoofing(keys.get("spoofing", b""), brief.batch)
     if plant is not None and plant.output_matrix is not None:
-        local = LocalFilter(process, plant, keys.get("measurement", b""), brief.batch)
+        local = LocalFilter(process, plant, keys.get("measurement", b""), brief.batch, spoofing)
     chart = brief.part.chart
     encoder = scheme.encoder(keys, brief.batch)
     return SensorCore(
@@ -264,6 +269,7 @@ def _core_of(brief: Brief[SensorPart], scheme: Scheme) -> SensorCore:
         PlantCore(process, keys["process"], brief.batch, initial, plant, disturbances),
         local,
         None if chart is None else CusumBatch(chart, brief.trials),
+        monitor,
     )
 
 

@@ -19,6 +19,7 @@ from evedrop.model.slot.link import LinkSchedule
 from evedrop.model.slot.link_law import law_of
 from evedrop.model.theory.horizon import horizon
 from evedrop.names import LEGITIMATE
+from evedrop.scenario import Scenario
 from evedrop.scenario.across import (
     acknowledgement_mistakes,
     application_mistakes,
@@ -27,7 +28,9 @@ from evedrop.scenario.across import (
     scheme_mistakes,
     strategy_mistakes,
 )
+from evedrop.scenario.application import APPLICATIONS
 from evedrop.scenario.closed_loop import loop_mistakes
+from evedrop.scenario.controlled import controlled_plant
 from evedrop.scenario.event_mistakes import event_mistakes
 from evedrop.scenario.expect import Around
 from evedrop.scenario.filter_noise import filter_mistakes
@@ -64,6 +67,8 @@ def mistakes_across(tables: ValidTables, beyond_horizon: bool) -> list[str]:
         event_mistakes,
     ):
         found += phase(tables)
+    if tables.scenario is not None and not found:
+        found += _application_objections(tables.scenario)
     if tables.nemesis is not None and tables.all_receivers:
         found += nemesis_mistakes(tables.nemesis, tables.slots, tables.receivers)
     if tables.scenario is not None and not found:
@@ -117,6 +122,13 @@ def _no_theory(name: str, tables: ValidTables, sound: bool) -> str | None:
         return None
     known = expectations_of(tables.scenario)[name].known
     return None if known else f"no theory covers {name} with these links, attacks and events together"
+
+
+def _application_objections(scenario: Scenario) -> list[str]:
+    """Mistakes that applications find in a scenario that is otherwise valid."""
+    loop = controlled_plant(scenario)
+    found = [(name, APPLICATIONS[name], table) for name, table in scenario.applications.items() if loop is not None]
+    return [said for _, one, table in found if loop is not None for said in one.objections(loop, table)]
 
 
 def _horizon_mistakes(process: Process, slots: int) -> list[str]:

@@ -7,7 +7,7 @@ time, and all else follows a chunk at a time.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
@@ -21,6 +21,7 @@ from evedrop.memory.packet_counts import PacketCounts
 from evedrop.model.acknowledgements import AckChannel
 from evedrop.model.digest import BlockDigests, Digests, InputLog
 from evedrop.model.input_aware import InputAwareEstimator
+from evedrop.model.integrity.monitor import Monitor
 from evedrop.model.numeric.detection import CusumBatch
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags, Receiver
@@ -32,6 +33,7 @@ from evedrop.model.slot.receiver import FollowedSlots
 from evedrop.model.slot.sensor import SensorCore, Sent
 from evedrop.names import CONTROLLER, LEGITIMATE
 from evedrop.scenario import Scenario
+from evedrop.scenario.controlled import monitor_of
 from evedrop.scenario.input_files import disturbances_of
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.score.acknowledging import chart_of, way_back_of
@@ -76,12 +78,15 @@ class ExactSimulation:
         self._roles, self._digests, self._packets = roles, digests, packets
         self._guard = roles.guard
         disturbances = disturbances_of(scenario)
-        process, chart = scenario.process.process, chart_of(scenario)
+        process, chart, plan = scenario.process.process, chart_of(scenario), monitor_of(scenario)
         self._sensor = SensorCore(
             roles.guard.encoder(roles.shared.encoder()),
             PlantCore(process, keys.process, batch, roles.initial, scenario.driven, disturbances),
-            local_filter_of(scenario, keys.measurement, batch),
+            local_filter_of(
+                scenario, keys.measurement, batch, None if plan is None else plan.spoofing(keys.spoofing, batch)
+            ),
             None if chart is None else CusumBatch(chart, batch.trials),
+            None if plan is None else Monitor(plan, keys.watermark, batch),
         )
         way_back = way_back_of(scenario)
         self._jammer = None if way_back is None else way_back.jammer
@@ -181,6 +186,7 @@ class ExactSimulation:
                 used,
             )
         true = made.true if self._sensor.filters else None
+        inputs = None if inputs is None else replace(inputs, monitored=made.monitored)
         whole = Slots(chunk.start, made.x, made.packets.nu, slots, made.packets.sent, alarms, inputs, true)
         return Chunk(chunk.start, receivers, whole)
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from evedrop.files import opened
 from evedrop.model.digest import DIGEST_BYTES
+from evedrop.model.integrity.monitor import MonitoredSlots
 from evedrop.model.links.link import REASONS
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats
@@ -91,8 +92,8 @@ DIGESTS = pa.schema(
 )
 
 
-def inputs_schema(inputs: int, disturbances: int) -> pa.Schema:
-    """The schema for these numbers of inputs and disturbances."""
+def inputs_schema(inputs: int, disturbances: int, monitored: bool = False) -> pa.Schema:
+    """The schema for these numbers of inputs and disturbances; monitored: whether there are a watermark and a detector."""
     return pa.schema(
         [
             ("slot", pa.int64()),
@@ -101,6 +102,7 @@ def inputs_schema(inputs: int, disturbances: int) -> pa.Schema:
             *([("d", pa.list_(pa.float64(), disturbances))] if disturbances else []),
             ("failed", pa.bool_()),
             ("clipped", pa.bool_()),
+            *([("watermark", pa.list_(pa.float64(), inputs)), ("statistic", pa.float64())] if monitored else []),
         ]
     )
 
@@ -112,9 +114,10 @@ def inputs_schema_in(path: Path) -> pa.Schema:
             pass
         schema = pq.read_schema(path)
         u, d = (int(schema.field(name).type.list_size) if name in schema.names else 0 for name in ("u", "d"))
+        monitored = "statistic" in schema.names
     except Exception:  # pyarrow raises many kinds of errors for a damaged file, and the table's reader reports them
-        u = d = 0
-    return inputs_schema(max(1, u), d)
+        u, d, monitored = 0, 0, False
+    return inputs_schema(max(1, u), d, monitored)
 
 
 def input_columns(slots: Slots, plant: Plant, disturbances: Floats, first_trial: int) -> list[NDArray[Any]]:
@@ -129,4 +132,12 @@ def input_columns(slots: Slots, plant: Plant, disturbances: Floats, first_trial:
         *([np.repeat(disturbances[some], recorded, axis=0)] if disturbances.shape[1] else []),
         slots.inputs.failed[:, :recorded].reshape(-1),
         plant.clips(u).reshape(-1),
+        *_monitored_columns(slots.inputs.monitored, recorded),
     ]
+
+
+def _monitored_columns(monitored: MonitoredSlots | None, recorded: int) -> list[NDArray[Any]]:
+    if monitored is None:
+        return []
+    e = monitored.watermark[:, :, :recorded].transpose(0, 2, 1)
+    return [e.reshape(-1, e.shape[2]), monitored.statistic[:, :recorded].reshape(-1)]

@@ -40,6 +40,7 @@ from evedrop.results.tables import (
     trials_schema,
 )
 from evedrop.scenario import Scenario
+from evedrop.scenario.controlled import monitor_of
 from evedrop.scenario.input_files import disturbances_of
 from evedrop.score.histogram import LEVELS
 from evedrop.score.slots import Slots
@@ -72,10 +73,11 @@ class ResultsWriter:
         n: int,
         around: Sequence[float] | None = None,
         loop: tuple[Plant, Floats] | None = None,
+        monitored: bool = False,
     ) -> None:
         """around: added to states and estimates, (n,); loop: plant and disturbances (slots, q) of a closed loop.
 
-        Raises OSError if the folder cannot be written.
+        monitored: whether there are a watermark and a detector. Raises OSError if the folder cannot be written.
         """
         self._digested = receivers if loop is None else (*receivers, CONTROLLER)
         self._around = None if around is None or not any(around) else np.array(around)
@@ -92,7 +94,7 @@ class ResultsWriter:
         }
         if loop is not None:
             plant, disturbances = loop
-            self._kinds["inputs"] = (inputs_schema(plant.inputs, disturbances.shape[1]), {})
+            self._kinds["inputs"] = (inputs_schema(plant.inputs, disturbances.shape[1], monitored), {})
         self._streams = {name: self._stream(name, 0) for name in self._kinds}
         self._outdated: list[TableStream] = []
         self._restarts = self._bytes = self._on_disk = self._slots = 0
@@ -113,7 +115,8 @@ class ResultsWriter:
             if scenario.driven is None or scenario.controller is None
             else (scenario.driven, disturbances_of(scenario))
         )
-        return cls(folder, scenario.receivers, len(scenario.process.A), scenario.process.around, loop)
+        states, around = len(scenario.process.A), scenario.process.around
+        return cls(folder, scenario.receivers, states, around, loop, monitor_of(scenario) is not None)
 
     def __enter__(self) -> Self:
         return self

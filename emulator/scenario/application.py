@@ -19,6 +19,7 @@ from evedrop.figures import error_column
 from evedrop.figures.standard_error import standard_error
 from evedrop.figures.text import estimate
 from evedrop.model.controllers import Assignment, Controller
+from evedrop.model.integrity.monitor import MonitoredSlots, MonitorPlan
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process
 from evedrop.model.registry import Registry
@@ -54,6 +55,10 @@ class ControlledPlant:
     """The same with their units, if the scenario gives units."""
     receivers: tuple[str, ...]
     """The legitimate estimator first."""
+    on_truth: bool = False
+    """Whether the controller acts on the true state."""
+    spoofed: tuple[tuple[int, int], ...] = ()
+    """The slots [from, to) of events in which the measurements are attacked; without such events an attack lasts all run."""
 
     @property
     def process(self) -> Process:
@@ -99,6 +104,10 @@ class ApplicationTally(ABC):
     @abstractmethod
     def add(self, x: Floats, u: Floats, estimates: Mapping[str, Floats]) -> None:
         """Add the next c slots: true states (c, n, R), inputs as decided (c, m, R), and every receiver's estimates, (c, n, R)."""
+
+    def add_monitored(self, x: Floats, u: Floats, monitored: MonitoredSlots) -> None:
+        """Add watermark and detector of the next c slots, before these go to `add`; by default nothing. x and u as there."""
+        del x, u, monitored
 
     @classmethod
     @abstractmethod
@@ -164,6 +173,11 @@ class PanelFeed(ABC):
         Returns PATH/CURVE → slots and values of its g new points, (2, g).
         """
 
+    def take_monitored(self, first: int, monitored: MonitoredSlots) -> Mapping[str, Floats]:
+        """The points of curves from watermark and detector of these slots, of one trial; by default none."""
+        del first, monitored
+        return {}
+
 
 class Application(ABC):
     """A use of a plant with a controller. A class, never an instance, is registered.
@@ -179,6 +193,20 @@ class Application(ABC):
     """Its figures in the summary that expectations and sweeps can use."""
     receiver_figures: ClassVar[tuple[str, ...]] = ()
     """Its figures for each receiver, likewise."""
+    has_monitor: ClassVar[bool] = False
+    """Whether it can have a monitor."""
+
+    @classmethod
+    def objections(cls, loop: ControlledPlant, table: Table) -> list[str]:
+        """Mistakes that only show with a valid process, plant and controller: "ENTRY: what is wrong"; by default none."""
+        del loop, table
+        return []
+
+    @classmethod
+    def monitor(cls, loop: ControlledPlant, table: Table) -> MonitorPlan | None:
+        """The watermark, the detector beside the sensor's filter and the attack that it wants; by default none."""
+        del loop, table
+        return None
 
     @classmethod
     @abstractmethod

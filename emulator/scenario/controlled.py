@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from evedrop.model.controllers import CONTROLLERS
-from evedrop.scenario.application import ControlledPlant
+from evedrop.model.integrity.monitor import MonitorPlan
+from evedrop.scenario.application import APPLICATIONS, ControlledPlant
 from evedrop.scenario.input_files import disturbances_of
 from evedrop.scenario.tables import Scenario
 
@@ -34,4 +35,15 @@ def controlled_plant(scenario: Scenario) -> ControlledPlant | None:
         tuple(table.disturbances),
         labels(table.disturbances, table.disturbance_units),
         scenario.receivers,
+        controller.acts_on == "truth",
+        tuple((start, min(stop, scenario.slots)) for start, stop in scenario.timeline.spoofs),
     )
+
+
+def monitor_of(scenario: Scenario) -> MonitorPlan | None:
+    """The watermark, detector and attack that an application of the scenario wants; None if none wants any."""
+    loop = controlled_plant(scenario)
+    plans = [
+        APPLICATIONS[name].monitor(loop, table) for name, table in scenario.applications.items() if loop is not None
+    ]
+    return next((plan for plan in plans if plan is not None), None)

@@ -31,6 +31,7 @@ def event_mistakes(tables: ValidTables) -> Iterator[str]:
         tables.scheme,
         "" if tables.encoding is None else tables.encoding.scheme,
         attack if "acknowledgements" in tables.given else "none",
+        any(one.has_monitor for one in tables.applications.values()),
     )
     for i, event in tables.event:
         path = f"event.{i}"

@@ -71,6 +71,16 @@ class StreamKeys:
         return stream_key(self.seed_root, "measurement")
 
     @property
+    def watermark(self) -> bytes:
+        """The key of the watermark that is added to the plant's inputs."""
+        return stream_key(self.seed_root, "watermark")
+
+    @property
+    def spoofing(self) -> bytes:
+        """The key of the values that an attacker makes the sensor report."""
+        return stream_key(self.seed_root, "spoofing")
+
+    @property
     def way_back(self) -> bytes:
         """The key of the losses of acknowledgements."""
         return stream_key(self.seed_root, f"link/{ACKNOWLEDGEMENTS}")

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from evedrop.model.slot.link import NEVER, Change, ReceiverOutage
-from evedrop.scenario.events.effects import Jamming, Leave, LinkCut, LinkHealed, LinkSettings, Return
+from evedrop.scenario.events.effects import Jamming, Leave, LinkCut, LinkHealed, LinkSettings, Return, Spoofing
 from evedrop.scenario.events.event import Act, EventKind
 
 Changed = Callable[[str, Mapping[str, Any]], dict[str, Any]]
@@ -47,14 +47,22 @@ class Timeline:
     @property
     def jams(self) -> list[list[int]] | None:
         """Slots [from, to) in which acknowledgements are attacked; None without such events: an attack then lasts all run."""
+        return self._spans(Jamming) or None
+
+    @property
+    def spoofs(self) -> list[list[int]]:
+        """Slots [from, to) of events in which measurements are attacked."""
+        return self._spans(Spoofing)
+
+    def _spans(self, kind: type[Jamming | Spoofing]) -> list[list[int]]:
         spans: list[list[int]] = []
         for act in self.acts:
-            match act.effect:
-                case Jamming(on=True):
+            if isinstance(act.effect, kind):
+                if act.effect.on:
                     spans.append([act.at, NEVER])
-                case Jamming():
+                else:
                     spans[-1][1] = act.at
-        return spans or None
+        return spans
 
     @classmethod
     def of(cls, events: Iterable[EventKind], receivers: Sequence[str], changed: Changed) -> Timeline:

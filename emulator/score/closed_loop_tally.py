@@ -43,7 +43,7 @@ class Acted:
 
     def part(self, trials: slice) -> Acted:
         """The same for some of the trials."""
-        inputs = InputSlots(self.inputs.u[..., trials], self.inputs.failed[:, trials])
+        inputs = self.inputs.part(trials)
         estimates = {name: x_hat[..., trials] for name, x_hat in self.estimates.items()}
         return Acted(inputs, self.x[..., trials], estimates, self.action[:, trials], self.true[..., trials])
 
@@ -115,6 +115,8 @@ class LoopTally:
         """Add the next slots."""
         inputs = acted.inputs
         for application in self.applications.values():
+            if inputs.monitored is not None:
+                application.add_monitored(acted.true, inputs.u, inputs.monitored)
             application.add(acted.true, inputs.u, acted.estimates)
         self.trial_slots += inputs.failed.size
         self.failed += int(np.count_nonzero(inputs.failed))

@@ -5,7 +5,7 @@ Source: docs/results.md, filter.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from typing import final
 
@@ -21,12 +21,14 @@ from evedrop.score.sums import squared_errors
 from evedrop.streams import Batch
 
 
-def local_filter_of(scenario: Scenario, key: bytes, batch: Batch) -> LocalFilter | None:
-    """The sensor's filter; None if the sensor knows the state."""
+def local_filter_of(
+    scenario: Scenario, key: bytes, batch: Batch, spoofing: Callable[[int, Floats], Floats] | None = None
+) -> LocalFilter | None:
+    """The sensor's filter; None if the sensor knows the state. spoofing: as for `LocalFilter`."""
     driven = scenario.driven
     if driven is None or driven.output_matrix is None:
         return None
-    return LocalFilter(scenario.process.process, driven, key, batch)
+    return LocalFilter(scenario.process.process, driven, key, batch, spoofing)
 
 
 def true_errors(true: Floats, x: Floats, x_hats: Mapping[str, Floats]) -> dict[str, Floats]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.kernels.current import kernels
+from evedrop.model.integrity.monitor import MonitoredSlots
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes, Flags
 
@@ -69,10 +70,13 @@ class InputSlots:
     """As decided, (c, m, R); the plant may clip it."""
     failed: Flags
     """Whether the decision failed, so that the previous inputs are held, (c, R)."""
+    monitored: MonitoredSlots | None = None
+    """The watermark, and what the detector beside the sensor's filter says; None without one."""
 
     def part(self, trials: slice) -> InputSlots:
         """The same for some of the trials."""
-        return InputSlots(self.u[..., trials], self.failed[:, trials])
+        monitored = None if self.monitored is None else self.monitored.part(trials)
+        return InputSlots(self.u[..., trials], self.failed[:, trials], monitored)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from typing import Any, final
 
 import numpy as np
 
+from evedrop.model.integrity.monitor import MonitoredSlots
 from evedrop.model.process import Floats
 from evedrop.scenario import Scenario
 from evedrop.scenario.application import APPLICATIONS, ControlledPlant
@@ -33,13 +34,18 @@ class Showing:
         loop = controlled_plant(scenario)
         return None if loop is None else cls(loop, scenario)
 
-    def take(self, u: Floats, estimates: Mapping[str, Floats]) -> Moved:
-        """The view's values of the next slots, from inputs as decided, (c, m), and estimates as deviations, (c, n)."""
+    def take(self, u: Floats, estimates: Mapping[str, Floats], monitored: MonitoredSlots | None = None) -> Moved:
+        """The view's values of the next slots, from inputs as decided, (c, m), and estimates as deviations, (c, n).
+
+        monitored: watermark and detector in this trial alone; None without them.
+        """
         limited = self._plant.limited(u.T).T
         first, self._next = self._next, self._next + len(u)
         values = np.hstack([self._disturbances[first : self._next], limited])
         curves: dict[str, Floats] = {}
         for feed in self._feeds:
+            if monitored is not None:
+                curves |= feed.take_monitored(first, monitored)
             curves |= feed.take(first, limited, estimates)
         return Moved(values, curves)
 

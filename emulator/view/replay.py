@@ -12,6 +12,7 @@ import pyarrow.compute as pc
 
 from evedrop.errors import UsageError
 from evedrop.loading import load
+from evedrop.model.integrity.monitor import MonitoredSlots
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Flags
 from evedrop.results.writer import Results, load_results
@@ -41,7 +42,7 @@ def replay(folder: Path, path: Path | None = None) -> Path:
     if not len(x):
         raise UsageError(f"{folder} has no recorded trial to show; run it again without --covariance-only or the like")
     _check_shapes(folder, len(scenario.process.A), x, peers)
-    inputs, showing = _inputs(results), showing_of(scenario)
+    inputs, monitored, showing = _inputs(results), _monitored(results), showing_of(scenario)
     if showing is not None and len(inputs) != len(x):
         raise UsageError(f"{folder}: inputs.parquet does not have the slots of trials.parquet; run the scenario again")
     around = np.array(scenario.process.around)
@@ -49,7 +50,8 @@ def replay(folder: Path, path: Path | None = None) -> Path:
     for first in range(0, len(x), _CHUNK):
         rows = slice(first, min(first + _CHUNK, len(x)))
         deviations = {name: peer.x_hat[rows] - around for name, peer in peers.items()}
-        moved = None if showing is None else showing.take(inputs[rows], deviations)
+        some = None if monitored is None else monitored.rows(rows)
+        moved = None if showing is None else showing.take(inputs[rows], deviations, some)
         shown = {name: peer.mapped(itemgetter(rows)) for name, peer in peers.items()}
         recording.add(SceneSlots(first, x[rows], nu[rows], shown, moved, sent[rows]))
     for event in results.events:
@@ -94,6 +96,15 @@ def _inputs(results: Results) -> Floats:
     if rows is None or not rows.num_rows:
         return np.empty((0, 0))
     return _matrix(rows.filter(pc.field("trial") == pc.min(rows["trial"])).sort_by("slot")["u"])
+
+
+def _monitored(results: Results) -> MonitoredSlots | None:
+    """Watermark and detector of the first recorded trial; None without them."""
+    rows = results.inputs
+    if rows is None or not rows.num_rows or "statistic" not in rows.schema.names:
+        return None
+    rows = rows.filter(pc.field("trial") == pc.min(rows["trial"])).sort_by("slot")
+    return MonitoredSlots(rows["statistic"].to_numpy()[:, None], _matrix(rows["watermark"])[:, :, None])
 
 
 def _peer(results: Results, name: str) -> PeerSlots:

@@ -79,6 +79,7 @@ def shown(slots: Slots, scored: Mapping[str, Scored], around: Sequence[float], s
     moved = None
     if showing is not None and slots.inputs is not None:
         estimates = {name: receiver.x_hat[:, :, 0] for name, receiver in slots.receivers.items()}
-        moved = showing.take(slots.inputs.u[:, :, 0], estimates)
+        monitored = None if slots.inputs.monitored is None else slots.inputs.monitored.part(slice(0, 1))
+        moved = showing.take(slots.inputs.u[:, :, 0], estimates, monitored)
     sent = None if slots.sent is None else slots.sent[:, 0]
     return SceneSlots(slots.first, slots.x[:, :, 0] + around, slots.nu[:, 0], peers, moved, sent)

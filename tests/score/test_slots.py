@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from evedrop.model.integrity.monitor import MonitoredSlots
 from evedrop.score.slots import InputSlots, ReceiverSlots, Slots, concatenated
 
 SHAPES = {"x_hat": (6, 2, 3), "P": (6, 2, 2, 3), "trace": (6, 2), "unsent": (6,), "true": (6, 2, 3), "x": (6, 2, 3)}
@@ -26,7 +27,7 @@ def whole() -> Slots:
             **plain, lost={"lost": np.arange(6, dtype=np.uint32), "cut": np.arange(7, 13, dtype=np.uint32)}
         )
     }
-    inputs = InputSlots(of_shape("x"), of_shape("failed"))
+    inputs = InputSlots(of_shape("x"), of_shape("failed"), MonitoredSlots(of_shape("statistic"), of_shape("x")))
     return Slots(
         4, of_shape("x"), of_shape("nu"), receivers, of_shape("sent"), of_shape("alarms"), inputs, of_shape("true")
     )
@@ -62,7 +63,7 @@ def entries(value: Any, path: str = "") -> dict[str, list[float]]:
 def test_every_entry_is_kept() -> None:
     """Slots that were cut into pieces are the same again when they are joined."""
     of_parts = [part(whole(), rows) for rows in (slice(0, 1), slice(1, 5), slice(5, 6))]
-    assert len(entries(whole())) == 19
+    assert len(entries(whole())) == 21
     assert entries(concatenated(of_parts)) == entries(whole())
 
 

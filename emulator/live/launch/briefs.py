@@ -30,6 +30,7 @@ from evedrop.names import ACKNOWLEDGEMENTS, CONTROLLER, LEGITIMATE, OBSERVER, OP
 from evedrop.plugins import named_in
 from evedrop.results.folder import new_folder
 from evedrop.scenario import Scenario
+from evedrop.scenario.controlled import monitor_of
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.score.acknowledging import chart_of, way_back_of
 
@@ -65,6 +66,7 @@ def sizes_of(scenario: Scenario, batch: int) -> Sizes:
         len(scheme.header),
         0 if plant is None or table is None else plant.inputs,
         1 if table is None else table.period,
+        monitor_of(scenario) is not None,
     )
 
 
@@ -181,6 +183,7 @@ def briefs_of(
         plant=loop.plant,
         controller=loop.of_sensor,
         modules=modules(scheme=spec),
+        monitor=loop.monitor,
     )
     made.append(brief(SENSOR, {**loop.sensor_keys(keys), **keys.secret(scheme.secret_streams)}, sensor))
     legitimate = LegitimatePart(

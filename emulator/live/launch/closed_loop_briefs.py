@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, final
 from evedrop.live.protocol.brief_closed_loop import (
     AssignmentEntry,
     EstimatorLoop,
+    MonitorEntry,
     PlantEntry,
     SensorLoop,
     SensorPlantEntry,
@@ -18,6 +19,7 @@ from evedrop.live.protocol.brief_closed_loop import (
 )
 from evedrop.live.protocol.brief_parts import ControllerPart
 from evedrop.scenario import Scenario
+from evedrop.scenario.controlled import monitor_of
 from evedrop.scenario.input_files import disturbances_of
 
 if TYPE_CHECKING:
@@ -38,12 +40,16 @@ class LoopBriefs:
         """For the sensor: the slots in which it waits for inputs, and whether it sends the state to the controller."""
         self.plant = None if driven is None else SensorPlantEntry.of(driven, disturbances=self._disturbances)
         """The plant with its disturbances, for the sensor."""
+        plan = monitor_of(scenario)
+        self.monitor = None if plan is None else MonitorEntry.of(plan)
+        """Watermark, detector and attack, for the sensor."""
 
     def sensor_keys(self, keys: StreamKeys) -> dict[str, bytes]:
         """Stream → key, for the sensor's own streams, without those of the secret."""
         driven = self._scenario.driven
         measures = driven is not None and driven.output_matrix is not None
-        return {"process": keys.process, **({"measurement": keys.measurement} if measures else {})}
+        monitors = {} if self.monitor is None else {"watermark": keys.watermark, "spoofing": keys.spoofing}
+        return {"process": keys.process, **({"measurement": keys.measurement} if measures else {}), **monitors}
 
     @property
     def of_legitimate(self) -> EstimatorLoop | None:

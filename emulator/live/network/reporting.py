@@ -33,7 +33,8 @@ def is_due(brief: AnyBrief, k: int) -> bool:
 class TruthReporter:
     """The sensor's reports: states and schedule; sent flags, alarms and inputs, if the scenario has them.
 
-    inputs: how many a controller decides; measures: whether the sensor filters its measurements.
+    inputs: how many a controller decides; measures: whether the sensor filters its measurements; monitors: whether it has a
+    detector beside its filter.
     """
 
     def __init__(
@@ -44,6 +45,7 @@ class TruthReporter:
         watches: bool = False,
         inputs: int = 0,
         measures: bool = False,
+        monitors: bool = False,
     ) -> None:
         self._brief = brief
         self._put = put
@@ -54,6 +56,8 @@ class TruthReporter:
         self._u = np.empty((brief.flow.batch, inputs, brief.trials)) if inputs else None
         self._failed = np.zeros_like(self._nu) if inputs else None
         self._true = np.empty_like(self._x) if measures else None
+        self._statistic = np.empty(self._nu.shape) if monitors else None
+        self._watermark = np.empty((brief.flow.batch, inputs, brief.trials)) if monitors else None
         self._first = 0
 
     def add(
@@ -78,6 +82,8 @@ class TruthReporter:
             self._u[rows], self._failed[rows] = steered
         if self._true is not None:
             self._true[rows] = made.true
+        if made.monitored is not None and self._statistic is not None and self._watermark is not None:
+            self._statistic[rows], self._watermark[rows] = made.monitored.statistic, made.monitored.watermark
         if is_due(self._brief, slots[-1]):
             self.flush(slots.stop)
 
@@ -89,8 +95,12 @@ class TruthReporter:
             sent, alarms, failed = (
                 None if column is None else column[rows] for column in (self._sent, self._alarms, self._failed)
             )
-            u, true = (None if column is None else column[rows] for column in (self._u, self._true))
-            self._put(end - 1, Truth(self._first, self._x[rows], self._nu[rows], sent, alarms, u, failed, true).pack())
+            u, *others = (
+                None if column is None else column[rows]
+                for column in (self._u, self._true, self._statistic, self._watermark)
+            )
+            truth = Truth(self._first, self._x[rows], self._nu[rows], sent, alarms, u, failed, *others)
+            self._put(end - 1, truth.pack())
         self._first = end
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from typing import Any, Generic, TypeVar, final
 
 import numpy as np
@@ -13,6 +14,7 @@ from evedrop.live.protocol.closed_loop import read_decisions
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.telemetry import Extent, Journal, Report, Truth, read_journal, read_report, read_truth
 from evedrop.model.digest import Blocks, DigestLog
+from evedrop.model.integrity.monitor import MonitoredSlots
 from evedrop.model.links.link import REASONS
 from evedrop.model.process import Floats
 from evedrop.model.slot.account import Account
@@ -148,6 +150,11 @@ class Joiner:
         if self._extent.inputs:
             u, failed = (_rows(truth, [getattr(part, name) for part, _ in truth]) for name in ("u", "failed"))
             inputs = InputSlots(u, failed)
+        if inputs is not None and self._extent.monitored:
+            statistic, watermark = (
+                _rows(truth, [getattr(part, name) for part, _ in truth]) for name in ("statistic", "watermark")
+            )
+            inputs = replace(inputs, monitored=MonitoredSlots(statistic, watermark))
         true = (
             _rows(truth, [part.true for part, _ in truth if part.true is not None]) if self._extent.measures else None
         )

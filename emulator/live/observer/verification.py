@@ -22,6 +22,7 @@ from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Belief
 from evedrop.names import ROUTER, SENSOR
 from evedrop.scenario import Scenario
+from evedrop.scenario.controlled import monitor_of
 from evedrop.score.slots import ReceiverSlots, Slots
 
 _ROUNDING = 1e-9  # sums of a thousand traces in different orders differ by less
@@ -200,4 +201,5 @@ def extent_of(scenario: Scenario, batch: int) -> Extent:
         scenario.record_trials,
         0 if plant is None or scenario.controller is None else plant.inputs,
         plant is not None and plant.output_matrix is not None,
+        monitor_of(scenario) is not None,
     )

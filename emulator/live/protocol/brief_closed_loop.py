@@ -16,16 +16,22 @@ from evedrop.entries import (
     LIMITS,
     MATRIX,
     NUMBERS,
+    SLOT,
     anything,
     entry,
     flag,
     inner,
+    listed,
+    maybe,
     named,
     not_negative,
+    number,
+    row,
     text,
     whole,
 )
 from evedrop.model.controllers.controller import Assignment
+from evedrop.model.integrity.monitor import MonitorPlan, Suspicion
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process
 
@@ -98,6 +104,61 @@ class SensorPlantEntry(PlantEntry):
 
     disturbances: str = field(metadata=entry(text))
     """As `encoded`."""
+
+
+@dataclass(frozen=True)
+class MonitorEntry:
+    """The watermark, the detector beside the sensor's filter and the attack on its measurements, as plain numbers."""
+
+    watermark: Matrix = field(metadata=entry(MATRIX))
+    """Σ_e."""
+    shift: Matrix = field(metadata=entry(MATRIX))
+    """G, as in `MonitorPlan`."""
+    unmarked: Matrix = field(metadata=entry(MATRIX))
+    """T⁻¹ after a slot without watermark."""
+    unmarked_log_det: float = field(metadata=entry(number))
+    marked: Matrix = field(metadata=entry(MATRIX))
+    """T⁻¹ after a slot with one."""
+    marked_log_det: float = field(metadata=entry(number))
+    policy: str = field(metadata=entry(text))
+    parameters: Mapping[str, float] = field(metadata=entry(named(number)))
+    attack: str | None = field(metadata=entry(maybe(text)))
+    """None if nobody attacks."""
+    attack_data: Mapping[str, Any] = field(metadata=entry(named(anything)))
+    spans: Sequence[tuple[int, int]] = field(metadata=entry(listed(row(SLOT, SLOT))))
+    """The slots [from, to) of the attack."""
+
+    @classmethod
+    def of(cls, plan: MonitorPlan) -> MonitorEntry:
+        """The entry of a plan."""
+        return cls(
+            plan.watermark.tolist(),
+            plan.shift.tolist(),
+            plan.unmarked.precision.tolist(),
+            plan.unmarked.log_det,
+            plan.marked.precision.tolist(),
+            plan.marked.log_det,
+            plan.policy,
+            dict(plan.parameters),
+            plan.attack,
+            dict(plan.attack_data),
+            [(start, stop) for start, stop in plan.spans],
+        )
+
+    @property
+    def plan(self) -> MonitorPlan:
+        """The plan."""
+        return MonitorPlan(
+            np.array(self.watermark, np.float64),
+            np.array(self.shift, np.float64),
+            Suspicion(np.array(self.unmarked, np.float64), self.unmarked_log_det),
+            Suspicion(np.array(self.marked, np.float64), self.marked_log_det),
+            self.policy,
+            self.parameters,
+            self.attack,
+            self.attack_data,
+            self.spans,
+        )
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,7 @@ from evedrop.entries import (
 from evedrop.live.protocol.brief_closed_loop import (
     AssignmentEntry,
     EstimatorLoop,
+    MonitorEntry,
     PlantEntry,
     SensorLoop,
     SensorPlantEntry,
@@ -178,6 +179,8 @@ class SensorPart:
     controller: SensorLoop | None = field(metadata=inner(SensorLoop, or_null=True))
     modules: str | None = field(default=None, metadata=entry(maybe(text), left_out=True))
     """As the router's."""
+    monitor: MonitorEntry | None = field(default=None, metadata=inner(MonitorEntry, left_out=True))
+    """None without a detector beside its filter."""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import numpy as np
 
 from evedrop.errors import BriefError, NotRegistered
 from evedrop.live.protocol.brief import WRITE_AGAIN, AnyBrief
-from evedrop.live.protocol.brief_closed_loop import PlantEntry, decoded
+from evedrop.live.protocol.brief_closed_loop import MonitorEntry, PlantEntry, decoded
 from evedrop.live.protocol.brief_parts import (
     ControllerPart,
     EavesdropperPart,
@@ -23,10 +23,12 @@ from evedrop.live.protocol.brief_parts import (
 from evedrop.model.acknowledgements import ATTACKS
 from evedrop.model.controllers import CONTROLLERS
 from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.integrity.monitor import Monitor
 from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.slot.link import Link, streams_of
 from evedrop.names import ACKNOWLEDGEMENTS
+from evedrop.streams import KEY_BYTES
 
 
 @contextmanager
@@ -48,9 +50,12 @@ def expect_usable(brief: AnyBrief) -> None:
         case SensorPart(plant=plant) as part:
             scheme = _scheme(brief, part)
             measures = plant is not None and plant.output_matrix is not None
-            _expect_keys(brief, ["process", *(["measurement"] if measures else []), *scheme.secret_streams])
+            monitors = ["watermark", "spoofing"] if part.monitor is not None else []
+            _expect_keys(brief, ["process", *(["measurement"] if measures else []), *monitors, *scheme.secret_streams])
             if plant is not None:
                 _expect_plant(brief, plant, plant.disturbances)
+            if part.monitor is not None:
+                _expect_monitor(brief, part.monitor, plant)
         case LegitimatePart(controller=loop) as part:
             _expect_keys(brief, _scheme(brief, part).estimator_streams)
             if loop is not None and loop.plant is not None:
@@ -99,6 +104,18 @@ def _expect_plant(brief: AnyBrief, entry: PlantEntry, disturbances: str | None =
         found = decoded(disturbances, brief.slots)
         if found.shape[1] != plant.disturbance_matrix.shape[1] or not np.isfinite(found).all():
             raise ValueError(f"it has {found.shape[1]} disturbances in each slot, or they are not finite")
+
+
+def _expect_monitor(brief: AnyBrief, entry: MonitorEntry, plant: PlantEntry | None) -> None:
+    with _using("part.monitor"):
+        if plant is None or plant.output_matrix is None:
+            raise ValueError("there is no filter whose innovations could be tested")
+        plan, p, m = entry.plan, len(plant.output_matrix), plant.plant.inputs
+        shapes = [one.shape for one in (plan.watermark, plan.shift, plan.marked.precision, plan.unmarked.precision)]
+        if shapes != [(m, m), (p, m), (p, p), (p, p)]:
+            raise ValueError(f"its matrices are {shapes}, and there are {m} inputs and {p} measurements")
+        Monitor(plan, bytes(KEY_BYTES), brief.batch)
+        plan.spoofing(bytes(KEY_BYTES), brief.batch)
 
 
 def _expect_controller(brief: AnyBrief, part: ControllerPart) -> None:

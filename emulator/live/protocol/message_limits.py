@@ -36,6 +36,8 @@ class Sizes:
     inputs: int = 0
     period: int = 1
     """Slots between decisions."""
+    monitored: bool = False
+    """Whether there are a watermark and a detector."""
 
     @property
     def of_kinds(self) -> dict[str, int]:
@@ -47,7 +49,8 @@ class Sizes:
         blocks = c // BLOCK_SLOTS + 2
         digests, sums = blocks * DIGEST_BYTES * R, blocks * 8 * R
         report = c * (state + 5 * R + 8 * n * n * self.recorded + 16) + digests + sums
-        truth = c * (2 * state + 8 * self.inputs * R + 4 * mask)
+        monitored = 8 * (self.inputs + 1) * R if self.monitored else 0
+        truth = c * (2 * state + 8 * self.inputs * R + 4 * mask + monitored)
         leaving = state + 8 * n * n * R
         decisions = 8 * (c + self.period) + digests + self.period // BLOCK_SLOTS * DIGEST_BYTES * R
         waits = _NAME_BYTES * (self.receivers + 1)

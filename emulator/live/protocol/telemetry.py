@@ -36,6 +36,8 @@ class Extent:
     """How many inputs a controller decides; 0 without one."""
     measures: bool = False
     """Whether the sensor filters its measurements."""
+    monitored: bool = False
+    """Whether the plant's side has a watermark and a detector."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -72,6 +74,10 @@ class Truth:
     """Where the decision failed, (c, R)."""
     true: Floats | None = None
     """The true states, (c, n, R), if the sensor filters, so that x is its estimate; None if x is the true state."""
+    statistic: Floats | None = None
+    """The detector's statistic after each slot, (c, R); None without a detector."""
+    watermark: Floats | None = None
+    """The watermark of the inputs, (c, m, R); None without a detector."""
 
     @property
     def count(self) -> int:
@@ -91,6 +97,8 @@ class Truth:
             fields["failed"] = packed_flags(self.failed).tobytes()
         if self.true is not None:
             fields["true"] = self.true.tobytes()
+        if self.statistic is not None and self.watermark is not None:
+            fields["statistic"], fields["watermark"] = self.statistic.tobytes(), self.watermark.tobytes()
         return pack(fields)
 
 
@@ -106,6 +114,8 @@ def read_truth(message: Reader, first: int, extent: Extent) -> Truth:
         message.finite("u", (c, extent.inputs, trials)) if extent.inputs else None,
         read_failed(message, (c, trials)) if extent.inputs else None,
         message.finite("true", (c, n, trials)) if extent.measures else None,
+        message.finite("statistic", (c, trials)) if extent.monitored else None,
+        message.finite("watermark", (c, extent.inputs, trials)) if extent.monitored else None,
     )
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 import numpy as np
 
@@ -113,7 +113,8 @@ def assumed(loop: WatermarkedLoop, attack: SensorAttack | None, watermark: Float
     return spread(inverse(cholesky(loop.innovation)), loop.deceived(source, watermark))
 
 
-class MonitoredSlots(NamedTuple):
+@dataclass(frozen=True)
+class MonitoredSlots:
     """The monitor over c slots."""
 
     statistic: Floats
@@ -124,7 +125,11 @@ class MonitoredSlots(NamedTuple):
     @classmethod
     def joined(cls, parts: Sequence[MonitoredSlots]) -> MonitoredSlots:
         """Consecutive slots as one."""
-        return cls(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("statistic", "watermark")))
+
+    def part(self, trials: slice) -> MonitoredSlots:
+        """The same for some of the trials."""
+        return MonitoredSlots(self.statistic[:, trials], self.watermark[..., trials])
 
     def rows(self, some: slice) -> MonitoredSlots:
         """Some of the slots."""

@@ -75,6 +75,11 @@ class SensorCore:
         """Whether the sensor filters its measurements, so that it does not transmit the true state."""
         return self._local is not None
 
+    @property
+    def monitors(self) -> bool:
+        """Whether there is a detector beside the sensor's filter."""
+        return self._monitor is not None
+
     def send(self, slots: range) -> Sent:
         """The next slots, at least one."""
         states = self._plant.advance(slots)

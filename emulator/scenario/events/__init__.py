@@ -16,6 +16,7 @@ from evedrop.scenario.events.note import Note
 from evedrop.scenario.events.partition import Partition
 from evedrop.scenario.events.pause import Pause, Resume
 from evedrop.scenario.events.set import Set
+from evedrop.scenario.events.spoof import Spoof
 
 _BUILT_IN: Mapping[str, type[EventKind]] = {
     "set": Set,
@@ -24,6 +25,7 @@ _BUILT_IN: Mapping[str, type[EventKind]] = {
     "kill": Kill,
     "pause": Pause,
     "jam": Jam,
+    "spoof": Spoof,
     "heal": Heal,
     "restart": Restart,
     "resume": Resume,

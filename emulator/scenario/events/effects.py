@@ -50,6 +50,13 @@ class Jamming:
 
 
 @dataclass(frozen=True)
+class Spoofing:
+    """The sensor's measurements are attacked from now on, or no longer."""
+
+    on: bool
+
+
+@dataclass(frozen=True)
 class Leave:
     """A receiver is away from now on."""
 
@@ -73,4 +80,4 @@ class Return:
     """Whether it continues from its last belief; otherwise from the prior of the slot in which it went away."""
 
 
-Effect = Nothing | LinkSettings | LinkCut | LinkHealed | Jamming | Leave | Return
+Effect = Nothing | LinkSettings | LinkCut | LinkHealed | Jamming | Spoofing | Leave | Return

@@ -16,7 +16,7 @@ from pydantic_core import PydanticCustomError
 from evedrop.errors import NoAnswer
 from evedrop.model.registry import place_of
 from evedrop.model.schemes.scheme import Scheme
-from evedrop.scenario.events.effects import Effect, Jamming, Leave, Nothing, Return
+from evedrop.scenario.events.effects import Effect, Jamming, Leave, Nothing, Return, Spoofing
 from evedrop.scenario.table import Found, Table
 from evedrop.streams import MOST_SLOTS
 
@@ -65,6 +65,8 @@ class Surroundings:
     scheme_name: str
     attack: str | None
     """The attack on acknowledgements; `none` if there is none."""
+    monitored: bool = False
+    """Whether the scenario has an application that can attack measurements, and detect it."""
 
 
 class When(Table):
@@ -149,7 +151,7 @@ def _expect_acts(acts: Sequence[object]) -> None:
     for act in acts:
         if not isinstance(act, Act) or not isinstance(act.effect, Effect):
             raise NoAnswer(f"acts() gave {act!r:.60}; expected an Act with an effect")
-        if not act.names and not isinstance(act.effect, (Nothing, Jamming)):
+        if not act.names and not isinstance(act.effect, (Nothing, Jamming, Spoofing)):
             raise NoAnswer("it names no receiver; expected one, or several")
         if len(act.names) != 1 and isinstance(act.effect, (Leave, Return)):
             raise NoAnswer("it names several receivers; expected one")

@@ -24,7 +24,7 @@ from evedrop.news import RunEvent
 
 SLOTS, N, TRIALS, RECORDED, WINDOW, INPUTS, PERIOD = 40, 2, 3, 1, 2, 1, 4
 SHAPE = (N, TRIALS)
-EXTENT = telemetry.Extent(SLOTS, 8, N, TRIALS, RECORDED, INPUTS, measures=True)
+EXTENT = telemetry.Extent(SLOTS, 8, N, TRIALS, RECORDED, INPUTS, measures=True, monitored=True)
 BLOCKS = Blocks(SLOTS, [6])
 K = 4
 """The slot that is due everywhere."""
@@ -102,7 +102,7 @@ EXAMPLES: Mapping[str, bytes] = {
     "status": operator.Answer(status=RunStatus(
         K, SLOTS, 9.0, "held", {"eve": True}, {"eve": LinkStatus.of(4, 2)}, [RunEvent(2, "cut eve", "scenario")])).pack(),
     "truth": telemetry.Truth(K, np.ones((2, *SHAPE)), np.ones((2, 3), bool), None, None, np.ones((2, 1, 3)),
-                             np.ones((2, 3), bool), np.ones((2, *SHAPE))).pack(),
+                             np.ones((2, 3), bool), np.ones((2, *SHAPE)), np.ones((2, 3)), np.ones((2, 1, 3))).pack(),
     "held": telemetry.held(K),
     "leaving": telemetry.leaving(K, Belief(_z, np.ones((N, N, TRIALS)), np.zeros(TRIALS, np.uint8))),
     "report": telemetry.Report(K, np.ones((2, *SHAPE)), np.ones((2, TRIALS), np.uint8), np.ones((2, N, N, 1)), np.ones((2, 2)),

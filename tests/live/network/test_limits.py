@@ -34,6 +34,7 @@ SIZES = st.builds(
     receivers=st.integers(1, 5),
     header=st.integers(0, 2),
     inputs=st.integers(0, 3),
+    monitored=st.booleans(),
     period=st.integers(1, 50),
 )
 
@@ -53,8 +54,9 @@ def largest(sizes: Sizes) -> dict[str, bytes]:
     bursts, delays = np.ones(COUNTED_BURSTS, np.uint32), np.ones(sizes.window + 2, np.uint32)
     account = Account(flags, lost, counts, bursts, delays, np.ones(c, np.uint32))
     truth = telemetry.Truth(
-        k, np.ones((c, n, R)), flags, flags, flags, u, flags if sizes.inputs else None, np.ones((c, n, R))
-    )
+        k, np.ones((c, n, R)), flags, flags, flags, u, flags if sizes.inputs else None, np.ones((c, n, R)),
+        np.ones((c, R)) if sizes.monitored else None, u if sizes.monitored else None,
+    )  # fmt: skip
     report = telemetry.Report(
         k,
         np.ones((c, n, R)),

@@ -291,6 +291,7 @@ OPTIONAL = {
     "noise_covariance",
     "output_matrix",
     "measurement_noise",
+    "monitor",
 }
 """Entries that a brief may leave out, or whose meaning another one gives."""
 WITHIN = (
@@ -299,18 +300,26 @@ WITHIN = (
     "part.parameters",
     "part.scheme",
     "part.noise_covariance",
+    "part.monitor.parameters",
+    "part.monitor.attack_data",
     "model.A",
     "model.Q",
 )
 """Tables with entries of the scenario, which their readers check, and matrices."""
-KINDS = ("eavesdroppers", "acknowledged", "microgrid", "twin-track", "colluding", "restart", "noise-before")
+_NONE: dict[str, Any] = {}
+_AS_THEY_ARE = ("eavesdroppers", "acknowledged", "microgrid", "twin-track", "colluding", "restart", "noise-before")
+KINDS = {
+    **dict.fromkeys(_AS_THEY_ARE, _NONE),
+    "replay-attack": {"integrity.attack": {"model": "replace", "matrix": [[0.8]]}},
+}
+"""Scenarios → what is changed in them."""
 
 
 def every_brief() -> dict[str, dict[str, Any]]:
     """Briefs of scenarios of many kinds, as JSON, by scenario and process."""
     found = {}
-    for name in KINDS:
-        scenario = load(name, {"slots": 8, "trials": 2, "record_trials": 1, "expect": [], "event": []})
+    for name, changes in KINDS.items():
+        scenario = load(name, {"slots": 8, "trials": 2, "record_trials": 1, "expect": [], "event": [], **changes})
         for process, brief in made(scenario).items():
             found[f"{name}/{process}"] = json.loads(brief.text)
     return found
@@ -399,3 +408,12 @@ def test_a_brief_that_is_no_file_is_refused(kind: str, tmp_path: Path) -> None:
         path.symlink_to("/dev/zero")
     with pytest.raises(BriefError, match=r"it is a (pipe or a device|folder)"):
         read_brief(path)
+
+
+def test_a_monitor_that_does_not_fit_its_plant_is_refused(tmp_path: Path) -> None:
+    """Its matrices must have the dimensions of inputs and measurements, and there must be a filter."""
+    found = json.loads(json.dumps(BRIEFS["replay-attack/sensor"]))
+    found["part"]["monitor"]["shift"] = [[1.0, 2.0]]
+    assert "part.monitor cannot be used (ValueError: its matrices are" in str(refusal(found, tmp_path))
+    found["part"]["plant"] = None
+    assert "part.monitor cannot be used (ValueError: there is no filter" in str(refusal(found, tmp_path))

@@ -90,8 +90,24 @@ def test_the_reasons_and_the_alarms_of_the_sensor_are_read_as_sent() -> None:
     assert np.array_equal(found.sent, sent)
     assert np.array_equal(found.alarms, alarms)
     assert (found.u, found.failed, found.true) == (None, None, None)
+    assert (found.statistic, found.watermark) == (None, None)
     bare = read_truth(Reader(KEY, Truth(4, truth.x, truth.nu).pack()), 4, Extent(9, 3, 2, 3))
     assert (bare.sent, bare.alarms) == (None, None)
+
+
+def test_statistic_and_watermark_of_a_detector_are_read_as_sent() -> None:
+    """Where a run has a detector, both must be there."""
+    statistic, watermark = np.array([[0.5, 0.0, 8.5]]), np.array([[[0.1, -0.2, 0.0]]])
+    u, failed = np.zeros((1, 1, 3)), np.zeros((1, 3), np.bool_)
+    given = (4, np.ones((1, 2, 3)), failed, None, None, u, failed, np.ones((1, 2, 3)))
+    extent = Extent(9, 3, 2, 3, inputs=1, measures=True, monitored=True)
+    found = read_truth(Reader(KEY, Truth(*given, statistic, watermark).pack()), 4, extent)
+    assert found.statistic is not None
+    assert found.watermark is not None
+    assert np.array_equal(found.statistic, statistic)
+    assert np.array_equal(found.watermark, watermark)
+    with pytest.raises(MalformedMessage, match="statistic"):
+        read_truth(Reader(KEY, Truth(*given).pack()), 4, extent)
 
 
 def test_a_delivery_of_nothing_has_an_empty_header() -> None:
