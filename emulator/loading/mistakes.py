@@ -38,6 +38,7 @@ from evedrop.scenario.link_table import LinkTable
 from evedrop.scenario.nemesis import nemesis_mistakes
 from evedrop.scenario.receivers import EavesdropperTable
 from evedrop.scenario.sentences import sentences
+from evedrop.scenario.singular_noise import singular_mistakes
 from evedrop.scenario.stream_keys import secret_in
 from evedrop.scenario.valid import ValidTables
 
@@ -63,6 +64,7 @@ def mistakes_across(tables: ValidTables, beyond_horizon: bool) -> list[str]:
         loop_mistakes,
         application_mistakes,
         filter_mistakes,
+        singular_mistakes,
         link_mistakes,
         event_mistakes,
     ):

@@ -19,10 +19,13 @@ from evedrop.model.error_factors import squares, triangular_solutions
 from evedrop.model.process import Floats, Process, product
 from evedrop.model.receiver import Action, Belief, Codes, Flags, Receiver, Reception
 from evedrop.model.reference_code import NONE, ReferenceCode, initial_factor
+from evedrop.model.staircase import is_singular
 from evedrop.model.theory.horizon import UNIT_ROUNDOFF
 
 Slots = NDArray[np.int64]
 
+ROUNDING_OF_REFERENCES = 2.0**-44
+"""The deviation of the rounding of a packet with a reference, relative to the numbers that it is computed from."""
 _NEGLIGIBLE = 1e-75  # of the noise: the square of such a deviation is lost in rounding, and its own square in underflow
 
 
@@ -87,6 +90,7 @@ class ReferenceReceiver(Receiver):
         super().__init__(process, trials)
         self._code = ReferenceCode(process, open_loop)
         self._noise: list[Floats] = [np.zeros_like(process.Q), process.noise_factor]
+        self._singular = is_singular(process)
         self._negligible = _NEGLIGIBLE * float(np.abs(process.noise_factor).max())
 
     def prior(self, first: int = 0) -> Belief:
@@ -173,6 +177,11 @@ class ReferenceReceiver(Receiver):
         x, r, X, R, noise = self._repeated(k, known, new)
         shown = np.where(state, x, x - r)
         top = np.where(state, X, X - R)
+        if self._singular:
+            # What is known of a direction without noise is known up to the rounding of x, r and z.
+            size = np.abs(x) + np.abs(r) + np.abs(z) + self._code.deviation(k)[:, None]
+            top = np.concatenate([top, ROUNDING_OF_REFERENCES * size[:, None, :] * np.eye(n)[:, :, None]], axis=1)
+            R = np.concatenate([R, 0.0 * noise], axis=1)
         joint = np.concatenate([np.concatenate([noise, top], axis=1), np.concatenate([0.0 * noise, R], axis=1)])
         joint = np.where(np.abs(joint) < self._negligible, 0.0, joint)
         factors = kernels.triangular_factors(joint.transpose(2, 0, 1).copy())

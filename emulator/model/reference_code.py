@@ -11,8 +11,9 @@ from typing import final
 import numpy as np
 
 from evedrop.kernels.current import kernels
-from evedrop.kernels.elementary import cholesky, inverse
+from evedrop.kernels.elementary import cholesky
 from evedrop.model.process import Floats, Process, StateFactors, product
+from evedrop.model.staircase import is_regular
 from evedrop.model.theory.horizon import TOLERANCE, UNIT_ROUNDOFF
 
 NONE = -1
@@ -63,7 +64,7 @@ class ReferenceCode:
     def oldest(self, k: int) -> int:
         """The oldest slot t whose reference may be used in slot k; k itself if there is none.
 
-        2⁻⁵³ √tr(L_{t,j} Σ_t L_{t,j}ᵀ) ≤ 0.01 √Q[i, i] for all i and all j up to k: beyond it x_j would be lost in rounding.
+        2⁻⁵³ √tr(L_{t,j} Σ_t L_{t,j}ᵀ) ≤ 0.01 √Q[i, i] for all Q[i, i] > 0 and j up to k: beyond it x_j is lost in rounding.
         """
         if not self.decorrelates:
             return 0
@@ -114,7 +115,8 @@ class _Watch:
 
     def __init__(self, process: Process) -> None:
         n = process.n
-        least = min(float(process.Q[i, i]) for i in range(n))
+        # A state without noise of its own loses nothing in a slot.
+        least = min((float(process.Q[i, i]) for i in range(n) if process.Q[i, i] > 0.0), default=0.0)
         self._limit = (TOLERANCE / UNIT_ROUNDOFF) ** 2 * least
         self._slots: list[int] = []
         self._factors: Floats = np.empty((0, n, n))
@@ -142,15 +144,6 @@ class _Watch:
     def _keep(self, factors: Floats, places: list[int]) -> None:
         self._slots = [self._slots[i] for i in places]
         self._factors = factors[places]
-
-
-def is_regular(A: Floats) -> bool:
-    """Whether A⁻¹ has correct digits in double precision."""
-    try:
-        size = float(np.abs(A).max()) * float(np.abs(inverse(A)).max())
-    except ValueError:
-        return False
-    return size <= TOLERANCE / UNIT_ROUNDOFF
 
 
 def _inverses(C: Floats) -> Floats:

@@ -1,6 +1,6 @@
 """A sensor that measures and filters: the process noise Q that results from its filter, and mistakes in its entries.
 
-Source: docs/scenario.md, plant; docs/mathematics.md, a filter at the sensor and singular noise.
+Source: docs/scenario.md, plant; docs/mathematics.md, a filter at the sensor.
 """
 
 from __future__ import annotations
@@ -12,14 +12,9 @@ from typing import Any
 import numpy as np
 
 from evedrop.kernels.elementary import semidefinite_factor
-from evedrop.model.eavesdroppers import STRATEGIES
-from evedrop.model.local_filter import MOST_STATES, FilterStep, Steps, settled
+from evedrop.model.local_filter import MOST_STATES, FilterStep, settled
 from evedrop.model.plant import Plant
 from evedrop.model.process import MARGINAL, Floats, Process
-from evedrop.model.schemes import scheme_of
-from evedrop.model.staircase import NOT_REACHED, Staircase, checked_slots
-from evedrop.model.theory.horizon import horizon
-from evedrop.model.theory.leak import Leaks
 from evedrop.scenario.plant import PlantTable, plant_of
 from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.valid import ValidTables
@@ -138,16 +133,18 @@ def filter_mistakes(tables: ValidTables) -> Iterator[str]:
             settled_of(process, plant)
         except ValueError:
             if not wrong:
-                yield _unsettled(np.array(process.A), plant_of(plant, process.around), _NEARLY) or (
-                    "plant.output_matrix: does not let the sensor's filter settle: the measurements must show every state "
-                    "that does not decay, and plant.noise must move some state, or the filter ends up ignoring all "
-                    "measurements"
-                )
+                yield from _why_unsettled(process, plant)
         if encoding is not None and scheme is not None and scheme.decides_initial_state():
             decides = f"the scheme {encoding.scheme} decides x_0 itself"
             yield f"plant.output_matrix: is given, but {decides}; expected another scheme"
-    if process.singular_noise:
-        yield from _singular_mistakes(tables, process.process)
+
+
+def _why_unsettled(process: ProcessTable, plant: PlantTable) -> Iterator[str]:
+    with suppress(ValueError):  # matrices of the plant do not fit the process, which is reported elsewhere
+        yield _unsettled(np.array(process.A), plant_of(plant, process.around), _NEARLY) or (
+            "plant.output_matrix: does not let the sensor's filter settle: the measurements must show every state "
+            "that does not decay, and plant.noise must move some state, or the filter ends up ignoring all measurements"
+        )
 
 
 def _unsettled(A: Floats, plant: Plant, least: float) -> str | None:
@@ -183,79 +180,3 @@ def _unsettled(A: Floats, plant: Plant, least: float) -> str | None:
 
 def _scaled(M: Floats) -> Floats:
     return np.asarray(M / max(float(np.abs(M).max(initial=0.0)), _SMALLEST))
-
-
-def _singular_mistakes(tables: ValidTables, process: Process) -> Iterator[str]:
-    """Mistakes of eavesdroppers that cannot work with this Q, which may be singular."""
-    blurred = False
-    for name, table in tables.eavesdroppers.items():
-        for entry, strategy in (("strategy", table.strategy), ("reads_as", table.reads_as)):
-            kind = None if strategy is None else STRATEGIES.get(strategy)
-            if kind is None:
-                continue
-            what = f"eavesdroppers.{name}.{entry}: is {strategy}"
-            if kind.inverts_noise:
-                yield (
-                    f"{what}, which uses the inverse of Q, and Q may be singular; expected another strategy, or a Q that is not"
-                )
-            if not kind.reads_leaks:
-                continue
-            try:
-                stairs = Staircase(process)
-            except ValueError as error:
-                yield f"{what}, which uses what innovations leak, but {error}; expected another strategy, or a regular Q"
-                continue
-            if kind.tests_range:
-                yield from (f"{what}, {why}" for why in _outside(tables, process, stairs))
-                blurred = blurred or stairs.singular
-    if blurred and tables.slots is not None:
-        with suppress(ValueError):  # a mistake in the covariance of a scheme's noise, reported elsewhere
-            law = None if tables.encoding is None else scheme_of(process, tables.encoding.spec).noise_law
-            yield from _blurred(Leaks(process, law), horizon(process, tables.slots), tables.slots)
-
-
-def _outside(tables: ValidTables, process: Process, stairs: Staircase) -> Iterator[str]:
-    """What moves the state out of the range of Q, and what to do about it."""
-    plant, expected = tables.plant, "expected another strategy, such as genie, or a regular Q"
-    if plant is None or tables.process is None:
-        return
-    known = plant_of(plant, tables.process.around)
-    told = "which tests packets against the range of Q"
-    sources = {"input_matrix": known.input_matrix, "disturbance_matrix": known.disturbance_matrix}
-    if known.output_matrix is None:
-        sources["noise"] = known.noise
-    for name, matrix in sources.items():
-        if (part := float(stairs.outside(matrix).max(initial=0.0))) > NOT_REACHED:
-            yield (
-                f"{told}, but plant.{name} moves the state out of it, by {part:.1e} of its size, where {NOT_REACHED:.0e} is "
-                f"rounding; {expected}"
-            )
-    if known.output_matrix is None or measured_mistakes(plant, process.n):
-        return
-    steps = Steps(process, known)
-    steps.next()
-    with suppress(ValueError):  # a filter that does not settle, which is reported elsewhere
-        settled(process, known)
-        while not steps.settled:
-            if (part := float(stairs.outside(steps.next().gain).max(initial=0.0))) > NOT_REACHED:
-                yield (
-                    f"{told}, but the sensor's filter moves its estimate out of it until it has settled, by {part:.1e} of a "
-                    f'step, where {NOT_REACHED:.0e} is rounding; expected initial_covariance = "{FILTER}" and '
-                    f'Q = "{FILTER}" in [process], with which the filter begins settled, or another strategy, such as genie'
-                )
-                return
-
-
-def _blurred(leaks: Leaks, last: int | None, slots: int) -> Iterator[str]:
-    """A mistake if rounding hides the range of Q, so that innovations may be taken for states; last: the horizon."""
-    n = leaks.stairs.process.n
-    # A run beyond the horizon is refused anyway.
-    for k in checked_slots(slots) if last is None else ():
-        some = range(k, k + 1)
-        if leaks.stairs.blurred(leaks.block(some)[:, :n, :n], leaks.rounding(some)):
-            yield (
-                f"slots: is {slots}; from slot {k} on the range of the singular Q is so close to the size of rounding that "
-                "more than one innovation in a million would be taken for a state; expected fewer slots, a smaller "
-                "initial_covariance, or eavesdroppers other than bayesian and likelihood"
-            )
-            return

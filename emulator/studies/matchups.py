@@ -24,6 +24,7 @@ from evedrop.results.comparison import Match, receiver_name
 from evedrop.scenario import Scenario
 from evedrop.scenario.across import lacking_streams
 from evedrop.scenario.events.effects import Jamming
+from evedrop.scenario.singular_noise import unsuited
 from evedrop.scenario.words import listed, near
 
 ATTACKERS: Mapping[str, str] = {
@@ -85,10 +86,15 @@ def matchups_of(
     adversaries: Sequence[str] | None = None,
     parameters: Mapping[str, Any] | None = None,
 ) -> Matchups:
-    """The matches of schemes and adversaries, by name; by default all of them. parameters: SCHEME.PARAMETER → value.
+    """The matches of schemes and adversaries, by name; by default all that the sensor can use.
+
+    parameters: SCHEME.PARAMETER → value.
 
     Raises UsageError with every unknown name, ScenarioError if a scheme cannot be used with this process and these links.
     """
+    if schemes is None and scenario.driven is not None and scenario.driven.output_matrix is not None:
+        # A sensor that measures does not decide the first state, which such a scheme needs.
+        schemes = [name for name in SCHEMES if not SCHEMES[name].decides_initial_state()]
     chosen = _chosen(schemes, adversaries, parameters or {})
     groups: list[Group] = []
     undefined: list[Match] = []
@@ -163,6 +169,9 @@ def _match(scenario: Scenario, scheme: str, adversary: str) -> Match:
         return Match(scheme, adversary, not_defined=why)
     table = _eavesdropper(scenario, scheme, strategy)
     parameters = {name: value for name, value in table.items() if name not in ("strategy", "link", "links", "window")}
+    for one in (strategy, table.get("reads_as")):
+        for reason in () if one is None else unsuited(scenario.process, scenario.plant, one):
+            return Match(scheme, adversary, not_defined=reason.why)
     lacking = lacking_streams(STRATEGIES[strategy].streams(parameters), SCHEMES[scheme])
     if lacking:
         return Match(scheme, adversary, not_defined=f"knows the {listed(lacking)}, and there is none")

@@ -57,6 +57,25 @@ def test_shipped_scenarios_can_be_compared(name: str) -> None:
     assert len(matchups_of(load(name)).groups) >= len(SCHEMES)
 
 
+def test_what_a_measuring_sensor_cannot_use_is_left_out() -> None:
+    """A scheme that decides the first state; strategies that invert its singular Q have a reason instead of figures."""
+    matchups = matchups_of(load("measured"))
+    assert set(matchups.schemes) == set(SCHEMES) - {"twin-track"}
+    against = {match.adversary: match.not_defined for match in matchups.undefined if match.scheme == "innovation"}
+    assert against["learning-em"] == "uses the inverse of Q, and Q may be singular"
+    assert not {"bayesian", "likelihood", "genie", "colluding"} & set(against)
+    steered = load(
+        "measured", {"process.initial_covariance": [[1.0, 0.0], [0.0, 1.0]], "eavesdroppers": {}, "expect": []}
+    )
+    (one,) = matchups_of(steered, ["innovation"], ["colluding"]).undefined
+    assert one.not_defined is not None
+    assert one.not_defined.startswith(
+        "tests packets against the range of Q, but the sensor's filter moves its estimate"
+    )
+    with pytest.raises(ScenarioError, match="the scheme twin-track decides x_0 itself"):
+        matchups_of(load("measured"), ["twin-track"], ["naive"])
+
+
 def test_all_wrong_names_are_told_at_once(evedrop: Evedrop) -> None:
     """Exit 2, every name that is none, and what there is."""
     options = ("--schemes", "cypher,plain", "--adversaries", "smrt", "--with", "innovation.mu_d=0.7")

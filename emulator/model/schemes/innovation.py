@@ -13,9 +13,9 @@ from evedrop.model import update
 from evedrop.model.checks import probabilities_mistakes
 from evedrop.model.process import Floats, Process, StateFactors, product
 from evedrop.model.receiver import Action, Belief, Beliefs, Codes, Flags, Receiver, Reception, select
-from evedrop.model.reference_code import is_regular
 from evedrop.model.schedule import Schedule, StateProbability
 from evedrop.model.schemes.scheme import Encoder, Packet, PacketBlock, Scheme, Shared
+from evedrop.model.staircase import is_regular
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.model.theory.leaked_bits import leaked_bits
 from evedrop.streams import Ahead, Batch, BlockReader
