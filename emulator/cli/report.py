@@ -29,7 +29,7 @@ from evedrop.figures.text import estimate, figure_text
 from evedrop.kernels.choice import fallback_warning
 from evedrop.news import ConnectionOutage, FolderMoved, Held, News, RunEnded, RunProgress, Started, ViewOpened
 from evedrop.scenario.application import applications_in
-from evedrop.score.summary import RARE_SHARE, ControllerSummary, LinkSummary, PeerSummary, Summary
+from evedrop.score.summary import RARE_SHARE, ControllerSummary, DirectionSummary, LinkSummary, PeerSummary, Summary
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -229,10 +229,8 @@ def print_summary(summary: Summary, folder: str, replay: str | None = None) -> N
         console.print(line)
     if summary.controller is not None:
         console.print(_loop_line(summary.controller))
-    for name, verdict in summary.secrecy.items():
-        console.print(verdict.sentence)
-        if verdict.leak is not None and verdict.leak.bits > 0.0:
-            console.print(f"{name}: packets that hide the state revealed {verdict.leak.text} of its path")
+    for one in _secrecy_lines(summary):
+        console.print(one)
     for name, peer in summary.peers.items():
         if peer.infinite_variance and peer.error_quantiles and summary.trials > 1:
             low, middle, high = (f"{value:.3g}" for value in peer.error_quantiles.values())
@@ -252,6 +250,40 @@ def print_summary(summary: Summary, folder: str, replay: str | None = None) -> N
         if replay is not None:
             console.print(f"    watch it live: {replay} --first-trial {surprising.trial} --trials 1")
     console.print(f"results: {folder}; to look at them: evedrop view {folder}")
+
+
+def _secrecy_lines(summary: Summary) -> Iterator[str | Table]:
+    """The verdicts, what hidden packets revealed, and the table of directions if there are any."""
+    for name, verdict in summary.secrecy.items():
+        yield verdict.sentence
+        if verdict.leak is not None and verdict.leak.bits > 0.0:
+            yield f"{name}: packets that hide the state revealed {verdict.leak.text} of its path"
+    if summary.directions:
+        yield _direction_table(summary.directions)
+
+
+def _direction_table(directions: Mapping[str, Mapping[str, DirectionSummary]]) -> Table:
+    """A row for each receiver and direction: its error, theory, and the verdict on secrecy in that direction."""
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
+    for heading in ("receiver", "direction"):
+        table.add_column(heading, no_wrap=True)
+    for heading in ("mean error", "theory", "z"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for heading in ("by theory", "relative secrecy", "perfect secrecy"):
+        table.add_column(heading, no_wrap=True)
+    for receiver, entries in directions.items():
+        for direction, one in entries.items():
+            table.add_row(
+                receiver,
+                direction,
+                estimate(one.mean_squared_error, one.standard_error),
+                figure_text(one.expected),
+                figure_text(one.z, "+.1f"),
+                {True: "unbounded", False: "bounded", None: "–"}[one.unbounded],
+                one.relative or "–",
+                one.perfect or "–",
+            )
+    return table
 
 
 def _link_lines(links: Mapping[str, LinkSummary]) -> Iterator[str]:

@@ -19,8 +19,10 @@ from evedrop.model.schemes import scheme_of
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.slot.link_law import LinkLaw, law_of
 from evedrop.model.theory import covariances as theory
+from evedrop.model.theory.clear_states import ClearStatesForm
 from evedrop.model.theory.closed_form import ClosedForm
 from evedrop.model.theory.covariances import ExpectedCovariance, Outcomes, OutcomesAt, SlotOutcomes
+from evedrop.model.theory.directions import Growth, growth
 from evedrop.model.theory.rare_events import Streaks, streaks
 from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
@@ -133,6 +135,23 @@ class Expectation:
         if self._outcomes is not None:
             return theory.limit_trace(self.process, self._outcomes)
         return math.nan if self._known is None else modulated.limit_of(self.process, *self._known)
+
+    def along(self, v: Floats, slots: int) -> Floats | None:
+        """The expected squared error of vᵀx, v (n,), in slots 0 … slots−1; None unless it is known by single slots."""
+        outcomes = None if self.closed is not None else self._outcomes
+        if outcomes is None:
+            return None
+        found: Floats = np.einsum("i,kij,j->k", v, theory.expected_covariances(self.process, outcomes, slots), v)
+        return found
+
+    @property
+    def growth(self) -> Growth | None:
+        """The directions in which the expected error grows without bound; None if theory knows none."""
+        closed = self.closed_bound if self.closed is None else self.closed
+        if isinstance(closed, ClearStatesForm):
+            return closed.growth
+        outcomes = None if closed is not None else self._outcomes
+        return None if outcomes is None else growth(self.process, outcomes)
 
     def streaks(self, slots: int) -> Streaks | None:
         """What streaks carry of its error in slots 0 … slots−1; None unless a closed form knows them (docs/mathematics.md)."""

@@ -95,6 +95,7 @@ def _expectation_mistakes(tables: ValidTables, sound: bool) -> Iterator[str]:
         tables.trials,
         lambda name: _no_theory(name, tables, sound),
         tables.applications,
+        None if tables.process is None else list(tables.process.directions or {}),
     )
     for i, expectation in tables.expect if tables.all_receivers else ():
         yield from (f"expect.{i}.{entry}: {what}" for entry, what in around.mistakes(expectation))

@@ -3,7 +3,7 @@
 Source: docs/scenario.md.
 """
 
-from evedrop.scenario.expect import ExpectTable, link_figure
+from evedrop.scenario.expect import ExpectTable, direction_figure, link_figure
 from evedrop.scenario.tables import Scenario
 
-__all__ = ["ExpectTable", "Scenario", "link_figure"]
+__all__ = ["ExpectTable", "Scenario", "direction_figure", "link_figure"]

@@ -22,13 +22,13 @@ from evedrop.scenario.words import as_toml, listed, near
 
 SECRECY = ("relative", "perfect")
 
-LINKS = "links"
+LINKS, DIRECTIONS = "links", "directions"
 _LOST_BY = re.compile(r"lost_by\.[a-z][a-z0-9_-]*")
 _COMPARISONS = ("below", "above", "near", "within", "within_relative")
 _ENTRIES: Mapping[str, tuple[str, ...]] = {
     "figure": (*_COMPARISONS, "slots", "quantile"),
     "link": (),
-    "secrecy": ("against",),
+    "secrecy": ("against", "direction"),
     "in_step": ("by", "since"),
 }
 """The subjects an expectation may have → the entries that go with each."""
@@ -73,6 +73,7 @@ class ExpectTable(Table):
     link: Annotated[str | None, Field(examples=["legitimate"])] = None
     secrecy: Annotated[Secrecy | None, Field(examples=["relative"])] = None
     against: Annotated[str | None, Field(examples=["smart"])] = None
+    direction: Annotated[str | None, Field(examples=["position"])] = None
     in_step: Annotated[str | None, Field(examples=["legitimate"])] = None
     by: Annotated[Slot | None, Field(examples=[40])] = None
     since: Annotated[Slot | None, Field(examples=[0])] = None
@@ -112,7 +113,8 @@ class ExpectTable(Table):
             case "link":
                 return "within its confidence interval"
             case "secrecy":
-                return "promised by theory and shown by the run"
+                both = self.direction is None or self.secrecy == "perfect"
+                return "promised by theory and shown by the run" if both else "shown by the run"
             case "in_step":
                 return f"by slot {self.by}" + ("" if self.since is None else f", since slot {self.since}")
         bounds = [f"{name} {value:.10g}" for name in ("below", "above") if (value := getattr(self, name)) is not None]
@@ -124,10 +126,11 @@ class ExpectTable(Table):
     @property
     def text(self) -> str:
         """The expectation as a sentence."""
+        of_direction = "" if self.direction is None else f" of {self.direction}"
         subject = {
             "figure": self.figure,
             "link": f"link {self.link}",
-            "secrecy": f"{self.secrecy} secrecy against {self.against}",
+            "secrecy": f"{self.secrecy} secrecy{of_direction} against {self.against}",
             "in_step": f"{self.in_step} in step",
         }[self.kind]
         if self.quantile is not None:
@@ -150,6 +153,12 @@ def link_figure(figure: str) -> tuple[str, tuple[str, ...]] | None:
     """The receiver of a link's figure, and the figure's path in the account of the link; None for a receiver's own figure."""
     parts = figure.split(".")
     return (parts[1], tuple(parts[2:])) if parts[0] == LINKS and len(parts) > 2 else None
+
+
+def direction_figure(figure: str) -> tuple[str, str] | None:
+    """The receiver and the direction of a direction's figure; None for any other."""
+    parts = figure.split(".")
+    return (parts[1], parts[2]) if parts[0] == DIRECTIONS and len(parts) == 3 else None
 
 
 def _nothing(table: Mapping[str, Any]) -> list[Found]:
@@ -180,6 +189,8 @@ def _figure_mistakes(table: Mapping[str, Any]) -> list[Found]:
         return found
     link = link_figure(figure)
     for name in ("slots", "quantile"):
+        if direction_figure(figure) is not None and table.get(name) is not None:
+            found.append((name, "is set, but the error in a direction is the mean of the whole run; remove the line"))
         if link is not None and table.get(name) is not None:
             instead = f"expected none, or the figure {link[0]}.received_fraction"
             found.append((name, f"is set, but a link's account is of the whole run; {instead}"))
@@ -222,11 +233,14 @@ class Around:
     """Why no theory covers a receiver; None if one does."""
     applications: Mapping[str, type[Application]] = field(default_factory=dict)
     """Those whose tables the scenario has."""
+    directions: Sequence[str] | None = ()
+    """Names of the process's directions; None if its table has a mistake."""
 
     def mistakes(self, expectation: ExpectTable) -> list[Found]:
         """Unknown receivers and figures, slots beyond the run, and quantiles of too few trials."""
         found: list[Found] = []
-        if expectation.figure is not None:
+        direction = None if expectation.figure is None else direction_figure(expectation.figure)
+        if expectation.figure is not None and (direction is None or direction[0] not in self.receivers):
             found += self._figure_mistakes(expectation.figure)
             application = expectation.figure.partition(".")[0]
             if application in self.applications:
@@ -240,7 +254,28 @@ class Around:
             if name is not None and name not in known:
                 choice = f"expected {listed(known)}" if known else "there is no eavesdropper; add one"
                 found.append((entry, f"is {as_toml(name)}; {choice}{near(name, known)}"))
+        found += self._direction_mistakes(expectation)
         return found + self._slot_mistakes(expectation) + self._quantile_mistakes(expectation.quantile)
+
+    def _unknown_direction(self, name: str) -> str | None:
+        """What to do if the process has no such direction; None if it has, or has mistakes."""
+        if self.directions is None or name in self.directions:
+            return None
+        if not self.directions:
+            return f"there are no directions; expected process.directions = {{ {name} = [1.0, 0.0] }}, a number for each state"
+        return f"expected {listed(self.directions)}{near(name, self.directions)}"
+
+    def _direction_mistakes(self, expectation: ExpectTable) -> list[Found]:
+        """Directions that the process does not have, as the entry `direction` or in a figure."""
+        named = [("direction", expectation.direction, "")]
+        figure = None if expectation.figure is None else direction_figure(expectation.figure)
+        if figure is not None and figure[0] in self.receivers:
+            named.append(("figure", figure[1], f"{DIRECTIONS}.{figure[0]}."))
+        return [
+            (entry, f"is {as_toml(before + name)}; {what}")
+            for entry, name, before in named
+            if name is not None and (what := self._unknown_direction(name)) is not None
+        ]
 
     def _figure_mistakes(self, figure: str) -> list[Found]:
         link = link_figure(figure)

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from evedrop.model.checks import is_number
 from evedrop.model.process import Process, mistakes_of
-from evedrop.scenario.table import Found, Matrix, Number, Table, numbers
+from evedrop.scenario.table import Found, Matrix, Number, ProcessName, Table, numbers
 from evedrop.scenario.words import as_toml, listed
 
 _MATRICES = ("A", "Q", "initial_covariance")
@@ -31,6 +32,8 @@ class ProcessTable(Table):
         list[Annotated[str, Field(strict=True, min_length=1)]] | None, Field(examples=[["SOC", "LOH"]])
     ] = None
     units: Annotated[list[Annotated[str, Field(strict=True, min_length=1)]] | None, Field(examples=[["%", "%"]])] = None
+
+    directions: Annotated[dict[ProcessName, list[Number]] | None, Field(examples=[{"sum": [1.0, 1.0]}])] = None
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
@@ -60,6 +63,7 @@ class ProcessTable(Table):
             A, Q, initial = (matrices.get(name, stand_in) for name in _MATRICES)
             singular = table.get("singular_noise") is True
             found += [(name, what) for name, what in mistakes_of(A, Q, initial, singular) if name in matrices]
+            found += _direction_mistakes(table.get("directions"), len(known))
             for name in ("reference", "states", "units"):
                 values = table.get(name)
                 if isinstance(values, list) and len(values) != len(known):
@@ -72,6 +76,26 @@ class ProcessTable(Table):
         return [0.0] * len(self.A) if self.reference is None else self.reference
 
     @property
+    def directions_as_arrays(self) -> dict[str, NDArray[np.float64]]:
+        """Name of a direction → its weights, (n,)."""
+        return {name: np.array(weights) for name, weights in (self.directions or {}).items()}
+
+    @property
     def process(self) -> Process:
         """The process it describes."""
         return Process(np.array(self.A), np.array(self.Q), np.array(self.initial_covariance), self.singular_noise)
+
+
+def _direction_mistakes(directions: object, n: int) -> list[Found]:
+    """Directions that have not n numbers, or only zeros; entries that are malformed are not looked at."""
+    if not isinstance(directions, Mapping):
+        return []
+    found: list[Found] = []
+    for name, weights in directions.items():
+        if not isinstance(weights, list) or not all(is_number(one) for one in weights):
+            continue
+        if len(weights) != n:
+            found.append((f"directions.{name}", f"has {len(weights)} entries; expected {n}, one for each state"))
+        elif not any(weights):
+            found.append((f"directions.{name}", "is zero; expected a direction, such as [1.0, 0.0]"))
+    return found

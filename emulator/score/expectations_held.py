@@ -13,14 +13,17 @@ from pathlib import Path
 
 import numpy as np
 
-from evedrop.scenario import ExpectTable, Scenario, link_figure
+from evedrop.scenario import ExpectTable, Scenario, direction_figure, link_figure
 from evedrop.scenario.application import APPLICATIONS, Summary
-from evedrop.score.summary import Found, Judged, LinkSummary, PeerSummary
+from evedrop.score.summary import DirectionSummary, Found, Judged, LinkSummary, PeerSummary
 from evedrop.score.sums import Tally
 from evedrop.score.verdict import Secrecy, Verdict
 from evedrop.score.watched import watch_of
 
 _MODES = {"exact": "", "covariance-only": " --covariance-only", "error-coordinates": " --error-coordinates"}
+
+_THEORY = {True: "theory promises it", False: "theory denies it", None: "no theory covers these links"}
+_RUN = {Verdict.HELD.value: "the run shows it", Verdict.FAILED.value: "the run shows that it fails"}
 
 
 def replay_of(folder: Path, scenario: Scenario, mode: str = "live") -> str:
@@ -42,6 +45,8 @@ class Evidence:
     secrecy: Mapping[str, Secrecy]
     applications: Mapping[str, Summary] = field(default_factory=dict)
     """Application → its entry of the summary."""
+    directions: Mapping[str, Mapping[str, DirectionSummary]] = field(default_factory=dict)
+    """As in the summary."""
 
     def judged(self, replay: str | None) -> list[Judged]:
         """Every expectation of the scenario; `replay` is the command that reproduces a failure."""
@@ -56,7 +61,11 @@ class Evidence:
         name = str(expect.figure)
         link = link_figure(name)
         application, *path = name.split(".")
-        if application in self.scenario.applications:
+        direction = direction_figure(name)
+        if direction is not None:
+            entry = self.directions.get(direction[0], {}).get(direction[1])
+            found = None if entry is None else entry.mean_squared_error
+        elif application in self.scenario.applications:
             summary = self.applications.get(application)
             found = None if summary is None else APPLICATIONS[application].figure(summary, path)
         else:
@@ -93,15 +102,28 @@ class Evidence:
 
     def _secrecy(self, expect: ExpectTable) -> tuple[Found, bool | None]:
         """Held if theory promises secrecy and the run shows it, otherwise not; undecided in a run that was cut short."""
+        if expect.direction is not None:
+            return self._secrecy_in(expect)
         verdict = self.secrecy[str(expect.against)]
         relative = expect.secrecy == "relative"
         shown = verdict.relative if relative else verdict.perfect
         promised = verdict.relative_by_theory if relative else verdict.perfect_by_theory
-        theory = {True: "theory promises it", False: "theory denies it", None: "no theory covers these links"}
-        run = {Verdict.HELD: "the run shows it", Verdict.FAILED: "the run shows that it fails"}
-        found = f"{theory[promised]}, {run.get(shown, f'the run has {shown.value}')}"
+        found = f"{_THEORY[promised]}, {_RUN.get(shown.value, f'the run has {shown.value}')}"
         complete = all(tally.done == tally.slots for tally in self.tallies.values())
         return found, promised is True and shown is Verdict.HELD if complete else None
+
+    def _secrecy_in(self, expect: ExpectTable) -> tuple[Found, bool | None]:
+        """The same in one direction, where theory only promises perfect secrecy: relative secrecy is what the run shows."""
+        verdict = self.directions.get(str(expect.against), {}).get(str(expect.direction))
+        if verdict is None:
+            return None, None
+        relative = expect.secrecy == "relative"
+        shown = str(verdict.relative if relative else verdict.perfect)
+        promise = "" if relative else f"{_THEORY[verdict.perfect_by_theory]}, "
+        run = _RUN.get(shown, f"the run has {shown}")
+        held = shown == Verdict.HELD.value and (relative or verdict.perfect_by_theory is True)
+        complete = all(tally.done == tally.slots for tally in self.tallies.values())
+        return f"{promise}{run}", held if complete else None
 
     def _in_step(self, expect: ExpectTable) -> tuple[Found, bool | None]:
         """The slot by which it was in step in all trials; undecided if the run was cut short before `by`."""

@@ -23,6 +23,7 @@ from evedrop.news import ConnectionOutage, RunEvent
 from evedrop.scenario import Scenario
 from evedrop.score.channel import link_summary_of
 from evedrop.score.closed_loop_tally import Acted
+from evedrop.score.directions import directions_of
 from evedrop.score.expectations_held import Evidence
 from evedrop.score.filtering import true_errors
 from evedrop.score.histogram import LEVELS
@@ -83,6 +84,8 @@ class Scorekeeper:
                 tally.conditional.add(receiver.action)
             if tally.leak is not None:
                 tally.leak.add(receiver.action, slots.nu, self._revealed[name])
+            for direction in tally.directions.values():
+                direction.add(slots.first, slots.x, receiver.x_hat)
             tally.add_traces(slots.first, traces)
             tally.account(receiver.delivered, receiver.action, receiver.lost, receiver.unsent)
             if slots.sent is not None:
@@ -152,7 +155,8 @@ def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | N
     user = tallies[LEGITIMATE]
     links = {name: link_summary_of(scenario, name, tally) for name, tally in tallies.items()}
     secret = {one.eavesdropper: one for one in verdicts(scenario, tallies)}
-    expectations = Evidence(scenario, peers, links, tallies, secret, applications).judged(ending.replay)
+    directions = directions_of(tallies, expected)
+    expectations = Evidence(scenario, peers, links, tallies, secret, applications, directions).judged(ending.replay)
     # Known only now that every figure has been computed.
     failures = totals.failures if ending.how == Ending.how else []
     return Summary(
@@ -180,6 +184,7 @@ def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | N
         applications=applications,
         surprising=_surprising(scenario, tallies),
         expectations=expectations,
+        directions=directions,
     )
 
 

@@ -171,6 +171,26 @@ class SecrecySummary:
 
 
 @dataclass(frozen=True)
+class DirectionSummary:
+    """A receiver's error in one direction, and for an eavesdropper the verdict on secrecy in that direction."""
+
+    mean_squared_error: float
+    """Of vᵀx."""
+    standard_error: float | None
+    """None for one trial, and where the receiver's error has infinite variance."""
+    expected: float | None
+    """Theory: the same over the same slots; None if it is unknown."""
+    z: float | None
+    """How many standard errors `mean_squared_error` is above `expected`."""
+    unbounded: bool | None
+    """Theory: whether the error grows without bound; None if it is unknown."""
+    relative: str | None = None
+    """As in `SecrecySummary`; None for the legitimate estimator."""
+    perfect: str | None = None
+    perfect_by_theory: bool | None = None
+
+
+@dataclass(frozen=True)
 class DetectionSummary:
     """Attacks that the sensor detected."""
 
@@ -282,6 +302,8 @@ class Summary:
     """Application → its entry, which is at the top level of summary.json."""
     surprising: Surprising | None
     expectations: Sequence[Judged]
+    directions: Mapping[str, Mapping[str, DirectionSummary]] = field(default_factory=dict)
+    """Receiver → direction → its entry; empty without directions, and in modes without estimates."""
 
     @property
     def failed_expectations(self) -> int:
@@ -307,7 +329,11 @@ class Summary:
 
         Raises KeyError for a missing entry, and TypeError or ValueError for a value of another type.
         """
-        own = {one.name: found[one.name] for one in fields(cls) if one.name != _OPEN}
+        # Results of an older version lack directions.
+        known = [
+            one.name for one in fields(cls) if one.name != _OPEN and (one.name != "directions" or one.name in found)
+        ]
+        own = {name: found[name] for name in known}
         others = {name: value for name, value in found.items() if name not in own}
         peers = {name: _peer_fields(peer) for name, peer in own["peers"].items()}
         return _adapter().validate_python({**own, "peers": peers, _OPEN: others})

@@ -100,6 +100,37 @@ def window_of(k: NDArray[np.intp], slots: int) -> NDArray[np.intp]:
 
 
 @final
+class DirectionErrors:
+    """The squared errors of vᵀx of one receiver, summed over the slots of each window and trial."""
+
+    def __init__(self, v: Floats, slots: int, trials: int) -> None:
+        """v: the direction, (n,); slots: of the whole run."""
+        self.v, self.slots = v, slots
+        self.window_errors = np.zeros((WINDOWS + 1, trials))
+        """As that of `Tally`."""
+        self.done = 0
+        """The number of slots so far; 0 in a mode without estimates."""
+
+    def add(self, first: int, x: Floats, x_hat: Floats) -> None:
+        """Add the slots from `first` on, from x and x̂, (c, n, R) each."""
+        self.done += len(x)
+        error = np.zeros((len(x), x.shape[2]))
+        for i, weight in enumerate(self.v.tolist()):
+            error += weight * (x[:, i] - x_hat[:, i])
+        # Slot by slot, so that the bits do not depend on how many slots are added at a time.
+        for window, row in zip(window_of(np.arange(first, self.done), self.slots), error * error, strict=True):
+            self.window_errors[window] += row
+
+    @classmethod
+    def merged(cls, parts: Sequence[DirectionErrors]) -> DirectionErrors:
+        """The sums of disjoint sets of trials, in their order."""
+        whole = cls(parts[0].v, parts[0].slots, 0)
+        whole.window_errors = np.concatenate([part.window_errors for part in parts], axis=1)
+        whole.done = min(part.done for part in parts)
+        return whole
+
+
+@final
 @dataclass
 class Tally(ReceiverTotals):
     """One receiver's totals over a run."""
@@ -115,6 +146,8 @@ class Tally(ReceiverTotals):
     """The expected errors given what happened to the packets; None where that does not determine them."""
     leak: LeakTally | None = None
     """What its packets reveal without the secret; None where that is unknown."""
+    directions: dict[str, DirectionErrors] = field(default_factory=dict)
+    """The errors in the scenario's directions, by their names."""
     window_errors: Floats = field(init=False)
     """Sum of errors of each window and trial, (WINDOWS + 1, R); the last row is slot 0, which is in no window."""
     bursts: NDArray[np.int64] = field(init=False)
@@ -250,7 +283,7 @@ def _counts_of_trials(flags: Flags) -> NDArray[np.int64]:
 _BYTE = 255  # the largest count in a byte
 
 
-def window_means(tally: Tally) -> Floats:
+def window_means(tally: Tally | DirectionErrors) -> Floats:
     """Mean squared error of each window and trial, (WINDOWS, R); NaN for windows without slots."""
     lengths = np.bincount(window_of(np.arange(1, tally.slots), tally.slots), minlength=WINDOWS)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -258,7 +291,7 @@ def window_means(tally: Tally) -> Floats:
     return means
 
 
-def trial_means(tally: Tally) -> Floats:
+def trial_means(tally: Tally | DirectionErrors) -> Floats:
     """Mean error of every trial over its slots, (R,)."""
     means: Floats = tally.window_errors.sum(axis=0) / tally.slots
     return means
@@ -283,6 +316,8 @@ def merged(parts: Sequence[Tally]) -> Tally:
     total.window_errors = np.concatenate([part.window_errors for part in parts], axis=1)
     conditional = [part.conditional for part in parts if part.conditional is not None]
     total.conditional = ConditionalError.merged(conditional) if conditional else None
+    for name in parts[0].directions:
+        total.directions[name] = DirectionErrors.merged([part.directions[name] for part in parts])
     leaks = [part.leak for part in parts if part.leak is not None]
     total.leak = LeakTally.merged(leaks) if leaks else None
     total.packets = np.concatenate([part.packets for part in parts], axis=1)

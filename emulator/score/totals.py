@@ -11,7 +11,7 @@ from evedrop.score.closed_loop_tally import LoopTally, SolveTimes
 from evedrop.score.conditional import conditional_error_of
 from evedrop.score.filtering import FilterTally
 from evedrop.score.leak import LeakTally, leak_is_known
-from evedrop.score.sums import Tally, merged
+from evedrop.score.sums import DirectionErrors, Tally, merged
 from evedrop.score.watched import Watched, watches_of
 
 
@@ -36,6 +36,8 @@ class Totals:
         }
         for name, tally in tallies.items():
             tally.conditional = conditional_error_of(scenario, name, trials)
+            for direction, v in scenario.process.directions_as_arrays.items():
+                tally.directions[direction] = DirectionErrors(v, scenario.slots, trials)
             tally.leak = LeakTally(trials) if leak_is_known(scenario, name) else None
         return cls(tallies)
 

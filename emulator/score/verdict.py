@@ -149,7 +149,7 @@ def rejected(p_values: Mapping[int, float]) -> list[int]:
     return sorted(found)
 
 
-def _relative(difference: Floats, test: SignTestOf, slots: int) -> tuple[Verdict, str]:
+def relative_verdict(difference: Floats, test: SignTestOf, slots: int) -> tuple[Verdict, str]:
     """The verdict on relative secrecy, and the slots in which it failed or is undecided, empty if in all.
 
     difference: the eavesdropper's mean error less the legitimate one, by window and trial, (WINDOWS, R). One window fails the
@@ -172,7 +172,7 @@ def _slots_of(windows: list[int], slots: int) -> str:
     return ", ".join(f"{span[0]} to {span[-1]}" for span in spans)
 
 
-def _perfect(eavesdropper: Floats, legitimate: Floats, bound: float, test: SignTestOf) -> Verdict:
+def perfect_verdict(eavesdropper: Floats, legitimate: Floats, bound: float, test: SignTestOf) -> Verdict:
     """Held if the eavesdropper's error grows from the first to the last quarter and the legitimate error stays within `bound`."""
     quarter = WINDOWS // 4
     if np.isnan(eavesdropper).any():
@@ -206,13 +206,13 @@ def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tall
     test = sign_of_median if heavy else sign_of_mean
     relative, windows = Verdict.UNDECIDED, ""
     if complete:
-        relative, windows = _relative(other_means - user_means, test, slots)
+        relative, windows = relative_verdict(other_means - user_means, test, slots)
     if not user_theory.has_limit:
         perfect = Verdict.UNDECIDED
     elif perfect_by_theory is False:
         perfect = Verdict.FAILED
     else:
-        perfect = _perfect(other_means, user_means, user_bound, test) if complete else Verdict.UNDECIDED
+        perfect = perfect_verdict(other_means, user_means, user_bound, test) if complete else Verdict.UNDECIDED
     ratio = other.error / user.error if user.error else math.inf if user.done else math.nan
     scattered = not heavy and user.alike and other.alike
     scatter = ratio_error(trial_means(other), trial_means(user)) if scattered else None

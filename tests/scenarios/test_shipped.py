@@ -86,6 +86,7 @@ def test_live_and_memory_are_the_same_bits(name: str, batch: str, twins: Callabl
             elif figure != "digest":
                 assert found == (same[figure] if same[figure] is None else pytest.approx(same[figure], rel=apart))
     assert live.summary["secrecy"] == memory.summary["secrecy"]
+    assert live.summary["directions"] == memory.summary["directions"]
     assert live.summary.get("integrity", {}).get("digest") == memory.summary.get("integrity", {}).get("digest")
 
 

@@ -13,7 +13,7 @@ from evedrop.memory.simulation import Mode
 from evedrop.memory.trials import Task, carry_out
 from evedrop.model.process import Floats
 from evedrop.score.sums import WINDOWS, merged, window_means
-from evedrop.score.verdict import ERROR_RATE, SignTestOf, Verdict, _relative, sign_of_mean, sign_of_median
+from evedrop.score.verdict import ERROR_RATE, SignTestOf, Verdict, relative_verdict, sign_of_mean, sign_of_median
 from tests.builders import MARGINAL, process_table
 
 TRIALS, SLOTS = 200, 81
@@ -69,7 +69,7 @@ STUDIES = pytest.mark.parametrize("studies", [200, pytest.param(1000, marks=pyte
 def test_failed_is_said_in_error_no_more_often_than_promised(studies: int, test: SignTestOf) -> None:
     """Without a difference in any window; with the whole rate for each window, 1000 studies would have too many."""
     samples = differences(studies)
-    found = counted([_relative(one, test, SLOTS)[0] for one in samples])
+    found = counted([relative_verdict(one, test, SLOTS)[0] for one in samples])
     assert found[Verdict.FAILED] <= most(studies)
     assert found[Verdict.HELD] <= most(studies)
     alone = sum(any(test(row).below <= ERROR_RATE for row in one) for one in samples)
@@ -85,6 +85,6 @@ def test_held_is_said_in_error_no_more_often_than_promised(studies: int) -> None
     """Without a difference in one window, and with a large one in all others: the worst case for this claim."""
     samples = differences(studies).copy()
     samples[:, 1:] += 1.0
-    found = counted([_relative(one, sign_of_mean, SLOTS)[0] for one in samples])
+    found = counted([relative_verdict(one, sign_of_mean, SLOTS)[0] for one in samples])
     assert 0 < found[Verdict.HELD] <= most(studies)
     assert found[Verdict.FAILED] == 0

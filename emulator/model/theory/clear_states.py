@@ -17,6 +17,7 @@ from evedrop.kernels.elementary import cholesky
 from evedrop.model.process import MARGINAL, Floats, Process
 from evedrop.model.receiver import Flags
 from evedrop.model.theory.closed_form import ClosedForm
+from evedrop.model.theory.directions import Growth, unstable_part
 
 _LARGEST = 1e150  # whose square is a double
 _LONGEST = 2_000  # slots in which a bounded error settles, or its limit is unknown
@@ -75,6 +76,13 @@ class ClearStatesForm(ClosedForm):
         unseen = _orthogonal_to(_invariant_hull(A.T, clear.T))
         return unstable_part(A, unseen, 1.0 - MARGINAL if self.mu_d == 1.0 else 1.0 + MARGINAL)
 
+    @property
+    def growth(self) -> Growth:
+        """Where the error grows: exactly in `growing`, or perhaps also elsewhere, but only where the state itself grows."""
+        if self.mu_d == 1.0 and not self.bound:
+            return Growth(self.growing, self.growing)
+        return Growth(self.growing, unstable_part(self.process.A, np.eye(self.process.n), 1.0 - MARGINAL))
+
     def _followed(self, slots: int) -> Floats:
         found = np.full(slots, np.inf)
         A, noise = self.process.A, self.process.noise_factor
@@ -103,17 +111,6 @@ class ClearStatesForm(ClosedForm):
         found: Floats = np.empty_like(L)
         found[order] = L
         return found
-
-
-def unstable_part(A: Floats, within: Floats, least: float) -> Floats:
-    """An orthonormal basis, (n, m), of the eigenspaces with |λ| ≥ least of A in an invariant subspace with this basis, (n, s)."""
-    from scipy.linalg import schur  # noqa: PLC0415 - slow to import
-
-    if not within.shape[1]:
-        return within
-    _, Z, count = schur(within.T @ A @ within, sort=lambda real, imaginary: math.hypot(real, imaginary) >= least)
-    found: Floats = within @ Z[:, :count]
-    return found
 
 
 def _invariant_hull(A: Floats, columns: Floats) -> Floats:

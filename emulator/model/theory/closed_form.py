@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 
 from evedrop.model.process import Floats
@@ -25,6 +24,6 @@ class ClosedForm(ABC):
         """Trace of the limit; inf if it is unbounded, NaN if it is too large to compute."""
 
     @property
+    @abstractmethod
     def infinite_variance(self) -> bool:
         """Whether the variance of tr P over trials has no bound (docs/mathematics.md, heavy tails)."""
-        return math.isinf(self.limit)

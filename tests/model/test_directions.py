@@ -1,0 +1,65 @@
+"""Where expected errors grow: the rule against long recursions, in each eigenspace and between them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from evedrop.model.process import Process
+from evedrop.model.theory.clear_states import ClearStatesForm
+from evedrop.model.theory.covariances import NOBODY, Outcomes, expected_covariances
+from evedrop.model.theory.directions import growth
+
+TURNED, _ = np.linalg.qr(np.random.default_rng(3).standard_normal((4, 4)))
+MIXED = Process(TURNED @ np.diag([1.3, 1.1, 1.0, 0.6]) @ TURNED.T, np.eye(4), np.eye(4))
+"""A symmetric A, whose eigenvectors are the columns of TURNED."""
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "grows"),
+    [
+        (Outcomes.legitimate(0.9, 0.9), [False] * 4),
+        (Outcomes.legitimate(0.5, 0.6), [True, False, False, False]),
+        (Outcomes.eavesdropper(0.3, 0.4, 1.0, 0.0), [True, True, False, False]),
+        (Outcomes.eavesdropper(0.9, 0.5, 1.0, 1.0), [True, True, True, False]),
+        (Outcomes.genie(0.3, 0.4), [True, True, False, False]),
+        (NOBODY, [True, True, True, False]),
+        (Outcomes(0.0, state=0.0, misled=0.0, decoded=1.0, initial=1.0), [True, True, False, False]),
+        (Outcomes.legitimate(1.0, 0.2), [False] * 4),
+        (Outcomes.plain(1.0), [False] * 4),
+    ],
+)
+def test_an_error_grows_where_it_is_kept_longer_than_it_shrinks(outcomes: Outcomes, grows: list[bool]) -> None:
+    """By eigenvectors, against the recursion over 3000 slots; a direction between them touches both."""
+    found = growth(MIXED, outcomes)
+    assert [found.along(v) for v in TURNED.T] == grows
+    assert found.along(TURNED[:, 3] + TURNED[:, 0]) is grows[0]
+    # Along the axes, where no rounding of a direction that grows gets into another.
+    late = expected_covariances(replace(MIXED, A=np.diag([1.3, 1.1, 1.0, 0.6])), outcomes, 900)[[300, 899]]
+    for i, expected in enumerate(grows):
+        before, after = (float(P[i, i]) for P in late)
+        assert (after > 1.5 * before) is expected
+
+
+def test_a_direction_is_not_an_eigenvector() -> None:
+    """A triangular A: the second state drives the first, so an error of the second direction alone stays bounded."""
+    process = Process(np.array([[1.2, 1.0], [0.0, 0.5]]), np.eye(2), np.eye(2))
+    found = growth(process, NOBODY)
+    assert found.along(np.array([1.0, 0.0])) is True
+    assert found.along(np.array([0.0, 1.0])) is False
+    turned = Process(process.A.T, np.eye(2), np.eye(2))
+    found = growth(turned, NOBODY)
+    assert [found.along(v) for v in np.eye(2)] == [True, True]  # the first state drives the second
+    # The left eigenvector of 0.5 is orthogonal to the right one of 1.2.
+    assert found.along(np.array([-1.0, 0.7])) is False
+
+
+def test_what_is_not_observed_grows() -> None:
+    """Exactly over a perfect link; behind a lossy one only growth, and what the state itself does not do, are certain."""
+    process = Process(np.array([[1.1, 0.3, 0.0], [0.0, 1.2, 0.0], [0.0, 0.0, 0.5]]), np.eye(3), np.eye(3))
+    hidden = np.array([True, False, True])
+    exact, lossy = (ClearStatesForm(process, hidden, 1.0, received, 10).growth for received in (1.0, 0.8))
+    assert [exact.along(v) for v in np.eye(3)] == [True, False, False]
+    assert [lossy.along(v) for v in np.eye(3)] == [True, None, False]
