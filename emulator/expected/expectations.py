@@ -12,6 +12,7 @@ import numpy as np
 from evedrop.expected.closed_forms import ClosedStream, closed_of
 from evedrop.model import modulated
 from evedrop.model.acknowledgements import FORGING
+from evedrop.model.modulated_streaks import modulated_streaks
 from evedrop.model.outcomes import eavesdropper_outcomes, legitimate_outcomes
 from evedrop.model.process import Floats, Process
 from evedrop.model.schedule import in_slot
@@ -155,8 +156,12 @@ class Expectation:
 
     def streaks(self, slots: int) -> Streaks | None:
         """What streaks carry of its error in slots 0 … slots−1; None unless a closed form knows them (docs/mathematics.md)."""
-        outcomes = None if self.closed is not None else self._outcomes
-        return None if outcomes is None else streaks(self.process, outcomes, slots)
+        if self.closed is not None or self._known is None:
+            return None
+        if self._outcomes is not None and not self._outcomes.leaked:
+            return streaks(self.process, self._outcomes, slots)
+        total = float(self.traces(slots).sum())
+        return modulated_streaks(self.process, *self._known, slots, total, self.slots_at)
 
     @property
     def infinite_variance(self) -> bool:

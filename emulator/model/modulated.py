@@ -47,7 +47,7 @@ class ModulatedCovariance:
     ) -> None:
         """slots_at: the outcomes of each slot, where they differ; `outcomes_at` is then their mean."""
         self._process, self._law = process, law
-        self._whole = _Odds.of(outcomes_at)
+        self._whole = SlotOdds.of(outcomes_at)
         self._slots_at = slots_at
         self._remaining = RemainingCovariances(process) if self._whole.leaks else None
         self._sigma = ExpectedCovariance(process, NOBODY)
@@ -156,7 +156,7 @@ class ModulatedCovariance:
         """E(s) after a slot, from E(s) before it, when the slot is `lag` slots ago."""
         A, chain = self._process.A, slot.segment.chain
         quality = slot.quality * slot.segment.arrived[lag]
-        whole = self._whole if self._slots_at is None else _Odds.of(self._slots_at(slot.k))
+        whole = self._whole if self._slots_at is None else SlotOdds.of(self._slots_at(slot.k))
         odds = {name: one[:, None, None] for name, one in whole.at(quality).items()}
         law = chain.law[:, None, None]
         if states is None or slot.before is None:
@@ -176,21 +176,24 @@ class ModulatedCovariance:
 _LARGEST = 160  # numbers that a block carries along: beyond it the operator costs more than it saves
 
 
+@final
 @dataclass(frozen=True)
-class _Odds:
+class SlotOdds:
     """The probabilities of a slot's outcomes, which are affine in the link's quality."""
 
     base: Mapping[str, float]
     slope: Mapping[str, float]
 
     @classmethod
-    def of(cls, outcomes_at: OutcomesAt) -> _Odds:
+    def of(cls, outcomes_at: OutcomesAt) -> SlotOdds:
+        """The probabilities by the outcomes for any quality."""
         never, always = outcomes_at(0.0), outcomes_at(1.0)
         base = {name: getattr(never, name) for name in PARTS}
         return cls(base, {name: getattr(always, name) - base[name] for name in PARTS})
 
     @property
     def leaks(self) -> bool:
+        """Whether a packet may leak what it does not contain."""
         return bool(self.slope["leaked"] or self.base["leaked"])
 
     def at(self, quality: Floats) -> dict[str, Floats]:

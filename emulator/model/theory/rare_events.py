@@ -26,7 +26,8 @@ from evedrop.model.theory.covariances import (
 
 LARGEST_RUN = 2**22
 """The most numbers, slots × n², in the covariances of a run for which the streaks of a misled receiver are computed."""
-_REST = 1e-9  # the share of the expectation that is left out, in the longest streaks
+REST = 1e-9
+"""The share of the expectation that is left out, in the longest streaks."""
 
 
 @final
@@ -46,7 +47,7 @@ class Streaks:
         if self.total == 0.0:
             return 0.0
         met = float(self.carried[self.number * trials >= 1.0].sum()) / self.total
-        return 1.0 - met if met < 1.0 - _REST else 0.0
+        return 1.0 - met if met < 1.0 - REST else 0.0
 
     def trials_for(self, share: float) -> float:
         """The number of trials for which this share is left in such slots; inf if it exceeds double precision. share > 1e-9."""
@@ -63,8 +64,8 @@ class Streaks:
 def streaks(process: Process, outcomes: Outcomes, slots: int) -> Streaks | None:
     """The streaks of a receiver in slots 0 … slots−1.
 
-    None if its error leaves double precision, for a genie, whose slots differ, and for a misled receiver in a run that is too
-    long (LARGEST_RUN).
+    None if its error leaves double precision, for a genie, whose slots differ (`modulated_streaks` knows them), and for a misled
+    receiver in a run that is too long (LARGEST_RUN).
 
     Source: docs/mathematics.md, rare events.
     """
@@ -79,7 +80,7 @@ def streaks(process: Process, outcomes: Outcomes, slots: int) -> Streaks | None:
     F = math.sqrt(kept) * process.A
     powers = np.concatenate([np.eye(process.n)[None], powers_of(F, block_length(F))])
     base, noise, found = powers[0], 0.0, np.zeros((2, 3, 0))
-    while found.shape[2] < slots and found[1].sum() < (1.0 - _REST) * total:
+    while found.shape[2] < slots and found[1].sum() < (1.0 - REST) * total:
         length = np.arange(found.shape[2], min(slots, found.shape[2] + len(powers) - 1))
         F_l, after = (powers @ base)[: len(length)], slots - 1 - length
         base = powers[-1] @ base

@@ -1,0 +1,142 @@
+"""Streaks behind links with a memory, of a genie, and with a μ_d for each slot, against enumerations of all courses of a run."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from evedrop.model import modulated_streaks as module
+from evedrop.model.links.link import Chain
+from evedrop.model.modulated import ModulatedCovariance
+from evedrop.model.modulated_streaks import modulated_streaks
+from evedrop.model.process import Floats, Process
+from evedrop.model.slot.link_law import LinkLaw, Segment
+from evedrop.model.theory.covariances import NOBODY, Outcomes, OutcomesAt, expected_traces
+from evedrop.model.theory.leak import RemainingCovariances
+from evedrop.model.theory.rare_events import Streaks, streaks
+from tests.model.test_rare_events import FIRST, LEGITIMATE, LOST, MISLEADING, MISLED, PLANE, SMART
+
+BURSTS = Chain(np.array([[0.8, 0.2], [0.5, 0.5]]), np.array([5.0, 2.0]) / 7.0, np.array([0.9, 0.3]))
+STEADY = Chain(np.ones((1, 1)), np.ones(1), np.array([0.7]))
+MU_D = (1.0, 0.2, 0.8, 0.5)
+SLOTS = len(MU_D)
+AT: dict[str, Callable[[float], OutcomesAt]] = {
+    "legitimate": lambda mu_d: lambda mu: Outcomes.legitimate(mu, mu_d),
+    "suspicious": lambda mu_d: lambda mu: Outcomes.eavesdropper(mu, mu_d, 0.9, 0.3),
+    "genie": lambda mu_d: lambda mu: Outcomes.genie(mu, mu_d),
+}
+
+
+def enumerated(process: Process, chain: Chain, outcomes_in: Callable[[int], OutcomesAt]) -> tuple[Floats, Floats]:
+    """The numbers and carried errors of `Streaks`, (3, SLOTS) each, from every course of the link's states and of outcomes."""
+    number, carried = np.zeros((3, SLOTS)), np.zeros((3, SLOTS))
+    sigma, remaining = [process.initial_covariance], RemainingCovariances(process)
+    M = [np.zeros_like(process.Q), *(remaining.next() for _ in range(1, SLOTS))]
+    for _ in range(1, SLOTS):
+        sigma.append(process.A @ sigma[-1] @ process.A.T + process.Q)
+    names = ("predicted", "decoded", "state", "misled", "leaked")
+    for states in itertools.product(range(len(chain.law)), repeat=SLOTS):
+        odds = [outcomes_in(k)(float(chain.quality[s])) for k, s in enumerate(states)]
+        likely = chain.law[states[0]] * np.prod([chain.transitions[pair] for pair in itertools.pairwise(states)])
+        for unused in (False, True):
+            for course in itertools.product(names, repeat=SLOTS - 1):
+                weight = likely * (odds[0].initial if unused else 1.0 - odds[0].initial)
+                weight *= np.prod([getattr(one, name) for one, name in zip(odds[1:], course, strict=True)])
+                P, kind, length = process.initial_covariance * unused, FIRST if unused else None, 0
+                for k in range(SLOTS):
+                    if k:
+                        outcome, moved = course[k - 1], process.A @ P @ process.A.T
+                        length += 1
+                        if outcome == "state":
+                            P, kind = np.zeros_like(P), None
+                        elif outcome == "misled":
+                            P, kind, length = 2.0 * process.A @ sigma[k - 1] @ process.A.T, MISLEADING, 0
+                        elif outcome == "decoded":
+                            P = moved
+                        else:
+                            P = moved + (process.Q if outcome == "predicted" else M[k])
+                            kind, length = (LOST, 0) if kind is None else (kind, length)
+                    if kind is not None:
+                        number[kind, length] += weight
+                        carried[kind, length] += weight * float(np.trace(P))
+    return number, carried
+
+
+def found_in(law: LinkLaw, at: OutcomesAt, slots: int, process: Process = PLANE) -> Streaks:
+    """The streaks of a run that has them."""
+    total = float(ModulatedCovariance(process, law, at).next_traces(slots).sum())
+    found = modulated_streaks(process, law, at, slots, total)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("reader", AT)
+@pytest.mark.parametrize("chain", [BURSTS, STEADY], ids=["bursts", "steady"])
+def test_streaks_are_those_of_all_courses_of_a_run(chain: Chain, reader: str) -> None:
+    """Kind by kind and length by length, with a μ_d for each slot and with one for all."""
+    law, mean = LinkLaw.steady(chain), AT[reader](0.5)
+    for slots_at in (lambda k: AT[reader](MU_D[min(k, SLOTS - 1)]), None):
+        total = float(ModulatedCovariance(PLANE, law, mean, slots_at).next_traces(SLOTS).sum())
+        found = modulated_streaks(PLANE, law, mean, SLOTS, total, slots_at)
+        assert found is not None
+        number, carried = enumerated(PLANE, chain, slots_at or (lambda _: mean))
+        assert found.number == pytest.approx(number, rel=1e-9, abs=1e-15)
+        assert found.carried == pytest.approx(carried, rel=1e-9, abs=1e-15)
+        assert found.carried.sum() == pytest.approx(total, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "outcomes", [LEGITIMATE, MISLED, SMART, NOBODY], ids=["legitimate", "misled", "smart", "nobody"]
+)
+def test_independent_losses_have_the_streaks_of_the_closed_form(outcomes: Outcomes) -> None:
+    """A chain of one state, in a longer run."""
+    found = modulated_streaks(
+        PLANE, LinkLaw.steady(STEADY), lambda _: outcomes, 40, float(expected_traces(PLANE, outcomes, 40).sum())
+    )
+    closed = streaks(PLANE, outcomes, 40)
+    assert found is not None
+    assert closed is not None
+    for trials in (1, 30, 1000):
+        assert found.share(trials) == pytest.approx(closed.share(trials), rel=1e-6, abs=1e-8)
+    assert found.trials_for(0.01) == closed.trials_for(0.01)
+
+
+def test_a_link_that_changes_during_the_run() -> None:
+    """From the slot of the change on the chain begins in its stationary law; all of the error is carried."""
+    better = Chain(BURSTS.transitions, BURSTS.law, np.array([1.0, 0.6]))
+    law = LinkLaw(
+        (*LinkLaw.steady(BURSTS).segments, Segment(20, better, 0.9, np.ones(1)), Segment(99, BURSTS, 1.0, np.ones(1)))
+    )
+    at = AT["suspicious"](0.4)
+    found = found_in(law, at, 60)
+    assert found.carried.sum() == pytest.approx(found.total, rel=2e-9)
+    assert np.all(np.diff(found.number) <= 0.0)
+
+
+def test_bursts_make_rare_events_rarer_and_larger() -> None:
+    """Of two links with the same mean loss, the one with long bursts has more of its error in streaks that trials miss."""
+    at, process = AT["legitimate"](0.6), Process(np.eye(1), np.eye(1), np.eye(1))
+    long = Chain(np.array([[0.99, 0.01], [0.09, 0.91]]), np.array([0.9, 0.1]), np.array([1.0, 0.0]))
+    alike = replace(STEADY, quality=np.array([0.9]))
+    shares = [found_in(LinkLaw.steady(chain), at, 100, process).share(20) for chain in (long, alike)]
+    assert shares[0] > 5.0 * shares[1] > 0.0
+
+
+def test_what_is_not_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Late packets, outages, models with other states, errors beyond double precision, and more numbers than are allowed."""
+    at, law = AT["legitimate"](0.5), LinkLaw.steady(BURSTS)
+    late = LinkLaw((replace(law.segments[0], arrived=np.array([0.5, 1.0])),))
+    away = replace(law, outages=((3, 5, True),))
+    other = LinkLaw((*law.segments, Segment(3, STEADY, 1.0, np.ones(1))))
+    for one in (late, away, other):
+        assert modulated_streaks(PLANE, one, at, 9, 1.0) is None
+    assert modulated_streaks(PLANE, law, at, 9, float("inf")) is None
+    total = found_in(law, at, 9).total
+    for name, most in (("_LARGEST_RUN", 9 * 4 * 2 - 1), ("MOST_NUMBERS", 9 * 4 * 2 * 3)):
+        with monkeypatch.context() as patch:
+            patch.setattr(module, name, most)
+            assert modulated_streaks(PLANE, law, at, 9, total) is None
