@@ -46,7 +46,7 @@ def warnings_of(scenario: Scenario) -> list[str]:
             + ("; no state_probability can, the link must be better" if bound >= 1.0 else "")
         )
     found += _reference_warnings(scenario, mu)
-    found += _filter_warnings(scenario)
+    found += [*_filter_warnings(scenario), *scheme_of(process, scenario.encoding.spec).warnings()]
     size = written_bytes(scenario)
     if size > _LARGE_BYTES:
         found.append(

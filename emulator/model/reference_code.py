@@ -146,6 +146,17 @@ class _Watch:
         self._factors = factors[places]
 
 
+def singular_warnings(process: Process) -> list[str]:
+    """The consequences of a singular A, for which there is no L with independent packets."""
+    if is_regular(process.A):
+        return []
+    return [
+        "process.A is singular to double precision (max |A| · max |A⁻¹| exceeds 9e13), so no code makes packets independent of "
+        "the state: references are carried by L = A, as in the scheme open-loop, and an eavesdropper that lost the reference "
+        "learns the decaying modes from every packet; a regular A prevents that"
+    ]
+
+
 def _inverses(C: Floats) -> Floats:
     """C⁻¹ of lower triangular matrices, (c, n, n)."""
     n = C.shape[1]

@@ -11,6 +11,7 @@ import pytest
 from evedrop.model import reference_code
 from evedrop.model.process import Process
 from evedrop.model.reference_code import ReferenceCode
+from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.acknowledged import Acknowledged
 from evedrop.model.schemes.open_loop import OpenLoop
 from evedrop.model.schemes.scheme import Scheme
@@ -141,6 +142,17 @@ def test_an_almost_singular_process_is_carried_by_itself() -> None:
     small = ReferenceCode(Process(np.diag([1.1, 1e-13]), np.diag([1e-4, 1.0]), np.eye(2)))
     assert small.decorrelates
     assert [small.oldest(k) for k in range(4)] == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("name", ["acknowledged", "random-code", "threshold-code"])
+def test_a_singular_process_is_warned_of(name: str) -> None:
+    """By every scheme with such a code, and by no other."""
+    singular, regular = (Process(np.diag([1.1, last]), np.eye(2), np.eye(2)) for last in (0.0, 0.5))
+    parameters = dict(SCHEMES[name].parameters)
+    (warning,) = scheme_of(singular, {"scheme": name, **parameters}).warnings()
+    assert warning.startswith("process.A is singular to double precision (max |A| · max |A⁻¹| exceeds 9e13)")
+    assert scheme_of(regular, {"scheme": name, **parameters}).warnings() == []
+    assert scheme_of(singular, {"scheme": "open-loop"}).warnings() == []
 
 
 def test_slots_of_the_code_may_be_read_in_any_order() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from evedrop.model.process import Floats, product
 from evedrop.model.receiver import Flags, Receiver
 from evedrop.model.reference import ReferenceReceiver
-from evedrop.model.reference_code import NONE, ReferenceCode
+from evedrop.model.reference_code import NONE, ReferenceCode, singular_warnings
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.model.theory.lost_reference import LostReference, growth_by_coin
@@ -61,6 +61,10 @@ class Acknowledged(Scheme):
     needs_acknowledgements = True
     reads_packets = True
     header = ("slot t of the reference; −1: none, z is the state",)
+
+    def warnings(self) -> list[str]:
+        """That of a singular A."""
+        return singular_warnings(self.process)
 
     def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
         """The references; nothing is secret."""

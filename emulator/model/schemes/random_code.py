@@ -10,7 +10,7 @@ from evedrop.model.checks import as_toml, probability_mistakes
 from evedrop.model.process import Process
 from evedrop.model.receiver import Flags, Receiver
 from evedrop.model.reference import ReferenceReceiver
-from evedrop.model.reference_code import ReferenceCode
+from evedrop.model.reference_code import ReferenceCode, singular_warnings
 from evedrop.model.schemes.mixed_packets import MIXED_HEADER, MixedEncoder
 from evedrop.model.schemes.scheme import NoInnovations, Scheme, Shared
 from evedrop.model.theory.covariances import radius
@@ -60,6 +60,10 @@ class RandomCode(Scheme):
             what += "the first flipped acknowledgement would leave the user behind for good; expected a number above 0, up to 1"
             return [("plain_probability", what)]
         return probability_mistakes(given, "plain_probability")
+
+    def warnings(self) -> list[str]:
+        """That of a singular A."""
+        return singular_warnings(self.process)
 
     def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
         """The references and the sensor's coin."""

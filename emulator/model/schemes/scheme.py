@@ -239,6 +239,10 @@ class Scheme(ABC):
         del keys, batch
         return None
 
+    def warnings(self) -> list[str]:
+        """What the user should know about the scheme with this process before a run."""
+        return []
+
     @property
     def noise_law(self) -> NoiseLaw | None:
         """The public law of packets that hold noise in place of a state; None if there are none."""

@@ -13,7 +13,7 @@ from evedrop.model.checks import as_toml, is_number, probability_mistakes
 from evedrop.model.process import Process
 from evedrop.model.receiver import Flags, Receiver
 from evedrop.model.reference import ReferenceReceiver
-from evedrop.model.reference_code import ReferenceCode
+from evedrop.model.reference_code import ReferenceCode, singular_warnings
 from evedrop.model.schemes.mixed_packets import MIXED_HEADER, MixedEncoder
 from evedrop.model.schemes.scheme import NoInnovations, Scheme, Shared
 from evedrop.model.theory.lost_reference import LostReference, growth_by_phases, most_coded
@@ -79,6 +79,10 @@ class ThresholdCode(Scheme):
             what += "expected a number below 1"
             found.append(("lost_belief", what))
         return found
+
+    def warnings(self) -> list[str]:
+        """That of a singular A."""
+        return singular_warnings(self.process)
 
     def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
         """The references; nothing is secret."""
