@@ -20,6 +20,7 @@ from evedrop.conformance.rules import (
     Row,
     RuleVerdict,
     calling,
+    expect_array,
     expect_bool,
     expect_names,
     expect_outcomes,
@@ -28,7 +29,7 @@ from evedrop.conformance.rules import (
     judged,
 )
 from evedrop.model.outcomes import legitimate_outcomes
-from evedrop.model.schemes.scheme import Scheme
+from evedrop.model.schemes.scheme import PacketBlock, Scheme
 
 _QUALITIES = (0.0, 0.5, 1.0)
 
@@ -96,6 +97,10 @@ class SchemeChecks(ReceiverChecks):
             with calling("eavesdropper_outcomes()", self._kind):
                 theirs = scheme.eavesdropper_outcomes(mu, 1.0, 1.0)
             expect_outcomes(f"eavesdropper_outcomes({mu}, 1.0, 1.0)", theirs)
+        packets = PacketBlock.of([slot.packet for slot in self._slots(problem)])
+        with calling("encrypted()", self._kind):
+            encrypted = scheme.encrypted(packets)
+        expect_array("encrypted()", encrypted, np.bool_, packets.nu.shape, "slots, one for each of the R trials")
         with calling("packet_bits, secret_bits and initial_secret_bits", self._kind):
             bits = (scheme.packet_bits, scheme.secret_bits, scheme.initial_secret_bits)
         if any(type(one) is not int or one < 0 for one in bits):

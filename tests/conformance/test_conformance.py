@@ -197,6 +197,13 @@ def test_a_scheme_that_breaks_a_rule_is_told_which(rule: str) -> None:
     assert remedy in found[rule]
 
 
+def test_a_scheme_says_of_every_packet_whether_it_is_encrypted() -> None:
+    """One flag for each slot and trial; anything else is told."""
+    kind = plain_with(encrypted=lambda self, packets: packets.nu[0])  # noqa: ARG005 - a method
+    found = broken(scheme_verdicts(kind, kind))
+    assert "encrypted()" in found["shapes and types"]
+
+
 class Forgetful(Suspicious):
     """Tosses a new coin for every slot that it is asked for, by how often it was asked."""
 
