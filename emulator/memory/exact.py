@@ -24,7 +24,7 @@ from evedrop.model.input_aware import InputAwareEstimator
 from evedrop.model.integrity.monitor import Monitor
 from evedrop.model.numeric.detection import CusumBatch
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Flags, Receiver
+from evedrop.model.receiver import Belief, Flags, Receiver
 from evedrop.model.schemes.scheme import Scheme, Shared
 from evedrop.model.slot.controller import ControllerCore
 from evedrop.model.slot.link_core import LinkCore
@@ -102,6 +102,10 @@ class ExactSimulation:
         self._logs = {
             name: BlockDigests(batch.trials, scenario.slots, scenario.outage_bounds(name)) for name in roles.receivers
         }
+
+    def belief(self, name: str) -> Belief:
+        """A receiver's belief after the last chunk."""
+        return self._receivers[name].belief
 
     def play(self, chunk: range, links: Mapping[str, LinkCore]) -> Chunk:
         """Simulate the next slots, which are those that the links have planned. No receiver leaves or returns among them."""

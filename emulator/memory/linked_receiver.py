@@ -10,7 +10,7 @@ from typing import final
 
 import numpy as np
 
-from evedrop.model.receiver import Receiver, prior
+from evedrop.model.receiver import Belief, Receiver, prior
 from evedrop.model.slot.receiver import Absence, FollowedSlots, ReceiverCore
 from evedrop.model.slot.transit import Arrivals
 from evedrop.scenario.timeline import Away
@@ -26,6 +26,11 @@ class LinkedReceiver:
         self._away: Away | None = None
         self._absence: Absence
         self._core = ReceiverCore(receiver, window)
+
+    @property
+    def belief(self) -> Belief:
+        """Its belief after the last slot in which it was present, or that it passed."""
+        return self._core.belief
 
     def take(self, slots: range, arrivals: Arrivals) -> FollowedSlots:
         """The beliefs after consecutive slots, at least one. The receiver is present in all of them, or away in all."""

@@ -23,7 +23,7 @@ from evedrop.memory.packet_counts import PacketCounts
 from evedrop.model import update
 from evedrop.model.digest import Digests, block_starts
 from evedrop.model.eavesdroppers import STRATEGIES
-from evedrop.model.eavesdroppers.eavesdropper import Knowledge
+from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
 from evedrop.model.input_aware import InputAwareEstimator
 from evedrop.model.outcomes import eavesdropper_outcomes
 from evedrop.model.process import Floats, ProcessNoise, Trajectory
@@ -53,7 +53,8 @@ class Mode(StrEnum):
 class Simulation:
     """Simulates all slots of a range of trials; `chunks` can be read only once.
 
-    lineage: whose random numbers they read; leaving out: eavesdroppers that are not simulated, which changes nothing else.
+    lineage: whose random numbers they read; leaving out: eavesdroppers that are not simulated, which changes nothing else; stops:
+    slots before which a chunk ends.
     """
 
     def __init__(
@@ -64,6 +65,7 @@ class Simulation:
         *,
         lineage: Lineage = OWN,
         leaving_out: Collection[str] = (),
+        stops: Collection[int] = (),
     ) -> None:
         self._scenario = scenario
         self._mode = mode
@@ -81,11 +83,14 @@ class Simulation:
             self._receivers: dict[str, Receiver] = {
                 LEGITIMATE: self._informed(guard.estimator(self._shared.estimator()))
             }
+        self._strategies: dict[str, Eavesdropper] = {}
+        self._stops = frozenset(stops)
         for name in scenario.eavesdroppers:
             if name in leaving_out:
                 continue
             with guard.asking(name, range(1)):
-                self._receivers[name] = guard.eavesdropper(name, self._eavesdropper(name))
+                self._strategies[name] = self._eavesdropper(name)
+                self._receivers[name] = guard.eavesdropper(name, self._strategies[name])
         self._betrayed = {
             name: STRATEGIES[table.strategy].betrayed(table.parameters)
             for name, table in scenario.eavesdroppers.items()
@@ -103,7 +108,7 @@ class Simulation:
             return estimator
         return InputAwareEstimator(estimator, scenario.driven, scenario.window(LEGITIMATE))
 
-    def _eavesdropper(self, name: str) -> Receiver:
+    def _eavesdropper(self, name: str) -> Eavesdropper:
         table = self._scenario.eavesdroppers[name]
         keys = self._keys.eavesdropper(name, table.strategy, table.parameters)
         encoding, law = self._scenario.encoding, self._scheme.noise_law
@@ -123,9 +128,8 @@ class Simulation:
         }[self._mode]()
         # The same length for any number of trials, so that sums over slots are formed in the same order.
         length = max(1, min(slots, _CHUNK_NUMBERS // self._process.n))
-        bounds = sorted(
-            {slots, *(start for name in names for start in block_starts(slots, self._scenario.outage_bounds(name)))}
-        )
+        starts = (start for name in names for start in block_starts(slots, self._scenario.outage_bounds(name)))
+        bounds = sorted({slots, *starts, *(stop for stop in self._stops if 0 < stop < slots)})
         for block, end in pairwise(bounds):
             for first in range(block, end, length):
                 chunk = range(first, min(first + length, end))
@@ -147,7 +151,13 @@ class Simulation:
             self._receivers,
             self._betrayed,
         )
-        return ExactSimulation(roles, self.digests, self.solve_times, self.packets).play
+        self._exact_simulation = ExactSimulation(roles, self.digests, self.solve_times, self.packets)
+        return self._exact_simulation.play
+
+    def learned(self) -> dict[str, Mapping[str, Floats]]:
+        """Eavesdropper → what it has learned of the process after the last chunk, as `Eavesdropper.learned`; in exact mode."""
+        found = {name: one.learned(self._exact_simulation.belief(name)) for name, one in self._strategies.items()}
+        return {name: one for name, one in found.items() if one}
 
     def _error_coordinates(self) -> Callable[[range, Mapping[str, LinkCore]], Chunk]:
         n, trials = self._process.n, self._batch.trials

@@ -27,6 +27,7 @@ MODULES: Mapping[str, str] = {
     "compare": "compare",
     "design": "design",
     "cost": "cost",
+    "learned": "learned",
     "figures": "figures",
     "paper": "paper",
     "view": "view",

@@ -1,0 +1,78 @@
+"""`evedrop learned`: what eavesdroppers that learn have learned by a slot, and what that is worth."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import asdict
+from typing import TYPE_CHECKING
+
+from evedrop.cli.options import as_json, entries, loaded, scenario
+from evedrop.command import Command
+
+if TYPE_CHECKING:
+    from evedrop.studies.learning_curve import LearningRow
+
+
+def learned(options: argparse.Namespace) -> int:
+    """Print what has been learned after 8, 16, 32, … slots."""
+    from evedrop.cli.report import ProgressLine
+    from evedrop.memory.montecarlo import teller
+    from evedrop.studies.learning_curve import learning_curve
+
+    options.trials = 100 if options.trials is None else options.trials
+    scenario = loaded(options)
+    total = scenario.trials * scenario.slots
+    with ProgressLine(total, "trial-slots", options.json) as line:
+        rows = learning_curve(scenario, teller(line.tell, total))
+    if options.json:
+        print(json.dumps([asdict(row) for row in rows]))
+    else:
+        _print(rows, scenario.trials)
+    return 0
+
+
+def _print(rows: list[LearningRow], trials: int) -> None:
+    """Print both tables."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    from evedrop.cli.report import terminal
+
+    console = terminal()
+    console.print(
+        f"{trials} trials: the error of each estimate over the truth, median over trials (mean ± standard error)"
+    )
+    table = Table(box=SIMPLE_HEAD)
+    for heading in ("slots", "learner", "A", "Q", "μ_d"):
+        table.add_column(heading, justify="right")
+    for row in rows:
+        for learner, values in row.parameters.items():
+            cells = (f"{one.median:.3g} ({_with_error(one.mean, one.standard_error)})" for one in values.values())
+            table.add_row(str(row.stop), learner, *cells)
+    console.print(table)
+    console.print("mean |x − x̂|² of the slots between, ± standard error, and the learner's over it")
+    table = Table(box=SIMPLE_HEAD)
+    for heading in (
+        "from slot",
+        "before",
+        "receiver",
+        "mean |x − x̂|²",
+        *(f"{name} / it" for name in rows[0].parameters),
+    ):
+        table.add_column(heading, justify="right")
+    for row in rows:
+        for name, error in row.errors.items():
+            ratios = (one.get(name) for one in row.ratios.values())
+            cells = ("" if one is None else _with_error(one.ratio, one.standard_error) for one in ratios)
+            table.add_row(str(row.first), str(row.stop), name, _with_error(error, row.standard_errors[name]), *cells)
+    console.print(table)
+
+
+def _with_error(value: float, error: float | None) -> str:
+    return f"{value:.3g}" if error is None else f"{value:.3g} ± {error:.1g}"
+
+
+COMMANDS = (
+    Command("learned", learned, "what eavesdroppers that learn the process have learned", (scenario, entries, as_json)),
+)

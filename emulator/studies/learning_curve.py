@@ -1,0 +1,147 @@
+"""What eavesdroppers that learn have learned of the process by a slot, and what that is worth.
+
+All eavesdroppers hear the same trials, so the errors of two of them are compared trial by trial.
+
+Source: docs/learning.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from evedrop.errors import UsageError
+from evedrop.figures.standard_error import ratio_error, standard_error
+from evedrop.memory.simulation import Simulation
+from evedrop.model.process import Floats
+from evedrop.names import LEGITIMATE
+from evedrop.scenario import Scenario
+
+_SIDE_BY_SIDE = 100  # trials
+_FIRST = 8  # slots before the first row
+
+
+@dataclass(frozen=True)
+class ParameterError:
+    """How far an estimate is from the truth, over the truth, by the Frobenius norm."""
+
+    median: float
+    """Over trials."""
+    mean: float
+    standard_error: float | None
+    """Of the mean."""
+
+
+@dataclass(frozen=True)
+class ErrorRatio:
+    """The mean squared error of one receiver over that of another one, in the same trials."""
+
+    ratio: float
+    standard_error: float | None
+
+
+@dataclass(frozen=True)
+class LearningRow:
+    """What is known after some slots."""
+
+    first: int
+    """Errors are those of the slots from here on."""
+    stop: int
+    """The number of slots so far."""
+    parameters: Mapping[str, Mapping[str, ParameterError]]
+    """Learner → `A`, `Q` and `mu_d` → the error of its estimate after these slots."""
+    errors: Mapping[str, float]
+    """Receiver → its mean squared error."""
+    standard_errors: Mapping[str, float | None]
+    """Receiver → the standard error of that."""
+    ratios: Mapping[str, Mapping[str, ErrorRatio]]
+    """Learner → every other receiver → the learner's mean squared error over the other's."""
+
+
+def learning_curve(scenario: Scenario, tell: Callable[[int], None]) -> list[LearningRow]:
+    """A row for every power of two from 8 slots on, and for the whole run; tell gets the trial-slots done since its last call.
+
+    Raises UsageError for a scenario in which no eavesdropper learns.
+    """
+    stops = [_FIRST]
+    while 2 * stops[-1] < scenario.slots:
+        stops.append(2 * stops[-1])
+    stops = [*(stop for stop in stops if stop < scenario.slots), scenario.slots]
+    windows = [*pairwise([0, *stops])]
+    end = scenario.first_trial + scenario.trials
+    bounds = [*range(scenario.first_trial, end, _SIDE_BY_SIDE), end]
+    parts = [_measured(scenario, range(*pair), windows, tell) for pair in pairwise(bounds)]
+    return [_row(window, [part[i] for part in parts]) for i, window in enumerate(windows)]
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """A window of some trials, (R,) each."""
+
+    off: Mapping[str, Mapping[str, Floats]]
+    """Learner → parameter → relative error."""
+    error: Mapping[str, Floats]
+    """Receiver → mean squared error."""
+
+
+def _measured(
+    scenario: Scenario, trials: range, windows: list[tuple[int, int]], tell: Callable[[int], None]
+) -> list[_Measured]:
+    simulation = Simulation(scenario, trials, stops=[stop for _, stop in windows])
+    process = scenario.process.process
+    truth = {"A": process.A, "Q": process.Q, "mu_d": np.array(scenario.encoding.mu_d)}
+    found: list[_Measured] = []
+    sums: dict[str, Floats] = {}
+    for chunk in simulation.chunks():
+        count = 0
+        for name, one in chunk.receivers.items():
+            count = len(one.error)
+            sums[name] = sums.get(name, np.zeros(len(trials))) + one.error.sum(axis=0)
+        first, stop = windows[len(found)]
+        if chunk.first + count == stop:
+            learned = simulation.learned()
+            if not learned:
+                raise UsageError(f"{scenario.title}: no eavesdropper learns; try the scenario learning")
+            off = {
+                name: {key: _relative(values, truth[key]) for key, values in one.items()}
+                for name, one in learned.items()
+            }
+            found.append(_Measured(off, {name: total / (stop - first) for name, total in sums.items()}))
+            sums = {}
+        tell(count * len(trials))
+    return found
+
+
+def _relative(found: Floats, truth: Floats) -> Floats:
+    """|found − truth| / |truth| of every trial: found (…, R) → (R,)."""
+    away = (found - truth[..., None]) ** 2
+    off: Floats = np.sqrt(away.reshape(-1, found.shape[-1]).sum(axis=0)) / float(np.sqrt((truth**2).sum()))
+    return off
+
+
+def _row(window: tuple[int, int], parts: list[_Measured]) -> LearningRow:
+    error = {name: np.concatenate([part.error[name] for part in parts]) for name in parts[0].error}
+    return LearningRow(
+        *window,
+        {
+            learner: {key: _summarised(np.concatenate([part.off[learner][key] for part in parts])) for key in values}
+            for learner, values in parts[0].off.items()
+        },
+        {name: float(np.mean(of)) for name, of in error.items()},
+        {name: standard_error(of) for name, of in error.items()},
+        {
+            learner: {
+                name: ErrorRatio(float(np.mean(error[learner]) / np.mean(of)), ratio_error(error[learner], of))
+                for name, of in error.items()
+                if name not in {learner, LEGITIMATE}
+            }
+            for learner in parts[0].off
+        },
+    )
+
+
+def _summarised(off: Floats) -> ParameterError:
+    return ParameterError(float(np.median(off)), float(np.mean(off)), standard_error(off))
