@@ -99,7 +99,7 @@ def _measured(
         count = 0
         for name, one in chunk.receivers.items():
             count = len(one.error)
-            sums[name] = sums.get(name, np.zeros(len(trials))) + one.error.sum(axis=0)
+            sums[name] = _added(one.error, sums.get(name, np.zeros(len(trials))))
         first, stop = windows[len(found)]
         if chunk.first + count == stop:
             learned = simulation.learned()
@@ -118,8 +118,15 @@ def _measured(
 def _relative(found: Floats, truth: Floats) -> Floats:
     """|found − truth| / |truth| of every trial: found (…, R) → (R,)."""
     away = (found - truth[..., None]) ** 2
-    off: Floats = np.sqrt(away.reshape(-1, found.shape[-1]).sum(axis=0)) / float(np.sqrt((truth**2).sum()))
-    return off
+    off: Floats = np.sqrt(_added(away.reshape(-1, found.shape[-1]), np.zeros(found.shape[-1])))
+    return off / float(np.linalg.norm(truth))
+
+
+def _added(rows: Floats, total: Floats) -> Floats:
+    """The total (R,) and all rows (c, R), one after the other: numpy's order depends on the number of trials."""
+    for row in rows:
+        total = total + row
+    return total
 
 
 def _row(window: tuple[int, int], parts: list[_Measured]) -> LearningRow:

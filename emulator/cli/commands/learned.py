@@ -13,6 +13,8 @@ from evedrop.command import Command
 if TYPE_CHECKING:
     from evedrop.studies.learning_curve import LearningRow
 
+_ROUNDING = 1e-12  # a standard error that is smaller, over the mean, is rounding
+
 
 def learned(options: argparse.Namespace) -> int:
     """Print what has been learned after 8, 16, 32, … slots."""
@@ -70,7 +72,9 @@ def _print(rows: list[LearningRow], trials: int) -> None:
 
 
 def _with_error(value: float, error: float | None) -> str:
-    return f"{value:.3g}" if error is None else f"{value:.3g} ± {error:.1g}"
+    if error is None:
+        return f"{value:.3g}"
+    return f"{value:.3g} ± {error if error > _ROUNDING * abs(value) else 0.0:.1g}"
 
 
 COMMANDS = (
