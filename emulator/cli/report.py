@@ -176,7 +176,7 @@ def closing_table(summary: Summary, width: int) -> Table:
                 + (_MARK if marked and not set(_SPLIT).isdisjoint(names) else "")
                 for column, names in shown.items()
             ),
-            *([figure_text(shown_figure(z, list(compared)), "+.1f") + (_MARK if marked else "")] if compared else []),
+            *([_z_text(shown_figure(z, list(compared)), marked)] if compared else []),
             *([(peer.digest or "–")[:12]] if wide else []),
         )
     return table
@@ -199,6 +199,10 @@ def _with_rare_estimate(peer: PeerSummary) -> tuple[_Figures, _Figures, _Figures
     return figures, errors, z, True
 
 
+def _z_text(z: float | None, marked: bool) -> str:
+    return figure_text(z, "+.1f") + (_MARK if marked and z is not None else "")
+
+
 def _split_lines(summary: Summary) -> Iterator[str]:
     """A line for each receiver whose mean error was estimated by splitting, or should have been."""
     for name, peer in summary.peers.items():
@@ -211,7 +215,7 @@ def _split_lines(summary: Summary) -> Iterator[str]:
         plain = estimate(shown_figure(peer.all_figures, _SPLIT), shown_figure(peer.standard_errors, _SPLIT))
         yield (
             f"{_MARK} {name}: by splitting, {rare.populations} populations of {rare.trials:,} trials, copied after "
-            f"{rare.splits} slots; the mean over the {summary.trials:,} trials is {plain}"
+            f"{rare.splits} slot{'' if rare.splits == 1 else 's'}; the mean over the {summary.trials:,} trials is {plain}"
         )
 
 

@@ -63,17 +63,16 @@ def modulated_streaks(
     groups = _begun(process, course)
     carry: Floats = np.kron(process.A, process.A).T.astype(np.float64)
     diagonal = np.eye(process.n).reshape(-1)
-    number, carried, done = [], [], 0
-    for length in range(slots):
+    number, carried, done, length = [], [], 0, 0
+    while True:
         number.append([float(w.sum()) for w, _ in groups])
         carried.append([float((C @ diagonal).sum()) for _, C in groups])
-        done += sum(C.size for _, C in groups)
+        length, done = length + 1, done + sum(C.size for _, C in groups)
         if done > MOST_NUMBERS:
             return None
-        if np.sum(carried) >= (1.0 - REST) * total or length + 1 == slots:
-            break
-        groups = [_lasting(course, carry, *one, length + 1) for one in groups]
-    return Streaks(np.array(number).T, np.array(carried).T, total)
+        if np.sum(carried) >= (1.0 - REST) * total or length == slots:
+            return Streaks(np.array(number).T, np.array(carried).T, total)
+        groups = [_lasting(course, carry, *one, length) for one in groups]
 
 
 def _course_of(

@@ -101,12 +101,12 @@ def test_left_out_eavesdroppers_change_nothing() -> None:
 
 def test_heavy_tails_agree_with_closed_forms() -> None:
     """For user, eavesdropper, bursts and a misled receiver, in the mean and slot by slot; plain means do not."""
-    scenario = scenario_of(slots=40)
+    scenario = scenario_of(slots=30)
     expected = expectations_of(scenario)
     plain = errors_of(scenario, Mode.COVARIANCE_ONLY, trials=POPULATIONS * 100)
     for name in scenario.receivers:
         means = Splitter(scenario, Mode.COVARIANCE_ONLY, name).estimated()
-        traces = expected[name].traces(40)
+        traces = expected[name].traces(30)
         found = means.estimate(100, expected[name])
         assert found.doubt is None
         assert found.z is not None
@@ -139,8 +139,8 @@ def test_the_exact_mode_estimates_the_same() -> None:
 
 def test_flipped_acknowledgements_agree_with_many_trials() -> None:
     """Where packets depend on acknowledgements, in a run that is short enough for plain trials to contain what matters."""
-    scenario = scenario_of(**ACKNOWLEDGED, slots=9)
-    many = errors_of(scenario, Mode.EXACT, trials=6000)
+    scenario = scenario_of(**ACKNOWLEDGED, slots=7)
+    many = errors_of(scenario, Mode.EXACT, trials=4000)
     for receiver in scenario.receivers:
         found, plain = Splitter(scenario, Mode.EXACT, receiver).estimated().of_populations, many[receiver].mean(axis=0)
         spread = math.hypot(found.std(ddof=1) / math.sqrt(len(found)), plain.std(ddof=1) / math.sqrt(len(plain)))
