@@ -11,6 +11,7 @@ from evedrop.errors import UsageError
 from evedrop.literature.crimson2023 import Crimson2023
 from evedrop.literature.kennedy2022 import Kennedy2022
 from evedrop.literature.luecke2022 import Luecke2022
+from evedrop.literature.naha2021 import Naha2021
 from evedrop.literature.paper import Paper, Progress
 from evedrop.literature.reproduction import Reproduction
 from evedrop.model.registry import near
@@ -19,6 +20,7 @@ PAPERS: Mapping[str, type[Paper]] = {
     "kennedy2022": Kennedy2022,
     "luecke2022": Luecke2022,
     "crimson2023": Crimson2023,
+    "naha2021": Naha2021,
 }
 """Name on the command line → paper, in the order of the list."""
 

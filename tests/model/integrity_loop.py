@@ -1,24 +1,18 @@
-"""A closed loop with a detector, slot by slot, in which every packet arrives: the reference for laws of the steady state."""
+"""Two closed loops with a detector, in which every packet arrives."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from evedrop.model.controllers.controller import Assignment
-from evedrop.model.integrity.monitor import Monitor, MonitorPlan
+from evedrop.model.integrity.monitor import MonitorPlan
 from evedrop.model.integrity.theory import loop_of
-from evedrop.model.local_filter import LocalFilter
 from evedrop.model.plant import Plant
-from evedrop.model.process import Floats, Process, product
-from evedrop.model.schemes.plain import PlainEncoder
-from evedrop.model.slot.plant import PlantCore
-from evedrop.model.slot.sensor import SensorCore
-from evedrop.streams import Batch
-from tests.builders import stream_keys
+from evedrop.model.process import Floats, Process
+from evedrop.model.slot.monitored_loop import LoopRun, simulate
 
 INF = np.array([np.inf])
 ONE = np.array([[1.0]])
@@ -42,20 +36,6 @@ REPLACED = ("replace", {"matrix": [[0.8]]})
 ALWAYS = ("always", {"threshold": 8.0})
 
 
-@dataclass(frozen=True)
-class LoopRun:
-    """What a simulation has found."""
-
-    statistic: Floats
-    """(slots, R)."""
-    watermark: Floats
-    """(slots, m, R)."""
-    epsilon: Floats
-    """Normalised innovations, (slots, p, R)."""
-    cost: Floats
-    """xᵀ W x + uᵀ U u, with u as it is applied, (slots, R)."""
-
-
 def simulated(
     watermark: Floats,
     slots: int,
@@ -66,28 +46,4 @@ def simulated(
     assignment: Assignment = SCALAR,
 ) -> LoopRun:
     """A batch of loops with seed 1."""
-    process, plant, loop = assignment.process, assignment.plant, loop_of(assignment)
-    keys, batch = stream_keys(1, ("process", "measurement", "watermark", "spoofing")), Batch(slots, trials)
-    plan = MonitorPlan.of(loop, watermark, policy, attack, spans)
-    states = PlantCore(process, keys["process"], batch, None, plant, np.zeros((slots, 0)))
-    local = LocalFilter(process, plant, keys["measurement"], batch, plan.spoofing(keys["spoofing"], batch))
-    monitor = Monitor(plan, keys["watermark"], batch)
-    sensor = SensorCore(PlainEncoder(), states, local, None, monitor)
-    found: tuple[list[Floats], ...] = ([], [], [], [])
-    for k in range(slots):
-        made = sensor.send(range(k, k + 1))
-        assert made.monitored is not None
-        statistic, watermark = made.monitored.statistic[0], made.monitored.watermark[0]
-        u = -product(loop.L, made.x[0])
-        sensor.hold(u)
-        applied, x = u + watermark, made.true[0]
-        cost = assignment.state_weights @ (x * x) + assignment.input_weights @ (applied * applied)
-        for column, values in zip(found, (statistic, watermark, local.normalised, cost), strict=True):
-            column.append(values)
-    return LoopRun(*map(np.array, found))
-
-
-def first_alarms(run: LoopRun, threshold: float) -> Floats:
-    """The slot of the first alarm of every trial, (R,); infinite without one."""
-    raised = run.statistic >= threshold
-    return np.where(raised.any(axis=0), raised.argmax(axis=0), np.inf)
+    return simulate(assignment, MonitorPlan.of(loop_of(assignment), watermark, policy, attack, spans), slots, trials)

@@ -18,7 +18,7 @@ from evedrop.model.slot.plant import PlantCore
 from evedrop.model.slot.sensor import Sent
 from evedrop.streams import Batch
 from tests.builders import stream_keys
-from tests.model.integrity_loop import ALWAYS, ONE, PLANAR, REPLACED, SCALAR, first_alarms, simulated
+from tests.model.integrity_loop import ALWAYS, ONE, PLANAR, REPLACED, SCALAR, simulated
 
 PARSIMONIOUS = ("parsimonious", {"watch_from": 0.05, "alarm_from": 0.999, "attack_rate": 1e-3})
 LOOP, WIDE = loop_of(SCALAR), loop_of(PLANAR)
@@ -38,7 +38,7 @@ def test_divergence_and_delay_are_those_of_the_scalar_example(
     assert theory.divergence == pytest.approx(divergence, rel=3e-3)
     assert POLICIES["always"].of({"threshold": 8.0}).expected_delay(theory.divergence) == pytest.approx(ratio, rel=2e-2)
     assert theory.cost == pytest.approx(1.201 * sigma, rel=1e-3)
-    delays = first_alarms(simulated(sigma * ONE, 250, 2000, REPLACED, [(1, 250)]), 8.0)
+    delays = simulated(sigma * ONE, 250, 2000, REPLACED, [(1, 250)]).first_alarms(8.0)
     assert np.isfinite(delays).all()
     error = delays.std() / np.sqrt(2000)
     assert abs(delays.mean() - delay) < 4.0 * 1.3 * error  # theirs is a mean, too, of 4000 trials
@@ -49,7 +49,7 @@ def test_without_watermark_the_scalar_attack_stays_unseen() -> None:
     none = 0.0 * ONE
     attack = SENSOR_ATTACKS["replace"].of(REPLACED[1], LOOP, none)
     assert WatermarkTheory.of(LOOP, attack, none).divergence == pytest.approx(0.002, abs=2e-4)
-    assert np.isfinite(first_alarms(simulated(none, 501, 400, REPLACED, [(1, 501)]), 8.0)).mean() < 0.03
+    assert np.isfinite(simulated(none, 501, 400, REPLACED, [(1, 501)]).first_alarms(8.0)).mean() < 0.03
 
 
 def test_laws_of_two_dimensions_are_those_of_textbook_equations() -> None:
@@ -119,7 +119,7 @@ def test_log_likelihood_ratios_have_their_means() -> None:
 def test_false_alarms_are_as_rare_as_promised() -> None:
     """With h = 3 at most e⁻³ of the slots begin one, and there are some."""
     policy = POLICIES["always"].of({"threshold": 3.0})
-    alarms = first_alarms(simulated(0.3 * ONE, 10, 3000, policy=("always", {"threshold": 3.0})), 3.0)
+    alarms = simulated(0.3 * ONE, 10, 3000, policy=("always", {"threshold": 3.0})).first_alarms(3.0)
     bound = policy.false_alarms(10)
     assert bound == pytest.approx(10.0 * np.exp(-3.0))
     assert 0.0 < np.isfinite(alarms).mean() < bound
@@ -140,8 +140,8 @@ def test_a_replay_is_seen_only_with_a_watermark() -> None:
     replay = ("replay", {"recorded": 30})
     attack = SENSOR_ATTACKS["replay"].of(replay[1], LOOP, 0.0 * ONE)
     assert WatermarkTheory.of(LOOP, attack, 0.0 * ONE).divergence == pytest.approx(0.0, abs=1e-12)
-    assert not np.isfinite(first_alarms(simulated(0.0 * ONE, 200, 200, replay, [(40, 200)]), 8.0)).any()
-    assert np.isfinite(first_alarms(simulated(0.5 * ONE, 200, 200, replay, [(40, 200)]), 8.0)).mean() > 0.95
+    assert not np.isfinite(simulated(0.0 * ONE, 200, 200, replay, [(40, 200)]).first_alarms(8.0)).any()
+    assert np.isfinite(simulated(0.5 * ONE, 200, 200, replay, [(40, 200)]).first_alarms(8.0)).mean() > 0.95
     feed = SENSOR_ATTACKS["replay"].read({"recorded": 3}).feed(b"", Batch(20, 1))
     heard = [float(feed.take(k, np.array([[float(k)]]), 5 <= k < 12)[0, 0]) for k in range(14)]
     assert heard == [0, 1, 2, 3, 4, 2, 3, 4, 2, 3, 4, 2, 12, 13]
@@ -173,7 +173,7 @@ def test_the_parsimonious_policy_is_the_posterior_of_an_attack() -> None:
 def test_the_parsimonious_policy_saves_watermark_and_still_detects() -> None:
     """It marks few slots when nobody attacks, most from the attack to the alarm, and none afterwards."""
     run = simulated(0.3 * ONE, 400, 300, REPLACED, [(150, 400)], PARSIMONIOUS)
-    marked, alarms = run.watermark[:, 0] != 0.0, first_alarms(run, 0.999)
+    marked, alarms = run.watermark[:, 0] != 0.0, run.first_alarms(0.999)
     assert marked[:150].mean() < 0.2
     assert (alarms >= 150).all()
     assert np.isfinite(alarms).all()
@@ -210,6 +210,8 @@ def test_a_plan_without_attack_is_designed_for_a_replay() -> None:
     whole = MonitoredSlots.joined(parts)
     assert whole.statistic[:, 0].tolist() == [1.0, 2.0]
     assert whole.rows(slice(1, 2)).watermark.tolist() == [[[2.0, 2.0]]]
+    assert whole.part(slice(0, 1)).watermark.tolist() == [[[1.0]], [[2.0]]]
+    assert whole.part(slice(0, 1)).statistic.tolist() == [[1.0], [2.0]]
 
 
 def test_slots_of_a_monitored_sensor_are_joined_and_cut() -> None:
