@@ -254,11 +254,11 @@ def design_policy(
 def design_budget(
     scenario: str | Path | Scenario, budget: float, *, changes: Mapping[str, Any] | None = None
 ) -> BudgetDesign:
-    """The threshold from which on a sensor should encrypt, for a budget of energy.
+    """The threshold from which a sensor should encrypt, for an energy budget.
 
     budget: mean energy in a slot, in the unit of the scenario's `[energy]`; changes: entries by dotted key.
 
-    Raises ScenarioError with every mistake of the scenario, UsageError if no threshold keeps the budget, see
+    Raises ScenarioError with every mistake of the scenario, UsageError if no threshold meets the budget, see
     `evedrop.expected.energy_budget.budget_of`.
     """
     from evedrop.expected.energy_budget import budget_of  # noqa: PLC0415 - a run does not need it

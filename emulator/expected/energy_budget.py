@@ -1,4 +1,4 @@
-"""The threshold of an encryption schedule that meets a budget of energy, and what other thresholds cost and achieve.
+"""The threshold of an encryption schedule that meets an energy budget, and what other thresholds cost and achieve.
 
 Source: docs/mathematics.md, quantised packets.
 """
@@ -54,7 +54,7 @@ class BudgetDesign:
     user: float
     """The trace of the user's expected error covariance in the limit, whatever the threshold is."""
     best: ThresholdFigures
-    """The least threshold that keeps the budget."""
+    """The least threshold that meets the budget."""
     others: tuple[ThresholdFigures, ...]
     """The whole thresholds 1, 2, …"""
     left_out: dict[str, str]
@@ -77,7 +77,7 @@ def budget_of(scenario: Scenario, budget: float) -> BudgetDesign:
     """The least threshold with which a scenario's sensor spends at most `budget` in a slot on average.
 
     Raises UsageError if the scheme has no such threshold, if the losses of a link are not independent and alike in all slots,
-    and for a budget that no threshold keeps.
+    and for a budget that no threshold meets.
     """
     if not 0.0 <= budget < math.inf:
         raise UsageError(f"--budget {budget:g}: expected a finite number of at least 0, an energy in a slot")
@@ -85,7 +85,7 @@ def budget_of(scenario: Scenario, budget: float) -> BudgetDesign:
     if SCHEMES[name].closed_forms.get(LEGITIMATE) != _CLOSED_FORM:
         able = [one for one in SCHEMES if SCHEMES[one].closed_forms.get(LEGITIMATE) == _CLOSED_FORM]
         raise UsageError(
-            f"a budget of energy is met by the threshold of the scheme {listed(able)}, and this scenario has {name}; "
+            f"an energy budget is met by the threshold of the scheme {listed(able)}, and this scenario has {name}; "
             f"evedrop compare SCENARIO --schemes {able[0]} --out DIR writes DIR/scenarios/{able[0]}.toml, which can be designed"
         )
     user = acknowledged_form(_with(scenario, 1.0), LEGITIMATE)
@@ -106,7 +106,7 @@ def budget_of(scenario: Scenario, budget: float) -> BudgetDesign:
     most = LARGEST_OPERATOR // scenario.process.process.n**2
     if not threshold <= most:
         raise UsageError(
-            f"no threshold up to {most} keeps the budget {budget:g}: packets in clear cost {in_clear:g} in a slot and encrypted "
+            f"no threshold up to {most} meets the budget {budget:g}: packets in clear cost {in_clear:g} in a slot and encrypted "
             f"ones {encrypted:g}, and {100.0 * encrypted_fraction(most, arrives):.2g} % are encrypted then; give more, such as "
             f"--budget {in_clear + 0.5 * (encrypted - in_clear):g}"
             + ("" if arrives else f"; no acknowledgement arrives, so nothing less than {encrypted:g} is enough")

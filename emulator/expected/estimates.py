@@ -59,7 +59,9 @@ def warnings_of(scenario: Scenario) -> list[str]:
 
 
 def _reference_warnings(scenario: Scenario, mu: float) -> list[str]:
-    """A warning if acknowledgements are forged and a user that lost the reference has it too late; mu: 0 if its link varies.
+    """A warning if acknowledgements are forged and a user that lost the reference gets it back too late.
+
+    mu: the quality of its link, 0 if that varies.
 
     Source: docs/mathematics.md, flipped acknowledgements.
     """

@@ -34,9 +34,9 @@ PLANT = Plant(
 )
 """Process noise 0.01 I, measured with C = I in noise of 0.01 I."""
 LOSSES, NOISE = 0.2, 0.7
-"""The loss probabilities γ̄ = γ̄ᵉ and the probability μ of noise in our simulation; those of their figures are not known here."""
+"""The loss probabilities γ̄ = γ̄ᵉ and the probability μ of noise in our simulation; we do not know those of their figures."""
 DETECTOR = ShiryaevTest(normal=0.2, raised=0.5, hazard=0.01, risk=0.01)
-"""Our example of a detector; theirs is not known here."""
+"""Our example of a detector; we do not know theirs."""
 _START = 20
 """Slots that are not counted: the filter and the errors have then settled."""
 _SLIDES = "slides"
@@ -100,15 +100,15 @@ def _example() -> Iterator[PublishedNumber]:
     ours = float(np.trace(filter_error()))
     reason = (
         "the Riccati equation has one solution for A, C = I and Q = R = 0.01 I, which is ours; 0.0114 results from R = 0.0107 I; "
-        "how the slides got it is not known here"
+        "we do not know how the slides arrive at it"
     )
     yield PublishedNumber.stated(_SLIDES, "tr P̄ of the filter", 0.0114, ours, NumberVerdict.NOT_PUBLIC, reason)
     near, far = noise_threshold(0.4, 0.25), noise_threshold(0.5, 0.3)
     reason = (
-        "the threshold on μ depends on both loss probabilities, which are not known here: many pairs give 0.14, such "
+        "the threshold on μ depends on both loss probabilities, which we do not know: many pairs give 0.14, such "
         f"as 0.4 for the user and 0.25 for the eavesdropper ({near:.3f}); with 0.5 and 0.3 it is {far:.3f}, with equal ones 0"
     )
-    what = "the μ from which on the eavesdropper errs more than the user"
+    what = "the μ above which the eavesdropper's error exceeds the user's"
     yield PublishedNumber.stated(_SLIDES, what, 0.14, "0 to 1", NumberVerdict.NOT_PUBLIC, reason)
 
 
@@ -183,7 +183,7 @@ def _detector(trials: int) -> Iterator[PublishedNumber]:
         "" if held else "more alarms are false than h allows",
         false[1],
     )
-    reason = "the rates, κ and h of their example are not known here"
+    reason = "we do not know the rates, κ and h of their example"
     yield PublishedNumber.stated(
         "detector", f"mean delay in slots, {rates}", None, delay[0], NumberVerdict.NOT_PUBLIC, reason, delay[1]
     )

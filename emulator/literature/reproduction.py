@@ -13,7 +13,7 @@ from typing import Any, Self, TypeAlias
 from evedrop.figures.text import estimate
 
 Value: TypeAlias = float | str | None
-"""A number; or text, for what is no number, such as a range; or None if there is none."""
+"""A number; text for anything else, such as a range; None if there is nothing."""
 
 
 class NumberVerdict(StrEnum):
@@ -28,7 +28,7 @@ class NumberVerdict(StrEnum):
     NOT_COMPARABLE = "not comparable"
     """The two numbers are not estimates of the same thing, or one of them is too uncertain."""
     DIFFERS = "differs"
-    """The difference is larger than the tolerance, and nobody has explained it."""
+    """The difference is larger than the tolerance, and there is no explanation."""
 
 
 @dataclass(frozen=True)

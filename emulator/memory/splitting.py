@@ -110,7 +110,7 @@ class Splitter:
         self._floor = importance_floor(errors, float(np.trace(scenario.process.process.Q)))
 
     def estimated(self, populations: int = POPULATIONS) -> SplitMeans:
-        """The estimates of some populations, split where pilots, whose trials are others, had to be."""
+        """The estimates of some populations, split in the slots in which pilots with other trials had to be split."""
         pilots = self._simulated(range(_PILOTS), None)
         return self._simulated(range(_PILOTS, _PILOTS + populations), pilots.splits)
 
@@ -119,7 +119,7 @@ class Splitter:
         return one.error if self._mode is Mode.COVARIANCE_ONLY else 0.5 * (one.error + one.trace)
 
     def _simulated(self, numbers: range, splits: Collection[int] | None) -> SplitMeans:
-        """The estimates of the populations of these numbers; splits: after which slots; None: wherever few trials count."""
+        """The estimates of the populations with these numbers; splits: after which slots; None: wherever few trials count."""
         count, slots = len(numbers), self._scenario.slots
         size = self._trials
         first = _FIRST_TRIAL + numbers.start * size

@@ -64,11 +64,11 @@ class Heeding(NamedTuple):
     patience: int
     """Those of packets after fewer misses than this are heeded, those after more are not."""
     share: float
-    """The share that is heeded of those after exactly as many."""
+    """The share that is heeded of those after exactly this many misses."""
 
     @classmethod
     def of(cls, quality: float, overheard: float) -> Heeding | None:
-        """The one that heeds the share `quality` in all, if the eavesdropper hears packets with the probability `overheard`.
+        """The rule that heeds a share `quality` of all, if the eavesdropper hears packets with the probability `overheard`.
 
         1 − (1−μ_e)^J (1 − μ_e a) = α, with the patience J and the share a. None if there is no choice: where no acknowledgement
         is lost, and where nothing is overheard.

@@ -55,7 +55,9 @@ def compare_all(matchups: Matchups, folder: Path, tell: Tell, plan: Plan) -> Com
     schemes in the folder.
     """
     if plan.mode is not Mode.EXACT:
-        raise UsageError(f"a comparison follows packets, which the mode {plan.mode.value} has not; leave the mode out")
+        raise UsageError(
+            f"a comparison follows packets, which the mode {plan.mode.value} does not have; leave the mode out"
+        )
     groups = matchups.groups
     workers = max(plan.workers_for(group.scenario) for group in groups)
     tasks = [tasks_of(group.scenario, plan.mode, 1) for group in groups]

@@ -152,14 +152,14 @@ def test_the_closing_report_has_its_lines() -> None:
     assert Integrity.lines(known) == [
         "false alarms in 0.01 of the trials, by theory at most 0.05",
         "the attack is detected in 1 of the other trials, after 12.0 ± 0.5 slots; h/D is 11.5",
-        "the watermark costs 0.36 a slot before the attack, by theory 0.35 (z 1.5); it is there in 0.5 of all slots",
+        "the watermark costs 0.36 a slot before the attack, by theory 0.35 (z 1.5); it is on in 0.5 of all slots",
     ]
     bare = {**dict.fromkeys(known), "false_alarm_fraction": 0.0, "detected_fraction": 0.0, "watermark_cost": 0.1}
     bare |= {"standard_errors": {}, "watermark_fraction": 1.0}
     assert Integrity.lines(bare) == [
         "false alarms in 0 of the trials",
         "the attack is detected in 0 of the other trials",
-        "the watermark costs 0.1 a slot before the attack; it is there in 1 of all slots",
+        "the watermark costs 0.1 a slot before the attack; it is on in 1 of all slots",
     ]
 
 
@@ -189,9 +189,9 @@ BASE = {"policy": "always", "threshold": 8.0, "watermark": [[0.3]]}
         ({"integrity.attack": {**ATTACK, "recorded": 3}}, "integrity.attack.recorded: is not a parameter of the attack replace"),
         ({"integrity.attack": {"model": "replace", "matrix": [[1.2]]}}, "integrity.attack.matrix: has the spectral radius 1.2"),
         ({"integrity": BASE}, "integrity.attack: is missing, but an event begins it; expected attack = {"),
-        ({"controller.period": 2}, "controller.period: is 2, and the laws of integrity are of decisions in every slot"),
+        ({"controller.period": 2}, "controller.period: is 2, but the laws of integrity assume a decision in every slot"),
         ({"controller.acts_on": "truth"}, 'controller.acts_on: is "truth", so that false measurements deceive nobody'),
-        ({"controller.rate_weights": [0.1]}, "controller.rate_weights: are given, and the laws of integrity have no such"),
+        ({"controller.rate_weights": [0.1]}, "controller.rate_weights: are given, but the laws of integrity assume none"),
         ({"controller": {"strategy": "mpc", "state_weights": [1.0], "input_weights": [0.1]}}, "controller.strategy: has no"),
         ({"event": [{"at": 160, "spoof": "sensor"}]}, 'event.0.spoof: is "sensor"; expected "measurements"'),
         ({"event": [{"at": 150, "spoof": "measurements"}, {"at": 170, "spoof": "measurements"}]}, "event.1.spoof: begins in"),

@@ -126,7 +126,7 @@ class Integrity(Application):
             expected, z = summary["expected_watermark_cost"], summary["watermark_cost_z"]
             if expected is not None:
                 said += f", by theory {expected:.3g}" + ("" if z is None else f" (z {z:.1f})")
-            lines.append(f"{said}; it is there in {cls.text(summary, ('watermark_fraction',), '.3g')} of all slots")
+            lines.append(f"{said}; it is on in {cls.text(summary, ('watermark_fraction',), '.3g')} of all slots")
         return lines
 
     @classmethod
@@ -184,9 +184,9 @@ def _objections(loop: ControlledPlant, table: IntegrityTable) -> Iterator[str]:
     if loop.on_truth:
         yield 'controller.acts_on: is "truth", so that false measurements deceive nobody; expected acts_on = "estimate"'
     if loop.period != 1:
-        yield f"controller.period: is {loop.period}, and the laws of integrity are of decisions in every slot; expected 1"
+        yield f"controller.period: is {loop.period}, but the laws of integrity assume a decision in every slot; expected 1"
     if assignment.rate_weights.any():
-        yield "controller.rate_weights: are given, and the laws of integrity have no such weights; remove the line"
+        yield "controller.rate_weights: are given, but the laws of integrity assume none; remove the line"
     if table.watermark is not None and len(table.watermark) != m:
         yield f"integrity.watermark: is {len(table.watermark)} × {len(table.watermark)}; expected {m} × {m}, as there are inputs"
         return

@@ -145,7 +145,7 @@ class IntegrityTally(ApplicationTally):
         if "watermark_cost" in means and not case.clips:
             expected = case.theory.cost * self._marked_before / before
             cost = float(expected.mean())
-            # The number of marked slots is random under some policies, so the two are compared trial by trial.
+            # The number of slots with a watermark is random under some policies, so the two are compared trial by trial.
             z = z_of(means["watermark_cost"], cost, standard_error(self._cost / before - expected))
         divergence = case.theory.divergence if case.attack_from is not None else None
         return {

@@ -92,7 +92,7 @@ def _designs(parser: argparse.ArgumentParser) -> None:
         "--budget",
         type=float,
         metavar="E",
-        help="the threshold from which on to encrypt, for a mean energy of at most E in a slot",
+        help="the threshold from which to encrypt, so that a slot costs an energy of at most E on average",
     )
     parser.add_argument(
         "--weight", type=float, nargs="+", metavar="β", help="weights of the user's error, 0 to 1 (default 0, 0.05 … 1)"

@@ -36,7 +36,7 @@ def _rare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rare",
         action="store_true",
-        help="estimate mean errors that rare events carry, too: trials with large errors are split (docs/montecarlo.md)",
+        help="also estimate the mean errors that rare events carry: split trials with large errors (docs/montecarlo.md)",
     )
 
 

@@ -100,7 +100,7 @@ def _print(found: Reproduction) -> None:
         console.print(f"[{number}] {reason}")
     console.print(", ".join(f"{verdict}: {count}" for verdict, count in found.counts.items()))
     if found.quick:
-        console.print("sizes are small: without --quick the standard errors are smaller")
+        console.print("these are quick estimates: without --quick the standard errors are smaller")
 
 
 def _papers(parser: argparse.ArgumentParser) -> None:

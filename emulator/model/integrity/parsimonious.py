@@ -37,7 +37,7 @@ class Parsimonious(WatermarkPolicy):
 
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
-        """Numbers that are no probabilities, and thresholds in the wrong order."""
+        """Numbers that are not probabilities, and thresholds in the wrong order."""
         found = [
             (name, f"is {given[name]}; expected a number between 0 and 1, both excluded")
             for name in (UPPER, RATE)

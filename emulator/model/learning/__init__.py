@@ -1,1 +1,1 @@
-"""What an eavesdropper does that knows neither A, Q nor μ_d: posterior and moments with parameters of its own in every trial."""
+"""How an eavesdropper learns A, Q and μ_d: its posterior and moments, with parameters of its own in every trial."""

@@ -1,4 +1,4 @@
-"""What a learning eavesdropper is told of the process, and what it takes in place of the rest.
+"""What a learner is told about the process, and what it assumes about the rest.
 
 Source: docs/mathematics.md, eavesdroppers that learn.
 """
@@ -23,7 +23,7 @@ KNOWABLE = ("A", "Q", "mu_d", "initial_covariance")
 
 @dataclass(frozen=True)
 class Known:
-    """What an eavesdropper knows of the process, and what it takes in place of the rest."""
+    """What an eavesdropper knows about the process, and what it assumes about the rest."""
 
     names: frozenset[str]
     """Those of A, Q, mu_d and initial_covariance that it knows."""

@@ -19,7 +19,7 @@ MOST_BITS = 32
 
 @final
 class DitheredQuantiser:
-    """Rounds a state plus dither to one of 2^bits levels; who reads the level subtracts the dither again.
+    """Rounds a state plus dither to one of 2^bits levels; a reader of the level subtracts the dither.
 
     State i of slot k has levels over [−H, H), H = `deviations` · √Σ_k[i, i], in steps Δ = 2H · 2^−bits. The dither d is uniform
     on [−Δ/2, Δ/2). What is read differs from the state by a number that is uniform on (−Δ/2, Δ/2] and independent of the state,

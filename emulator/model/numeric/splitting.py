@@ -1,4 +1,4 @@
-"""Splitting: populations of trials in which the important ones are copied and the others dropped, with weights that undo it.
+"""Splitting: populations in which important trials are copied and others dropped, with weights that compensate.
 
 Source: docs/mathematics.md, splitting.
 """

@@ -25,7 +25,9 @@ _WIDEST = 100.0  # deviations
 
 @final
 class QuantisedScheduleEncoder(Encoder):
-    """Sends what is read from the level of x_k; from the threshold on, the middle of the masked level. The header tells which.
+    """Sends the number that is read from the level of x_k; from the threshold on, the middle of the masked level.
+
+    The header tells which.
 
     At a holding time of ⌊θ⌋ the packet is masked with probability 1 − (θ − ⌊θ⌋), by the stream `threshold`.
     """
@@ -78,7 +80,7 @@ class QuantisedScheduleEstimator(Receiver):
 class QuantisedSchedule(Scheme):
     """Quantises the state with subtractive dither, and encrypts as `encrypted-schedule` does, from a threshold θ on.
 
-    θ need not be whole: at a holding time of ⌊θ⌋ a coin decides, so that any budget of energy between that of packets in clear
+    θ need not be whole: at a holding time of ⌊θ⌋ a coin decides, so that any energy budget between that of packets in clear
     and that of a cipher is met exactly. The dither is public: a packet in clear is shown as the number that is read from it.
 
     Source: Huang, Ding, Leong, Quevedo, Shi (2021); docs/mathematics.md, quantised packets.

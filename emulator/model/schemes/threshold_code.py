@@ -103,7 +103,7 @@ class ThresholdCode(Scheme):
         """None: what a packet tells depends on the acknowledgements before it."""
 
     def lost_reference(self, received: float, acknowledged: tuple[float, float]) -> LostReference:
-        """States in clear follow each other until one is acknowledged; then m coded packets are, until b exceeds θ again."""
+        """The sensor sends states until one is acknowledged, then m acknowledged coded packets until b exceeds θ again."""
         if self._forged == 0.0:
             coded, remedy = math.inf, "assumed_flip is above 0: the sensor never expects a lost reference"
         else:

@@ -50,7 +50,7 @@ class ClearStatesForm(ClosedForm):
 
     @property
     def infinite_variance(self) -> bool:
-        """Not that theory knew of: what it knows is the same in every trial."""
+        """False: the error that theory knows is the same in every trial."""
         return False
 
     @cached_property

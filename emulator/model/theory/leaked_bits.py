@@ -22,13 +22,13 @@ from evedrop.kernels.elementary import cholesky
 from evedrop.model.process import Floats, Process, product
 from evedrop.model.theory.covariances import block_length
 
-_AS_GOOD_AS_INFINITE = 1e60  # a deviation of the state, in those of the noise: beside it a packet reveals nothing
+_AS_GOOD_AS_INFINITE = 1e60  # a deviation of the state relative to the noise's, with which a packet reveals nothing
 
 
 def leaked_bits(process: Process, slots: int) -> Floats:
     """The bits that an innovation packet reveals in each slot k = 0 … slots−1, (slots,); 0 in slot 0. A must be regular.
 
-    In slots beyond the horizon too, where Σ_k exceeds double precision.
+    Also valid in slots beyond the horizon, where Σ_k exceeds double precision.
 
     Source: docs/mathematics.md, leak in bits.
     """
