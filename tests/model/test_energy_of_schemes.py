@@ -25,7 +25,7 @@ def test_energy_is_linear_in_packets_bits_and_encryptions() -> None:
 
 
 def test_every_scheme_says_which_packets_it_encrypts() -> None:
-    """`cipher` all, the two with a schedule those whose header says so, all others none."""
+    """`cipher` all, `partial-encryption` states, the two with a schedule by the holding time, all others none."""
     gamma = coins(0.6, 20, 30)
     for name in SCHEMES:
         scheme = scheme_of(PROCESS, {"scheme": name, **SCHEMES[name].parameters})
@@ -42,6 +42,8 @@ def test_every_scheme_says_which_packets_it_encrypts() -> None:
             assert found[0].all()
             assert found[1:][~gamma[:-1]].all()  # θ = 1.5: there, and where a coin says so
             assert 0.4 < found[1:][gamma[:-1]].mean() < 0.6
+        elif name == "partial-encryption":
+            assert np.array_equal(found, ~np.array([packet.nu for packet in played.packets]))
         else:
             assert not found.any()
 
