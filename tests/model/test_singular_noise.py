@@ -398,7 +398,7 @@ def test_the_part_of_a_noise_outside_the_range_is_measured() -> None:
 
 
 def test_how_often_the_last_state_is_certain() -> None:
-    """The figures of the documentation: a fifth to a quarter of trials with a singular Q, hardly any with diag(Q)."""
+    """A fifth to a quarter of trials with a singular Q, hardly any with diag(Q), as documented; and the belief is true."""
     singular = Process(
         np.array([[1.0, 0.1], [0.0, 1.0]]),
         np.array([[2.025e-3, 4.5e-3], [4.5e-3, 1e-2]]),
@@ -406,12 +406,12 @@ def test_how_often_the_last_state_is_certain() -> None:
         singular_noise=True,
     )
     regular = Process(singular.A, np.diag(np.diag(singular.Q)), singular.initial_covariance)
-    certain = []
+    certain: list[float] = []
     for process in (singular, regular):
         batch, random = Batch(21, 600), np.random.default_rng(1)
         eve, belief = Bayesian(Knowledge(process, 0.3, {}, {}), batch), None
         L = np.linalg.cholesky(process.initial_covariance)
-        x, carried = L @ random.standard_normal((2, 600)), StateFactors(process)
+        x, carried, above = L @ random.standard_normal((2, 600)), StateFactors(process), np.zeros(600)
         for k in range(21):
             z = x
             if k:
@@ -420,7 +420,9 @@ def test_how_often_the_last_state_is_certain() -> None:
                 chi = carried.carried(k) @ random.standard_normal((2, 600))
                 z = np.where(random.random(600) < 0.3, x, w + chi)
             belief = eve.step(k, belief or eve.prior(), Reception(random.random(600) < 0.9, z))
+            above += ((belief.x_hat - x) ** 2).sum(axis=0) - np.trace(belief.P)
         assert belief is not None
+        assert abs(above.mean()) < 4.5 * above.std() / 600**0.5
         certain.append(float(np.mean(belief.memory[0].max(axis=0) > 1.0 - 1e-6)))
     assert 0.18 < certain[0] < 0.29
     assert certain[1] < 0.01
