@@ -190,10 +190,13 @@ def test_what_innovations_leave_is_exact(case: str) -> None:
             assert np.allclose(read, M, rtol=1e-12, atol=1e-14 * scale)
 
 
-@pytest.mark.parametrize("case", PROCESSES)
+UNROUND = process_of([[1.0, 0.1, 0.0], [0.03, 0.9, 0.07], [0.0, 0.2, 1.1]], [[0.3], [0.1], [0.7]])
+
+
+@pytest.mark.parametrize("case", [*PROCESSES, "of numbers that are not round"])
 def test_directions_without_noise_are_zeros_to_the_bit(case: str) -> None:
     """The covariance m slots after a state has the rank of [G, A G, …], and 0 in all other rows: no rounding, in any slot."""
-    process = PROCESSES[case]
+    process = PROCESSES.get(case, UNROUND)
     stairs = Staircase(process)
     A, P, reached = stairs.process.A, np.zeros((process.n, process.n)), np.zeros((process.n, 0))
     G = process.noise_factor
