@@ -161,6 +161,7 @@ def test_the_closing_report_has_its_lines() -> None:
         "the attack is detected in 0 of the other trials",
         "the watermark costs 0.1 a slot before the attack; it is on in 1 of all slots",
     ]
+    assert len(Integrity.lines({**bare, "watermark_fraction": 0.0})) == 2
 
 
 BASE = {"policy": "always", "threshold": 8.0, "watermark": [[0.3]]}

@@ -121,7 +121,7 @@ class Integrity(Application):
             if summary["expected_delay"] is not None:
                 found += f"; h/D is {summary['expected_delay']:.3g}"
             lines.append(found)
-        if summary["watermark_cost"] is not None:
+        if summary["watermark_cost"] is not None and summary["watermark_fraction"]:
             said = f"the watermark costs {cls.text(summary, ('watermark_cost',), '.3g')} a slot before the attack"
             expected, z = summary["expected_watermark_cost"], summary["watermark_cost_z"]
             if expected is not None:
