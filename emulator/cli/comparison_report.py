@@ -39,7 +39,7 @@ def print_comparison(found: Comparison, folder: str) -> None:
 
 
 def _schemes(found: Comparison) -> Table:
-    table = _table("scheme", ("legitimate", "theory", "ACKs", "sent", "bits/slot", "energy", "secret", "clear", "leak"))
+    table = _table("scheme", ("legitimate", "theory", "ACKs", "sent", "bits", "energy", "secret", "clear", "leak"))
     for head in ("closest adversary", "verdict"):
         table.add_column(head, no_wrap=True)
     for name, one in found.schemes.items():
@@ -130,7 +130,7 @@ def _undefined(found: Comparison) -> Iterator[str]:
 
 def _remarks(found: Comparison) -> Iterator[str]:
     yield (
-        "sent: the share of slots with a packet; bits/slot, energy: what the sensor sends, headers included, and spends in a "
+        "sent: the share of slots with a packet; bits, energy: what the sensor sends, headers included, and spends in a "
         "slot on average; secret: the most bits that a slot uses, + bits that a trial uses once; "
         "clear: the share of slots whose packet is the state itself; leak: the bits about the path of states that another packet "
         "reveals without the secret"
