@@ -80,13 +80,19 @@ def adversaries_of() -> tuple[str, ...]:
     return (*STRATEGIES, *ATTACKERS)
 
 
+def usual_adversaries(scenario: Scenario) -> tuple[str, ...]:
+    """The names of all adversaries but those that are costly and not in the scenario."""
+    own = {table.strategy for table in scenario.eavesdroppers.values()}
+    return tuple(name for name in adversaries_of() if name in ATTACKERS or name in own or not STRATEGIES[name].costly)
+
+
 def matchups_of(
     scenario: Scenario,
     schemes: Sequence[str] | None = None,
     adversaries: Sequence[str] | None = None,
     parameters: Mapping[str, Any] | None = None,
 ) -> Matchups:
-    """The matches of schemes and adversaries, by name; by default all that the sensor can use.
+    """The matches of schemes and adversaries, by name; by default all that the sensor can use and that are not costly.
 
     parameters: SCHEME.PARAMETER → value.
 
@@ -95,6 +101,8 @@ def matchups_of(
     if schemes is None and scenario.driven is not None and scenario.driven.output_matrix is not None:
         # A sensor that measures does not decide the first state, which such a scheme needs.
         schemes = [name for name in SCHEMES if not SCHEMES[name].decides_initial_state()]
+    if adversaries is None:
+        adversaries = usual_adversaries(scenario)
     chosen = _chosen(schemes, adversaries, parameters or {})
     groups: list[Group] = []
     undefined: list[Match] = []

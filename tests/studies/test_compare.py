@@ -19,7 +19,7 @@ from evedrop.model.schemes import SCHEMES
 from evedrop.model.theory.closed_forms import encrypted_fraction
 from evedrop.results.comparison import Comparison
 from evedrop.score.verdict import SecrecyKept
-from evedrop.studies.matchups import ATTACKERS
+from evedrop.studies.matchups import ATTACKERS, usual_adversaries
 
 MARGINAL: dict[str, Any] = {"slots": 150, "trials": 60, "process__initial_covariance": [[1e-3, 0.0], [0.0, 1e-4]]}
 """Of the scenario `bayesian`: long enough for verdicts, and no first slot that rules the mean of the few trials that lose it."""
@@ -70,7 +70,8 @@ def test_every_pair_is_there_or_says_why_not(everything: Everything) -> None:
     """Every scheme has a cell for every adversary: two errors and a verdict, or a reason."""
     found, _ = everything
     assert set(found.schemes) == set(SCHEMES)
-    assert set(found.adversaries) == set(STRATEGIES) | set(ATTACKERS)
+    assert set(STRATEGIES) | set(ATTACKERS) == {*found.adversaries, "learning-em", "learning-particle"}
+    assert set(usual_adversaries(load("learning"))) == {*found.adversaries, "learning-em"}
     for scheme in found.schemes.values():
         assert tuple(scheme.cells) == found.adversaries
         for cell in scheme.cells.values():

@@ -52,6 +52,8 @@ class Eavesdropper(Receiver):
     """Whether it has several links instead of one; it hears what any of them delivers."""
     only_against: ClassVar[tuple[str | tuple[str, ...], str] | None] = None
     """The only scheme, or schemes, that `evedrop compare` sets it against, and what it would be against any other; None: all."""
+    costly: ClassVar[bool] = False
+    """Whether it takes so long that `evedrop compare` leaves it out, unless it is named or the scenario has it."""
     inverts_noise: ClassVar[bool] = False
     """Whether it uses the inverse of Q, so that Q must not be singular."""
     reads_leaks: ClassVar[bool] = False

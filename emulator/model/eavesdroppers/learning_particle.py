@@ -68,6 +68,7 @@ class LearningParticle(PacketReader):
         "learns from packets each of which is the state or an innovation, and others would mislead it",
     )
     inverts_noise = True  # if it knows Q
+    costly = True
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)
