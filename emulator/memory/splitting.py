@@ -31,10 +31,7 @@ LEAST_TRIALS = 100
 _PILOTS = 8  # populations that decide in which slots all others are split
 _FIRST_TRIAL = 2**47  # far from the trials of any study, so that both are independent
 _SPLIT_BELOW = 0.5  # of the trials that count
-_WIDEST, _LARGEST_SHARE = (
-    0.1,
-    0.15,
-)  # beyond them the populations are too skewed for their standard error to be true
+_WIDEST = 0.1  # of the mean: with a larger standard error the populations are too skewed for it to be true
 
 
 @final

@@ -225,9 +225,16 @@ def test_simulated_genies_agree_with_theory() -> None:
 
 
 def test_it_bounds_every_strategy() -> None:
-    """Nobody who hears the same packets has a smaller mean error in any slot, at 4.5 standard errors of the difference."""
+    """No strategy that hears the same packets has a smaller mean error in any slot, at 4.5 standard errors of the difference.
+
+    Learners are left out: they are slow, and know less than the others.
+    """
     batch, parameters = Batch(60, 2000), {"use_state": 0.9, "use_innovation": 0.1}
-    receivers = {name: made(Knowledge(MARGINAL, 0.3, parameters, keys(5)), batch) for name, made in READERS.items()}
+    receivers = {
+        name: made(Knowledge(MARGINAL, 0.3, parameters, keys(5)), batch)
+        for name, made in READERS.items()
+        if not made.costly
+    }
     for slot, beliefs in followed(receivers, slots(MARGINAL, 0.3, 0.9, batch, 5)):
         errors = {name: ((slot.x - belief.x_hat) ** 2).sum(axis=0) for name, belief in beliefs.items()}
         for name, error in errors.items():

@@ -13,9 +13,10 @@ from evedrop.model.integrity.loop import Source, spread, stationary
 from evedrop.model.integrity.monitor import Monitor, MonitoredSlots, MonitorPlan, assumed
 from evedrop.model.integrity.theory import WatermarkTheory, loop_of, watermark_cost
 from evedrop.model.plant import Plant
+from evedrop.model.schemes.plain import PlainEncoder
 from evedrop.model.schemes.scheme import PacketBlock
 from evedrop.model.slot.plant import PlantCore
-from evedrop.model.slot.sensor import Sent
+from evedrop.model.slot.sensor import SensorCore, Sent
 from evedrop.streams import Batch
 from tests.builders import stream_keys
 from tests.model.integrity_loop import ALWAYS, ONE, PLANAR, REPLACED, SCALAR, simulated
@@ -212,6 +213,15 @@ def test_a_plan_without_attack_is_designed_for_a_replay() -> None:
     assert whole.rows(slice(1, 2)).watermark.tolist() == [[[2.0, 2.0]]]
     assert whole.part(slice(0, 1)).watermark.tolist() == [[[1.0]], [[2.0]]]
     assert whole.part(slice(0, 1)).statistic.tolist() == [[1.0], [2.0]]
+
+
+def test_a_sensor_says_whether_it_has_a_detector() -> None:
+    """Its process then reports what the detector finds."""
+    batch = Batch(4, 1)
+    plan = MonitorPlan.of(LOOP, 0.3 * ONE, ALWAYS, None)
+    for monitor in (None, Monitor(plan, bytes(32), batch)):
+        sensor = SensorCore(PlainEncoder(), PlantCore(SCALAR.process, bytes(32), batch), None, None, monitor)
+        assert sensor.monitors is (monitor is not None)
 
 
 def test_slots_of_a_monitored_sensor_are_joined_and_cut() -> None:

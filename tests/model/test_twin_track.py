@@ -68,7 +68,7 @@ def test_errors_are_the_closed_form() -> None:
 @pytest.mark.parametrize("process", [STABLE, UNSTABLE])
 @pytest.mark.parametrize("quality", [1.0, 0.8])
 def test_no_strategy_is_below_the_bound(process: Process, quality: float) -> None:
-    """Every strategy there is, even with a schedule's key, has a mean squared error of at least ½ tr A^k Σ0 A^kᵀ."""
+    """Every strategy but the slow learners, even with a schedule's key, has a mean squared error of at least ½ tr A^k Σ0 A^kᵀ."""
     slots, trials = 15, 4000
     batch = Batch(slots, trials)
     eavesdroppers = {
@@ -77,12 +77,16 @@ def test_no_strategy_is_below_the_bound(process: Process, quality: float) -> Non
             batch,
         )
         for name, strategy in READERS.items()
+        if not strategy.costly
     }
-    gamma = {"legitimate": coins(0.7, slots, trials), **{name: coins(quality, slots, trials, 3) for name in READERS}}
+    gamma = {
+        "legitimate": coins(0.7, slots, trials),
+        **{name: coins(quality, slots, trials, 3) for name in eavesdroppers},
+    }
     played = play(TwinTrack(process), batch, gamma, eavesdroppers)
     bound = twin_track_bound(process, slots)
     assert np.allclose(bound, [0.5 * np.trace(spread(process, k)) for k in range(slots)], rtol=1e-12)
-    for name in READERS:
+    for name in eavesdroppers:
         found = played.squared_error(name)
         assert (found.mean(1) + 5.0 * found.std(1) / np.sqrt(trials) > bound).all()
         if name == "naive" and quality == 1.0:

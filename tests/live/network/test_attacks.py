@@ -49,7 +49,8 @@ change(one)
 LIES = {
     "x_hat = 7, P = 0, no digests": (
         "change(lambda self: dict(x_hat=self.x_hat * 0.0 + 7.0, P=self.P * 0.0, trace=self.trace * 0.0,"
-        " digests={block: one * 0 for block, one in self.digests.items()}))",
+        " digests={block: one * 0 for block, one in self.digests.items()},"
+        " trace_sums={block: one * 0 for block, one in self.trace_sums.items()}))",
         r"smart contradicts itself: its digest of slots 0 to 255 of trial 0 is (00){16}, and what it reported of these slots "
         r"gives [0-9a-f]{32}; look at logs/smart.log",
     ),

@@ -270,6 +270,14 @@ def test_a_malformed_outage_is_refused(role: str, outage: list[Any], said: str, 
     assert said in str(refusal(found, tmp_path))
 
 
+@pytest.mark.parametrize("wrong", [[0.5] * 3, [1.5], [-0.1]])
+def test_probabilities_that_are_not_one_for_each_slot_are_refused(wrong: list[float], tmp_path: Path) -> None:
+    """A list of μ_d(k) has one number from 0 to 1 for each slot."""
+    found = json.loads(made(scenario_of())["smart"].text)
+    found["model"]["state_probabilities"] = wrong if len(wrong) > 1 else wrong * found["slots"]
+    assert "model.state_probabilities are not" in str(refusal(found, tmp_path))
+
+
 @pytest.mark.parametrize("role", ["router", "sensor", "legitimate", "smart", "observer"])
 def test_unknown_entries_of_a_part_are_refused(role: str, tmp_path: Path) -> None:
     """As those of the brief itself."""
