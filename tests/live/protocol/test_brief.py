@@ -276,6 +276,8 @@ def test_probabilities_that_are_not_one_for_each_slot_are_refused(wrong: list[fl
     found = json.loads(made(scenario_of())["smart"].text)
     found["model"]["state_probabilities"] = wrong if len(wrong) > 1 else wrong * found["slots"]
     assert "model.state_probabilities are not" in str(refusal(found, tmp_path))
+    found["model"]["state_probabilities"] = [0.5] * found["slots"]
+    assert refusal(found, tmp_path) is None
 
 
 @pytest.mark.parametrize("role", ["router", "sensor", "legitimate", "smart", "observer"])
