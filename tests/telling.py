@@ -22,7 +22,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, NoReturn
 
 from evedrop import __main__ as command
-from evedrop.cli.report import ProgressLine
+from evedrop.cli.progress_line import ProgressLine
 from evedrop.fork_server import serve
 from evedrop.live.launch import preloading
 from evedrop.news import Held

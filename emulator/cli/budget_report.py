@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from evedrop.cli.report import terminal
+from evedrop.figures.text import finite_text
 
 if TYPE_CHECKING:
     from evedrop.expected.energy_budget import BudgetDesign
@@ -19,7 +19,7 @@ def print_budget(design: BudgetDesign) -> None:
     console = terminal()
     console.print(
         f"a packet in clear costs {design.in_clear:g}, an encrypted one {design.encrypted:g}; errors are traces in the limit; "
-        f"the user's is {_number(design.user)}"
+        f"the user's is {finite_text(design.user)}"
     )
     shown = Table(box=SIMPLE_HEAD)
     names = list(design.best.eavesdroppers)
@@ -32,7 +32,7 @@ def print_budget(design: BudgetDesign) -> None:
             f"{figures.threshold:.6g}",
             f"{figures.encrypted_fraction:.4f}",
             f"{figures.energy:.6g}",
-            *(_number(figures.eavesdroppers[name]) for name in names),
+            *(finite_text(figures.eavesdroppers[name]) for name in names),
             "the budget's" if figures is design.best else "",
         )
     console.print(shown)
@@ -40,7 +40,3 @@ def print_budget(design: BudgetDesign) -> None:
         who = ", ".join(f"{name} ({strategy})" for name, strategy in design.left_out.items())
         console.print(f"left out: {who}: no closed form of its error is known under this scheme")
     console.print(f"threshold = {design.best.threshold!r}")
-
-
-def _number(value: float) -> str:
-    return f"{value:.4g}" if math.isfinite(value) else "∞"

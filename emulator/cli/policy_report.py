@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from itertools import groupby
 from typing import TYPE_CHECKING
 
@@ -10,6 +9,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from evedrop.cli.report import terminal
+from evedrop.figures.text import finite_text
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -79,8 +79,4 @@ def _by_holding_time(thresholds: Sequence[int], states: int) -> str:
 
 
 def _figures(figures: PolicyFigures) -> tuple[str, ...]:
-    return (*map(_number, (figures.user, figures.eavesdropper)), f"{figures.transmissions:.4f}")
-
-
-def _number(value: float) -> str:
-    return f"{value:.4g}" if math.isfinite(value) else "∞"
+    return (*map(finite_text, (figures.user, figures.eavesdropper)), f"{figures.transmissions:.4f}")

@@ -1,145 +1,28 @@
-"""The terminal output of runs, sweeps and designs: a progress line, and tables with the sentences that go with them."""
+"""The results of runs and sweeps on the terminal: tables, and the sentences that go with them."""
 
 from __future__ import annotations
 
 import math
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
-from io import StringIO
-from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self, TextIO, cast, final
+from typing import TYPE_CHECKING
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    SpinnerColumn,
-    TaskID,
-    TextColumn,
-    TimeRemainingColumn,
-)
 from rich.table import Table
 
 from evedrop.figures import all_figures, columns, error_column, shown_figure, unloadable_figures, z_column
 from evedrop.figures.text import estimate, figure_text
-from evedrop.kernels.choice import fallback_warning
-from evedrop.news import ConnectionOutage, FolderMoved, Held, News, RunEnded, RunProgress, Started, ViewOpened
 from evedrop.scenario.application import applications_in
 from evedrop.score.summary import RARE_SHARE, ControllerSummary, DirectionSummary, LinkSummary, PeerSummary, Summary
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from evedrop.model.theory.design import Design
 
-_DIGEST_WIDTH = (
-    100  # the least width of a terminal, in columns, to show digests, and the standard error of every figure
-)
+_DIGEST_WIDTH = 100
+"""The least width of a terminal, in columns, to show digests, and the standard error of every figure."""
 _LARGE_COUNT = 1e7
-
-
-class _Unfailing:
-    """A stream that ignores write errors: the terminal may be closed while the run is being ended in order."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-
-    def write(self, text: str) -> int:
-        with suppress(OSError):
-            return self._stream.write(text)
-        return len(text)
-
-    def flush(self) -> None:
-        with suppress(OSError):
-            self._stream.flush()
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
-
-
-def _unfailing(stream: TextIO | None) -> TextIO:
-    return cast(TextIO, _Unfailing(StringIO() if stream is None else stream))  # a shell may have closed it
-
-
-@final
-class ProgressLine:
-    """Shows the news of a run on standard error; a context manager. total: progress at the end, counted in `unit`s."""
-
-    def __init__(self, total: int, unit: str, quiet: bool = False) -> None:
-        self.console = Console(file=_unfailing(sys.stderr), highlight=False, markup=False)
-        self._quiet = quiet
-        self._total = total
-        self.moved: Path | None = None
-        """The results folder, if it was renamed."""
-        self._progress = Progress(
-            SpinnerColumn(),
-            TextColumn("{task.description}"),
-            *([BarColumn(bar_width=24)] if self.console.width >= _DIGEST_WIDTH + 20 else []),
-            MofNCompleteColumn(),
-            TextColumn(f"{unit} · {{task.fields[rate]}}"),
-            TimeRemainingColumn(compact=True),
-            TextColumn("{task.fields[errors]}"),
-            console=self.console,
-            transient=True,
-            disable=quiet or not self.console.is_terminal,
-        )
-        self._task: TaskID = self._progress.add_task("starting", total=total, rate="", errors="")
-
-    def __enter__(self) -> Self:
-        if (warning := fallback_warning()) is not None:
-            self.console.print(f"warning: {warning}", soft_wrap=True)
-        self._progress.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._progress.stop()
-
-    def tell(self, news: News) -> None:
-        """Show one item of news."""
-        match news:
-            case Started():
-                self._progress.update(self._task, description="running")
-            case Held():
-                self._progress.update(
-                    self._task, description=f"held before slot {news.before}", completed=news.before, rate=""
-                )
-            case RunProgress():
-                self._progress.update(
-                    self._task,
-                    description="running",
-                    total=self._total if news.total is None else news.total,
-                    completed=news.done,
-                    rate=f"{news.rate:,.0f} {news.rate_unit}",
-                    errors="  ".join(f"{name} {error:.2g}" for name, error in news.squared_errors.items()),
-                )
-            case ViewOpened() if not self._quiet:
-                if news.address:
-                    self._print(f"live view, open to anybody who has this address: {news.address}")
-                if news.warning:
-                    self._print(f"warning: {news.warning}")
-            case ConnectionOutage() if not self._quiet:
-                self._print(outage_line(news))
-            case FolderMoved():
-                self.moved = Path(news.folder)
-                self._print(f"the results folder was renamed while the run went on; it is {self.moved}")
-            case RunEnded() if news.view:
-                self._print(f"the view stopped early: {news.view}")
-
-    def _print(self, line: str) -> None:
-        self.console.print(line, soft_wrap=True)
-
-
-def outage_line(outage: ConnectionOutage) -> str:
-    """An outage as a sentence."""
-    went = "the run did not go on" if outage.until is None else f"the run went on after {outage.seconds:.1f} s"
-    where = "" if outage.shard is None else f" of shard {outage.shard}"
-    return f"{outage.process}{where} cut off at slot {outage.slot}; {went}"
 
 
 def closing_table(summary: Summary, width: int) -> Table:
@@ -370,64 +253,6 @@ def print_sweep(table: pa.Table, keys: tuple[str, ...], folder: str) -> None:
     console = terminal()
     console.print(shown)
     console.print(f"results: {folder}/sweep.parquet, sweep.png")
-
-
-def print_design(design: Design) -> None:
-    """Print a design as text: bounds, intervals, optima and the price of secrecy."""
-    console = terminal()
-    console.print(f"spectral radius {design.rho:.6g}; legitimate link quality μ = {design.mu:g}")
-    if design.remark is not None:
-        console.print(design.remark)
-    else:
-        found = "error is unbounded"
-        if math.isfinite(design.trace):
-            found = (
-                f"trace is {design.trace:.4g}, {design.cost:.3g} times that of sending every state "
-                f"({design.plain_trace:.4g})"
-            )
-        console.print(
-            f"admissible: {design.bound:.6g} < μ_d ≤ 1; at this scenario's μ_d = {design.mu_d:g} the legitimate {found}"
-        )
-    if design.minimum is not None:
-        console.print(f"least μ_d for the wanted trace: {design.minimum:.6g}")
-    table = Table(box=SIMPLE_HEAD)
-    table.add_column("against", no_wrap=True)
-    for head in (
-        "bounded from",
-        "perfect secrecy",
-        "relative secrecy",
-        "best J_r",
-        "best J_r/J",
-        "its trace",
-        "holds from slot",
-    ):
-        table.add_column(head, justify="right", no_wrap=True)
-    for name, against in design.eavesdroppers.items():
-        table.add_row(
-            name,
-            _number(against.bound),
-            "none" if against.perfect is None else _half_open(against.perfect, against.bound),
-            "none"
-            if not against.relative
-            else " ∪ ".join(f"({low:.5f}, {high:.5f})" for low, high in against.relative),
-            "–" if against.best_difference is None else f"{against.best_difference:.5f}",
-            "–" if against.best_ratio is None else f"{against.best_ratio:.5f}",
-            _number(against.trace),
-            "–" if against.relative_from is None else str(against.relative_from),
-        )
-    console.print(table)
-    if design.omission is not None:
-        console.print(design.omission)
-
-
-def _half_open(interval: tuple[float, float], bound: float) -> str:
-    """The interval of perfect secrecy; closed at its upper end, unless that is 1 and the error is bounded there."""
-    low, high = interval
-    return f"({low:.5f}, {high:.5f}{')' if high == bound == 1.0 else ']'}"
-
-
-def _number(value: float) -> str:
-    return f"{value:.6g}" if math.isfinite(value) else "∞"
 
 
 class _Console(Console):

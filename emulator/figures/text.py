@@ -12,6 +12,11 @@ def figure_text(value: float | None, how: str = ".4g") -> str:
     return "–" if value is None else format(value, how)
 
 
+def finite_text(value: float, how: str = ".4g") -> str:
+    """A number as text; ∞ for one that is not finite."""
+    return format(value, how) if math.isfinite(value) else "∞"
+
+
 def estimate(value: float | None, error: float | None, how: str = ".4g") -> str:
     """An estimate with its standard error, to the place of that error's first digit: 0.0123 ± 0.0004. how: without an error."""
     if value is None or not error or not math.isfinite(value):

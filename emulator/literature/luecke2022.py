@@ -36,7 +36,7 @@ UNSTABLE = Process(
 
 _THEIR_SLOTS = 200_000
 _RUN_SLOTS = 50_000
-"""The slots of one run of theirs in the search for a policy, of which they averaged several."""
+"""The slots of one of their runs in the search for a policy; they averaged several runs."""
 _START = 50
 """Slots that are not counted: the law of the covariances has then forgotten the start."""
 _BATCH = 2500

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from evedrop.cli.report import ProgressLine
+from evedrop.cli.progress_line import ProgressLine
 from evedrop.news import Held
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from evedrop.cli.report import ProgressLine
+from evedrop.cli.progress_line import ProgressLine
 from evedrop.environment import own_environment
 from evedrop.kernels import binding, choice
 from evedrop.names import KERNELS_VARIABLE

@@ -215,6 +215,24 @@ def test_a_plan_without_attack_is_designed_for_a_replay() -> None:
     assert whole.part(slice(0, 1)).statistic.tolist() == [[1.0], [2.0]]
 
 
+def test_evidence_is_weighed_by_the_law_of_its_own_slot() -> None:
+    """CUSUM and posterior after slots with a watermark and without, by the formula of each; the two laws differ."""
+    entered, epsilon = np.array([[0.4, -0.7, 0.2]]), np.array([[1.3, -0.4, 2.2]])
+    parsimonious = ("parsimonious", {"watch_from": 0.05, "alarm_from": 0.999, "attack_rate": 1e-3})
+    for policy, marked in ((ALWAYS, True), (parsimonious, False)):
+        plan = MonitorPlan.of(LOOP, 0.3 * ONE, policy, REPLACED)
+        monitor = Monitor(plan, stream_keys(1, ("watermark",))["watermark"], Batch(4, 3))
+        monitor.take(0, epsilon, None)
+        assert monitor.watermark.all() == marked
+        monitor.take(1, epsilon, entered)
+        T = float(1.0 / (plan.marked if marked else plan.unmarked).precision[0, 0])
+        moved = epsilon[0] + float(plan.shift[0, 0]) * entered[0]
+        llr = 0.5 * (epsilon[0] ** 2 - moved**2 / T - np.log(T))
+        assert np.allclose(monitor.statistic, plan.made_policy.step(np.zeros(3), llr), rtol=1e-12)
+        assert monitor.statistic.any()
+        assert abs(plan.marked.precision - plan.unmarked.precision).min() > 1e-4
+
+
 def test_a_sensor_says_whether_it_has_a_detector() -> None:
     """Its process then reports what the detector finds."""
     batch = Batch(4, 1)
@@ -225,7 +243,7 @@ def test_a_sensor_says_whether_it_has_a_detector() -> None:
 
 
 def test_slots_of_a_monitored_sensor_are_joined_and_cut() -> None:
-    """With what the monitor says of each; a plant without inputs has nothing to mark."""
+    """The monitor's results are joined and cut with them; a plant without inputs has nothing to mark."""
     states = PlantCore(SCALAR.process, bytes(32), Batch(4, 1))
     states.mark(ONE)
     assert states.entered is None

@@ -224,3 +224,14 @@ def test_factors_of_a_matrix_and_division_by_it() -> None:
     assert isinstance(flat, Factors)
     assert np.allclose(covariance(flat)[:, :, 0], 0.5 * np.eye(2))
     assert Factor([[1.0]], [2.0]).diagonal == [2.0]
+
+
+def test_estimates_out_of_all_proportion_to_the_packets_are_made_smaller() -> None:
+    """To four times the largest packet, by one that estimates A; one that is told A keeps what follows from it."""
+    x_hat, P = np.array([[1e9], [0.5]]), np.array([[[1e18], [1e9]], [[1e9], [4.0]]])
+    largest = np.array([[2.0], [3.0]])
+    bounded_mean, bounded_covariance = learner(MARGINAL, Batch(4, 1)).in_proportion(x_hat, P, largest)
+    assert bounded_mean.tolist() == [[8.0], [0.5]]
+    assert np.allclose(bounded_covariance[:, :, 0], [[64.0, 8.0], [8.0, 4.0]])
+    told = learner(MARGINAL, Batch(4, 1), ["A"]).in_proportion(x_hat, P, largest)
+    assert all(np.array_equal(one, other) for one, other in zip(told, (x_hat, P), strict=True))

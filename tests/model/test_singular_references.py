@@ -11,7 +11,7 @@ from evedrop.model.receiver import Reception
 from evedrop.model.reference import ReferenceReceiver
 from evedrop.model.reference_code import NONE
 from tests.model.rationals import Matrix, combined, exact, inverted, times, transposed
-from tests.model.test_singular_noise import PROCESSES, sigmas
+from tests.model.singular_processes import PROCESSES, sigmas
 
 SLOTS = 9
 ACKNOWLEDGED = {0, 3, 4, 6}

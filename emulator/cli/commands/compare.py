@@ -14,7 +14,7 @@ def compare(options: argparse.Namespace) -> int:
     """Compare every scheme against every adversary."""
     from evedrop.api import compare as compare_all
     from evedrop.cli.comparison_report import print_comparison
-    from evedrop.cli.report import ProgressLine
+    from evedrop.cli.progress_line import ProgressLine
     from evedrop.loading import value_of
     from evedrop.memory.montecarlo import Plan
     from evedrop.results.folder import results_folder

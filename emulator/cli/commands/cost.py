@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 def cost(options: argparse.Namespace) -> int:
     """Compare a house's scheme with `plain`, day by day."""
-    from evedrop.cli.report import ProgressLine
+    from evedrop.cli.progress_line import ProgressLine
     from evedrop.memory.montecarlo import teller
     from evedrop.studies.secrecy_cost import secrecy_cost
 

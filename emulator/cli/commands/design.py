@@ -16,8 +16,8 @@ def design(options: argparse.Namespace) -> int:
     """Print the admissible μ_d, the cost and secrecy of each choice; or when to send or to encrypt, or a μ_d for each slot."""
     from evedrop import api
     from evedrop.cli.budget_report import print_budget
+    from evedrop.cli.design_report import print_design
     from evedrop.cli.policy_report import print_policies
-    from evedrop.cli.report import print_design
     from evedrop.cli.schedule_report import print_schedules
 
     chosen = {"--policy": options.policy, "--schedule": options.schedule, "--budget": options.budget}

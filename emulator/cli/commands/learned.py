@@ -18,7 +18,7 @@ _ROUNDING = 1e-12  # a standard error that is smaller, over the mean, is roundin
 
 def learned(options: argparse.Namespace) -> int:
     """Print what has been learned after 8, 16, 32, … slots."""
-    from evedrop.cli.report import ProgressLine
+    from evedrop.cli.progress_line import ProgressLine
     from evedrop.memory.montecarlo import teller
     from evedrop.studies.learning_curve import learning_curve
 

@@ -13,7 +13,7 @@ from evedrop.errors import Interrupted
 
 def montecarlo(options: argparse.Namespace) -> int:
     """Run the trials of a scenario in memory."""
-    from evedrop.cli.report import ProgressLine
+    from evedrop.cli.progress_line import ProgressLine
     from evedrop.memory.montecarlo import simulate
     from evedrop.results.folder import results_folder
 

@@ -35,7 +35,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _run(options: argparse.Namespace) -> Ended:
-    from evedrop.cli.report import ProgressLine
+    from evedrop.cli.progress_line import ProgressLine
     from evedrop.live.launch.launcher import launch
     from evedrop.results.folder import results_folder
 

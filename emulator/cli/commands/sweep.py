@@ -13,7 +13,8 @@ from evedrop.command import Command
 
 def sweep(options: argparse.Namespace) -> int:
     """Run Monte Carlo over a grid."""
-    from evedrop.cli.report import ProgressLine, print_sweep
+    from evedrop.cli.progress_line import ProgressLine
+    from evedrop.cli.report import print_sweep
     from evedrop.results.folder import results_folder
     from evedrop.studies.sweep import grid_of, sweep_over
 

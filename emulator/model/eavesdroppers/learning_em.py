@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 from evedrop.kernels.factored import covariance
 from evedrop.kernels.mixtures import moments as moments_of
 from evedrop.model.checks import as_toml, number_mistakes
-from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge
+from evedrop.model.eavesdroppers.learner import Learner
 from evedrop.model.learning.climb import NARROW, Learned, climbed
-from evedrop.model.learning.course import Course, advanced, bounded, scale_of, unheard
-from evedrop.model.learning.known import knowing_mistakes, known
+from evedrop.model.learning.course import Course, advanced, scale_of, unheard
+from evedrop.model.learning.known import knowing_mistakes
 from evedrop.model.learning.moments import Moments
 from evedrop.model.learning.posterior import Parameters
 from evedrop.model.process import Floats
@@ -59,23 +60,16 @@ class Memory(NamedTuple):
         return cls(learned, *stored[c + 1 :])
 
 
-class LearningEm(PacketReader):
+class LearningEm(Learner):
     """Learns A, Q, μ_d and Σ_k from its own packets, and weighs packets by what it has learned.
 
     parameters: `knows`, names of what it is given; `keeps`, the slots that it keeps to go through again.
     """
 
     parameters = MappingProxyType({"knows": [], "keeps": 64})
-    only_against = (
-        ("innovation", "plain"),
-        "learns from packets each of which is the state or an innovation, and others would mislead it",
-    )
-    inverts_noise = True  # if it knows Q
-    costly = True
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)
-        self.known = known(knowledge.process, knowledge.state_probability, knowledge.parameters["knows"])
         self._keeps = int(knowledge.parameters["keeps"])
         self._climbs = climbing_slots(knowledge.process.n, self._keeps)
 
@@ -96,9 +90,8 @@ class LearningEm(PacketReader):
 
     def knowing(self, k: int, x: Floats, belief: Belief) -> Belief:
         """One component with covariance 0; what it has learned stays."""
-        memory, (n, trials) = Memory.read(belief.memory), x.shape
-        nothing = np.zeros((n * (n - 1) // 2, 1, trials)), np.zeros((n, 1, trials))
-        course = Course(np.ones((1, trials)), x[:, None, :], *nothing, *memory.learned.course[4:])
+        memory = Memory.read(belief.memory)
+        course = memory.learned.course.knowing(x)
         after = super().knowing(k, x, belief)
         return after._replace(memory=memory._replace(learned=memory.learned._replace(course=course)).stored())
 
@@ -131,8 +124,7 @@ class LearningEm(PacketReader):
     def _believed(self, action: Codes, memory: Memory) -> Belief:
         """The mean and covariance of the posterior, made smaller where they are out of all proportion to the packets."""
         x_hat, P = moments_of(memory.learned.course.mixture)
-        if "A" not in self.known.names:
-            x_hat, P = bounded(x_hat, P, memory.largest)
+        x_hat, P = self.in_proportion(x_hat, P, memory.largest)
         return Belief(x_hat, P, action, memory.stored())
 
     def _small_step(self, k: int, learned: Learned, gamma: Flags, z: Floats, age: int) -> tuple[Learned, Floats]:

@@ -20,10 +20,11 @@ from evedrop.kernels.factored import covariance
 from evedrop.kernels.mixtures import moments as moments_of
 from evedrop.kernels.mixtures import summed
 from evedrop.model.checks import as_toml, number_mistakes
-from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
-from evedrop.model.learning.course import Course, advanced, bounded, scale_of, unheard
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge
+from evedrop.model.eavesdroppers.learner import Learner
+from evedrop.model.learning.course import Course, advanced, scale_of, unheard
 from evedrop.model.learning.draws import drawn, lattice, numbers_of
-from evedrop.model.learning.known import knowing_mistakes, known
+from evedrop.model.learning.known import knowing_mistakes
 from evedrop.model.learning.moments import Moments
 from evedrop.model.learning.posterior import Parameters
 from evedrop.model.process import Floats
@@ -56,23 +57,16 @@ class Cloud(NamedTuple):
         )
 
 
-class LearningParticle(PacketReader):
+class LearningParticle(Learner):
     """Learns A, Q, μ_d and Σ_k from its own packets, by `particles` candidates; `knows`: what it is told.
 
     `Belief.memory`: the cloud's arrays with the particles as last axis but one, then the packets' scale and largest entries.
     """
 
     parameters = MappingProxyType({"knows": [], "particles": 64})
-    only_against = (
-        ("innovation", "plain"),
-        "learns from packets each of which is the state or an innovation, and others would mislead it",
-    )
-    inverts_noise = True  # if it knows Q
-    costly = True
 
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)
-        self.known = known(knowledge.process, knowledge.state_probability, knowledge.parameters["knows"])
         self._count = int(knowledge.parameters["particles"])
         self._numbers = numbers_of(knowledge.process.n)
         self._coins = BlockReader(knowledge.keys["coin"], batch, self._count * self._numbers + 1)
@@ -104,10 +98,7 @@ class LearningParticle(PacketReader):
     def knowing(self, k: int, x: Floats, belief: Belief) -> Belief:
         """Every particle has the state; what they have learned stays."""
         cloud, scale, largest = self._read(belief)
-        n, columns = len(x), self._count * self.trials
-        nothing = np.zeros((n * (n - 1) // 2, 1, columns)), np.zeros((n, 1, columns))
-        course = Course(np.ones((1, columns)), self._wide(x)[:, None, :], *nothing, *cloud.course[4:])
-        stored = self._stored(cloud._replace(course=course), scale, largest)
+        stored = self._stored(cloud._replace(course=cloud.course.knowing(self._wide(x))), scale, largest)
         return super().knowing(k, x, belief)._replace(memory=stored)
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
@@ -191,8 +182,7 @@ class LearningParticle(PacketReader):
         x_hat = self._mean(portion, means)
         away = means - self._wide(x_hat)
         P = self._mean(portion, within + away[:, None] * away[None])
-        if "A" not in self.known.names:
-            x_hat, P = bounded(x_hat, P, largest)
+        x_hat, P = self.in_proportion(x_hat, P, largest)
         return Belief(x_hat, P, action, self._stored(cloud, scale, largest))
 
     def _wide(self, values: NDArray[Any]) -> NDArray[Any]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from evedrop.kernels.elementary import exp
 from evedrop.model.integrity.policy import WatermarkPolicy
+from evedrop.model.numeric.shiryaev import probability_of_change
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags
 
@@ -51,9 +52,8 @@ class Parsimonious(WatermarkPolicy):
 
     def step(self, statistic: Floats, llr: Floats) -> Floats:
         """The posterior probability that an attack has begun (Shiryaev)."""
-        prior = statistic + (1.0 - statistic) * self._rate
-        attacked = prior * exp(np.minimum(np.maximum(llr, -_STEEPEST), _STEEPEST))
-        return np.where(self.alarms(statistic), statistic, attacked / (attacked + (1.0 - prior)))
+        ratio = exp(np.minimum(np.maximum(llr, -_STEEPEST), _STEEPEST))
+        return np.where(self.alarms(statistic), statistic, probability_of_change(statistic, self._rate, ratio, 1.0))
 
     def marks(self, statistic: Floats) -> Flags:
         """Between the thresholds."""

@@ -50,6 +50,12 @@ class Course(NamedTuple):
         """Σ_k as estimated."""
         return Factors(self.sigma_lower, self.sigma_diagonal)
 
+    def knowing(self, x: Floats) -> Course:
+        """The posterior once the slot's state x, (n, R), is known: one component, with covariance 0."""
+        n, trials = x.shape
+        none = np.zeros((n * (n - 1) // 2, 1, trials)), np.zeros((n, 1, trials))
+        return Course(np.ones((1, trials)), x[:, None, :], *none, *self[4:])
+
 
 class Advanced(NamedTuple):
     """A slot's result."""

@@ -1,4 +1,4 @@
-"""The Bayesian eavesdropper's posterior where every trial has its own A, Q, Σ and μ_d, and what it says of the last transition.
+"""The Bayesian eavesdropper's posterior of the state and of the last transition, where every trial has its own A, Q, Σ and μ_d.
 
 The formulas are those of `evedrop.kernels.posterior`, whose A and Q are the same in all trials.
 

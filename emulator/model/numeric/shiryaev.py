@@ -1,6 +1,6 @@
-"""Shiryaev's quickest detection of a rise in the loss rate of a link: the probability that it has already happened.
+"""Shiryaev's quickest detection: the probability that a change has already happened, such as a rise in a link's loss rate.
 
-Source: docs/mathematics.md, when noise begins.
+Source: docs/mathematics.md, when noise begins; integrity.
 """
 
 from __future__ import annotations
@@ -14,10 +14,21 @@ from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags
 
 
+def probability_of_change(p: Floats, hazard: float, changed: Floats, same: Floats | float) -> Floats:
+    """p⁻ = p + (1−p)κ, then p⁻ f₁ / (p⁻ f₁ + (1−p⁻) f₀): the probability that the change has happened, (R,), after a slot.
+
+    p: the same before the slot, (R,); hazard: κ; changed, same: f₁ and f₀, (R,), up to a common factor.
+    """
+    before = p + (1.0 - p) * hazard
+    after = before * changed
+    found: Floats = after / (after + (1.0 - before) * same)
+    return found
+
+
 @final
 @dataclass(frozen=True)
 class ShiryaevTest:
-    """p⁻ = p + (1−p)κ; p ← p⁻ f₁ / (p⁻ f₁ + (1−p⁻) f₀), with an alarm where 1 − p ≤ h.
+    """The test of a link's loss rate by `probability_of_change`, with an alarm where 1 − p ≤ h.
 
     f₁ and f₀ are the probabilities of what happened to the packet, with and without the change. Raises ValueError if the second
     rate is not above the first, or if a number is not between 0 and 1.
@@ -47,11 +58,8 @@ class ShiryaevTest:
 
     def step(self, p: Floats, lost: Flags) -> Floats:
         """P after a slot, (R,)."""
-        before = p + (1.0 - p) * self.hazard
-        changed = before * np.where(lost, self.raised, 1.0 - self.raised)
-        same = (1.0 - before) * np.where(lost, self.normal, 1.0 - self.normal)
-        found: Floats = changed / (changed + same)
-        return found
+        changed = np.where(lost, self.raised, 1.0 - self.raised)
+        return probability_of_change(p, self.hazard, changed, np.where(lost, self.normal, 1.0 - self.normal))
 
     def alarms(self, p: Floats) -> Flags:
         """Whether the alarm is raised, (R,)."""

@@ -59,7 +59,7 @@ class NoiseEstimator(PacketUser):
 
 @final
 class NoiseShared(Shared):
-    """The schedule, of which both sides have the key, and the noise, which the sensor alone draws."""
+    """The schedule, whose key both sides have, and the noise, which only the sensor draws."""
 
     def __init__(self, scheme: Noise, keys: Mapping[str, bytes], batch: Batch) -> None:
         self._scheme, self._keys, self._batch = scheme, keys, batch

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
 from typing import Annotated, Self
 
 from pydantic import Field
 
 from evedrop.scenario.events.effects import Jamming
-from evedrop.scenario.events.event import Act, EventKind, Surroundings
+from evedrop.scenario.events.event import Act, EventKind, Surroundings, begun_too_early
 from evedrop.scenario.table import Found
 from evedrop.scenario.words import as_toml
 
@@ -45,7 +44,4 @@ class Jam(EventKind):
     @classmethod
     def in_turn(cls, events: Sequence[tuple[int, Self]]) -> Iterator[str]:
         """Mistakes where an attack begins before the previous one has ended."""
-        jams = sorted(((event.first, event.to, i) for i, event in events), key=lambda one: one[0])
-        for (_, to, _), (first, _, i) in pairwise(jams):
-            if to is None or to > first:
-                yield f"event.{i}.jam: begins in slot {first}, while another one lasts; expected that one to end first"
+        yield from begun_too_early(events)

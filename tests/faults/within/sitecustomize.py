@@ -46,7 +46,7 @@ if FOLDER and sys.orig_argv[1:4] == ["-m", "evedrop", "run"]:
 
         module.Brief.write = write
 
-    _CHANGES = {"evedrop.cli.report": _telling, "evedrop.live.protocol.brief": _wired}
+    _CHANGES = {"evedrop.cli.progress_line": _telling, "evedrop.live.protocol.brief": _wired}
 
     class _Finder:
         """Finds the modules that are to be changed, and changes them when they have been run."""

@@ -15,31 +15,12 @@ import pytest
 from evedrop.errors import BriefError
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.launch.ports import places_at
-from evedrop.live.protocol.brief import AnyBrief, Brief, Flow, Model, has_part, read_brief
+from evedrop.live.protocol.brief import has_part, read_brief
 from evedrop.live.protocol.brief_parts import EavesdropperPart, ObserverPart, RouterPart, SensorPart
-from evedrop.live.protocol.brief_use import expect_usable
-from evedrop.loading import load
-from evedrop.scenario import Scenario
 from evedrop.scenario.stream_keys import StreamKeys
 from tests.conftest import Evedrop
+from tests.live.protocol.made_briefs import BRIEF, BRIEFS, made, refusal, scenario_of
 
-BRIEF = Brief(
-    run="r01",
-    process="eve",
-    role="eavesdropper",
-    router="tcp/127.0.0.1:17460",
-    user="eve",
-    password="p",  # noqa: S106 - an example
-    slots=10,
-    trials=3,
-    first_trial=5,
-    recorded=1,
-    flow=Flow(8, 2),
-    model=Model([[1.0, 0.1], [0.0, 1.0]], [[1e-3, 0.0], [0.0, 1e-3]], [[1.0, 0.0], [0.0, 1.0]], 0.5),
-    keys={"schedule": "ab" * 32},
-    part=EavesdropperPart("smart", {}, 0, []),
-    ends_with_stdin=False,
-)
 PLAIN: dict[str, Any] = json.loads(BRIEF.text)
 
 
@@ -131,33 +112,6 @@ def test_refuses_what_is_not_there(tmp_path: Path) -> None:
     path.chmod(0o600)
     with pytest.raises(BriefError, match="is not a brief of this version"):
         read_brief(path)
-
-
-def scenario_of(seed: int = 3, **changes: Any) -> Scenario:
-    """A scenario with one eavesdropper of each strategy."""
-    link = {"link": {"quality": 0.8}}
-    suspicious = {"strategy": "suspicious", "use_state": 0.9, "use_innovation": 0.1, **link}
-    table: dict[str, Any] = {
-        "title": "Briefs",
-        "slots": 50,
-        "seed": seed,
-        "process": asdict(BRIEF.model),
-        "encoding": {"scheme": "innovation", "state_probability": 0.5},
-        "legitimate": link,
-        "eavesdroppers": {
-            "naive": {"strategy": "naive", **link},
-            "smart": {"strategy": "smart", **link},
-            "doubtful": suspicious,
-        },
-    }
-    for entry in ("state_probability", "state_probabilities", "header"):
-        del table["process"][entry]
-    return Scenario.model_validate({**table, **changes})
-
-
-def made(scenario: Scenario) -> dict[str, AnyBrief]:
-    """The briefs of a scenario."""
-    return briefs_of(scenario, "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False))
 
 
 def test_who_is_given_which_keys() -> None:
@@ -316,23 +270,6 @@ WITHIN = (
     "model.Q",
 )
 """Tables with entries of the scenario, which their readers check, and matrices."""
-_NONE: dict[str, Any] = {}
-_AS_THEY_ARE = ("eavesdroppers", "acknowledged", "microgrid", "twin-track", "colluding", "restart", "noise-before")
-KINDS = {
-    **dict.fromkeys(_AS_THEY_ARE, _NONE),
-    "replay-attack": {"integrity.attack": {"model": "replace", "matrix": [[0.8]]}},
-}
-"""Scenarios → what is changed in them."""
-
-
-def every_brief() -> dict[str, dict[str, Any]]:
-    """Briefs of scenarios of many kinds, as JSON, by scenario and process."""
-    found = {}
-    for name, changes in KINDS.items():
-        scenario = load(name, {"slots": 8, "trials": 2, "record_trials": 1, "expect": [], "event": [], **changes})
-        for process, brief in made(scenario).items():
-            found[f"{name}/{process}"] = json.loads(brief.text)
-    return found
 
 
 def entries(table: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any], str]]:
@@ -342,21 +279,6 @@ def entries(table: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any], s
             yield f"{path}{name}", table, name
             if f"{path}{name}" not in WITHIN:
                 yield from entries(inner, f"{path}{name}.")
-
-
-def refusal(found: dict[str, Any], folder: Path) -> str | None:
-    """What is said of a brief; None if it can be used."""
-    path = folder / "brief.json"
-    path.write_text(json.dumps(found))
-    path.chmod(0o600)
-    try:
-        expect_usable(read_brief(path))
-    except BriefError as error:
-        return str(error)
-    return None
-
-
-BRIEFS = every_brief()
 
 
 @pytest.mark.parametrize("name", BRIEFS)

@@ -15,7 +15,7 @@ from evedrop.errors import MalformedMessage
 from evedrop.live.protocol.keys import RunKeys, reader_of, writer_of
 from evedrop.live.protocol.message_limits import low_pass
 from tests.live.network.readers import EXAMPLES, READERS, TRIALS, fields_of
-from tests.live.protocol.test_brief import BRIEFS, refusal
+from tests.live.protocol.made_briefs import BRIEFS, refusal
 
 
 def u4(*counts: int) -> bytes:

@@ -1,0 +1,126 @@
+"""The progress line of runs and studies, on standard error."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import suppress
+from io import StringIO
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, TextIO, cast, final
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TaskID,
+    TextColumn,
+    TimeRemainingColumn,
+)
+
+from evedrop.kernels.choice import fallback_warning
+from evedrop.news import ConnectionOutage, FolderMoved, Held, News, RunEnded, RunProgress, Started, ViewOpened
+
+_BAR_WIDTH = 120  # the least width of a terminal, in columns, that has room for a bar
+
+
+class _Unfailing:
+    """A stream that ignores write errors: the terminal may be closed while the run is being ended in order."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        with suppress(OSError):
+            return self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with suppress(OSError):
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def _unfailing(stream: TextIO | None) -> TextIO:
+    return cast(TextIO, _Unfailing(StringIO() if stream is None else stream))  # a shell may have closed it
+
+
+@final
+class ProgressLine:
+    """Shows the news of a run on standard error; a context manager. total: progress at the end, counted in `unit`s."""
+
+    def __init__(self, total: int, unit: str, quiet: bool = False) -> None:
+        self.console = Console(file=_unfailing(sys.stderr), highlight=False, markup=False)
+        self._quiet = quiet
+        self._total = total
+        self.moved: Path | None = None
+        """The results folder, if it was renamed."""
+        self._progress = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            *([BarColumn(bar_width=24)] if self.console.width >= _BAR_WIDTH else []),
+            MofNCompleteColumn(),
+            TextColumn(f"{unit} · {{task.fields[rate]}}"),
+            TimeRemainingColumn(compact=True),
+            TextColumn("{task.fields[errors]}"),
+            console=self.console,
+            transient=True,
+            disable=quiet or not self.console.is_terminal,
+        )
+        self._task: TaskID = self._progress.add_task("starting", total=total, rate="", errors="")
+
+    def __enter__(self) -> Self:
+        if (warning := fallback_warning()) is not None:
+            self.console.print(f"warning: {warning}", soft_wrap=True)
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._progress.stop()
+
+    def tell(self, news: News) -> None:
+        """Show one item of news."""
+        match news:
+            case Started():
+                self._progress.update(self._task, description="running")
+            case Held():
+                self._progress.update(
+                    self._task, description=f"held before slot {news.before}", completed=news.before, rate=""
+                )
+            case RunProgress():
+                self._progress.update(
+                    self._task,
+                    description="running",
+                    total=self._total if news.total is None else news.total,
+                    completed=news.done,
+                    rate=f"{news.rate:,.0f} {news.rate_unit}",
+                    errors="  ".join(f"{name} {error:.2g}" for name, error in news.squared_errors.items()),
+                )
+            case ViewOpened() if not self._quiet:
+                if news.address:
+                    self._print(f"live view, open to anybody who has this address: {news.address}")
+                if news.warning:
+                    self._print(f"warning: {news.warning}")
+            case ConnectionOutage() if not self._quiet:
+                self._print(outage_line(news))
+            case FolderMoved():
+                self.moved = Path(news.folder)
+                self._print(f"the results folder was renamed while the run went on; it is {self.moved}")
+            case RunEnded() if news.view:
+                self._print(f"the view stopped early: {news.view}")
+
+    def _print(self, line: str) -> None:
+        self.console.print(line, soft_wrap=True)
+
+
+def outage_line(outage: ConnectionOutage) -> str:
+    """An outage as a sentence."""
+    went = "the run did not go on" if outage.until is None else f"the run went on after {outage.seconds:.1f} s"
+    where = "" if outage.shard is None else f" of shard {outage.shard}"
+    return f"{outage.process}{where} cut off at slot {outage.slot}; {went}"

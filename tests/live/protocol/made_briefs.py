@@ -1,0 +1,95 @@
+"""Briefs of scenarios of many kinds, and what their reader says of them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from evedrop.errors import BriefError
+from evedrop.live.launch.briefs import ObserverTask, briefs_of
+from evedrop.live.protocol.brief import AnyBrief, Brief, Flow, Model, read_brief
+from evedrop.live.protocol.brief_parts import EavesdropperPart
+from evedrop.live.protocol.brief_use import expect_usable
+from evedrop.loading import load
+from evedrop.scenario import Scenario
+
+BRIEF = Brief(
+    run="r01",
+    process="eve",
+    role="eavesdropper",
+    router="tcp/127.0.0.1:17460",
+    user="eve",
+    password="p",  # noqa: S106 - an example
+    slots=10,
+    trials=3,
+    first_trial=5,
+    recorded=1,
+    flow=Flow(8, 2),
+    model=Model([[1.0, 0.1], [0.0, 1.0]], [[1e-3, 0.0], [0.0, 1e-3]], [[1.0, 0.0], [0.0, 1.0]], 0.5),
+    keys={"schedule": "ab" * 32},
+    part=EavesdropperPart("smart", {}, 0, []),
+    ends_with_stdin=False,
+)
+
+
+def scenario_of(seed: int = 3, **changes: Any) -> Scenario:
+    """A scenario with one eavesdropper of each strategy."""
+    link = {"link": {"quality": 0.8}}
+    suspicious = {"strategy": "suspicious", "use_state": 0.9, "use_innovation": 0.1, **link}
+    table: dict[str, Any] = {
+        "title": "Briefs",
+        "slots": 50,
+        "seed": seed,
+        "process": asdict(BRIEF.model),
+        "encoding": {"scheme": "innovation", "state_probability": 0.5},
+        "legitimate": link,
+        "eavesdroppers": {
+            "naive": {"strategy": "naive", **link},
+            "smart": {"strategy": "smart", **link},
+            "doubtful": suspicious,
+        },
+    }
+    for entry in ("state_probability", "state_probabilities", "header"):
+        del table["process"][entry]
+    return Scenario.model_validate({**table, **changes})
+
+
+def made(scenario: Scenario) -> dict[str, AnyBrief]:
+    """The briefs of a scenario."""
+    return briefs_of(scenario, "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False))
+
+
+_NONE: dict[str, Any] = {}
+_AS_THEY_ARE = ("eavesdroppers", "acknowledged", "microgrid", "twin-track", "colluding", "restart", "noise-before")
+KINDS = {
+    **dict.fromkeys(_AS_THEY_ARE, _NONE),
+    "replay-attack": {"integrity.attack": {"model": "replace", "matrix": [[0.8]]}},
+}
+"""Scenarios → what is changed in them."""
+
+
+def every_brief() -> dict[str, dict[str, Any]]:
+    """Briefs of scenarios of many kinds, as JSON, by scenario and process."""
+    found = {}
+    for name, changes in KINDS.items():
+        scenario = load(name, {"slots": 8, "trials": 2, "record_trials": 1, "expect": [], "event": [], **changes})
+        for process, brief in made(scenario).items():
+            found[f"{name}/{process}"] = json.loads(brief.text)
+    return found
+
+
+def refusal(found: dict[str, Any], folder: Path) -> str | None:
+    """What is said of a brief; None if it can be used."""
+    path = folder / "brief.json"
+    path.write_text(json.dumps(found))
+    path.chmod(0o600)
+    try:
+        expect_usable(read_brief(path))
+    except BriefError as error:
+        return str(error)
+    return None
+
+
+BRIEFS = every_brief()
