@@ -114,8 +114,7 @@ def application_mistakes(tables: ValidTables) -> Iterator[str]:
     """Applications without plant or controller, names that plant and process lack, and eavesdroppers of the same name."""
     for name, application in tables.applications.items():
         if not {"plant", "controller"} <= {*tables.given}:
-            described = "which it describes; expected both, or no such table"
-            yield f"{name}: is given without a [plant] and a [controller], {described}"
+            yield f"{name}: is given without a [plant] and a [controller]; expected both, or no table [{name}]"
         elif name in tables.application_tables:
             yield from _named_mistakes(name, application, tables.application_tables[name], tables)
         if name in tables.receivers[1:]:
