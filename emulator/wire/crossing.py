@@ -1,0 +1,73 @@
+"""What becomes of a message on a wire, and its record: one row for each message and link, made when its fate is known.
+
+Source: docs/wire.md, the journal.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+
+from evedrop.model.links.link import Fate
+
+
+class Crossing(IntEnum):
+    """The outcome of a message on a link. Up to `CUT` as `Fate`; the rest is not emulated but happens to the wire itself."""
+
+    DELIVERED = Fate.DELIVERED
+    """Given to Zenoh on the other side."""
+    LOST = Fate.LOST
+    """Erased by the link's loss model."""
+    CORRUPTED = Fate.CORRUPTED
+    """Damaged on the way, as a checksum would show."""
+    OVERFLOW = Fate.OVERFLOW
+    """The emulated queue before a link of limited rate was full."""
+    CUT = Fate.CUT
+    """The link was cut, or its sides were partitioned."""
+    UNLINKED = 16
+    """No link of the file takes its key between these sides."""
+    TOO_LARGE = 17
+    """Larger than `WirePlan.largest`."""
+    HELD_UP = 18
+    """The wire already held as many delayed messages as it may."""
+    LOOPED = 19
+    """A program is connected to both sides, so the message would go round."""
+    UNDERWAY = 20
+    """Still delayed when the wire ended."""
+    REFUSED = 21
+    """Zenoh raised an error when the message was put on the other side."""
+
+    @property
+    def emulated(self) -> bool:
+        """Whether a link's settings decide this outcome."""
+        return self <= Crossing.CUT
+
+
+class Kind(IntEnum):
+    """What a message is."""
+
+    PUT = 0
+    DELETE = 1
+    QUERY = 2
+    REPLY = 3
+
+
+UNLINKED = 2**16 - 1
+"""The code of a link in the record of a message that no link takes."""
+
+RECORD = np.dtype(
+    [
+        ("time", "<f8"),  # seconds since 1970, when the wire heard it
+        ("n", "<i8"),  # its number among the messages of its key and kind on its link, from 0
+        ("sequence", "<i8"),  # its sender's own number for it; -1 if it has none
+        ("delay", "<f8"),  # seconds that the link holds it back, its queue included
+        ("key", "<u4"),  # code of the key
+        ("source", "<u4"),  # code of the sender; 0 if it is not known
+        ("size", "<u4"),  # bytes of payload and attachment
+        ("link", "<u2"),  # code of the link
+        ("kind", "u1"),  # `Kind`
+        ("fate", "u1"),  # `Crossing`
+    ]
+)
+"""A row of the journal while the wire runs, 48 bytes; codes of keys and sources are kept beside it."""

@@ -1,0 +1,118 @@
+"""What a wire file describes: sides, links between them, events. Made by `evedrop.wire.file` and read by everything else.
+
+Source: docs/wire.md, the file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import zenoh
+
+
+@dataclass(frozen=True)
+class SideTls:
+    """The certificates of a side, as paths of PEM files."""
+
+    certificate: str
+    key: str
+    authority: str | None = None
+    """The authority whose clients may connect; None: a client needs no certificate."""
+
+
+@dataclass(frozen=True)
+class Side:
+    """A place at which programs connect: a Zenoh router session of the wire."""
+
+    name: str
+    listen: tuple[str, ...] = ()
+    """Zenoh endpoints; port 0 lets the system choose."""
+    connect: tuple[str, ...] = ()
+    """Endpoints of routers that are there already."""
+    tls: SideTls | None = None
+    users: Mapping[str, str] | None = None
+    """User → password of those who may connect; None: everybody may."""
+    keys: tuple[str, ...] = ("**",)
+    """The key expressions that programs on this side may use; all others are refused by access control."""
+
+
+@dataclass(frozen=True)
+class WireLink:
+    """One direction between two sides, for some keys."""
+
+    name: str
+    number: int
+    """Its place among the links of the file, from 0: its code in the journal."""
+    source: str
+    """The side whose messages it carries."""
+    target: str
+    """The side that gets them."""
+    keys: str
+    """A Zenoh key expression. The first link of the file that has source, target and key takes a message."""
+    settings: Mapping[str, Any]
+    """As `evedrop.model.slot.link.LinkSchedule.settings`, with a message of a key as a slot, delays in seconds,
+    `rate` in bytes per second and `queue` in bytes."""
+    tap: bool = False
+    """Whether it only copies publications, and carries no queries."""
+    correlation: tuple[str, float] | None = None
+    """The name of the link whose losses these are tied to, and how strongly."""
+
+    @cached_property
+    def expression(self) -> zenoh.KeyExpr:
+        """The key expression, for `includes` and `intersects`."""
+        return zenoh.KeyExpr(self.keys)
+
+    def takes(self, key: zenoh.KeyExpr) -> bool:
+        """Whether a message with this key, which may contain wildcards, is one of this link's."""
+        return self.expression.intersects(key)
+
+
+@dataclass(frozen=True)
+class WireEvent:
+    """Something that happens at a time, or from one time to another."""
+
+    start: float
+    """Seconds after the start of the wire."""
+    stop: float | None
+    """None: it lasts."""
+    partition: tuple[str, str] | None = None
+    """Two sides between which nothing passes but liveliness and what is lossless."""
+    cut: str | None = None
+    """The name of a link that is cut."""
+    link: str | None = None
+    """The name of a link whose settings change to `settings`."""
+    settings: Mapping[str, Any] | None = None
+    note: str | None = None
+
+
+@dataclass(frozen=True)
+class WirePlan:
+    """A wire."""
+
+    seed: int
+    sides: Mapping[str, Side]
+    links: tuple[WireLink, ...]
+    events: tuple[WireEvent, ...] = ()
+    lossless: tuple[str, ...] = ()
+    """Key expressions of messages that no link loses, delays or holds up."""
+    largest: int = 2**30
+    """Bytes of the largest message."""
+    query_seconds: float = 10.0
+    """For how long a query waits for replies from the other sides."""
+    held_messages: int = 100_000
+    """The most messages that wait for their delay to be over, on all links together."""
+    held_bytes: int = 2**30
+    """Their most bytes."""
+    expectations: tuple[Mapping[str, Any], ...] = ()
+
+    def link_of(self, source: str, target: str, key: zenoh.KeyExpr) -> WireLink | None:
+        """The first link that takes the messages of a key from one side to another; None if there is none."""
+        links = (link for link in self.links if (link.source, link.target) == (source, target))
+        return next((link for link in links if link.takes(key)), None)
+
+    def is_lossless(self, key: zenoh.KeyExpr) -> bool:
+        """Whether messages with this key are never lost."""
+        return any(zenoh.KeyExpr(one).includes(key) for one in self.lossless)
