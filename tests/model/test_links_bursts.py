@@ -261,3 +261,15 @@ def test_states_that_are_never_come_back_to_are_no_part_of_the_chain() -> None:
     assert chain is not None
     assert chain.independent
     assert chain.quality.tolist() == [0.8]
+
+
+@pytest.mark.parametrize("spec", [BURSTS, SOFT, FOUR_STATES])
+def test_a_trial_alone(spec: dict[str, Any]) -> None:
+    """A trial has the same losses alone, where a loop over numbers is quicker, as among others; also in pieces."""
+    loss = loss_of(spec)
+    u = drawn(700, range(5), loss.uniforms_per_slot).transpose(0, 2, 1)
+    together = loss.fates(0, u)
+    for trial in range(5):
+        alone, one = loss_of(spec), u[:, :, trial : trial + 1]
+        pieces = [alone.fates(start, one[start:stop]) for start, stop in ((0, 1), (1, 300), (300, 301), (301, 700))]
+        assert np.array_equal(np.concatenate(pieces)[:, 0], together[:, trial])

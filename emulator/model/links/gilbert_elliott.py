@@ -73,10 +73,23 @@ class GilbertElliott(LossModel):
             states[0] = u[0] < self._stationary_bad
         else:
             states[0] ^= self._state & differs[0]
-        before = states[0]
-        for after, differ in zip(states[1:], differs[1:], strict=True):
-            np.bitwise_and(differ, before, out=differ)
-            np.bitwise_xor(after, differ, out=after)
-            before = after
+        if states.shape[1] == 1:
+            states[:, 0] = _in_turn(states[:, 0].tolist(), differs[:, 0].tolist())
+        else:
+            before = states[0]
+            for after, differ in zip(states[1:], differs[1:], strict=True):
+                np.bitwise_and(differ, before, out=differ)
+                np.bitwise_xor(after, differ, out=after)
+                before = after
         self._state = states[-1].copy()
         return states
+
+
+def _in_turn(states: list[bool], differs: list[bool]) -> list[bool]:
+    """The same loop for a single trial, for which numpy's calls would take ten times as long."""
+    found = states[:1]
+    before = states[0]
+    for after, differ in zip(states[1:], differs[1:], strict=True):
+        before = after != (differ and before)
+        found.append(before)
+    return found

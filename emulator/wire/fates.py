@@ -1,0 +1,120 @@
+"""The fates of the messages of a key on a link: seed, link, kind, key and n determine the fate of the n-th message.
+
+A link of a scenario decides the fate of a packet in each slot. Here the n-th message of a key is slot n, and a slot lasts a
+second, so that every model of losses and delays is used unchanged. What depends on time is not in here: the queue of a link
+of limited rate, cuts and partitions.
+
+Source: docs/wire.md, the same traffic, the same losses.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable, Mapping
+from itertools import repeat
+from typing import Any, final
+
+from evedrop.model.slot.link import NEVER, Change, Fates, Link, LinkSchedule, streams_of
+from evedrop.streams import Batch, root_of_seed, stream_key
+from evedrop.wire.plan import WireLink
+
+MessageFate = tuple[int, float, bool]
+"""`Crossing` code, delay in seconds, and whether a second copy arrives with the first."""
+_FIRST_BLOCK, _LARGEST_BLOCK = 32, 1024  # fates made at once: a key with few messages needs little memory
+_PASSED_AT_ONCE = 65_536
+_LATEST = 2**32 - 1  # seconds: more than the longest delay, so that no message is too late
+_BY_TIME = frozenset({"rate", "queue"})
+_PROMPT = tuple((code, 0.0, False) for code in range(256))  # shared by all messages without delay and copy
+
+
+@final
+class KeyFates:
+    """The fates of one key's messages of one kind on one link, in order.
+
+    kind: `put` (deletes are puts), `query` or `reply`; start: the number of the first message to decide; changes: earlier
+    changes of the settings, each at the number of the first message that had them.
+
+    Threads may call its methods at the same time: no fate is given twice.
+    """
+
+    def __init__(
+        self, link: WireLink, key: str, kind: str, seed: int, start: int = 0, changes: Iterable[Change] = ()
+    ) -> None:
+        # Of several changes at one message the last one counts, as with `change`.
+        last = {change.at: change for change in sorted(changes, key=lambda one: one.at)}
+        made = tuple(Change(at, None if one.settings is None else _timeless(one.settings)) for at, one in last.items())
+        schedule = LinkSchedule(_timeless(link.settings), _LATEST, made, correlation=link.correlation)
+        root = root_of_seed(seed)
+        keys = {name: stream_key(root, f"wire/{name}/{kind}/{key}") for name in streams_of(link.name, schedule)}
+        self._link = Link(schedule, link.name, keys, Batch(NEVER, 1))
+        self._lock = threading.Lock()
+        self._start = self._stop = start  # `_stop`: the end of the fates in `_ready`
+        self._block = 0
+        self._ready: list[MessageFate] = []  # the next fates, the last one first
+
+    def next(self) -> MessageFate:
+        """The fate of the next message."""
+        while True:
+            try:
+                return self._ready.pop()
+            except IndexError:
+                self._refill()
+
+    @property
+    def n(self) -> int:
+        """The number of the next message."""
+        with self._lock:
+            return self._stop - len(self._ready)
+
+    def change(self, settings: Mapping[str, Any]) -> int:
+        """Give the link other settings, as in `WireLink.settings`. Returns the number of the first message that has them."""
+        with self._lock:
+            left = self._emptied()
+            if left == 0:
+                left = len(self._planned())
+            at = self._stop - left
+            self._ready.extend(_rows(self._link.amended(at, [Change(at, _timeless(settings))])))
+        return at
+
+    def _refill(self) -> None:
+        with self._lock:
+            if not self._ready:
+                self._ready.extend(self._planned())
+
+    def _emptied(self) -> int:
+        """Discard the fates that are ready, and count them; another thread may take some of them at the same time."""
+        count = 0
+        while True:
+            try:
+                self._ready.pop()
+            except IndexError:
+                return count
+            count += 1
+
+    def _planned(self) -> list[MessageFate]:
+        """The fates of the next block, the last one first."""
+        if self._block == 0:
+            # The memory of a loss model is that of all messages before.
+            for first in range(0, self._start, _PASSED_AT_ONCE):
+                self._link.fates(range(first, min(first + _PASSED_AT_ONCE, self._start)))
+        self._block = min(2 * self._block or _FIRST_BLOCK, _LARGEST_BLOCK)
+        slots = range(self._stop, self._stop + self._block)
+        self._stop = slots.stop
+        return _rows(self._link.planned(slots))
+
+
+def _timeless(settings: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The settings without those whose effect depends on time."""
+    return {name: value for name, value in settings.items() if name not in _BY_TIME}
+
+
+def _rows(fates: Fates) -> list[MessageFate]:
+    """The fates of consecutive messages, the last one first."""
+    codes = fates.codes[::-1, 0].tolist()
+    if fates.delays is None and fates.again is None:
+        return [_PROMPT[code] for code in codes]
+    delays: Iterable[float] = repeat(0.0)
+    if fates.delays is not None and fates.rests is not None:
+        delays = (fates.delays[::-1, 0] + fates.rests[::-1]).tolist()
+    again = repeat(False) if fates.again is None else fates.again[::-1, 0].tolist()
+    return list(zip(codes, delays, again, strict=False))
