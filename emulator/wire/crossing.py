@@ -52,6 +52,14 @@ class Kind(IntEnum):
     QUERY = 2
     REPLY = 3
 
+    @property
+    def stream(self) -> str:
+        """The kind of messages with which it shares its numbers and random streams: a delete is numbered as a put."""
+        return "put" if self is Kind.DELETE else self.name.lower()
+
+
+AGAIN = 0x80
+"""Added to the kind in the record of a message that was delivered twice."""
 
 UNLINKED = 2**16 - 1
 """The code of a link in the record of a message that no link takes."""
@@ -59,14 +67,17 @@ UNLINKED = 2**16 - 1
 RECORD = np.dtype(
     [
         ("time", "<f8"),  # seconds since 1970, when the wire heard it
-        ("n", "<i8"),  # its number among the messages of its key and kind on its link, from 0
+        (
+            "n",
+            "<i8",
+        ),  # its number among the messages of its key and kind on its link, from 0; -1 if no model decides on it
         ("sequence", "<i8"),  # its sender's own number for it; -1 if it has none
         ("delay", "<f8"),  # seconds that the link holds it back, its queue included
         ("key", "<u4"),  # code of the key
         ("source", "<u4"),  # code of the sender; 0 if it is not known
         ("size", "<u4"),  # bytes of payload and attachment
         ("link", "<u2"),  # code of the link
-        ("kind", "u1"),  # `Kind`
+        ("kind", "u1"),  # `Kind`, with `AGAIN`
         ("fate", "u1"),  # `Crossing`
     ]
 )

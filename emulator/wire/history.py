@@ -1,0 +1,133 @@
+"""The history of a wire's folder: its starts, the settings of its links and their changes, and how many messages it numbered.
+
+A wire that starts again in the same folder goes on from here, so that the n-th message of a key has the same fate whether or
+not the wire was ended or killed between.
+
+Source: docs/wire.md, a wire that starts again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, final
+
+from evedrop.errors import UsageError
+from evedrop.model.slot.link import Change
+from evedrop.wire.plan import WirePlan
+
+Numbered = tuple[str, str, str]
+"""Link, key, and kind of stream: what has numbers of its own."""
+_FILE = "history.jsonl"
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of a link, and from which message of each stream on they were in force: from the first on if not stated."""
+
+    settings: Mapping[str, Any]
+    since: Mapping[tuple[str, str], int]
+
+
+@final
+@dataclass
+class WireHistory:
+    """What was written so far in the file `history.jsonl` of a journal's folder, and its continuation."""
+
+    folder: Path
+    start: int = 0
+    """The number of the latest start, from 1."""
+    ended: bool = True
+    """Whether the latest start ended, and was not killed."""
+    counts: dict[Numbered, int] = field(default_factory=dict)
+    """How many messages each stream had numbered at the end of the latest start that ended."""
+    links: dict[int, list[str]] = field(default_factory=dict)
+    """Start → the names of its links, in the order of their codes."""
+    _seed: int | None = None
+    _settings: dict[str, list[_Settings]] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, folder: Path) -> WireHistory:
+        """Read the history of a journal's folder; an empty one if there is none. Raises UsageError if it is damaged."""
+        history = cls(folder)
+        path = folder / _FILE
+        try:
+            lines = path.read_bytes().split(b"\n")[:-1]  # the last line may be torn
+        except FileNotFoundError:
+            return history
+        except OSError as error:
+            raise UsageError(f"{path} cannot be read ({error.strerror}); give another --out") from error
+        for at, line in enumerate(lines, start=1):
+            try:
+                history._take(json.loads(line))
+            except (ValueError, TypeError, KeyError, AttributeError) as error:
+                raise UsageError(f"{path}, line {at}, is not the history of a wire; give another --out") from error
+        return history
+
+    def begin(self, plan: WirePlan, now: float) -> None:
+        """Begin the next start. Raises UsageError if an earlier one had another seed, and OSError if the disk is full."""
+        if self._seed not in {None, plan.seed}:
+            raise UsageError(
+                f"the wire of {self.folder.parent} had the seed {self._seed}, and this one has {plan.seed}: its fates would not "
+                "go on; give the same seed, or another --out"
+            )
+        links = {link.name: dict(link.settings) for link in plan.links}
+        self._write({"start": self.start + 1, "time": now, "seed": plan.seed, "links": links})
+
+    def change(self, link: str, settings: Mapping[str, Any], since: Mapping[tuple[str, str], int], now: float) -> None:
+        """Note other settings of a link. since: (key, kind of stream) → the first number that has them. Raises OSError."""
+        rows = [[*stream, n] for stream, n in since.items()]
+        self._write({"change": link, "time": now, "settings": dict(settings), "since": rows})
+
+    def end(self, counts: Mapping[Numbered, int], now: float, missing: int = 0) -> None:
+        """End the latest start. missing: the number of rows for which the disk had no room. Raises OSError."""
+        self._write(
+            {"end": self.start, "time": now, "counts": [[*one, n] for one, n in counts.items()], "missing": missing}
+        )
+
+    def changes_of(self, link: str, key: str, kind: str) -> tuple[Change, ...]:
+        """The settings of a stream's messages: the first from message 0 on, then the changes. For `KeyFates`."""
+        found: dict[int, Mapping[str, Any]] = {}
+        for one in self._settings.get(link, []):
+            found[one.since.get((key, kind), 0)] = one.settings
+        return tuple(Change(at, settings) for at, settings in sorted(found.items()))
+
+    def _write(self, entry: Mapping[str, Any]) -> None:
+        line = json.dumps(entry).encode() + b"\n"
+        path = self.folder / _FILE
+        with os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600), "r+b", buffering=0) as file:
+            whole = file.readall().rfind(b"\n") + 1
+            file.truncate(whole)  # a line that was torn must not begin this one
+            if file.write(line) != len(line):
+                file.truncate(whole)
+                raise OSError(28, os.strerror(28), str(path))  # ENOSPC: only a full disk accepts part of a line
+        self._take(json.loads(line))
+
+    def _take(self, entry: Mapping[str, Any]) -> None:
+        if "start" in entry:
+            self.start, self.ended, self._seed = int(entry["start"]), False, int(entry["seed"])
+            self.links[self.start] = list(entry["links"])
+            for name, settings in entry["links"].items():
+                self._add(name, settings, {})
+        elif "change" in entry:
+            self._add(
+                entry["change"], entry["settings"], {(str(k), str(kind)): int(n) for k, kind, n in entry["since"]}
+            )
+        elif int(entry["end"]) == self.start:
+            self.ended = True
+            self.counts = {(str(link), str(key), str(kind)): int(n) for link, key, kind, n in entry["counts"]}
+
+    def _add(self, link: str, settings: Mapping[str, Any], since: Mapping[tuple[str, str], int]) -> None:
+        """Settings come into force; those of a start, at the present counts of all streams."""
+        known = self._settings.setdefault(link, [])
+        counted = {(key, kind): n for (name, key, kind), n in self.counts.items() if name == link}
+        if not known or known[-1].settings != settings:
+            known.append(_Settings(settings, {**counted, **since}))
+
+
+def highest(counts: dict[Numbered, int], stream: Numbered, n: int) -> None:
+    """Raise the count of a stream to n, in place."""
+    counts[stream] = max(counts.get(stream, 0), n)

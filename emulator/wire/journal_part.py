@@ -1,0 +1,221 @@
+"""A part of a wire's journal: a file of records that is written in memory, and the Parquet file made from it.
+
+The file is mapped into memory, so its records survive the end of the process at any instruction. Its place on the disk is taken
+when it is made, so a full disk cannot end the process later. The last byte of a record, which is written last, is its fate + 1:
+a record whose last byte is 0 is not whole.
+
+Source: docs/wire.md, the journal.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import mmap
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from evedrop.results.folder import private_opener
+from evedrop.wire.crossing import AGAIN, RECORD, UNLINKED, Crossing, Kind
+
+Records = NDArray[Any]
+"""Structured, of the type `RECORD`."""
+STORED = 1
+"""Added to fates in memory and in files of records."""
+_POPULATE = getattr(mmap, "MAP_POPULATE", 0)
+
+REASONS: dict[Crossing, str] = {
+    one: "loss" if one is Crossing.LOST else one.name.lower() for one in Crossing if one is not Crossing.DELIVERED
+}
+"""The reason for each fate, as it is called in tables."""
+_WORDS = ("delivered", "lost", "dropped")
+
+
+def word_of(fate: Crossing) -> str:
+    """`delivered`, `lost` by the emulated link, or `dropped` by the wire itself."""
+    return _WORDS[0] if fate is Crossing.DELIVERED else _WORDS[1] if fate.emulated else _WORDS[2]
+
+
+_WORD_CODES = np.zeros(256, np.int8)
+_REASON_CODES = np.zeros(256, np.int8)
+for _at, _fate in enumerate(REASONS):
+    _WORD_CODES[_fate], _REASON_CODES[_fate] = _WORDS.index(word_of(_fate)), _at
+_KINDS = tuple(one.name.lower() for one in Kind)
+
+PARQUET = pa.schema(
+    [
+        ("time", pa.float64()),
+        ("link", pa.dictionary(pa.int32(), pa.string())),
+        ("key", pa.dictionary(pa.int32(), pa.string())),
+        ("size", pa.int64()),
+        ("source", pa.dictionary(pa.int32(), pa.string())),
+        ("sequence", pa.int64()),
+        ("fate", pa.dictionary(pa.int8(), pa.string())),
+        ("reason", pa.dictionary(pa.int8(), pa.string())),
+        ("delay", pa.float64()),
+        ("n", pa.int64()),
+        ("kind", pa.dictionary(pa.int8(), pa.string())),
+        ("again", pa.bool_()),
+    ]
+)
+"""The columns of a Parquet file of the journal."""
+
+
+@dataclass(frozen=True)
+class Words:
+    """What the codes in records stand for."""
+
+    links: Sequence[str]
+    keys: dict[int, str]
+    sources: dict[int, str]
+
+
+@final
+class JournalPart:
+    """Records in a file, or in memory alone if the disk is full."""
+
+    def __init__(self, path: Path | None, rows: int) -> None:
+        """path: of a new file for so many rows. Raises OSError if there is no room on the disk for all of them."""
+        self.path = path
+        size = rows * RECORD.itemsize
+        if path is None:
+            self.buffer = mmap.mmap(-1, size)
+        else:
+            self.buffer = _mapped(path, size)
+        self._stored: Records = np.frombuffer(self.buffer, RECORD)
+        self.handed = 0
+        """The number of rows that were handed to the listeners."""
+        self.amendments = 0
+        """How many times a fate was changed."""
+        self.settled = 0.0
+        """The time from which on none of these rows is delayed any more."""
+
+    def take(self) -> Records:
+        """A copy of the rows that are whole and were not taken yet, up to the first that is not whole."""
+        rest = self._stored[self.handed :]
+        missing = rest["fate"] == 0
+        rows = _whole(rest[: int(missing.argmax()) if missing.any() else len(rest)])
+        self.handed += len(rows)
+        if len(rows):
+            self.settled = max(self.settled, float((rows["time"] + rows["delay"]).max()))
+        return rows
+
+    def whole(self) -> Records:
+        """A copy of all rows that are whole."""
+        return _whole(self._stored)
+
+    def amend(self, place: int, fate: int) -> Records:
+        """Change the fate of a row; returns the row as it was, (1,)."""
+        before = _whole(self._stored[place : place + 1])
+        self._stored["fate"][place] = fate + STORED
+        self.amendments += 1
+        return before
+
+    @property
+    def full(self) -> bool:
+        """Whether all rows were taken."""
+        return self.handed == len(self._stored)
+
+    def remove(self) -> None:
+        """Remove the file. The memory goes with the last reference to it."""
+        if self.path is not None:
+            self.path.unlink(missing_ok=True)
+
+
+def _mapped(path: Path, size: int) -> mmap.mmap:
+    """A new file, complete at once under its name. Raises OSError if the disk is full."""
+    unfinished = path.with_suffix(".new")
+    descriptor = os.open(unfinished, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o600)
+    try:
+        if hasattr(os, "posix_fallocate"):  # not on macOS
+            os.posix_fallocate(descriptor, 0, size)
+        else:
+            left = memoryview(bytes(size))
+            while left:
+                left = left[os.write(descriptor, left) :]
+        buffer = mmap.mmap(descriptor, size, flags=mmap.MAP_SHARED | _POPULATE)
+        os.replace(unfinished, path)
+    except OSError:
+        unfinished.unlink(missing_ok=True)
+        raise
+    finally:
+        os.close(descriptor)
+    return buffer
+
+
+def _whole(stored: Records) -> Records:
+    """A copy of the whole ones of stored records, with their fates."""
+    records: Records = stored[stored["fate"] != 0]
+    records["fate"] -= STORED
+    return records
+
+
+def records_in(path: Path) -> Records:
+    """The whole records of a part's file, in order. Raises OSError if it cannot be read."""
+    return _whole(np.fromfile(path, RECORD))
+
+
+def table_of(records: Records, words: Words) -> pa.Table:
+    """Records as a table with the columns `PARQUET`."""
+    fates = records["fate"]
+    none, unlinked = fates == Crossing.DELIVERED, records["link"] == UNLINKED
+    links = np.where(unlinked, 0, records["link"]).astype(np.int32)
+    columns = (
+        pa.array(records["time"]),
+        pa.DictionaryArray.from_arrays(pa.array(links, mask=unlinked), pa.array(list(words.links), pa.string())),
+        _words(records["key"], words.keys, "key"),
+        pa.array(records["size"].astype(np.int64)),
+        _words(records["source"], words.sources, "source"),
+        pa.array(records["sequence"], mask=records["sequence"] < 0),
+        pa.DictionaryArray.from_arrays(pa.array(_WORD_CODES[fates]), pa.array(_WORDS)),
+        pa.DictionaryArray.from_arrays(pa.array(_REASON_CODES[fates], mask=none), pa.array(list(REASONS.values()))),
+        pa.array(records["delay"]),
+        pa.array(records["n"], mask=records["n"] < 0),
+        pa.DictionaryArray.from_arrays(
+            pa.array((records["kind"] & ~np.uint8(AGAIN)).astype(np.int8)), pa.array(_KINDS)
+        ),
+        pa.array((records["kind"] & AGAIN) != 0),
+    )
+    return pa.Table.from_arrays(columns, schema=PARQUET)
+
+
+def _words(codes: NDArray[np.uint32], words: Mapping[int, str], what: str) -> pa.DictionaryArray:
+    """A dictionary column with only the words that occur; code 0 is null, and a code without a word names itself."""
+    found, places = np.unique(codes, return_inverse=True)
+    texts = [words.get(code, f"unknown {what} {code}") for code in found.tolist()]
+    return pa.DictionaryArray.from_arrays(
+        pa.array(places.astype(np.int32), mask=codes == 0), pa.array(texts, pa.string())
+    )
+
+
+def write_parquet(path: Path, table: pa.Table) -> None:
+    """Write a Parquet file, which is complete under its name. Raises OSError if the disk is full."""
+    unfinished = path.with_suffix(".new")
+    try:
+        with open(unfinished, "wb", opener=private_opener) as file:
+            pq.write_table(table, file, compression="zstd", compression_level=1)
+        os.replace(unfinished, path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            unfinished.unlink()
+        raise
+
+
+def amend_parquet(path: Path, row: int, fate: Crossing) -> dict[str, Any]:
+    """Change the fate of one row of a Parquet file; returns the row as it was. Raises OSError if the file cannot be written."""
+    table = pq.read_table(path)
+    before: dict[str, Any] = table.slice(row, 1).to_pylist()[0]
+    for name, text in (("fate", word_of(fate)), ("reason", REASONS.get(fate))):
+        texts = table[name].cast(pa.string()).to_pylist()
+        texts[row] = text
+        at, column = table.schema.get_field_index(name), PARQUET.field(name)
+        table = table.set_column(at, column, pa.array(texts, pa.string()).cast(column.type))
+    write_parquet(path, table)
+    return before

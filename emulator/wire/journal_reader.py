@@ -1,0 +1,96 @@
+"""Reads the journal of a wire: its Parquet files, and the records that are not yet in one.
+
+Source: docs/wire.md, the journal.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from evedrop.errors import UsageError
+from evedrop.wire.crossing import Crossing
+from evedrop.wire.history import WireHistory
+from evedrop.wire.journal_part import PARQUET, Records, Words, records_in, table_of
+
+JOURNAL_FOLDER = "journal"
+"""The folder inside a wire's folder that contains its journal."""
+UNFINISHED = "unfinished"
+"""The folder inside it for records that are not yet in a Parquet file."""
+
+
+def journal_tables(folder: Path) -> Iterator[pa.Table]:
+    """The journal of a wire's folder in the order of its rows, a table for each part; also of a wire that goes on or was killed.
+
+    Raises UsageError if there is no journal, or a part cannot be read.
+    """
+    journal = folder / JOURNAL_FOLDER
+    if not journal.is_dir():
+        raise UsageError(
+            f"{folder} is not the folder of a wire: it has no folder {JOURNAL_FOLDER}; give the --out of a wire"
+        )
+    links = WireHistory.read(journal).links
+    for name in part_names(journal):
+        try:
+            yield _table(journal, name, links)
+        except (OSError, pa.ArrowException) as error:
+            raise UsageError(f"part {name} of the journal in {journal} cannot be read ({error})") from error
+
+
+def _table(journal: Path, name: str, links: dict[int, list[str]]) -> pa.Table:
+    path = journal / UNFINISHED / f"{name}.rows"
+    with contextlib.suppress(FileNotFoundError):  # a wire that goes on may just have made the Parquet file
+        if not parquet_path(journal, name).exists():
+            start = int(name.partition("-")[0])
+            return table_of(records_in(path), words_in(path.parent, start, links.get(start, [])))
+    return pq.read_table(parquet_path(journal, name), schema=PARQUET)
+
+
+def part_names(journal: Path) -> list[str]:
+    """The names of all parts of a journal, such as 001-0002 for the second part of the first start, in order."""
+    found = {path.stem for path in (*journal.glob("*.parquet"), *(journal / UNFINISHED).glob("*.rows"))}
+    parts = [name for name in found if re.fullmatch(r"\d{3,}-\d{4,}", name)]  # a user may keep files of others there
+    return sorted(parts, key=lambda name: [int(number) for number in name.split("-")])
+
+
+def parquet_path(journal: Path, name: str) -> Path:
+    """The Parquet file of a part."""
+    return journal / f"{name}.parquet"
+
+
+def words_in(unfinished: Path, start: int, links: list[str]) -> Words:
+    """The words of the codes in records of a start that did not end."""
+    words = Words(links, {}, {})
+    with contextlib.suppress(FileNotFoundError):
+        for line in (unfinished / f"{start:03d}.words").read_bytes().splitlines():
+            with contextlib.suppress(ValueError, TypeError):  # the last line may be torn
+                what, code, text = json.loads(line)
+                (words.keys if what == "key" else words.sources)[int(code)] = str(text)
+    return words
+
+
+def lost_with_the_process(records: Records, alive: float) -> Records:
+    """The records of a wire that was killed, as they must be: a message that was still delayed did not arrive.
+
+    alive: a time at which the wire still ran.
+    """
+    if len(records):
+        alive = max(alive, float(records["time"].max()))
+        held = (records["fate"] == Crossing.DELIVERED) & (records["time"] + records["delay"] > alive)
+        records["fate"][held] = Crossing.UNDERWAY
+    return records
+
+
+def last_beat(unfinished: Path) -> float:
+    """The latest time that a wire noted while it ran; 0 if it noted none."""
+    with contextlib.suppress(OSError, struct.error):
+        beat: float = struct.unpack("<d", (unfinished / "alive").read_bytes())[0]
+        return beat
+    return 0.0

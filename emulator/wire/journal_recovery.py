@@ -1,0 +1,63 @@
+"""What a wire does with a journal that an earlier start left behind, because it was killed or the disk was full.
+
+Source: docs/wire.md, a wire that starts again.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from pathlib import Path
+
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from evedrop.errors import UsageError
+from evedrop.wire.crossing import Kind
+from evedrop.wire.history import Numbered, WireHistory, highest
+from evedrop.wire.journal_part import records_in, table_of, write_parquet
+from evedrop.wire.journal_reader import UNFINISHED, last_beat, lost_with_the_process, parquet_path, part_names, words_in
+
+
+def locked(folder: Path) -> int:
+    """The descriptor of a folder that this process alone may use until it closes it. Raises UsageError if another one does."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(descriptor)
+        raise UsageError(f"another wire writes to {folder.parent}; end it, or give another --out") from error
+    except OSError:  # a file system without locks
+        pass
+    return descriptor
+
+
+def recover(journal: Path, history: WireHistory) -> int:
+    """Make Parquet files from all that an earlier start left behind, and end that start; returns the number of such records.
+
+    Raises OSError if the disk is full; then nothing is lost.
+    """
+    place = journal / UNFINISHED
+    recovered, alive = 0, last_beat(place)
+    names = [name for name in part_names(journal) if int(name.partition("-")[0]) == history.start]
+    if not history.ended:
+        counts = dict(history.counts)
+        words = words_in(place, history.start, history.links[history.start])
+        for name in names:
+            path = place / f"{name}.rows"
+            if not parquet_path(journal, name).exists():
+                records = lost_with_the_process(records_in(path), alive)
+                recovered += len(records)
+                write_parquet(parquet_path(journal, name), table_of(records, words))
+            _count_table(counts, parquet_path(journal, name))
+        history.end(counts, alive)
+    for path in (*journal.glob("*.new"), *place.iterdir()):
+        path.unlink()
+    return recovered
+
+
+def _count_table(counts: dict[Numbered, int], path: Path) -> None:
+    table = pq.read_table(path, columns=["link", "key", "kind", "n"], filters=pc.field("n").is_valid())
+    for row in table.group_by(["link", "key", "kind"]).aggregate([("n", "max")]).to_pylist():
+        if row["link"] is not None:
+            highest(counts, (row["link"], row["key"], Kind[row["kind"].upper()].stream), row["n_max"] + 1)

@@ -1,0 +1,285 @@
+"""The journal of a wire: every record is in it exactly once, whatever happens to the process or the disk."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from evedrop.errors import UsageError
+from evedrop.wire import journal as journal_module
+from evedrop.wire.crossing import AGAIN, RECORD, UNLINKED, Crossing, Kind
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal_part import STORED, JournalPart, Records, records_in
+from evedrop.wire.journal_reader import journal_tables
+from tests.conftest import wait_until
+from tests.wire.wire_plans import wire_plan
+
+LOSSY = {"loss": {"model": "bernoulli", "quality": 0.6}}
+BETTER = {"loss": {"model": "bernoulli", "quality": 0.9}}
+
+
+def rows_of(folder: Path) -> list[dict[str, Any]]:
+    """All rows of a wire's journal."""
+    rows: list[dict[str, Any]] = pa.concat_tables(journal_tables(folder)).to_pylist()
+    return rows
+
+
+def put(
+    journal: WireJournal, n: int, fate: Crossing = Crossing.DELIVERED, *, key: str = "scan/1", delay: float = 0.0
+) -> int:
+    """Record a put on the first link."""
+    return int(journal.record(1000.0 + n, n, -1, delay, journal.key_code(key), 0, 64, 0, Kind.PUT, fate))
+
+
+def test_every_record_of_many_threads_is_in_parquet_exactly_once(tmp_path: Path) -> None:
+    """Over several parts, in the order of their rows, and each was handed to the listeners exactly once."""
+    heard: list[Records] = []
+
+    def work(name: str) -> None:
+        for n in range(3000):
+            put(journal, n, key=name)
+
+    with WireJournal(tmp_path, wire_plan(), part_rows=1000) as journal:
+        journal.listeners.append(heard.append)
+        threads = [threading.Thread(target=work, args=(f"scan/{one}",)) for one in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    rows = rows_of(tmp_path)
+    for one in range(4):
+        assert [row["n"] for row in rows if row["key"] == f"scan/{one}"] == list(range(3000))
+        assert journal.counts["scan", f"scan/{one}", "put"] == 3000
+    blocks = np.concatenate(heard)
+    assert [(journal.key_of(key), n) for key, n in zip(blocks["key"], blocks["n"], strict=True)] == [
+        (row["key"], row["n"]) for row in rows
+    ]
+    assert sorted(path.name for path in (tmp_path / "journal").iterdir()) == [
+        *(f"001-{part:04d}.parquet" for part in range(1, 13)), "history.jsonl",
+    ]  # fmt: skip
+
+
+def test_a_row_says_all_that_was_recorded(tmp_path: Path) -> None:
+    """Names in place of codes, null where there is nothing, and sizes that do not fit as the largest."""
+    with WireJournal(tmp_path, wire_plan()) as journal:
+        key, source = journal.key_code("scan/ä"), journal.source_code("gid")
+        journal.record(1.5, 3, 2**40, 0.25, key, source, 64, 0, Kind.PUT | AGAIN, Crossing.DELIVERED)
+        journal.record(2.5, -1, -1, 0.0, key, 0, 2**33, UNLINKED, Kind.QUERY, Crossing.UNLINKED)
+        journal.record(3.5, 4, -1, 0.0, key, 0, 0, 0, Kind.DELETE, Crossing.LOST)
+    first = {"time": 1.5, "link": "scan", "key": "scan/ä", "size": 64, "source": "gid", "sequence": 2**40, "fate": "delivered",
+             "reason": None, "delay": 0.25, "n": 3, "kind": "put", "again": True}  # fmt: skip
+    second = {"time": 2.5, "link": None, "key": "scan/ä", "size": 2**32 - 1, "source": None, "sequence": None,
+              "fate": "dropped", "reason": "unlinked", "delay": 0.0, "n": None, "kind": "query", "again": False}  # fmt: skip
+    third = {**first, "time": 3.5, "size": 0, "source": None, "sequence": None, "fate": "lost", "reason": "loss", "delay": 0.0,
+             "n": 4, "kind": "delete", "again": False}  # fmt: skip
+    assert rows_of(tmp_path) == [first, second, third]
+    assert journal.counts == {("scan", "scan/ä", "put"): 5}
+
+
+def test_another_wire_on_the_same_folder_is_refused(tmp_path: Path) -> None:
+    """While the first one runs; afterwards it may have the folder, but not with another seed."""
+    with WireJournal(tmp_path, wire_plan()) as journal:
+        put(journal, 0)
+        with pytest.raises(UsageError, match=r"another wire writes to .*; end it, or give another --out"):
+            WireJournal(tmp_path, wire_plan())
+    with pytest.raises(UsageError, match="had the seed 7, and this one has 8"):
+        WireJournal(tmp_path, wire_plan(seed=8))
+    with WireJournal(tmp_path, wire_plan()) as journal:
+        assert journal.counts == {("scan", "scan/1", "put"): 1}
+        put(journal, 1)
+    assert [row["n"] for row in rows_of(tmp_path)] == [0, 1]
+
+
+def test_amended_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before the listeners had the row, after, and when it is in Parquet already: they add up to what the journal says."""
+    monkeypatch.setattr(journal_module, "_PATIENCE", 0.0)
+    tally = dict.fromkeys(Crossing, 0)
+
+    def add(block: Records) -> None:
+        for fate in block["fate"]:
+            tally[Crossing(fate)] += 1
+
+    def amend(record: Records, fate: Crossing) -> None:
+        assert (record["n"][0], journal.key_of(record["key"][0]), record["size"][0]) == (2, "scan/1", 64)
+        tally[Crossing(record["fate"][0])] -= 1
+        tally[fate] += 1
+
+    with WireJournal(tmp_path, wire_plan(), part_rows=4) as journal:
+        journal.listeners.append(add)
+        journal.amendment_listeners.append(amend)
+        late = [put(journal, 2) for _ in range(4)]
+        wait_until((tmp_path / "journal" / "001-0001.parquet").exists, "a Parquet file")
+        journal.amend(late[1], Crossing.REFUSED)
+        handed, fresh = put(journal, 2), put(journal, 2)
+        journal.flush()
+        journal.amend(handed, Crossing.UNDERWAY)
+        journal.amend(fresh, Crossing.REFUSED)
+        journal.amend(put(journal, 2), Crossing.UNDERWAY)
+    reasons = [row["reason"] for row in rows_of(tmp_path)]
+    assert reasons == [None, "refused", None, None, "underway", "refused", "underway"]
+    assert {fate: count for fate, count in tally.items() if count} == {
+        Crossing.DELIVERED: 3, Crossing.REFUSED: 2, Crossing.UNDERWAY: 2,
+    }  # fmt: skip
+
+
+def test_a_listener_that_fails_gets_no_more_records(tmp_path: Path) -> None:
+    """And the user is told; the journal and all other listeners go on."""
+    told: list[str] = []
+    heard: list[Records] = []
+    with WireJournal(tmp_path, wire_plan(), tell=told.append) as journal:
+        journal.listeners += [lambda block: heard.append(block[10**6]), heard.append]
+        put(journal, 0)
+        journal.flush()
+        put(journal, 1)
+    assert [len(block) for block in heard] == [1, 1]
+    assert len(told) == 1
+    assert "IndexError" in told[0]
+
+
+def test_a_record_that_is_torn_is_not_read(tmp_path: Path) -> None:
+    """At whichever byte the process ended while it wrote the last record."""
+    part = JournalPart(tmp_path / "001-0001.rows", 60)
+    record = np.zeros(1, RECORD)
+    record["n"], record["fate"] = 5, Crossing.LOST + STORED
+    for size in range(RECORD.itemsize):
+        part.buffer[: RECORD.itemsize] = record.tobytes()
+        part.buffer[RECORD.itemsize : 2 * RECORD.itemsize] = record.tobytes()[:size] + bytes(RECORD.itemsize - size)
+        assert records_in(tmp_path / "001-0001.rows")["n"].tolist() == [5]
+    assert part.take()["n"].tolist() == [5]
+
+
+def test_the_settings_that_each_message_had_are_known_after_a_restart(tmp_path: Path) -> None:
+    """Changes by events and the operator, and those of the file between two starts, for old and new keys."""
+    first = WireJournal(tmp_path, wire_plan())
+    for n in range(10):
+        put(first, n)
+    first.change("scan", BETTER, {("scan/1", "put"): 6})
+    first.close()
+    assert [(one.at, one.settings) for one in first.changes_of("scan", "scan/1", "put")] == [(0, LOSSY), (6, BETTER)]
+    assert [(one.at, one.settings) for one in first.changes_of("scan", "scan/2", "put")] == [(0, BETTER)]
+    history = tmp_path / "journal" / "history.jsonl"
+    history.write_bytes(history.read_bytes() + b'{"change": "sc')  # torn
+    with WireJournal(tmp_path, wire_plan()) as second:
+        changes = [(one.at, one.settings) for one in second.changes_of("scan", "scan/1", "put")]
+        assert changes == [(0, LOSSY), (6, BETTER), (10, LOSSY)]
+        assert [one.at for one in second.changes_of("scan", "scan/2", "put")] == [0]
+    assert [json.loads(line).get("start") for line in history.read_text().splitlines()] == [1, None, None, 2, None]
+    history.write_text("nonsense\n")
+    with pytest.raises(UsageError, match=r"history.jsonl, line 1, is not the history of a wire; give another --out"):
+        WireJournal(tmp_path, wire_plan())
+
+
+KILLED = """
+import mmap, os, random, signal, struct, sys, time
+from pathlib import Path
+import pyarrow as pa
+from evedrop.wire.crossing import Kind
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal_reader import journal_tables
+from tests.wire.wire_plans import wire_plan
+
+folder, recorded, chance = Path(sys.argv[1]), mmap.mmap(-1, 8), random.Random(5)
+
+
+def write(first):
+    journal = WireJournal(folder, wire_plan(), part_rows=3000)
+    assert journal.counts.get(("scan", "scan/1", "put"), 0) >= first
+    n = first = journal.counts.get(("scan", "scan/1", "put"), 0)
+    key = journal.key_code("scan/1")
+    while True:
+        journal.record(time.time(), n, n, 0.0 if n % 2 else 3600.0, key, 0, 64, 0, Kind.PUT, 0)
+        n += 1
+        struct.pack_into("<q", recorded, 0, n)
+
+
+total = 0
+for turn in range(8):
+    child = os.fork()
+    if child == 0:
+        write(total)
+    target = total + chance.choice([1, 7, 2999, 3000, 3001, 10_000])
+    while struct.unpack("<q", recorded[:])[0] < target:
+        assert os.waitpid(child, os.WNOHANG) == (0, 0)
+    time.sleep(chance.random() / 50)
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    total = struct.unpack("<q", recorded[:])[0]
+    read = sum(table.num_rows for table in journal_tables(folder))
+    assert total <= read <= total + 1, (total, read)
+    total = read
+with WireJournal(folder, wire_plan()) as journal:
+    assert journal.counts == {("scan", "scan/1", "put"): total}
+rows = pa.concat_tables(journal_tables(folder)).to_pylist()
+assert [row["n"] for row in rows] == [row["sequence"] for row in rows] == list(range(total))
+assert {row["key"] for row in rows} == {"scan/1"}
+assert {(row["n"] % 2, row["reason"]) for row in rows} == {(1, None), (0, "underway")}
+assert not list(folder.glob("journal/unfinished")), "the wire that ended left something behind"
+print(total)
+"""
+
+
+def test_a_wire_may_be_killed_at_any_moment(tmp_path: Path) -> None:
+    """Kill -9, 8 times in one folder: every recorded row is in the journal once, and the numbers of messages go on.
+
+    A message that was still delayed when its wire was killed is under way, not delivered.
+    """
+    command = [sys.executable, "-c", KILLED, str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) > 5000
+
+
+ON_SMALL_DISK = """
+import subprocess, sys, time
+from pathlib import Path
+import pyarrow as pa
+from evedrop.wire.crossing import Kind
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal_reader import journal_tables
+from tests.wire.wire_plans import wire_plan
+
+disk = Path(sys.argv[1])
+if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=256k", "none", disk], stderr=subprocess.DEVNULL).returncode:
+    sys.exit(77)
+told, heard = [], []
+with WireJournal(disk / "run", wire_plan(), tell=told.append, part_rows=1000) as journal:
+    journal.listeners.append(lambda block: heard.extend(block["n"].tolist()))
+    key = journal.key_code("scan/1")
+    for n in range(20_000):
+        journal.record(time.time(), n, -1, 0.0, key, 0, 64, 0, Kind.PUT, 0)
+    for code in range(3000):
+        journal.key_code(f"scan/a/long/name/of/a/key/{code}")
+    assert [journal.key_code("scan/1"), journal.key_code("scan/a/long/name/of/a/key/2999")] == [1, 3001]
+    journal.flush()
+    assert heard == list(range(20_000))
+    assert journal.incomplete_since is not None and 14_000 < journal.missing < 20_000, journal.missing
+kept = [row["n"] for table in journal_tables(disk / "run") for row in table.to_pylist()]
+assert kept == list(range(20_000 - journal.missing))
+print(*told, sep="\\n")
+"""
+
+
+def test_on_a_full_disk_the_wire_goes_on(tmp_path: Path) -> None:
+    """Listeners get every record; the journal keeps what there is room for, and says once from when on it is incomplete."""
+    if os.geteuid() != 0 or shutil.which("unshare") is None:
+        pytest.skip("only root may mount a small disk")
+    command = ["unshare", "--mount", sys.executable, "-c", ON_SMALL_DISK, str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
+    if done.returncode in {1, 77} and "Traceback" not in done.stderr:
+        pytest.skip("this machine lets nobody mount")
+    assert done.returncode == 0, done.stderr
+    incomplete, *last = done.stdout.splitlines()
+    assert "the journal is incomplete from" in incomplete
+    assert "No space left on device" in incomplete
+    assert all("its records stay in" in line for line in last)
+    assert len(last) <= 1
