@@ -108,6 +108,17 @@ def parse(
 
     folder: where the files are that the text names; files that a change names are in the current folder.
     """
+    tables = tables_in(text, source)
+    recordings_located(tables, folder)
+    disturbance_file_located(tables, folder)
+    for entry in ("secret_file", "modules"):
+        if isinstance(tables.get(entry), str):
+            tables[entry] = str((folder / tables[entry]).absolute())
+    return checked(tables, source, changes, beyond_horizon=beyond_horizon, folder=folder)
+
+
+def tables_in(text: str, source: str) -> dict[str, Any]:
+    """The tables of a TOML text, of which no entry is checked yet. Raises ScenarioError if a value cannot be used at all."""
     if (values := text.count(",")) > MOST_VALUES:
         large = f"has about {values} values; expected at most {MOST_VALUES}"
         raise ScenarioError(source, [f"{large}: put disturbances and recordings into files of their own"])
@@ -121,12 +132,7 @@ def parse(
         raise ScenarioError(source, [f"not TOML: {error}"]) from error
     if mistakes := list(unusable(tables)):
         raise ScenarioError(source, mistakes)
-    recordings_located(tables, folder)
-    disturbance_file_located(tables, folder)
-    for entry in ("secret_file", "modules"):
-        if isinstance(tables.get(entry), str):
-            tables[entry] = str((folder / tables[entry]).absolute())
-    return checked(tables, source, changes, beyond_horizon=beyond_horizon, folder=folder)
+    return tables
 
 
 def checked(
@@ -142,7 +148,7 @@ def checked(
     folder: where custom modules are, if the tables name any and name no folder of modules.
     """
     for key, value in (changes or {}).items():
-        _set(tables, key, value)
+        set_entry(tables, key, value)
     if changes and (wrong := list(unusable(tables))):
         raise ScenarioError(source, wrong)
     if any(named_in(tables)):
@@ -183,7 +189,7 @@ def _across(
         return [f"modules: a class raised {place_of(error)} when it was asked about itself; expected no error"]
 
 
-def _set(tables: dict[str, Any], dotted: str, value: Any) -> None:
+def set_entry(tables: dict[str, Any], dotted: str, value: Any) -> None:
     """Put a value at a dotted key. Tables may be new; list entries are given by number, including the next one."""
     names = dotted.split(".")
     inner: Any = tables

@@ -83,8 +83,9 @@ class WireEvent:
     cut: str | None = None
     """The name of a link that is cut."""
     link: str | None = None
-    """The name of a link whose settings change to `settings`."""
+    """The name of a link whose settings change."""
     settings: Mapping[str, Any] | None = None
+    """Those of its settings that change, and what they change to."""
     note: str | None = None
 
 
@@ -112,6 +113,10 @@ class WirePlan:
         """The first link that takes the messages of a key from one side to another; None if there is none."""
         links = (link for link in self.links if (link.source, link.target) == (source, target))
         return next((link for link in links if link.takes(key)), None)
+
+    def named(self, name: str) -> WireLink:
+        """The link with this name. Raises KeyError if there is none."""
+        return {link.name: link for link in self.links}[name]
 
     def is_lossless(self, key: zenoh.KeyExpr) -> bool:
         """Whether messages with this key are never lost."""

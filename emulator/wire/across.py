@@ -1,0 +1,181 @@
+"""Mistakes of a wire file that only show when its tables are compared: names, endpoints, events. Any table may be malformed.
+
+Source: docs/wire.md, the file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from pydantic import ValidationError
+
+from evedrop.model.checks import as_toml
+from evedrop.scenario.sentences import sentences
+from evedrop.scenario.words import listed, near
+from evedrop.wire.endpoints import Place, place_of
+from evedrop.wire.tables import CHANGEABLE, WireLinkTable, WireSettingsTable, changed_settings
+
+Tables = Sequence[Mapping[str, Any]]
+
+
+def mistakes_across(tables: Mapping[str, Any]) -> Iterator[str]:
+    """Mistakes across the tables of a wire file."""
+    side = tables.get("side")
+    sides: Mapping[str, Any] = side if isinstance(side, Mapping) else {}
+    links, events = _tables(tables.get("link")), _tables(tables.get("event"))
+    yield from _endpoint_mistakes(sides)
+    if sides:
+        yield from _side_mistakes(sides, links)
+    yield from _name_mistakes(links)
+    yield from _correlation_mistakes(links)
+    for i, event in enumerate(events):
+        yield from (f"event.{i}.{line}" for line in _event_mistakes(event, sides, links))
+
+
+def link_names(links: Tables) -> list[str]:
+    """The name of each link: that in its table, or FROM-TO, or FROM-TO-2 and so on where that is taken."""
+    taken = {str(link["name"]) for link in links if link.get("name") is not None}
+    names = []
+    for link in links:
+        name = link.get("name")
+        if name is None:
+            plain = f"{link.get('from')}-{link.get('to')}"
+            numbered = (f"{plain}-{number}" for number in range(2, 2 * len(links) + 2))
+            name = next(one for one in (plain, *numbered) if one not in taken)
+            taken.add(name)
+        names.append(str(name))
+    return names
+
+
+def change_mistakes(settings: Mapping[str, Any], correlated: bool, changes: Mapping[str, Any]) -> Iterator[str]:
+    """Mistakes in changed entries of a link with these settings. correlated: whether its losses are tied to another link's."""
+    for entry in changes:
+        if entry not in CHANGEABLE:
+            yield f"{entry}: is not a link setting that can be changed; expected {listed(CHANGEABLE)}{near(entry, CHANGEABLE)}"
+    try:
+        made = changed_settings(settings, {entry: value for entry, value in changes.items() if entry in CHANGEABLE})
+    except ValidationError as error:
+        yield from sentences(error, WireSettingsTable)
+        return
+    if correlated and made.get("loss", settings["loss"])["model"] != settings["loss"]["model"]:
+        yield "loss.model: differs from the first one, but the link's losses are tied to another link's; expected the same model"
+
+
+def _tables(found: Any) -> Tables:
+    """The entries of a list of tables; a malformed one is empty."""
+    return [one if isinstance(one, Mapping) else {} for one in found] if isinstance(found, list) else []
+
+
+def _endpoint_mistakes(sides: Mapping[str, Any]) -> Iterator[str]:
+    """Two sides, or one side twice, at one place."""
+    listens, connects = _places(sides, "listen"), _places(sides, "connect")
+    round_and_round = "so that messages would go round"
+    for i, one in enumerate(listens):
+        if (other := _overlapping(one, listens[:i])) is not None:
+            same = "the same place" if one.endpoint == other.endpoint else f"the same place as {other.endpoint}"
+            yield f"{one.said}, {same} at which side {other.side} listens; expected another port"
+    for i, one in enumerate(connects):
+        if (other := _overlapping(one, listens)) is not None:
+            where = f"where side {other.side} of this wire listens, {round_and_round}"
+            yield f"{one.said}, {where}; expected a router outside of the wire"
+        if (other := _overlapping(one, connects[:i])) is not None:
+            why = "" if one.side == other.side else f", {round_and_round}"
+            yield f"{one.said}, the router to which side {other.side} connects{why}; expected another router"
+
+
+class _Placed(NamedTuple):
+    """A well-formed endpoint of a side."""
+
+    path: str
+    side: str
+    endpoint: str
+    place: Place
+
+    @property
+    def said(self) -> str:
+        """The beginning of a message about it."""
+        return f"{self.path}: is {as_toml(self.endpoint)}"
+
+
+def _overlapping(one: _Placed, others: Sequence[_Placed]) -> _Placed | None:
+    return next((other for other in others if one.place.overlaps(other.place)), None)
+
+
+def _places(sides: Mapping[str, Any], entry: str) -> list[_Placed]:
+    found = []
+    for name, side in sides.items():
+        given = side.get(entry) if isinstance(side, Mapping) else None
+        several = {f".{i}": one for i, one in enumerate(given)} if isinstance(given, list) else {"": given}
+        for number, endpoint in several.items():
+            if isinstance(endpoint, str) and (place := place_of(endpoint)) is not None:
+                found.append(_Placed(f"side.{name}.{entry}{number}", name, endpoint, place))
+    return found
+
+
+def _unknown(name: object, known: Sequence[str], what: str) -> str:
+    choice = f"expected {listed(known)}" if known else f"the file has no {what}"
+    return f"is {as_toml(name)}; {choice}{near(name, known)}"
+
+
+def _side_mistakes(sides: Mapping[str, Any], links: Tables) -> Iterator[str]:
+    for i, link in enumerate(links):
+        for entry in ("from", "to"):
+            if isinstance(link.get(entry), str) and link[entry] not in sides:
+                yield f"link.{i}.{entry}: {_unknown(link[entry], [*sides], 'side')}"
+        if isinstance(link.get("to"), str) and link["to"] == link.get("from") and link["to"] in sides:
+            yield f"link.{i}.to: is {as_toml(link['to'])}, where the link begins; expected another side"
+
+
+def _name_mistakes(links: Tables) -> Iterator[str]:
+    first: dict[str, int] = {}
+    for i, link in enumerate(links):
+        if isinstance(name := link.get("name"), str) and first.setdefault(name, i) != i:
+            yield f"link.{i}.name: is {as_toml(name)}, the name of link.{first[name]}; expected a name of its own"
+
+
+def _correlation_mistakes(links: Tables) -> Iterator[str]:
+    names = link_names(links)
+    for i, (name, link) in enumerate(zip(names, links, strict=True)):
+        tie = link.get("correlation")
+        other = tie.get("with") if isinstance(tie, Mapping) else None
+        if not isinstance(other, str):
+            continue
+        path = f"link.{i}.correlation.with"
+        others = [one for one in names if one != name]
+        if other not in others:
+            yield f"{path}: {_unknown(other, others, 'other link')}"
+            continue
+        theirs = links[names.index(other)]
+        if theirs.get("correlation") is not None:
+            yield f"{path}: is {other}, whose own losses are tied to another link's; expected a link without correlation"
+        elif (there := _model(theirs)) != (here := _model(link)):
+            yield f"{path}: is {other}, but the loss models differ ({there} there and {here} here); expected the same model"
+
+
+def _model(link: Mapping[str, Any]) -> object:
+    loss = link.get("loss")
+    return loss.get("model") if isinstance(loss, Mapping) else "bernoulli"
+
+
+def _event_mistakes(event: Mapping[str, Any], sides: Mapping[str, Any], links: Tables) -> Iterator[str]:
+    partition = event.get("partition")
+    if isinstance(partition, list) and sides:
+        for i, name in enumerate(partition):
+            if isinstance(name, str) and name not in sides:
+                yield f"partition.{i}: {_unknown(name, [*sides], 'side')}"
+        if len(partition) == 2 and partition[0] == partition[1]:
+            yield f"partition: is {as_toml(partition)}; expected two different sides"
+    names = link_names(links)
+    for entry in ("cut", "link"):
+        if isinstance(event.get(entry), str) and event[entry] not in names:
+            yield f"{entry}: {_unknown(event[entry], names, 'link')}"
+    if isinstance(event.get("set"), Mapping) and event.get("link") in names:
+        link = links[names.index(event["link"])]
+        try:
+            settings = WireLinkTable.model_validate(link).wire_settings()
+        except ValidationError:
+            return  # the link's own mistakes are reported
+        yield from (
+            f"set.{line}" for line in change_mistakes(settings, link.get("correlation") is not None, event["set"])
+        )

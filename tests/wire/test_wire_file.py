@@ -1,0 +1,368 @@
+"""Wire files: what they mean, what is refused and in which words, and that a resolved file means the same."""
+
+from __future__ import annotations
+
+import tomllib
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from evedrop.errors import ScenarioError, UsageError
+from evedrop.wire.endpoints import place_of
+from evedrop.wire.file import load_wire, resolved_wire, wire_of
+from evedrop.wire.plan import Side, SideTls, WireEvent
+from evedrop.wire.units import in_seconds
+
+EXAMPLE = Path(str(resources.files("evedrop.wire"))) / "examples" / "robot.toml"
+BASE = """
+[side.robot]
+listen = "tcp/127.0.0.1:7448"
+[side.base]
+listen = "tcp/127.0.0.1:7449"
+[[link]]
+from = "robot"
+to = "base"
+"""
+
+
+def of(text: str, folder: Path = Path()) -> Any:
+    """The wire in a text."""
+    return wire_of(tomllib.loads(text), "wire.toml", folder=folder)
+
+
+def mistakes(text: str, folder: Path = Path()) -> list[str]:
+    """What is said of a wire file that is refused."""
+    with pytest.raises(ScenarioError) as caught:
+        of(text, folder)
+    assert caught.value.exit_status == 2
+    return caught.value.mistakes
+
+
+def test_the_example() -> None:
+    """It means what its lines say, and its resolved file means the same."""
+    plan = load_wire(EXAMPLE)
+    assert plan.seed == 7
+    assert plan.lossless == ("robot/stop",)
+    assert plan.sides["base"] == Side("base", ("tcp/127.0.0.1:7449",))
+    assert [link.name for link in plan.links] == ["scan", "radio", "orders", "tap"]
+    assert [link.tap for link in plan.links] == [False, False, False, True]
+    assert plan.named("scan").settings == {
+        "loss": {"model": "gilbert-elliott", "p": 0.01, "r": 0.2},
+        "delay": {"model": "normal", "mean": 0.02, "deviation": 0.005},
+        "rate": 2e6,
+        "queue": 256_000,
+    }
+    assert plan.events[0] == WireEvent(12.0, 15.0, partition=("robot", "base"))
+    assert plan.events[1].settings == {"loss": {"model": "gilbert-elliott", "p": 0.05, "r": 0.2}, "rate": 5e5}
+    assert wire_of(tomllib.loads(resolved_wire(plan))) == plan
+
+
+def test_everything_that_a_file_can_have(tmp_path: Path) -> None:
+    """Each entry arrives in the plan, and in the resolved file; files are found beside the wire file."""
+    (tmp_path / "walk.csv").write_text("1\n0\n1\n1\n")
+    text = """
+    seed = 11
+    lossless = "a/**"
+    largest = "64 MB"
+    query_seconds = "2 s"
+    held_messages = 50
+    held_bytes = "1 MiB"
+    [side.robot]
+    listen = ["tls/0.0.0.0:7448", "unixsock-stream//run/robot"]
+    tls = { certificate = "robot.pem", key = "robot.key", authority = "ca.pem" }
+    users = { ada = "secret" }
+    keys = ["robot/**", "@ros2_lv/**"]
+    [side.base]
+    connect = "tcp/127.0.0.1:7447"
+    [side.third]
+    [[link]]
+    from = "robot"
+    to = "base"
+    loss = { model = "trace", file = "walk.csv" }
+    delay = { model = "trace", values = [0.5, 1.0] }
+    reorder = 0.1
+    duplicate = 0.2
+    corrupt = 0.3
+    [[link]]
+    from = "robot"
+    to = "base"
+    keys = "b/**"
+    [[link]]
+    name = "robot-third"
+    from = "robot"
+    to = "third"
+    loss = { model = "trace", outcomes = "10" }
+    correlation = { with = "robot-base", strength = 0.5 }
+    [[link]]
+    from = "robot"
+    to = "third"
+    delay = { model = "constant", value = 1, unit = "seconds" }
+    rate = "8 Mbit/s"
+    [[event]]
+    at = 1
+    cut = "robot-base-2"
+    [[event]]
+    at = "1 min"
+    link = "robot-third-2"
+    set = { quality = 0.5, duplicate = 0.0, delay = { model = "constant", value = "5 ms" } }
+    [[event]]
+    at = "90 s"
+    note = "the robot enters the lift"
+    [[event]]
+    at = 2.0
+    link = "robot-base-2"
+    set = { rate = "1 kB/s" }
+    """
+    plan = of(text, tmp_path)
+    assert (plan.seed, plan.largest, plan.query_seconds, plan.held_messages, plan.held_bytes) == (
+        11,
+        64_000_000,
+        2.0,
+        50,
+        2**20,
+    )
+    files = [str(tmp_path / name) for name in ("robot.pem", "robot.key", "ca.pem")]
+    endpoints = ("tls/0.0.0.0:7448", "unixsock-stream//run/robot")
+    assert plan.sides["robot"] == Side(
+        "robot", endpoints, (), SideTls(*files), {"ada": "secret"}, ("robot/**", "@ros2_lv/**")
+    )
+    assert plan.sides["base"] == Side("base", (), ("tcp/127.0.0.1:7447",))
+    assert plan.sides["third"] == Side("third", ("tcp/127.0.0.1:0",))
+    assert [link.name for link in plan.links] == ["robot-base", "robot-base-2", "robot-third", "robot-third-2"]
+    assert plan.links[0].settings == {
+        "loss": {"model": "trace", "outcomes": "1011"},
+        "delay": {"model": "trace", "values": [0.5, 1.0]},
+        "reorder": 0.1,
+        "duplicate": 0.2,
+        "corrupt": 0.3,
+    }
+    assert plan.links[1].settings == {"loss": {"model": "bernoulli", "quality": 1.0}}
+    assert plan.links[2].correlation == ("robot-base", 0.5)
+    assert plan.links[3].settings["delay"] == {"model": "constant", "value": 1}
+    assert (plan.links[3].settings["rate"], plan.links[3].settings["queue"]) == (1e6, 256_000)
+    quality = {"model": "bernoulli", "quality": 0.5}
+    changed = {"loss": quality, "duplicate": 0.0, "delay": {"model": "constant", "value": 0.005}}
+    assert plan.events[1] == WireEvent(60.0, None, link="robot-third-2", settings=changed)
+    assert plan.events[2].note == "the robot enters the lift"
+    assert plan.events[3].settings == {"rate": 1000.0, "queue": 256_000}
+    assert wire_of(tomllib.loads(resolved_wire(plan))) == plan
+
+
+def test_changes_by_dotted_key(tmp_path: Path) -> None:
+    """As with `--set`."""
+    (tmp_path / "wire.toml").write_text(BASE)
+    plan = load_wire(
+        tmp_path / "wire.toml", {"seed": 9, "link.0.quality": 0.5, "link.1.from": "base", "link.1.to": "robot"}
+    )
+    assert plan.seed == 9
+    assert plan.links[0].settings == {"loss": {"model": "bernoulli", "quality": 0.5}}
+    assert plan.links[1].name == "base-robot"
+
+
+def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
+    """It is named, with the way to an example; text that is not TOML is refused."""
+    with pytest.raises(UsageError, match=r"wire.toml cannot be read \(No such file.*--example"):
+        load_wire(tmp_path / "wire.toml")
+    (tmp_path / "wire.toml").write_text("seed =")
+    with pytest.raises(ScenarioError, match="not TOML"):
+        load_wire(tmp_path / "wire.toml")
+    (tmp_path / "wire.toml").write_text(f"{BASE}name = 'a\\u0007b'".replace("'", '"'))
+    with pytest.raises(ScenarioError, match=r"U\+0007"):
+        load_wire(tmp_path / "wire.toml")
+
+
+def test_all_mistakes_at_once() -> None:
+    """Those of single tables and those across tables are in one message."""
+    found = mistakes("""
+    lossles = []
+    largest = "64 Mb"
+    [side.robot]
+    listen = "tcp/127.0.0.1:7448"
+    [side.base]
+    listen = ["tcp/0.0.0.0:7448", "tcp/127.0.0.1"]
+    [[link]]
+    from = "robto"
+    to = "base"
+    keys = "a//b"
+    quality = 1.5
+    [[event]]
+    at = "12"
+    partition = ["robot", "bsae"]
+    """)
+    assert found == [
+        'side.base.listen.1: is "tcp/127.0.0.1"; expected PROTOCOL/HOST:PORT with the protocol tcp, tls, quic, ws or '
+        "unixsock-stream, such as tcp/127.0.0.1:7448",
+        "link.0.quality: is 1.5; expected a number from 0 to 1, such as 0.9",
+        'link.0.keys: is "a//b"; expected a key expression that Zenoh accepts (empty chunks are forbidden, as well as '
+        "leading and trailing slashes)",
+        'event.0.at: is "12"; expected seconds, or a text such as "20 ms"; the units are us, µs, ms, s, min, h, such as "12 s"',
+        'largest: is "64 Mb"; expected bytes, or a text such as "256 kB"; the units are B, kB, MB, GB, KiB, MiB, GiB, such as '
+        '"64 MB"',
+        "lossles: is not an entry of this table; did you mean lossless?",
+        'side.base.listen.0: is "tcp/0.0.0.0:7448", the same place as tcp/127.0.0.1:7448 at which side robot listens; '
+        "expected another port",
+        'link.0.from: is "robto"; expected robot or base; did you mean robot?',
+        'event.0.partition.1: is "bsae"; expected robot or base; did you mean base?',
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", "side: is missing; expected side"),
+        ("[side.robot]", "side: has fewer than 2 entries; expected at least that many"),
+        ("side = 3", "side: is 3; expected a table"),
+        (f"{BASE}keys = 'a/**/**'", "link.0.keys: is \"a/**/**\"; expected a key expression that Zenoh accepts (`**/**` must be "
+         "replaced by `**` to reach canon-form); did you mean a/**?"),
+        (BASE.replace('"base"', '"robot"'), 'link.0.to: is "robot", where the link begins; expected another side'),
+        (BASE.replace("7449", "7448"), 'side.base.listen: is "tcp/127.0.0.1:7448", the same place at which side robot listens; '
+         "expected another port"),
+        (BASE.replace("tcp/127.0.0.1:7449", "udp/127.0.0.1:7449"), 'side.base.listen.0: is "udp/127.0.0.1:7449"; expected tcp, '
+         "tls, quic, ws or unixsock-stream in place of udp, which would lose messages of its own"),
+        (BASE.replace("tcp/127.0.0.1:7449", "tls/127.0.0.1:7449"), "side.base.tls: is missing; expected a certificate and its "
+         "key for tls/127.0.0.1:7449"),
+        (BASE.replace("[side.base]", "[side.base]\ntls = { certificate = 'a', key = 'b' }"),
+         "side.base.tls: is given, but no endpoint of the side begins with quic or tls"),
+        (BASE.replace("[side.base]", "[side.base]\nconnect = 'tcp/localhost:7448'"), 'side.base.connect: is '
+         '"tcp/localhost:7448", where side robot of this wire listens, so that messages would go round; expected a router '
+         "outside of the wire"),
+        ("[side.a]\nconnect = 'tcp/h:1'\n[side.b]\nconnect = ['tcp/h:1']", 'side.b.connect.0: is "tcp/h:1", the router to which '
+         "side a connects, so that messages would go round; expected another router"),
+        ("[side.a]\nconnect = ['tcp/h:1', 'tcp/h:1']\n[side.b]", 'side.a.connect.1: is "tcp/h:1", the router to which side a '
+         "connects; expected another router"),
+        (BASE.replace("side.base", "side.Base")
+         .replace('"base"', '"Base"'),
+         'side.Base: is "Base"; expected a name of a lower-case letter, then up to 31 of '
+         "a-z 0-9 _ -"),
+        (BASE.replace("[side.base]", "[side.base]\nusers = { 'a:b' = 'c' }"), 'side.base.users.a:b: is "a:b"; expected a user '
+         "name without a colon"),
+        (f"{BASE}name = 'Scan'", 'link.0.name: is "Scan"; expected a name of a lower-case letter, then up to 79 of a-z 0-9 _ -, '
+         'such as "scan"'),
+        (f"{BASE}name = 'x'\n[[link]]\nname = 'x'\nfrom = 'base'\nto = 'robot'", 'link.1.name: is "x", the name of link.0; '
+         "expected a name of its own"),
+        (f"{BASE}rate = '2 MB'", 'link.0.rate: is "2 MB"; expected bytes per second, or a text such as "2 MB/s"; the units are '
+         'B/s, kB/s, MB/s, GB/s, KiB/s, MiB/s, GiB/s, bit/s, kbit/s, Mbit/s, Gbit/s, such as "2 MB/s"'),
+        (f"{BASE}queue = 1000", "link.0.queue: is given without a rate, so that nothing queues; expected a rate as well"),
+        (f"{BASE}reorder = 0.1", "link.0.reorder: is given without a delay, so that nothing can overtake; expected a delay as "
+         "well"),
+        (f"{BASE}quality = 0.5\nloss = {{ model = 'bernoulli', quality = 0.5 }}", "link.0.quality: is given together with loss, "
+         "whose short form it is; expected one of them"),
+        (f"{BASE}loss = {{ model = 'gilbert' }}", None),
+        (f"{BASE}loss = {{ model = 'trace', outcomes = '10', once = true }}", "link.0.loss.once: is true, but a wire has no last "
+         "message; expected false: the recording repeats"),
+        (f"{BASE}loss = {{ model = 'trace', file = 'none.csv' }}", None),
+        (f"{BASE}delay = {{ model = 'constant', value = '2 slots' }}", 'link.0.delay.value: is "2 slots"; expected seconds, or a '
+         'text such as "20 ms"'),
+        (f"{BASE}delay = {{ model = 'constant', value = 2, unit = 'slots' }}", 'link.0.delay.unit: is "slots"; expected no unit: '
+         "delays on a wire are in seconds"),
+        (f"{BASE}correlation = {{ with = 'scan', strength = 0.5 }}", 'link.0.correlation.with: is "scan"; the file has no other '
+         "link"),
+        (f"{BASE}correlation = {{ with = 'x', strength = 0.5 }}\n[[link]]\nname = 'x'\nfrom = 'base'\nto = 'robot'\ncorrelation "
+         "= { with = 'robot-base', strength = 0.5 }", None),
+        (f"{BASE}correlation = {{ with = 'x', strength = 0.5 }}\n[[link]]\nname = 'x'\nfrom = 'base'\nto = 'robot'\nloss = "
+         "{ model = 'pattern', outcomes = '10' }", "link.0.correlation.with: is x, but the loss models differ (pattern there "
+         "and bernoulli here); expected the same model"),
+        (f"{BASE}[[event]]\nat = 1", 'event.0.event: does not say what happens; expected one of partition, cut, set or note, '
+         'such as partition = ["robot", "base"]'),
+        (f"{BASE}[[event]]\nat = 1\ncut = 'robot-base'\nnote = 'x'", "event.0.event: has cut or note at once; expected one of "
+         'partition, cut, set or note, such as partition = ["robot", "base"]'),
+        (f"{BASE}[[event]]\nat = 1\ncut = 'robot-bsae'", 'event.0.cut: is "robot-bsae"; expected robot-base; did you mean '
+         "robot-base?"),
+        (f"{BASE}[[event]]\nat = 1\npartition = ['robot', 'robot']", 'event.0.partition: is ["robot", "robot"]; expected two '
+         "different sides"),
+        (f"{BASE}[[event]]\ncut = 'robot-base'", 'event.0.at: is missing; expected at = "12 s"'),
+        (f"{BASE}[[event]]\nat = 1\nfrom = 2\ncut = 'robot-base'", "event.0.at: and from are both there; expected one of them"),
+        (f"{BASE}[[event]]\nat = 1\nto = 2\ncut = 'robot-base'", "event.0.to: is given without from; expected from and to, or "
+         "only at"),
+        (f"{BASE}[[event]]\nfrom = '3 s'\nto = '2000 ms'\ncut = 'robot-base'", 'event.0.to: is "2000 ms", not after from, which '
+         'is "3 s"; expected a later time'),
+        (f"{BASE}[[event]]\nat = 1\nset = {{}}\nlink = 'robot-base'", "event.0.set: is empty; expected what changes, such as "
+         "set = { quality = 0.2 }"),
+        (f"{BASE}[[event]]\nat = 1\nset = {{ quality = 0.1 }}", 'event.0.link: is missing, but set is given; expected link = '
+         '"robot-base" and what to set'),
+        (f"{BASE}[[event]]\nat = 1\nnote = 'x'\nlink = 'robot-base'", 'event.0.set: is missing, but link is given; expected '
+         'link = "robot-base" and what to set'),
+        (f"{BASE}[[event]]\nat = 1\nlink = 'robot-base'\nset = {{ qualty = 0.1 }}", "event.0.set.qualty: is not a link setting "
+         "that can be changed; expected quality, loss, delay, reorder, duplicate, corrupt, rate or queue; did you mean "
+         "quality?"),
+        (f"{BASE}[[event]]\nat = 1\nlink = 'robot-base'\nset = {{ quality = 2 }}", "event.0.set.quality: is 2; expected a number "
+         "from 0 to 1, such as 0.9"),
+        (f"{BASE}quality = 3\n[[event]]\nat = 1\nlink = 'robot-base'\nset = {{ quality = 0.5 }}", "link.0.quality: is 3; "
+         "expected a number from 0 to 1, such as 0.9"),
+    ],
+)  # fmt: skip
+def test_one_mistake(text: str, expected: str | None) -> None:
+    """It is the only one that is reported, in words that say what to do. None: only that there is one."""
+    found = mistakes(text)
+    assert len(found) == 1 or expected is None
+    assert expected is None or found == [expected]
+
+
+def test_a_correlated_link_keeps_its_model() -> None:
+    """Its uniform numbers are the other link's, and each model uses them in its own way."""
+    found = mistakes(f"""{BASE}correlation = {{ with = "x", strength = 0.5 }}
+    [[link]]
+    name = "x"
+    from = "base"
+    to = "robot"
+    [[event]]
+    at = 1
+    link = "robot-base"
+    set = {{ loss = {{ model = "pattern", outcomes = "10" }} }}
+    """)
+    assert found == [
+        "event.0.set.loss.model: differs from the first one, but the link's losses are tied to another link's; expected the same "
+        "model"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [
+        ("20 ms", 0.02),
+        ("20ms", 0.02),
+        ("1.5 s", 1.5),
+        ("2 min", 120.0),
+        ("1 h", 3600.0),
+        ("3 µs", 3e-6),
+        ("1e3 us", 1e-3),
+    ],
+)
+def test_lengths_of_time(text: str, seconds: float) -> None:
+    """They are the numbers that a file without units would have."""
+    assert in_seconds(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["", "ms", "20", "-1 s", "20 sec", "1 2 s", "nan s", "inf s"])
+def test_what_is_not_a_length_of_time(text: str) -> None:
+    """It has no meaning."""
+    assert in_seconds(text) is None
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "overlap"),
+    [
+        ("tcp/127.0.0.1:7", "tcp/127.0.0.1:7", True),
+        ("tcp/127.0.0.1:7", "ws/localhost:7#a=b", True),
+        ("tcp/127.0.0.1:7", "tcp/127.0.0.2:7", False),
+        ("tcp/[::]:7", "tcp/127.0.0.2:7?x", True),
+        ("tcp/127.0.0.1:7", "quic/127.0.0.1:7", False),
+        ("tcp/127.0.0.1:0", "tcp/127.0.0.1:0", False),
+        ("unixsock-stream//a", "unixsock-stream//a", True),
+        ("unixsock-stream//a", "tcp/127.0.0.1:7", False),
+    ],
+)
+def test_places(one: str, other: str, overlap: bool) -> None:
+    """Two endpoints overlap if nothing can listen on both."""
+    first, second = place_of(one), place_of(other)
+    assert first is not None
+    assert second is not None
+    assert first.overlaps(second) == second.overlaps(first) == overlap
+
+
+@pytest.mark.parametrize("endpoint", ["tcp/h:65536", "tcp/h", "tcp", "serial/x:1", "h:1", "tcp/a:b:1", "tcp/:1"])
+def test_malformed_endpoints(endpoint: str) -> None:
+    """They are no places."""
+    assert place_of(endpoint) is None
