@@ -14,11 +14,13 @@ from evedrop.fitting import candidate
 from evedrop.fitting.candidate import Candidate, delay_candidates, wilson
 from evedrop.fitting.run_lengths import RunLaw, lengths_of, p_value
 from evedrop.model.checks import toml_of
+from evedrop.model.process import Floats
 from evedrop.recordings.link_recording import LinkRecording, Outcomes
 
 FEWEST = 100
 """The fewest outcomes from which a model can be estimated."""
-_FEWEST_DELAYS = 10
+FEWEST_DELAYS = 10
+"""The fewest delays from which a model can be estimated."""
 _LEVEL = 0.01
 DELAY = "delay"
 
@@ -119,17 +121,26 @@ def fit(path: Path, column: str | None = None, delay_column: str | None = None) 
     if column is None and len(names) == 2 and DELAY in names:
         column = next(name for name in names if name != DELAY)
     outcomes = recording.outcomes(column)
-    _check(path, outcomes)
+    _check(str(path), outcomes)
     wanted = delay_column or (DELAY if DELAY in names and column != DELAY else None)
     delays = np.empty(0) if wanted is None else recording.delays(wanted)
     delays = delays[~np.isnan(delays)]
-    if wanted is not None and len(delays) < _FEWEST_DELAYS:
-        what = f"{wanted} has {len(delays)} delays; expected {_FEWEST_DELAYS} or more, such as a longer recording"
+    if wanted is not None and len(delays) < FEWEST_DELAYS:
+        what = f"{wanted} has {len(delays)} delays; expected {FEWEST_DELAYS} or more, such as a longer recording"
         raise TraceError(str(path), "file", what)
+    return fit_outcomes(str(path), outcomes, delays)
+
+
+def fit_outcomes(name: str, outcomes: Outcomes, delays: Floats) -> Fit:
+    """Find the models that may have produced outcomes, (n,), and delays, (d,), which may be empty.
+
+    name: what was recorded, for messages. Raises TraceError if nothing can be estimated.
+    """
+    _check(name, outcomes)
     candidates = [candidate.bernoulli(outcomes), candidate.gilbert(outcomes), candidate.gilbert_elliott(outcomes)]
     chosen = min(candidates, key=lambda one: one.bic(len(outcomes)))
     return Fit(
-        str(path),
+        name,
         len(outcomes),
         int((outcomes == 0).sum()),
         candidates,
@@ -140,18 +151,16 @@ def fit(path: Path, column: str | None = None, delay_column: str | None = None) 
     )
 
 
-def _check(path: Path, outcomes: Outcomes) -> None:
+def _check(name: str, outcomes: Outcomes) -> None:
     """Raise TraceError for a recording from which nothing can be estimated."""
     count, delivered = len(outcomes), int(outcomes.sum())
     if count < FEWEST:
-        raise TraceError(
-            str(path), "file", f"has {count} outcomes; expected {FEWEST} or more, such as a longer recording"
-        )
+        raise TraceError(name, "file", f"has {count} outcomes; expected {FEWEST} or more, such as a longer recording")
     if delivered in {0, count}:
         low, high = wilson(delivered, count)
         all_or_none, bound = ("delivered", f"at least {low:.4g}") if delivered else ("lost", f"at most {high:.4g}")
         raise TraceError(
-            str(path),
+            name,
             "file",
             f"has {count} outcomes, all {all_or_none}: the quality is {bound} with 95 % confidence if losses are independent, "
             "and nothing can be said about bursts; expected a recording with both, such as a longer one",
@@ -173,16 +182,22 @@ def lines(found: Fit) -> list[str]:
     """The fit as printed lines."""
     share = 100.0 * found.lost / found.count
     mean = "none of them ended" if found.bursts.mean is None else f"{found.bursts.mean:.4g} slots on average"
-    told = [
-        f"{found.trace}: {found.count} outcomes, {found.lost} lost ({share:.4g} %), {found.bursts.count} bursts, {mean}"
+    return [
+        f"{found.trace}: {found.count} outcomes, {found.lost} lost ({share:.4g} %), {found.bursts.count} bursts, {mean}",
+        *model_lines(found),
+        found.toml,
     ]
-    told += _table(found.candidates, found.chosen, found.count)
+
+
+def model_lines(found: Fit) -> list[str]:
+    """The candidates, the models that were taken, and how well they fit, as printed lines."""
+    told = _table(found.candidates, found.chosen, found.count)
     told.append(f"taken: {found.chosen.name}, by BIC; its bursts last {found.bursts.fitted:.4g} slots on average")
     told.append(f"fit: {found.goodness}")
     if found.chosen_delay is not None:
         told.append(f"{found.delays} delays")
         told += _table(found.delay_candidates, found.chosen_delay, found.delays)
-    return [*told, found.toml]
+    return told
 
 
 def _table(candidates: Sequence[Candidate], chosen: Candidate, count: int) -> list[str]:

@@ -1,0 +1,48 @@
+"""What a recording tells of the messages on a link: which were lost, and how long the others took.
+
+Source: docs/links.md, recordings of messages.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+from evedrop.errors import TraceError
+from evedrop.model.process import Floats
+from evedrop.recordings.message_numbers import MessageSeries
+
+_SHORTEST_PART = 20
+
+
+@final
+@dataclass(frozen=True)
+class MessageRecording:
+    """The messages of a topic, or of a link of a wire."""
+
+    name: str
+    """The recording and the topic or link, for messages."""
+    series: MessageSeries
+    delays: Floats
+    """Seconds, of each message that was delivered and whose delay is known, (d,)."""
+    corrupt: float | None = None
+    """The fraction of messages that were damaged among those that were not lost; None: nothing would show it."""
+    notes: tuple[str, ...] = ()
+    """What was left out or assumed, in sentences."""
+    source: str = "robot"
+    """The side from which the messages came."""
+    target: str = "base"
+    keys: str = "**"
+    """The key expression of the messages in a wire file."""
+
+
+def check_parts(name: str, series: MessageSeries, why: str) -> None:
+    """Raise TraceError if the messages are cut into parts so short that nothing can be said of bursts; why: what cuts them."""
+    count = len(series.outcomes)
+    if count < _SHORTEST_PART * series.parts and series.parts > 1:
+        raise TraceError(
+            name,
+            "file",
+            f"its {count} outcomes are in {series.parts} parts, {count / series.parts:.3g} outcomes long on average: {why}; "
+            f"expected parts of {_SHORTEST_PART} or more",
+        )

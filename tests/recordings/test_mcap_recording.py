@@ -1,0 +1,372 @@
+"""MCAP recordings, written with the mcap library as recorders write them: what was lost is found, and the rest is refused."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.writer import CompressionType, Writer
+
+from evedrop.errors import TraceError
+from evedrop.fitting.message_fit import fit_messages
+from evedrop.model.links import loss_of
+from evedrop.model.links.link import Fate
+from evedrop.recordings.link_recording import Outcomes
+from evedrop.recordings.mcap_recording import mcap_recording
+from evedrop.recordings.message_numbers import MessageArrivals, numbers_of_times, series_of
+from tests.conftest import Evedrop
+
+SECOND = 10**9
+BEGAN = 1_700_000_000 * SECOND
+
+
+@dataclass
+class Recorded:
+    """The messages of a publisher, as a recorder heard them: number, time of sending and of recording in seconds."""
+
+    topic: str
+    messages: Sequence[tuple[int, float, float]]
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    own_times: bool = True
+    """False: the recorder writes its own time as the time of publication, as rosbag2 did before Jazzy."""
+
+
+def write(path: Path, recorded: Iterable[Recorded], compression: CompressionType = CompressionType.ZSTD) -> Path:
+    """A recording of several publishers, each on a channel of its own, in the order of recording."""
+    with path.open("wb") as file:
+        _write(file, list(recorded), compression)
+    return path
+
+
+def _write(file: BinaryIO, recorded: Sequence[Recorded], compression: CompressionType) -> None:
+    writer = Writer(file, chunk_size=4096, compression=compression)
+    writer.start("ros2", "libmcap")
+    schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
+    rows = []
+    for one in recorded:
+        channel = writer.register_channel(one.topic, "cdr", schema, dict(one.metadata))
+        for number, sent, heard in one.messages:
+            logged = BEGAN + round(heard * SECOND)
+            rows.append((logged, channel, number, BEGAN + round(sent * SECOND) if one.own_times else logged))
+    for logged, channel, number, published in sorted(rows, key=lambda row: row[0]):
+        writer.add_message(channel, logged, b"\x00\x01\x00\x00", published, number % 2**32)
+    writer.finish()
+
+
+def lossy(spec: Mapping[str, Any], count: int, seed: int = 1) -> Outcomes:
+    """What a link does to messages, (count,)."""
+    loss = loss_of(dict(spec))
+    uniforms = np.random.default_rng(seed).random((count, loss.uniforms_per_slot, 1))
+    delivered: Outcomes = (loss.fates(0, uniforms)[:, 0] == Fate.DELIVERED).astype(np.uint8)
+    return delivered
+
+
+def heard(
+    outcomes: Outcomes, period: float = 0.1, first: int = 1, delay: float = 0.005
+) -> list[tuple[int, float, float]]:
+    """The messages that arrived of those that were sent regularly, from the number `first` on."""
+    return [(first + i, i * period, i * period + delay) for i in np.flatnonzero(outcomes).tolist()]
+
+
+def trimmed(outcomes: Outcomes) -> list[int]:
+    """From the first to the last delivered: nobody can see what was lost before or after."""
+    places = np.flatnonzero(outcomes)
+    found: list[int] = outcomes[places[0] : places[-1] + 1].tolist()
+    return found
+
+
+BURSTS = {"model": "gilbert-elliott", "p": 0.05, "r": 0.3}
+
+
+@pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD])
+def test_missing_numbers_are_losses(tmp_path: Path, compression: CompressionType) -> None:
+    """Exactly the outcomes of the link, up to the last message that arrived; another topic's messages do not matter."""
+    outcomes = lossy(BURSTS, 3000)
+    path = write(
+        tmp_path / "walk.mcap",
+        [Recorded("/scan", heard(outcomes)), Recorded("/odom", heard(lossy(BURSTS, 3000, 2)))],
+        compression,
+    )
+    found = mcap_recording(path, "/scan")
+    assert found.series.outcomes.tolist() == trimmed(outcomes)
+    assert (found.series.parts, found.series.repeated, found.series.late) == (1, 0, 0)
+    assert found.series.seconds == pytest.approx(0.1)
+    assert found.delays == pytest.approx(0.005, abs=1e-9)
+    assert len(found.delays) == outcomes.sum()
+    assert found.keys == "*/scan/**"
+
+
+@given(
+    st.lists(st.integers(0, 1), min_size=2, max_size=60).filter(lambda word: sum(word) > 1),
+    st.integers(0, 2**32 - 1),
+    st.randoms(use_true_random=False),
+)
+def test_late_and_repeated_messages_are_no_losses(word: list[int], first: int, random: Any) -> None:
+    """Whatever is late or comes twice, and wherever the numbers wrap: the outcomes are those of the link."""
+    places = [i for i, outcome in enumerate(word) if outcome]
+    arrived = places + [place for place in places if random.random() < 0.3]
+    arrived.sort(key=lambda place: place + random.random() * 5.0)
+    numbers = np.array([(first + place) % 2**32 for place in arrived], np.int64)
+    sent = np.array(arrived, np.float64)
+    found = series_of(MessageArrivals(numbers, np.arange(len(arrived), dtype=np.float64), sent), wrap=2**32)
+    assert found.outcomes.tolist() == trimmed(np.array(word, np.uint8))
+    assert found.repeated == len(arrived) - len(places)
+    assert found.parts == 1
+    assert found.kept.sum() == len(places)
+
+
+@pytest.mark.parametrize("times_known", [True, False])
+@pytest.mark.parametrize("before", [200, 40])
+def test_a_sender_that_starts_again_loses_nothing(before: int, times_known: bool) -> None:
+    """Its numbers go back to 1: two parts, between which nothing is known; a late message is not taken for that."""
+    first, second = lossy(BURSTS, before, 3), lossy(BURSTS, 300, 4)
+    numbers = [number for number, *_ in [*heard(first), *heard(second)]]
+    numbers[10], numbers[11] = numbers[11], numbers[10]
+    sent = np.arange(len(numbers), dtype=np.float64)
+    sent[10], sent[11] = sent[11], sent[10]
+    clock = np.arange(len(numbers), dtype=np.float64)
+    found = series_of(MessageArrivals(np.array(numbers), clock, sent if times_known else None), wrap=2**32)
+    assert (found.parts, found.restarts, found.late, found.repeated) == (2, 1, 1, 0)
+    assert found.outcomes.tolist() == trimmed(first) + trimmed(second)
+
+
+def test_a_counter_that_leaps_is_no_loss() -> None:
+    """100 000 numbers in the time of one message: the counter was set; in the time of as many messages: they were lost."""
+    numbers = np.concatenate([np.arange(200), 100_000 + np.arange(200)])
+    leapt = series_of(MessageArrivals(numbers, np.arange(400.0)))
+    assert (leapt.leaps, leapt.parts, leapt.outcomes.tolist()) == (1, 2, [1] * 400)
+    away = series_of(MessageArrivals(numbers, numbers.astype(np.float64)))
+    assert (away.leaps, away.parts, len(away.outcomes), away.outcomes.sum()) == (0, 1, 100_200, 400)
+
+
+def test_a_long_silence_can_be_left_out() -> None:
+    """With a limit, a recorder that paused or a robot that was away for a minute loses no messages; short gaps still do."""
+    numbers = np.concatenate([np.arange(0, 100, 2), 700 + np.arange(0, 100, 2)])
+    arrivals = MessageArrivals(numbers, numbers / 10.0)
+    assert series_of(arrivals).outcomes.sum() == len(numbers)
+    found = series_of(arrivals, longest=30.0)
+    assert found.outages == pytest.approx((60.2,))
+    assert found.outcomes.tolist() == ([1, 0] * 49 + [1]) * 2
+
+
+def test_too_many_outcomes_are_refused() -> None:
+    """Before memory is taken for them."""
+    arrivals = MessageArrivals(np.array([0, 1, 10**9]), np.array([0.0, 1.0, 1e9]))
+    with pytest.raises(ValueError, match="more than 10000000 outcomes"):
+        series_of(arrivals)
+
+
+def test_regular_messages_are_numbered_by_their_times() -> None:
+    """Up to a quarter of a period of jitter; messages further away are counted."""
+    random = np.random.default_rng(5)
+    kept = np.flatnonzero(lossy(BURSTS, 2000))
+    numbers, off = numbers_of_times(kept * 0.1 + random.uniform(-0.01, 0.01, len(kept)), 0.1)
+    assert numbers.tolist() == (kept - kept[0]).tolist()
+    assert off == 0.0
+    assert numbers_of_times(np.sort(random.uniform(0.0, 200.0, 2000)), 0.1)[1] > 0.3
+
+
+def test_a_recording_without_numbers_needs_a_period(tmp_path: Path) -> None:
+    """As ros2 bag record makes it: refused with the reason and the remedy; with the period the outcomes are those of the link."""
+    outcomes = lossy(BURSTS, 3000)
+    messages = [(0, sent, logged) for _, sent, logged in heard(outcomes)]
+    path = write(tmp_path / "bag.mcap", [Recorded("/scan", messages)])
+    with pytest.raises(TraceError, match=r"numbers no message of /scan .*--period \(the median of /scan is 0.1 s\)"):
+        mcap_recording(path)
+    found = mcap_recording(path, period=0.1)
+    assert found.series.outcomes.tolist() == trimmed(outcomes)
+    assert any("a message that the publisher left out counts as lost" in note for note in found.notes)
+    with pytest.raises(TraceError, match=r"more than a quarter of 0.07 s away"):
+        mcap_recording(path, period=0.07)
+
+
+def test_a_bag_from_before_jazzy_has_no_delays(tmp_path: Path) -> None:
+    """Its recorder wrote one time for both; losses are found all the same."""
+    outcomes = lossy(BURSTS, 500)
+    path = write(tmp_path / "bag.mcap", [Recorded("/scan", heard(outcomes), own_times=False)])
+    found = mcap_recording(path)
+    assert found.series.outcomes.tolist() == trimmed(outcomes)
+    assert len(found.delays) == 0
+    assert any("before Jazzy" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("offset", [-5.0, 1.7e9])
+def test_two_clocks_give_no_delays(tmp_path: Path, offset: float) -> None:
+    """A log time before the time of sending, or years after it: the reason is said, and losses are found all the same."""
+    outcomes = lossy(BURSTS, 500)
+    messages = [(number, sent, logged + offset) for number, sent, logged in heard(outcomes)]
+    found = mcap_recording(write(tmp_path / "bag.mcap", [Recorded("/scan", messages)]))
+    assert found.series.outcomes.tolist() == trimmed(outcomes)
+    assert len(found.delays) == 0
+    assert any("did not use one clock" in note for note in found.notes)
+
+
+def test_a_recorder_that_counts_by_itself_shows_no_loss(tmp_path: Path) -> None:
+    """One counter for all topics, and one for each topic: both refused, and two publishers that count alike are not."""
+    random = np.random.default_rng(6)
+    topics = random.integers(0, 2, 2000)
+    counted = [
+        Recorded(f"/{name}", [(i, i * 0.1, i * 0.1 + 0.01) for i in np.flatnonzero(topics == at).tolist()])
+        for at, name in enumerate(("scan", "odom"))
+    ]
+    path = write(tmp_path / "one.mcap", counted)
+    with pytest.raises(TraceError, match="numbers the messages of all topics with one counter"):
+        mcap_recording(path, "/scan")
+    path = write(tmp_path / "each.mcap", [Recorded("/scan", heard(np.ones(500, np.uint8)))])
+    with pytest.raises(TraceError, match="either nothing was lost, or the recorder itself counted"):
+        mcap_recording(path)
+
+
+@pytest.mark.parametrize("offset", [0, 1000])
+def test_two_publishers_in_one_channel_are_refused(tmp_path: Path, offset: int) -> None:
+    """rosbag2 keeps one channel for a topic, so the numbers of its publishers are mixed: they cannot be told apart."""
+    one = heard(lossy(BURSTS, 500))
+    other = [(number + offset, sent + 0.03, logged + 0.03) for number, sent, logged in heard(lossy(BURSTS, 500, 2))]
+    both = sorted([*one, *other], key=lambda message: message[2])
+    path = write(tmp_path / "bag.mcap", [Recorded("/tf", both)])
+    with pytest.raises(TraceError, match="several share the topic"):
+        mcap_recording(path)
+    path = write(tmp_path / "old.mcap", [Recorded("/tf", both, own_times=False)])
+    with pytest.raises(TraceError, match=r"several share the topic|two publishers that count alike"):
+        mcap_recording(path)
+    path = write(tmp_path / "channels.mcap", [Recorded("/tf", one), Recorded("/tf", other)])
+    with pytest.raises(TraceError, match="several publishers share it"):
+        mcap_recording(path)
+
+
+def test_what_was_kept_for_late_subscribers_is_left_out(tmp_path: Path) -> None:
+    """A message of transient-local durability from long before the recording is no sign of losses."""
+    messages = [(1, -3600.0, 0.0), *heard(lossy(BURSTS, 500), first=36_001)]
+    found = mcap_recording(write(tmp_path / "bag.mcap", [Recorded("/map", messages)]))
+    assert len(found.series.outcomes) <= 500
+    assert any("kept for late subscribers" in note for note in found.notes)
+
+
+def test_reliable_delivery_is_told(tmp_path: Path) -> None:
+    """Its losses are not those of the network."""
+    metadata = {"offered_qos_profiles": "- history: keep_last\n  depth: 10\n  reliability: reliable\n"}
+    path = write(tmp_path / "bag.mcap", [Recorded("/scan", heard(lossy(BURSTS, 500)), metadata)])
+    assert any("offers reliable delivery" in note for note in mcap_recording(path).notes)
+
+
+def test_a_split_bag_is_one_recording(tmp_path: Path) -> None:
+    """The files of a bag's folder follow each other, the tenth after the ninth."""
+    messages = heard(lossy(BURSTS, 1100))
+    (tmp_path / "bag").mkdir()
+    for at in range(11):
+        part = messages[at * len(messages) // 11 : (at + 1) * len(messages) // 11]
+        write(tmp_path / "bag" / f"bag_{at}.mcap", [Recorded("/scan", part)])
+    whole = write(tmp_path / "whole.mcap", [Recorded("/scan", messages)])
+    assert mcap_recording(tmp_path / "bag").series.outcomes.tolist() == mcap_recording(whole).series.outcomes.tolist()
+
+
+def test_a_recording_that_breaks_off_is_used_up_to_there(tmp_path: Path) -> None:
+    """The robot lost its power: what was written counts, and the message says so."""
+    outcomes = lossy(BURSTS, 3000)
+    path = write(tmp_path / "bag.mcap", [Recorded("/scan", heard(outcomes))], CompressionType.NONE)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    found = mcap_recording(path)
+    count = len(found.series.outcomes)
+    assert 500 < count < 2500
+    assert found.series.outcomes.tolist() == trimmed(outcomes)[:count]
+    assert any("breaks off" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "does not begin as an MCAP recording does|has no messages"),
+        (b"SQLite format 3\x00" * 20, "does not begin as an MCAP recording does"),
+        (None, "No such file"),
+    ],
+)
+def test_what_is_no_recording_is_said(tmp_path: Path, content: bytes | None, said: str) -> None:
+    """One reason, and what was expected."""
+    path = tmp_path / "walk.mcap"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(TraceError, match=said):
+        mcap_recording(path)
+
+
+@given(st.integers(0, 10_000), st.integers(0, 255))
+def test_a_damaged_byte_raises_no_other_error(tmp_path_factory: pytest.TempPathFactory, place: int, value: int) -> None:
+    """The recording is used, or refused as one."""
+    folder = tmp_path_factory.getbasetemp()
+    path = folder / "damaged.mcap"
+    whole = folder / "whole.mcap"
+    if not whole.exists():
+        write(whole, [Recorded("/scan", heard(lossy(BURSTS, 300)))], CompressionType.NONE)
+    content = bytearray(whole.read_bytes())
+    content[place % len(content)] = value
+    path.write_bytes(content)
+    with contextlib.suppress(TraceError):
+        mcap_recording(path)
+
+
+@pytest.mark.parametrize("spec", [{"model": "bernoulli", "quality": 0.8}, BURSTS])
+def test_the_fitted_link_loses_as_the_recorded_one_did(spec: dict[str, Any], tmp_path: Path) -> None:
+    """Rate and length of bursts of 200 000 messages through the fitted model, within 4 % of the link that was recorded."""
+    outcomes = lossy(spec, 8000)
+    path = write(tmp_path / "bag.mcap", [Recorded("/scan", heard(outcomes, 0.02))])
+    loss = loss_of(fit_messages(mcap_recording(path)).settings["loss"])
+    uniforms = np.random.default_rng(9).random((1000, loss.uniforms_per_slot, 200))
+    again = loss.fates(0, uniforms) == Fate.LOST
+    assert again.mean() == pytest.approx(1.0 - outcomes.mean(), rel=0.04)
+    recorded = outcomes == 0
+    burst = recorded.sum() / (recorded[1:] & ~recorded[:-1]).sum()
+    assert again[1:].sum() / (again[1:] & ~again[:-1]).sum() == pytest.approx(burst, rel=0.04)
+
+
+def test_the_command_prints_links_for_both(evedrop: Evedrop) -> None:
+    """A link for a wire file, with seconds, and one for a scenario, in slots of the messages' distance; --json says the same."""
+    random = np.random.default_rng(8)
+    messages = [
+        (number, sent, sent + abs(random.normal(0.03, 0.004))) for number, sent, _ in heard(lossy(BURSTS, 2000), 0.1)
+    ]
+    messages += messages[::100]
+    write(evedrop.folder / "tuesday.mcap", [Recorded("/scan", messages)])
+    done = evedrop("links", "fit", "tuesday.mcap")
+    assert (done.status, done.err) == (0, "")
+    text = done.out
+    wire = tomllib.loads(text[text.index("[[link]]") : text.index("# for a scenario")])["link"][0]
+    assert (wire["from"], wire["to"], wire["keys"]) == ("robot", "base", "*/scan/**")
+    assert wire["loss"]["model"] == "gilbert-elliott"
+    assert wire["delay"]["mean"] == pytest.approx(0.03, abs=0.001)
+    assert wire["duplicate"] == pytest.approx(0.01, abs=0.001)
+    assert "# for a scenario with slots of 0.1 s:" in text
+    link = tomllib.loads(text.splitlines()[-1])["link"]
+    assert link["delay"]["mean"] == pytest.approx(0.3, abs=0.01)
+    assert (link["loss"], link["duplicate"]) == (wire["loss"], wire["duplicate"])
+    found = json.loads(evedrop("links", "fit", "tuesday.mcap", "--slot", "0.03", "--json").out)
+    assert found["settings"]["loss"] == wire["loss"]
+    assert found["link"]["delay"]["mean"] == pytest.approx(1.0, abs=0.04)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--column", "a"), "--column is for a table of outcomes, and tuesday.mcap is an MCAP recording"),
+        (("--topic", "/odom"), 'has no topic "/odom"; it has /scan (2 messages), /map (2 messages)'),
+        ((), "has several topics; expected --topic and one of /scan (2 messages), /map (2 messages)"),
+        (("--topic", "/scan"), "tuesday.mcap, /scan: has 3 outcomes; expected 100 or more"),
+        (("--slot", "0"), "--slot 0: expected seconds, more than 0"),
+    ],
+)
+def test_mistakes_of_the_command_are_said(evedrop: Evedrop, arguments: tuple[str, ...], said: str) -> None:
+    """One line, exit 2."""
+    messages = [(1, 0.0, 0.01), (3, 0.2, 0.21)]
+    write(evedrop.folder / "tuesday.mcap", [Recorded("/scan", messages), Recorded("/map", messages)])
+    done = evedrop("links", "fit", "tuesday.mcap", *arguments)
+    assert (done.status, done.out) == (2, "")
+    (line,) = done.err.splitlines()
+    assert said in line
