@@ -14,6 +14,7 @@ from evedrop.model import modulated
 from evedrop.model.acknowledgements import FORGING
 from evedrop.model.modulated_streaks import modulated_streaks
 from evedrop.model.outcomes import eavesdropper_outcomes, legitimate_outcomes
+from evedrop.model.parts_of_runs import parts_of
 from evedrop.model.process import Floats, Process
 from evedrop.model.schedule import in_slot
 from evedrop.model.schemes import scheme_of
@@ -24,7 +25,7 @@ from evedrop.model.theory.clear_states import ClearStatesForm
 from evedrop.model.theory.closed_form import ClosedForm
 from evedrop.model.theory.covariances import ExpectedCovariance, Outcomes, OutcomesAt, SlotOutcomes
 from evedrop.model.theory.directions import Growth, growth
-from evedrop.model.theory.rare_events import Streaks, streaks
+from evedrop.model.theory.rare_events import Streaks, streaks, total_of
 from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
 
@@ -142,7 +143,9 @@ class Expectation:
         outcomes = None if self.closed is not None else self._outcomes
         if outcomes is None:
             return None
-        found: Floats = np.einsum("i,kij,j->k", v, theory.expected_covariances(self.process, outcomes, slots), v)
+        stream, found = ExpectedCovariance(self.process, outcomes), np.empty(slots)
+        for part in parts_of(range(slots)):
+            found[part.start : part.stop] = np.einsum("i,kij,j->k", v, stream.next(len(part)), v)
         return found
 
     @property
@@ -160,7 +163,7 @@ class Expectation:
             return None
         if self._outcomes is not None and not self._outcomes.leaked:
             return streaks(self.process, self._outcomes, slots)
-        total = float(self.traces(slots).sum())
+        total = total_of(self.stream().next_traces, slots)
         return modulated_streaks(self.process, *self._known, slots, total, self.slots_at)
 
     @property

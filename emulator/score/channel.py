@@ -15,6 +15,7 @@ from evedrop.figures.links import LinkAccount
 from evedrop.model.delays import delay_of
 from evedrop.model.links import loss_of
 from evedrop.model.links.link import Chain, LossModel
+from evedrop.model.parts_of_runs import parts_of
 from evedrop.model.slot.link import LinkSchedule
 from evedrop.model.slot.link_law import stretches
 from evedrop.scenario import Scenario
@@ -52,7 +53,7 @@ def link_summary_of(scenario: Scenario, receiver: str, tally: Tally) -> LinkSumm
         return found
     rate = 1.0 - tally.lost.get("lost", 0) / met
     slots = sum(len(piece) for piece, _ in pieces)
-    expected = sum(float(loss.quality_at(piece).sum()) for piece, loss in pieces) / slots
+    expected = sum(float(loss.quality_at(part).sum()) for piece, loss in pieces for part in parts_of(piece)) / slots
     variance = sum(loss.rate_variance(piece) * len(piece) ** 2 for piece, loss in pieces) / slots**2 / tally.trials
     variance *= slots * tally.trials / met if tally.unsent else 1.0
     low, high = interval(rate, expected, variance)

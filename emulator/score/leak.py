@@ -14,32 +14,33 @@ import numpy as np
 from evedrop.figures.standard_error import standard_error, z_of
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Codes, Flags
-from evedrop.model.schedule import in_slots
+from evedrop.model.schedule import StateProbability, in_slots
 from evedrop.model.schemes import scheme_of
 from evedrop.model.slot.link_law import law_of
+from evedrop.model.theory.leaked_bits import RevealedBits
 from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
 from evedrop.score.summary import LeakSummary
 
 
 class PacketBits(NamedTuple):
-    """What the packet of each slot reveals without the secret."""
+    """What the packets of c slots reveal without the secret."""
 
     by_type: Floats
-    """Bits of a packet with ν = 0, and of one with ν = 1, (slots, 2); inf for the state itself."""
+    """Bits of a packet with ν = 0, and of one with ν = 1, (c, 2); inf for the state itself."""
     clear: Floats
-    """The probability that it is the state itself, (slots,)."""
+    """The probability that it is the state itself, (c,)."""
     hidden_bits: Floats
-    """The expected bits of a packet that is not, times the probability of such a packet, (slots,)."""
+    """The expected bits of a packet that is not, times the probability of such a packet, (c,)."""
 
 
-class RevealedBits(NamedTuple):
-    """What a packet reveals in each slot of a scenario to the receiver behind one link."""
+class HeardBits(NamedTuple):
+    """What the packets of c slots reveal to the receiver behind one link."""
 
     by_type: Floats
-    """Bits of a packet with ν = 0, and of one with ν = 1, (slots, 2); inf for the state itself."""
+    """Bits of a packet with ν = 0, and of one with ν = 1, (c, 2); inf for the state itself."""
     expected: Floats | None
-    """Theory: bits that packets other than states reveal, (slots,); None if theory does not cover the link."""
+    """Theory: bits that packets other than states reveal, (c,); None if theory does not cover the link."""
 
 
 @final
@@ -52,11 +53,10 @@ class LeakTally:
         self.slots = 0
         """The number of slots so far; 0 in a mode without packets."""
 
-    def add(self, action: Codes, nu: Flags, revealed: RevealedBits) -> None:
+    def add(self, action: Codes, nu: Flags, revealed: HeardBits) -> None:
         """Add the next slots: the receiver's actions, and the packets' types, (c, R) each."""
-        some = slice(self.slots, self.slots + len(action))
         self.slots += len(action)
-        of_state, of_other = revealed.by_type[some].T[:, :, None]
+        of_state, of_other = revealed.by_type.T[:, :, None]
         bits = np.where(action == Action.LOST, 0.0, np.where(nu, of_other, of_state))
         clear = np.isinf(bits)
         # Slot by slot, so that a trial's bits do not depend on how many slots are added at a time.
@@ -66,7 +66,7 @@ class LeakTally:
         if revealed.expected is None:
             self._expected = math.nan
         else:
-            for expected in revealed.expected[some].tolist():
+            for expected in revealed.expected.tolist():
                 self._expected += expected
 
     @classmethod
@@ -99,31 +99,53 @@ def leak_is_known(scenario: Scenario, receiver: str) -> bool:
     """
     if receiver == LEGITIMATE or scenario.plant is not None or scenario.window(receiver):
         return False
-    return scheme_of(scenario.process.process, scenario.encoding.spec).revealed_bits(1) is not None
+    return scheme_of(scenario.process.process, scenario.encoding.spec).revealed_bits() is not None
 
 
-def revealed_by_packets(scenario: Scenario) -> PacketBits | None:
+@final
+class PacketBitsStream:
+    """What a scenario's packets reveal, a number of slots at a time from slot 0 on."""
+
+    def __init__(self, mu_d: StateProbability, revealed: RevealedBits) -> None:
+        """mu_d: the probability of ν = 0."""
+        self._mu_d, self._revealed, self._first = mu_d, revealed, 0
+
+    def next(self, slots: int) -> PacketBits:
+        """What those of the next slots reveal."""
+        known, some = self._revealed.next(slots), range(self._first, self._first + slots)
+        self._first = some.stop
+        state = np.where(np.arange(some.start, some.stop) == 0, 1.0, in_slots(self._mu_d, some))
+        clear, hidden = np.zeros(slots), np.zeros(slots)
+        for odds, bits in zip((state, 1.0 - state), known, strict=True):
+            clear += np.where(np.isinf(bits), odds, 0.0)
+            hidden += np.where(np.isinf(bits), 0.0, bits) * odds
+        return PacketBits(np.stack(known, axis=1), clear, hidden)
+
+
+def revealed_by_packets(scenario: Scenario) -> PacketBitsStream | None:
     """What the scenario's packets reveal; None if its scheme does not say."""
     scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
-    known = scheme.revealed_bits(scenario.slots)
-    if known is None:
-        return None
-    state = np.where(np.arange(scenario.slots) == 0, 1.0, in_slots(scheme.mu_d, range(scenario.slots)))
-    clear, hidden = np.zeros(scenario.slots), np.zeros(scenario.slots)
-    for odds, bits in zip((state, 1.0 - state), known, strict=True):
-        clear += np.where(np.isinf(bits), odds, 0.0)
-        hidden += np.where(np.isinf(bits), 0.0, bits) * odds
-    return PacketBits(np.stack(known, axis=1), clear, hidden)
+    revealed = scheme.revealed_bits()
+    return None if revealed is None else PacketBitsStream(scheme.mu_d, revealed)
 
 
-def revealed_to(scenario: Scenario) -> dict[str, RevealedBits]:
-    """Receiver → what packets reveal to it, for all of which it is known."""
-    names = [name for name in scenario.receivers if leak_is_known(scenario, name)]
-    packets = revealed_by_packets(scenario) if names else None
-    if packets is None:
-        return {}
-    laws = {name: law_of(scenario.schedule(name)) for name in names}
-    return {
-        name: RevealedBits(packets.by_type, None if law is None else law.rates(scenario.slots) * packets.hidden_bits)
-        for name, law in laws.items()
-    }
+@final
+class HeardBitsStream:
+    """What packets reveal to each receiver for which it is known, a number of slots at a time from slot 0 on."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        names = [name for name in scenario.receivers if leak_is_known(scenario, name)]
+        self._packets = revealed_by_packets(scenario) if names else None
+        self._laws = {name: law_of(scenario.schedule(name)) for name in names}
+        self._first = 0
+
+    def next(self, slots: int) -> dict[str, HeardBits]:
+        """Receiver → what the packets of the next slots reveal to it."""
+        if self._packets is None:
+            return {}
+        packets, some = self._packets.next(slots), range(self._first, self._first + slots)
+        self._first = some.stop
+        return {
+            name: HeardBits(packets.by_type, None if law is None else law.rates(some) * packets.hidden_bits)
+            for name, law in self._laws.items()
+        }

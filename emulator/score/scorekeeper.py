@@ -27,7 +27,7 @@ from evedrop.score.directions import directions_of
 from evedrop.score.expectations_held import Evidence
 from evedrop.score.filtering import true_errors
 from evedrop.score.histogram import LEVELS
-from evedrop.score.leak import revealed_to
+from evedrop.score.leak import HeardBitsStream
 from evedrop.score.slots import Slots
 from evedrop.score.summary import RARE_SHARE, PeerSummary, RareEvents, Summary, Surprising, Verification
 from evedrop.score.sums import SlotSums, Tally, slot_sums, squared_errors, trial_means
@@ -60,7 +60,7 @@ class Scorekeeper:
         if theory is None:
             theory = {name: one.stream() for name, one in expectations_of(scenario).items()}
         self._theory = theory
-        self._revealed = revealed_to(scenario)
+        self._revealed = HeardBitsStream(scenario)
         self.totals = Totals.of(scenario, trials)
 
     def add(self, slots: Slots, known: Mapping[str, tuple[Floats, Floats]] | None = None) -> dict[str, Scored]:
@@ -70,6 +70,7 @@ class Scorekeeper:
         """
         scored = {}
         self._add_plant(slots)
+        revealed = self._revealed.next(slots.count)
         for name, receiver in slots.receivers.items():
             if known is None:
                 errors, traces = squared_errors(slots.x, receiver.x_hat), receiver.traces_of_trials
@@ -83,7 +84,7 @@ class Scorekeeper:
             if tally.conditional is not None:
                 tally.conditional.add(receiver.action)
             if tally.leak is not None:
-                tally.leak.add(receiver.action, slots.nu, self._revealed[name])
+                tally.leak.add(receiver.action, slots.nu, revealed[name])
             for direction in tally.directions.values():
                 direction.add(slots.first, slots.x, receiver.x_hat)
             tally.add_traces(slots.first, traces)

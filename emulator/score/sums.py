@@ -99,6 +99,11 @@ def window_of(k: NDArray[np.intp], slots: int) -> NDArray[np.intp]:
     return np.where(k == 0, -1, (k - 1) * WINDOWS // max(slots - 1, 1))
 
 
+def window_bounds(slots: int) -> NDArray[np.intp]:
+    """The first slot of each window of a run of `slots` slots, and the slot after the last one, (WINDOWS + 1,)."""
+    return 1 - -np.arange(WINDOWS + 1) * max(slots - 1, 0) // WINDOWS
+
+
 @final
 class DirectionErrors:
     """The squared errors of vᵀx of one receiver, summed over the slots of each window and trial."""
@@ -285,7 +290,7 @@ _BYTE = 255  # the largest count in a byte
 
 def window_means(tally: Tally | DirectionErrors) -> Floats:
     """Mean squared error of each window and trial, (WINDOWS, R); NaN for windows without slots."""
-    lengths = np.bincount(window_of(np.arange(1, tally.slots), tally.slots), minlength=WINDOWS)
+    lengths = np.diff(window_bounds(tally.slots))
     with np.errstate(invalid="ignore", divide="ignore"):
         means: Floats = tally.window_errors[:WINDOWS] / lengths[:, None]
     return means

@@ -15,9 +15,10 @@ import numpy as np
 from evedrop.expected.expectations import Expectation
 from evedrop.figures.standard_error import ratio_error
 from evedrop.figures.text import estimate
+from evedrop.model.parts_of_runs import parts_of
 from evedrop.model.process import Floats
 from evedrop.score.summary import LeakSummary, SecrecySummary
-from evedrop.score.sums import WINDOWS, Tally, trial_means, window_means, window_of
+from evedrop.score.sums import WINDOWS, Tally, trial_means, window_bounds, window_means
 
 ERROR_RATE = 0.01
 """Of a verdict: how often `held`, or `failed`, may be said in error."""
@@ -167,9 +168,8 @@ def relative_verdict(difference: Floats, test: SignTestOf, slots: int) -> tuple[
 
 def _slots_of(windows: list[int], slots: int) -> str:
     """The slots of some windows in words: "1 to 124, 625 to 749"."""
-    window = window_of(np.arange(slots), slots)
-    spans = [np.flatnonzero(window == one) for one in windows]
-    return ", ".join(f"{span[0]} to {span[-1]}" for span in spans)
+    bounds = window_bounds(slots)
+    return ", ".join(f"{bounds[one]} to {bounds[one + 1] - 1}" for one in windows)
 
 
 def perfect_verdict(eavesdropper: Floats, legitimate: Floats, bound: float, test: SignTestOf) -> Verdict:
@@ -198,9 +198,9 @@ def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tall
     perfect_by_theory = perfect_by_theory if known and not math.isnan(user_bound + theirs.limit) else None
     complete = user.done == user.slots
     slots = user.slots if complete else max(user.done, 2)
-    gap = theirs.traces(slots) - user_theory.traces(slots)
     bounded_user = math.isfinite(user_bound) or not user_theory.has_limit
-    always = bounded_user and slots > 1 and bool(np.all(gap[1:] > 0.0))
+    holds_from = _holds_from(user_theory, theirs, slots)
+    always = bounded_user and slots > 1 and holds_from == 1
     user_means, other_means = window_means(user), window_means(other)
     heavy = user_theory.infinite_variance or other_theory.infinite_variance
     test = sign_of_median if heavy else sign_of_mean
@@ -221,7 +221,7 @@ def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tall
         relative,
         perfect,
         (always or (None if bounded else False)) if known else None,
-        _holds_from(gap) if known and bounded_user else None,
+        holds_from if known and bounded_user else None,
         windows,
         perfect_by_theory,
         ratio,
@@ -233,11 +233,15 @@ def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tall
     )
 
 
-def _holds_from(gap: Floats) -> int | None:
-    """The first slot k ≥ 1 from which the gap (slots,) is positive to its end; None if there is none."""
-    wrong = np.flatnonzero(~(gap[1:] > 0.0)) + 1
-    first = int(wrong[-1]) + 1 if wrong.size else 1
-    return first if first < len(gap) else None
+def _holds_from(user: Expectation, other: Expectation, slots: int) -> int | None:
+    """The first slot k ≥ 1 from which theory expects the other's error to be larger up to slot slots−1; None without one."""
+    streams, first = (user.stream(), other.stream()), 1
+    for part in parts_of(range(slots)):
+        smaller, larger = (stream.next_traces(len(part)) for stream in streams)
+        wrong = np.flatnonzero(~(larger - smaller > 0.0))
+        if wrong.size:
+            first = max(1, part.start + int(wrong[-1]) + 1)
+    return first if first < slots else None
 
 
 class SecrecyKept(StrEnum):

@@ -163,9 +163,10 @@ def _needs(scenario: Scenario, packets: PacketCounts) -> Needs:
 def _leak(scenario: Scenario) -> PacketLeak | None:
     if scenario.plant is not None:
         return None
-    revealed = revealed_by_packets(scenario)
-    if revealed is None:
+    packets = revealed_by_packets(scenario)
+    if packets is None:
         return None
+    revealed = packets.next(scenario.slots)
     hidden = 1.0 - revealed.clear
     bits = float(revealed.hidden_bits.sum()) / float(hidden.sum()) if hidden.any() else None
     return PacketLeak(float(np.mean(revealed.clear)), bits)

@@ -17,7 +17,7 @@ from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.slot.link_law import LinkLaw
 from evedrop.model.theory.covariances import Outcomes, limit_trace, stability_bound
 from evedrop.model.theory.leak import remaining_limit
-from evedrop.model.theory.leaked_bits import leaked_bits
+from evedrop.model.theory.leaked_bits import LeakedBits
 from tests.builders import MARGINAL, MICROGRID, UNSTABLE
 from tests.model import rationals
 from tests.model.rationals import Matrix, exact
@@ -35,7 +35,7 @@ def bits_of(ratio: Fraction) -> float:
 @given(models(lowest=0.5))
 def test_the_bits_of_an_innovation(model: Model) -> None:
     """½ log₂ det Σ_k / det A Σ_{k−1} Aᵀ, for noise of any condition: nothing cancels, in large leaks and in small ones."""
-    found = leaked_bits(model.process, SLOTS)
+    found = LeakedBits(model.process).next(SLOTS)
     assert found[0] == 0.0
     sigmas = rationals.state_covariances(model.A, model.Q, model.initial)
     carried = rationals.congruent(model.A, next(sigmas))
@@ -79,37 +79,44 @@ def test_the_bits_add_up_to_what_the_path_revealed(process: Process) -> None:
     explained = rationals.times(cross, rationals.inverted(packets), rationals.transposed(cross))
     left = rationals.combined((1, path), (-1, explained))
     expected = bits_of(rationals.determinant(path) / rationals.determinant(left))
-    assert leaked_bits(process, 8)[heard].sum() == pytest.approx(expected, rel=1e-10)
+    assert LeakedBits(process).next(8)[heard].sum() == pytest.approx(expected, rel=1e-10)
 
 
 def test_a_stable_mode_goes_on_leaking() -> None:
     """The limit is that of M: 0 without a stable mode, and reached however large the state has become."""
-    found = leaked_bits(UNSTABLE, 3000)
+    found = LeakedBits(UNSTABLE).next(3000)
     expected = 0.5 * math.log2(np.linalg.det(UNSTABLE.Q) / np.linalg.det(remaining_limit(UNSTABLE)))
     assert found[-1] == pytest.approx(expected, rel=1e-9)
     assert round(expected, 3) == 0.706  # as docs/mathematics.md says
     growing = Process(np.array([[1.3, 0.2], [0.0, 1.1]]), np.eye(2), np.eye(2))
-    assert 0.0 <= leaked_bits(growing, 400)[-1] < 1e-20
+    assert 0.0 <= LeakedBits(growing).next(400)[-1] < 1e-20
     steep = Process(np.array([[1e10, 0.3], [0.0, 0.999]]), np.array([[1.0, 0.5], [0.5, 1.0]]), np.eye(2))
     limit = 0.5 * math.log2(np.linalg.det(steep.Q) / np.linalg.det(remaining_limit(steep)))
-    assert leaked_bits(steep, 20_000)[-1] == pytest.approx(limit, rel=1e-9)
+    assert LeakedBits(steep).next(20_000)[-1] == pytest.approx(limit, rel=1e-9)
 
 
 def test_marginal_states_hide_innovations_ever_better() -> None:
     """Σ_k = (k + 1) Q: an innovation of two states reveals log₂(1 + 1/k) bits."""
     k = np.arange(1, 600)
-    np.testing.assert_allclose(leaked_bits(MICROGRID, 600)[1:], np.log2(1.0 + 1.0 / k), rtol=1e-12)
-    assert leaked_bits(MICROGRID, 0).shape == (0,)
+    np.testing.assert_allclose(LeakedBits(MICROGRID).next(600)[1:], np.log2(1.0 + 1.0 / k), rtol=1e-12)
+    assert LeakedBits(MICROGRID).next(0).shape == (0,)
+
+
+def test_bits_do_not_depend_on_how_many_slots_are_asked_for() -> None:
+    """Across the ends of the blocks in which they are computed."""
+    stream = LeakedBits(UNSTABLE)
+    parts = [stream.next(slots) for slots in (1, 0, 200, 300, 99)]
+    assert np.array_equal(np.concatenate(parts), LeakedBits(UNSTABLE).next(600))
 
 
 def test_schemes_say_what_their_packets_reveal() -> None:
     """The table of docs/mathematics.md; nothing is claimed where it depends on the packets before."""
     found = {}
     for name in SCHEMES:
-        known = scheme_of(MICROGRID, {"scheme": name, **SCHEMES[name].parameters}).revealed_bits(3)
+        known = scheme_of(MICROGRID, {"scheme": name, **SCHEMES[name].parameters}).revealed_bits()
         if known is not None:
-            found[name] = [one[-1] for one in known]
-    leak = leaked_bits(MICROGRID, 3)[-1]
+            found[name] = [one[-1] for one in known.next(3)]
+    leak = LeakedBits(MICROGRID).next(3)[-1]
     assert found == {
         "cipher": [0.0, 0.0],
         "innovation": [math.inf, leak],
@@ -118,7 +125,7 @@ def test_schemes_say_what_their_packets_reveal() -> None:
         "withholding": [math.inf, 0.0],
     }
     singular = Process(np.array([[1.0, 1.0], [1.0, 1.0]]), np.eye(2), np.eye(2))
-    assert scheme_of(singular, {"scheme": "innovation", "state_probability": 0.5}).revealed_bits(3) is None
+    assert scheme_of(singular, {"scheme": "innovation", "state_probability": 0.5}).revealed_bits() is None
 
 
 def test_the_rates_of_a_link() -> None:
@@ -127,11 +134,13 @@ def test_the_rates_of_a_link() -> None:
     assert chain is not None
     steady = LinkLaw.steady(chain)
     away = LinkLaw(steady.segments, ((2, 4, True), (5, 100, False)))
-    np.testing.assert_allclose(steady.rates(3), 0.75)
-    np.testing.assert_allclose(away.rates(6), [0.75, 0.75, 0.0, 0.0, 0.75, 0.0])
+    np.testing.assert_allclose(steady.rates(range(3)), 0.75)
+    np.testing.assert_allclose(away.rates(range(6)), [0.75, 0.75, 0.0, 0.0, 0.75, 0.0])
     slow, good = (replace(steady.segments[0], arrived=np.array([0.5])), replace(steady.segments[0], start=2))
-    np.testing.assert_allclose(LinkLaw((slow, good)).rates(4), [0.375, 0.375, 0.75, 0.75])
-    np.testing.assert_allclose(LinkLaw((slow, good)).rates(1), [0.375])
+    np.testing.assert_allclose(LinkLaw((slow, good)).rates(range(4)), [0.375, 0.375, 0.75, 0.75])
+    np.testing.assert_allclose(LinkLaw((slow, good)).rates(range(1)), [0.375])
+    for law in (away, LinkLaw((slow, good))):
+        assert np.array_equal([float(law.rates(range(k, k + 1))[0]) for k in range(6)], law.rates(range(6)))
 
 
 @settings(deadline=None, max_examples=30)

@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 
+from evedrop.model import parts_of_runs
 from evedrop.model.process import Floats, Process
 from evedrop.model.theory import rare_events
 from evedrop.model.theory.covariances import NOBODY, Outcomes, expected_traces
@@ -74,6 +75,19 @@ def test_streaks_are_those_of_all_courses_of_a_run(process: Process, outcomes: O
     assert found.number == pytest.approx(number, rel=1e-12, abs=1e-15)
     assert found.carried == pytest.approx(carried, rel=1e-12, abs=1e-15)
     assert found.total == pytest.approx(carried.sum(), rel=1e-12)
+
+
+@pytest.mark.parametrize("outcomes", [LEGITIMATE, MISLED, SMART, Outcomes.legitimate(0.8, 0.0)])
+def test_streaks_do_not_depend_on_the_parts_of_a_run(monkeypatch: pytest.MonkeyPatch, outcomes: Outcomes) -> None:
+    """A long run is computed in parts, whose end is kept; streaks longer than a part make it keep more."""
+    whole = found_in(STABLE, outcomes, 700)
+    monkeypatch.setattr(parts_of_runs, "SLOTS_AT_ONCE", 7)
+    monkeypatch.setattr(rare_events, "SLOTS_AT_ONCE", 7)
+    parts = found_in(STABLE, outcomes, 700)
+    assert whole.number.shape[1] > 7
+    assert np.array_equal(parts.number, whole.number)
+    np.testing.assert_allclose(parts.carried, whole.carried, rtol=1e-12)
+    assert parts.total == pytest.approx(whole.total, rel=1e-12)
 
 
 @pytest.mark.parametrize("outcomes", [LEGITIMATE, MISLED, SMART], ids=["legitimate", "misled", "smart"])

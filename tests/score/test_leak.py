@@ -13,8 +13,8 @@ from evedrop.loading import load
 from evedrop.memory.montecarlo import Plan
 from evedrop.memory.simulation import Mode
 from evedrop.model.receiver import Action
-from evedrop.model.theory.leaked_bits import leaked_bits
-from evedrop.score.leak import LeakTally, RevealedBits, leak_is_known, revealed_to
+from evedrop.model.theory.leaked_bits import LeakedBits
+from evedrop.score.leak import HeardBits, HeardBitsStream, LeakTally, leak_is_known
 
 ALONE = Plan(workers=1)
 
@@ -29,7 +29,7 @@ def test_the_bits_of_a_run_are_those_of_its_innovations(tmp_path: Path) -> None:
     some: dict[str, Any] = {"slots": 120, "trials": 40, "record_trials": 40}
     results = montecarlo("eavesdroppers", out=tmp_path / "run", plan=ALONE, expect=[], **some)
     scenario = load("eavesdroppers", some)
-    bits = leaked_bits(scenario.process.process, 120)
+    bits = LeakedBits(scenario.process.process).next(120)
     total, clear = np.zeros(40), 0
     for row in results.trials.to_pylist():
         if row["peer"] == "smart" and row["action"] != "dropped":
@@ -61,8 +61,8 @@ def test_a_schedule_of_probabilities_leaks_slot_by_slot() -> None:
     chances = [1.0, 0.2, 0.9, 0.0]
     encoding = {"scheme": "innovation", "state_probability": chances}
     scenario = load("eavesdroppers", {"slots": 4, "encoding": encoding, "expect": []})
-    bits = leaked_bits(scenario.process.process, 4)
-    expected = revealed_to(scenario)["smart"].expected
+    bits = LeakedBits(scenario.process.process).next(4)
+    expected = HeardBitsStream(scenario).next(4)["smart"].expected
     assert expected is not None
     np.testing.assert_allclose(expected, scenario.quality["smart"] * (1.0 - np.array(chances)) * bits, rtol=1e-12)
 
@@ -73,14 +73,14 @@ def test_trials_in_parts_have_the_same_bits() -> None:
     action = random.choice([Action.LOST, Action.STATE, Action.DISCARDED], (30, 8)).astype(np.uint8)
     nu = random.random((30, 8)) < 0.5
     by_type = np.stack([np.full(30, np.inf), random.random(30)], axis=1)
-    revealed = RevealedBits(by_type, random.random(30))
+    expected_bits = random.random(30)
     whole = LeakTally(8)
-    whole.add(action, nu, revealed)
+    whole.add(action, nu, HeardBits(by_type, expected_bits))
     parts = []
     for trials in (slice(0, 3), slice(3, 8)):
         part = LeakTally(trials.stop - trials.start)
         for rows in (slice(0, 7), slice(7, 30)):
-            part.add(action[rows, trials], nu[rows, trials], revealed)
+            part.add(action[rows, trials], nu[rows, trials], HeardBits(by_type[rows], expected_bits[rows]))
         parts.append(part)
     found, expected = LeakTally.merged(parts).summary, whole.summary
     assert found is not None
@@ -92,7 +92,7 @@ def test_trials_in_parts_have_the_same_bits() -> None:
         expected.standard_error,
     )
     short = LeakTally(2)
-    short.add(action[:5, :2], nu[:5, :2], revealed)
+    short.add(action[:5, :2], nu[:5, :2], HeardBits(by_type[:5], expected_bits[:5]))
     assert LeakTally.merged([*parts, short]).summary is None
 
 
@@ -100,8 +100,8 @@ def test_where_it_is_not_known(tmp_path: Path) -> None:
     """The user, late packets, a plant, schemes whose packets depend on those before, and modes without packets."""
     assert not leak_is_known(load("eavesdroppers"), "legitimate")
     for scenario in ("heated-room", "acknowledged"):
-        assert revealed_to(load(scenario)) == {}, scenario
-    assert list(revealed_to(load("late"))) == ["hasty"]  # it accepts no late packets
+        assert HeardBitsStream(load(scenario)).next(3) == {}, scenario
+    assert list(HeardBitsStream(load("late")).next(3)) == ["hasty"]  # it accepts no late packets
     assert not leak_is_known(load("late", {"eavesdroppers.hasty.window": 3}), "hasty")
     pattern = {"eve": {"strategy": "naive", "link": {"loss": {"model": "pattern", "outcomes": "110"}}}}
     leak = leak_of("eavesdroppers", tmp_path / "pattern", "eve", slots=60, trials=5, eavesdroppers=pattern)
@@ -129,7 +129,7 @@ def test_a_comparison_has_the_leak_of_schemes_and_pairs(tmp_path: Path) -> None:
     assert leaks["cipher"]["leak"] == {"clear_fraction": 0.0, "bits": 0.0}
     assert leaks["twin-track"]["leak"] is None
     scenario = load("bayesian", {"slots": 40})
-    mu_d, bits = scenario.encoding.mu_d, leaked_bits(scenario.process.process, 40)
+    mu_d, bits = scenario.encoding.mu_d, LeakedBits(scenario.process.process).next(40)
     assert leaks["innovation"]["leak"]["clear_fraction"] == pytest.approx((1.0 + 39 * mu_d) / 40)
     assert leaks["innovation"]["leak"]["bits"] == pytest.approx(bits.sum() / 39)
     rows = {row["scheme"]: row for row in found.table.to_pylist()}

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from evedrop.model.parts_of_runs import parts_of
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes, Flags
 
@@ -100,8 +101,8 @@ class LossModel(ABC):
         chain, count = self.chain, len(slots)
         if chain is not None:
             return count_variance(chain.transitions, chain.law, chain.quality, count) / count**2
-        quality = self.quality_at(slots)
-        return float((quality * (1.0 - quality)).sum()) / count**2
+        qualities = (self.quality_at(part) for part in parts_of(slots))
+        return sum(float((quality * (1.0 - quality)).sum()) for quality in qualities) / count**2
 
     @property
     def memoryless(self) -> bool:

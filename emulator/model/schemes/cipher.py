@@ -12,6 +12,7 @@ from evedrop.model.process import MARGINAL, Floats, Process
 from evedrop.model.receiver import Belief, Codes, Flags, Receiver, Reception
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, PacketBlock, Scheme, Shared
 from evedrop.model.theory.covariances import Outcomes, state_covariances
+from evedrop.model.theory.leaked_bits import RevealedBits
 from evedrop.streams import Batch
 
 
@@ -77,9 +78,9 @@ class Cipher(Scheme):
         traces: Floats = np.trace(state_covariances(self.process, slots), axis1=1, axis2=2)
         return traces, self.process.spectral_radius >= 1.0 - MARGINAL
 
-    def revealed_bits(self, slots: int) -> tuple[Floats, Floats]:
+    def revealed_bits(self) -> RevealedBits:
         """Nothing."""
-        return np.zeros(slots), np.zeros(slots)
+        return RevealedBits(0.0, 0.0)
 
     def outcomes(self, mu: float) -> Outcomes:
         """A state with every packet."""

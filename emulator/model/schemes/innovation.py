@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, final
@@ -17,7 +18,7 @@ from evedrop.model.schedule import Schedule, StateProbability
 from evedrop.model.schemes.scheme import Encoder, Packet, PacketBlock, Scheme, Shared
 from evedrop.model.staircase import is_regular
 from evedrop.model.theory.covariances import Outcomes
-from evedrop.model.theory.leaked_bits import leaked_bits
+from evedrop.model.theory.leaked_bits import LeakedBits, RevealedBits
 from evedrop.streams import Ahead, Batch, BlockReader
 
 _INNOVATION = int(Action.INNOVATION)  # numpy compares with an int ten times as fast
@@ -144,11 +145,11 @@ class Innovation(Scheme):
         """Schedule and noise."""
         return SharedSecret(self.process, self.mu_d, keys, batch)
 
-    def revealed_bits(self, slots: int) -> tuple[Floats, Floats] | None:
+    def revealed_bits(self) -> RevealedBits | None:
         """The state, or what an innovation leaks; None if A is singular, for an innovation then shows a part of w itself."""
         if not is_regular(self.process.A):
             return None
-        return np.full(slots, np.inf), leaked_bits(self.process, slots)
+        return RevealedBits(math.inf, LeakedBits(self.process))
 
     def outcomes(self, mu: float) -> Outcomes:
         """Theorem IV.1."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, final
@@ -17,6 +18,7 @@ from evedrop.model.receiver import Flags, Receiver, select
 from evedrop.model.schedule import Schedule
 from evedrop.model.schemes.scheme import Encoder, Packet, PacketBlock, Scheme, Shared
 from evedrop.model.theory.covariances import Outcomes
+from evedrop.model.theory.leaked_bits import RevealedBits
 from evedrop.streams import Ahead, Batch, BlockReader
 
 
@@ -140,9 +142,9 @@ class Noise(Scheme):
         """A state with probability μμ_d: E P → (1−μμ_d) S(μμ_d)."""
         return Outcomes.eavesdropper(mu, self.state_probability, 1.0, 0.0)
 
-    def revealed_bits(self, slots: int) -> tuple[Floats, Floats]:
+    def revealed_bits(self) -> RevealedBits:
         """The state; noise, which does not depend on it, reveals nothing."""
-        return np.full(slots, np.inf), np.zeros(slots)
+        return RevealedBits(math.inf, 0.0)
 
     def eavesdropper_outcomes(self, mu_e: float, use_state: float, use_innovation: float) -> Outcomes | None:
         """None for a receiver that may take noise for the state: `closed_forms` has the effect of that."""

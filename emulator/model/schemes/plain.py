@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -11,6 +12,7 @@ from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
 from evedrop.model.theory.covariances import Outcomes
+from evedrop.model.theory.leaked_bits import RevealedBits
 from evedrop.streams import Batch
 
 
@@ -44,9 +46,9 @@ class Plain(Scheme):
         """A state with every packet."""
         return Outcomes.plain(mu)
 
-    def revealed_bits(self, slots: int) -> tuple[Floats, Floats]:
+    def revealed_bits(self) -> RevealedBits:
         """The state."""
-        return np.full(slots, np.inf), np.zeros(slots)
+        return RevealedBits(math.inf, 0.0)
 
     def eavesdropper_outcomes(self, mu_e: float, use_state: float, use_innovation: float) -> Outcomes:
         """As in the paper, with μ_d = 1."""

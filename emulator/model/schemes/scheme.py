@@ -18,6 +18,7 @@ from evedrop.model.receiver import Flags, Receiver
 from evedrop.model.schedule import StateProbability, in_slot, mean_of
 from evedrop.model.theory.closed_form import ClosedForm
 from evedrop.model.theory.covariances import Outcomes
+from evedrop.model.theory.leaked_bits import RevealedBits
 from evedrop.model.theory.lost_reference import LostReference
 from evedrop.model.theory.quantisation import QuantisationError
 from evedrop.streams import Batch
@@ -311,15 +312,14 @@ class Scheme(ABC):
         del slots
         return None
 
-    def revealed_bits(self, slots: int) -> tuple[Floats, Floats] | None:
-        """The bits about the path of states that a packet with ν = 0, and one with ν = 1, reveals in each slot, (slots,) each.
+    def revealed_bits(self) -> RevealedBits | None:
+        """The bits about the path of states that a packet with ν = 0, and one with ν = 1, reveals in each slot.
 
         To a receiver without the secret that knows ν, beyond what all earlier packets revealed; inf: the packet is the state
         itself. The probability of ν = 0 must be `mu_d`. None: unknown.
 
         Source: docs/mathematics.md, leak in bits.
         """
-        del slots
         return None
 
     def bound_outcomes(self, mu_e: float) -> Outcomes | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
@@ -15,6 +16,7 @@ from evedrop.model.schedule import Schedule
 from evedrop.model.schemes.plain import PlainEstimator
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
 from evedrop.model.theory.covariances import Outcomes
+from evedrop.model.theory.leaked_bits import RevealedBits
 from evedrop.streams import Batch
 
 
@@ -69,9 +71,9 @@ class Withholding(Scheme):
         """A state with probability μp: E P → (1−μp) S(μp)."""
         return self.eavesdropper_outcomes(mu, 1.0, 1.0)
 
-    def revealed_bits(self, slots: int) -> tuple[Floats, Floats]:
+    def revealed_bits(self) -> RevealedBits:
         """The state; silence, by a coin that does not depend on the state, reveals nothing."""
-        return np.full(slots, np.inf), np.zeros(slots)
+        return RevealedBits(math.inf, 0.0)
 
     def eavesdropper_outcomes(self, mu_e: float, use_state: float, use_innovation: float) -> Outcomes:
         """Silent slots mislead no receiver."""

@@ -59,15 +59,20 @@ class LinkLaw:
         """Slots by which a packet may be late."""
         return len(self.segments[0].arrived) - 1
 
-    def rates(self, slots: int) -> Floats:
-        """Probability that the packet of each slot arrives in that slot, (slots,)."""
-        found = np.zeros(slots)
+    def rates(self, slots: range) -> Floats:
+        """Probability that the packet of each slot arrives in that slot, (c,)."""
+        found = np.zeros(len(slots))
         starts = [segment.start for segment in self.segments]
-        for segment, stop in zip(self.segments, [*starts[1:], slots], strict=True):
-            some = range(min(segment.start, slots), min(stop, slots))
-            found[some.start : some.stop] = segment.arrived[0] * (segment.quality(some) @ segment.chain.law)
+        for segment, stop in zip(self.segments, [*starts[1:], slots.stop], strict=True):
+            some = range(max(segment.start, slots.start), min(stop, slots.stop))
+            if some:
+                rate = np.zeros(len(some))
+                # State by state, so that the bits do not depend on how many slots are asked for at a time.
+                for quality, odds in zip(segment.quality(some).T, segment.chain.law.tolist(), strict=True):
+                    rate += quality * odds
+                found[some.start - slots.start : some.stop - slots.start] = segment.arrived[0] * rate
         for start, stop, _ in self.outages:
-            found[start:stop] = 0.0
+            found[max(start - slots.start, 0) : max(stop - slots.start, 0)] = 0.0
         return found
 
     @property

@@ -105,16 +105,33 @@ def state_covariances(process: Process, slots: int) -> Floats:
     return expected_covariances(process, NOBODY, slots)
 
 
-def noise_covariances(process: Process, slots: int) -> Floats:
-    """E[χ_k χ_kᵀ] = A Σ_{k−1} Aᵀ for k = 0 … slots−1, (slots, n, n); 0 at k = 0. inf from where it overflows.
+@final
+class NoiseCovariances:
+    """E[χ_k χ_kᵀ] = A Σ_{k−1} Aᵀ, a number of slots at a time from k = 0, where it is 0. inf from where it overflows.
 
     Source: docs/mathematics.md, encoding noise.
     """
-    sigma = state_covariances(process, max(slots - 1, 0))
-    with np.errstate(over="ignore", invalid="ignore"):
-        carried = process.A @ sigma @ process.A.T
-    zero = np.zeros((min(slots, 1), process.n, process.n))
-    return _unbounded_from_overflow(np.concatenate([zero, carried]))
+
+    def __init__(self, process: Process) -> None:
+        self._A, self._states = process.A, ExpectedCovariance(process, NOBODY)
+        self._first = True
+
+    def next(self, slots: int) -> Floats:
+        """Those of the next slots, (slots, n, n)."""
+        zeros = int(self._first and slots > 0)
+        self._first = self._first and slots == 0
+        sigma = self._states.next(slots - zeros)
+        with np.errstate(over="ignore", invalid="ignore"):
+            carried = self._A @ sigma @ self._A.T
+        return _unbounded_from_overflow(np.concatenate([np.zeros((zeros, *self._A.shape)), carried]))
+
+
+def noise_covariances(process: Process, slots: int) -> Floats:
+    """E[χ_k χ_kᵀ] for k = 0 … slots−1, (slots, n, n); inf from where it overflows.
+
+    Source: docs/mathematics.md, encoding noise.
+    """
+    return NoiseCovariances(process).next(slots)
 
 
 def misled_covariances(process: Process, slots: int) -> Floats:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import final
 
 import numpy as np
 
@@ -25,35 +26,66 @@ from evedrop.model.theory.covariances import block_length
 _AS_GOOD_AS_INFINITE = 1e60  # a deviation of the state relative to the noise's, with which a packet reveals nothing
 
 
-def leaked_bits(process: Process, slots: int) -> Floats:
-    """The bits that an innovation packet reveals in each slot k = 0 … slots−1, (slots,); 0 in slot 0. A must be regular.
+@final
+class LeakedBits:
+    """The bits that an innovation packet reveals, a number of slots at a time from k = 0; 0 in slot 0. A must be regular.
 
-    Also valid in slots beyond the horizon, where Σ_k exceeds double precision.
+    Also valid in slots beyond the horizon, where Σ_k exceeds double precision. Values do not depend on how many slots are asked
+    for at a time.
 
     Source: docs/mathematics.md, leak in bits.
     """
-    matrices = (np.float64(one).tobytes() for one in (process.A, process.noise_factor, process.initial_covariance))
-    return _leaked_bits(*matrices, process.n, slots)
+
+    def __init__(self, process: Process) -> None:
+        self._model = (np.float64(process.A).tobytes(), np.float64(process.noise_factor).tobytes(), process.n)
+        self._carried = product(process.A, cholesky(process.initial_covariance)).tobytes()
+        self._block: Floats = np.zeros(1)
+        self._next = 0
+
+    def next(self, slots: int) -> Floats:
+        """The bits of the next slots, (slots,)."""
+        parts = [np.zeros(0)]
+        while slots > 0:
+            if self._next == len(self._block):
+                self._block, self._carried = _next_block(*self._model, self._carried)
+                self._next = 0
+            part = self._block[self._next : self._next + slots]
+            self._next += len(part)
+            slots -= len(part)
+            parts.append(part)
+        return np.concatenate(parts)
 
 
-@lru_cache(maxsize=4)
-def _leaked_bits(dynamics: bytes, factor: bytes, initial: bytes, n: int, slots: int) -> Floats:
-    """The same from A, Q^½ and Σ0 as bytes; not to be changed. A study asks for the same ones for each block of its trials."""
-    A, noise, start = (np.frombuffer(one).reshape(n, n) for one in (dynamics, factor, initial))
+@lru_cache(maxsize=64)
+def _next_block(dynamics: bytes, factor: bytes, n: int, start: bytes) -> tuple[Floats, bytes]:
+    """The bits of the slots of a block, not to be changed, and a factor of C in the slot after it.
+
+    dynamics, factor, start: A, Q^½ and a factor of C in the first of these slots, as bytes. A study asks for the same ones for
+    each block of its trials.
+    """
+    A, noise, carried = (np.frombuffer(one).reshape(n, n) for one in (dynamics, factor, start))
     largest = _AS_GOOD_AS_INFINITE * float(np.abs(noise).max()) or math.inf
-    length = block_length(A)
-    found = np.zeros(max(slots, 1))
-    carried, k = product(A, cholesky(start)), 1
-    while k < slots:
-        more = kernels.carried_factors(A, noise, carried, min(length, slots - k))
-        factors = np.concatenate([carried[None], more])
-        found[k : k + len(more)] = _bits(factors[:-1], noise)
-        # A column that is scaled down still means a variance that is as good as infinite.
-        carried = more[-1] / np.maximum(1.0, np.abs(more[-1]).max(axis=0) / largest)
-        k += len(more)
-    found = found[:slots]
+    more = kernels.carried_factors(A, noise, carried, block_length(A))
+    found = _bits(np.concatenate([carried[None], more[:-1]]), noise)
     found.flags.writeable = False
-    return found
+    # A column that is scaled down still means a variance that is as good as infinite.
+    return found, (more[-1] / np.maximum(1.0, np.abs(more[-1]).max(axis=0) / largest)).tobytes()
+
+
+@final
+class RevealedBits:
+    """The bits about the path of states that a packet with ν = 0, and one with ν = 1, reveals, from slot 0 on.
+
+    inf: the packet is the state itself.
+    """
+
+    def __init__(self, of_state: float, of_other: float | LeakedBits) -> None:
+        self._of_state, self._of_other = of_state, of_other
+
+    def next(self, slots: int) -> tuple[Floats, Floats]:
+        """Those of the next slots, (slots,) each."""
+        other = self._of_other.next(slots) if isinstance(self._of_other, LeakedBits) else np.full(slots, self._of_other)
+        return np.full(slots, self._of_state), other
 
 
 def _bits(carried: Floats, noise: Floats) -> Floats:

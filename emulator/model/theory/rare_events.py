@@ -10,17 +10,19 @@ Source: docs/mathematics.md, rare events.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import final
 
 import numpy as np
 
+from evedrop.model.parts_of_runs import SLOTS_AT_ONCE, parts_of
 from evedrop.model.process import Floats, Process
 from evedrop.model.theory.covariances import (
+    ExpectedCovariance,
+    NoiseCovariances,
     Outcomes,
     block_length,
-    expected_traces,
-    misled_covariances,
     powers_of,
 )
 
@@ -71,18 +73,21 @@ def streaks(process: Process, outcomes: Outcomes, slots: int) -> Streaks | None:
     """
     if outcomes.leaked or (outcomes.misled and slots * process.n**2 > LARGEST_RUN):
         return None
-    total = float(expected_traces(process, outcomes, slots).sum())
+    total = total_of(ExpectedCovariance(process, outcomes).next_traces, slots)
     if not math.isfinite(total):
         return None
     kept, lost, misled = outcomes.kept, outcomes.predicted, outcomes.misled
-    begun = np.cumsum(lost * _in_step(outcomes, slots))
-    spread = np.cumsum(misled_covariances(process, slots), axis=0) if misled else None
+    last = min(slots, SLOTS_AT_ONCE)
+    begun, spread = _begun(process, outcomes, slots, last)
     F = math.sqrt(kept) * process.A
     powers = np.concatenate([np.eye(process.n)[None], powers_of(F, block_length(F))])
     base, noise, found = powers[0], 0.0, np.zeros((2, 3, 0))
     while found.shape[2] < slots and found[1].sum() < (1.0 - REST) * total:
         length = np.arange(found.shape[2], min(slots, found.shape[2] + len(powers) - 1))
-        F_l, after = (powers @ base)[: len(length)], slots - 1 - length
+        if length[-1] >= last:
+            last = min(slots, 4 * (int(length[-1]) + 1))
+            begun, spread = _begun(process, outcomes, slots, last)
+        F_l, after, row = (powers @ base)[: len(length)], slots - 1 - length, last - 1 - length
         base = powers[-1] @ base
         q = _traces(F_l, process.Q)
         u = np.empty(len(length))
@@ -90,24 +95,59 @@ def streaks(process: Process, outcomes: Outcomes, slots: int) -> Streaks | None:
             u[i] = noise
             noise = kept * noise + lost * one
         often = kept**length
-        number = [often * begun[after], often * misled * after, often * outcomes.initial]
+        number = [often * begun[row], often * misled * after, often * outcomes.initial]
         carried = [
-            begun[after] * (q + u),
-            np.zeros(len(length)) if spread is None else misled * (_traces(F_l, spread[after]) + after * u),
+            begun[row] * (q + u),
+            np.zeros(len(length)) if spread is None else misled * (_traces(F_l, spread[row]) + after * u),
             outcomes.initial * (_traces(F_l, process.initial_covariance) + u),
         ]
         found = np.concatenate([found, [number, carried]], axis=2)
     return Streaks(found[0], found[1], total)
 
 
-def _in_step(outcomes: Outcomes, slots: int) -> Floats:
-    """The probability that the error is 0 before slot k, for k = 0 … slots−1, (slots,); 0 for k = 0."""
-    found = np.zeros(slots)
-    before = 1.0 - outcomes.initial
-    for k in range(1, slots):
-        found[k] = before
-        before = outcomes.state + outcomes.decoded * before
-    return found
+def total_of(next_traces: Callable[[int], Floats], slots: int) -> float:
+    """Σ_k tr E P_k over slots 0 … slots−1; next_traces: returns tr E P_k of as many next slots as it is asked for."""
+    return sum(float(next_traces(len(part)).sum()) for part in parts_of(range(slots)))
+
+
+def _begun(process: Process, outcomes: Outcomes, slots: int, last: int) -> tuple[Floats, Floats | None]:
+    """For each of the last slots of a run, (last,): the expected number of streaks that a loss has begun so far.
+
+    And Σ f_k so far, (last, n, n); None for a receiver that is never misled.
+    """
+    number, noise = _InStep(outcomes), NoiseCovariances(process) if outcomes.misled else None
+    begun, spread = np.zeros(1), np.zeros((1, process.n, process.n))
+    kept: list[tuple[Floats, Floats]] = []
+    for part in parts_of(range(slots)):
+        count = len(part)
+        begun = np.cumsum(np.concatenate([begun[-1:], outcomes.predicted * number.next(count)]))[1:]
+        if noise is not None:
+            spread = np.cumsum(np.concatenate([spread[-1:], 2.0 * noise.next(count)]), axis=0)[1:]
+        if part.stop > slots - last:
+            kept.append((begun, spread))
+    numbers, sums = (np.concatenate(one)[-last:] for one in zip(*kept, strict=True))
+    return numbers, sums if outcomes.misled else None
+
+
+@final
+class _InStep:
+    """The probability that the error is 0 before slot k, a number of slots at a time from k = 0; 0 for k = 0."""
+
+    def __init__(self, outcomes: Outcomes) -> None:
+        self._outcomes = outcomes
+        self._next, self._first = 0.0, True
+
+    def next(self, slots: int) -> Floats:
+        """That of the next slots, (slots,)."""
+        found, one = np.empty(slots), self._outcomes
+        for k in range(slots):
+            found[k] = self._next
+            after = 1.0 - one.initial if self._first else one.state + one.decoded * self._next
+            if not self._first and after == self._next:  # and so in all later slots
+                found[k:] = after
+                break
+            self._next, self._first = after, False
+        return found
 
 
 def _traces(F: Floats, P: Floats) -> Floats:
