@@ -5,7 +5,8 @@ Source: docs/wire.md, the file.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 from pydantic import ValidationError
@@ -17,6 +18,8 @@ from evedrop.wire.endpoints import Place, place_of
 from evedrop.wire.tables import CHANGEABLE, WireLinkTable, WireSettingsTable, changed_settings
 
 Tables = Sequence[Mapping[str, Any]]
+LinkNow = tuple[Mapping[str, Any], bool]
+"""A link's settings, and whether its losses are tied to another link's."""
 
 
 def mistakes_across(tables: Mapping[str, Any]) -> Iterator[str]:
@@ -29,8 +32,10 @@ def mistakes_across(tables: Mapping[str, Any]) -> Iterator[str]:
         yield from _side_mistakes(sides, links)
     yield from _name_mistakes(links)
     yield from _correlation_mistakes(links)
+    names = link_names(links)
     for i, event in enumerate(events):
-        yield from (f"event.{i}.{line}" for line in _event_mistakes(event, sides, links))
+        settings_of = partial(_settings_of, dict(zip(names, links, strict=True)))
+        yield from (f"event.{i}.{line}" for line in event_mistakes(event, [*sides], names, settings_of))
 
 
 def link_names(links: Tables) -> list[str]:
@@ -54,12 +59,20 @@ def change_mistakes(settings: Mapping[str, Any], correlated: bool, changes: Mapp
         if entry not in CHANGEABLE:
             yield f"{entry}: is not a link setting that can be changed; expected {listed(CHANGEABLE)}{near(entry, CHANGEABLE)}"
     try:
-        made = changed_settings(settings, {entry: value for entry, value in changes.items() if entry in CHANGEABLE})
+        made = changed_settings(settings, {entry: changes[entry] for entry in changes if entry in CHANGEABLE}, settings)
     except ValidationError as error:
         yield from sentences(error, WireSettingsTable)
         return
     if correlated and made.get("loss", settings["loss"])["model"] != settings["loss"]["model"]:
         yield "loss.model: differs from the first one, but the link's losses are tied to another link's; expected the same model"
+
+
+def _settings_of(links: Mapping[str, Mapping[str, Any]], name: str) -> LinkNow | None:
+    """The settings of a link of the file at the start; None if the link's table has mistakes, which are reported elsewhere."""
+    try:
+        return WireLinkTable.model_validate(links[name]).wire_settings(), links[name].get("correlation") is not None
+    except ValidationError:
+        return None
 
 
 def _tables(found: Any) -> Tables:
@@ -113,7 +126,8 @@ def _places(sides: Mapping[str, Any], entry: str) -> list[_Placed]:
     return found
 
 
-def _unknown(name: object, known: Sequence[str], what: str) -> str:
+def unknown(name: object, known: Sequence[str], what: str) -> str:
+    """The end of a message about a name that nothing has. what: `side` or `link`."""
     choice = f"expected {listed(known)}" if known else f"the file has no {what}"
     return f"is {as_toml(name)}; {choice}{near(name, known)}"
 
@@ -122,7 +136,7 @@ def _side_mistakes(sides: Mapping[str, Any], links: Tables) -> Iterator[str]:
     for i, link in enumerate(links):
         for entry in ("from", "to"):
             if isinstance(link.get(entry), str) and link[entry] not in sides:
-                yield f"link.{i}.{entry}: {_unknown(link[entry], [*sides], 'side')}"
+                yield f"link.{i}.{entry}: {unknown(link[entry], [*sides], 'side')}"
         if isinstance(link.get("to"), str) and link["to"] == link.get("from") and link["to"] in sides:
             yield f"link.{i}.to: is {as_toml(link['to'])}, where the link begins; expected another side"
 
@@ -144,7 +158,7 @@ def _correlation_mistakes(links: Tables) -> Iterator[str]:
         path = f"link.{i}.correlation.with"
         others = [one for one in names if one != name]
         if other not in others:
-            yield f"{path}: {_unknown(other, others, 'other link')}"
+            yield f"{path}: {unknown(other, others, 'other link')}"
             continue
         theirs = links[names.index(other)]
         if theirs.get("correlation") is not None:
@@ -158,24 +172,26 @@ def _model(link: Mapping[str, Any]) -> object:
     return loss.get("model") if isinstance(loss, Mapping) else "bernoulli"
 
 
-def _event_mistakes(event: Mapping[str, Any], sides: Mapping[str, Any], links: Tables) -> Iterator[str]:
+def event_mistakes(
+    event: Mapping[str, Any], sides: Sequence[str], links: Sequence[str], settings_of: Callable[[str], LinkNow | None]
+) -> Iterator[str]:
+    """Mistakes in an event that only show with the sides and links of the wire, given by their names.
+
+    settings_of: the settings of a link, and whether its losses are tied to another link's; None for a link with mistakes.
+    """
     partition = event.get("partition")
     if isinstance(partition, list) and sides:
         for i, name in enumerate(partition):
             if isinstance(name, str) and name not in sides:
-                yield f"partition.{i}: {_unknown(name, [*sides], 'side')}"
+                yield f"partition.{i}: {unknown(name, sides, 'side')}"
         if len(partition) == 2 and partition[0] == partition[1]:
             yield f"partition: is {as_toml(partition)}; expected two different sides"
-    names = link_names(links)
     for entry in ("cut", "link"):
-        if isinstance(event.get(entry), str) and event[entry] not in names:
-            yield f"{entry}: {_unknown(event[entry], names, 'link')}"
-    if isinstance(event.get("set"), Mapping) and event.get("link") in names:
-        link = links[names.index(event["link"])]
-        try:
-            settings = WireLinkTable.model_validate(link).wire_settings()
-        except ValidationError:
-            return  # the link's own mistakes are reported
-        yield from (
-            f"set.{line}" for line in change_mistakes(settings, link.get("correlation") is not None, event["set"])
-        )
+        if isinstance(event.get(entry), str) and event[entry] not in links:
+            yield f"{entry}: {unknown(event[entry], links, 'link')}"
+    if (
+        isinstance(event.get("set"), Mapping)
+        and event.get("link") in links
+        and (now := settings_of(event["link"])) is not None
+    ):
+        yield from (f"set.{line}" for line in change_mistakes(*now, event["set"]))

@@ -101,7 +101,7 @@ def _plan(file: WireFile) -> WirePlan:
         seed=file.seed,
         sides={name: _side(name, table) for name, table in file.side.items()},
         links=links,
-        events=tuple(wire_event(table, settings) for table in file.event),
+        events=tuple(wire_event(table, settings, settings) for table in file.event),
         lossless=tuple(file.lossless),
         largest=file.largest,
         query_seconds=file.query_seconds,
@@ -121,13 +121,17 @@ def _link(number: int, name: str, table: WireLinkTable) -> WireLink:
     return WireLink(name, number, table.source, table.target, table.keys, table.wire_settings(), table.tap, tie)
 
 
-def wire_event(table: WireEventTable, settings: Mapping[str, Mapping[str, Any]]) -> WireEvent:
-    """The event of a table. settings: those of each link at the start of the wire."""
+def wire_event(
+    table: WireEventTable, settings: Mapping[str, Mapping[str, Any]], first: Mapping[str, Mapping[str, Any]]
+) -> WireEvent:
+    """The event of a table. settings: those of each link when the event begins; first: those at the start of the wire."""
     start = table.at if table.start is None else table.start
     assert start is not None  # noqa: S101 - checked when the table was read
-    first, second = table.partition or ("", "")
-    changes = None if table.link is None or table.set is None else changed_settings(settings[table.link], table.set)
-    partition = None if table.partition is None else (first, second)
+    one, other = table.partition or ("", "")
+    changes = None
+    if table.link is not None and table.set is not None:
+        changes = changed_settings(settings[table.link], table.set, first[table.link])
+    partition = None if table.partition is None else (one, other)
     return WireEvent(start, table.to, partition, table.cut, table.link, changes, table.note)
 
 

@@ -260,11 +260,20 @@ CHANGEABLE = tuple(entry for entry in WireSettingsTable.model_fields if entry !=
 """The entries of a link that can change while the wire runs."""
 
 
-def changed_settings(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Those settings of a link that change, from entries of its table. Raises ValidationError if the result is not valid."""
+_NEEDS = {"rate": "queue", "queue": "rate", "reorder": "delay"}
+
+
+def changed_settings(
+    settings: Mapping[str, Any], changes: Mapping[str, Any], first: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Those settings of a link that change, from entries of its table. Raises ValidationError if the result is not valid.
+
+    settings: the present ones; first: those at the start. What a change needs and the link did not have at the start is part of
+    the result, so that it can be added to the settings at any time.
+    """
     entries = {name: value for name, value in settings.items() if not (name == "loss" and "quality" in changes)}
     made = WireSettingsTable.model_validate({**entries, **changes}).wire_settings()
     names = ["loss" if name == "quality" else name for name in changes]
-    if "rate" in changes and "queue" not in settings:
-        names.append("queue")
+    needed = [_NEEDS[name] for name in names if name in _NEEDS]
+    names += [name for name in needed if name in made and name not in names and name not in first]
     return {name: made.get(name, 0.0) for name in names}

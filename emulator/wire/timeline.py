@@ -1,0 +1,141 @@
+"""The events of a wire, in the order of time: which links are cut and what their settings are at each moment.
+
+A link is cut while an event cuts it, or while its two sides are partitioned. Changes of its settings that last at the same time
+apply in the order in which they began, and end one by one.
+
+Source: docs/wire.md, events.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from pydantic import ValidationError
+
+from evedrop.errors import ScenarioError
+from evedrop.model.checks import as_toml
+from evedrop.scenario.sentences import sentences
+from evedrop.wire.across import event_mistakes, unknown
+from evedrop.wire.file import wire_event
+from evedrop.wire.plan import WireEvent, WirePlan
+from evedrop.wire.tables import WireEventTable
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A time at which something changes, and the state of all links from then on."""
+
+    time: float
+    """Seconds after the start of the wire."""
+    said: tuple[str, ...]
+    """A line for each event that begins or ends."""
+    cut: frozenset[str]
+    """The names of the links that are cut, or whose sides are partitioned."""
+    settings: Mapping[str, Mapping[str, Any]]
+    """Of every link, by name."""
+
+
+def moments(plan: WirePlan) -> tuple[Moment, ...]:
+    """All moments of a wire, in order of time; the first one is its start."""
+    times = {0.0, *(event.start for event in plan.events), *(one.stop for one in plan.events if one.stop is not None)}
+    return tuple(moment_at(plan, time) for time in sorted(times))
+
+
+def moment_at(plan: WirePlan, time: float) -> Moment:
+    """The state of all links at a time, and what happens just then."""
+    lasting = _lasting(plan, time)
+    settings: dict[str, Mapping[str, Any]] = {link.name: link.settings for link in plan.links}
+    for event in lasting:
+        if event.link is not None and event.settings is not None:
+            settings[event.link] = {**settings[event.link], **event.settings}
+    apart = [set(event.partition) for event in lasting if event.partition is not None]
+    named = {event.cut for event in lasting}
+    cut = {link.name for link in plan.links if link.name in named or {link.source, link.target} in apart}
+    said = [_ended(event) for event in plan.events if event.stop == time and event.note is None]
+    said += [_begun(event) for event in plan.events if event.start == time]
+    return Moment(time, tuple(said), frozenset(cut), settings)
+
+
+def with_change(plan: WirePlan, table: Mapping[str, Any], time: float) -> tuple[WirePlan, str]:
+    """The plan with an event that begins at a time and lasts, and the line that says what it does.
+
+    table: as `[[event]]` without a time. Raises ScenarioError with every mistake, worded as for the events of a file.
+    """
+    now = moment_at(plan, time).settings
+    tied = {link.name for link in plan.links if link.correlation is not None}
+    found = {"at": time, **table}
+    mistakes = list(event_mistakes(found, [*plan.sides], [*now], lambda name: (now[name], name in tied)))
+    try:
+        checked = WireEventTable.model_validate(found)
+    except ValidationError as error:
+        raise ScenarioError("event", [*sentences(error, WireEventTable), *mistakes]) from error
+    if mistakes:
+        raise ScenarioError("event", mistakes)
+    event = wire_event(checked, now, {link.name: link.settings for link in plan.links})
+    return replace(plan, events=(*plan.events, event)), _begun(event)
+
+
+def with_cut_ended(plan: WirePlan, link: str, time: float) -> tuple[WirePlan, str]:
+    """The plan in which no event cuts a link at a time, and the line that says so.
+
+    Later events stay, and so do partitions. Raises ScenarioError if the link is not cut.
+    """
+    names = [one.name for one in plan.links]
+    if link not in names:
+        raise ScenarioError("event", [f"heal: {unknown(link, names, 'link')}"])
+    apart = link in moment_at(plan, time).cut
+    wanted = "end the partition of its sides with `evedrop heal`" if apart else "expected a link that is cut"
+    return _ended_at(plan, time, lambda event: event.cut == link, f"heal: {link} is not cut by itself; {wanted}")
+
+
+def with_partition_ended(plan: WirePlan, one: str, other: str, time: float) -> tuple[WirePlan, str]:
+    """The plan in which two sides are not partitioned at a time. Raises ScenarioError if they are not partitioned before."""
+    sides = [*plan.sides]
+    if strange := [f"heal: {unknown(name, sides, 'side')}" for name in (one, other) if name not in sides]:
+        raise ScenarioError("event", strange)
+    pair = {one, other}
+    said = f"heal: {one} and {other} are not partitioned; expected two sides that are"
+    return _ended_at(plan, time, lambda event: event.partition is not None and {*event.partition} == pair, said)
+
+
+def _ended_at(plan: WirePlan, time: float, of: Callable[[WireEvent], bool], otherwise: str) -> tuple[WirePlan, str]:
+    """End the events of a kind that last at a time."""
+    lasting = [event for event in _lasting(plan, time) if of(event)]
+    if not lasting:
+        raise ScenarioError("event", [otherwise])
+    # One that begins at this very moment is left out: an event must end after its beginning.
+    kept = [event for event in plan.events if event not in lasting or event.start < time]
+    events = tuple(replace(event, stop=time) if event in lasting else event for event in kept)
+    return replace(plan, events=events), _ended(lasting[0])
+
+
+def _lasting(plan: WirePlan, time: float) -> list[WireEvent]:
+    """The events that last at a time, in the order in which they began."""
+    found = [event for event in plan.events if event.start <= time and (event.stop is None or time < event.stop)]
+    return sorted(found, key=lambda event: event.start)
+
+
+def _begun(event: WireEvent) -> str:
+    """What an event does."""
+    if event.partition is not None:
+        return f"partition {', '.join(event.partition)}"
+    if event.cut is not None:
+        return f"cut {event.cut}"
+    if event.settings is not None:
+        return f"link {event.link}: {', '.join(_settings(event.settings))}"
+    return f"{event.note}"
+
+
+def _ended(event: WireEvent) -> str:
+    """What ends with an event."""
+    if event.partition is not None:
+        return f"heal {', '.join(event.partition)}"
+    if event.cut is not None:
+        return f"heal {event.cut}"
+    return f"link {event.link}: {', '.join(event.settings or ())} as before"
+
+
+def _settings(settings: Mapping[str, Any]) -> Iterator[str]:
+    return (f"{name} = {as_toml(value)}" for name, value in settings.items())

@@ -1,0 +1,143 @@
+"""The events of a wire in order: cuts, partitions and changes that overlap; and those that an operator adds."""
+
+from __future__ import annotations
+
+import tomllib
+from typing import Any
+
+import pytest
+
+from evedrop.errors import ScenarioError
+from evedrop.wire.file import resolved_wire, wire_of
+from evedrop.wire.plan import WirePlan
+from evedrop.wire.timeline import moment_at, moments, with_change, with_cut_ended, with_partition_ended
+
+SIDES: dict[str, Any] = {"robot": {}, "base": {}, "listener": {}}
+LINKS = [
+    {"name": "scan", "from": "robot", "to": "base", "keys": "scan/**", "quality": 0.9},
+    {"from": "robot", "to": "base"},
+    {"from": "base", "to": "robot"},
+    {"from": "robot", "to": "listener", "tap": True},
+]
+
+
+def plan_of(*events: dict[str, Any]) -> WirePlan:
+    """A wire with these events."""
+    return wire_of({"side": SIDES, "link": LINKS, "event": list(events)})
+
+
+def quality(plan: WirePlan, time: float) -> float:
+    """That of the link scan at a time."""
+    value: float = moment_at(plan, time).settings["scan"]["loss"]["quality"]
+    return value
+
+
+def test_a_wire_without_events() -> None:
+    """It has one moment, its start, with the settings of the file."""
+    plan = plan_of()
+    (moment,) = moments(plan)
+    assert (moment.time, moment.said, moment.cut) == (0.0, (), frozenset())
+    assert moment.settings == {link.name: link.settings for link in plan.links}
+
+
+def test_cuts_and_partitions_overlap() -> None:
+    """A link is cut until both have ended; a partition cuts the links between its sides in both directions, and no others."""
+    plan = plan_of(
+        {"from": 1, "to": 5, "cut": "scan"},
+        {"from": 3, "to": 8, "partition": ["base", "robot"]},
+        {"at": 4, "note": "the lift"},
+        {"at": 8, "cut": "robot-listener"},
+    )
+    both = frozenset({"scan", "robot-base", "base-robot"})
+    assert [(one.time, one.cut, one.said) for one in moments(plan)] == [
+        (0.0, frozenset(), ()),
+        (1.0, {"scan"}, ("cut scan",)),
+        (3.0, both, ("partition base, robot",)),
+        (4.0, both, ("the lift",)),
+        (5.0, both, ("heal scan",)),
+        (8.0, {"robot-listener"}, ("heal base, robot", "cut robot-listener")),
+    ]
+
+
+def test_changes_overlap() -> None:
+    """They apply in the order in which they began, whatever their order in the file, and end one by one."""
+    plan = plan_of(
+        {"from": 3, "to": 6, "link": "scan", "set": {"quality": 0.3}},
+        {"from": 1, "to": 9, "link": "scan", "set": {"quality": 0.1, "duplicate": 0.5}},
+    )
+    assert [quality(plan, time) for time in (0, 1, 2.9, 3, 5.9, 6, 9)] == [0.9, 0.1, 0.1, 0.3, 0.3, 0.1, 0.9]
+    assert [moment_at(plan, time).settings["scan"].get("duplicate") for time in (0, 5, 9)] == [None, 0.5, None]
+    assert moment_at(plan, 3.0).said == ('link scan: loss = { model = "bernoulli", quality = 0.3 }',)
+    assert moment_at(plan, 6.0).said == ("link scan: loss as before",)
+    assert moment_at(plan, 5.0).settings["robot-base"] == plan.named("robot-base").settings
+
+
+def test_an_operator_adds_events() -> None:
+    """They last, on top of those of the file; what the plan then says can be written as a file."""
+    plan, said = with_change(plan_of({"from": 1, "to": 9, "partition": ["robot", "base"]}), {"cut": "scan"}, 2.0)
+    assert said == "cut scan"
+    plan, said = with_change(plan, {"link": "scan", "set": {"quality": 0.2}}, 3.0)
+    assert said == 'link scan: loss = { model = "bernoulli", quality = 0.2 }'
+    plan, said = with_change(plan, {"link": "scan", "set": {"rate": "1 kB/s"}}, 4.0)
+    assert said == "link scan: rate = 1000.0, queue = 256000"
+    plan, said = with_change(plan, {"link": "scan", "set": {"queue": 10}}, 5.0)
+    assert said == "link scan: queue = 10, rate = 1000.0"
+    assert moment_at(plan, 5.0).settings["scan"]["queue"] == 10
+    assert quality(plan, 100.0) == 0.2
+    assert "scan" in moment_at(plan, 100.0).cut
+    assert wire_of(tomllib.loads(resolved_wire(plan))) == plan
+
+
+def test_an_operator_ends_cuts() -> None:
+    """Those that last; later ones of the file stay. A cut ended at its very beginning leaves nothing."""
+    plan = plan_of({"at": 1, "cut": "scan"}, {"from": 2, "to": 9, "cut": "scan"}, {"from": 20, "to": 21, "cut": "scan"})
+    healed, said = with_cut_ended(plan, "scan", 4.0)
+    assert said == "heal scan"
+    assert [("scan" in moment_at(healed, time).cut) for time in (3, 4, 8, 20)] == [True, False, False, True]
+    assert moment_at(with_cut_ended(plan, "scan", 1.0)[0], 1.5).cut == frozenset()
+    assert wire_of(tomllib.loads(resolved_wire(with_cut_ended(plan, "scan", 1.0)[0])))
+
+
+def test_an_operator_ends_partitions() -> None:
+    """Named in any order; cuts stay."""
+    plan = plan_of({"at": 1, "partition": ["robot", "base"]}, {"at": 1, "cut": "scan"})
+    healed, said = with_partition_ended(plan, "base", "robot", 4.0)
+    assert said == "heal robot, base"
+    assert moment_at(healed, 4.0).cut == {"scan"}
+
+
+def refused(*arguments: Any) -> list[str]:
+    """What is said of a change by an operator that is refused: a function and its arguments."""
+    with pytest.raises(ScenarioError) as caught:
+        arguments[0](*arguments[1:])
+    return caught.value.mistakes
+
+
+def test_what_an_operator_cannot_do() -> None:
+    """The messages are those of a file, all at once, and say what to do."""
+    plan = plan_of({"at": 1, "partition": ["robot", "base"]})
+    assert refused(with_change, plan, {"link": "scan", "set": {"qualty": 1, "corrupt": 2}}, 2.0) == [
+        "set.qualty: is not a link setting that can be changed; expected quality, loss, delay, reorder, duplicate, corrupt, rate "
+        "or queue; did you mean quality?",
+        "set.corrupt: is 2; expected a number from 0 to 1, such as 0.01",
+    ]
+    assert refused(with_change, plan, {"cut": "scna", "partition": ["robot", "bas"]}, 2.0) == [
+        'event: has partition or cut at once; expected one of partition, cut, set or note, such as partition = ["robot", "base"]',
+        'partition.1: is "bas"; expected robot, base or listener; did you mean base?',
+        'cut: is "scna"; expected scan, robot-base, base-robot or robot-listener; did you mean scan?',
+    ]
+    assert refused(with_cut_ended, plan, "scan", 2.0) == [
+        "heal: scan is not cut by itself; end the partition of its sides with `evedrop heal`"
+    ]
+    assert refused(with_cut_ended, plan, "scan", 0.5) == [
+        "heal: scan is not cut by itself; expected a link that is cut"
+    ]
+    assert refused(with_cut_ended, plan, "scn", 2.0) == [
+        'heal: is "scn"; expected scan, robot-base, base-robot or robot-listener; did you mean scan?'
+    ]
+    assert refused(with_partition_ended, plan, "robot", "listener", 2.0) == [
+        "heal: robot and listener are not partitioned; expected two sides that are"
+    ]
+    assert refused(with_partition_ended, plan, "robot", "bse", 2.0) == [
+        'heal: is "bse"; expected robot, base or listener; did you mean base?'
+    ]
