@@ -10,7 +10,6 @@ from typing import Any, final
 
 import numpy as np
 
-from evedrop.errors import UsageError
 from evedrop.fitting.candidate import rounded
 from evedrop.fitting.fit import FEWEST_DELAYS, Fit, fit_outcomes, model_lines
 from evedrop.model.checks import toml_of
@@ -89,10 +88,8 @@ def fit_messages(recording: MessageRecording, slot: float | None = None) -> Mess
 
     slot: seconds of a slot; None: the median time between two messages.
 
-    Raises TraceError if nothing can be estimated, and UsageError if `slot` is not a time.
+    Raises TraceError if nothing can be estimated.
     """
-    if slot is not None and not 0.0 < slot < np.inf:
-        raise UsageError(f"--slot {slot:g}: expected seconds, more than 0")
     delays = recording.delays if len(recording.delays) >= FEWEST_DELAYS and recording.delays.any() else np.empty(0)
     return MessageFit(
         recording, fit_outcomes(recording.name, recording.series.outcomes, delays), slot or recording.series.seconds

@@ -5,11 +5,14 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from evedrop.cli.options import argument, as_json
 from evedrop.command import Command
 from evedrop.errors import UsageError
+
+if TYPE_CHECKING:
+    from evedrop.recordings.message_recording import MessageRecording
 
 
 def fit_link(options: argparse.Namespace) -> int:
@@ -17,7 +20,9 @@ def fit_link(options: argparse.Namespace) -> int:
     from evedrop.recordings.mcap_recording import is_mcap
 
     if is_mcap(options.trace):
-        told, lines = _messages(options, "an MCAP recording", ("topic", "period", "outage", "slot"))
+        told, lines = _mcap(options)
+    elif options.trace.is_dir():
+        told, lines = _journal(options)
     else:
         told, lines = _table(options)
     print(json.dumps(told, ensure_ascii=False) if options.json else "\n".join(lines))
@@ -33,17 +38,29 @@ def _table(options: argparse.Namespace) -> tuple[dict[str, Any], Sequence[str]]:
     return found.as_dict(), lines(found)
 
 
-def _messages(options: argparse.Namespace, what: str, names: Sequence[str]) -> tuple[dict[str, Any], Sequence[str]]:
-    """The fit of messages that were recorded."""
-    from evedrop.fitting.message_fit import fit_messages, message_lines
+def _mcap(options: argparse.Namespace) -> tuple[dict[str, Any], Sequence[str]]:
+    """The fit of a topic of an MCAP recording."""
     from evedrop.recordings.mcap_recording import mcap_recording
 
-    _refuse_others(options, what, names)
-    for name in ("period", "outage", "slot"):
-        value = getattr(options, name)
-        if value is not None and not 0.0 < value < float("inf"):
-            raise UsageError(f"--{name} {value:g}: expected seconds, more than 0")
-    recording = mcap_recording(options.trace, options.topic, options.period, options.outage)
+    _refuse_others(options, "an MCAP recording", ("topic", "period", "outage", "slot"))
+    return _messages(mcap_recording(options.trace, options.topic, options.period, options.outage), options)
+
+
+def _journal(options: argparse.Namespace) -> tuple[dict[str, Any], Sequence[str]]:
+    """The fit of a link of a wire."""
+    from evedrop.wire.recorded_link import journal_recording
+
+    _refuse_others(options, "a folder", ("link", "key", "gaps", "outage", "slot"))
+    if options.outage is not None and not options.gaps:
+        raise UsageError("--outage: expected --gaps with it; what a wire itself cuts is never counted as lost")
+    recording = journal_recording(options.trace, options.link, options.key, gaps=options.gaps, longest=options.outage)
+    return _messages(recording, options)
+
+
+def _messages(recording: MessageRecording, options: argparse.Namespace) -> tuple[dict[str, Any], Sequence[str]]:
+    """The fit of messages that were recorded."""
+    from evedrop.fitting.message_fit import fit_messages, message_lines
+
     found = fit_messages(recording, options.slot)
     return found.as_dict(), message_lines(found)
 
@@ -53,6 +70,9 @@ _ONLY = {
     "delay_column": "a table of outcomes",
     "topic": "an MCAP recording",
     "period": "an MCAP recording",
+    "link": "the folder of a wire",
+    "key": "the folder of a wire",
+    "gaps": "the folder of a wire",
     "outage": "a recording of messages",
     "slot": "a recording of messages",
 }
@@ -60,10 +80,14 @@ _ONLY = {
 
 
 def _refuse_others(options: argparse.Namespace, what: str, names: Sequence[str]) -> None:
-    """Raise UsageError for options that this kind of recording does not have."""
+    """Raise UsageError for options that this kind of recording does not have, and for times that are not positive."""
     for name, whose in _ONLY.items():
         if name not in names and getattr(options, name) not in {None, False}:
             raise UsageError(f"--{name.replace('_', '-')} is for {whose}, and {options.trace} is {what}; leave it out")
+    for name in ("period", "outage", "slot"):
+        value = getattr(options, name)
+        if value is not None and not 0.0 < value < float("inf"):
+            raise UsageError(f"--{name} {value:g}: expected seconds, more than 0")
 
 
 def _fits(parser: argparse.ArgumentParser) -> None:
@@ -79,6 +103,11 @@ def _fits(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--period", type=float, metavar="S", help="seconds between two messages, of a sender that does not number them"
     )
+    parser.add_argument("--link", metavar="NAME", help="the link of a wire; default the only one with messages")
+    parser.add_argument("--key", metavar="K", help="only messages of a wire with keys that this key expression takes")
+    parser.add_argument(
+        "--gaps", action="store_true", help="what was lost before a wire: numbers that are missing in its journal"
+    )
     parser.add_argument(
         "--outage", type=float, metavar="S", help="a silence of more than so many seconds is not counted as losses"
     )
@@ -91,7 +120,7 @@ COMMANDS = (
     Command(
         "fit",
         fit_link,
-        "the loss model and delays of a recorded link: a table or an MCAP recording",
+        "the loss model and delays of a recorded link: a table, an MCAP recording or the folder of a wire",
         (argument("trace", "RECORDING"), _fits, as_json),
         group="links",
     ),

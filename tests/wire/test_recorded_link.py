@@ -1,0 +1,191 @@
+"""The journal of a wire as a recording: its models are found again, and so is what was lost before the wire."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evedrop.errors import TraceError, UsageError
+from evedrop.fitting.message_fit import fit_messages
+from evedrop.wire.crossing import AGAIN, Crossing, Kind
+from evedrop.wire.fates import KeyFates
+from evedrop.wire.file import resolved_wire, wire_of
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.plan import WirePlan
+from evedrop.wire.recorded_link import journal_recording
+from tests.conftest import Evedrop
+
+SETTINGS = {
+    "loss": {"model": "gilbert-elliott", "p": 0.05, "r": 0.3},
+    "delay": {"model": "normal", "mean": 0.02, "deviation": 0.003},
+    "duplicate": 0.05,
+    "corrupt": 0.04,
+}
+
+
+def plan_of(settings: Mapping[str, Any], seed: int = 7) -> WirePlan:
+    """A wire with a link `scan` and one that loses nothing."""
+    sides = {"robot": {"listen": "tcp/127.0.0.1:0"}, "base": {"listen": "tcp/127.0.0.1:0"}}
+    links = [
+        {"name": "scan", "from": "robot", "to": "base", "keys": "*/scan/**", **settings},
+        {"name": "rest", "from": "robot", "to": "base", "quality": 1.0},
+    ]
+    return wire_of({"seed": seed, "side": sides, "link": links})
+
+
+def carried(
+    folder: Path, plan: WirePlan, counts: Mapping[str, int], hidden: Mapping[int, Crossing] | None = None
+) -> None:
+    """A journal of messages of some keys on the link `scan`, ten a second each, as a wire keeps it.
+
+    hidden: what happened to the n-th message of each key before its loss model.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "wire.toml").write_text(resolved_wire(plan))
+    with WireJournal(folder, plan) as journal:
+        for key, count in counts.items():
+            fates = KeyFates(plan.links[0], key, "put", plan.seed)
+            for n in range(count):
+                fate, delay, again = fates.next()
+                fate = (hidden or {}).get(n, Crossing(fate))
+                kind = Kind.PUT | (AGAIN if again and fate == Crossing.DELIVERED else 0)
+                row = (
+                    1e9 + 0.1 * n,
+                    n,
+                    n + 1,
+                    delay,
+                    journal.key_code(key),
+                    journal.source_code("a"),
+                    64,
+                    0,
+                    kind,
+                    fate,
+                )
+                journal.record(*row)
+            journal.record(1e9, 0, 1, 0.0, journal.key_code(key), 0, 64, 1, Kind.PUT, Crossing.DELIVERED)
+
+
+def test_the_models_of_a_link_are_found_again(tmp_path: Path) -> None:
+    """From 6000 messages of two keys: losses, delays, copies and damage, within about four standard errors."""
+    carried(tmp_path, plan_of(SETTINGS), {"0/scan/a": 3000, "0/scan/b": 3000})
+    found = fit_messages(journal_recording(tmp_path, "scan"))
+    settings = found.settings
+    assert found.fit.chosen.name == "gilbert"
+    assert settings["loss"]["p"] == pytest.approx(0.05, abs=0.013)
+    assert settings["loss"]["r"] == pytest.approx(0.3, abs=0.065)
+    assert settings["delay"]["mean"] == pytest.approx(0.02, abs=2e-4)
+    assert settings["delay"]["deviation"] == pytest.approx(0.003, abs=2e-4)
+    assert settings["duplicate"] == pytest.approx(0.05, abs=0.013)
+    assert settings["corrupt"] == pytest.approx(0.04, abs=0.011)
+    assert found.recording.series.parts == 2
+    assert found.slot == pytest.approx(0.1)
+
+
+def test_a_fitted_link_in_a_wire_loses_as_the_recorded_one(tmp_path: Path) -> None:
+    """The printed [[link]] in a wire file: rate and bursts of 20 000 other messages are within 10 % of the recording's."""
+    carried(tmp_path, plan_of(SETTINGS), {"0/scan/a": 20_000})
+    found = fit_messages(journal_recording(tmp_path, "scan"))
+    (link,) = tomllib.loads(found.wire_toml)["link"]
+    assert (link["from"], link["to"], link["keys"]) == ("robot", "base", "*/scan/**")
+    sides = {"robot": {"listen": "tcp/127.0.0.1:0"}, "base": {"listen": "tcp/127.0.0.1:0"}}
+    again = wire_of({"seed": 8, "side": sides, "link": [link]})
+    fates = KeyFates(again.links[0], "0/scan/b", "put", 8)
+    lost = np.array([fates.next()[0] == Crossing.LOST for _ in range(20_000)])
+    recorded = found.recording.series.outcomes == 0
+    assert lost.mean() == pytest.approx(recorded.mean(), rel=0.1)
+
+    def burst(word: Any) -> float:
+        return float(word.sum() / (word[1:] & ~word[:-1]).sum())
+
+    assert burst(lost) == pytest.approx(burst(recorded), rel=0.1)
+
+
+def test_what_hides_the_loss_model_cuts_the_messages_into_parts(tmp_path: Path) -> None:
+    """Cuts and full queues are neither losses nor deliveries; what the wire could not hold was not lost by the model."""
+    settings = {"loss": {"model": "pattern", "outcomes": "1" * 29 + "0"}}
+    hidden = {
+        **dict.fromkeys(range(100, 130), Crossing.CUT), 200: Crossing.OVERFLOW, 300: Crossing.HELD_UP, 399: Crossing.UNDERWAY,
+    }  # fmt: skip
+    carried(tmp_path, plan_of(settings), {"0/scan/a": 400}, hidden)
+    found = journal_recording(tmp_path, "scan")
+    expected = [0 if n % 30 == 29 else 1 for n in range(400) if hidden.get(n) not in {Crossing.CUT, Crossing.OVERFLOW}]
+    assert found.series.outcomes.tolist() == expected
+    assert found.series.parts == 3
+    assert any("31 messages met a cut" in note for note in found.notes)
+    carried(tmp_path / "all", plan_of(settings), {"0/scan/a": 200}, dict.fromkeys(range(0, 200, 5), Crossing.CUT))
+    with pytest.raises(TraceError, match="cuts, queues and limits hide"):
+        journal_recording(tmp_path / "all", "scan")
+
+
+def test_missing_numbers_are_what_was_lost_before_the_wire(tmp_path: Path) -> None:
+    """By sender and key: the second sender is the first after a restart, and its numbers begin again."""
+    plan = plan_of(SETTINGS)
+    random = np.random.default_rng(3)
+    words = {("0/scan/a", "x"): random.random(400) < 0.8, ("0/scan/a", "y"): random.random(300) < 0.8}
+    with WireJournal(tmp_path, plan) as journal:
+        n = 0
+        for (key, source), word in words.items():
+            for number in np.flatnonzero(word).tolist():
+                codes = (journal.key_code(key), journal.source_code(source))
+                fate = Crossing.LOST if n % 3 == 0 else Crossing.DELIVERED
+                journal.record(1e9 + 0.1 * number, n, number + 1, 0.0, *codes, 64, 0, Kind.PUT, fate)
+                n += 1
+        journal.record(1e9, 0, -1, 0.0, journal.key_code("0/scan/q"), 0, 64, 0, Kind.QUERY, Crossing.DELIVERED)
+    found = journal_recording(tmp_path, gaps=True)
+    expected: list[int] = []
+    for word in words.values():
+        places = np.flatnonzero(word)
+        expected += word[places[0] : places[-1] + 1].astype(int).tolist()
+    assert found.series.outcomes.tolist() == expected
+    assert (found.series.parts, found.series.restarts, len(found.delays)) == (2, 0, 0)
+
+
+def test_the_command_takes_the_folder_of_a_wire(evedrop: Evedrop) -> None:
+    """With --link where there are several; --key leaves the other keys out; a scenario's slot is the messages' distance."""
+    carried(evedrop.folder / "runs", plan_of(SETTINGS), {"0/scan/a": 1500, "0/scan/b": 500})
+    done = evedrop("links", "fit", "runs", "--link", "scan", "--key", "*/scan/a")
+    assert (done.status, done.err) == (0, "")
+    assert done.out.startswith("runs, link scan, */scan/a: ")
+    text = done.out
+    (wire,) = tomllib.loads(text[text.index("[[link]]") : text.index("# for a scenario")])["link"]
+    assert wire["keys"] == "*/scan/a"
+    found = json.loads(evedrop("links", "fit", "runs", "--link", "scan", "--json").out)
+    assert found["outcomes"] == 2000
+    assert found["slot_seconds"] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((), "has several links; expected --link and one of scan (300 messages), rest (1 messages)"),
+        (("--link", "orders"), 'has no messages on a link "orders"; it has scan (300 messages), rest (1 messages)'),
+        (("--link", "scan", "--key", "a//b"), "--key a//b: Zenoh refuses this key expression"),
+        (("--link", "scan", "--key", "b"), "has no message on this link and key"),
+        (("--link", "scan", "--gaps"), "lacks none of 300 numbers of its senders: nothing was lost before the wire"),
+        (("--link", "rest"), "has 1 outcomes; expected 100 or more"),
+        (
+            ("--link", "scan", "--topic", "/scan"),
+            "--topic is for an MCAP recording, and runs is a folder; leave it out",
+        ),
+        (("--link", "scan", "--outage", "5"), "--outage: expected --gaps with it"),
+    ],
+)
+def test_mistakes_are_said(evedrop: Evedrop, arguments: Iterable[str], said: str) -> None:
+    """One line, exit 2."""
+    carried(evedrop.folder / "runs", plan_of(SETTINGS), {"0/scan/a": 300})
+    done = evedrop("links", "fit", "runs", *arguments)
+    assert (done.status, done.out) == (2, "")
+    (line,) = done.err.splitlines()
+    assert said in line
+
+
+def test_a_folder_without_a_journal_is_refused(tmp_path: Path) -> None:
+    """As what it is not."""
+    with pytest.raises(UsageError, match="is not the folder of a wire"):
+        journal_recording(tmp_path)
