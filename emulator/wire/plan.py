@@ -66,8 +66,15 @@ class WireLink:
         return zenoh.KeyExpr(self.keys)
 
     def takes(self, key: zenoh.KeyExpr) -> bool:
-        """Whether a message with this key, which may contain wildcards, is one of this link's."""
-        return self.expression.intersects(key)
+        """Whether a message with this key, which may contain wildcards, is one of this link's.
+
+        The history of an advanced publisher, `KEY/@adv/…`, goes where its key goes.
+        """
+        return self.expression.intersects(key) or self._takes_history(str(key))
+
+    def _takes_history(self, key: str) -> bool:
+        before, verbatim, _ = key.partition("/@adv/")
+        return bool(verbatim) and self.expression.intersects(zenoh.KeyExpr(before))
 
 
 @dataclass(frozen=True)

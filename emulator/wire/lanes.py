@@ -1,0 +1,129 @@
+"""What a link does with messages at this moment: it is cut or not, its queue has room or not, and each key has its fates.
+
+A message meets, in this order: the limit of its size, the queue of a link of limited rate, a cut, and the fate that the link's
+models give it.
+
+Source: docs/wire.md, what becomes of a message.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any, final
+
+from evedrop.wire.crossing import Crossing
+from evedrop.wire.fates import KeyFates
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.plan import WireLink, WirePlan
+
+_CUT, _OVERFLOW, _TOO_LARGE = int(Crossing.CUT), int(Crossing.OVERFLOW), int(Crossing.TOO_LARGE)
+_LOOPED = int(Crossing.LOOPED)
+
+Decision = tuple[int, int, float, bool]
+"""Number of the message, `Crossing` code, delay in seconds, whether it is delivered twice."""
+Lane = Callable[[float, int], Decision]
+"""Decides on the next message of a key, from the present time in seconds and the message's bytes."""
+
+
+@final
+class LinkState:
+    """A link while the wire runs. Threads may call its methods at the same time."""
+
+    def __init__(self, link: WireLink, plan: WirePlan, journal: WireJournal) -> None:
+        self.link = link
+        self.looped = False
+        """Whether its sides are joined outside the wire, so that its messages would go round."""
+        self._seed, self._largest = plan.seed, plan.largest
+        self._journal = journal
+        self._reasons: set[str] = set()
+        self._fates: dict[tuple[str, str], KeyFates] = {}
+        self._lock = threading.Lock()
+        self._free = 0.0  # when the queue will have sent all its messages
+        self._set(link.settings)
+
+    @property
+    def cut(self) -> bool:
+        """Whether nothing passes."""
+        return bool(self._reasons)
+
+    def block(self, reason: str) -> None:
+        """Cut the link for a reason; it stays cut until all reasons are gone."""
+        with self._lock:
+            self._reasons = self._reasons | {reason}
+
+    def unblock(self, reason: str | None = None) -> None:
+        """Take a reason away, or all of them."""
+        with self._lock:
+            self._reasons = set() if reason is None else self._reasons - {reason}
+
+    def change(self, settings: Mapping[str, Any]) -> None:
+        """Give the link other settings from the next message of each key on."""
+        with self._lock:
+            since = {(key, kind): fates.change(settings) for (kind, key), fates in self._fates.items()}
+            self._set(settings)
+            self._journal.change(self.link.name, settings, since)
+
+    def lane(self, kind: str, key: str, lossless: bool) -> Lane:
+        """What decides on the messages of a key and kind."""
+        return self._never(kind, key) if lossless else self._decide(kind, key)
+
+    def _decide(self, kind: str, key: str) -> Lane:
+        fates = self._fates_of(kind, key)
+        n, lock, largest, after = fates.n, self._lock, self._largest, fates.next
+
+        def decide(now: float, size: int) -> Decision:
+            nonlocal n
+            with lock:
+                at = n
+                n = at + 1
+                code, delay, again = after()
+                if self._rate:
+                    wait = self._wait(now, size)
+                    if wait is None:
+                        return at, _OVERFLOW, 0.0, False
+                    delay += wait
+            if size > largest:
+                return at, _TOO_LARGE, 0.0, False
+            if self.looped:
+                return at, _LOOPED, 0.0, False
+            if self._reasons:
+                return at, _CUT, 0.0, False
+            return at, code, delay if code == 0 else 0.0, again
+
+        return decide
+
+    def _never(self, kind: str, key: str) -> Lane:
+        """For messages that are never lost: they take no fates, but they are numbered."""
+        n, lock, largest = self._journal.counts.get((self.link.name, key, kind), 0), self._lock, self._largest
+
+        def decide(_now: float, size: int) -> Decision:
+            nonlocal n
+            with lock:
+                at = n
+                n = at + 1
+            return at, 0 if size <= largest else _TOO_LARGE, 0.0, False
+
+        return decide
+
+    def _fates_of(self, kind: str, key: str) -> KeyFates:
+        with self._lock:
+            fates = self._fates.get((kind, key))
+            if fates is None:
+                name = self.link.name
+                start = self._journal.counts.get((name, key, kind), 0)
+                fates = KeyFates(self.link, key, kind, self._seed, start, self._journal.changes_of(name, key, kind))
+                self._fates[kind, key] = fates
+            return fates
+
+    def _set(self, settings: Mapping[str, Any]) -> None:
+        self._rate = float(settings.get("rate") or 0.0)
+        self._queue = float(settings.get("queue") or 0.0)
+
+    def _wait(self, now: float, size: int) -> float | None:
+        """Seconds until the link has sent a message; None if its queue is full. The queue is never too small for one message."""
+        wait = max(0.0, self._free - now)
+        if wait > 0 and wait * self._rate + size > self._queue:
+            return None
+        self._free = max(self._free, now) + size / self._rate
+        return wait + size / self._rate

@@ -1,0 +1,150 @@
+"""A wire at work: the sessions of its sides, and everything that crosses between them.
+
+Source: docs/wire.md.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Mapping
+from types import TracebackType
+from typing import Self, final
+
+import zenoh
+
+from evedrop.errors import UsageError
+from evedrop.output import warn
+from evedrop.wire.crossing import Crossing
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.lanes import LinkState
+from evedrop.wire.liveliness import LivelinessRelay
+from evedrop.wire.neighbours import Neighbours
+from evedrop.wire.plan import WirePlan
+from evedrop.wire.publications import PublicationRelay, Publishers
+from evedrop.wire.queries import QueryRelay
+from evedrop.wire.ros2 import service_key
+from evedrop.wire.scheduler import Scheduler
+from evedrop.wire.side import SideSession
+
+_LOOK_SECONDS = 0.2
+_MOST_SHARE = 0.1  # of a processor's time, for looking
+
+
+@final
+class WireRelay:
+    """The open sides of a wire and what crosses between them; use it as a context manager.
+
+    `block`, `unblock` and `change` may be called by any thread.
+    """
+
+    def __init__(self, plan: WirePlan, journal: WireJournal, tell: Callable[[str], None] = warn) -> None:
+        """tell: for what the user must know while the wire runs. Raises UsageError if a side cannot be opened."""
+        self.plan = plan
+        self.links: Mapping[str, LinkState] = {link.name: LinkState(link, plan, journal) for link in plan.links}
+        """By their names."""
+        self._journal, self._tell = journal, tell
+        self._stack = contextlib.ExitStack()
+        self._ended = threading.Event()
+        self._woken = threading.Event()
+        zenoh.init_log_from_env_or("error")
+
+    def __enter__(self) -> Self:
+        with contextlib.ExitStack() as stack:
+            self._open(stack)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.close()
+
+    @property
+    def endpoints(self) -> Mapping[str, tuple[str, ...]]:
+        """Side → where programs connect."""
+        return {name: side.endpoints for name, side in self.sides.items()}
+
+    def link(self, name: str) -> LinkState:
+        """A link by its name. Raises UsageError if there is none."""
+        if name not in self.links:
+            raise UsageError(f"there is no link {name}; the links are {', '.join(self.links) or 'none'}")
+        return self.links[name]
+
+    def partition(self, one: str, other: str, reason: str = "partition") -> None:
+        """Cut all links between two sides. Raises UsageError if there is no such side."""
+        for state in self._between(one, other):
+            state.block(reason)
+
+    def join(self, one: str, other: str, reason: str | None = None) -> None:
+        """End a partition, or with reason None whatever cuts the links between two sides."""
+        for state in self._between(one, other):
+            state.unblock(reason)
+
+    def _between(self, one: str, other: str) -> list[LinkState]:
+        for name in (one, other):
+            if name not in self.plan.sides:
+                raise UsageError(f"there is no side {name}; the sides are {', '.join(self.plan.sides)}")
+        return [state for state in self.links.values() if {state.link.source, state.link.target} == {one, other}]
+
+    def _open(self, stack: contextlib.ExitStack) -> None:
+        plan, journal, states = self.plan, self._journal, list(self.links.values())
+        self.sides = {name: stack.enter_context(SideSession(side, plan.largest)) for name, side in plan.sides.items()}
+        scheduler = Scheduler(plan.held_messages, plan.held_bytes, lambda row: journal.amend(row, Crossing.REFUSED))
+        stack.callback(self._end_delays, scheduler)
+        publishers = {name: Publishers(side.session) for name, side in self.sides.items()}
+        self._queries = QueryRelay(self.sides, states, plan, journal, scheduler)
+        stack.callback(self._queries.close)
+        relays = [
+            PublicationRelay(
+                side, [one for one in states if one.link.source == name], publishers, plan, journal, scheduler
+            )
+            for name, side in self.sides.items()
+        ]
+        for relay in relays:
+            stack.callback(relay.close)
+        self._neighbours = Neighbours(self.sides, states, self._tell)
+        self._liveliness = LivelinessRelay(self.sides, plan, self._woken.set)
+        stack.callback(self._liveliness.close)
+        self._look()
+        self._queries.start()
+        for relay in relays:
+            relay.start()
+        thread = threading.Thread(target=self._keep_up, name="wire", daemon=True)
+        thread.start()
+        stack.callback(thread.join)
+        stack.callback(self._woken.set)
+        stack.callback(self._ended.set)
+
+    def _end_delays(self, scheduler: Scheduler) -> None:
+        """Count the messages that were still delayed."""
+        for row in scheduler.close():
+            self._journal.amend(row, Crossing.UNDERWAY)
+
+    def _look(self, ask: bool = True) -> None:
+        """Follow what programs declare. Queryables come before tokens: who sees a service's token may ask it at once."""
+        if ask:
+            self._neighbours.update()
+        tokens = self._liveliness.tokens
+        services = [
+            (side, key) for side, held in tokens.items() for token in held if (key := service_key(token)) is not None
+        ]
+        self._queries.update(services)
+        self._liveliness.update(ask)
+
+    def _keep_up(self) -> None:
+        pause, due = _LOOK_SECONDS, 0.0
+        while not self._ended.is_set():
+            self._woken.wait(max(0.0, due - time.monotonic()))
+            self._woken.clear()
+            begun = time.monotonic()
+            ask = begun >= due
+            try:
+                self._look(ask)
+            except zenoh.ZError as error:
+                if not self._ended.is_set():
+                    self._tell(f"Zenoh does not say what programs declare ({error}); trying again")
+            if ask:
+                pause = max(_LOOK_SECONDS, (time.monotonic() - begun) / _MOST_SHARE)
+                due = time.monotonic() + pause

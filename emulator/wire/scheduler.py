@@ -1,0 +1,88 @@
+"""Holds messages back until their delay is over, and gives them on in the order of their times.
+
+Source: docs/wire.md, delays.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import threading
+import time
+from collections.abc import Callable
+from typing import NamedTuple, final
+
+
+class _Held(NamedTuple):
+    due: float
+    serial: int
+    size: int
+    row: int
+    send: Callable[[], object]
+
+
+@final
+class Scheduler:
+    """A thread that carries out what is due. It holds a limited number of messages, and of bytes."""
+
+    def __init__(self, most: int, most_bytes: int, failed: Callable[[int], None]) -> None:
+        """most, most_bytes: what it may hold; failed: is given the row of a message that raised an error."""
+        self._most, self._most_bytes, self._failed = most, most_bytes, failed
+        self._heap: list[_Held] = []
+        self._bytes = 0
+        self._serial = itertools.count()
+        self._changed = threading.Condition()
+        self._ended = False
+        self._thread = threading.Thread(target=self._run, name="delays", daemon=True)
+        self._thread.start()
+
+    def hold(self, delay: float, size: int, row: int, send: Callable[[], object]) -> bool:
+        """Send a message of some bytes after some seconds; returns whether there is room for it. row: its row in the journal."""
+        with self._changed:
+            if self._ended or len(self._heap) >= self._most or self._bytes + size > self._most_bytes:
+                return False
+            held = _Held(time.monotonic() + delay, next(self._serial), size, row, send)
+            heapq.heappush(self._heap, held)
+            self._bytes += size
+            if self._heap[0] is held:
+                self._changed.notify()
+        return True
+
+    @property
+    def held(self) -> int:
+        """How many messages wait."""
+        return len(self._heap)
+
+    def close(self) -> list[int]:
+        """End the thread. Returns the rows of the messages that were not sent."""
+        with self._changed:
+            self._ended = True
+            self._changed.notify()
+        self._thread.join()
+        left, self._heap = [held.row for held in sorted(self._heap)], []
+        return left
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                held = self._due()
+            if held is None:
+                return
+            try:
+                held.send()
+            except Exception:
+                self._failed(held.row)
+
+    def _due(self) -> _Held | None:
+        """The next message, when it is due; None at the end. The lock is held."""
+        while not self._ended:
+            if not self._heap:
+                self._changed.wait()
+                continue
+            wait = self._heap[0].due - time.monotonic()
+            if wait <= 0:
+                held = heapq.heappop(self._heap)
+                self._bytes -= held.size
+                return held
+            self._changed.wait(wait)
+        return None

@@ -1,0 +1,188 @@
+"""The session of a side: a Zenoh router to which programs connect, with what it lets them do, and where it listens.
+
+Source: docs/wire.md, sides.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, final
+
+import zenoh
+
+from evedrop.errors import UsageError
+from evedrop.wire.plan import Side, SideTls, WireLink
+
+ZenohConfig = dict[str, Any]
+HIDDEN = ("@ros2_lv/**", "@/*/@ros2_lv/**", "**/@adv/**")
+"""Keys that `**` does not match although programs use them: the graph of ROS 2, and the histories of advanced publishers."""
+_CONNECT_SECONDS = 10.0
+_CLIENT_MESSAGES = (
+    "put",
+    "delete",
+    "declare_subscriber",
+    "query",
+    "reply",
+    "declare_queryable",
+    "liveliness_token",
+    "liveliness_query",
+    "declare_liveliness_subscriber",
+)
+
+
+@final
+class SideSession:
+    """The open session of a side; use it as a context manager, or its threads outlive the program."""
+
+    def __init__(self, side: Side, largest: int) -> None:
+        """largest: bytes of the largest message. Raises UsageError if the side cannot listen or connect where it must."""
+        self.side = side
+        self.name = side.name
+        with _users_file(side.users) as users:
+            config = side_config(side, largest, users)
+            try:
+                self.session = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+            except zenoh.ZError as error:
+                raise UsageError(_refusal(side, str(error))) from error
+        self.zid = str(self.session.zid())
+        self.endpoints = self._endpoints()
+        """Where programs connect: the ports are those that the system chose where the plan has port 0."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.session.close()
+
+    def ask(self, below: str) -> dict[str, bytes]:
+        """What the administration space of this router says under `@/ZID/router` and below: key without this prefix → value."""
+        prefix = f"@/{self.zid}/router"
+        found = (reply.ok for reply in self.session.get(f"{prefix}{below}"))
+        return {str(one.key_expr)[len(prefix) :]: one.payload.to_bytes() for one in found if one is not None}
+
+    def sources(self, what: str) -> dict[str, set[str]]:
+        """The keys that others have declared here, with the Zenoh ids of who did. what: `token`, `queryable` and so on.
+
+        Keys with a verbatim chunk, such as `@adv`, are not found.
+        """
+        found: dict[str, set[str]] = {}
+        for key, value in self.ask(f"/{what}/**").items():
+            told = json.loads(value)
+            ids = {zid for kind in ("routers", "peers", "clients") for zid in told.get(kind, ())} - {self.zid}
+            if ids:
+                found[key.removeprefix(f"/{what}/")] = ids
+        return found
+
+    def _endpoints(self) -> tuple[str, ...]:
+        if all(not one.split("?")[0].split("#")[0].endswith(":0") for one in self.side.listen):
+            return self.side.listen
+        told = json.loads(self.ask("")[""])
+        return tuple(told["locators"])
+
+
+def expressions_of(side: Side, links: Iterable[WireLink] = ()) -> tuple[str, ...]:
+    """The key expressions under which a wire listens at a side: those that the side allows, and those that `**` hides.
+
+    links: whose key expressions may name further keys that `**` hides.
+    """
+    found = list(side.keys)
+    if side.keys == ("**",):
+        found += [*HIDDEN, *(link.keys for link in links if "@" in link.keys)]
+    else:
+        found += [f"{key}/@adv/**" for key in side.keys if key.endswith("**")]
+    return tuple(dict.fromkeys(found))
+
+
+def side_config(side: Side, largest: int, users_file: str | None) -> ZenohConfig:
+    """The configuration of a side's session. Messages keep the timestamp that they have, or have none."""
+    link: ZenohConfig = {"rx": {"max_message_size": max(largest, 2**30)}}
+    if side.tls is not None:
+        link["tls"] = _tls(side.tls)
+    config: ZenohConfig = {
+        "mode": "router",
+        "listen": {"endpoints": list(side.listen), "exit_on_failure": True},
+        "connect": {
+            "endpoints": list(side.connect),
+            "timeout_ms": int(_CONNECT_SECONDS * 1000),
+            "exit_on_failure": True,
+            "retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
+        },
+        "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "adminspace": {"enabled": True, "permissions": {"read": True, "write": False}},
+        "timestamping": {"enabled": False},
+        "transport": {"link": link},
+    }
+    if users_file is not None:
+        config["transport"]["auth"] = {"usrpwd": {"dictionary_file": users_file}}
+    if side.keys != ("**",):
+        config["access_control"] = _access(expressions_of(side))
+    return config
+
+
+def _access(keys: tuple[str, ...]) -> ZenohConfig:
+    """Access control that lets every program use some keys and no others."""
+    rule = {
+        "id": "keys",
+        "permission": "allow",
+        "flows": ["ingress", "egress"],
+        "messages": list(_CLIENT_MESSAGES),
+        "key_exprs": list(keys),
+    }
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": [rule],
+        "subjects": [{"id": "everybody"}],
+        "policies": [{"subjects": ["everybody"], "rules": ["keys"]}],
+    }
+
+
+def _tls(tls: SideTls) -> ZenohConfig:
+    section: ZenohConfig = {
+        "listen_certificate": tls.certificate,
+        "listen_private_key": tls.key,
+        "connect_certificate": tls.certificate,
+        "connect_private_key": tls.key,
+        "enable_mtls": tls.authority is not None,
+    }
+    if tls.authority is not None:
+        section["root_ca_certificate"] = tls.authority
+    return section
+
+
+@contextlib.contextmanager
+def _users_file(users: Mapping[str, str] | None) -> Iterator[str | None]:
+    """A private file of users and passwords, which Zenoh reads when it opens a session."""
+    if users is None:
+        yield None
+        return
+    with tempfile.TemporaryDirectory(prefix="evedrop-") as folder:
+        path = Path(folder, "users")
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:
+            file.writelines(f"{user}:{password}\n" for user, password in users.items())
+        yield str(path)
+
+
+def _refusal(side: Side, why: str) -> str:
+    """The message for a session that Zenoh does not open."""
+    where = " and ".join(
+        filter(
+            None,
+            (
+                f"listen at {', '.join(side.listen)}" if side.listen else "",
+                f"connect to {', '.join(side.connect)}" if side.connect else "",
+            ),
+        )
+    )
+    return (
+        f"side {side.name} cannot {where} ({why.splitlines()[0]}); end the program that listens there already, start the router "
+        "that it must connect to, or give the side other endpoints"
+    )

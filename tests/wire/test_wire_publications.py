@@ -1,0 +1,182 @@
+"""Publications cross a wire whole, or are lost for a reason that the journal states."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from evedrop.wire.crossing import UNLINKED, Crossing, Kind
+from evedrop.wire.fates import KeyFates
+from tests.conftest import wait_until
+from tests.wire.wire_at_work import DEAD, LOSSY, PERFECT, WireAtWork, at_work, both_ways, link, plan_of
+
+
+def reader(session: zenoh.Session, key: str = "**") -> list[zenoh.Sample]:
+    """The list into which all samples of a key go."""
+    found: list[zenoh.Sample] = []
+    session.declare_subscriber(key, found.append)
+    return found
+
+
+def ready(wire: WireAtWork, sender: zenoh.Session, receiver: zenoh.Session) -> None:
+    """Return when a message of the one program reaches the other, by a key of its own."""
+    come: list[zenoh.Sample] = []
+    with receiver.declare_subscriber("ready", come.append):
+        wait_until(lambda: sender.put("ready", b"") or come, "a first message crosses")
+
+
+def everything(sample: zenoh.Sample) -> dict[str, Any]:
+    """All that a sample carries, in comparable form."""
+    source = sample.source_info
+    return {
+        "key": str(sample.key_expr),
+        "payload": sample.payload.to_bytes(),
+        "kind": str(sample.kind),
+        "encoding": str(sample.encoding),
+        "attachment": None if sample.attachment is None else sample.attachment.to_bytes(),
+        "priority": str(sample.priority),
+        "congestion control": str(sample.congestion_control),
+        "express": sample.express,
+        "timestamp": None if sample.timestamp is None else str(sample.timestamp),
+        "source": None if source is None else (str(source.source_id.zid), source.source_id.eid, source.source_sn),
+    }
+
+
+def test_everything_that_a_message_carries_crosses(tmp_path: Path) -> None:
+    """A reader at the other side gets exactly what a reader at the same side gets."""
+    with (
+        at_work(both_ways(), tmp_path) as wire,
+        wire.program("robot") as sender,
+        wire.program("robot") as near,
+        wire.program("base") as far,
+    ):
+        ready(wire, sender, far)
+        ready(wire, sender, near)
+        here, there = reader(near, "thing/**"), reader(far, "thing/**")
+        wait_until(lambda: sender.put("thing/ready", b"") or (here and there), "both readers hear")
+        here.clear()
+        there.clear()
+        info = zenoh.SourceInfo(sender.id, 41)
+        full: dict[str, Any] = {"attachment": b"seen", "timestamp": sender.new_timestamp(), "source_info": info}
+        quality: dict[str, Any] = {
+            "priority": zenoh.Priority.REAL_TIME,
+            "congestion_control": zenoh.CongestionControl.BLOCK,
+            "express": True,
+        }
+        sender.put("thing/plain", b"1")
+        sender.put("thing/full", b"2" * 100_000, encoding=zenoh.Encoding("application/cbor;s=1"), **full, **quality)
+        sender.delete("thing/full", **full, **quality)
+        sender.delete("thing/plain")
+        sender.put("thing/*/wild", b"3", congestion_control=zenoh.CongestionControl.BLOCK)
+        sender.put("thing/full", b"4", priority=zenoh.Priority.BACKGROUND)
+        sender.put("thing/last", b"", priority=zenoh.Priority.BACKGROUND)
+
+        def sorted_by_priority(samples: list[zenoh.Sample]) -> list[dict[str, Any]]:
+            return sorted((everything(one) for one in samples if "ready" not in str(one.key_expr)), key=str)
+
+        wait_until(lambda: len(sorted_by_priority(here)) == 7 and len(sorted_by_priority(there)) == 7, "all cross")
+        assert sorted_by_priority(there) == sorted_by_priority(here)
+        assert [one["source"] for one in sorted_by_priority(there)].count((str(sender.zid()), sender.id.eid, 41)) == 2
+        assert [one["timestamp"] for one in sorted_by_priority(there)].count(None) == 5
+
+
+def test_the_nth_message_of_a_key_has_the_fate_that_the_seed_gives(tmp_path: Path) -> None:
+    """Whatever else flows, and deletes are numbered like puts."""
+    plan = both_ways(LOSSY)
+    with at_work(plan, tmp_path) as wire, wire.program("robot") as sender, wire.program("base") as far:
+        ready(wire, sender, far)
+        got = reader(far, "scan")
+        count = itertools.count()
+        wait_until(lambda: sender.put("scan", b"first") or (next(count) >= 0 and got), "the reader hears")
+        already = next(count)
+        for n in range(already, 200):
+            if n % 3:
+                sender.put("scan", str(n).encode(), congestion_control=zenoh.CongestionControl.BLOCK)
+            else:
+                sender.delete("scan", attachment=str(n).encode(), congestion_control=zenoh.CongestionControl.BLOCK)
+            sender.put("other", b"", congestion_control=zenoh.CongestionControl.BLOCK)
+
+        def rows() -> Any:
+            found = wire.rows
+            return found[found["key"] == wire.journal.key_code("scan")]
+
+        wait_until(lambda: len(rows()) == 200, "the wire hears all")
+        fates = KeyFates(plan.links[0], "scan", "put", plan.seed)
+        expected = [fates.next()[0] for _ in range(200)]
+        assert rows()["n"].tolist() == list(range(200))
+        assert rows()["fate"].tolist() == expected
+        delivered = [n for n in range(already, 200) if expected[n] == 0]
+        wait_until(lambda: len(got) >= len(delivered) + expected[:already].count(0), "all that is delivered")
+        numbers = [
+            int((one.attachment or one.payload).to_string()) for one in got if one.payload.to_bytes() != b"first"
+        ]
+        assert numbers == delivered
+
+
+def test_a_message_that_no_link_takes_is_recorded_as_unlinked(tmp_path: Path) -> None:
+    """It is not lost silently."""
+    plan = plan_of(link("robot", "base", keys="scan/**"), link("base", "robot"))
+    with at_work(plan, tmp_path) as wire, wire.program("robot") as sender:
+        wait_until(lambda: sender.put("pose", b"123") or len(wire.rows), "the wire hears")
+        row = wire.rows[0]
+        assert (row["fate"], row["link"], row["n"], row["size"]) == (Crossing.UNLINKED, UNLINKED, -1, 3)
+
+
+def test_the_first_link_that_matches_takes_a_message_and_a_tap_has_losses_of_its_own(tmp_path: Path) -> None:
+    """Of three sides, the base gets what the first link lets through, and the listener what its tap does."""
+    plan = plan_of(
+        link("robot", "base", DEAD, "scan/**", name="scan"),
+        link("robot", "base", PERFECT, name="rest"),
+        link("robot", "listener", PERFECT, tap=True),
+    )
+    with (
+        at_work(plan, tmp_path) as wire,
+        wire.program("robot") as sender,
+        wire.program("base") as base,
+        wire.program("listener") as listener,
+    ):
+        ready(wire, sender, base)
+        ready(wire, sender, listener)
+        at_base, at_listener = reader(base), reader(listener)
+        wait_until(lambda: sender.put("ready", b"") or (at_base and at_listener), "both hear")
+        sender.put("scan/1", b"x")
+        sender.put("pose", b"y")
+        wait_until(lambda: "pose" in [str(one.key_expr) for one in at_base], "the other link carries it")
+        wait_until(lambda: "scan/1" in [str(one.key_expr) for one in at_listener], "the tap carries it")
+        assert "scan/1" not in [str(one.key_expr) for one in at_base]
+        assert wire.fates("scan") == [Crossing.LOST]
+
+
+def test_deletes_puts_and_sizes_are_recorded(tmp_path: Path) -> None:
+    """With the sender's own number, where it gives one."""
+    with at_work(both_ways(), tmp_path) as wire, wire.program("robot") as sender:
+        wait_until(lambda: sender.put("ready", b"") or len(wire.rows), "the wire hears")
+        before = len(wire.rows)
+        sender.put("a", b"12345", attachment=b"67", source_info=zenoh.SourceInfo(sender.id, 12))
+        sender.delete("a")
+        wait_until(lambda: len(wire.rows) >= before + 2, "the wire hears")
+        put, delete = [row for row in wire.rows if row["key"] == wire.journal.key_code("a")]
+        assert (put["kind"], put["size"], put["sequence"], put["n"]) == (Kind.PUT, 7, 12, 0)
+        assert put["source"] == wire.journal.source_code(f"{sender.zid()}/{sender.id.eid}")
+        assert (delete["kind"], delete["size"], delete["sequence"], delete["n"]) == (Kind.DELETE, 0, -1, 1)
+
+
+@pytest.mark.parametrize(
+    ("settings", "fields", "fate"),
+    [
+        (PERFECT, {"largest": 10}, Crossing.TOO_LARGE),
+        ({**PERFECT, "delay": {"model": "constant", "value": 1000.0}}, {"held_messages": 0}, Crossing.HELD_UP),
+        ({**PERFECT, "delay": {"model": "constant", "value": 1000.0}}, {"held_bytes": 10}, Crossing.HELD_UP),
+        ({**PERFECT, "corrupt": 1.0}, {}, Crossing.CORRUPTED),
+    ],
+)
+def test_why_a_message_does_not_cross(
+    tmp_path: Path, settings: dict[str, Any], fields: dict[str, Any], fate: Crossing
+) -> None:
+    """The journal says so."""
+    with at_work(both_ways(settings, **fields), tmp_path) as wire, wire.program("robot") as sender:
+        wait_until(lambda: sender.put("a", b"x" * 11) or fate in [*wire.fates(), *wire.amended], "the wire hears")

@@ -1,0 +1,99 @@
+"""Wires at work for tests: real sides, real programs connected to them, and the rows of the journal."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zenoh
+
+from evedrop.wire.crossing import RECORD, Crossing
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal_part import Records
+from evedrop.wire.plan import Side, WireLink, WirePlan
+from evedrop.wire.relay import WireRelay
+from tests.conftest import wait_until
+
+PERFECT: Mapping[str, Any] = {"loss": {"model": "bernoulli", "quality": 1.0}}
+DEAD: Mapping[str, Any] = {"loss": {"model": "bernoulli", "quality": 0.0}}
+LOSSY: Mapping[str, Any] = {"loss": {"model": "bernoulli", "quality": 0.6}}
+ANYWHERE = "tcp/127.0.0.1:0"
+
+
+def link(source: str, target: str, settings: Mapping[str, Any] = PERFECT, keys: str = "**", **fields: Any) -> WireLink:
+    """A link, named after its sides unless the fields say otherwise; `plan_of` numbers it."""
+    return WireLink(**{"name": f"{source}-{target}", "number": 0, "source": source, "target": target, "keys": keys,
+                       "settings": settings, **fields})  # fmt: skip
+
+
+def plan_of(*links: WireLink, sides: Mapping[str, Side] | None = None, **fields: Any) -> WirePlan:
+    """A wire with these links, whose sides listen at any free port of this machine."""
+    names = dict.fromkeys(name for one in links for name in (one.source, one.target))
+    found = {name: Side(name, (ANYWHERE,)) for name in names} | dict(sides or {})
+    numbered = tuple(WireLink(**{**_fields(one), "number": at}) for at, one in enumerate(links))
+    return WirePlan(fields.pop("seed", 7), found, numbered, **fields)
+
+
+def both_ways(settings: Mapping[str, Any] = PERFECT, back: Mapping[str, Any] = PERFECT, **fields: Any) -> WirePlan:
+    """A wire of the sides robot and base, with a link each way."""
+    return plan_of(link("robot", "base", settings), link("base", "robot", back), **fields)
+
+
+class WireAtWork:
+    """A wire that runs in this process."""
+
+    def __init__(self, relay: WireRelay, journal: WireJournal, told: list[str], rows: list[Records]) -> None:
+        self.relay, self.journal, self.told = relay, journal, told
+        self.amended: list[Crossing] = []
+        """Fates that rows were given after they had been handed to listeners."""
+        journal.amendment_listeners.append(lambda _, fate: self.amended.append(fate))
+        self._rows = rows
+
+    def program(self, *sides: str, **config: Any) -> zenoh.Session:
+        """A session of a program that is connected to these sides."""
+        return program([one for side in sides for one in self.relay.endpoints[side]], **config)
+
+    @property
+    def rows(self) -> Records:
+        """All rows of the journal so far."""
+        self.journal.flush()
+        found: Records = np.concatenate([np.empty(0, RECORD), *self._rows])
+        return found
+
+    def fates(self, link_name: str | None = None) -> list[Crossing]:
+        """The fates of all messages so far, or of those on one link."""
+        rows = self.rows
+        if link_name is not None:
+            rows = rows[rows["link"] == self.relay.link(link_name).link.number]
+        return [Crossing(one) for one in rows["fate"].tolist()]
+
+    def when_heard(self, count: int) -> list[Crossing]:
+        """The fates, once there are that many."""
+        wait_until(lambda: len(self.rows) >= count, f"{count} rows in the journal")
+        return self.fates()
+
+
+@contextlib.contextmanager
+def at_work(plan: WirePlan, folder: Path) -> Iterator[WireAtWork]:
+    """A wire that runs in this process."""
+    told: list[str] = []
+    rows: list[Records] = []
+    with WireJournal(folder, plan) as journal:
+        journal.listeners.append(lambda block: rows.append(block.copy()))
+        with WireRelay(plan, journal, told.append) as relay:
+            yield WireAtWork(relay, journal, told, rows)
+
+
+def program(endpoints: Sequence[str], **config: Any) -> zenoh.Session:
+    """A session of a program; config: entries of Zenoh's configuration."""
+    quiet = {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}}
+    base = {"mode": "client", "connect": {"endpoints": list(endpoints)}, "scouting": quiet}
+    return zenoh.open(zenoh.Config.from_json5(json.dumps({**base, **config})))
+
+
+def _fields(one: WireLink) -> dict[str, Any]:
+    return {name: getattr(one, name) for name in one.__dataclass_fields__}
