@@ -32,34 +32,22 @@ class LinkState:
 
     def __init__(self, link: WireLink, plan: WirePlan, journal: WireJournal) -> None:
         self.link = link
+        self.cut = False
+        """Whether an event cuts it, or parts its sides."""
         self.looped = False
         """Whether its sides are joined outside the wire, so that its messages would go round."""
         self._seed, self._largest = plan.seed, plan.largest
         self._journal = journal
-        self._reasons: set[str] = set()
         self._fates: dict[tuple[str, str], KeyFates] = {}
         self._lock = threading.Lock()
         self._free = 0.0  # when the queue will have sent all its messages
         self._set(link.settings)
 
-    @property
-    def cut(self) -> bool:
-        """Whether nothing passes."""
-        return bool(self._reasons)
-
-    def block(self, reason: str) -> None:
-        """Cut the link for a reason; it stays cut until all reasons are gone."""
-        with self._lock:
-            self._reasons = self._reasons | {reason}
-
-    def unblock(self, reason: str | None = None) -> None:
-        """Take a reason away, or all of them."""
-        with self._lock:
-            self._reasons = set() if reason is None else self._reasons - {reason}
-
     def change(self, settings: Mapping[str, Any]) -> None:
         """Give the link other settings from the next message of each key on."""
         with self._lock:
+            if settings == self._settings:
+                return
             since = {(key, kind): fates.change(settings) for (kind, key), fates in self._fates.items()}
             self._set(settings)
             self._journal.change(self.link.name, settings, since)
@@ -87,7 +75,7 @@ class LinkState:
                 return at, _TOO_LARGE, 0.0, False
             if self.looped:
                 return at, _LOOPED, 0.0, False
-            if self._reasons:
+            if self.cut:
                 return at, _CUT, 0.0, False
             return at, code, delay if code == 0 else 0.0, again
 
@@ -117,6 +105,7 @@ class LinkState:
             return fates
 
     def _set(self, settings: Mapping[str, Any]) -> None:
+        self._settings = settings
         self._rate = float(settings.get("rate") or 0.0)
         self._queue = float(settings.get("queue") or 0.0)
 

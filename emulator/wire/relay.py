@@ -14,7 +14,6 @@ from typing import Self, final
 
 import zenoh
 
-from evedrop.errors import UsageError
 from evedrop.output import warn
 from evedrop.wire.crossing import Crossing
 from evedrop.wire.journal import WireJournal
@@ -27,6 +26,7 @@ from evedrop.wire.queries import QueryRelay
 from evedrop.wire.ros2 import service_key
 from evedrop.wire.scheduler import Scheduler
 from evedrop.wire.side import SideSession
+from evedrop.wire.timeline import Moment
 
 _LOOK_SECONDS = 0.2
 _MOST_SHARE = 0.1  # of a processor's time, for looking
@@ -36,7 +36,7 @@ _MOST_SHARE = 0.1  # of a processor's time, for looking
 class WireRelay:
     """The open sides of a wire and what crosses between them; use it as a context manager.
 
-    `block`, `unblock` and `change` may be called by any thread.
+    `apply` may be called by any thread.
     """
 
     def __init__(self, plan: WirePlan, journal: WireJournal, tell: Callable[[str], None] = warn) -> None:
@@ -66,27 +66,11 @@ class WireRelay:
         """Side → where programs connect."""
         return {name: side.endpoints for name, side in self.sides.items()}
 
-    def link(self, name: str) -> LinkState:
-        """A link by its name. Raises UsageError if there is none."""
-        if name not in self.links:
-            raise UsageError(f"there is no link {name}; the links are {', '.join(self.links) or 'none'}")
-        return self.links[name]
-
-    def partition(self, one: str, other: str, reason: str = "partition") -> None:
-        """Cut all links between two sides. Raises UsageError if there is no such side."""
-        for state in self._between(one, other):
-            state.block(reason)
-
-    def join(self, one: str, other: str, reason: str | None = None) -> None:
-        """End a partition, or with reason None whatever cuts the links between two sides."""
-        for state in self._between(one, other):
-            state.unblock(reason)
-
-    def _between(self, one: str, other: str) -> list[LinkState]:
-        for name in (one, other):
-            if name not in self.plan.sides:
-                raise UsageError(f"there is no side {name}; the sides are {', '.join(self.plan.sides)}")
-        return [state for state in self.links.values() if {state.link.source, state.link.target} == {one, other}]
+    def apply(self, moment: Moment) -> None:
+        """Cut the links that are cut from now on, let the others go on, and give all of them their settings."""
+        for name, state in self.links.items():
+            state.cut = name in moment.cut
+            state.change(moment.settings[name])
 
     def _open(self, stack: contextlib.ExitStack) -> None:
         plan, journal, states = self.plan, self._journal, list(self.links.values())

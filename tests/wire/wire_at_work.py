@@ -68,7 +68,7 @@ class WireAtWork:
         """The fates of all messages so far, or of those on one link."""
         rows = self.rows
         if link_name is not None:
-            rows = rows[rows["link"] == self.relay.link(link_name).link.number]
+            rows = rows[rows["link"] == self.relay.links[link_name].link.number]
         return [Crossing(one) for one in rows["fate"].tolist()]
 
     def when_heard(self, count: int) -> list[Crossing]:
