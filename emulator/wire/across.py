@@ -15,6 +15,7 @@ from evedrop.model.checks import as_toml
 from evedrop.scenario.sentences import sentences
 from evedrop.scenario.words import listed, near
 from evedrop.wire.endpoints import Place, place_of
+from evedrop.wire.expect import expectation_mistakes
 from evedrop.wire.tables import CHANGEABLE, WireLinkTable, WireSettingsTable, changed_settings
 
 Tables = Sequence[Mapping[str, Any]]
@@ -33,6 +34,7 @@ def mistakes_across(tables: Mapping[str, Any]) -> Iterator[str]:
     yield from _name_mistakes(links)
     yield from _correlation_mistakes(links)
     names = link_names(links)
+    yield from expectation_mistakes(_tables(tables.get("expect")), names)
     for i, event in enumerate(events):
         settings_of = partial(_settings_of, dict(zip(names, links, strict=True)))
         yield from (f"event.{i}.{line}" for line in event_mistakes(event, [*sides], names, settings_of))

@@ -107,7 +107,7 @@ def _plan(file: WireFile) -> WirePlan:
         query_seconds=file.query_seconds,
         held_messages=file.held_messages,
         held_bytes=file.held_bytes,
-        expectations=tuple(file.expect),
+        expectations=tuple(one.model_dump(exclude_none=True) for one in file.expect),
     )
 
 

@@ -57,7 +57,7 @@ _LARGEST = 2**32 - 1
 Listener = Callable[[Records], None]
 """Gets each block of new records."""
 AmendmentListener = Callable[[Records, Crossing], None]
-"""Gets a record that it got before, and the fate that it has now."""
+"""Gets records that it got before, and the fate that they have now."""
 
 
 @final
@@ -79,6 +79,8 @@ class WireJournal:
         self.amendment_listeners: list[AmendmentListener] = []
         self.incomplete_since: float | None = None
         """The time from which on the disk had no room for something; None: the journal is complete."""
+        self.recorded = 0
+        """The number of all records, when it is closed."""
         self.missing = 0
         """The number of records for which the disk had no room; listeners got them."""
         self.links = [link.name for link in plan.links]
@@ -96,6 +98,7 @@ class WireJournal:
         self._buffers: dict[int, Any] = {}
         self._next = 0  # the part whose rows are handed over now
         self._amended: deque[tuple[Records, Crossing]] = deque()
+        self._number = itertools.count()
         self._amended_late: deque[tuple[int, Crossing]] = deque()
         self._convert_after = 0.0
         try:
@@ -128,6 +131,11 @@ class WireJournal:
         self._alive = os.open(self._place / "alive", os.O_WRONLY | os.O_CREAT, 0o600)
         self._beat()
         self._add_part(0)
+
+    @property
+    def start(self) -> int:
+        """The number of this start of the wire in its folder, from 1."""
+        return self._history.start
 
     def key_code(self, key: str) -> int:
         """The code of a key in records."""
@@ -179,8 +187,9 @@ class WireJournal:
                     block = np.empty(0, RECORD) if part is None else part.take()
                     if part is not None and part.full:
                         self._next += 1
-                for record, fate in amended:
-                    self._hear(self.amendment_listeners, record, fate)
+                for fate in {fate for _, fate in amended}:
+                    records = np.concatenate([record for record, its in amended if its == fate])
+                    self._hear(self.amendment_listeners, records, fate)
                 if part is None or not len(block):
                     return
                 if part.path is None:
@@ -194,6 +203,7 @@ class WireJournal:
             return
         self._ended.set()
         self._thread.join()
+        self.recorded = next(self._number)
         self.flush()
         try:
             self._amend_converted()
@@ -219,7 +229,7 @@ class WireJournal:
 
     def _recorder(self) -> Callable[..., int]:
         """The function `record`, which looks nothing up in the object: it is called for every message."""
-        number, rows, width, buffers = itertools.count().__next__, self._rows, RECORD.itemsize, self._buffers
+        number, rows, width, buffers = self._number.__next__, self._rows, RECORD.itemsize, self._buffers
         write, room, does_not_fit = struct.Struct("<dqqdIIIHBB").pack_into, self._room, struct.error
 
         def record(

@@ -18,6 +18,7 @@ from evedrop.scenario.link_table import CorrelationTable, LinkTable
 from evedrop.scenario.table import NAME, Found, Table, expected
 from evedrop.scenario.words import listed
 from evedrop.wire.endpoints import ENCRYPTED, FREE, checked_endpoint
+from evedrop.wire.expect import WireExpectTable
 from evedrop.wire.units import Rate, Seconds, Size, in_seconds
 
 DEFAULT_QUEUE = 256_000
@@ -248,7 +249,7 @@ class WireFile(Table):
     side: Annotated[dict[Annotated[str, AfterValidator(_side_name)], SideTable], Field(min_length=2)]
     link: Annotated[list[WireLinkTable], Field(default_factory=list)]
     event: Annotated[list[WireEventTable], Field(default_factory=list)]
-    expect: Annotated[list[dict[str, Any]], Field(default_factory=list)]
+    expect: Annotated[list[WireExpectTable], Field(default_factory=list)]
     lossless: Annotated[KeyExpressions, Field(default_factory=list)]
     largest: Annotated[Size, Field(examples=["64 MB"])] = 2**30
     query_seconds: Annotated[Seconds, Field(examples=["10 s"])] = 10.0

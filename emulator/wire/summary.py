@@ -1,0 +1,233 @@
+"""The summary of a wire: what became of all messages, each link against its model, and whether expectations held.
+
+Source: docs/wire.md, the summary.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+import zenoh
+
+from evedrop.output import warn
+from evedrop.results.folder import write_private
+from evedrop.results.summary_file import plain
+from evedrop.score.summary import Judged
+from evedrop.wire.crossing import UNLINKED, Crossing, Kind
+from evedrop.wire.expect import WireExpectTable
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal_part import REASONS, Records
+from evedrop.wire.law import bounds, expected
+from evedrop.wire.plan import WireLink, WirePlan
+from evedrop.wire.tallies import LinkTally, StreamTally
+
+_QUANTILES = (0.5, 0.9, 0.99)
+
+
+@dataclass(frozen=True)
+class WireLinkSummary:
+    """What became of the messages of a link."""
+
+    source: str
+    target: str
+    keys: str
+    heard: int
+    bytes: int
+    delivered: int
+    again: int
+    """How many of the messages met with a second copy."""
+    lost_by: Mapping[str, int]
+    """Reason → messages that the link's settings stopped."""
+    dropped_by: Mapping[str, int]
+    """Reason → messages that the wire itself or Zenoh stopped."""
+    rate: float | None
+    """The fraction that the link's models let through, of the messages on which they decided; None if there were none."""
+    expected_rate: float | None
+    bounds: tuple[float, float] | None
+    """Between which this fraction is in 99 % of all wires with these models."""
+    within_bounds: bool | None
+    delays: Mapping[str, float]
+    """Quantile → seconds for which delivered messages were held back."""
+    gap_messages: int
+    """The most messages of one key in a row that were not delivered."""
+    gap_seconds: float
+    """The longest time from a delivered message of a key to its next one, if messages between them were not delivered."""
+
+
+@final
+class WireSummary:
+    """Listens to a wire's journal, and adds up. Threads may call its methods at the same time."""
+
+    def __init__(self, plan: WirePlan, journal: WireJournal) -> None:
+        self._plan, self._journal = plan, journal
+        self._links = {link.number: LinkTally() for link in plan.links}
+        self._unlinked = LinkTally()
+        self._lossless: dict[int, bool] = {}
+        self._lock = threading.Lock()
+        self._began, self._seconds = time.monotonic(), 0.0
+        journal.listeners.append(self.add)
+        journal.amendment_listeners.append(self.amend)
+
+    def add(self, records: Records) -> None:
+        """Add a block of the journal."""
+        with self._lock:
+            kinds = (records["kind"] & 0x7F).astype(np.int64)
+            kinds[kinds == Kind.DELETE] = Kind.PUT  # they share their numbers
+            streams = np.stack([records["link"], records["key"], kinds]).astype(np.int64)
+            order = np.lexsort(streams[::-1])  # stable
+            streams, records = streams[:, order], records[order]
+            starts = np.flatnonzero((np.diff(streams) != 0).any(axis=0)) + 1
+            for (code, key, kind), part in zip(
+                streams[:, np.r_[0, starts]].T.tolist(), np.split(records, starts), strict=True
+            ):
+                tally = self._tally(code)
+                tally.add(part)
+                if code != UNLINKED:
+                    tally.streams.setdefault((key, kind), StreamTally()).add(part, not self._is_lossless(key))
+
+    def amend(self, records: Records, fate: Crossing) -> None:
+        """Count records of the journal that were added with another fate."""
+        with self._lock:
+            for code in np.unique(records["link"]).tolist():
+                self._tally(code).amend(records[records["link"] == code], fate)
+
+    def _tally(self, code: int) -> LinkTally:
+        return self._unlinked if code == UNLINKED else self._links[code]
+
+    def _is_lossless(self, key: int) -> bool:
+        if key not in self._lossless:
+            self._lossless[key] = self._plan.is_lossless(zenoh.KeyExpr(self._journal.key_of(key)))
+        return self._lossless[key]
+
+    def links(self) -> dict[str, WireLinkSummary]:
+        """Link → what became of its messages so far."""
+        with self._lock:
+            return {link.name: self._of_link(link, self._links[link.number]) for link in self._plan.links}
+
+    def counts(self) -> dict[str, tuple[int, int]]:
+        """Link → messages heard and messages delivered so far."""
+        with self._lock:
+            return {
+                link.name: (self._links[link.number].heard, self._links[link.number].delivered)
+                for link in self._plan.links
+            }
+
+    @property
+    def unaccounted(self) -> int:
+        """Records of the closed journal that are not in exactly one fate of one link: 0, or the wire has a fault."""
+        tallies = [*self._links.values(), self._unlinked]
+        return abs(self._journal.recorded - sum(int(tally.fates.sum()) for tally in tallies))
+
+    def as_dict(self) -> dict[str, Any]:
+        """The entries of summary.json."""
+        journal, links = self._journal, self.links()
+        return {
+            "seed": self._plan.seed,
+            "start": journal.start,
+            "seconds": self._seconds,
+            "heard": journal.recorded,
+            "unlinked": self._unlinked.heard,
+            "unaccounted": self.unaccounted,
+            "journal": {
+                "recovered": journal.recovered,
+                "missing": journal.missing,
+                "incomplete_since": journal.incomplete_since,
+            },
+            "links": {name: asdict(link) for name, link in links.items()},
+            "expectations": [judged.as_dict() for judged in self.judged(links)],
+        }
+
+    def judged(self, links: Mapping[str, WireLinkSummary]) -> list[Judged]:
+        """The expectations of the wire, and whether they held."""
+        tables = [WireExpectTable.model_validate(table) for table in self._plan.expectations]
+        return [self._judged(table, links[table.subject]) for table in tables]
+
+    def finish(self, out: Path) -> int:
+        """Write summary.json of a wire whose journal is closed; returns the exit status.
+
+        1 if an expectation failed or the journal is incomplete, 3 if a message is unaccounted for.
+        """
+        self._seconds = time.monotonic() - self._began
+        found = self.as_dict()
+        unfinished = out / "summary.json.new"
+        try:
+            write_private(unfinished, json.dumps(plain(found), indent=1, ensure_ascii=False) + "\n")
+            os.replace(unfinished, out / "summary.json")
+        except OSError as error:
+            warn(f"the summary of the wire cannot be written ({error})")
+            return 1
+        if self.unaccounted:
+            return 3
+        failed = any(one["held"] is False for one in found["expectations"])
+        return 1 if failed or self._journal.incomplete_since is not None else 0
+
+    def _judged(self, table: WireExpectTable, link: WireLinkSummary) -> Judged:
+        if table.link is not None:
+            return Judged(table.text, link.within_bounds, link.rate, table.wanted)
+        figure = str(table.figure).rpartition(".")[2]
+        found: float | None
+        match figure:
+            case "delivery":
+                found = link.delivered / link.heard if link.heard else None
+            case "latency":
+                tally = self._links[self._plan.named(table.subject).number]
+                found = tally.delay_quantile(table.quantile or 0.5)
+            case "gap_messages":
+                found = link.gap_messages if link.heard else None
+            case _:
+                found = link.gap_seconds if link.heard else None
+        return Judged(table.text, None if found is None else table.holds(found), found, table.wanted)
+
+    def _of_link(self, link: WireLink, tally: LinkTally) -> WireLinkSummary:
+        streams = list(tally.streams.values())
+        tried, passed = (sum(getattr(one, name) for one in streams) for name in ("tried", "passed"))
+        rate = model = between = within = None
+        if tried:
+            laws = [self._law(link, *stream, one) for stream, one in tally.streams.items() if one.tried]
+            mean, variance = (sum(law[i] for law in laws) for i in (0, 1))
+            low, high = bounds(mean, variance, tried)
+            rate, model, between, within = (
+                passed / tried,
+                mean / tried,
+                (low / tried, high / tried),
+                low <= passed <= high,
+            )
+        reasons = [(REASONS[fate], count, fate.emulated) for fate, count in tally.lost_by()]
+        quantiles = {f"{level:g}": tally.delay_quantile(level) for level in _QUANTILES}
+        return WireLinkSummary(
+            source=link.source,
+            target=link.target,
+            keys=link.keys,
+            heard=tally.heard,
+            bytes=tally.bytes,
+            delivered=tally.delivered,
+            again=tally.again,
+            lost_by={reason: count for reason, count, emulated in reasons if emulated},
+            dropped_by={reason: count for reason, count, emulated in reasons if not emulated},
+            rate=rate,
+            expected_rate=model,
+            bounds=between,
+            within_bounds=within,
+            delays={level: found for level, found in quantiles.items() if found is not None},
+            gap_messages=max((one.longest for one in streams), default=0),
+            gap_seconds=max((one.silence for one in streams), default=0.0),
+        )
+
+    def _law(self, link: WireLink, key: int, kind: int, tally: StreamTally) -> tuple[float, float]:
+        """How many of a stream's messages its models should have let through, and the variance of this number."""
+        changes = self._journal.changes_of(link.name, self._journal.key_of(key), Kind(kind).stream)
+        ranges = [range(*numbers) for numbers in sorted(tally.ranges)]
+        mean, variance = expected(link.settings, changes, ranges)
+        if not tally.scattered:
+            return mean, variance
+        # A sample of a known range: the range varies as a whole, and the sample within it.
+        share = tally.tried / sum(len(numbers) for numbers in ranges)
+        return mean * share, variance * share**2 + mean * share * (1.0 - mean * share / tally.tried)

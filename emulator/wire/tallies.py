@@ -1,0 +1,135 @@
+"""What a wire's summary counts while it runs: the fates of each link's messages, their delays, and runs of missing messages.
+
+Source: docs/wire.md, the summary.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evedrop.model.process import Floats
+from evedrop.wire.crossing import AGAIN, Crossing
+from evedrop.wire.journal_part import Records
+
+_SAMPLE = 2**17  # delays of a link that are kept; of more, every second, fourth and so on
+_MOST_RANGES = 2048
+_TRIED = np.zeros(256, bool)  # of fates: the link's models decided, and that decision is known
+_PASSED = np.zeros(256, bool)
+for _fate in (Crossing.LOST, Crossing.CORRUPTED):
+    _TRIED[_fate] = True
+for _fate in (Crossing.DELIVERED, Crossing.HELD_UP, Crossing.UNDERWAY, Crossing.REFUSED):
+    _TRIED[_fate] = _PASSED[_fate] = True
+
+
+@final
+class StreamTally:
+    """The messages of one key and kind on one link."""
+
+    def __init__(self) -> None:
+        self.tried = 0
+        """Messages on which the link's models decided."""
+        self.passed = 0
+        """Those of them that the models let through."""
+        self.longest = 0
+        """The most messages in a row that were not delivered."""
+        self.silence = 0.0
+        """The longest time, in seconds, from a delivered message to the next one, if messages between them were not delivered."""
+        self.ranges: list[tuple[int, int]] = []
+        """The numbers of the messages in `tried`: first, and first after; in no particular order."""
+        self.scattered = False
+        """Whether they are too scattered to be kept: then `ranges` is one that contains all of them."""
+        self._missing = 0
+        self._since: float | None = None  # when the latest delivered message was heard, or else the first message
+
+    def add(self, records: Records, decided: bool) -> None:
+        """Add messages in the order in which they were heard. decided: whether the link's models decide on this key at all."""
+        fates, times = records["fate"], records["time"]
+        if decided:
+            tried = _TRIED[fates] & (records["n"] >= 0)
+            self.tried += int(tried.sum())
+            self.passed += int(_PASSED[fates[tried]].sum())
+            self._add_numbers(np.sort(records["n"][tried]))
+        places = np.flatnonzero(fates == Crossing.DELIVERED)
+        since = float(times[0]) if self._since is None else self._since
+        runs = np.diff(places, prepend=-1) - 1
+        last = len(records) - 1 - (int(places[-1]) if len(places) else -1)  # missing at the end
+        if len(places):
+            runs[0] += self._missing
+            lengths = np.diff(times[places], prepend=since)
+            self.longest = max(self.longest, int(runs.max()))
+            self.silence = max(self.silence, float(lengths[runs > 0].max(initial=0.0)))
+            self._missing, self._since = last, float(times[places[-1]])
+        else:
+            self._missing, self._since = self._missing + last, since
+        if self._missing:
+            self.longest = max(self.longest, self._missing)
+            self.silence = max(self.silence, float(times[-1]) - self._since)
+
+    def _add_numbers(self, numbers: NDArray[np.int64]) -> None:
+        if not len(numbers):
+            return
+        breaks = np.flatnonzero(np.diff(numbers) != 1) + 1
+        starts, stops = numbers[np.r_[0, breaks]].tolist(), (numbers[np.r_[breaks - 1, -1]] + 1).tolist()
+        found = list(zip(starts, stops, strict=True))
+        if self.ranges and self.ranges[-1][1] == found[0][0]:
+            found[0] = (self.ranges.pop()[0], found[0][1])
+        self.ranges += found
+        if self.scattered or len(self.ranges) > _MOST_RANGES:
+            self.scattered = True
+            self.ranges = [(min(start for start, _ in self.ranges), max(stop for _, stop in self.ranges))]
+
+
+@final
+class LinkTally:
+    """All messages of one link."""
+
+    def __init__(self) -> None:
+        self.heard = self.bytes = self.again = 0
+        self.fates = np.zeros(256, np.int64)
+        """Messages by fate; their sum is `heard`."""
+        self.streams: dict[tuple[int, int], StreamTally] = {}
+        """(code of the key, kind) → its messages."""
+        self._delays: list[Floats] = []
+        self._kept, self._step, self._skip = 0, 1, 0
+
+    def add(self, records: Records) -> None:
+        """Add messages to all but `streams`."""
+        self.heard += len(records)
+        self.bytes += int(records["size"].sum(dtype=np.int64))
+        self.again += int(np.count_nonzero(records["kind"] & AGAIN))
+        self.fates += np.bincount(records["fate"], minlength=256)
+        delays = records["delay"][records["fate"] == Crossing.DELIVERED]
+        taken = delays[self._skip :: self._step].copy()
+        self._skip = (self._skip - len(delays)) % self._step
+        self._delays.append(taken)
+        self._kept += len(taken)
+        if self._kept > _SAMPLE:
+            thinned = np.concatenate(self._delays)
+            self._skip += self._step * (len(thinned) % 2)
+            self._delays, self._step = [thinned[::2]], 2 * self._step
+            self._kept = len(self._delays[0])
+
+    def amend(self, records: Records, fate: Crossing) -> None:
+        """Messages that were added have another fate."""
+        self.fates -= np.bincount(records["fate"], minlength=256)
+        self.fates[fate] += len(records)
+
+    @property
+    def delivered(self) -> int:
+        """Messages given to Zenoh on the other side."""
+        return int(self.fates[Crossing.DELIVERED])
+
+    def lost_by(self) -> Iterator[tuple[Crossing, int]]:
+        """The reasons for which messages were not delivered, with their numbers, but those that did not occur."""
+        for fate in Crossing:
+            if fate is not Crossing.DELIVERED and self.fates[fate]:
+                yield fate, int(self.fates[fate])
+
+    def delay_quantile(self, level: float) -> float | None:
+        """A quantile of the time for which delivered messages were held back, in seconds; None if there are none."""
+        delays = np.concatenate(self._delays) if self._delays else np.zeros(0)
+        return float(np.quantile(delays, level, method="inverted_cdf")) if len(delays) else None
