@@ -79,7 +79,11 @@ def contents(path: Path, most: int) -> bytes:
     """All bytes of a regular file. Raises Unreadable if it cannot be read, or has more than `most` bytes."""
     try:
         with opened(path) as file:
-            found = file.read(most + 1)
+            # Asking for `most` bytes would reserve memory for all of them.
+            size = os.fstat(file.fileno()).st_size
+            found = file.read(min(size, most) + 1)
+            if size < len(found) <= most:  # it has grown meanwhile
+                found += file.read(most + 1 - len(found))
     except OSError as error:
         raise Unreadable(why_of(error)) from error
     if len(found) > most:

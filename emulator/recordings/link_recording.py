@@ -27,7 +27,7 @@ Outcomes = NDArray[np.uint8]
 _PARQUET = (".parquet", ".pq")
 _EXPECTED = "expected a CSV or Parquet file of 0 (lost) and 1 (delivered)"
 _LIMIT = Limit.of_rows(MOST_OUTCOMES)
-_MOST_BYTES = 2**28  # decompressed, of a column in a row group of a Parquet file, which is in memory at once
+_MOST_BYTES = 2**28  # decompressed, of a row group of a Parquet file, whose column is in memory at once
 _LONGEST_VALUE = 100  # characters of a text found where a number should be
 _MOST_NAMES = 20  # columns that a message lists
 
@@ -133,12 +133,13 @@ class LinkRecording:
         place = self._place(names, column)
         if table.schema_arrow.field(place).type.num_fields:
             self._no("file", f"has lists or tables in the column {_shown(names[place])}; {_EXPECTED}")
-        groups = [table.metadata.row_group(i) for i in range(table.metadata.num_row_groups)]
-        paths = [table.schema.column(i).path for i in range(len(table.schema))]
-        sizes = [group.column(paths.index(names[place])).total_uncompressed_size for group in groups]
+        # The size of the column alone would do, but Arrow ends the process when it reads that of a malformed file.
+        sizes = [table.metadata.row_group(i).total_byte_size for i in range(table.metadata.num_row_groups)]
         if max(sizes, default=0) > _MOST_BYTES:
-            large = f"has {max(sizes)} bytes in a row group of the column {_shown(names[place])}"
-            self._no("file", f"{large}; expected at most {_MOST_BYTES}")
+            large = f"has {max(sizes)} bytes in a row group; expected at most {_MOST_BYTES}"
+            self._no(
+                "file", f"{large}: write it with fewer rows in a group, or with the column {_shown(names[place])} alone"
+            )
         row = 0
         for batch in table.iter_batches(columns=[names[place]]):
             values = batch.column(0)

@@ -205,7 +205,7 @@ def last_round(folder: Path) -> TableRound:
     except OSError:
         return TableRound()
     for line in reversed(lines):
-        with contextlib.suppress(ValueError, TypeError, KeyError, AttributeError):
+        with contextlib.suppress(ValueError, TypeError, KeyError, AttributeError, OverflowError):
             found = json.loads(line)
             tables = {str(name): (Path(str(file)).name, int(rows)) for name, (file, rows) in found["tables"].items()}
             return TableRound(str(found["at"]), int(found["slots"]), tables)

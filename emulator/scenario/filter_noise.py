@@ -5,6 +5,7 @@ Source: docs/scenario.md, plant; docs/mathematics.md, a filter at the sensor.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from typing import Any
@@ -102,6 +103,13 @@ def measured_mistakes(plant: PlantTable, n: int) -> list[str]:
         return [
             f"plant.output_matrix: {large}; expected at most {MOST_STATES} of each, because the filter uses plain arithmetic"
         ]
+    found += [
+        f"plant.{name}: has an entry that is infinite or not a number; expected finite numbers"
+        for name, rows in (("output_matrix", C), ("measurement_noise", V))
+        if not all(math.isfinite(one) for row in rows for one in row)
+    ]
+    if found:
+        return found
     if not C or any(len(row) != n for row in C):
         wrong = next((len(row) for row in C if len(row) != n), 0)
         found.append(f"plant.output_matrix: has a row of {wrong} numbers; expected {n}, one for each state")

@@ -133,11 +133,11 @@ class AcknowledgementsTable(Table):
             ]
         if attack != "flip" and flip is not None:
             return [("flip", f"is set, but the attack {as_toml(attack)} flips nothing; remove the line")]
-        if attack in OVERHEARING and jammer is None:
+        if attack in [*OVERHEARING] and jammer is None:
             return [
                 ("jammer", f"is missing; the attack {attack} needs the eavesdropper that it serves, by what that hears")
             ]
-        if attack not in OVERHEARING and jammer is not None:
+        if attack not in [*OVERHEARING] and jammer is not None:
             return [
                 (
                     "jammer",

@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from evedrop.score.verdict import MARKS, SecrecyKept
+from evedrop.view import palette
 from evedrop.view.figure_style import panels
+from evedrop.view.palette import hexadecimal
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -17,10 +19,10 @@ if TYPE_CHECKING:
 
 # Blue for secrecy kept, darker where perfect; orange for broken: distinct with any colour blindness, and in greyscale.
 _GROUND = {
-    SecrecyKept.PERFECT: "#1f6fb2",
-    SecrecyKept.RELATIVE: "#a9cdea",
-    SecrecyKept.UNDECIDED: "#f1efe8",
-    SecrecyKept.BROKEN: "#e8833a",
+    SecrecyKept.PERFECT: hexadecimal(palette.PERFECT),
+    SecrecyKept.RELATIVE: hexadecimal(palette.RELATIVE),
+    SecrecyKept.UNDECIDED: hexadecimal(palette.UNDECIDED),
+    SecrecyKept.BROKEN: hexadecimal(palette.BROKEN),
 }
 _INK = {
     SecrecyKept.PERFECT: "white",

@@ -7,10 +7,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from evedrop.view.palette import FIGURES, hexadecimal
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-BLUE, RED, GREEN, ORANGE, GREY = "#0072b2", "#c1272d", "#009e73", "#d98200", "#5f6368"
+BLUE, RED, GREEN, ORANGE, GREY = map(hexadecimal, FIGURES)
+"""The colours of `FIGURES`, as matplotlib writes them."""
 
 _STYLE: Any = {
     "axes.axisbelow": True,

@@ -7,18 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from evedrop.model.receiver import Action, Codes
+from evedrop.view import palette
 from evedrop.view.palette import Colour
 from evedrop.view.scene import SceneSlots, Shown
 
-BLUE: Colour = (84, 150, 250)
-GREEN: Colour = (30, 128, 96)
-SLATE: Colour = (70, 76, 90)
-AMBER: Colour = (244, 178, 40)
-RED: Colour = (206, 60, 66)
-DARK: Colour = (34, 37, 44)
-
 LEGEND = (
-    "blue: state · green: innovation decoded · amber: misled by one · grey: innovation sent, discarded · red: dropped · "
+    "blue: state · green: innovation decoded · amber: misled by one · purple: innovation sent, discarded · red: dropped · "
     "dark: silence"
 )
 
@@ -31,9 +25,12 @@ class Lane:
     colours: tuple[Colour, ...]
 
 
-SENT = Lane(("state", "innovation", "silent"), (BLUE, SLATE, DARK))
-LEGITIMATE = Lane(("dropped", "state", "innovation", "discarded", "silent"), (RED, BLUE, GREEN, SLATE, DARK))
-EAVESDROPPER = Lane((*LEGITIMATE.words, "misled"), (*LEGITIMATE.colours, AMBER))
+SENT = Lane(("state", "innovation", "silent"), (palette.STATE, palette.DISCARDED, palette.SILENT))
+LEGITIMATE = Lane(
+    ("dropped", "state", "innovation", "discarded", "silent"),
+    (palette.DROPPED, palette.STATE, palette.DECODED, palette.DISCARDED, palette.SILENT),
+)
+EAVESDROPPER = Lane((*LEGITIMATE.words, "misled"), (*LEGITIMATE.colours, palette.MISLED))
 SILENT = 4
 """Code of a slot in which nothing was sent, so that nothing could be lost."""
 MISLED = 5

@@ -1,4 +1,8 @@
-"""The colours of the view, distinct for the colour-blind, and on dark and light backgrounds: no curve is white or black."""
+"""All colours of Evedrop, by what they stand for: view, figures and tables take theirs from here.
+
+Two colours of one panel differ by at least 15 (CIEDE2000) for full colour vision, deuteranopia, protanopia and tritanopia;
+the colours of a lane differ in brightness, too. tests/view/test_palette.py checks both.
+"""
 
 from __future__ import annotations
 
@@ -8,26 +12,69 @@ GROUND: Colour = (16, 18, 22)
 """The background of the state plane, which is dark in both themes."""
 TRUTH: Colour = (226, 228, 234)
 """The truth on `GROUND`."""
-TRUTH_CURVE: Colour = (138, 144, 156)
-"""The truth on the background of the theme."""
+TRUTH_CURVE: Colour = (151, 154, 159)
+"""The truth on the background of the theme: no curve is white or black."""
 
-_RECEIVERS: tuple[Colour, ...] = (
-    (45, 190, 165),  # teal
-    (245, 130, 70),  # orange
-    (175, 130, 250),  # violet
-    (80, 170, 245),  # sky
-    (222, 184, 48),  # yellow
-    (236, 106, 168),  # pink
-    (142, 168, 66),  # olive
+RECEIVERS: tuple[Colour, ...] = (
+    (100, 199, 149),  # mint
+    (244, 182, 33),  # yellow
+    (144, 4, 250),  # violet
+    (207, 2, 26),  # red
+    (186, 110, 223),  # lilac
+    (65, 144, 97),  # green
+    (146, 73, 136),  # plum
 )
+"""The legitimate estimator first, then the eavesdroppers in the scenario's order; the same in the view and in sweeps."""
+
+PLANT: tuple[Colour, ...] = (*RECEIVERS[1:], TRUTH_CURVE)
+"""Disturbances and inputs of a closed loop, in order."""
+
+STATE: Colour = (83, 148, 249)  # blue
+DECODED: Colour = (36, 112, 99)  # green
+DISCARDED: Colour = (91, 60, 106)  # purple
+MISLED: Colour = (246, 176, 40)  # amber
+DROPPED: Colour = (209, 70, 34)  # red
+SILENT: Colour = (34, 37, 44)  # dark
+LANES: tuple[Colour, ...] = (STATE, DECODED, DISCARDED, MISLED, DROPPED, SILENT)
+"""The outcomes of a packet."""
+
+BLUE: Colour = (0, 114, 178)
+RED: Colour = (193, 39, 45)
+GREEN: Colour = (79, 191, 139)
+ORANGE: Colour = (217, 130, 0)
+GREY: Colour = (95, 99, 104)
+FIGURES: tuple[Colour, ...] = (BLUE, RED, GREEN, ORANGE, GREY)
+"""Curves of the figures of papers, on white."""
+
+PERFECT: Colour = (31, 111, 178)
+RELATIVE: Colour = (169, 205, 234)
+UNDECIDED: Colour = (241, 239, 232)
+BROKEN: Colour = (232, 131, 58)
+VERDICTS: tuple[Colour, ...] = (PERFECT, RELATIVE, UNDECIDED, BROKEN)
+"""The backgrounds of verdicts on secrecy in a comparison."""
+
+PANELS: dict[str, tuple[Colour, ...]] = {
+    "state plane": (*RECEIVERS, TRUTH, GROUND),
+    "curves": (*RECEIVERS, TRUTH_CURVE),
+    "plant": PLANT,
+    "lanes": LANES,
+    "figures": FIGURES,
+    "verdicts": VERDICTS,
+}
+"""The colours that share a panel."""
 
 
 def colour(i: int) -> Colour:
     """Colour of the i-th receiver; the legitimate estimator is 0. Repeats after seven."""
-    return _RECEIVERS[i % len(_RECEIVERS)]
+    return RECEIVERS[i % len(RECEIVERS)]
 
 
 def dim(of: Colour, share: float) -> Colour:
     """The same colour at a share of its brightness."""
     r, g, b = of
     return int(r * share), int(g * share), int(b * share)
+
+
+def hexadecimal(of: Colour) -> str:
+    """The colour as matplotlib and HTML write it, such as `#64c795`."""
+    return "#{:02x}{:02x}{:02x}".format(*of)

@@ -10,9 +10,10 @@ from typing import Any
 import pyarrow as pa
 
 from evedrop.figures import all_figures, error_column, shown_figure
-from evedrop.view.figure_style import BLUE, GREEN, GREY, ORANGE, RED, panels
+from evedrop.view.figure_style import panels
+from evedrop.view.palette import RECEIVERS, hexadecimal
 
-_COLOURS = (BLUE, RED, ORANGE, GREEN, GREY, "#7b3294", "#00a6d6", "#8c564b")
+_COLOURS = tuple(hexadecimal(one) for one in RECEIVERS)
 _MARKS = "osD^vPX*"
 _MOST_PANELS = 6
 
@@ -30,7 +31,7 @@ def draw(path: Path, table: pa.Table, keys: Sequence[str]) -> None:
     peers = list(dict.fromkeys(row["peer"] for row in rows))
     with panels(path, len(others), 1.2 + 4.2 * len(others), 3.9) as axes:
         for one, values in zip(axes, others, strict=True):
-            for peer, colour, mark in zip(peers, _COLOURS * 8, _MARKS * 8, strict=False):
+            for peer, colour, mark in zip(peers, _COLOURS * 10, _MARKS * 9, strict=False):
                 mine = [row for row in rows if row["peer"] == peer and tuple(row[key] for key in keys[1:]) == values]
                 x = _positions([row[keys[0]] for row in mine])
                 theory = [_height(row, lines) for row in mine]

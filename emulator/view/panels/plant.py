@@ -9,20 +9,12 @@ from typing import final
 import rerun as rr
 
 from evedrop.view.column import Column, scalars
-from evedrop.view.palette import Colour
+from evedrop.view.palette import PLANT
 from evedrop.view.panels.curves import curves_view, line_style, thinned, whole_run
 from evedrop.view.panels.panel import PlacedView, ViewPanel
 from evedrop.view.scene import Scene, SceneSlots
 
 _PATH = "moving"
-_COLOURS: tuple[Colour, ...] = (
-    (226, 178, 40),
-    (222, 92, 82),
-    (80, 150, 235),
-    (60, 180, 120),
-    (170, 120, 230),
-    (140, 140, 140),
-)
 
 
 @final
@@ -42,7 +34,7 @@ class WhatMovesThePlant(ViewPanel):
     def styles(self) -> dict[str, rr.SeriesLines]:
         """Steps, because a value holds for its whole slot."""
         return {
-            _curve(label): line_style(label, _COLOURS[i % len(_COLOURS)], 1.4, steps=True)
+            _curve(label): line_style(label, PLANT[i % len(PLANT)], 1.4, steps=True)
             for i, label in enumerate(self.scene.moving)
         }
 

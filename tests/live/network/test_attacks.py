@@ -69,6 +69,11 @@ LIES = {
     ),
     "a better covariance than it has": (
         "change(lambda self: dict(P=self.P * 0.5, trace=self.trace * [0.5, 0.25]))",
+        "smart contradicts itself: its sum of tr P over slots 0 to 255 of trial 0",
+    ),
+    "a better covariance than it has, in all sums too": (
+        "change(lambda self: dict(P=self.P * 0.5, trace=self.trace * [0.5, 0.25], "
+        "trace_sums={k: one * 0.5 for k, one in self.trace_sums.items()}))",
         "smart contradicts itself: its digest of slots 0 to 255 of trial 0",
     ),
     "packets that it denies": (

@@ -1,0 +1,42 @@
+"""The colours of a panel can be told apart, also by the colour-blind. Vision and distance are the library coloraide's."""
+
+from __future__ import annotations
+
+from itertools import combinations, pairwise
+
+import pytest
+from coloraide import Color
+
+from evedrop.view import lanes
+from evedrop.view.palette import DROPPED, LANES, PANELS, Colour, hexadecimal
+
+_LEAST = 15.0  # CIEDE2000; 1 is just noticeable side by side
+_VISIONS = (None, "deutan", "protan", "tritan")
+
+
+def _seen(one: Colour, vision: str | None) -> Color:
+    full = Color(hexadecimal(one))
+    return full if vision is None else full.filter(vision)
+
+
+@pytest.mark.parametrize("panel", PANELS)
+@pytest.mark.parametrize("vision", _VISIONS)
+def test_colours_that_share_a_panel_differ(panel: str, vision: str | None) -> None:
+    """By CIEDE2000 of at least 15, with full colour vision and with each kind of dichromacy."""
+    for one, other in combinations(PANELS[panel], 2):
+        found = _seen(one, vision).delta_e(_seen(other, vision), method="2000")
+        assert found >= _LEAST, f"{hexadecimal(one)} and {hexadecimal(other)} differ by {found:.1f}"
+
+
+def test_lanes_differ_in_brightness() -> None:
+    """By at least 6 of 100 in CIE lightness, so that a grey print shows them too."""
+    lightness = sorted(Color(hexadecimal(one)).convert("lab-d65")["l"] for one in LANES)
+    assert min(after - before for before, after in pairwise(lightness)) >= 6.0
+
+
+def test_lanes_use_the_colours_of_the_table() -> None:
+    """Every outcome of a lane has a colour of its own, from the table."""
+    for lane in (lanes.SENT, lanes.LEGITIMATE, lanes.EAVESDROPPER):
+        assert set(lane.colours) <= set(LANES)
+        assert len(set(lane.colours)) == len(lane.words)
+    assert lanes.EAVESDROPPER.colours[0] == DROPPED
