@@ -41,7 +41,11 @@ class PanelSet:
 
     def layout(self) -> rrb.Blueprint:
         """The views of all panels on two sides."""
-        placed = self._each(lambda panel: [_drawable(one) for one in panel.views()])
+        placed = [
+            one
+            for name, panel in [*self._panels.items()]
+            for one in self._tried(name, partial(_views, panel, _drawable if PANELS.foreign(name) else _placed))
+        ]
         sides = []
         for side in ("left", "right"):
             here = [one for one in placed if one.side == side]
@@ -84,11 +88,22 @@ class PanelSet:
             return ()
 
 
-def _drawable(one: PlacedView) -> PlacedView:
+def _views(panel: ViewPanel, check: Callable[[PlacedView], PlacedView]) -> list[PlacedView]:
+    return [check(one) for one in panel.views()]
+
+
+def _placed(one: PlacedView) -> PlacedView:
     """The same view, if a layout can contain it. Raises an error otherwise."""
     if not isinstance(one, PlacedView) or one.side not in {"left", "right"} or not one.share > 0.0:
         raise TypeError(f"views() gave {one!r}; expected a PlacedView, left or right, with a share above 0")
-    create_in_memory_blueprint(application_id="view", blueprint=rrb.Blueprint(one.view)).storage.drain_as_bytes()
+    return one
+
+
+def _drawable(one: PlacedView) -> PlacedView:
+    """The same, and Rerun can draw it. Rerun keeps some threads for each view that is tried like this."""
+    create_in_memory_blueprint(
+        application_id="view", blueprint=rrb.Blueprint(_placed(one).view)
+    ).storage.drain_as_bytes()
     return one
 
 

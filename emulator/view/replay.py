@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import closing
 from operator import itemgetter
 from pathlib import Path
 
@@ -47,16 +48,16 @@ def replay(folder: Path, path: Path | None = None) -> Path:
         raise UsageError(f"{folder}: inputs.parquet does not have the slots of trials.parquet; run the scenario again")
     around = np.array(scenario.process.around)
     recording = open_recording(scenario, folder.name, path)
-    for first in range(0, len(x), _CHUNK):
-        rows = slice(first, min(first + _CHUNK, len(x)))
-        deviations = {name: peer.x_hat[rows] - around for name, peer in peers.items()}
-        some = None if monitored is None else monitored.rows(rows)
-        moved = None if showing is None else showing.take(inputs[rows], deviations, some)
-        shown = {name: peer.mapped(itemgetter(rows)) for name, peer in peers.items()}
-        recording.add(SceneSlots(first, x[rows], nu[rows], shown, moved, sent[rows]))
-    for event in results.events:
-        recording.note(event.slot, "INFO", event.line)
-    recording.close()
+    with closing(recording):
+        for first in range(0, len(x), _CHUNK):
+            rows = slice(first, min(first + _CHUNK, len(x)))
+            deviations = {name: peer.x_hat[rows] - around for name, peer in peers.items()}
+            some = None if monitored is None else monitored.rows(rows)
+            moved = None if showing is None else showing.take(inputs[rows], deviations, some)
+            shown = {name: peer.mapped(itemgetter(rows)) for name, peer in peers.items()}
+            recording.add(SceneSlots(first, x[rows], nu[rows], shown, moved, sent[rows]))
+        for event in results.events:
+            recording.note(event.slot, "INFO", event.line)
     if recording.failure is not None:
         path.unlink(missing_ok=True)
         raise UsageError(f"{path} cannot be written ({recording.failure}); make the folder writable")

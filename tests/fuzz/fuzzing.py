@@ -1,6 +1,6 @@
 """Reads examples that were changed at random, and says which of them a reader broke on.
 
-    python -m tests.fuzz.fuzzing READER --seed N --count N
+    python -m tests.fuzz.fuzzing READER --seed N --first N --count N
 
 What breaks a reader is written into tests/corpus/READER, and read again by `make test` from then on.
 """
@@ -82,12 +82,12 @@ def broken_by(reader: Reader, data: bytes, folder: Path) -> Failure | None:
     return None if how is None else Failure(data, how)
 
 
-def campaign(name: str, seed: int, count: int) -> list[Failure]:
-    """The failures of a reader among so many changed examples."""
+def campaign(name: str, seed: int, count: int, first: int = 0) -> list[Failure]:
+    """The failures of a reader among so many changed examples, from the one with the number `first` on."""
     reader = READERS[name]
     found: list[Failure] = []
     with tempfile.TemporaryDirectory(prefix="fuzz-") as place:
-        for number in range(count):
+        for number in range(first, first + count):
             mutator = Mutator(f"{name}/{seed}/{number}", reader.words())
             failure = broken_by(reader, reader.changed(mutator, number), Path(place) / "of-one")
             if failure is not None:
@@ -111,13 +111,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("readers", nargs="*", metavar="READER", help=f"one of {', '.join(READERS)}; default all")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--count", type=int, default=1000)
     options = parser.parse_args()
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
     broken = False
     for name in options.readers or READERS:
         started = time.process_time()
-        failures = campaign(name, options.seed, options.count)
+        failures = campaign(name, options.seed, options.count, options.first)
         seconds = time.process_time() - started
         sys.stdout.write(f"{name}: {options.count} read in {seconds:.1f} s, {len(failures)} failures\n")
         sys.stdout.flush()

@@ -64,9 +64,12 @@ def test_changed_bytes_are_read_or_refused(name: str) -> None:
 @pytest.mark.parametrize("name", READERS)
 def test_a_million_changed_bytes_are_read_or_refused(name: str) -> None:
     """In a process of its own, whose memory has a limit; what breaks a reader is kept in the corpus."""
-    command = [sys.executable, "-m", "tests.fuzz.fuzzing", name, "--seed", "1", "--count", str(LONG[name])]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2])
-    assert done.returncode == 0, done.stdout + done.stderr
+    at_once = 100 if name.startswith("view-") else LONG[name]  # Rerun keeps some threads of every recording
+    for first in range(0, LONG[name], at_once):
+        command = [sys.executable, "-m", "tests.fuzz.fuzzing", name, "--seed", "1"]
+        command += ["--first", str(first), "--count", str(at_once)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2])
+        assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_a_million_is_a_million() -> None:
