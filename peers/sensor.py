@@ -1,18 +1,22 @@
-"""The sensor: simulates the process, sends one packet in each slot by the scheme, and stays within the window."""
+"""The sensor: makes or takes the states, sends one packet in each slot by the scheme, and stays within the window."""
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Collection
 from functools import partial
+from queue import Empty
 from typing import final
 
 from evedrop.conformance.checked import checked_encoder
 from evedrop.conformance.problems import Problem
+from evedrop.errors import RunError
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.network.mailbox import Mailbox
 from evedrop.live.network.pending import most_slots
 from evedrop.live.network.process_session import ProcessSession
+from evedrop.live.network.program import ProgramStates
 from evedrop.live.network.reporting import TruthReporter
 from evedrop.live.network.resending import GapDetector, ReplayBuffer
 from evedrop.live.network.session import Session
@@ -23,6 +27,7 @@ from evedrop.live.protocol.codec import Reader, read_progress
 from evedrop.live.protocol.commands import End, Go, Hold, Start
 from evedrop.live.protocol.packets import barrier, read_acknowledgement, resend, uplink
 from evedrop.live.protocol.telemetry import held
+from evedrop.model.given_states import GivenStates, recorded
 from evedrop.model.integrity.monitor import Monitor
 from evedrop.model.local_filter import LocalFilter
 from evedrop.model.numeric.detection import CusumBatch
@@ -36,6 +41,7 @@ from evedrop.names import OBSERVER, SENSOR
 from evedrop.peers.closed_loop import Steered
 
 _PROGRESS_BYTES = 16 * 2**20  # for one follower: far more than are ever under way
+_SETTLE_SECONDS = 2.0
 _LOOK_SECONDS = 0.05  # how soon a request to hold is noticed
 
 
@@ -54,7 +60,7 @@ class Window:
         sent: ReplayBuffer,
         clock: Clock = SYSTEM_CLOCK,
     ) -> None:
-        self._window, self._sent, self._place = window, sent, session.place
+        self._window, self._sent, self._place, self._clock = window, sent, session.place, clock
         self._done = dict.fromkeys(followers, 0)
         self._absent: Collection[str] = ()
         self._limit = window
@@ -75,9 +81,20 @@ class Window:
                 *(self._keys[name] for name in self._followed if self._done[name] + self._window <= k)
             ):
                 name, payload = self._news.get()
-            if isinstance(payload, bytes):
-                self._done[name] = max(self._done[name], read_progress(self._keys[name], payload, k))
-            self._measure()
+            self._take(name, payload, k)
+
+    def settle(self, k: int, seconds: float) -> None:
+        """Wait until all slots below k are done, for some seconds at most."""
+        deadline = self._clock.monotonic() + seconds
+        with contextlib.suppress(Empty):
+            while min(self._done[name] for name in self._followed) < k:
+                self._take(*self._news.get(max(0.0, deadline - self._clock.monotonic())), k)
+
+    def _take(self, name: str, payload: bytes | bool, k: int) -> None:
+        """Take a progress message; all slots of it are below k or k itself."""
+        if isinstance(payload, bytes):
+            self._done[name] = max(self._done[name], read_progress(self._keys[name], payload, k))
+        self._measure()
 
     def go_on(self, k: int, absent: Collection[str]) -> None:
         """All processes have done all slots below k; do not wait for the absent ones from now on."""
@@ -160,8 +177,17 @@ class Sensing:
     where the next depends on an answer to it.
     """
 
-    def __init__(self, brief: Brief[SensorPart], scheme: Scheme, core: SensorCore, session: ProcessSession) -> None:
+    def __init__(
+        self,
+        brief: Brief[SensorPart],
+        scheme: Scheme,
+        core: SensorCore,
+        session: ProcessSession,
+        program: ProgramStates | None = None,
+    ) -> None:
+        """program: from which the core takes the states, if from any."""
         part = brief.part
+        self._program = program
         self._brief, self._session, self._core = brief, session, core
         self._send = session.kept(session.keys.uplink, head=resend, back=part.history)
         self._window = Window(session, (*part.receivers, OBSERVER), brief.flow.window, self._send)
@@ -178,7 +204,7 @@ class Sensing:
         self._barriers = Barriers(brief, session, self._window, telemetry, self._reporter.flush)
         self._betrayed = set(part.leaks.values())
         self._answered = self._back is not None or self._steered is not None
-        self._most = 1 if part.pace or self._answered else most_slots(brief)
+        self._most = 1 if part.pace or self._answered or program is not None else most_slots(brief)
         self._slots = range(0)
         """Those that were made at once and are being sent."""
         self._made: Sent
@@ -192,7 +218,13 @@ class Sensing:
             self._wait(k)
             if k == self._slots.stop:
                 self._slots = range(k, min(k + self._most, self._end_of_report(k)))
-                self._made = self._core.send(self._slots)
+                try:
+                    self._made = self._core.send(self._slots)
+                except RunError:  # the program gave no state: what it gave so far should be in the results
+                    self._window.settle(k - k % self._brief.flow.batch, _SETTLE_SECONDS)
+                    raise
+                if self._program is not None:
+                    self._start += self._program.waited  # so that later slots are not in a hurry
             self._send_packet(k)
             if k + 1 == self._slots.stop:
                 self._report(k + 1)
@@ -250,7 +282,7 @@ class Sensing:
         return self._start + k * self._brief.part.pace - time.monotonic()
 
 
-def _core_of(brief: Brief[SensorPart], scheme: Scheme) -> SensorCore:
+def _core_of(brief: Brief[SensorPart], scheme: Scheme, program: ProgramStates | None) -> SensorCore:
     process, keys, entry = brief.model.process, brief.stream_keys, brief.part.plant
     plant = None if entry is None else entry.plant
     disturbances = None if entry is None else decoded(entry.disturbances, brief.slots)
@@ -262,11 +294,16 @@ def _core_of(brief: Brief[SensorPart], scheme: Scheme) -> SensorCore:
         spoofing = plan.spoofing(keys.get("spoofing", b""), brief.batch)
     if plant is not None and plant.output_matrix is not None:
         local = LocalFilter(process, plant, keys.get("measurement", b""), brief.batch, spoofing)
+    given = None
+    if program is not None:
+        given = GivenStates(process, program.take, brief.trials)
+    elif brief.part.states is not None:
+        given = GivenStates(process, recorded(decoded(brief.part.states, brief.slots)), brief.trials)
     chart = brief.part.chart
     encoder = scheme.encoder(keys, brief.batch)
     return SensorCore(
         checked_encoder(encoder, brief.part.scheme["scheme"], scheme, Problem(process, brief.batch)),
-        PlantCore(process, keys["process"], brief.batch, initial, plant, disturbances),
+        PlantCore(process, keys["process"], brief.batch, initial, plant, disturbances, given),
         local,
         None if chart is None else CusumBatch(chart, brief.trials),
         monitor,
@@ -276,9 +313,11 @@ def _core_of(brief: Brief[SensorPart], scheme: Scheme) -> SensorCore:
 def sense(brief: Brief[SensorPart], connect: Callable[[AnyBrief], ProcessSession] = Session) -> None:
     """Run the sensor of a brief; connect: opens its session."""
     scheme = scheme_of(brief.model.process, brief.part.scheme)
-    core = _core_of(brief, scheme)
-    with connect(brief) as session:
-        sensing = Sensing(brief, scheme, core, session)
+    entry = brief.part.program
+    patience = brief.flow.longest_outage
+    source = None if entry is None else ProgramStates(entry, bool(brief.part.pace), patience)
+    with source or contextlib.nullcontext() as program, connect(brief) as session:
+        sensing = Sensing(brief, scheme, _core_of(brief, scheme, program), session, program)
         session.ready()
         session.wait_for(Start)
         sensing.carry_on()

@@ -79,7 +79,9 @@ class Expectation:
     slots_at: SlotOutcomes | None = None
     """The outcomes of each slot, where μ_d differs from slot to slot; `outcomes_at` is then their mean, and there is no limit."""
     of_model: bool = False
-    """Whether the process is only the model of a plant: then it is not the errors of a run that theory expects."""
+    """Whether the process is only a model of what moves the states: then it is not the errors of a run that theory expects."""
+    assumed: bool = False
+    """Whether it is only what receivers assume: then theory expects nothing."""
 
     @property
     def known(self) -> bool:
@@ -205,6 +207,9 @@ def bound_of(scenario: Scenario, receiver: str) -> OutcomesAt | None:
 
 def expectations_of(scenario: Scenario) -> dict[str, Expectation]:
     """Receiver → theory's expectation of it."""
+    table = scenario.process
+    if table.given and not table.theory:
+        return dict.fromkeys(scenario.receivers, Expectation(table.process, None, None, of_model=True, assumed=True))
     found = {}
     scheme, mu_d = scheme_of(scenario.process.process, scenario.encoding.spec), scenario.encoding.state_probabilities
     for name in scenario.receivers:
@@ -219,7 +224,7 @@ def expectations_of(scenario: Scenario) -> dict[str, Expectation]:
             closed_bound=closed if bound else None,
             slots_at=None if mu_d is None else _in_slots(mu_d, partial(_known_in_slot, scenario, name, scheme)),
             bound_slots_at=None if mu_d is None else lambda k: partial(_bound, scheme.in_slot(k)),
-            of_model=scenario.plant is not None,
+            of_model=scenario.of_model,
         )
     return found
 

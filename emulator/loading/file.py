@@ -25,10 +25,10 @@ from evedrop.scenario.dry_run import dry_run, foreign
 from evedrop.scenario.events import EVENTS
 from evedrop.scenario.filter_noise import filter_noise_read
 from evedrop.scenario.input_files import (
-    disturbance_file_located,
-    disturbances_read,
     read_recordings,
     recordings_located,
+    tables_located,
+    tables_read,
 )
 from evedrop.scenario.sentences import sentences
 from evedrop.scenario.tables import Scenario
@@ -110,7 +110,7 @@ def parse(
     """
     tables = tables_in(text, source)
     recordings_located(tables, folder)
-    disturbance_file_located(tables, folder)
+    tables_located(tables, folder)
     for entry in ("secret_file", "modules"):
         if isinstance(tables.get(entry), str):
             tables[entry] = str((folder / tables[entry]).absolute())
@@ -155,7 +155,7 @@ def checked(
         tables.setdefault("modules", str(folder))
     if isinstance(tables.get("modules"), str):
         tables["modules"] = str(Path(tables["modules"]).absolute())
-    recordings = [*read_recordings(tables), *disturbances_read(tables), *filter_noise_read(tables)]
+    recordings = [*read_recordings(tables), *tables_read(tables), *filter_noise_read(tables)]
     try:
         scenario = Scenario.read(tables)
     except ValidationError as error:

@@ -29,13 +29,14 @@ from evedrop.scenario.across import (
     strategy_mistakes,
 )
 from evedrop.scenario.application import APPLICATIONS
-from evedrop.scenario.closed_loop import loop_mistakes
+from evedrop.scenario.closed_loop import given_state_mistakes, loop_mistakes
 from evedrop.scenario.controlled import controlled_plant
 from evedrop.scenario.event_mistakes import event_mistakes
 from evedrop.scenario.expect import Around
 from evedrop.scenario.filter_noise import filter_mistakes
 from evedrop.scenario.link_table import LinkTable
 from evedrop.scenario.nemesis import nemesis_mistakes
+from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.receivers import EavesdropperTable
 from evedrop.scenario.sentences import sentences
 from evedrop.scenario.singular_noise import singular_mistakes
@@ -62,6 +63,7 @@ def mistakes_across(tables: ValidTables, beyond_horizon: bool) -> list[str]:
         encoding_mistakes,
         acknowledgement_mistakes,
         loop_mistakes,
+        given_state_mistakes,
         application_mistakes,
         filter_mistakes,
         singular_mistakes,
@@ -93,12 +95,19 @@ def _expectation_mistakes(tables: ValidTables, sound: bool) -> Iterator[str]:
         tables.receivers,
         tables.slots,
         tables.trials,
-        lambda name: _no_theory(name, tables, sound),
+        lambda name: _assumed(tables.process) or _no_theory(name, tables, sound),
         tables.applications,
         None if tables.process is None else list(tables.process.directions or {}),
     )
     for i, expectation in tables.expect if tables.all_receivers else ():
         yield from (f"expect.{i}.{entry}: {what}" for entry, what in around.mistakes(expectation))
+
+
+def _assumed(process: ProcessTable | None) -> str | None:
+    """The reason why theory expects nothing of given states; None if it may."""
+    if process is None or not process.given or process.theory:
+        return None
+    return f"A and Q need not describe states that come from a {process.source}; theory = true says that they do"
 
 
 def _no_theory(name: str, tables: ValidTables, sound: bool) -> str | None:

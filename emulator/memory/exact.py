@@ -20,6 +20,7 @@ from evedrop.memory.linked_receiver import LinkedReceiver
 from evedrop.memory.packet_counts import PacketCounts
 from evedrop.model.acknowledgements import AckChannel
 from evedrop.model.digest import BlockDigests, Digests, InputLog
+from evedrop.model.given_states import GivenStates, recorded
 from evedrop.model.input_aware import InputAwareEstimator
 from evedrop.model.integrity.monitor import Monitor
 from evedrop.model.numeric.detection import CusumBatch
@@ -34,7 +35,7 @@ from evedrop.model.slot.sensor import SensorCore, Sent
 from evedrop.names import CONTROLLER, LEGITIMATE
 from evedrop.scenario import Scenario
 from evedrop.scenario.controlled import monitor_of
-from evedrop.scenario.input_files import disturbances_of
+from evedrop.scenario.input_files import disturbances_of, states_of
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.score.acknowledging import chart_of, way_back_of
 from evedrop.score.closed_loop_tally import SolveTimes
@@ -79,9 +80,11 @@ class ExactSimulation:
         self._guard = roles.guard
         disturbances = disturbances_of(scenario)
         process, chart, plan = scenario.process.process, chart_of(scenario), monitor_of(scenario)
+        states = states_of(scenario)
+        given = None if states is None else GivenStates(process, recorded(states), batch.trials)
         self._sensor = SensorCore(
             roles.guard.encoder(roles.shared.encoder()),
-            PlantCore(process, keys.process, batch, roles.initial, scenario.driven, disturbances),
+            PlantCore(process, keys.process, batch, roles.initial, scenario.driven, disturbances, given),
             local_filter_of(
                 scenario, keys.measurement, batch, None if plan is None else plan.spoofing(keys.spoofing, batch)
             ),

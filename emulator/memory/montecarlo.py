@@ -32,6 +32,7 @@ from evedrop.results.folder import HeldFolder, new_folder
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.writer import ResultsWriter, write_summary
 from evedrop.scenario import Scenario
+from evedrop.scenario.input_files import states_of
 from evedrop.score.expectations_held import replay_of
 from evedrop.score.histogram import SlotHistograms
 from evedrop.score.scorekeeper import Ending, events_of, summary_of
@@ -134,12 +135,17 @@ def disk_errors(folder: Path) -> Iterator[None]:
 
 
 def check_mode(scenario: Scenario, mode: Mode) -> None:
-    """Raise UsageError if a mode cannot simulate the scenario: a receiver reads packets, or numbers leave double precision."""
+    """Raise UsageError if a mode cannot simulate the scenario: a receiver reads packets, or numbers leave double precision.
+
+    The exact mode can simulate all but states that come from a program.
+    """
     if mode is Mode.EXACT:
+        states_of(scenario)
         return
-    if mode is Mode.ERROR_COORDINATES and scenario.plant is not None:
+    if mode is Mode.ERROR_COORDINATES and scenario.of_model:
+        why = "the plant's inputs and disturbances depend on states" if scenario.driven else "the states are given"
         raise UsageError(
-            f"--{mode.value} follows errors, not states, and the plant's inputs and disturbances depend on states; leave "
+            f"--{mode.value} follows errors, not states, and {why}; leave "
             f"--{mode.value} out, or give --{Mode.COVARIANCE_ONLY.value} instead, for the covariances alone"
         )
     _check_scheme(scenario, mode)
@@ -166,7 +172,7 @@ def check_mode(scenario: Scenario, mode: Mode) -> None:
 
 def _split_mode(scenario: Scenario) -> Mode:
     """The mode in which trials are split: covariances alone scatter less than errors, where events determine them."""
-    if scenario.plant is not None:
+    if scenario.of_model:
         return Mode.EXACT
     try:
         check_mode(scenario, Mode.COVARIANCE_ONLY)

@@ -1,14 +1,14 @@
-"""The disturbances of a plant, from a CSV file: a line with their names, then a line of numbers for every slot.
+"""The disturbances of a plant, or states, from a CSV file: a line with their names, then a line of numbers for every slot.
 
     time [s], P_solar [kW], P_load [kW]
     0, 0.0, 0.235
     1, 0.0, 0.235
 
-A name may be followed by its unit. If the scenario states the units of disturbances, the file must state them too; powers in
-W and kW are converted to the scenario's unit. A column `time`, in seconds, shows where slots are missing. The file may be
-compressed (`.csv.gz`), may have other columns, and may be longer than the run: rows after the last slot are not read.
+A name may be followed by its unit. If the scenario states the units, the file must state them too; powers in W and kW are
+converted to the scenario's unit. A column `time`, in seconds, shows where slots are missing. The file may be compressed
+(`.csv.gz`), may have other columns, and may be longer than the run: rows after the last slot are not read.
 
-Source: docs/scenario.md, plant; docs/microgrid.md, a day of your own.
+Source: docs/scenario.md, process and plant; docs/microgrid.md, a day of your own.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _HEADER = re.compile(r"^(?P<name>[^\[\]]*?)\s*\[(?P<unit>[^\[\]]*)\]$")
 _TIME = "time"
 _EXAMPLE = "time [s], P_solar [kW], P_load [kW]"
 _MOST_SAID = 5
-_TIME_ERROR = 1e-6  # in slots: times may be rounded
+_TIME_ERROR, _SCATTER = 1e-6, 0.1  # in slots: times may be rounded, and those that were measured scatter
 MOST_NUMBERS = 10_000_000
 """The most numbers in a table of disturbances, slots times columns: more than a month of two columns by the second."""
 _ROWS_UNASKED = 10_000  # for a scenario without a number of slots, which is reported as a mistake of its own
@@ -53,8 +53,11 @@ def read_disturbances(
     units: Sequence[str] | None = None,
     slots: int | None = None,
     slot_seconds: float = 1.0,
+    recorded: bool = False,
 ) -> list[list[float]]:
     """A row for each slot with the numbers of these names, in their order and units.
+
+    recorded: whether times were measured: they may start anywhere, and scatter by a tenth of a slot.
 
     Raises DisturbanceError with every mistake: no file, missing columns, wrong units, values that are not finite numbers, times
     that do not advance by `slot_seconds`, fewer rows than `slots`.
@@ -63,9 +66,7 @@ def read_disturbances(
     if slots is not None and slots > most:
         raise DisturbanceError(
             str(path),
-            [
-                f"is read for {slots} slots of {len(names)} columns; expected at most {most} slots, or fewer disturbances"
-            ],
+            [f"is read for {slots} slots of {len(names)} columns; expected at most {most} slots, or fewer columns"],
         )
     limit = _ROWS_UNASKED if slots is None else max(0, slots)
     rows = _rows(path, limit)
@@ -80,7 +81,8 @@ def read_disturbances(
     numbers, mistakes = found.numbers, found.mistakes
     timed = columns != [] and columns[0].name == _TIME and _TIME not in names
     if timed and not mistakes:
-        mistakes = list(_few(_time_mistakes(found.lines, [row[0] for row in numbers], slot_seconds), "times"))
+        times = [row[0] for row in numbers]
+        mistakes = list(_few(_time_mistakes(found.lines, times, slot_seconds, recorded), "times"))
     if not mistakes and slots is not None and len(numbers) < slots:
         few = f"has {len(numbers)} rows; expected slots, which is {slots}, or more"
         mistakes = [f"{few}: a longer file, or --slots {len(numbers)}" if numbers else few]
@@ -89,10 +91,60 @@ def read_disturbances(
     return [row[1:] for row in numbers] if timed else numbers
 
 
-def disturbances_text(names: Sequence[str], units: Sequence[str] | None, rows: Sequence[Sequence[float]]) -> str:
+@dataclass(frozen=True)
+class StateRecording:
+    """A recording of states."""
+
+    path: str
+    names: Sequence[str]
+    units: Sequence[str] | None
+    """None unless every column has one."""
+    rows: Sequence[Sequence[float]]
+    seconds: float | None
+    """The time from one state to the next; None without a column of times."""
+
+
+def recorded_states(path: Path, names: Sequence[str] | None = None) -> StateRecording:
+    """All states of a file; names: its columns, by default all but the time.
+
+    Raises DisturbanceError as `read_disturbances` does; times may scatter by a tenth of their mean distance.
+    """
+    rows = _rows(path, MOST_NUMBERS)
+    head = next(rows, None)
+    if head is None:
+        raise DisturbanceError(
+            str(path), ["is empty; expected a line of names such as x, y, then a line for every slot"]
+        )
+    there = [match["name"] if (match := _HEADER.match(cell)) else cell for cell in head.cells]
+    names = [name for name in there if name != _TIME] if names is None else names
+    columns, mistakes = _columns(head, names, None)
+    found = _numbers(islice(rows, MOST_NUMBERS // max(1, len(columns))), len(head.cells), columns)
+    if mistakes := mistakes or found.mistakes:
+        raise DisturbanceError(str(path), mistakes)
+    numbers, seconds = found.numbers, None
+    if columns[0].name == _TIME and _TIME not in names:
+        times, numbers = [row[0] for row in numbers], [row[1:] for row in numbers]
+        seconds = (times[-1] - times[0]) / (len(times) - 1) if len(times) > 1 else 0.0
+        if mistakes := list(_few(_time_mistakes(found.lines, times, seconds, recorded=True), "times")):
+            raise DisturbanceError(str(path), mistakes)
+    units = [match["unit"].strip() for cell in head.cells if (match := _HEADER.match(cell)) and match["name"] in names]
+    return StateRecording(str(path), names, units if len(units) == len(names) else None, numbers, seconds)
+
+
+def table_text(names: Sequence[str], units: Sequence[str] | None, rows: Sequence[Sequence[float]]) -> str:
     """The text of a file that is read back to the same bits."""
+    return table_head(names, units) + number_lines(rows)
+
+
+def table_head(names: Sequence[str], units: Sequence[str] | None) -> str:
+    """The first line of such a file."""
     head = names if units is None else [f"{name} [{unit}]" for name, unit in zip(names, units, strict=True)]
-    return "".join(f"{','.join(line)}\n" for line in [list(head), *([repr(value) for value in row] for row in rows)])
+    return f"{','.join(head)}\n"
+
+
+def number_lines(rows: Sequence[Sequence[float]]) -> str:
+    """Its lines of numbers."""
+    return "".join(f"{','.join([repr(value) for value in row])}\n" for row in rows)
 
 
 class _Row(NamedTuple):
@@ -214,12 +266,12 @@ def _cell_mistakes(rows: Sequence[_Row], width: int, columns: Sequence[_Column])
                 yield f"line {row.line}: {column.name} is {shown}; expected a finite number"
 
 
-def _time_mistakes(lines: Sequence[int], times: Sequence[float], slot_seconds: float) -> Iterator[str]:
-    """Mistakes where the time does not start at 0 or does not advance by one slot."""
-    if times and times[0] != 0.0:
+def _time_mistakes(lines: Sequence[int], times: Sequence[float], slot_seconds: float, recorded: bool) -> Iterator[str]:
+    """Mistakes where the time does not start at 0 or does not advance by one slot; recorded: as in `read_disturbances`."""
+    if times and times[0] != 0.0 and not recorded:
         yield f"line {lines[0]}: the time starts at {times[0]:.10g} s; expected 0, with that subtracted from every time"
     for line, (before, time) in zip(lines[1:], pairwise(times), strict=True):
-        if abs(time - before - slot_seconds) <= _TIME_ERROR * slot_seconds:
+        if abs(time - before - slot_seconds) <= (_SCATTER if recorded else _TIME_ERROR) * slot_seconds:
             continue
         slots = (time - before) / slot_seconds
         missing = round(slots) - 1 if math.isfinite(slots) else 0

@@ -10,34 +10,48 @@ from pathlib import Path
 import tomli_w
 
 from evedrop.plugins import sources_of
-from evedrop.recordings.disturbance_file import disturbances_text
+from evedrop.recordings.disturbance_file import table_text
 from evedrop.results.folder import write_private
+from evedrop.results.taken_states import STATES
 from evedrop.scenario import Scenario
 
 DISTURBANCES = "disturbances.csv"
 """The file in a results folder if its scenario has disturbances."""
 
 
-def write_resolved(folder: Path, scenario: Scenario) -> None:
-    """Write the scenario.toml of a results folder, and its disturbances; both files are complete at any moment."""
-    texts = {"scenario.toml": resolved(scenario)}
-    plant = scenario.plant
-    if plant is not None and plant.disturbance_values:
-        texts = {
-            DISTURBANCES: disturbances_text(plant.disturbances, plant.disturbance_units, plant.disturbance_values),
-            **texts,
-        }
-    for name, text in texts.items():
+def write_resolved(folder: Path, scenario: Scenario, taken: bool = False) -> None:
+    """Write the scenario.toml of a results folder, and its states and disturbances; each file is complete at any moment.
+
+    taken: whether all states of a program have been written, so that the run can be repeated from them.
+    """
+    for name, text in {**input_texts(scenario), "scenario.toml": resolved(scenario, taken)}.items():
         unfinished = folder / f"{name}.new"
         write_private(unfinished, text)
         os.replace(unfinished, folder / name)
 
 
-def resolved(scenario: Scenario) -> str:
-    """The complete scenario as TOML, with the versions that made it: running it again gives the same digests."""
+def input_texts(scenario: Scenario) -> dict[str, str]:
+    """The files beside a complete scenario: name → text."""
+    plant, process = scenario.plant, scenario.process
+    found = {}
+    if plant is not None and plant.disturbance_values:
+        found[DISTURBANCES] = table_text(plant.disturbances, plant.disturbance_units, plant.disturbance_values)
+    if process.source == "file":
+        found[STATES] = table_text(process.states or (), process.units, process.state_values or ())
+    return found
+
+
+def resolved(scenario: Scenario, taken: bool = False) -> str:
+    """The complete scenario as TOML, with the versions that made it: running it again gives the same digests.
+
+    taken: as in `write_resolved`.
+    """
     tables = scenario.model_dump(mode="json", exclude_none=True)
     if scenario.plant is not None and tables["plant"].pop("disturbance_values", None):
         tables["plant"]["disturbance_file"] = DISTURBANCES
+    if scenario.process.given:
+        tables["process"].pop("state_values", None)
+        tables["process"] |= {"state_file": STATES, **({"source": "file"} if taken else {})}
     if scenario.secret_file is not None:
         tables["secret_file"] = str(Path(scenario.secret_file).absolute())
     tables["made_with"] = {

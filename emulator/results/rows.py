@@ -16,6 +16,7 @@ def write_rows(writer: ResultsWriter, slots: Slots, scored: Mapping[str, Scored]
     for name, one in scored.items():
         writer.slot_rows(slots.first, name, one.sums, one.expected)
     writer.input_rows(slots, first_trial)
+    writer.state_rows(slots)
     writer.trial_rows(slots, {name: one.squared_error for name, one in scored.items()}, first_trial)
     writer.journal_rows(slots)
 

@@ -39,9 +39,11 @@ from evedrop.results.tables import (
     inputs_schema,
     trials_schema,
 )
+from evedrop.results.taken_states import TakenStates
 from evedrop.scenario import Scenario
 from evedrop.scenario.controlled import monitor_of
 from evedrop.scenario.input_files import disturbances_of
+from evedrop.scenario.process import ProcessTable
 from evedrop.score.histogram import LEVELS
 from evedrop.score.slots import Slots
 from evedrop.score.summary import Summary
@@ -74,16 +76,20 @@ class ResultsWriter:
         around: Sequence[float] | None = None,
         loop: tuple[Plant, Floats] | None = None,
         monitored: bool = False,
+        program: ProcessTable | None = None,
     ) -> None:
         """around: added to states and estimates, (n,); loop: plant and disturbances (slots, q) of a closed loop.
 
-        monitored: whether there are a watermark and a detector. Raises OSError if the folder cannot be written.
+        monitored: whether there are a watermark and a detector; program: a process whose states come from one.
+
+        Raises OSError if the folder cannot be written.
         """
         self._digested = receivers if loop is None else (*receivers, CONTROLLER)
         self._around = None if around is None or not any(around) else np.array(around)
         self._held = HeldFolder(folder)
         self._unfinished = Unfinished(folder)
         self._loop = loop
+        self._taken = None if program is None else TakenStates(folder, program)
         peers = {"peer": self._digested}
         words = {**peers, "sent": SENT, "action": ACTIONS}
         self._kinds: dict[str, tuple[pa.Schema, Mapping[str, tuple[str, ...]]]] = {
@@ -116,7 +122,8 @@ class ResultsWriter:
             else (scenario.driven, disturbances_of(scenario))
         )
         states, around = len(scenario.process.A), scenario.process.around
-        return cls(folder, scenario.receivers, states, around, loop, monitor_of(scenario) is not None)
+        program = scenario.process if scenario.process.source == "zenoh" else None
+        return cls(folder, scenario.receivers, states, around, loop, monitor_of(scenario) is not None, program)
 
     def __enter__(self) -> Self:
         return self
@@ -137,6 +144,8 @@ class ResultsWriter:
         except (OSError, pa.ArrowException) as found:  # the streams stay where they are, and can be read
             failure = failure or (found if isinstance(found, OSError) else OSError(str(found)))
         self._unfinished.close()
+        if self._taken is not None:
+            self._taken.close()
         self._held.close()
         if failure is not None and error is None:
             raise failure
@@ -189,6 +198,8 @@ class ResultsWriter:
         if self._broken:  # rows after an incomplete batch could not be read
             raise OSError(errno.EIO, "an earlier part could not be written")
         self._broken = True  # until the round succeeds
+        if self._taken is not None:
+            self._taken.write()
         self._unfinished.round(self._at, self._slots, self._streams)
         self._broken = False
         self._on_disk, self._bytes = self._on_disk + self._bytes, 0
@@ -263,6 +274,11 @@ class ResultsWriter:
                     np.moveaxis(receiver.P, 3, 1).reshape(count, -1),
                 ],
             )
+
+    def state_rows(self, slots: Slots) -> None:
+        """A line per slot: the states that were taken from a program, which all trials share."""
+        if self._taken is not None:
+            self._taken.add(slots.x[:, :, 0])
 
     def _levels(self, x: Floats) -> Floats:
         """States (c, n, r) as rows, (c r, n), with the reference added, from which they are deviations."""

@@ -1,6 +1,6 @@
-"""Mistakes in plant and controller that only show with the process, the legitimate estimator and the events.
+"""Mistakes in plant, controller and given states that only show with process, scheme, legitimate estimator and events.
 
-Source: docs/scenario.md, plant and controller.
+Source: docs/scenario.md, process, plant and controller.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import numpy as np
 
 from evedrop.kernels.elementary import semidefinite_factor
 from evedrop.model.controllers import CONTROLLERS
+from evedrop.model.schemes import SCHEMES
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.events.effects import Leave
 from evedrop.scenario.plant import ControllerTable, PlantTable, assignment_of, limit_mistakes, plant_of
@@ -39,6 +40,34 @@ def loop_mistakes(tables: ValidTables) -> Iterator[str]:
             yield from _controller_and_plant(plant, tables.controller, tables.process, tables.slot_seconds or 1.0)
     if tables.controller is not None:
         yield from _outages(tables, tables.controller)
+
+
+def given_state_mistakes(tables: ValidTables) -> Iterator[str]:
+    """Mistakes together with states that come from a recording or a program."""
+    process = tables.process
+    if process is None or not process.given:
+        return
+    where = f"process.source: is {process.source}"
+    for name in ("plant", "controller", *tables.applications):
+        if name in tables.given:
+            yield (
+                f"{where}, but there is a [{name}], and nothing here moves such states; expected no [{name}], or no source, "
+                "so that states are simulated"
+            )
+    if tables.encoding is not None and tables.scheme is not None and tables.scheme.decides_initial_state():
+        able = listed(sorted(name for name in SCHEMES if not SCHEMES[name].decides_initial_state()))
+        yield (
+            f"encoding.scheme: is {tables.encoding.scheme}, whose secret decides the first state, and states come from a "
+            f"{process.source}; expected {able}"
+        )
+    if process.source == "zenoh" and tables.shards is not None and tables.shards > 1:
+        yield (
+            f"shards: is {tables.shards}; expected 1: each set of processes has a sensor of its own, and these would take "
+            "different states from the program"
+        )
+    rows = process.state_values
+    if process.source == "file" and rows and tables.slots is not None and len(rows) < tables.slots:
+        yield f"process.state_values: has {len(rows)} rows; expected slots, which is {tables.slots}, or more"
 
 
 def _plant_and_process(plant: PlantTable, process: ProcessTable) -> Iterator[str]:

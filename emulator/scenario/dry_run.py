@@ -46,7 +46,9 @@ def dry_run(scenario: Scenario) -> list[str]:
     Does not affect the digests of the run.
     """
     # The numbers of a day are hundreds of thousands, and name no class.
-    if not foreign(scenario.model_dump(exclude_unset=True, exclude={"plant": {"disturbance_values"}})):
+    if not foreign(
+        scenario.model_dump(exclude_unset=True, exclude={"plant": {"disturbance_values"}, "process": {"state_values"}})
+    ):
         return []
     batch = Batch(min(scenario.slots, _SLOTS), _TRIALS, scenario.first_trial)
     problem = Problem(scenario.process.process, batch)

@@ -1,6 +1,6 @@
-"""The files that a scenario names, read when it is loaded, so that no other process needs them: disturbances, recordings.
+"""The files that a scenario names, read when it is loaded, so that no other process needs them: states, disturbances, traces.
 
-Source: docs/scenario.md, plant; docs/links.md, traces.
+Source: docs/scenario.md, process and plant; docs/links.md, traces.
 """
 
 from __future__ import annotations
@@ -11,46 +11,82 @@ from typing import Any
 
 import numpy as np
 
-from evedrop.errors import DisturbanceError, TraceError
+from evedrop.errors import DisturbanceError, TraceError, UsageError
 from evedrop.model.checks import is_number
 from evedrop.model.delays.trace import MOST_DELAYS
+from evedrop.model.given_states import deviations
 from evedrop.model.process import Floats
 from evedrop.recordings.disturbance_file import found_file, read_disturbances
 from evedrop.recordings.link_recording import LinkRecording
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import as_toml
 
-
-def disturbance_file_located(tables: Mapping[str, Any], folder: Path) -> None:
-    """Replace the name of the disturbance file with its path, in place; folder: that of the scenario."""
-    plant = tables.get("plant")
-    if isinstance(plant, dict) and isinstance(plant.get("disturbance_file"), str):
-        plant["disturbance_file"] = str(found_file(plant["disturbance_file"], folder))
+_TABLES = {"plant": ("disturbance", "disturbances", "disturbance_units"), "process": ("state", "states", "units")}
+"""Table that may name a file of numbers → the first word of its entries, and its entries with names and units."""
 
 
-def disturbances_read(tables: Mapping[str, Any]) -> list[str]:
-    """Replace the name of the disturbance file with the numbers in it, in place. Returns the mistakes, with their paths."""
-    plant = tables.get("plant")
-    if not isinstance(plant, dict) or not isinstance(plant.get("disturbance_file"), str):
-        return []
-    if "disturbance_values" in plant:
-        del plant["disturbance_file"]
-        return ["plant.disturbance_file: is given together with disturbance_values; expected one of them"]
-    names = plant.get("disturbances")
+def tables_located(tables: Mapping[str, Any], folder: Path) -> None:
+    """Replace the names of the files of states and disturbances with their paths, in place; folder: that of the scenario."""
+    for name, (kind, *_) in _TABLES.items():
+        table = tables.get(name)
+        if isinstance(table, dict) and isinstance(table.get(f"{kind}_file"), str):
+            table[f"{kind}_file"] = str(found_file(table[f"{kind}_file"], folder))
+
+
+def tables_read(tables: Mapping[str, Any]) -> list[str]:
+    """Replace the names of the files of states and disturbances with the numbers in them, in place.
+
+    A file of states is left alone unless states come from it. Returns the mistakes, with their paths.
+    """
+    found = []
+    for name, (kind, *labels) in _TABLES.items():
+        table = tables.get(name)
+        unused = kind == "state" and isinstance(table, dict) and table.get("source") != "file"
+        if isinstance(table, dict) and isinstance(table.get(f"{kind}_file"), str) and not unused:
+            wrong = _read(tables, table, kind, *(table.get(label) for label in labels))
+            found += [f"{name}.{kind}_file: {what}" for what in wrong]
+    return found
+
+
+def _read(tables: Mapping[str, Any], table: dict[str, Any], kind: str, names: object, units: object) -> list[str]:
+    """Replace the name of one file; `kind`: the first word of its entries in the table."""
+    file, values = table.pop(f"{kind}_file"), f"{kind}_values"
+    if values in table:
+        return [f"is given together with {values}; expected one of them"]
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         names = []
-    units, slots, seconds = plant.get("disturbance_units"), tables.get("slots"), tables.get("slot_seconds")
+    if kind == "state" and not names:  # which is a mistake of its own
+        table[values] = []
+        return []
+    slots, seconds = tables.get("slots"), tables.get("slot_seconds")
     if not isinstance(units, list) or not all(isinstance(unit, str) for unit in units):
         units = None
     slots = slots if type(slots) is int and slots > 0 else None
     seconds = float(seconds) if seconds and is_number(seconds, 0.0, 1e6) else 1.0
-    file = plant.pop("disturbance_file")
     try:
-        plant["disturbance_values"] = read_disturbances(found_file(file, Path()), names, units, slots, seconds)
+        table[values] = read_disturbances(
+            found_file(file, Path()), names, units, slots, seconds, recorded=kind == "state"
+        )
     except DisturbanceError as error:
-        plant["disturbance_values"] = []
-        return [f"plant.disturbance_file: {file} {what}" for what in error.mistakes]
+        table[values] = []
+        return [f"{file} {what}" for what in error.mistakes]
     return []
+
+
+def states_of(scenario: Scenario) -> Floats | None:
+    """The given states of every slot, as deviations from the reference, (slots, n); None if they are simulated.
+
+    Raises UsageError if they come from a program: only a live run can take them.
+    """
+    process = scenario.process
+    if process.source == "zenoh":
+        raise UsageError(
+            "process.source: is zenoh, and only a live run can take states from a program; give `evedrop run`, then use its "
+            'results folder, whose states are recorded, or give source = "file"'
+        )
+    if process.source != "file":
+        return None
+    return deviations(np.array((process.state_values or [])[: scenario.slots]), np.array(process.around))
 
 
 def disturbances_of(scenario: Scenario) -> Floats:

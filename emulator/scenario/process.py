@@ -14,6 +14,7 @@ from pydantic import Field
 
 from evedrop.model.checks import is_number
 from evedrop.model.process import Process, mistakes_of
+from evedrop.scenario.given import ProgramTable, Source, source_mistakes
 from evedrop.scenario.table import Found, Matrix, Number, ProcessName, Table, numbers
 from evedrop.scenario.words import as_toml, listed
 
@@ -21,7 +22,7 @@ _MATRICES = ("A", "Q", "initial_covariance")
 
 
 class ProcessTable(Table):
-    """`[process]`: x_{k+1} = A x_k + w_k, w ~ N(0, Q), x_0 ~ N(0, initial_covariance)."""
+    """`[process]`: x_{k+1} = A x_k + w_k, w ~ N(0, Q), x_0 ~ N(0, initial_covariance), or where else states come from."""
 
     A: Annotated[Matrix, Field(examples=[[[1.0, 0.3], [0.5, 1.001]]])]
     Q: Annotated[Matrix, Field(examples=[[[0.001, 0.0], [0.0, 0.001]]])]
@@ -34,6 +35,13 @@ class ProcessTable(Table):
     units: Annotated[list[Annotated[str, Field(strict=True, min_length=1)]] | None, Field(examples=[["%", "%"]])] = None
 
     directions: Annotated[dict[ProcessName, list[Number]] | None, Field(examples=[{"sum": [1.0, 1.0]}])] = None
+    source: Annotated[Source | None, Field(examples=["file"])] = None
+    state_file: Annotated[str | None, Field(strict=True, examples=["pose.csv"])] = None
+    state_values: Annotated[list[list[Number]] | None, Field(examples=[[[0.0, 0.1], [0.1, 0.1]]])] = None
+    zenoh: Annotated[ProgramTable | None, Field(examples=[{"key": "robot/pose", "connect": "tcp/127.0.0.1:7447"}])] = (
+        None
+    )
+    theory: Annotated[bool | None, Field(strict=True, examples=[True])] = None
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
@@ -64,6 +72,7 @@ class ProcessTable(Table):
             singular = table.get("singular_noise") is True
             found += [(name, what) for name, what in mistakes_of(A, Q, initial, singular) if name in matrices]
             found += _direction_mistakes(table.get("directions"), len(known))
+            found += source_mistakes(table, len(known))
             for name in ("reference", "states", "units"):
                 values = table.get(name)
                 if isinstance(values, list) and len(values) != len(known):
@@ -74,6 +83,11 @@ class ProcessTable(Table):
     def around(self) -> list[float]:
         """The public reference, (n,): states are transmitted as deviations from it. Zeros unless it is given."""
         return [0.0] * len(self.A) if self.reference is None else self.reference
+
+    @property
+    def given(self) -> bool:
+        """Whether the true states come from a recording or a program, and A and Q are only what the receivers assume."""
+        return self.source in {"file", "zenoh"}
 
     @property
     def directions_as_arrays(self) -> dict[str, NDArray[np.float64]]:

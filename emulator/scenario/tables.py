@@ -296,6 +296,11 @@ class Scenario(Table):
         return (LEGITIMATE, *self.eavesdroppers)
 
     @property
+    def of_model(self) -> bool:
+        """Whether the process is only a model: a plant, a recording or a program moves the true states."""
+        return self.plant is not None or self.process.given
+
+    @property
     def driven(self) -> Plant | None:
         """The plant that drives the true states; None if the process alone does."""
         return None if self.plant is None else plant_of(self.plant, self.process.around)

@@ -105,7 +105,7 @@ def conditional_error_of(scenario: Scenario, receiver: str, trials: int) -> Cond
     """
     outcomes_at = outcomes_of(scenario, receiver)
     away = scenario.timeline.outages[receiver] or scenario.window(receiver)
-    if outcomes_at is None or away or scenario.plant is not None:
+    if outcomes_at is None or away or scenario.of_model:
         return None
     outcomes = outcomes_at(_ANY_QUALITY)
     if outcomes.misled or outcomes.leaked or SCHEMES[scenario.encoding.scheme].needs_acknowledgements:

@@ -97,7 +97,7 @@ def leak_is_known(scenario: Scenario, receiver: str) -> bool:
     Not for the legitimate estimator, which has the secret, for schemes that do not say what their packets reveal, for packets
     that may come late, and for a plant, whose noise is not the one that theory describes.
     """
-    if receiver == LEGITIMATE or scenario.plant is not None or scenario.window(receiver):
+    if receiver == LEGITIMATE or scenario.of_model or scenario.window(receiver):
         return False
     return scheme_of(scenario.process.process, scenario.encoding.spec).revealed_bits() is not None
 

@@ -227,10 +227,17 @@ def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tall
         ratio,
         user.trials,
         "median" if heavy else "mean",
-        unknown="no closed form of its error is known" if other_theory.outcomes_at is None else Secrecy.unknown,
+        unknown=_unknown(other_theory),
         ratio_error=scatter,
         leak=None if other.leak is None else other.leak.summary,
     )
+
+
+def _unknown(theory: Expectation) -> str:
+    """Why theory makes no claim about an eavesdropper, as the end of a sentence."""
+    if theory.assumed:
+        return "what theory expects of these states is not known"
+    return "no closed form of its error is known" if theory.outcomes_at is None else Secrecy.unknown
 
 
 def _holds_from(user: Expectation, other: Expectation, slots: int) -> int | None:

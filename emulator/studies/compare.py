@@ -33,7 +33,7 @@ from evedrop.names import LEGITIMATE
 from evedrop.news import Tell
 from evedrop.results.comparison import Cell, Comparison, Needs, PacketLeak, SchemeResult, SimulatedError, Theory
 from evedrop.results.folder import make_private, new_folder, private_pictures, write_private
-from evedrop.results.resolved_scenario import resolved
+from evedrop.results.resolved_scenario import input_texts, resolved
 from evedrop.scenario import Scenario
 from evedrop.score.histogram import LEVELS
 from evedrop.score.leak import revealed_by_packets
@@ -161,7 +161,7 @@ def _needs(scenario: Scenario, packets: PacketCounts) -> Needs:
 
 
 def _leak(scenario: Scenario) -> PacketLeak | None:
-    if scenario.plant is not None:
+    if scenario.of_model:
         return None
     packets = revealed_by_packets(scenario)
     if packets is None:
@@ -194,7 +194,7 @@ def _theory(scenario: Scenario, receiver: str, expected: Expectation) -> Theory 
     if known is not None:
         traces = known.traces(scenario.slots)
         return Theory(float(np.mean(traces)), float(traces[-1]), known.limit, known is not expected)
-    if receiver == LEGITIMATE or receiver in scenario.leaks:
+    if receiver == LEGITIMATE or receiver in scenario.leaks or expected.assumed:
         return None
     found = scheme_of(scenario.process.process, scenario.encoding.spec).error_floor(scenario.slots)
     if found is None:
@@ -212,6 +212,8 @@ def _write(folder: Path, found: Comparison, played: Sequence[tuple[Group, Merger
         make_private(scenarios)
         for group, _ in played:
             write_private(scenarios / f"{group.name}.toml", resolved(group.scenario))
+            for name, text in input_texts(group.scenario).items():
+                write_private(scenarios / name, text)
         draw(private_pictures(folder / "compare"), found)
 
 

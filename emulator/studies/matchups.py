@@ -98,8 +98,9 @@ def matchups_of(
 
     Raises UsageError with every unknown name, ScenarioError if a scheme cannot be used with this process and these links.
     """
-    if schemes is None and scenario.driven is not None and scenario.driven.output_matrix is not None:
-        # A sensor that measures does not decide the first state, which such a scheme needs.
+    measured = scenario.driven is not None and scenario.driven.output_matrix is not None
+    if schemes is None and (measured or scenario.process.given):
+        # A sensor that measures, or is given the states, does not decide the first state, which such a scheme needs.
         schemes = [name for name in SCHEMES if not SCHEMES[name].decides_initial_state()]
     if adversaries is None:
         adversaries = usual_adversaries(scenario)

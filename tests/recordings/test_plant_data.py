@@ -10,7 +10,7 @@ import pytest
 
 from evedrop.errors import DisturbanceError
 from evedrop.recordings import disturbance_file as plant_data
-from evedrop.recordings.disturbance_file import disturbances_text, read_disturbances
+from evedrop.recordings.disturbance_file import read_disturbances, table_text
 
 NAMES = ("P_solar", "P_load")
 UNITS = ("kW", "kW")
@@ -130,5 +130,5 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     """To the same bits, with units and without."""
     rows = [[0.1, 1 / 3], [1e-300, -0.0]]
     for units in (None, UNITS):
-        path = write(tmp_path, disturbances_text(NAMES, units, rows))
+        path = write(tmp_path, table_text(NAMES, units, rows))
         assert read_disturbances(path, NAMES, units) == rows

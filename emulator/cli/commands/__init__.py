@@ -35,6 +35,7 @@ MODULES: Mapping[str, str] = {
     "test": "testing",
     "check": "check",
     "links": "links",
+    "process": "process_fit",
     "selftest": "selftest",
     "brief": "process",
     "health": "process",

@@ -12,12 +12,14 @@ from evedrop.errors import NoAnswer, UsageError
 from evedrop.live.launch.closed_loop_briefs import LoopBriefs
 from evedrop.live.launch.ports import RouterEndpoints, Routers, identities_of, places_at
 from evedrop.live.protocol.brief import AnyBrief, Brief, Flow, Model
+from evedrop.live.protocol.brief_closed_loop import encoded
 from evedrop.live.protocol.brief_parts import (
     EavesdropperPart,
     LegitimatePart,
     LinkEntry,
     ObserverPart,
     Part,
+    ProgramEntry,
     RelayPart,
     RouterPart,
     SensorPart,
@@ -31,6 +33,8 @@ from evedrop.plugins import named_in
 from evedrop.results.folder import new_folder
 from evedrop.scenario import Scenario
 from evedrop.scenario.controlled import monitor_of
+from evedrop.scenario.input_files import states_of
+from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.score.acknowledging import chart_of, way_back_of
 
@@ -41,13 +45,18 @@ _LAUNCHED_PATIENCE = 30  # seconds
 
 
 def flow_of(scenario: Scenario) -> Flow:
-    """The flow control: a window of at most 4096 slots and 64 MiB, and four reports per window; with a pace, one every 40 ms."""
+    """The flow control: a window of at most 4096 slots and 64 MiB, and four reports per window; with a pace, one every 40 ms.
+
+    A program that gives the states may be slow: at its own pace there is a report for each slot.
+    """
     receivers = len(scenario.receivers)
     slot_bytes = 8 * len(scenario.process.A) * scenario.trials * (2 * receivers + 2)
     window = max(2, min(_MOST_SLOTS_AHEAD, _WINDOW_BYTES // slot_bytes))
     batch = max(1, window // 4)
     if scenario.pace:
         batch = max(1, min(batch, round(_REPORT_SECONDS / scenario.pace)))
+    elif scenario.process.source == "zenoh":
+        batch = 1  # the program's pace is not known, and what it has sent should be on disk when it falls silent
     sizes = sizes_of(scenario, batch)
     return Flow(window, batch, scenario.longest_outage, max(sizes.of_kinds.values()))
 
@@ -123,6 +132,7 @@ def briefs_of(
     leaks, back, chart = scenario.leaks, way_back_of(scenario), chart_of(scenario)
     identities = identities_of(run, places, tuple(users))
     loop, flow = LoopBriefs(scenario), flow_of(scenario)
+    states = None if public.source == "zenoh" else states_of(scenario)
     limits = sizes_of(scenario, flow.batch).of_kinds
 
     def modules(**named: Any) -> str | None:
@@ -184,6 +194,8 @@ def briefs_of(
         controller=loop.of_sensor,
         modules=modules(scheme=spec),
         monitor=loop.monitor,
+        states=None if states is None else encoded(states),
+        program=_program_of(public),
     )
     made.append(brief(SENSOR, {**loop.sensor_keys(keys), **keys.secret(scheme.secret_streams)}, sensor))
     legitimate = LegitimatePart(
@@ -218,6 +230,16 @@ def briefs_of(
         )
         made.append(brief(name, keys.eavesdropper(name, table.strategy, table.parameters), eavesdropper))
     return {one.process: one for one in made}
+
+
+def _program_of(process: ProcessTable) -> ProgramEntry | None:
+    """The program that publishes the states; None if none does."""
+    program = process.zenoh
+    if process.source != "zenoh" or program is None:
+        return None
+    return ProgramEntry(
+        program.key, process.states or (), process.around, program.connect, program.listen, program.offsets
+    )
 
 
 def _answers(scenario: Scenario) -> dict[str, Any]:

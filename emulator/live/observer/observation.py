@@ -139,9 +139,9 @@ class ObservedRun:
             patience = self._brief.flow.longest_outage
             self._due = {source: GapDetector(key, patience) for source, key in conductor.keys.items()}
             self._recovery = Recovery(conductor, self._steering, self._brief.flow, self._scenario.pace, tell)
-            batch = self._brief.flow.batch
-            limit = patience_of(patience, self._scenario.pace, batch)
-            self._stall = Stall(limit, batch, lambda: conductor.ask(Where()))
+            program = self._scenario.process.source == "zenoh"
+            limit = patience_of(patience, self._scenario.pace, self._brief.flow.batch, program)
+            self._stall = Stall(limit, self._brief.flow.batch, lambda: conductor.ask(Where()))
             try:
                 conductor.assemble()
                 self._started = self._ended = time.monotonic()
@@ -369,6 +369,8 @@ class ObservedRun:
         self._digest_rows.write(self._writer)
         self._final = self._summary(how)
         self._writer.settle(self._at, self._final)
+        if self._scenario.process.source == "zenoh" and self._joiner.done == self._scenario.slots:
+            write_resolved(self.folder, self._scenario, taken=True)
 
     def finish(self, status: int, how: str, report: Report) -> int:
         """Close the view, write the summary, and tell the launcher; returns the exit status of the run.

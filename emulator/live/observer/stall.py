@@ -19,16 +19,20 @@ from evedrop.live.protocol.keys import writer_of
 from evedrop.live.protocol.whereabouts import Whereabouts
 from evedrop.names import OBSERVER
 
-_LEAST_SECONDS = 5.0  # a busy machine may not let a process work for some seconds
+LEAST_SECONDS = 5.0
+"""The least of these: a busy machine may not let a process work for some seconds."""
 _LOOK_SECONDS = 0.25
 _STEP_SECONDS = (
     1.0  # the most that counts between two looks: time in which the observer itself did not run does not count
 )
 
 
-def patience_of(longest_outage: float, pace: float, batch: int) -> float:
-    """Seconds for which a process may do nothing while the run waits for it; longer with a pace, when it may have no work."""
-    return max(_LEAST_SECONDS, longest_outage) + 2.0 * pace * batch
+def patience_of(longest_outage: float, pace: float, batch: int, program: bool = False) -> float:
+    """Seconds for which a process may do nothing while the run waits for it; longer with a pace, when it may have no work.
+
+    program: whether one gives the states; if it falls silent, the sensor has time to say so itself.
+    """
+    return max(LEAST_SECONDS, longest_outage) + 2.0 * pace * batch + (LEAST_SECONDS if program else 0.0)
 
 
 @final

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 
 from evedrop.entries import (
     MATRIX,
+    NUMBERS,
     SLOT,
     Check,
     anything,
@@ -158,6 +159,23 @@ class RelayPart:
 
 
 @dataclass(frozen=True)
+class ProgramEntry:
+    """The program that publishes the states, and the form of its messages."""
+
+    key: str = field(metadata=entry(text))
+    states: Sequence[str] = field(metadata=entry(_TEXTS))
+    """The names of the states."""
+    reference: Sequence[float] = field(metadata=entry(NUMBERS))
+    """The states' reference, from which deviations are transmitted."""
+    connect: str | None = field(default=None, metadata=entry(text, left_out=True))
+    """The endpoint to connect to; None to listen."""
+    listen: str | None = field(default=None, metadata=entry(text, left_out=True))
+    """The endpoint to listen on."""
+    offsets: Sequence[int] | None = field(default=None, metadata=entry(listed(whole(0)), left_out=True))
+    """Where in a message each state is, in bytes, as f8; None: messages are JSON."""
+
+
+@dataclass(frozen=True)
 class SensorPart:
     """The sensor's part."""
 
@@ -181,6 +199,10 @@ class SensorPart:
     """As the router's."""
     monitor: MonitorEntry | None = field(default=None, metadata=inner(MonitorEntry, left_out=True))
     """None without a detector beside its filter."""
+    states: str | None = field(default=None, metadata=entry(text, left_out=True))
+    """Given states of all slots, as deviations, as `brief_closed_loop.encoded`; None if they are not known before the run."""
+    program: ProgramEntry | None = field(default=None, metadata=inner(ProgramEntry, left_out=True))
+    """The program that gives the states; None if none does."""
 
 
 @dataclass(frozen=True)

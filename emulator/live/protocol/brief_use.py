@@ -56,6 +56,7 @@ def expect_usable(brief: AnyBrief) -> None:
                 _expect_plant(brief, plant, plant.disturbances)
             if part.monitor is not None:
                 _expect_monitor(brief, part.monitor, plant)
+            _expect_states(brief, part)
         case LegitimatePart(controller=loop) as part:
             _expect_keys(brief, _scheme(brief, part).estimator_streams)
             if loop is not None and loop.plant is not None:
@@ -104,6 +105,21 @@ def _expect_plant(brief: AnyBrief, entry: PlantEntry, disturbances: str | None =
         found = decoded(disturbances, brief.slots)
         if found.shape[1] != plant.disturbance_matrix.shape[1] or not np.isfinite(found).all():
             raise ValueError(f"it has {found.shape[1]} disturbances in each slot, or they are not finite")
+
+
+def _expect_states(brief: AnyBrief, part: SensorPart) -> None:
+    n, program = brief.model.process.n, part.program
+    with _using("part.states"):
+        if part.states is not None:
+            found = decoded(part.states, brief.slots)
+            if found.shape[1] != n or not np.isfinite(found).all():
+                raise ValueError(f"it has {found.shape[1]} states, not {n}, or they are not finite")
+    with _using("part.program"):
+        if program is not None:
+            if {len(program.states), len(program.reference), len(program.offsets or program.states)} != {n}:
+                raise ValueError(f"it does not have {n} states, as the model does")
+            if (program.connect is None) == (program.listen is None):
+                raise ValueError("it needs connect or listen, and not both")
 
 
 def _expect_monitor(brief: AnyBrief, entry: MonitorEntry, plant: PlantEntry | None) -> None:

@@ -1,6 +1,6 @@
-"""The true states of a batch: of a process alone, or of a plant that inputs and disturbances move.
+"""The true states of a batch: of a process alone, of a plant that inputs and disturbances move, or given ones.
 
-Source: docs/mathematics.md, model and closed loop.
+Source: docs/mathematics.md, model, closed loop and given states.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from typing import NamedTuple, final
 
 import numpy as np
 
+from evedrop.model.given_states import GivenStates
 from evedrop.model.plant import Drive, Plant
 from evedrop.model.process import Floats, Process, Trajectory
 from evedrop.streams import Batch
@@ -29,7 +30,8 @@ class States(NamedTuple):
 class PlantCore:
     """Computes the states, in order.
 
-    key: of the stream `process`; initial: as for `Trajectory`; disturbances (slots, q): needed with a plant.
+    key: of the stream `process`; initial: as for `Trajectory`; disturbances (slots, q): needed with a plant; given: the states
+    themselves, in place of all of these.
     """
 
     def __init__(
@@ -40,12 +42,16 @@ class PlantCore:
         initial: Floats | None = None,
         plant: Plant | None = None,
         disturbances: Floats | None = None,
+        given: GivenStates | None = None,
     ) -> None:
+        self._given = given
         self._trajectory = Trajectory(process, key, batch, initial, None if plant is None else plant.noise)
         self._drive = None if plant is None or disturbances is None else Drive(plant, disturbances)
 
     def advance(self, slots: range) -> States:
         """The states of the next slots."""
+        if self._given is not None:
+            return States(*self._given.advance(slots))
         if self._drive is None:
             return States(*self._trajectory.advance_block(len(slots)))
         pushed, x, predicted = [], [], []

@@ -1,0 +1,123 @@
+"""The states that a program outside the run publishes, on a Zenoh session of its own.
+
+Source: docs/programs.md.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections import deque
+from types import TracebackType
+from typing import Self, final
+
+import zenoh
+
+from evedrop.errors import BriefError, RunError
+from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
+from evedrop.live.protocol.brief_parts import ProgramEntry
+from evedrop.live.protocol.keys import ZenohConfig
+from evedrop.live.protocol.state_message import MOST_BYTES, read_state
+from evedrop.model.process import Floats
+
+LEAST_SECONDS = 5.0
+"""The least time for which a program may be silent, as for a process of the run."""
+_MOST_WAITING = 100_000
+_CONNECT_SECONDS = 30.0
+
+
+def program_config(entry: ProgramEntry) -> ZenohConfig:
+    """Zenoh configuration of the session: one endpoint, and no scouting for others."""
+    scouting = {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}}
+    if entry.listen is not None:
+        listen = {"endpoints": [entry.listen], "exit_on_failure": True}
+        return {"mode": "router", "listen": listen, "scouting": scouting}
+    connect = {
+        "endpoints": [entry.connect],
+        "timeout_ms": int(_CONNECT_SECONDS * 1000),
+        "exit_on_failure": True,
+        "retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 1.5},
+    }
+    return {"mode": "client", "connect": connect, "scouting": scouting}
+
+
+@final
+class ProgramStates:
+    """Takes one state for each slot from the messages of a program; a context manager.
+
+    newest: whether a slot takes the newest state, and older ones are left out; otherwise each message is the state of a slot.
+    patience: seconds for which the program may be silent.
+    """
+
+    def __init__(self, entry: ProgramEntry, newest: bool, patience: float, clock: Clock = SYSTEM_CLOCK) -> None:
+        """Raises BriefError if there is no router at the endpoint, or if the endpoint cannot be listened on."""
+        self._entry, self._newest = entry, newest
+        self._patience = max(patience, LEAST_SECONDS)
+        self._clock = clock
+        self._heard: deque[bytes] = deque(maxlen=1 if newest else _MOST_WAITING + 1)
+        self._news = threading.Condition()
+        self._waited = 0.0
+        where = entry.listen or entry.connect
+        try:
+            self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(program_config(entry))))
+        except zenoh.ZError as error:
+            what = (
+                "cannot listen at" if entry.listen is not None else f"cannot connect within {_CONNECT_SECONDS:.0f} s to"
+            )
+            raise BriefError(
+                f"process.zenoh: the sensor {what} {where} ({error}); start the router there first, or give another endpoint"
+            ) from error
+        self._subscriber = self._session.declare_subscriber(entry.key, self._hear)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._session.close()
+
+    def _hear(self, sample: zenoh.Sample) -> None:
+        """Keep a message; called on a thread of Zenoh's. Deletions, and messages of another key, are no states."""
+        if sample.kind != zenoh.SampleKind.PUT or str(sample.key_expr) != self._entry.key:
+            return
+        large = len(sample.payload) > MOST_BYTES
+        payload = bytes(MOST_BYTES + 1) if large else sample.payload.to_bytes()
+        with self._news:
+            self._heard.append(payload)
+            self._news.notify()
+
+    @property
+    def waited(self) -> float:
+        """Seconds that the last slot waited for its state."""
+        return self._waited
+
+    def take(self, slots: range) -> Floats:
+        """The state of one slot, as deviations from the reference, (1, n).
+
+        Raises RunError if the program is silent for too long, sends what is not a state, or sends faster than slots go by.
+        """
+        k, began = slots.start, self._clock.monotonic()
+        with self._news:
+            there = self._news.wait_for(lambda: self._heard, self._patience)
+            self._waited = self._clock.monotonic() - began
+            if len(self._heard) > _MOST_WAITING:
+                raise RunError(
+                    f"{self._about}: more than {_MOST_WAITING} states wait at slot {k}: the program sends faster than the run "
+                    "goes; give a pace, so that each slot takes the newest state"
+                )
+            payload = self._heard.popleft() if there else None
+        if payload is None:
+            what = "no state came" if k == 0 else f"no state came after that of slot {k - 1}"
+            raise RunError(
+                f"{self._about}: {what} for {self._patience:.0f} s; check that its program runs and publishes this key, or "
+                "raise longest_outage"
+            )
+        try:
+            return read_state(payload, self._entry)[None]
+        except ValueError as error:
+            raise RunError(f"{self._about}: the message of slot {k} {error}") from error
+
+    @property
+    def _about(self) -> str:
+        return f"{self._entry.key} at {self._entry.listen or self._entry.connect}"

@@ -1,0 +1,113 @@
+"""States that a scenario takes from a recording or from a program, in place of a simulated process.
+
+Source: docs/scenario.md, process; docs/programs.md.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import AfterValidator, Field
+
+from evedrop.model.given_states import LARGEST
+from evedrop.scenario.table import Found, Table, expected, numbers
+from evedrop.scenario.words import as_toml
+
+Source = Literal["model", "file", "zenoh"]
+"""Where the true states come from: `model`, the process itself."""
+_KEY = re.compile(r"[^/*$#?]+(?:/[^/*$#?]+)*")
+_ENDPOINT = re.compile(r"[a-z_-]+/\S+")
+_WORD = re.compile(r"[^\s\[\],\"#](?:[^\[\],\"#\n\r]*[^\s\[\],\"#])?")
+_MOST_BYTES = 65_536
+_EXAMPLE = 'zenoh = { key = "robot/pose", connect = "tcp/127.0.0.1:7447" }'
+
+
+def _key(found: str) -> str:
+    if not _KEY.fullmatch(found):
+        raise expected("one key without wildcards, such as robot/pose")
+    return found
+
+
+def _endpoint(found: str) -> str:
+    if not _ENDPOINT.fullmatch(found):
+        raise expected("an endpoint of Zenoh, such as tcp/127.0.0.1:7447")
+    return found
+
+
+Endpoint = Annotated[str, Field(strict=True, examples=["tcp/127.0.0.1:7447"]), AfterValidator(_endpoint)]
+
+
+class ProgramTable(Table):
+    """`zenoh = {…}` of a process: the key on which a program publishes the states, and how it is reached."""
+
+    key: Annotated[str, Field(strict=True, examples=["robot/pose"]), AfterValidator(_key)]
+    connect: Endpoint | None = None
+    listen: Endpoint | None = None
+    offsets: Annotated[
+        list[Annotated[int, Field(strict=True, ge=0, le=_MOST_BYTES)]] | None, Field(examples=[[4, 12]])
+    ] = None
+
+    @classmethod
+    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+        """Neither or both of `connect` and `listen`."""
+        if (table.get("connect") is None) == (table.get("listen") is None):
+            which = "is missing" if table.get("connect") is None else "is given together with listen"
+            return [
+                (
+                    "connect",
+                    f"{which}; expected the endpoint of a router that the program uses, such as connect = "
+                    '"tcp/127.0.0.1:7447", or listen, the endpoint that the program itself connects to',
+                )
+            ]
+        return []
+
+
+def source_mistakes(table: Mapping[str, Any], n: int) -> Iterator[Found]:
+    """Mistakes in the entries of `[process]` that say where states come from; n: the number of states.
+
+    The table is unchecked: any entry may be missing or malformed.
+    """
+    source, names = table.get("source"), table.get("states")
+    held = {"state_file": table.get("state_file"), "state_values": table.get("state_values")}
+    if source is None:
+        entries = {**held, "zenoh": table.get("zenoh")}
+        kinds = [("zenoh" if name == "zenoh" else "file", name) for name, value in entries.items() if value is not None]
+        yield from (("source", f'is missing, but {name} is given; expected source = "{kind}"') for kind, name in kinds)
+    if source == "file" and all(value is None for value in held.values()):
+        yield "state_file", 'is missing; expected state_file = "pose.csv", or state_values'
+    if source == "zenoh" and table.get("zenoh") is None:
+        yield "zenoh", f"is missing; expected {_EXAMPLE}"
+    if source in {"file", "zenoh"} and names is None:
+        yield "states", 'is missing; expected the names of the states in file or message, such as states = ["x", "y"]'
+    for entry in ("states", "units") if source in {"file", "zenoh"} else ():
+        found = table.get(entry)
+        words = found if isinstance(found, list) and all(isinstance(one, str) for one in found) else []
+        wrong = next((one for one in words if not _WORD.fullmatch(one)), None)
+        if wrong is not None:
+            yield entry, f'has {as_toml(wrong)}; expected words for the first line of a CSV file, without [ ] , " and #'
+        elif entry == "states" and len({*words}) < len(words):
+            yield entry, "has a name twice; expected different names"
+    if source not in {"file", "zenoh"} and table.get("theory") is not None:
+        yield "theory", "is given, but the states are simulated, and theory describes them; remove the line"
+    program = table.get("zenoh")
+    offsets = program.get("offsets") if isinstance(program, Mapping) else None
+    if isinstance(offsets, list) and len(offsets) != n:
+        yield "zenoh.offsets", f"has {len(offsets)} entries; expected {n}, one for each state"
+    yield from _row_mistakes(held["state_values"], n)
+
+
+def _row_mistakes(rows: Any, n: int) -> Iterator[Found]:
+    if not numbers(rows):
+        return
+    wrong = next((i for i, row in enumerate(rows) if len(row) != n), None)
+    if wrong is not None:
+        yield "state_values", f"row {wrong} has {len(rows[wrong])} numbers; expected {n}, one for each state"
+        return
+    values = np.array(rows, np.float64).reshape(-1, n)
+    large = np.argwhere(~(np.abs(values) <= LARGEST))
+    if large.size:
+        i, j = large[0]
+        yield "state_values", f"row {i} has {values[i, j]:g}; expected finite numbers of up to {LARGEST:g}"

@@ -1,0 +1,142 @@
+"""Live runs whose states come from a program: a real one, which knows nothing of Evedrop."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evedrop.api import montecarlo, run
+from evedrop.errors import RunError
+from evedrop.live.launch.preloading import preloaded
+from evedrop.loading import checked
+from evedrop.memory.montecarlo import Plan
+from evedrop.ports import free_port
+from evedrop.recordings.disturbance_file import table_text
+from evedrop.results.diff import difference
+from evedrop.results.writer import Results, load_results
+from evedrop.scenario import Scenario
+from tests.builders import MARGINAL, digests_of, process_table
+
+PLAYER = Path(__file__).parents[2] / "docs" / "examples" / "csv_player.py"
+ROWS = np.random.default_rng(5).standard_normal((80, 2)).cumsum(axis=0).tolist()
+
+
+def scenario_of(slots: int, process: dict[str, Any], **more: Any) -> Scenario:
+    """A scenario whose states are given, with a reference and two eavesdroppers."""
+    link = {"link": {"quality": 0.8}}
+    own = {**process_table(MARGINAL), "states": ["x", "v"], "reference": [0.1, -0.7]}
+    return checked(
+        {
+            "title": "A program",
+            "slots": slots,
+            "trials": 2,
+            "longest_outage": 5.0,
+            "process": {**own, **process},
+            "encoding": {"scheme": "innovation", "state_probability": 0.4},
+            "legitimate": link,
+            "eavesdroppers": {"smart": {"strategy": "smart", **link}, "naive": {"strategy": "naive", **link}},
+            **more,
+        },
+        "file",
+    )
+
+
+def program(**entries: Any) -> dict[str, Any]:
+    """The entries of a process whose states a program publishes at a free port, which the sensor listens on."""
+    return {"source": "zenoh", "zenoh": {"key": "robot/pose", "listen": f"tcp/127.0.0.1:{free_port()}", **entries}}
+
+
+@contextmanager
+def playing(folder: Path, source: dict[str, Any], lines: list[str], every: float = 0.0) -> Iterator[None]:
+    """Play lines of a CSV file to the sensor, in a process."""
+    path = folder / "pose.csv"
+    path.write_text("".join(f"{line}\n" for line in ["x [m],v", *lines]))
+    where = ["--connect", source["zenoh"]["listen"]]
+    command = [sys.executable, str(PLAYER), str(path), "robot/pose", *where, "--every", str(every)]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as player:
+        try:
+            yield
+        finally:
+            player.kill()
+
+
+def lines_of(rows: list[list[float]]) -> list[str]:
+    """Rows as lines of a file."""
+    return table_text(["x", "v"], None, rows).splitlines()[1:]
+
+
+def rows_of(results: Results) -> list[dict[str, Any]]:
+    """The rows of recorded trials, by slot and receiver."""
+    return sorted(results.trials.to_pylist(), key=lambda row: (row["slot"], row["peer"]))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def servers() -> Iterator[None]:
+    """One set of fork servers for all runs."""
+    with preloaded():
+        yield
+
+
+def test_a_run_over_a_program_can_be_repeated(tmp_path: Path) -> None:
+    """At the program's own pace, each message is a slot: the digests are those of its file, and of the recorded run."""
+    source = program()
+    with playing(tmp_path, source, lines_of(ROWS)):
+        live = run(scenario_of(60, source), out=tmp_path / "live")
+    assert live.summary["ended"] == "complete"
+    of_file = scenario_of(60, {"source": "file", "state_values": ROWS})
+    memory = montecarlo(of_file, trials=2, out=tmp_path / "memory", plan=Plan(workers=1))
+    again = montecarlo(tmp_path / "live", trials=2, out=tmp_path / "again", plan=Plan(workers=1))
+    assert digests_of(live) == digests_of(memory) == digests_of(again)
+    assert difference(live, again).same
+    assert live.summary["peers"]["naive"]["expected_trace_covariance"] is None
+    assert (tmp_path / "live" / "states.csv").read_text() == (tmp_path / "again" / "states.csv").read_text()
+
+
+def test_a_paced_run_takes_the_newest_state(tmp_path: Path) -> None:
+    """Of a program that sends faster than slots go by: never a state twice, never an older one; and the run can be repeated."""
+    source = program()
+    rows = [[float(k), -float(k)] for k in range(4000)]
+    with playing(tmp_path, source, lines_of(rows), every=0.002):
+        live = run(scenario_of(20, source, pace=0.02), out=tmp_path / "live")
+    assert live.summary["ended"] == "complete"
+    taken = np.loadtxt(tmp_path / "live" / "states.csv", delimiter=",", skiprows=1)[:, 0]
+    assert len(taken) == 20
+    assert np.all(np.diff(taken) > 0.5)
+    assert taken[-1] > 40.0
+    again = montecarlo(tmp_path / "live", trials=2, out=tmp_path / "again", plan=Plan(workers=1))
+    assert difference(live, again).same
+
+
+def test_a_message_that_is_no_state_ends_the_run(tmp_path: Path) -> None:
+    """The message names key, endpoint, slot and value; the slots so far can be repeated."""
+    source = program()
+    lines = [*lines_of(ROWS[:30]), "nan,1.0", *lines_of(ROWS[30:])]
+    with playing(tmp_path, source, lines), pytest.raises(RunError) as caught:
+        run(scenario_of(60, source), out=tmp_path / "live")
+    where = source["zenoh"]["listen"]
+    assert f"robot/pose at {where}: the message of slot 30 has x = nan; expected a finite number" in str(caught.value)
+    states = (tmp_path / "live" / "states.csv").read_text().splitlines()
+    assert states[0] == "x,v"
+    assert len(states) == 31
+    kept: dict[str, Any] = {"process__source": "file", "slots": 30}
+    again = montecarlo(tmp_path / "live", trials=2, out=tmp_path / "again", plan=Plan(workers=1), **kept)
+    live = load_results(tmp_path / "live")
+    assert (live.summary["slots"], live.trials.num_rows) == (30, 90)
+    assert rows_of(again) == rows_of(live)
+
+
+@pytest.mark.long
+def test_a_program_that_dies_ends_the_run(tmp_path: Path) -> None:
+    """So does one that never starts: the sensor names the slot."""
+    source = program()
+    with playing(tmp_path, source, lines_of(ROWS[:30])), pytest.raises(RunError, match="after that of slot 29 for 5 s"):
+        run(scenario_of(60, source), out=tmp_path / "died")
+    with pytest.raises(RunError, match=r"robot/pose at .*: no state came for 5 s; check that its program runs"):
+        run(scenario_of(60, program()), out=tmp_path / "absent")
