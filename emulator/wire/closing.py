@@ -5,10 +5,13 @@ Source: docs/wire.md, the summary.
 
 from __future__ import annotations
 
+import io
+import shutil
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
+from rich.console import Console
 from rich.table import Table
 
 from evedrop.score.summary import Judged
@@ -38,6 +41,13 @@ def wire_table(summary: Mapping[str, Any]) -> Table:
             f"{link['gap_messages']:,}",
         )
     return table
+
+
+def closing_lines(summary: Mapping[str, Any]) -> list[str]:
+    """The closing table as text, and the sentences."""
+    text = io.StringIO()
+    Console(file=text, width=max(100, shutil.get_terminal_size().columns)).print(wire_table(summary))
+    return [*(line.rstrip() for line in text.getvalue().splitlines()), *wire_sentences(summary)]
 
 
 def wire_sentences(summary: Mapping[str, Any]) -> Iterator[str]:

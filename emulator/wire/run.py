@@ -9,27 +9,61 @@ from collections.abc import Callable
 from pathlib import Path
 
 from evedrop.output import warn
-from evedrop.results.folder import make_private
+from evedrop.results.folder import make_private, new_folder, write_private
 from evedrop.signals import stop_on_signals
+from evedrop.wire.closing import closing_lines
 from evedrop.wire.conductor import WireConductor
+from evedrop.wire.control import WireControl
+from evedrop.wire.file import resolved_wire
 from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal_reader import JOURNAL_FOLDER
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.relay import WireRelay
+from evedrop.wire.summary import WireSummary
 
 
 def run_wire(plan: WirePlan, out: Path, *, seconds: float | None = None, say: Callable[[str], None] = print) -> int:
     """Run a wire until a signal, or for some seconds; returns the exit status.
 
-    out: its results folder, which may be that of an earlier start; say: for a line about each side and each event.
+    out: its results folder, empty or that of an earlier start; say: for a line about each side and each event, and for the
+    summary. Raises UsageError if the folder or a side cannot be used.
     """
-    make_private(out)
-    with (
-        stop_on_signals() as stop,
-        WireJournal(out, plan) as journal,
-        WireRelay(plan, journal, warn) as relay,
-        WireConductor(plan, relay, say),
-    ):
-        for name, endpoints in relay.endpoints.items():
-            say(f"{name} {' '.join(endpoints)}")
-        stop.wait(seconds)
-    return 0
+    if (out / JOURNAL_FOLDER).is_dir():
+        make_private(out)
+    else:
+        new_folder(out)
+    events: list[str] = []
+
+    def happened(line: str) -> None:
+        events.append(line)
+        say(line)
+
+    with stop_on_signals() as stop:
+        with WireJournal(out, plan) as journal:
+            summary = WireSummary(plan, journal)
+            _write_plan(out, plan)
+            if journal.recovered:
+                say(
+                    f"{journal.recovered:,} messages were recovered from an earlier start, which was killed; their numbers go on"
+                )
+            with (
+                WireRelay(plan, journal, warn) as relay,
+                WireConductor(plan, relay, happened) as conductor,
+                WireControl(out, relay, conductor, summary, journal, events),
+            ):
+                for name, endpoints in relay.endpoints.items():
+                    say(f"{name} {' '.join(endpoints)}")
+                stop.wait(seconds)
+        status = summary.finish(out)
+    for line in closing_lines(summary.as_dict()):
+        say(line)
+    say(f"results: {out}")
+    return status
+
+
+def _write_plan(out: Path, plan: WirePlan) -> None:
+    """Write wire.toml, the complete file of the wire."""
+    try:
+        write_private(out / "wire.toml", resolved_wire(plan))
+    except OSError as error:
+        warn(f"wire.toml cannot be written ({error}); the wire goes on")

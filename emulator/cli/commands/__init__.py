@@ -19,6 +19,8 @@ MODULES: Mapping[str, str] = {
     "run": "run",
     "montecarlo": "montecarlo",
     "link": "steer",
+    "partition": "steer",
+    "heal": "steer",
     "pause": "steer",
     "resume": "steer",
     "step": "steer",

@@ -1,4 +1,4 @@
-"""The commands for a run in progress: each asks the run's observer, prints the answer, and ends.
+"""The commands for a run or wire in progress: each asks the run's observer, or the wire, prints the answer, and ends.
 
 Slow imports are made only by the command that needs them.
 """
@@ -30,6 +30,18 @@ def link(options: argparse.Namespace) -> int:
     return _ask(options.run, "link", f"link {options.name}", event=event)
 
 
+def partition(options: argparse.Namespace) -> int:
+    """Let nothing pass between two sides of a wire."""
+    event = {"partition": [options.one, options.other]}
+    return _ask(options.run, "link", f"partition {options.one} {options.other}", event=event)
+
+
+def heal(options: argparse.Namespace) -> int:
+    """End the partition of two sides of a wire."""
+    event = {"join": [options.one, options.other]}
+    return _ask(options.run, "link", f"heal {options.one} {options.other}", event=event)
+
+
 def pause(options: argparse.Namespace) -> int:
     """Hold the run before its next slot."""
     return _ask(options.run, "pause", "pause")
@@ -53,12 +65,15 @@ def status(options: argparse.Namespace) -> int:
     """Print the run's status."""
     from evedrop.live.network.control_file import read_controls
     from evedrop.live.network.operator import Request
-    from evedrop.live.protocol.status import status_of_shards
+    from evedrop.live.protocol.status import RunStatus, status_of_shards
 
     answers = [
-        _answer(options.run, control, Request("status"), "status", _PATIENCE) for control in read_controls(options.run)
+        _answer(options.run, control, Request("status"), "status", _PATIENCE).status
+        for control in read_controls(options.run)
     ]
-    found = status_of_shards([answer.status for answer in answers if answer.status is not None])
+    of_runs = [answer for answer in answers if isinstance(answer, RunStatus)]
+    of_wires = [answer for answer in answers if answer is not None and not isinstance(answer, RunStatus)]
+    found = of_wires[0] if of_wires else status_of_shards(of_runs)
     print(json.dumps(asdict(found), ensure_ascii=False) if options.json else "\n".join(found.lines))
     return 0
 
@@ -138,11 +153,11 @@ def _put(changes: dict[str, Any], name: str, dotted: str, text: str) -> None:
 
 
 def _going_on(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("run", type=Path, metavar="RUN", help="the results folder of a run in progress")
+    parser.add_argument("run", type=Path, metavar="RUN", help="the results folder of a run or wire in progress")
 
 
 def _changed_link(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("name", metavar="NAME", help="the receiver whose link it is")
+    parser.add_argument("name", metavar="NAME", help="the receiver whose link it is; of a wire, the link")
     parser.add_argument(
         "changes",
         nargs="+",
@@ -151,14 +166,23 @@ def _changed_link(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _two_sides(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("one", metavar="A", help="a side of the wire")
+    parser.add_argument("other", metavar="B", help="another side of the wire")
+
+
 def _slots(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("slots", type=int, metavar="N", help="number of slots")
 
 
 COMMANDS = (
-    Command("link", link, "change, cut or heal a link of a run in progress", (_going_on, _changed_link)),
+    Command("link", link, "change, cut or heal a link of a run or wire in progress", (_going_on, _changed_link)),
+    Command(
+        "partition", partition, "let nothing pass between two sides of a wire in progress", (_going_on, _two_sides)
+    ),
+    Command("heal", heal, "end the partition of two sides of a wire in progress", (_going_on, _two_sides)),
     Command("pause", pause, "hold a run in progress between two slots", (_going_on,)),
     Command("resume", resume, "let a held run go on", (_going_on,)),
     Command("step", step, "let a run go on for some slots, and hold it again", (_going_on, _slots)),
-    Command("status", status, "the status of a run in progress", (_going_on, as_json)),
+    Command("status", status, "the status of a run or wire in progress", (_going_on, as_json)),
 )

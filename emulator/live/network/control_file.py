@@ -48,7 +48,7 @@ def remove_control(folder: Path) -> None:
 def no_run(folder: Path, why: str) -> UsageError:
     """The error for steering a run that is not going on; why: how that was found out."""
     return UsageError(
-        f"no run is going on in {folder}; {why}; give the results folder of a run between its start and its end"
+        f"no run is going on in {folder}; {why}; give the results folder of a run or wire between its start and its end"
     )
 
 

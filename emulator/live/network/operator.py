@@ -19,10 +19,12 @@ from evedrop.live.protocol.codec import Reader, pack
 from evedrop.live.protocol.envelope import enclosed, payload_of
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.status import RunStatus
+from evedrop.live.protocol.wire_status import WireStatus
 from evedrop.names import OBSERVER
 
 DOES = ("link", "pause", "resume", "step", "status")
 """The possible requests."""
+_STATUSES: Mapping[str, type[RunStatus | WireStatus]] = {"status": RunStatus, "wire": WireStatus}
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,8 @@ class Request:
     do: str
     """One of `DOES`."""
     event: Mapping[str, Any] | None = None
-    """For `link`: the entries of an [[event]] of a scenario, except its time."""
+    """For `link`: the entries of an [[event]] of a scenario or a wire, except its time; on a wire also
+    `heal` and `join`, which end a cut and a partition."""
     slots: int | None = None
     """For `step`."""
 
@@ -64,15 +67,15 @@ class Answer:
     """The effect, as a sentence."""
     refused: tuple[str, ...] = ()
     """The mistakes in the request, a line each; then nothing has changed."""
-    status: RunStatus | None = None
-    """The run's status, if the request was `status`."""
+    status: RunStatus | WireStatus | None = None
+    """The status of the run or the wire, if the request was `status`."""
 
     def pack(self) -> bytes:
         """Encode it as a message."""
         if self.refused:
             return pack({"refused": list(self.refused)})
         if self.status is not None:
-            return pack({"status": asdict(self.status)})
+            return pack({"wire" if isinstance(self.status, WireStatus) else "status": asdict(self.status)})
         return pack({"k": self.slot, "said": self.said})
 
 
@@ -81,13 +84,14 @@ def read_answer(key: str, payload: bytes) -> Answer:
     message = Reader(key, payload)
     if message.has("refused"):
         return Answer(refused=message.names("refused"))
-    if message.has("status"):
-        found = message.map("status")
-        try:
-            expect(table_of(RunStatus), "status", found)
-        except ValueError as error:
-            raise message.malformed(str(error), "the status of a run") from error
-        return Answer(status=read(RunStatus, found))
+    for name, kind in _STATUSES.items():
+        if message.has(name):
+            found = message.map(name)
+            try:
+                expect(table_of(kind), name, found)
+            except ValueError as error:
+                raise message.malformed(str(error), f"the status of a {'run' if name == 'status' else name}") from error
+            return Answer(status=read(kind, found))
     return Answer(message.integer("k"), message.text("said"))
 
 

@@ -11,6 +11,7 @@ from evedrop.errors import MalformedMessage
 from evedrop.live.network.operator import Answer, read_answer
 from evedrop.live.protocol.codec import pack
 from evedrop.live.protocol.status import LinkStatus, RunStatus, status_of_shards
+from evedrop.live.protocol.wire_status import WireLinkStatus, WireStatus
 from evedrop.news import RunEvent
 
 KEY = "evedrop/r1/control/observer"
@@ -72,3 +73,22 @@ def test_the_status_of_shards_is_that_of_the_slowest_with_the_packets_of_all() -
     assert (found.slot, found.state, found.events) == (40, "held", STATUS.events)
     assert found.processes == {"sensor": True, "smart": False}
     assert found.links == {"smart": LinkStatus(80, 60, 0.75), "naive": LinkStatus(0, 0, None)}
+
+
+WIRE = WireStatus(
+    12.5, {"robot": ["tcp/127.0.0.1:7448"]}, {"scan": WireLinkStatus(4, 3, False)}, ["2.0 s: cut scan"], "complete"
+)
+
+
+def test_the_status_of_a_wire_is_read_as_it_was_sent() -> None:
+    """And shown a line for each side, link and event."""
+    assert read_answer(KEY, Answer(status=WIRE).pack()).status == WIRE
+    assert list(WIRE.lines) == [
+        "12.5 s, journal complete",
+        "side robot: tcp/127.0.0.1:7448",
+        "link scan: 3 of 4 messages delivered, 0.7500",
+        "event at 2.0 s: cut scan",
+    ]
+    assert str(WireLinkStatus(0, 0, True)) == "0 of 0 messages delivered, –, cut"
+    with pytest.raises(MalformedMessage, match=r"wire.seconds is -1, expected .* the status of a wire"):
+        read_answer(KEY, pack({"wire": {**asdict(WIRE), "seconds": -1}}))
