@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,11 @@ def load_wire(path: str | Path, changes: Mapping[str, Any] | None = None) -> Wir
         example = "a wire file is a TOML file; `evedrop wire --example` prints one"
         raise UsageError(f"{shown(path)} cannot be read ({error}); {example}") from error
     return wire_of(tables_in(text, shown(path)), shown(path), changes, folder=path.parent)
+
+
+def example_wire() -> str:
+    """A commented wire file to start from."""
+    return resources.files("evedrop.wire").joinpath("examples", "robot.toml").read_text(encoding="utf-8")
 
 
 def wire_of(

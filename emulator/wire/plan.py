@@ -12,6 +12,9 @@ from typing import Any
 
 import zenoh
 
+HISTORY = "/@adv/"
+"""What follows the key of an advanced publisher in the keys of its history."""
+
 
 @dataclass(frozen=True)
 class SideTls:
@@ -73,7 +76,7 @@ class WireLink:
         return self.expression.intersects(key) or self._takes_history(str(key))
 
     def _takes_history(self, key: str) -> bool:
-        before, verbatim, _ = key.partition("/@adv/")
+        before, verbatim, _ = key.partition(HISTORY)
         return bool(verbatim) and self.expression.intersects(zenoh.KeyExpr(before))
 
 

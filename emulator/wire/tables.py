@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import zenoh
 from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic_core import PydanticCustomError
 
 from evedrop.model.checks import as_toml
 from evedrop.model.delays import DELAY_MODELS
@@ -26,21 +27,24 @@ DEFAULT_QUEUE = 256_000
 _LINK_NAME = re.compile(r"[a-z][a-z0-9_-]{0,79}")
 
 
-def _key_expression(text: str) -> str:
+def key_expression_mistake(text: str) -> str | None:
+    """Why Zenoh refuses a key expression, in words that follow it, and what it would accept; None if it accepts it."""
     try:
         zenoh.KeyExpr(text)
     except zenoh.ZError as error:
-        raise expected("a key expression that Zenoh accepts", _remedy(text, error)) from error
+        why = str(error).partition("`: ")[2].rpartition(" at /")[0]
+        try:
+            hint = f"; did you mean {zenoh.KeyExpr.autocanonize(text)}?"
+        except zenoh.ZError:
+            hint = "; expected one such as robot/scan/**"
+        return f", which Zenoh refuses ({why}){hint}"
+    return None
+
+
+def _key_expression(text: str) -> str:
+    if (why := key_expression_mistake(text)) is not None:
+        raise PydanticCustomError("expected", "one value", {"said": why})
     return text
-
-
-def _remedy(text: str, error: zenoh.ZError) -> str:
-    """What Zenoh has against a key expression, and the one that it would accept if it can be told."""
-    why = str(error).partition("`: ")[2].rpartition(" at /")[0]
-    try:
-        return f" ({why}); did you mean {zenoh.KeyExpr.autocanonize(text)}?"
-    except zenoh.ZError:
-        return f" ({why})"
 
 
 def _side_name(name: str) -> str:

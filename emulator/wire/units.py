@@ -36,6 +36,12 @@ def in_seconds(text: str) -> float | None:
     return in_unit(text, _TIMES)
 
 
+def seconds_of(text: str) -> float | None:
+    """The seconds in a text such as "20 ms" or "0.02", up to `LONGEST_SECONDS`; None if it is neither."""
+    found = in_seconds(text if text.strip()[-1:].isalpha() else f"{text} s")
+    return found if found is not None and found <= LONGEST_SECONDS else None
+
+
 def _seconds(value: Any) -> Any:
     return _read(value, _TIMES, 'seconds, or a text such as "20 ms"')
 

@@ -43,6 +43,11 @@ from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.writer import ResultsWriter
 from evedrop.score.sums import SlotSums
 from evedrop.view.replay import replay
+from evedrop.wire.check import key_lines, warnings_of_wire, wire_lines
+from evedrop.wire.fates import KeyFates
+from evedrop.wire.file import example_wire, load_wire, resolved_wire, wire_of
+from evedrop.wire.law import expected
+from evedrop.wire.timeline import moments
 from tests.fuzz.mutation import Mutator, words_of
 from tests.live.network import golden
 
@@ -175,6 +180,31 @@ def _set_examples() -> list[bytes]:
     keys = ("slots=40", "title=x", "legitimate.link.quality=0.5", "eavesdroppers.smart.link={quality = 0.3}",
             "process.A.0.0=1.5", "event.0={at = 3, cut = \"legitimate\"}", "expect=[]", "process.Q=[[1.0]]")  # fmt: skip
     return [key.encode() for key in keys]
+
+
+# Wires
+
+
+@cache
+def _wires() -> list[bytes]:
+    """The example, and one with a bit of everything."""
+    return [example_wire().encode(), _EXAMPLES.joinpath("wire.toml").read_bytes()]
+
+
+def _wire(data: bytes, folder: Path) -> None:
+    """As `evedrop wire --check` does; what is accepted can be written, read again and carried out."""
+    if _names_code(data):
+        return
+    path = folder / "wire.toml"
+    path.write_bytes(data)
+    plan = load_wire(path)
+    assert wire_of(tomllib.loads(resolved_wire(plan))) == plan
+    assert [*wire_lines(plan), *key_lines(plan, ["robot/scan"])]
+    assert list(warnings_of_wire(plan)) is not None
+    assert moments(plan)
+    for link in plan.links:
+        KeyFates(link, "robot/scan", "put", plan.seed).next()
+        expected(link.settings, [], [range(10)])
 
 
 # Tables that a scenario names
@@ -361,6 +391,12 @@ _WALK = b"k,received,delay\n0,1,2.5\n1,0,\n2,1,3\n"
 
 FILES: dict[str, Reader] = {
     "scenario": Reader(_scenarios, read_scenario, (raw, _as_toml, _as_toml, _as_toml), words=_scenario_words),
+    "wire": Reader(
+        _wires,
+        _wire,
+        (raw, _as_toml, _as_toml),
+        words=lambda: words_of([tomllib.loads(one.decode()) for one in _wires()]),
+    ),
     "change": Reader(_set_examples, read_change, (raw,)),
     "disturbances": Reader(lambda: [_DAY], _disturbances, (raw, _cells)),
     "disturbances-gz": Reader(

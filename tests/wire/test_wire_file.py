@@ -195,8 +195,8 @@ def test_all_mistakes_at_once() -> None:
         'side.base.listen.1: is "tcp/127.0.0.1"; expected PROTOCOL/HOST:PORT with the protocol tcp, tls, quic, ws or '
         "unixsock-stream, such as tcp/127.0.0.1:7448",
         "link.0.quality: is 1.5; expected a number from 0 to 1, such as 0.9",
-        'link.0.keys: is "a//b"; expected a key expression that Zenoh accepts (empty chunks are forbidden, as well as '
-        "leading and trailing slashes)",
+        'link.0.keys: is "a//b", which Zenoh refuses (empty chunks are forbidden, as well as leading and trailing slashes); '
+        "expected one such as robot/scan/**",
         'event.0.at: is "12"; expected seconds, or a text such as "20 ms"; the units are us, µs, ms, s, min, h, such as "12 s"',
         'largest: is "64 Mb"; expected bytes, or a text such as "256 kB"; the units are B, kB, MB, GB, KiB, MiB, GiB, such as '
         '"64 MB"',
@@ -214,7 +214,7 @@ def test_all_mistakes_at_once() -> None:
         ("", "side: is missing; expected side"),
         ("[side.robot]", "side: has fewer than 2 entries; expected at least that many"),
         ("side = 3", "side: is 3; expected a table"),
-        (f"{BASE}keys = 'a/**/**'", "link.0.keys: is \"a/**/**\"; expected a key expression that Zenoh accepts (`**/**` must be "
+        (f"{BASE}keys = 'a/**/**'", "link.0.keys: is \"a/**/**\", which Zenoh refuses (`**/**` must be "
          "replaced by `**` to reach canon-form); did you mean a/**?"),
         (BASE.replace('"base"', '"robot"'), 'link.0.to: is "robot", where the link begins; expected another side'),
         (BASE.replace("7449", "7448"), 'side.base.listen: is "tcp/127.0.0.1:7448", the same place at which side robot listens; '

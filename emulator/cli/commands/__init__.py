@@ -38,6 +38,7 @@ MODULES: Mapping[str, str] = {
     "check": "check",
     "links": "links",
     "process": "process_fit",
+    "wire": "wire",
     "selftest": "selftest",
     "brief": "process",
     "health": "process",

@@ -1,0 +1,200 @@
+"""`evedrop wire --check`: what a file means, which link a key takes, and warnings; and the rest of the command line."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from evedrop.cli.main import main
+from evedrop.wire.check import key_lines, warnings_of_wire, wire_lines
+from evedrop.wire.file import example_wire, wire_of
+from evedrop.wire.plan import WirePlan
+
+
+def plan_of(*links: Mapping[str, object], lossless: str = "", **robot: object) -> WirePlan:
+    """A wire with these links."""
+    sides = {"robot": robot, "base": {}, "third": {}}
+    return wire_of({"side": sides, "link": list(links), "lossless": [lossless] if lossless else []})
+
+
+TO_BASE = {"from": "robot", "to": "base"}
+
+
+def test_the_example(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The command prints the example, and then what that file means, with the link of each key in each direction."""
+    assert main(["wire", "--example"]) == 0
+    text = capsys.readouterr().out
+    assert text == example_wire()
+    path = tmp_path / "robot.toml"
+    path.write_text(text)
+    keys = ["robot/scan/front", "robot/**", "robot/stop", "robot/@config/x"]
+    assert main(["wire", "--check", str(path), *keys, "--set", "link.1.quality=0.5"]) == 0
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    assert printed.out.splitlines() == [
+        f"{path}: 3 sides, 4 links, 2 events: no mistakes",
+        "  side  robot     tcp/127.0.0.1:7448",
+        "  side  base      tcp/127.0.0.1:7449",
+        "  side  listener  tcp/127.0.0.1:7450",
+        '  link  scan      robot → base  robot/scan/**  loss = { model = "gilbert-elliott", p = 0.01, r = 0.2 }, '
+        'rate = 2000000.0, queue = 256000, delay = { model = "normal", mean = 0.02, deviation = 0.005 }',
+        '  link  radio     robot → base  **  loss = { model = "bernoulli", quality = 0.5 }, '
+        'delay = { model = "constant", value = 0.01 }',
+        '  link  orders    base → robot  **  loss = { model = "bernoulli", quality = 0.99 }',
+        '  link  tap       robot → listener (tap)  **  loss = { model = "bernoulli", quality = 0.6 }',
+        "  never lost  robot/stop",
+        "  key  robot/scan/front",
+        "    robot → base  scan",
+        "    robot → listener  tap (a copy of publications, no queries)",
+        "    base → robot  orders",
+        "  key  robot/**",
+        "    robot → base  scan (which takes only some of these keys)",
+        "    robot → listener  tap (a copy of publications, no queries)",
+        "    base → robot  orders",
+        "  key  robot/stop  (never lost)",
+        "    robot → base  radio",
+        "    robot → listener  tap (a copy of publications, no queries)",
+        "    base → robot  orders",
+        "  key  robot/@config/x",
+        "    robot → base  no link takes it",
+        "    robot → listener  no link takes it",
+        "    base → robot  no link takes it",
+        "    wildcards do not match the parts of a key that begin with @: name them in a link's keys",
+    ]
+
+
+def test_what_a_side_asks_for_and_a_link_without_faults() -> None:
+    """Users, certificates and keys are told; correlation too."""
+    tls = {"certificate": "a", "key": "b", "authority": "c"}
+    guarded: dict[str, Any] = {
+        "listen": "tls/127.0.0.1:7",
+        "tls": tls,
+        "users": {"ada": "x"},
+        "keys": "a/**",
+        "connect": "tls/h:8",
+    }
+    tied = {**TO_BASE, "keys": "b", "correlation": {"with": "robot-base", "strength": 0.5}}
+    assert list(wire_lines(plan_of(TO_BASE, tied, **guarded))) == [
+        "side  robot         tls/127.0.0.1:7, connects to tls/h:8  (users ada; certificates required; only a/**)",
+        "side  base          tcp/127.0.0.1:0",
+        "side  third         tcp/127.0.0.1:0",
+        "link  robot-base    robot → base  **  no faults",
+        "link  robot-base-2  robot → base  b  losses tied to robot-base with strength 0.5",
+    ]
+
+
+def test_warnings() -> None:
+    """Links that never take a key, sides without a link, links without a way back, and sides open to other machines."""
+    plan = plan_of(TO_BASE, {**TO_BASE, "keys": "a/**"}, listen=["tcp/0.0.0.0:7", "tcp/127.0.0.1:8"])
+    assert list(warnings_of_wire(plan)) == [
+        "link robot-base-2 takes no key: robot-base, which comes first, takes all of them; move robot-base-2 up",
+        "side robot listens on tcp/0.0.0.0:7, which other machines may reach, without encryption (tls) and without users or an "
+        "authority",
+        "side third has no link: nothing crosses to it or from it",
+        "no link leads from base back to robot: queries from robot get no replies",
+    ]
+    back = {"from": "base", "to": "robot"}
+    tap = {"from": "robot", "to": "third", "tap": True}
+    tls = {"certificate": "a", "key": "b", "authority": "c"}
+    assert not list(
+        warnings_of_wire(plan_of({**TO_BASE, "keys": "a/**"}, TO_BASE, back, tap, listen="tls/[::]:7", tls=tls))
+    )
+
+
+def test_keys_that_zenoh_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """All of them are named."""
+    path = tmp_path / "wire.toml"
+    path.write_text(example_wire())
+    assert main(["wire", "--check", str(path), "a//b", "a/b", "a/**/**"]) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.splitlines() == [
+        'evedrop: key "a//b", which Zenoh refuses (empty chunks are forbidden, as well as leading and trailing slashes); '
+        "expected one such as robot/scan/**",
+        'key "a/**/**", which Zenoh refuses (`**/**` must be replaced by `**` to reach canon-form); did you mean a/**?',
+    ]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "wire: expected a FILE; `evedrop wire --example` prints one"),
+        (["--example", "FILE"], "wire --example: expected no FILE; it prints an example of one"),
+        (["FILE", "a/b"], "a/b: keys are for --check, which says which link a key takes"),
+        (["FILE", "--for", "60 sec"], 'wire --for 60 sec: expected seconds, or a length of time such as "60 s"'),
+        (["FILE", "--for", "0"], 'wire --for 0: expected seconds, or a length of time such as "60 s"'),
+        (["none.toml"], "none.toml cannot be read (No such file or directory)"),
+        (["FILE", "--set", "seed=-1"], "seed: is -1; expected a number at least 0"),
+    ],
+)
+def test_what_the_command_refuses(
+    words: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before it starts anything, with what was expected."""
+    path = tmp_path / "wire.toml"
+    path.write_text(example_wire())
+    assert main(["wire", *(str(path) if word == "FILE" else word for word in words)]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_key_without_any_link() -> None:
+    """Where there are no links, a key takes none."""
+    assert list(key_lines(plan_of(), ["a/b"])) == ["key  a/b"]
+
+
+def test_the_history_of_a_key() -> None:
+    """It takes the link of its key."""
+    plan = plan_of({**TO_BASE, "keys": "a/*"})
+    assert list(key_lines(plan, ["a/b/@adv/pub/1"]))[1] == "  robot → base  robot-base"
+    assert list(key_lines(plan, ["b/@adv/pub/1"]))[1] == "  robot → base  no link takes it"
+
+
+def test_the_page_shows_what_the_command_prints(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The example file, the answer of --check, and the mistakes of a file are in docs/wire.md as they are printed."""
+    page = (Path(__file__).parents[2] / "docs" / "wire.md").read_text(encoding="utf-8")
+    assert f"```toml\n{example_wire()}```" in page
+    path = tmp_path / "robot.toml"
+    path.write_text(example_wire())
+    assert main(["wire", "--check", str(path), "robot/scan/front", "robot/@config/x"]) == 0
+    assert capsys.readouterr().out.replace(str(path), "robot.toml") in page
+    wrong = {
+        '"robot/scan/**"': '"robot//scan"',
+        '"12 s"': '"12 sec"',
+        ":7449": ":7448",
+        'name = "radio"\nfrom = "robot"': 'name = "radio"\nfrom = "robto"',
+    }
+    for right, mistake in wrong.items():
+        path.write_text(path.read_text().replace(right, mistake, 1))
+    assert main(["wire", str(path)]) == 2
+    assert capsys.readouterr().err.replace(str(path), "robot.toml") in page
+
+
+def test_the_events_of_the_page() -> None:
+    """They are accepted with the example."""
+    page = (Path(__file__).parents[2] / "docs" / "wire.md").read_text(encoding="utf-8")
+    (events,) = [block for block in re.findall(r"```toml\n(.*?)```", page, re.DOTALL) if block.startswith("[[event]]")]
+    plan = wire_of(tomllib.loads(example_wire()) | tomllib.loads(events))
+    assert [event.note for event in plan.events][-1] == "the robot enters the lift"
+
+
+def test_the_command_runs_a_wire(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It prints the endpoint of each side and each event, warns, and ends after the given time."""
+    path = tmp_path / "wire.toml"
+    path.write_text(
+        '[side.robot]\n[side.base]\n[[link]]\nfrom = "robot"\nto = "base"\n[[event]]\nat = 0.01\ncut = "robot-base"\n'
+    )
+    assert main(["wire", str(path), "--for", "100 ms", "--out", str(tmp_path / "out")]) == 0
+    printed = capsys.readouterr()
+    endpoints = dict(line.split() for line in printed.out.splitlines()[:2])
+    assert endpoints.keys() == {"robot", "base"}
+    assert all(re.fullmatch(r"tcp/127\.0\.0\.1:[1-9]\d*", one) for one in endpoints.values())
+    assert "0.0 s: cut robot-base" in printed.out
+    assert printed.err == "evedrop: warning: no link leads from base back to robot: queries from robot get no replies\n"
+    assert (tmp_path / "out" / "summary.json").is_file()
+    assert main(["wire", str(path), "--for", "10 ms", "--out", str(tmp_path / "again"), "--quiet"]) == 0
+    assert capsys.readouterr().out == ""
