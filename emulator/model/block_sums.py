@@ -13,6 +13,18 @@ import numpy as np
 from evedrop.model.digest import Blocks
 from evedrop.model.process import Floats
 
+_FEW_TRIALS = 64  # of which numpy adds a slot at a time more slowly than it accumulates all slots
+
+
+def added_in_order(total: Floats, numbers: Floats) -> Floats:
+    """A total of every trial, (R,), and the numbers of some slots, (c, R): their sum, (R,), one slot added after the other."""
+    if numbers.shape[1] < _FEW_TRIALS:
+        return np.asarray(np.add.accumulate(np.concatenate([total[None], numbers]), axis=0)[-1])
+    total = total.copy()
+    for row in numbers:
+        total += row
+    return total
+
 
 @final
 class BlockSums:
@@ -33,8 +45,7 @@ class BlockSums:
         while k < slots.stop:
             stop = min(slots.stop, self._blocks.end(k))
             rows = numbers[k - slots.start : stop - slots.start]
-            # Adds one slot after the other, in contrast to `sum`.
-            self.unfinished = np.add.accumulate(np.concatenate([self.unfinished[None], rows]), axis=0)[-1]
+            self.unfinished = added_in_order(self.unfinished, rows)
             if stop == self._blocks.end(k):
                 found[self._blocks.start(k)] = self.unfinished
                 self.unfinished = np.zeros_like(self.unfinished)

@@ -12,6 +12,7 @@ from typing import NamedTuple, final
 import numpy as np
 
 from evedrop.figures.standard_error import standard_error, z_of
+from evedrop.model.block_sums import added_in_order
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Codes, Flags
 from evedrop.model.schedule import StateProbability, in_slots
@@ -49,7 +50,7 @@ class LeakTally:
 
     def __init__(self, trials: int) -> None:
         self._bits, self._clear = np.zeros(trials), np.zeros(trials)
-        self._expected = 0.0  # NaN without theory
+        self._expected = np.zeros(1)  # NaN without theory
         self.slots = 0
         """The number of slots so far; 0 in a mode without packets."""
 
@@ -59,15 +60,10 @@ class LeakTally:
         of_state, of_other = revealed.by_type.T[:, :, None]
         bits = np.where(action == Action.LOST, 0.0, np.where(nu, of_other, of_state))
         clear = np.isinf(bits)
-        # Slot by slot, so that a trial's bits do not depend on how many slots are added at a time.
-        for hidden in np.where(clear, 0.0, bits):
-            self._bits += hidden
+        self._bits = added_in_order(self._bits, np.where(clear, 0.0, bits))
         self._clear += clear.sum(axis=0)
-        if revealed.expected is None:
-            self._expected = math.nan
-        else:
-            for expected in revealed.expected.tolist():
-                self._expected += expected
+        expected = np.full(len(action), math.nan) if revealed.expected is None else revealed.expected
+        self._expected = added_in_order(self._expected, expected[:, None])
 
     @classmethod
     def merged(cls, parts: Sequence[LeakTally]) -> LeakTally:
@@ -86,7 +82,8 @@ class LeakTally:
             return None
         means = self._bits / self.slots
         bits, error = float(np.mean(means)), standard_error(means)
-        expected = None if math.isnan(self._expected) else self._expected / self.slots
+        total = float(self._expected[0])
+        expected = None if math.isnan(total) else total / self.slots
         clear = float(np.mean(self._clear)) / self.slots
         return LeakSummary(clear, bits, error, expected, z_of(bits, expected, error))
 

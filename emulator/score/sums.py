@@ -14,7 +14,7 @@ from evedrop.figures import figure
 from evedrop.figures.figure import ReceiverTotals, TotalsFigure, TrialTotals
 from evedrop.figures.standard_error import standard_error
 from evedrop.kernels.current import kernels
-from evedrop.model.block_sums import BlockSums
+from evedrop.model.block_sums import BlockSums, added_in_order
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Codes, Flags
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
@@ -122,9 +122,9 @@ class DirectionErrors:
         error = np.zeros((len(x), x.shape[2]))
         for i, weight in enumerate(self.v.tolist()):
             error += weight * (x[:, i] - x_hat[:, i])
-        # Slot by slot, so that the bits do not depend on how many slots are added at a time.
-        for window, row in zip(window_of(np.arange(first, self.done), self.slots), error * error, strict=True):
-            self.window_errors[window] += row
+        windows = window_of(np.arange(first, self.done), self.slots)
+        for window in dict.fromkeys(windows.tolist()):
+            self.window_errors[window] = added_in_order(self.window_errors[window], (error * error)[windows == window])
 
     @classmethod
     def merged(cls, parts: Sequence[DirectionErrors]) -> DirectionErrors:
