@@ -33,7 +33,7 @@ def print_comparison(found: Comparison, folder: str) -> None:
     console.print(f"{found.title} · {found.slots:,} slots · {trials}")
     console.print(_schemes(found))
     console.print(_pairs(found))
-    for line in (*_undefined(found), *_remarks(found)):
+    for line in (*_left_out(found), *_undefined(found), *_remarks(found)):
         console.print(line)
     console.print(f"results: {folder}/compare.json, compare.png, scenarios/")
 
@@ -118,6 +118,12 @@ def verdict(cell: Cell) -> str:
 
 def _rare_share(of: SimulatedError | None) -> float:
     return 0.0 if of is None or of.rare_events is None or of.infinite_variance else of.rare_events.share
+
+
+def _left_out(found: Comparison) -> Iterator[str]:
+    """A line for each scheme that cannot be used with the process."""
+    for scheme, why in found.left_out.items():
+        yield f"left out: {scheme}: {'; '.join(why)}"
 
 
 def _undefined(found: Comparison) -> Iterator[str]:

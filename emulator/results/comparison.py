@@ -245,6 +245,8 @@ class Comparison:
     first_trial: int
     adversaries: tuple[str, ...]
     schemes: Mapping[str, SchemeResult] = field(default_factory=dict)
+    left_out: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Scheme that cannot be used with the process → why not, in lines."""
 
     @property
     def dominant(self) -> tuple[str, ...]:
@@ -283,6 +285,7 @@ class Comparison:
                 }
                 for name, one in self.schemes.items()
             },
+            "left_out": {name: list(why) for name, why in self.left_out.items()},
         }
 
     def as_json(self, indent: int | None = 1) -> str:

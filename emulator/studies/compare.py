@@ -127,7 +127,9 @@ def _comparison(matchups: Matchups, played: Sequence[tuple[Group, Merger]]) -> C
             {adversary: cells[adversary] for adversary in matchups.adversaries},
             _leak(scenario),
         )
-    return Comparison(title, some.slots, some.trials, some.seed, some.first_trial, matchups.adversaries, schemes)
+    return Comparison(
+        title, some.slots, some.trials, some.seed, some.first_trial, matchups.adversaries, schemes, matchups.left_out
+    )
 
 
 def _cells(group: Group, totals: Mapping[str, Tally]) -> dict[str, Cell]:

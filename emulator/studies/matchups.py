@@ -73,6 +73,8 @@ class Matchups:
     groups: tuple[Group, ...]
     """In order of schemes; for each scheme, the group without an attack comes first."""
     undefined: tuple[Match, ...]
+    left_out: Mapping[str, tuple[str, ...]]
+    """Scheme that cannot be used with this process → why not, in lines."""
 
 
 def adversaries_of() -> tuple[str, ...]:
@@ -96,21 +98,18 @@ def matchups_of(
 
     parameters: SCHEME.PARAMETER → value.
 
-    Raises UsageError with every unknown name, ScenarioError if a scheme cannot be used with this process and these links.
+    Raises UsageError with every unknown name. Raises ScenarioError if a scheme that is named, or has such a parameter, cannot be
+    used with this process, if none can, and if the adversaries of a scheme cannot.
     """
-    measured = scenario.driven is not None and scenario.driven.output_matrix is not None
-    if schemes is None and (measured or scenario.process.given):
-        # A sensor that measures, or is given the states, does not decide the first state, which such a scheme needs.
-        schemes = [name for name in SCHEMES if not SCHEMES[name].decides_initial_state()]
     if adversaries is None:
         adversaries = usual_adversaries(scenario)
     chosen = _chosen(schemes, adversaries, parameters or {})
     groups: list[Group] = []
     undefined: list[Match] = []
     mistakes: dict[str, None] = {}
+    left_out: dict[str, tuple[str, ...]] = {}
     for scheme in chosen[0]:
         matches = [_match(scenario, scheme, name) for name in chosen[1]]
-        undefined += [match for match in matches if match.not_defined is not None]
         encoding = _encoding(scenario, scheme, parameters or {})
         for attack in ("none", *ATTACKERS.values()):
             some = tuple(one for one in matches if one.not_defined is None and one.attack == attack)
@@ -119,10 +118,34 @@ def matchups_of(
             try:
                 groups.append(Group(_scenario(scenario, encoding, attack, some), some))
             except ScenarioError as error:
-                mistakes.update(dict.fromkeys(f"with the scheme {scheme}: {line}" for line in error.mistakes))
+                unusable = _unusable(scenario, encoding)
+                if unusable:
+                    left_out[scheme] = unusable
+                    break
+                mistakes.update(dict.fromkeys(_with_scheme(scheme, error.mistakes)))
+        else:
+            undefined += [match for match in matches if match.not_defined is not None]
+    meant = {key.rpartition(".")[0] for key in parameters or {}} if schemes is None else set(schemes)
+    for scheme, why in left_out.items():
+        if scheme in meant or not groups:
+            mistakes.update(dict.fromkeys(_with_scheme(scheme, why)))
     if mistakes:
         raise ScenarioError(scenario.title, list(mistakes))
-    return Matchups(*chosen, tuple(groups), tuple(undefined))
+    usable = tuple(scheme for scheme in chosen[0] if scheme not in left_out)
+    return Matchups(usable, chosen[1], tuple(groups), tuple(undefined), left_out)
+
+
+def _with_scheme(scheme: str, mistakes: Iterable[str]) -> list[str]:
+    return [f"with the scheme {scheme}: {line}" for line in mistakes]
+
+
+def _unusable(scenario: Scenario, encoding: Tables) -> tuple[str, ...]:
+    """Why a scheme cannot be used with this process, whatever the adversaries, in lines; empty if it can."""
+    try:
+        _scenario(scenario, encoding, "none", ())
+    except ScenarioError as error:
+        return tuple(error.mistakes)
+    return ()
 
 
 def _chosen(

@@ -61,6 +61,7 @@ def test_what_a_measuring_sensor_cannot_use_is_left_out() -> None:
     """A scheme that decides the first state; strategies that invert its singular Q have a reason instead of figures."""
     matchups = matchups_of(load("measured"))
     assert set(matchups.schemes) == set(SCHEMES) - {"twin-track"}
+    assert set(matchups.left_out) == {"twin-track"}
     against = {match.adversary: match.not_defined for match in matchups.undefined if match.scheme == "innovation"}
     (learner,) = matchups_of(load("measured"), ["innovation"], ["learning-em"]).undefined
     assert learner.not_defined == "uses the inverse of Q, and Q may be singular"
@@ -111,9 +112,34 @@ def test_mistakes_of_a_scheme_name_it() -> None:
     """A scenario's links may be none for a scheme that stays silent."""
     scenario = load("bayesian", {"expect": [], "legitimate.link": {"quality": 0.9, "rate": 0.9}})
     with pytest.raises(ScenarioError, match=r"with the scheme withholding: legitimate\.link\.rate"):
-        matchups_of(scenario)
+        matchups_of(scenario, ["plain", "withholding"])
     with pytest.raises(UsageError, match="no scheme is named"):
         matchups_of(scenario, schemes=[])
+
+
+def test_a_scheme_that_cannot_be_used_is_left_out_with_its_reason(evedrop: Evedrop) -> None:
+    """Of μ_d = 0 `withholding` makes a sensor that sends nothing; where its name is given, nothing is compared."""
+    silent = ("--set", "encoding.state_probability=0.0", "--adversaries", "naive", "--slots", "5", "--trials", "2")
+    done = evedrop("compare", "numerical", *silent, "--out", "found")
+    assert (done.status, done.err) == (0, "")
+    (line,) = (line for line in done.out.splitlines() if line.startswith("left out:"))
+    assert line.startswith("left out: withholding: encoding.state_probability: is 0.0, so nothing is sent")
+    found = json.loads((evedrop.folder / "found/compare.json").read_text(encoding="utf-8"))
+    assert set(found["schemes"]) == set(SCHEMES) - {"withholding"}
+    assert [one[:24] for one in found["left_out"]["withholding"]] == ["encoding.state_probabili"]
+    assert evedrop("compare", "numerical", *silent, "--schemes", "plain,withholding").status == 2
+
+
+def test_what_no_scheme_can_use_is_refused() -> None:
+    """A mistake in the scenario is not one of its schemes: what does not fit the links of the adversaries, or any scheme."""
+    scenario = load("numerical", {"expect": []})
+    endless = scenario.model_copy(update={"slots": 10**6})
+    with pytest.raises(ScenarioError, match="with the scheme plain: slots: is 1000000"):
+        matchups_of(endless)
+    learner = {"strategy": "replay-informed", "reads_as": "smart", "learns_at": 20, "link": {"quality": 0.9}}
+    late = load("numerical", {"expect": [], "eavesdroppers": {"late": learner}}).model_copy(update={"slots": 5})
+    with pytest.raises(ScenarioError, match=r"with the scheme innovation: eavesdroppers.replay-informed.learns_at"):
+        matchups_of(late)
 
 
 def test_the_command_prints_a_table_and_writes_its_folder(evedrop: Evedrop) -> None:
@@ -145,7 +171,7 @@ def test_json_is_strict_and_has_what_is_documented(evedrop: Evedrop) -> None:
     assert done.out.count("\n") == 1
     assert found == json.loads((evedrop.folder / "found" / "compare.json").read_text())
     assert set(found) == {
-        *("scenario", "slots", "trials", "seed", "first_trial", "adversaries", "dominant", "schemes"),
+        *("scenario", "slots", "trials", "seed", "first_trial", "adversaries", "dominant", "schemes", "left_out"),
     }
     scheme = found["schemes"]["acknowledged"]
     assert set(scheme) == {"parameters", "needs", "legitimate", "leak", "closest", "against"}
