@@ -22,3 +22,9 @@ class Command:
     options: tuple[Option, ...] = ()
     group: str | None = None
     """The word before its name, such as `links` in `links fit`; None if there is none."""
+    section: str = "other commands"
+    """The title under which `--help` lists it."""
+    example: str = ""
+    """A command line that shows its use, without the program's name."""
+    page: str = ""
+    """The page of the documentation about it, such as `links`, as `evedrop docs` knows it."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from evedrop.cli.commands import GROUP, MODULES, ROLES
+from evedrop.cli.parser import Parser
 from evedrop.errors import EvedropError, Interrupted, RunError, UsageError
 from evedrop.files import shown
 from evedrop.output import OUTPUT, finish, named_output, say, silence, warn
@@ -19,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["is_role", "main"]
 
-_Parsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+_Parsers: TypeAlias = "argparse._SubParsersAction[Parser]"
 
 
 def is_role(arguments: Sequence[str]) -> bool:
@@ -30,7 +32,11 @@ def is_role(arguments: Sequence[str]) -> bool:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns its exit status."""
     given = sys.argv[1:] if arguments is None else list(arguments)
-    options = parser_of(given[0] if given else "").parse_args(given)
+    if "_ARGCOMPLETE" in os.environ:  # a shell asks for completions
+        import argcomplete
+
+        argcomplete.autocomplete(parser_of())
+    options = parser_of(given[0] if given else "").parse_whole(given)
     command: Callable[[argparse.Namespace], int] = options.command
     try:
         _check_names(options)
@@ -75,29 +81,40 @@ def _check_names(options: argparse.Namespace) -> None:
 
 def parser_of(first: str = "") -> argparse.ArgumentParser:
     """The parser; first: the first argument. If it names a command, only that command's module is loaded."""
-    parser = argparse.ArgumentParser(
-        prog="evedrop", description="A network emulator for secrecy in remote state estimation."
+    parser = Parser(
+        prog="evedrop",
+        description="A network emulator for secrecy in remote state estimation.",
+        epilog="evedrop COMMAND --help describes a command; evedrop docs lists the pages of the documentation.",
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
-    top = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    top = parser.add_subparsers(title="commands", required=True, metavar="COMMAND", parser_class=Parser)
     groups: dict[str, _Parsers] = {}
     for command in _commands(first):
-        where = top
+        where, does = top, command.does
         if command.group is not None:
             if command.group not in groups:
                 groups[command.group] = _added(top, command.group, f"commands about {command.group}").add_subparsers(
-                    title="commands", required=True, metavar="COMMAND"
+                    title="commands", required=True, metavar="COMMAND", parser_class=Parser
                 )
             where = groups[command.group]
-        one = _added(where, command.name, command.does)
-        one.set_defaults(command=command.run)
+        one = _added(where, command.name, does, _epilog(command))
+        one.set_defaults(command=command.run, parser=one)
         for option in command.options:
             option(one)
+        name = command.name if command.group is None else f"{command.group} {command.name}"
+        parser.sections.setdefault(command.section, {})[name] = does
     return parser
 
 
-def _added(parsers: _Parsers, name: str, does: str) -> argparse.ArgumentParser:
-    return parsers.add_parser(name, help=does, description=f"{does[0].upper()}{does[1:]}.")
+def _added(parsers: _Parsers, name: str, does: str, epilog: str = "") -> Parser:
+    return parsers.add_parser(name, help=does, description=f"{does[0].upper()}{does[1:]}.", epilog=epilog)
+
+
+def _epilog(command: Command) -> str:
+    """An example, and where to read more."""
+    lines = [f"example:\n  evedrop {command.example}"] if command.example else []
+    lines += [f"more: evedrop docs {command.page}"] if command.page else []
+    return "\n\n".join(lines)
 
 
 def _commands(first: str) -> Iterator[Command]:

@@ -3,6 +3,28 @@
 Source: docs/scenario.md.
 """
 
-from evedrop.loading.file import checked, load, parse, read, set_entry, shipped, tables_in, value_of, write_new
+from evedrop.loading.file import (
+    built_in_text,
+    checked,
+    load,
+    parse,
+    read,
+    set_entry,
+    shipped,
+    tables_in,
+    value_of,
+    write_new,
+)
 
-__all__ = ["checked", "load", "parse", "read", "set_entry", "shipped", "tables_in", "value_of", "write_new"]
+__all__ = [
+    "built_in_text",
+    "checked",
+    "load",
+    "parse",
+    "read",
+    "set_entry",
+    "shipped",
+    "tables_in",
+    "value_of",
+    "write_new",
+]

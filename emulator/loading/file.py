@@ -52,13 +52,25 @@ def shipped() -> dict[str, Path]:
     return {path.stem: path for path in sorted(folder.glob("[a-z]*.toml"), key=lambda path: path.stem)}
 
 
-def write_new(path: Path) -> None:
-    """Write the commented scenario to start from. Raises UsageError if the file exists or cannot be written."""
+def built_in_text(name: str) -> str:
+    """The file of a built-in scenario. Raises UsageError if there is no scenario of this name."""
+    if name not in shipped():
+        raise UsageError(
+            f"{name}: there is no built-in scenario of this name{near(name, shipped()) or '; evedrop list prints them'}"
+        )
+    return shipped()[name].read_text(encoding="utf-8")
+
+
+def write_new(path: Path, origin: str | None = None) -> None:
+    """Write a scenario to start from: the commented one, or a copy of the built-in scenario `origin`.
+
+    Raises UsageError if the file exists or cannot be written, or there is no such scenario.
+    """
+    commented = Path(str(resources.files("evedrop.scenarios"))).joinpath("_new.toml")
+    text = commented.read_text(encoding="utf-8") if origin is None else built_in_text(origin)
     try:
         with path.open("x", encoding="utf-8") as file:
-            file.write(
-                Path(str(resources.files("evedrop.scenarios"))).joinpath("_new.toml").read_text(encoding="utf-8")
-            )
+            file.write(text)
     except FileExistsError as error:
         raise UsageError(f"{path} exists already; give another name") from error
     except OSError as error:

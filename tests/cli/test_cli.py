@@ -276,7 +276,7 @@ def test_a_command_line_that_is_none_is_exit_2(evedrop: Evedrop, arguments: tupl
     """Argparse says what it expected."""
     done = evedrop(*arguments)
     assert (done.status, done.out) == (2, "")
-    assert "usage: " in done.err
+    assert "try: evedrop" in done.err
 
 
 def test_a_brief_of_another_role_is_refused(evedrop: Evedrop) -> None:

@@ -18,7 +18,7 @@ def test_a_package_adds_a_command_by_its_metadata(evedrop: Evedrop) -> None:
     """One file and one line: it is in the help, has options, and its result is the exit status."""
     install(evedrop.folder, {"greeting.py": COMMAND}, {"evedrop.commands": {"greet": "greeting"}})
     environment = {**evedrop.environment, "PYTHONPATH": str(evedrop.folder)}
-    assert "greet       say hello" in evedrop.process("--help", env=environment).out
+    assert "greet         say hello" in evedrop.process("--help", env=environment).out
     done = evedrop.process("greet", "you", env=environment)
     assert (done.status, done.out, done.err) == (0, "hello you\n", "")
 
@@ -31,7 +31,7 @@ def test_a_package_that_is_broken_breaks_no_help(evedrop: Evedrop) -> None:
     environment = {**evedrop.environment, "PYTHONPATH": str(evedrop.folder)}
     done = evedrop.process("--help", env=environment)
     assert done.status == 0
-    assert "a live run: processes, network, view, results" in done.out
+    assert "run a scenario live" in done.out
     assert done.err.splitlines() == [
         "evedrop: warning: the commands of broken cannot be loaded (RuntimeError: not today)",
         "evedrop: warning: the command run of taking is left out: expected a new name, and no group",

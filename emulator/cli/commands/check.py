@@ -68,4 +68,14 @@ def _classes(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(f"--{kind}", metavar="NAME", help=text)
 
 
-COMMANDS = (Command("check", check, "validate scenarios, or classes of your own", (_scenarios, changes, _classes)),)
+COMMANDS = (
+    Command(
+        "check",
+        check,
+        "check scenarios or classes of your own, and start nothing",
+        (_scenarios, changes, _classes),
+        section="make",
+        example="check my-scenario.toml",
+        page="scenario",
+    ),
+)

@@ -68,6 +68,12 @@ def _compares(parser: argparse.ArgumentParser) -> None:
 
 COMMANDS = (
     Command(
-        "compare", compare, "every scheme against every adversary", (scenario, entries, output, _compares, workers)
+        "compare",
+        compare,
+        "compare every scheme with every eavesdropper, in memory",
+        (scenario, entries, output, _compares, workers),
+        section="study",
+        example="compare vehicle --trials 100",
+        page="compare",
     ),
 )

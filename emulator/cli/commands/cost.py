@@ -63,5 +63,13 @@ def _cells(one: MeanEstimate, scale: float, unit: str) -> tuple[str, str, str]:
 
 
 COMMANDS = (
-    Command("cost", cost, "the energy that secrecy costs a house, against plain", (scenario, entries, as_json)),
+    Command(
+        "cost",
+        cost,
+        "compute the energy that secrecy costs a house",
+        (scenario, entries, as_json),
+        section="study",
+        example="cost microgrid",
+        page="microgrid",
+    ),
 )

@@ -106,7 +106,10 @@ COMMANDS = (
     Command(
         "design",
         design,
-        "admissible μ_d, secrecy, optimum, per eavesdropper; per slot; when to send or encrypt",
+        "choose μ_d, or when to send or encrypt, for a scenario",
         (scenario, changes, _designs, as_json),
+        section="study",
+        example="design numerical",
+        page="design",
     ),
 )

@@ -26,5 +26,13 @@ def _two_runs(parser: argparse.ArgumentParser) -> None:
 
 
 COMMANDS = (
-    Command("diff", diff, "the first slot, trial and peer at which two runs differ, with both values", (_two_runs,)),
+    Command(
+        "diff",
+        diff,
+        "show the first difference between two runs",
+        (_two_runs,),
+        section="inspect",
+        example="diff runs/one runs/other",
+        page="results",
+    ),
 )

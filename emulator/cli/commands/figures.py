@@ -36,6 +36,12 @@ def _figures(parser: argparse.ArgumentParser) -> None:
 
 COMMANDS = (
     Command(
-        "figures", figures, "the paper's figures and number table, with our values next to the paper's", (_figures,)
+        "figures",
+        figures,
+        "draw the figures of the paper, and a table of its numbers and ours",
+        (_figures,),
+        section="study",
+        example="figures paper/",
+        page="papers",
     ),
 )

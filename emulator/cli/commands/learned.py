@@ -78,5 +78,13 @@ def _with_error(value: float, error: float | None) -> str:
 
 
 COMMANDS = (
-    Command("learned", learned, "what eavesdroppers that learn the process have learned", (scenario, entries, as_json)),
+    Command(
+        "learned",
+        learned,
+        "show what eavesdroppers that learn the process know, slot by slot",
+        (scenario, entries, as_json),
+        section="study",
+        example="learned learning --trials 20",
+        page="learning",
+    ),
 )

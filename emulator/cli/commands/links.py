@@ -120,8 +120,11 @@ COMMANDS = (
     Command(
         "fit",
         fit_link,
-        "the loss model and delays of a recorded link: a table, an MCAP recording or the folder of a wire",
+        "find the loss model and delays of a recorded link: a table, an MCAP recording or the folder of a wire",
         (argument("trace", "RECORDING"), _fits, as_json),
         group="links",
+        section="study",
+        example="links fit walk.csv",
+        page="links",
     ),
 )

@@ -40,4 +40,14 @@ def _rare(parser: argparse.ArgumentParser) -> None:
     )
 
 
-COMMANDS = (Command("montecarlo", montecarlo, "the same trials in memory (default 1000)", (scenario, *MEMORY, _rare)),)
+COMMANDS = (
+    Command(
+        "montecarlo",
+        montecarlo,
+        "simulate the trials of a scenario in memory (1000 unless told otherwise)",
+        (scenario, *MEMORY, _rare),
+        section="run",
+        example="montecarlo vehicle --trials 200",
+        page="montecarlo",
+    ),
+)

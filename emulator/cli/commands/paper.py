@@ -111,6 +111,12 @@ def _papers(parser: argparse.ArgumentParser) -> None:
 
 COMMANDS = (
     Command(
-        "paper", paper, "a paper's numbers next to ours: agreement, erratum, or why not comparable", (_papers, as_json)
+        "paper",
+        paper,
+        "compare the numbers of a published paper with ours",
+        (_papers, as_json),
+        section="study",
+        example="paper luecke2022",
+        page="papers",
     ),
 )

@@ -197,14 +197,33 @@ def _role(role: str) -> Option:
 _BRIEF = argument("brief", "BRIEF")
 
 COMMANDS = (
-    Command("brief", brief, "write the briefs, to start the processes by hand", (scenario, entries, _briefs)),
-    Command("health", health, "whether the process of a brief is on the network", (_BRIEF,)),
+    Command(
+        "brief",
+        brief,
+        "write the files with which each process of a run is started by hand",
+        (scenario, entries, _briefs),
+        section="processes",
+        example="brief vehicle --out briefs",
+        page="hosts",
+    ),
+    Command(
+        "health",
+        health,
+        "check that the process of a brief is on the network",
+        (_BRIEF,),
+        section="processes",
+        example="health briefs/smart.json",
+        page="containers",
+    ),
     *(
         Command(
             role,
             process,
-            f"one process of a run, the {role}",
+            f"run only the {role}",
             (_BRIEF, _role(role), *((_observed, served) if role == "observer" else ())),
+            section="processes",
+            example=f"{role} briefs/{role}.json",
+            page="hosts",
         )
         for role in ROLES
     ),

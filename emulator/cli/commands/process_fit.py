@@ -39,8 +39,11 @@ COMMANDS = (
     Command(
         "fit",
         fit,
-        "the process that explains recorded states",
+        "find the process that explains recorded states",
         (argument("file", "FILE"), _fits, as_json),
         group="process",
+        section="study",
+        example="process fit pose.csv",
+        page="scenario",
     ),
 )

@@ -79,6 +79,22 @@ _LIVE = (entries, output, _live)
 
 
 COMMANDS = (
-    Command("demo", demo, "the shipped scenario `vehicle`, live, in real time, with the view", _LIVE),
-    Command("run", run, "a live run: processes, network, view, results", (scenario, *_LIVE)),
+    Command(
+        "demo",
+        demo,
+        "run the built-in scenario `vehicle` live, with the view",
+        _LIVE,
+        section="run",
+        example="demo",
+        page="view",
+    ),
+    Command(
+        "run",
+        run,
+        "run a scenario live: separate processes over a network, with a view and results",
+        (scenario, *_LIVE),
+        section="run",
+        example="run vehicle --view web",
+        page="scenario",
+    ),
 )

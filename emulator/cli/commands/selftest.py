@@ -23,4 +23,13 @@ def selftest(_: argparse.Namespace) -> int:
     return 0
 
 
-COMMANDS = (Command("selftest", selftest, "versions, processor, golden digest computed here"),)
+COMMANDS = (
+    Command(
+        "selftest",
+        selftest,
+        "check this machine against reference digests",
+        section="inspect",
+        example="selftest",
+        page="testing",
+    ),
+)

@@ -43,4 +43,14 @@ def _over(parser: argparse.ArgumentParser) -> None:
     )
 
 
-COMMANDS = (Command("sweep", sweep, "Monte Carlo over a grid of values of any entries", (scenario, _over, *MEMORY)),)
+COMMANDS = (
+    Command(
+        "sweep",
+        sweep,
+        "simulate a scenario in memory over a grid of values",
+        (scenario, _over, *MEMORY),
+        section="study",
+        example="sweep numerical --over encoding.state_probability=0.6,0.7,0.8",
+        page="montecarlo",
+    ),
+)

@@ -52,4 +52,14 @@ def _tests(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="how many to run at the same time; default 1")
 
 
-COMMANDS = (Command("test", test, "scenarios as tests: one line each, a report for CI", (_places, _tests)),)
+COMMANDS = (
+    Command(
+        "test",
+        test,
+        "run scenarios as tests, with a report for CI",
+        (_places, _tests),
+        section="run",
+        example="test scenarios/ --junit report.xml",
+        page="testing",
+    ),
+)

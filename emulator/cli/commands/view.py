@@ -60,4 +60,14 @@ def _shown(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--slot", type=int, metavar="K", help="the slot to draw; default the last")
 
 
-COMMANDS = (Command("view", view, "open a finished run", (argument("run", "RUN"), _shown, served)),)
+COMMANDS = (
+    Command(
+        "view",
+        view,
+        "open a finished run, draw it, or print its report again",
+        (argument("run", "RUN"), _shown, served),
+        section="inspect",
+        example="view runs/vehicle --picture vehicle.png",
+        page="view",
+    ),
+)

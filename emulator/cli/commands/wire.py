@@ -86,6 +86,12 @@ def _course(parser: argparse.ArgumentParser) -> None:
 
 COMMANDS = (
     Command(
-        "wire", wire, "faults between programs that use Zenoh or ROS 2, from a wire file", (_file, changes, _course)
+        "wire",
+        wire,
+        "run links with faults between programs that use Zenoh or ROS 2",
+        (_file, changes, _course),
+        section="run",
+        example="wire robot.toml --out runs/wire",
+        page="wire",
     ),
 )

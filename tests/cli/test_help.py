@@ -1,0 +1,131 @@
+"""Help, hints for mistyped words, the pages of the documentation, and completion."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from evedrop.cli.main import main, parser_of
+from evedrop.command import Command
+
+SECTIONS = ["make", "run", "study", "steer", "inspect", "processes"]
+
+
+def commands() -> list[Command]:
+    """All built-in commands."""
+    from importlib import import_module
+
+    from evedrop.cli.commands import MODULES
+
+    names = list(dict.fromkeys(MODULES.values()))
+    return [one for name in names for one in import_module(f"evedrop.cli.commands.{name}").COMMANDS]
+
+
+@pytest.mark.parametrize("command", commands(), ids=lambda one: one.name)
+def test_every_command_has_a_section_and_an_example_that_is_understood(command: Command) -> None:
+    """The example names the command, and the parser takes all of it."""
+    assert command.section in SECTIONS
+    words = shlex.split(command.example.partition(" >>")[0])
+    assert command.name in words[:2]
+    options, unknown = parser_of(words[0]).parse_known_args(words)
+    assert not unknown
+    assert options.command is command.run
+
+
+@pytest.mark.parametrize("command", commands(), ids=lambda one: one.name)
+def test_the_page_of_a_command_exists(command: Command, capsys: pytest.CaptureFixture[str]) -> None:
+    """The help names a page that `evedrop docs` prints."""
+    if command.page:
+        assert main(["docs", command.page]) == 0
+        assert capsys.readouterr().out.startswith("# ")
+
+
+def test_help_lists_all_commands_in_sections(capsys: pytest.CaptureFixture[str]) -> None:
+    """In the order of the sections, each command once."""
+    assert list(parser_of().sections) == SECTIONS
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    said = capsys.readouterr().out
+    assert [line.rstrip(":") for line in said.splitlines() if line.endswith(":")] == SECTIONS
+
+
+@pytest.mark.parametrize("columns", [40, 80])
+def test_help_fits_a_narrow_terminal(columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No line is wider than the terminal."""
+    monkeypatch.setenv("COLUMNS", str(columns))
+    assert max(map(len, parser_of().format_help().splitlines())) <= columns
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["rn", "vehicle"], "unknown command rn; did you mean run?"),
+        (["links", "fitt", "x.csv"], "unknown command fitt; did you mean fit?"),
+        (["run", "vehicle", "--vew", "off"], "unknown option --vew; did you mean --view?"),
+        (["run", "vehicle", "--slot", "4"], "unknown option --slot; did you mean --slots?"),
+        (["run", "vehicle", "--slot=4"], "unknown option --slot=4; did you mean --slots?"),
+        (["run", "vehicle", "--view", "wob"], "expected one of auto, native, web, off; did you mean web?"),
+        (["show", "vehicel"], "there is no built-in scenario of this name; did you mean vehicle?"),
+        (["docs", "lnks"], "there is no page of this name; did you mean links?"),
+    ],
+)
+def test_a_mistyped_word_gets_a_hint(given: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """And no option is taken by its first letters."""
+    try:
+        status = main(given)
+    except SystemExit as error:
+        status = int(str(error.code))
+    assert status == 2
+    assert said in capsys.readouterr().err
+
+
+def test_docs_lists_every_page(capsys: pytest.CaptureFixture[str]) -> None:
+    """With its title."""
+    assert main(["docs"]) == 0
+    said = capsys.readouterr().out
+    pages = (Path(__file__).parents[2] / "docs").rglob("*.md")
+    assert {line.split()[0].rpartition("/")[2] for line in said.splitlines()} == {page.stem for page in pages}
+
+
+def test_new_copies_a_built_in_scenario(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The copy is what `show` prints."""
+    assert main(["new", str(tmp_path / "mine.toml"), "--from", "vehicle"]) == 0
+    capsys.readouterr()
+    assert main(["show", "vehicle"]) == 0
+    assert (tmp_path / "mine.toml").read_text(encoding="utf-8") == capsys.readouterr().out
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_is_shell_code_for_evedrop(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """One for each shell."""
+    assert main(["completion", shell]) == 0
+    assert "evedrop" in capsys.readouterr().out
+
+
+def test_a_shell_gets_the_commands_that_begin_alike() -> None:
+    """As a shell asks for them: by the environment, on file descriptor 8."""
+    line = "evedrop mon"
+    asked = {
+        **os.environ,
+        "_ARGCOMPLETE": "1",
+        "_ARGCOMPLETE_SUPPRESS_SPACE": "1",
+        "COMP_LINE": line,
+        "COMP_POINT": str(len(line)),
+        "COMP_TYPE": "9",
+        "IFS": "\n",
+    }
+    command = [sys.executable, "-m", "evedrop"]
+    done = subprocess.run(
+        ["bash", "-c", 'exec "$@" 8>&1 9>&2', "_", *command],
+        env=asked,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert "montecarlo" in done.stdout
