@@ -79,7 +79,7 @@ def _check_names(options: argparse.Namespace) -> None:
             )
 
 
-def parser_of(first: str = "") -> argparse.ArgumentParser:
+def parser_of(first: str = "") -> Parser:
     """The parser; first: the first argument. If it names a command, only that command's module is loaded."""
     parser = Parser(
         prog="evedrop",

@@ -35,7 +35,7 @@ class Parser(argparse.ArgumentParser):
     """A parser of one command, or of all; sections: title → command → description, for the help of all."""
 
     def __init__(self, *given: Any, **named: Any) -> None:
-        super().__init__(*given, **{"formatter_class": _Help, **named}, allow_abbrev=False)
+        super().__init__(*given, **{"formatter_class": _Help, "allow_abbrev": False, **named})
         self.sections: dict[str, dict[str, str]] = {}
 
     def format_help(self) -> str:

@@ -31,9 +31,9 @@ def docs(options: argparse.Namespace) -> int:
 
 def completion(options: argparse.Namespace) -> int:
     """Print the lines that make a shell complete commands and options."""
-    import argcomplete
+    from argcomplete.shell_integration import shellcode
 
-    print(argcomplete.shellcode(["evedrop"], shell=options.shell))
+    print(shellcode(["evedrop"], shell=options.shell))
     return 0
 
 
