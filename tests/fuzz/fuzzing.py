@@ -31,6 +31,7 @@ CORPUS = Path(__file__).parents[1] / "corpus"
 LONGEST_SECONDS = 20.0
 """Of processor, for anything that is read: a scenario of many slots and states takes some of them on a slow machine."""
 _MEMORY = 4 * 2**30
+_MEMORY_WITH_RERUN = 8 * 2**30  # of addresses, of which Rerun uses little
 _MOST_FAILURES = 25
 
 
@@ -114,7 +115,8 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--count", type=int, default=1000)
     options = parser.parse_args()
-    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
+    memory = _MEMORY_WITH_RERUN if any(name.startswith("view-") for name in options.readers) else _MEMORY
+    resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
     broken = False
     for name in options.readers or READERS:
         started = time.process_time()
