@@ -1,5 +1,7 @@
 """A pytest plugin that runs scenario files as tests: `pytest scenarios/`, `pytest my.toml`. One file is one test and one run.
 
+Its fixture `evedrop_wire` gives a test wires between programs (docs/wire.md, from pytest).
+
 pytest loads this plugin in every project of an environment that has Evedrop installed, so it makes no slow imports itself.
 
 Source: docs/testing.md.
@@ -7,8 +9,9 @@ Source: docs/testing.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
@@ -18,6 +21,7 @@ from evedrop.discovery import is_scenario
 
 if TYPE_CHECKING:
     from evedrop.studies.scenario_tests import Finding
+    from evedrop.wire.running import RunningWire
 
 _PRELOADED = pytest.StashKey[ExitStack]()
 
@@ -38,6 +42,23 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
     """A collector for a scenario file; None for any other file."""
     return ScenarioFile.from_parent(parent, path=file_path) if is_scenario(file_path) else None
+
+
+@pytest.fixture
+def evedrop_wire(tmp_path: Path) -> Iterator[Callable[..., RunningWire]]:
+    """A function that opens a wire for this test: its arguments are those of `evedrop.wire`, its results in `tmp_path`.
+
+    The test fails if an expectation of a wire did not hold when the wire ended.
+    """
+    from evedrop.wire.running import wire  # noqa: PLC0415 - needed only by tests that open a wire
+
+    with ExitStack() as stack:
+        folders = (tmp_path / f"wire-{number}" for number in count(1))
+
+        def opened(*arguments: Any, **entries: Any) -> RunningWire:
+            return stack.enter_context(wire(*arguments, **{"out": next(folders), **entries}))
+
+        yield opened
 
 
 @final

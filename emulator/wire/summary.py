@@ -12,25 +12,49 @@ import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, final
+from typing import Any, Protocol, final
 
 import numpy as np
 import zenoh
-from numpy.typing import NDArray
 
+from evedrop.model.slot.link import Change
 from evedrop.output import warn
 from evedrop.results.folder import write_private
 from evedrop.results.summary_file import plain
 from evedrop.score.summary import Judged
 from evedrop.wire.crossing import UNLINKED, Crossing, Kind
 from evedrop.wire.expect import WireExpectTable
-from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal import AmendmentListener, Listener
 from evedrop.wire.journal_part import REASONS, Records
 from evedrop.wire.law import bounds, expected
 from evedrop.wire.plan import WireLink, WirePlan
 from evedrop.wire.tallies import LinkTally, StreamTally
 
 _QUANTILES = (0.5, 0.9, 0.99)
+
+
+class SummarisedJournal(Protocol):
+    """What a summary needs of a journal: `WireJournal` has it, and so has a journal that is only read."""
+
+    listeners: list[Listener]
+    amendment_listeners: list[AmendmentListener]
+    recorded: int
+    missing: int
+    incomplete_since: float | None
+
+    @property
+    def start(self) -> int:
+        """The number of the start of the wire in its folder, from 1."""
+
+    @property
+    def recovered(self) -> int:
+        """The number of records that an earlier start had left behind."""
+
+    def key_of(self, code: int) -> str:
+        """The key of a code."""
+
+    def changes_of(self, link: str, key: str, kind: str) -> tuple[Change, ...]:
+        """The settings that the messages of a stream had."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +91,7 @@ class WireLinkSummary:
 class WireSummary:
     """Listens to a wire's journal, and adds up. Threads may call its methods at the same time."""
 
-    def __init__(self, plan: WirePlan, journal: WireJournal) -> None:
+    def __init__(self, plan: WirePlan, journal: SummarisedJournal) -> None:
         self._plan, self._journal = plan, journal
         self._links = {link.number: LinkTally() for link in plan.links}
         self._unlinked = LinkTally()
@@ -85,13 +109,14 @@ class WireSummary:
             streams = np.stack([records["link"], records["key"], kinds]).astype(np.int64)
             order = np.lexsort(streams[::-1])  # stable
             streams, records = streams[:, order], records[order]
-            for part in _split(records, streams[:1]):
-                self._tally(int(part["link"][0])).add(part)
-            for (code, key, kind), part in zip(_firsts(streams), _split(records, streams), strict=True):
+            starts = np.flatnonzero((np.diff(streams) != 0).any(axis=0)) + 1
+            for (code, key, kind), part in zip(
+                streams[:, np.r_[0, starts]].T.tolist(), np.split(records, starts), strict=True
+            ):
+                tally = self._tally(code)
+                tally.add(part)
                 if code != UNLINKED:
-                    streams_of = self._links[code].streams
-                    stream = streams_of.get((key, kind)) or streams_of.setdefault((key, kind), StreamTally())
-                    stream.add(part, not self._is_lossless(key))
+                    tally.streams.setdefault((key, kind), StreamTally()).add(part, not self._is_lossless(key))
 
     def amend(self, records: Records, fate: Crossing) -> None:
         """Count records of the journal that were added with another fate."""
@@ -231,19 +256,3 @@ class WireSummary:
         # A sample of a known range: the range varies as a whole, and the sample within it.
         share = tally.tried / sum(len(numbers) for numbers in ranges)
         return mean * share, variance * share**2 + mean * share * (1.0 - mean * share / tally.tried)
-
-
-def _changes(columns: NDArray[np.int64]) -> NDArray[np.intp]:
-    """Where sorted columns differ from those before them."""
-    return np.flatnonzero((np.diff(columns) != 0).any(axis=0)) + 1
-
-
-def _split(records: Records, columns: NDArray[np.int64]) -> list[Records]:
-    """The records in groups with equal columns."""
-    return np.split(records, _changes(columns))
-
-
-def _firsts(columns: NDArray[np.int64]) -> list[list[int]]:
-    """The columns of each group."""
-    found: list[list[int]] = columns[:, np.r_[0, _changes(columns)]].T.tolist()
-    return found

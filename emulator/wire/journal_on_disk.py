@@ -1,0 +1,100 @@
+"""The journal of a wire as it is on disk, in place of the one that the wire keeps: for figures of a wire in another process.
+
+Source: docs/wire.md, from Python.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from evedrop.model.slot.link import Change
+from evedrop.wire.crossing import AGAIN, RECORD, UNLINKED, Crossing, Kind
+from evedrop.wire.history import WireHistory
+from evedrop.wire.journal import AmendmentListener, Listener
+from evedrop.wire.journal_part import REASONS, Records
+from evedrop.wire.journal_reader import JOURNAL_FOLDER, journal_tables
+from evedrop.wire.plan import WirePlan
+from evedrop.wire.summary import WireSummary
+
+_FATES = {reason: int(fate) for fate, reason in REASONS.items()}
+_KINDS = {one.name.lower(): int(one) for one in Kind}
+
+
+def summary_on_disk(folder: Path, plan: WirePlan) -> WireSummary:
+    """The summary of a wire so far, from its results folder. Raises UsageError if there is no journal."""
+    journal = JournalOnDisk(folder, plan)
+    summary = WireSummary(plan, journal)
+    journal.read()
+    return summary
+
+
+@final
+class JournalOnDisk:
+    """The journal of the latest start of a wire."""
+
+    def __init__(self, folder: Path, plan: WirePlan) -> None:
+        self.listeners: list[Listener] = []
+        self.amendment_listeners: list[AmendmentListener] = []
+        self.recorded = self.recovered = self.missing = 0
+        self.incomplete_since: float | None = None
+        self._folder = folder
+        self._links = {link.name: link.number for link in plan.links}
+        self._history = WireHistory.read(folder / JOURNAL_FOLDER)
+        self._keys: list[str] = []
+        self._codes: dict[str, int] = {}
+
+    @property
+    def start(self) -> int:
+        """The number of the start, from 1."""
+        return self._history.start
+
+    def key_of(self, code: int) -> str:
+        """The key of a code."""
+        return self._keys[code]
+
+    def changes_of(self, link: str, key: str, kind: str) -> tuple[Change, ...]:
+        """The settings that the messages of a stream had, from message 0 on."""
+        return self._history.changes_of(link, key, kind)
+
+    def read(self) -> None:
+        """Hand all records to the listeners. Raises UsageError if there is no journal."""
+        for table in journal_tables(self._folder):
+            records = self._records(table)
+            self.recorded += len(records)
+            for listener in self.listeners if len(records) else ():
+                listener(records)
+
+    def _records(self, table: pa.Table) -> Records:
+        """The rows of a table as records; senders are left out."""
+        for key in {*_words(table["key"])} - {*self._keys}:
+            self._codes[key] = len(self._keys)
+            self._keys.append(key)
+        rows = np.zeros(table.num_rows, RECORD)
+        for name, none in (("time", None), ("n", -1), ("sequence", -1), ("delay", None), ("size", None)):
+            column = table[name] if none is None else table[name].fill_null(none)
+            rows[name] = column.to_numpy()
+        rows["key"] = _codes(table["key"], self._codes, 0)
+        rows["link"] = _codes(table["link"], self._links, UNLINKED)
+        rows["fate"] = _codes(table["reason"], _FATES, Crossing.DELIVERED)
+        rows["kind"] = _codes(table["kind"], _KINDS, Kind.PUT) | np.where(table["again"].to_numpy(), AGAIN, 0)
+        return rows
+
+
+def _words(column: pa.ChunkedArray) -> list[str]:
+    """The words that a dictionary column may contain."""
+    return [word for chunk in column.chunks for word in chunk.dictionary.to_pylist()]
+
+
+def _codes(column: pa.ChunkedArray, codes: Mapping[str, int], none: int) -> NDArray[np.int64]:
+    """The codes of the words of a dictionary column; none: of null, and of an unknown word."""
+    parts = [np.empty(0, np.int64)]
+    for chunk in column.chunks:
+        table: list[Any] = [*(codes.get(word, none) for word in chunk.dictionary.to_pylist()), none]
+        parts.append(np.array(table, np.int64)[chunk.indices.fill_null(len(table) - 1).to_numpy(zero_copy_only=False)])
+    return np.concatenate(parts)

@@ -1,0 +1,160 @@
+"""Wires from Python: in a process of their own, steered, read while they run, and judged when they end."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from evedrop import wire
+from evedrop.errors import ScenarioError, UsageError
+from evedrop.wire.crossing import AGAIN, Crossing, Kind
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal_on_disk import summary_on_disk
+from evedrop.wire.recorded_link import journal_recording
+from evedrop.wire.running import ExpectationFailed, RunningWire
+from evedrop.wire.summary import WireSummary
+from tests.conftest import wait_until
+from tests.wire.wire_plans import wire_plan
+
+LINK = {"name": "scan", "from": "robot", "to": "base", "quality": 0.6}
+
+
+def heard(running: RunningWire) -> int:
+    """The messages of the link so far."""
+    return running.status().links["scan"].heard
+
+
+def test_a_wire_is_opened_steered_read_and_judged(tmp_path: Path) -> None:
+    """All in one, because a process takes a second to begin: what programs get is what the journal and the summary say."""
+    expectation = {"figure": "scan.delivery", "above": 0.9}
+    got: list[int] = []
+    running = wire(side=["robot", "base"], link=[LINK], expect=[expectation], seed=7, out=tmp_path / "wire")
+    with pytest.raises(ExpectationFailed, match=r"expected scan\.delivery above 0\.9: FAILED"), running:
+        used(running, got)
+    assert not running.is_running
+    summary = json.loads((tmp_path / "wire" / "summary.json").read_text())
+    assert running.summary() == summary
+    assert summary["links"]["scan"]["delivered"] == len(got)
+    with pytest.raises(UsageError, match="no run is going on"):
+        running.cut("scan")
+
+
+def used(running: RunningWire, got: list[int]) -> None:
+    """Send messages over a wire, steer it, and read it; got: for what arrives."""
+    assert running.is_running
+    with zenoh.open(running.config("robot")) as robot, zenoh.open(running.config("base")) as base:
+        kept = (  # declarations end with their objects
+            base.declare_subscriber("numbers", lambda sample: got.append(int(sample.payload.to_string()))),
+            base.liveliness().declare_token("base-is-there"),
+        )
+        wait_until(lambda: list(robot.liveliness().get("base-is-there")) != [], "the token crosses")
+        numbers = robot.declare_publisher("numbers")
+        for n in range(400):
+            numbers.put(str(n))
+        wait_until(lambda: heard(running) == 400, "the wire hears all")
+        running.link("scan", quality=1.0)
+        numbers.put("400")
+        wait_until(lambda: got[-1:] == [400], "a link that loses nothing delivers")
+        running.partition("robot", "base")
+        numbers.put("401")
+        wait_until(lambda: heard(running) == 402, "the wire hears more")
+        running.heal("robot", "base")
+        running.cut("scan")
+        numbers.put("402")
+        wait_until(lambda: heard(running) == 403, "the wire hears more")
+        running.heal("scan")
+        numbers.put("403")
+        wait_until(lambda: got[-1:] == [403], "a healed link delivers")
+        del kept
+    rows = running.rows().to_pylist()
+    assert got == [row["n"] for row in rows if row["fate"] == "delivered"]
+    assert {row["n"]: row["reason"] for row in rows if row["n"] > 399} == {
+        400: None, 401: "cut", 402: "cut", 403: None,
+    }  # fmt: skip
+    found = running.summary()["links"]["scan"]
+    assert (found["heard"], found["delivered"], found["lost_by"]["cut"]) == (404, len(got), 2)
+    running.expect("scan.delivery", above=0.5, below=0.7)
+    running.expect(link="scan")
+    with pytest.raises(ExpectationFailed, match=r"expected 0\.5 quantile of scan\.latency above 1: FAILED, found 0"):
+        running.expect("scan.latency", quantile=0.5, above=1.0)
+    with pytest.raises(ScenarioError, match="there is no link scam"):
+        running.expect("scam.delivery", above=0.5)
+    with pytest.raises(UsageError, match=r"are not partitioned.*nothing was changed"):
+        running.heal("robot", "base")
+    with pytest.raises(UsageError, match="expected a side that listens: robot or base"):
+        running.endpoint("moon")
+    series = journal_recording(running.folder, "scan").series
+    assert series.outcomes.tolist() == [int(row["reason"] is None) for row in rows if row["reason"] != "cut"]
+
+
+def test_a_wire_that_cannot_begin_says_why(tmp_path: Path) -> None:
+    """With the message of the command."""
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(UsageError, match="is not empty"), wire(wire_plan(), out=tmp_path):
+        pytest.fail("it has begun")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "entries", "error", "said"),
+    [
+        (("missing.toml",), {}, UsageError, "cannot be read"),
+        ((), {"side": ["robot"], "link": [LINK]}, ScenarioError, 'link.0.to: is "base"'),
+        ((wire_plan(),), {"seed": 3}, UsageError, "expected no entries with a plan"),
+    ],
+)
+def test_mistakes_are_said_before_anything_begins(
+    arguments: tuple[Any, ...], entries: Mapping[str, Any], error: type[UsageError], said: str, tmp_path: Path
+) -> None:
+    """By the call, before the `with` statement; no folder is made."""
+    with pytest.raises(error, match=said):
+        wire(*arguments, **{"out": tmp_path / "wire", **entries})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_entry_of_a_file_is_changed_by_its_dotted_key(tmp_path: Path) -> None:
+    """With `__` for the dot."""
+    text = 'seed = 7\n[side.robot]\n[side.base]\n[[link]]\nfrom = "robot"\nto = "base"\nquality = 0.5\n'
+    (tmp_path / "radio.toml").write_text(text)
+    changed = wire(tmp_path / "radio.toml", out=tmp_path / "wire", seed=8, link__0__quality=0.9)
+    assert changed.plan.seed == 8
+    assert changed.plan.links[0].settings["loss"]["quality"] == 0.9
+
+
+def test_figures_from_the_disk_are_those_of_the_wire(tmp_path: Path) -> None:
+    """Of every kind of message, fate and link, with changed settings, second copies, and fates that were changed later."""
+    plan = wire_plan(
+        scan={"loss": {"model": "bernoulli", "quality": 0.6}}, rest={"loss": {"model": "bernoulli", "quality": 1.0}}
+    )
+    with WireJournal(tmp_path, plan) as journal:
+        summary = WireSummary(plan, journal)
+        fates = [*Crossing]
+        for n in range(600):
+            kind = list(Kind)[n % 4] | (AGAIN if n % 7 == 0 and fates[n % 5] == Crossing.DELIVERED else 0)
+            key = journal.key_code(f"scan/{n % 3}")
+            row = journal.record(1e9 + n, n // 12, -1, 0.01 * n, key, 0, n, n % 2, kind, fates[n % 5])
+            if n == 300:
+                journal.change("scan", {"loss": {"model": "bernoulli", "quality": 0.9}}, {("scan/0", "put"): 25})
+            if n == 500:
+                journal.amend(row, Crossing.UNDERWAY)
+        journal.flush()
+        live, on_disk = summary.as_dict(), summary_on_disk(tmp_path, plan).as_dict()
+        assert on_disk["links"] == live["links"]
+        assert on_disk["heard"] == 600
+    assert summary_on_disk(tmp_path, plan).as_dict()["links"] == summary.as_dict()["links"]
+
+
+def test_the_page_shows_the_example_and_every_method() -> None:
+    """As it is executed, and all that a wire has."""
+    docs = Path(__file__).parents[2] / "docs"
+    page = (docs / "wire.md").read_text(encoding="utf-8")
+    _, shown = re.findall(r"```python\n(.*?)```", page[page.index("## From Python") :], re.DOTALL)
+    assert shown in (docs / "examples" / "wire" / "test_chatter.py").read_text(encoding="utf-8")
+    for name in vars(RunningWire):
+        if not name.startswith("_") and name not in {"is_running"}:
+            assert f"`{name}(" in page
