@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from evedrop.cli.options import changes, changes_of
+from evedrop.cli.options import changes_of
 from evedrop.command import Command
 from evedrop.errors import UsageError
 
@@ -74,6 +74,11 @@ def _file(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--example", action="store_true", help="print an example of a wire file")
 
 
+def _changes(parser: argparse.ArgumentParser) -> None:
+    what = "change an entry of the file by its dotted key, such as link.1.quality=0.5; repeatable"
+    parser.add_argument("--set", dest="changes", action="append", default=[], metavar="KEY=VALUE", help=what)
+
+
 def _course(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="results folder; that of an earlier wire, to go on with its fates"
@@ -89,7 +94,7 @@ COMMANDS = (
         "wire",
         wire,
         "run links with faults between programs that use Zenoh or ROS 2",
-        (_file, changes, _course),
+        (_file, _changes, _course),
         section="run",
         example="wire robot.toml --out runs/wire",
         page="wire",

@@ -1,0 +1,60 @@
+"""Every loss model on a real wire: what arrives is what the fates say, within the bounds of the law, whatever else flows."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from pathlib import Path
+
+import zenoh
+
+from evedrop.model.links.link import Fate
+from evedrop.wire.fates import KeyFates
+from evedrop.wire.law import bounds, expected
+from tests.conftest import wait_until
+from tests.wire.wire_at_work import at_work, link, plan_of
+from tests.wire.wire_links import LOSSES
+
+COUNT = 2000
+
+
+def test_what_arrives_is_what_the_fates_say(tmp_path: Path) -> None:
+    """For each model, between messages of all the others, in order; the rate is within the 99 % bounds of the law."""
+    plan = plan_of(
+        *(link("robot", "base", {"loss": loss}, f"{model}/**", name=model) for model, loss in LOSSES.items())
+    )
+    due = {}
+    for one in plan.links:
+        fates = KeyFates(one, f"{one.name}/x", "put", plan.seed)
+        due[one.name] = [n for n in range(COUNT) if fates.next()[0] == Fate.DELIVERED]
+    heard: dict[str, list[int]] = defaultdict(list)
+
+    others: list[str] = []
+
+    def hear(sample: zenoh.Sample) -> None:
+        model, _, rest = str(sample.key_expr).partition("/")
+        if rest == "x":
+            heard[model].append(int(sample.payload.to_string()))
+        else:
+            others.append(model)
+
+    def other_arrives() -> bool:
+        other.put("of another key on the same link")
+        return bool(others)
+
+    with at_work(plan, tmp_path) as wire, wire.program("robot") as robot, wire.program("base") as base:
+        base.declare_subscriber("**", zenoh.handlers.Callback(hear, indirect=False))
+        block = zenoh.CongestionControl.BLOCK
+        puts = {name: robot.declare_publisher(f"{name}/x", congestion_control=block) for name in due}
+        other = robot.declare_publisher("bernoulli/y", congestion_control=block)
+        wait_until(other_arrives, "the base hears the robot")
+        for n in range(COUNT):
+            for name, publisher in puts.items():
+                publisher.put(str(n))
+                if n % 7 == len(name) % 7:
+                    other.put("of another key on the same link")
+        wait_until(lambda: sum(map(len, heard.values())) >= sum(map(len, due.values())), "all messages have arrived")
+    assert heard == due
+    for one in plan.links:
+        mean, variance = expected(one.settings, [], [range(COUNT)])
+        low, high = bounds(mean, variance, COUNT)
+        assert low <= len(heard[one.name]) <= high
