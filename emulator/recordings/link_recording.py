@@ -174,11 +174,15 @@ class LinkRecording:
 
 
 def _rows(file: Iterable[str]) -> Iterator[tuple[int, list[str]]]:
-    """Line number and cells of every line that is not blank."""
-    reader = csv.reader(file)
+    """Line number and cells of every line. A blank line between others is a gap, one empty cell; all others are left out."""
+    reader, begun, blank = csv.reader(file), False, list[int]()
     for row in reader:
-        if row:
-            yield reader.line_num, [cell.strip() for cell in row]
+        if len(row) < 2 and not any(map(str.strip, row)):
+            blank += [reader.line_num] if begun else []
+            continue
+        yield from ((line, [""]) for line in blank)
+        blank, begun = [], True
+        yield reader.line_num, [cell.strip() for cell in row]
 
 
 def _parquet(path: Path) -> Any:

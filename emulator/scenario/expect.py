@@ -174,7 +174,7 @@ def _figure_mistakes(table: Mapping[str, Any]) -> list[Found]:
     if middle is None and distances:
         found.append((distances[0], "is set without near; expected near = 0.01 as well"))
     elif middle is None and below is None and above is None:
-        what = "and above are both missing; expected at least one, such as below = 0.01, or near and within"
+        what = "is missing, and so is above; add below, above or near, such as below = 0.01"
         found.append(("below", what))
     elif middle is not None and not distances:
         found.append(("within", "is missing; expected within = 0.002, or within_relative = 0.1, with near"))

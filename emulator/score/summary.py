@@ -265,7 +265,7 @@ class Judged:
     @property
     def sentence(self) -> str:
         """The expectation as a sentence of the closing report."""
-        word = {True: "held", False: "FAILED", None: "this run does not tell"}[self.held]
+        word = {True: "held", False: "FAILED", None: "not evaluated, the run has no value for it"}[self.held]
         said = f"expected {self.text}: {word}"
         if self.found is None:
             return said + (", found none" if self.held is False else "")

@@ -92,7 +92,7 @@ class Secrecy:
             Verdict.FAILED: f"relative secrecy failed in this run{where}",
             Verdict.UNDECIDED: f"{self.trials} trials are too few to decide{where}"
             if self.trials > 1
-            else "one trial decides nothing (try --trials 200)",
+            else "one trial is not enough for a verdict (try --trials 200)",
         }[self.relative]
         if self.perfect is Verdict.HELD:
             run = "perfect secrecy held in this run: its error grew while the legitimate one stayed bounded"

@@ -63,7 +63,7 @@ class WireExpectTable(Table):
             return [("figure", 'is missing; expected figure = "scan.delivery" with below or above, or link = "scan"')]
         found = []
         if not set(given) & set(_BOUNDS):
-            found.append(("below", "and above are both missing; expected one of them, or both"))
+            found.append(("below", "is missing, and so is above; add one of them, or both"))
         if str(table["figure"]).endswith(".latency") == ("quantile" not in given):
             said = (
                 "is missing; a latency needs one"

@@ -20,7 +20,7 @@ from evedrop.wire.plan import WireLink
 
 MessageFate = tuple[int, float, bool]
 """`Crossing` code, delay in seconds, and whether a second copy arrives with the first."""
-_FIRST_BLOCK, _LARGEST_BLOCK = 32, 1024  # fates made at once: a key with few messages needs little memory
+_FIRST_BLOCK, _LARGEST_BLOCK = 32, 2048  # fates made at once: a key with few messages needs little memory
 _PASSED_AT_ONCE = 65_536
 _LATEST = 2**32 - 1  # seconds: more than the longest delay, so that no message is too late
 _BY_TIME = frozenset({"rate", "queue"})

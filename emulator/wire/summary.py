@@ -16,6 +16,7 @@ from typing import Any, Protocol, final
 
 import numpy as np
 import zenoh
+from numpy.typing import NDArray
 
 from evedrop.model.slot.link import Change
 from evedrop.output import warn
@@ -109,14 +110,13 @@ class WireSummary:
             streams = np.stack([records["link"], records["key"], kinds]).astype(np.int64)
             order = np.lexsort(streams[::-1])  # stable
             streams, records = streams[:, order], records[order]
-            starts = np.flatnonzero((np.diff(streams) != 0).any(axis=0)) + 1
-            for (code, key, kind), part in zip(
-                streams[:, np.r_[0, starts]].T.tolist(), np.split(records, starts), strict=True
-            ):
-                tally = self._tally(code)
-                tally.add(part)
+            for part in _split(records, streams[:1]):
+                self._tally(int(part["link"][0])).add(part)
+            for (code, key, kind), part in zip(_firsts(streams), _split(records, streams), strict=True):
                 if code != UNLINKED:
-                    tally.streams.setdefault((key, kind), StreamTally()).add(part, not self._is_lossless(key))
+                    streams_of = self._links[code].streams
+                    stream = streams_of.get((key, kind)) or streams_of.setdefault((key, kind), StreamTally())
+                    stream.add(part, not self._is_lossless(key))
 
     def amend(self, records: Records, fate: Crossing) -> None:
         """Count records of the journal that were added with another fate."""
@@ -256,3 +256,19 @@ class WireSummary:
         # A sample of a known range: the range varies as a whole, and the sample within it.
         share = tally.tried / sum(len(numbers) for numbers in ranges)
         return mean * share, variance * share**2 + mean * share * (1.0 - mean * share / tally.tried)
+
+
+def _changes(columns: NDArray[np.int64]) -> NDArray[np.intp]:
+    """Where sorted columns differ from those before them."""
+    return np.flatnonzero((np.diff(columns) != 0).any(axis=0)) + 1
+
+
+def _split(records: Records, columns: NDArray[np.int64]) -> list[Records]:
+    """The records in groups with equal columns."""
+    return np.split(records, _changes(columns))
+
+
+def _firsts(columns: NDArray[np.int64]) -> list[list[int]]:
+    """The columns of each group."""
+    found: list[list[int]] = columns[:, np.r_[0, _changes(columns)]].T.tolist()
+    return found

@@ -39,7 +39,7 @@ def write(folder: Path, name: str, text: str | bytes) -> Path:
         ("1\n1\n0\n1\n", None),
         ("1\r\n1\r\n0\r\n1", None),
         ("received\n1\n1\n0\n1\n", None),
-        ("\ufeffreceived\n1\n\n1\n0\n1\n\n", "received"),
+        ("\ufeff\nreceived\n1\n1\n0\n1\n\n", "received"),
         ("k,received,rssi\n0,1,-60\n1, 1 ,-61\n2,0,\n3,1,-70\n", "received"),
     ],
 )
@@ -223,3 +223,13 @@ def test_messages_show_values_as_toml(value: Any) -> None:
     assert len(text) <= 61
     if len(text) <= 60:
         assert repr(tomllib.loads(f"v = {text}")["v"]) == repr(value)
+
+
+def test_a_blank_line_between_outcomes_is_a_gap_and_refused(tmp_path: Path) -> None:
+    """Left out, it would move all outcomes after it by a slot; around the outcomes it means nothing."""
+    path = tmp_path / "walk.csv"
+    path.write_text("\n1\n0\n1\n\n", encoding="utf-8")
+    assert LinkRecording(path).outcomes().tolist() == [1, 0, 1]
+    path.write_text("1\n\n0\n1\n", encoding="utf-8")
+    with pytest.raises(TraceError, match="line 2 is empty"):
+        LinkRecording(path).outcomes()

@@ -46,7 +46,7 @@ def mistakes(*expectations: dict[str, Any], **changes: Any) -> list[str]:
         ({"secrecy": "relative", "figure": ERROR}, "secrecy: is given together with figure; expected one of figure, link, sec"),
         ({"link": "smart", "below": 1.0}, "below: is set, but link has no such entry; remove the line"),
         ({"in_step": "smart", "by": 9, "slots": [0, 9]}, "slots: is set, but in_step has no such entry"),
-        ({"figure": ERROR}, "below: and above are both missing; expected at least one"),
+        ({"figure": ERROR}, "below: is missing, and so is above; add below, above or near"),
         ({"figure": ERROR, "within": 1.0}, "within: is set without near; expected near = 0.01 as well"),
         ({"figure": ERROR, "within_relative": 0.1, "below": 1.0}, "within_relative: is set without near"),
         ({"figure": ERROR, "near": 1.0}, "within: is missing; expected within = 0.002, or within_relative = 0.1"),

@@ -77,7 +77,7 @@ from tests.scenario.good import GOOD, mistakes
             "eavesdroppers: has 65 entries; expected at most 64",
         ),
         ("expect", [{"figure": "smart.mean_eror", "below": 1.0}], "expect.0.figure: is \"smart.mean_eror\"; expected REC"),
-        ("expect", [{"figure": "smart.used_fraction"}], "expect.0.below: and above are both missing"),
+        ("expect", [{"figure": "smart.used_fraction"}], "expect.0.below: is missing, and so is above"),
         ("expect", [{"figure": "smart.used_fraction", "below": float("nan")}], "expect.0.below: is nan; expected a fin"),
         ("secret_file", "no-such-file", "secret_file: no-such-file cannot be read (No such file or directory)"),
         ("secret_file", "/dev/null", "secret_file: /dev/null cannot be read (it is a pipe or a device, not a file)"),

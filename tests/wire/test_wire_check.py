@@ -128,6 +128,7 @@ def test_keys_that_zenoh_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[s
         (["FILE", "a/b"], "a/b: keys are for --check, which says which link a key takes"),
         (["FILE", "--for", "60 sec"], 'wire --for 60 sec: expected seconds, or a length of time such as "60 s"'),
         (["FILE", "--for", "0"], 'wire --for 0: expected seconds, or a length of time such as "60 s"'),
+        (["FILE", "--for", "1e9 h"], 'wire --for 1e9 h: expected seconds, or a length of time such as "60 s"'),
         (["none.toml"], "none.toml cannot be read (No such file or directory)"),
         (["FILE", "--set", "seed=-1"], "seed: is -1; expected a number at least 0"),
     ],
@@ -190,7 +191,7 @@ def test_the_command_runs_a_wire(tmp_path: Path, capsys: pytest.CaptureFixture[s
     )
     assert main(["wire", str(path), "--for", "100 ms", "--out", str(tmp_path / "out")]) == 0
     printed = capsys.readouterr()
-    endpoints = dict(line.split() for line in printed.out.splitlines()[:2])
+    endpoints = dict(line.split() for line in printed.out.splitlines() if " tcp/" in line)
     assert endpoints.keys() == {"robot", "base"}
     assert all(re.fullmatch(r"tcp/127\.0\.0\.1:[1-9]\d*", one) for one in endpoints.values())
     assert "0.0 s: cut robot-base" in printed.out

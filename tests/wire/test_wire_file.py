@@ -322,6 +322,8 @@ def test_a_correlated_link_keeps_its_model() -> None:
     ("text", "seconds"),
     [
         ("20 ms", 0.02),
+        ("9 ms", 0.009),
+        ("20 us", 2e-5),
         ("20ms", 0.02),
         ("1.5 s", 1.5),
         ("2 min", 120.0),

@@ -67,6 +67,24 @@ def test_variance_of_a_chain_with_gaps(model: str) -> None:
     assert found[1] == pytest.approx(total, rel=1e-9)
 
 
+def test_variance_of_a_recording_that_begins_anywhere() -> None:
+    """For one range it is that over all places where the recording may begin; with gaps it is at least that."""
+    outcomes = "1110010" * 3 + "0000"
+    settings = {"loss": {"model": "trace", "outcomes": outcomes, "random_start": True}, "corrupt": 0.4}
+    for ranges in ([range(5, 19)], [range(3), range(24, 28), range(40, 41)]):
+        counts = [
+            sum(int(outcomes[(n + begin) % len(outcomes)]) for some in ranges for n in some)
+            for begin in range(len(outcomes))
+        ]
+        exact = 0.6**2 * float(np.var(counts)) + 0.6 * 0.4 * float(np.mean(counts))
+        mean, variance = expected(settings, [], ranges)
+        assert mean == pytest.approx(0.6 * float(np.mean(counts)))
+        if len(ranges) == 1:
+            assert variance == pytest.approx(exact)
+        else:
+            assert variance > exact
+
+
 def test_a_change_of_the_loss_model_begins_a_new_memory() -> None:
     """Variances on both sides add up; a change of something else leaves them tied."""
     bursts = {"loss": LOSSES["gilbert-elliott"]}

@@ -233,7 +233,7 @@ below = 0.5
         )
     said = "\n".join(caught.value.mistakes)
     for line in (
-        "expect.0.below: and above are both missing; expected one of them, or both",
+        "expect.0.below: is missing, and so is above; add one of them, or both",
         'expect.0.figure: is "scam.delivery", but there is no link scam; expected a figure or the name of scan',
         'expect.1.figure: is "scan.latencies"; expected LINK.delivery, LINK.latency, LINK.gap_messages or LINK.gap_seconds',
         'expect.1.below: is "3 apples"; expected a number, or a length of time such as "20 ms"',

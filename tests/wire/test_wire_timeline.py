@@ -45,7 +45,7 @@ def test_cuts_and_partitions_overlap() -> None:
     plan = plan_of(
         {"from": 1, "to": 5, "cut": "scan"},
         {"from": 3, "to": 8, "partition": ["base", "robot"]},
-        {"at": 4, "note": "the lift"},
+        {"from": 4, "to": 5, "note": "the lift"},
         {"at": 8, "cut": "robot-listener"},
     )
     both = frozenset({"scan", "robot-base", "base-robot"})

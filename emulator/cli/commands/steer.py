@@ -192,7 +192,7 @@ COMMANDS = (
         (_going_on, _two_sides),
         section="steer",
         example="partition runs/wire robot base",
-        page="control",
+        page="wire",
     ),
     Command(
         "heal",
@@ -201,7 +201,7 @@ COMMANDS = (
         (_going_on, _two_sides),
         section="steer",
         example="heal runs/wire robot base",
-        page="control",
+        page="wire",
     ),
     Command(
         "pause",

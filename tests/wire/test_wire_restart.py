@@ -1,0 +1,76 @@
+"""A wire that is killed and starts again in the same folder loses the messages that it would have lost without that."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+
+from evedrop.live.network.control_file import read_control
+from evedrop.live.network.operator import Request, ask
+from evedrop.live.protocol.wire_status import WireStatus
+from evedrop.wire.fates import KeyFates
+from evedrop.wire.file import load_wire
+from tests.conftest import Evedrop, Live, wait_until
+from tests.wire.wire_at_work import program
+
+FILE = """
+seed = 7
+[side.robot]
+[side.base]
+[[link]]
+name = "scan"
+from = "robot"
+to = "base"
+keys = "scan"
+quality = 0.6
+[[link]]
+from = "robot"
+to = "base"
+"""
+COUNT = 500
+
+
+def carrying(evedrop: Evedrop, path: Path, numbers: range, arrived: list[int]) -> Live:
+    """Start the wire, and put messages with these numbers at one side; those that come to the other side go into `arrived`."""
+    wire = evedrop.started("wire", str(path))
+    control = wire.folder / "control.json"
+    wait_until(lambda: control.exists() or wire.process.poll() is not None, "a wire that can be asked")
+    answer = ask(read_control(wire.folder), Request("status"), 30.0)
+    assert answer is not None
+    assert isinstance(answer.status, WireStatus)
+    sides = answer.status.sides
+    with program(sides["robot"]) as robot, program(sides["base"]) as base:
+        ready: list[bytes] = []
+        base.declare_subscriber("ready", lambda sample: ready.append(sample.payload.to_bytes()))
+        base.declare_subscriber("scan", lambda sample: arrived.append(int(sample.payload.to_bytes())))
+        wait_until(lambda: robot.put("ready", b"") or ready, "a first message crosses")
+        for n in numbers:
+            robot.put("scan", str(n).encode())
+        robot.put("ready", b"last")
+        wait_until(lambda: ready[-1] == b"last", "the last message crosses")
+    return wire
+
+
+def test_a_wire_that_was_killed_goes_on_with_its_fates(evedrop: Evedrop) -> None:
+    """Kill -9 of the command between two starts: what arrives is what one wire would have let through."""
+    path = evedrop.folder / "robot.toml"
+    path.write_text(FILE)
+    arrived: list[int] = []
+    wire = carrying(evedrop, path, range(COUNT), arrived)
+    os.kill(wire.process.pid, signal.SIGKILL)
+    wire.process.communicate()
+    (wire.folder / "control.json").unlink()
+    wire = carrying(evedrop, path, range(COUNT, 2 * COUNT), arrived)
+    os.kill(wire.process.pid, signal.SIGINT)
+    done = wire.end()
+    assert done.status == 0, done.err
+    assert "messages were recovered from an earlier start, which was killed; their numbers go on" in done.out
+    (link, _) = load_wire(path).links
+    fates = KeyFates(link, "scan", "put", 7)
+    assert arrived == [n for n in range(2 * COUNT) if fates.next()[0] == 0]
+    summary = json.loads((wire.folder / "summary.json").read_text())
+    assert (summary["start"], summary["links"]["scan"]["heard"], summary["unaccounted"]) == (2, COUNT, 0)
+    assert summary["journal"]["recovered"] >= COUNT
+    assert not (wire.folder / "control.json").exists()
