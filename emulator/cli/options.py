@@ -97,12 +97,45 @@ def changes_of(options: argparse.Namespace) -> dict[str, Any]:
     return changes
 
 
+def over_wire(parser: argparse.ArgumentParser) -> None:
+    """Add the options for a wire as the network."""
+    parser.add_argument("--wire", type=Path, metavar="FILE", help="take links and events from this wire file")
+    parser.add_argument(
+        "--wire-key", metavar="KEY", help="the key of the packets on the wire; default that of the program of the states"
+    )
+    parser.add_argument(
+        "--wire-side",
+        action="append",
+        default=[],
+        metavar="PROCESS=SIDE",
+        help="the side of the wire that the sensor or a receiver is on; default the side of its name; repeatable",
+    )
+
+
+def _of_wire(options: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
+    """The changes that give a scenario the network of `--wire`; none without it."""
+    sides = [one.partition("=") for one in getattr(options, "wire_side", ())]
+    if getattr(options, "wire", None) is None:
+        if sides or getattr(options, "wire_key", None) is not None:
+            raise UsageError("--wire-key and --wire-side belong to a wire; give --wire FILE as well")
+        return {}
+    if wrong := next((name for name, equals, side in sides if not (name and equals and side)), None):
+        raise UsageError(f"--wire-side {wrong}: expected PROCESS=SIDE, such as --wire-side sensor=robot")
+    from evedrop.wire.file import load_wire
+    from evedrop.wire.network import over_wire
+
+    return over_wire(scenario, load_wire(options.wire), options.wire_key, {name: side for name, _, side in sides})
+
+
 def loaded(options: argparse.Namespace, beyond_horizon: bool = False) -> Scenario:
     """Load the scenario of a command, with its changes; prints warnings."""
     from evedrop.expected.estimates import warnings_of
-    from evedrop.loading import load
+    from evedrop.loading import checked, load
 
     scenario = load(options.scenario, changes_of(options), beyond_horizon=beyond_horizon)
+    if network := _of_wire(options, scenario):
+        tables = scenario.model_dump(mode="json", exclude_none=True)
+        scenario = checked(tables, str(options.wire), network, beyond_horizon=beyond_horizon)
     for warning in warnings_of(scenario):
         print(f"evedrop: warning: {warning}", file=sys.stderr)
     return scenario

@@ -26,6 +26,11 @@ def link_mistakes(tables: ValidTables) -> Iterator[str]:
             yield f"{path}.delay.unit: is seconds; expected slot_seconds = 0.02, the duration of a slot, at the top of the file"
         if link.correlation is not None:
             yield from _correlation_mistakes(f"{path}.correlation.with", name, link, link.correlation.to, tables)
+    for name in () if tables.wire is None else tables.wire.links:
+        if name not in tables.receivers:
+            yield f"wire.links.{name}: is not a receiver; expected {listed(tables.receivers)}"
+        elif name not in tables.links and tables.scenario is not None:
+            yield f"wire.links.{name}: is a receiver with several links; expected one with a single link"
 
 
 def _correlation_mistakes(entry: str, name: str, link: LinkTable, other: str, tables: ValidTables) -> Iterator[str]:

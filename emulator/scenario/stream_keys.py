@@ -13,6 +13,7 @@ from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.slot.link import LinkSchedule, streams_of
 from evedrop.names import ACKNOWLEDGEMENTS
 from evedrop.scenario import Scenario
+from evedrop.scenario.wire_table import WireTable
 from evedrop.streams import root_of_seed, stream_key
 
 _SECRET_BYTES = 32
@@ -37,14 +38,16 @@ class StreamKeys:
 
     seed_root: bytes
     secret_root: bytes
+    wire: WireTable | None = None
+    """The wire whose random numbers some links draw; None if each draws its own."""
 
     @classmethod
     def of(cls, scenario: Scenario) -> StreamKeys:
         """The keys of a scenario: from its seed, and the secret's from a file if it names one. Raises as `secret_in`."""
         root = root_of_seed(scenario.seed)
         if scenario.secret_file is None:
-            return cls(root, stream_key(root, "secret"))
-        return cls(root, stream_key(secret_in(scenario.secret_file), "secret"))
+            return cls(root, stream_key(root, "secret"), scenario.wire)
+        return cls(root, stream_key(secret_in(scenario.secret_file), "secret"), scenario.wire)
 
     def secret(self, names: tuple[str, ...]) -> dict[str, bytes]:
         """Stream → its key, for these streams of the shared secret."""
@@ -57,7 +60,9 @@ class StreamKeys:
 
     def link(self, receiver: str, schedule: LinkSchedule) -> dict[str, bytes]:
         """Stream → its key, for all streams that a receiver's link draws from."""
-        return {name: stream_key(self.seed_root, name) for name in streams_of(receiver, schedule)}
+        streams = streams_of(receiver, schedule)
+        own = {name: stream_key(self.seed_root, name) for name in streams}
+        return own if self.wire is None else {**own, **self.wire.stream_keys(streams)}
 
     def links(self, schedules: Mapping[str, LinkSchedule]) -> dict[str, bytes]:
         """Stream → its key, for all links."""

@@ -47,6 +47,7 @@ from evedrop.scenario.table import Found, Probability, ProcessName, Table, again
 from evedrop.scenario.timeline import Timeline
 from evedrop.scenario.values import MOST_EAVESDROPPERS
 from evedrop.scenario.words import as_toml, listed
+from evedrop.scenario.wire_table import WireTable
 from evedrop.streams import MOST_SLOTS
 
 
@@ -190,6 +191,9 @@ class Scenario(Table):
     controller: Annotated[ControllerTable | None, Field(examples=[{"strategy": "lqr"}])] = None
     acknowledgements: Annotated[AcknowledgementsTable | None, Field(examples=[{"link": {"quality": 0.9}}])] = None
     energy: Annotated[EnergyTable | None, Field(examples=[{"packet": 1.0, "encryption": 0.5}])] = None
+    wire: Annotated[
+        WireTable | None, Field(examples=[{"seed": 7, "key": "robot/pose", "links": {"legitimate": "radio"}}])
+    ] = None
     network: Annotated[NetworkTable | None, Field(examples=[{"routers": 2}])] = None
     event: Annotated[list[AnyEvent], Field(max_length=10_000, examples=[[{"at": 400, "cut": "legitimate"}]])] = Field(
         default_factory=list

@@ -31,6 +31,7 @@ from evedrop.scenario.tables import (
     EncodingTable,
     Scenario,
 )
+from evedrop.scenario.wire_table import WireTable
 
 K = TypeVar("K")
 T = TypeVar("T")
@@ -71,6 +72,7 @@ class ValidTables:
     controller: ControllerTable | None
     acknowledgements: AcknowledgementsTable | None
     nemesis: NemesisTable | None
+    wire: WireTable | None
 
     @property
     def scheme(self) -> type[Scheme] | None:

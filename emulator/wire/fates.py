@@ -15,7 +15,8 @@ from itertools import repeat
 from typing import Any, final
 
 from evedrop.model.slot.link import NEVER, Change, Fates, Link, LinkSchedule, streams_of
-from evedrop.streams import Batch, root_of_seed, stream_key
+from evedrop.scenario.wire_table import wire_stream_key
+from evedrop.streams import Batch, root_of_seed
 from evedrop.wire.plan import WireLink
 
 MessageFate = tuple[int, float, bool]
@@ -45,7 +46,7 @@ class KeyFates:
         made = tuple(Change(at, None if one.settings is None else _timeless(one.settings)) for at, one in last.items())
         schedule = LinkSchedule(_timeless(link.settings), _LATEST, made, correlation=link.correlation)
         root = root_of_seed(seed)
-        keys = {name: stream_key(root, f"wire/{name}/{kind}/{key}") for name in streams_of(link.name, schedule)}
+        keys = {name: wire_stream_key(root, name, kind, key) for name in streams_of(link.name, schedule)}
         self._link = Link(schedule, link.name, keys, Batch(NEVER, 1))
         self._lock = threading.Lock()
         self._start = self._stop = start  # `_stop`: the end of the fates in `_ready`

@@ -6,7 +6,7 @@ import argparse
 import contextlib
 
 from evedrop.cli.in_memory import MEMORY, plan_of
-from evedrop.cli.options import loaded, print_so_far, scenario
+from evedrop.cli.options import loaded, over_wire, print_so_far, scenario
 from evedrop.command import Command
 from evedrop.errors import Interrupted
 
@@ -45,7 +45,7 @@ COMMANDS = (
         "montecarlo",
         montecarlo,
         "simulate the trials of a scenario in memory (1000 unless told otherwise)",
-        (scenario, *MEMORY, _rare),
+        (scenario, over_wire, *MEMORY, _rare),
         section="run",
         example="montecarlo vehicle --trials 200",
         page="montecarlo",

@@ -8,7 +8,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from evedrop.cli.holding import hold
-from evedrop.cli.options import entries, loaded, output, print_so_far, scenario
+from evedrop.cli.options import entries, loaded, output, over_wire, print_so_far, scenario
 from evedrop.command import Command
 from evedrop.errors import Interrupted, RunError
 
@@ -92,7 +92,7 @@ COMMANDS = (
         "run",
         run,
         "run a scenario live: separate processes over a network, with a view and results",
-        (scenario, *_LIVE),
+        (scenario, over_wire, *_LIVE),
         section="run",
         example="run vehicle --view web",
         page="scenario",
