@@ -101,7 +101,9 @@ def over_wire(parser: argparse.ArgumentParser) -> None:
     """Add the options for a wire as the network."""
     parser.add_argument("--wire", type=Path, metavar="FILE", help="take links and events from this wire file")
     parser.add_argument(
-        "--wire-key", metavar="KEY", help="the key of the packets on the wire; default that of the program of the states"
+        "--wire-key",
+        metavar="KEY",
+        help="the key of the packets on the wire; default that of the program of the states",
     )
     parser.add_argument(
         "--wire-side",

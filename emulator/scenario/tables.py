@@ -46,8 +46,8 @@ from evedrop.scenario.receivers import EavesdropperTable, LegitimateTable
 from evedrop.scenario.table import Found, Probability, ProcessName, Table, again, one_of, registered
 from evedrop.scenario.timeline import Timeline
 from evedrop.scenario.values import MOST_EAVESDROPPERS
-from evedrop.scenario.words import as_toml, listed
 from evedrop.scenario.wire_table import WireTable
+from evedrop.scenario.words import as_toml, listed
 from evedrop.streams import MOST_SLOTS
 
 

@@ -1,6 +1,6 @@
 """`[wire]`: receivers whose links draw their random numbers as the links of a wire do, so that packets have the same fates.
 
-Source: docs/scenario.md, wire; docs/links.md, the links of a wire.
+Source: docs/scenario.md, wire; docs/wire.md, a wire as the network of a run.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 The packet of slot k has the fate of the k-th message that a program publishes on a key of the wire.
 
-Source: docs/links.md, the links of a wire.
+Source: docs/wire.md, a wire as the network of a run.
 """
 
 from __future__ import annotations
@@ -46,16 +46,20 @@ def over_wire(
     lossless = not wrong and key is not None and plan.is_lossless(_expression(key, wrong))
     happens = moments(plan)
     if scenario.slot_seconds is None and (len(happens) > 1 or any("delay" in one.settings for one in links.values())):
-        wrong.append("its delays and events are in seconds, and the scenario has no slot_seconds; give slot_seconds = 0.1")
+        wrong.append(
+            "its delays and events are in seconds, and the scenario has no slot_seconds; give slot_seconds = 0.1"
+        )
     for name, link in links.items():
         if not lossless:
-            wrong += _unusable(name, link, links, scenario, happens)
+            wrong += _unusable(name, link, links, happens)
     if wrong:
         raise UsageError("\n".join(f"--wire: {one}" for one in wrong))
     made: dict[str, Any] = {}
     for name, link in links.items():
         table = LEGITIMATE if name == LEGITIMATE else f"eavesdroppers.{name}"
-        made[f"{table}.link"] = _table(_LOSSLESS if lossless else link.settings, None if lossless else _tie(link, links))
+        made[f"{table}.link"] = _table(
+            _LOSSLESS if lossless else link.settings, None if lossless else _tie(link, links)
+        )
     if not lossless:
         made["wire"] = {"seed": plan.seed, "key": key, "links": {name: link.name for name, link in links.items()}}
         events = [event for name, link in links.items() for event in _events(name, link, happens, scenario)]
@@ -71,7 +75,9 @@ def _places(scenario: Scenario, plan: WirePlan, sides: Mapping[str, str], wrong:
     for name, side in found.items():
         if side not in plan.sides:
             given = f"--wire-side {name}={next(iter(plan.sides))}"
-            wrong.append(f"{name} is on no side of the wire, whose sides are {listed(tuple(plan.sides))}; give such as {given}")
+            wrong.append(
+                f"{name} is on no side of the wire, whose sides are {listed(tuple(plan.sides))}; give such as {given}"
+            )
     return found
 
 
@@ -103,15 +109,11 @@ def _links(
     return found
 
 
-def _unusable(
-    name: str, link: WireLink, links: Mapping[str, WireLink], scenario: Scenario, happens: Sequence[Moment]
-) -> Iterator[str]:
+def _unusable(name: str, link: WireLink, links: Mapping[str, WireLink], happens: Sequence[Moment]) -> Iterator[str]:
     """The reasons why a receiver cannot have a link of the wire."""
     if any("rate" in moment.settings[link.name] for moment in happens):
-        yield (
-            f"{link.name}, the link of {name}, has a rate in bytes per second, and a packet of a scenario has no bytes; leave the "
-            "rate out"
-        )
+        why = "has a rate in bytes per second, and a packet of a scenario has no bytes; leave the rate out"
+        yield f"{link.name}, the link of {name}, {why}"
     tie = None if link.correlation is None else link.correlation[0]
     if tie is not None and tie not in {one.name for other, one in links.items() if other != name}:
         yield f"{link.name}, the link of {name}, is tied to {tie}, which is no other receiver's link"

@@ -44,6 +44,6 @@ COMMANDS = (
         group="process",
         section="study",
         example="process fit pose.csv",
-        page="scenario",
+        page="programs",
     ),
 )

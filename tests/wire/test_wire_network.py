@@ -1,0 +1,261 @@
+"""A wire as the network of a run: the packets have the fates that a program's messages have on the wire."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from evedrop.api import montecarlo, run
+from evedrop.cli.main import main
+from evedrop.errors import ScenarioError, UsageError
+from evedrop.loading import checked, load
+from evedrop.memory.montecarlo import Plan
+from evedrop.model.links.link import Fate
+from evedrop.results.diff import difference
+from evedrop.results.writer import Results
+from evedrop.scenario import Scenario
+from evedrop.wire.fates import KeyFates
+from evedrop.wire.file import wire_of
+from evedrop.wire.network import over_wire
+from evedrop.wire.plan import WirePlan
+from evedrop.wire.timeline import moments
+from tests.builders import MARGINAL, process_table
+from tests.conftest import wait_until
+from tests.wire.wire_at_work import at_work
+
+PLAYER = Path(__file__).parents[2] / "docs" / "examples" / "csv_player.py"
+KEY = "robot/pose"
+SIDES = {"sensor": "robot", "legitimate": "base", "eve": "listener"}
+BURSTS = {"model": "gilbert-elliott", "p": 0.1, "r": 0.4}
+SECONDS = 0.05
+
+
+def scenario_of(slots: int = 300, **more: Any) -> Scenario:
+    """A scenario with one eavesdropper, whose links are replaced."""
+    link = {"link": {"quality": 1.0}}
+    tables = {
+        "title": "Over a wire",
+        "slots": slots,
+        "slot_seconds": SECONDS,
+        "process": process_table(MARGINAL),
+        "encoding": {"scheme": "innovation", "state_probability": 0.4},
+        "legitimate": {"window": 3, **link},
+        "eavesdroppers": {"eve": {"strategy": "smart", **link}},
+        **more,
+    }
+    return checked({name: value for name, value in tables.items() if value is not None}, "file")
+
+
+def wire(**more: Any) -> WirePlan:
+    """A wire from a robot to its base and, as a tap, to a listener."""
+    radio = {"name": "radio", "from": "robot", "to": "base", "keys": "robot/**", "loss": BURSTS}
+    tap = {"name": "tap", "from": "robot", "to": "listener", "tap": True, "loss": {**BURSTS, "r": 0.3}}
+    sides: dict[str, Any] = {"robot": {}, "base": {}, "listener": {}}
+    return wire_of(
+        {"seed": 11, "side": sides, "link": [radio | more.pop("radio", {}), tap | more.pop("tap", {})], **more}
+    )
+
+
+def changed(plan: WirePlan, scenario: Scenario | None = None) -> Scenario:
+    """The scenario over the wire."""
+    before = scenario_of() if scenario is None else scenario
+    return checked(before.model_dump(mode="json", exclude_none=True), "wire", over_wire(before, plan, KEY, SIDES))
+
+
+def delivered(results: Results, receiver: str) -> list[bool]:
+    """Whether the packet of each slot was delivered in its own slot, in the only trial."""
+    rows = results.slots.to_pylist()
+    return [row["received_fraction"] == 1.0 for row in rows if row["peer"] == receiver]
+
+
+def fates_on(plan: WirePlan, name: str, slots: int) -> list[bool]:
+    """The same of messages that a program publishes, one in each slot, by the wire's own fates."""
+    link = next(one for one in plan.links if one.name == name)
+    fates, found, before = KeyFates(link, KEY, "put", plan.seed), [], link.settings
+    for k in range(slots):
+        now = [one for one in moments(plan) if one.time <= k * SECONDS + 1e-9][-1]
+        if now.settings[name] != before:
+            before = now.settings[name]
+            fates.change(before)
+        code, delay, _ = fates.next()
+        found.append(code == Fate.DELIVERED and name not in now.cut and delay < SECONDS)
+    return found
+
+
+EVENTS = [
+    {"from": "2 s", "to": "3.26 s", "partition": ["robot", "base"]},
+    {"from": "5 s", "to": "9 s", "link": "tap", "set": {"loss": {**BURSTS, "p": 0.3}}},
+    {"from": "7 s", "to": "8 s", "link": "tap", "set": {"delay": {"model": "constant", "value": "150 ms"}}},
+    {"at": "12 s", "cut": "tap"},
+    {"at": "40 s", "note": "too late for this run"},
+]
+
+
+def test_packets_have_the_fates_of_messages(tmp_path: Path) -> None:
+    """With delays, faults, correlation, cuts and changes; live as in memory, and the results folder repeats the run."""
+    delay = {"model": "normal", "mean": "40 ms", "deviation": "30 ms"}
+    plan = wire(
+        radio={"delay": delay, "duplicate": 0.05, "corrupt": 0.02, "reorder": 0.1},
+        tap={"correlation": {"with": "radio", "strength": 0.5}},
+        event=EVENTS,
+    )
+    scenario = changed(plan)
+    memory = montecarlo(scenario, trials=1, out=tmp_path / "memory", plan=Plan(workers=1))
+    for receiver, name in (("legitimate", "radio"), ("eve", "tap")):
+        found = delivered(memory, receiver)
+        assert found == fates_on(plan, name, 300)
+        assert 0 < sum(found) < 300
+    live = run(scenario, out=tmp_path / "live")
+    again = montecarlo(tmp_path / "live", trials=1, out=tmp_path / "again", plan=Plan(workers=1))
+    assert difference(live, memory).same
+    assert difference(live, again).same
+
+
+def hear(numbers: set[int], sample: zenoh.Sample) -> None:
+    """Keep the number that a message is."""
+    numbers.add(int(sample.payload.to_bytes()))
+
+
+def matched(publisher: zenoh.Publisher) -> bool:
+    """Whether a publisher has a subscriber."""
+    status: Any = publisher.matching_status
+    return bool(status.matching)
+
+
+def test_a_program_on_the_wire_loses_what_the_run_loses(tmp_path: Path) -> None:
+    """A real wire between a real publisher and two subscribers."""
+    plan, heard = wire(), {"base": set[int](), "listener": set[int]()}
+    with ExitStack() as stack:
+        work = stack.enter_context(at_work(plan, tmp_path / "wire"))
+        robot, base, listener = (stack.enter_context(work.program(side)) for side in ("robot", "base", "listener"))
+        for side, session in (("base", base), ("listener", listener)):
+            session.declare_subscriber(KEY, partial(hear, heard[side]))
+        publisher = robot.declare_publisher(KEY)
+        wait_until(lambda: matched(publisher), "the wire subscribes")
+        for k in range(200):
+            publisher.put(str(k).encode())
+        fates = work.when_heard(400)
+        expected = sum(one == 0 for one in fates)
+        wait_until(lambda: sum(map(len, heard.values())) == expected, "all messages arrive")
+    found = montecarlo(changed(plan, scenario_of(200)), trials=1, out=tmp_path / "run", plan=Plan(workers=1))
+    for receiver, side in (("legitimate", "base"), ("eve", "listener")):
+        assert {k for k, one in enumerate(delivered(found, receiver)) if one} == heard[side]
+
+
+def test_states_may_cross_a_wire(tmp_path: Path) -> None:
+    """A player on one side, the sensor on another: the run takes the states that the wire lets through."""
+    plan, path = wire(), tmp_path / "pose.csv"
+    path.write_text("\n".join(["x,v", *(f"{k},0.5" for k in range(20_000))]))
+    with at_work(plan, tmp_path / "wire") as work:
+        (robot,), (base,) = work.relay.endpoints["robot"], work.relay.endpoints["base"]
+        command = [sys.executable, str(PLAYER), str(path), KEY, "--connect", robot, "--every", "0.002"]
+        process = {
+            **process_table(MARGINAL),
+            "states": ["x", "v"],
+            "source": "zenoh",
+            "zenoh": {"key": KEY, "connect": base},
+        }
+        with subprocess.Popen(command, stdout=subprocess.DEVNULL) as player:
+            try:
+                assert run(scenario_of(40, process=process), out=tmp_path / "run").summary["ended"] == "complete"
+            finally:
+                player.kill()
+    lines = (tmp_path / "run" / "states.csv").read_text().splitlines()[1:]
+    taken = [int(float(line.partition(",")[0])) for line in lines]
+    through = [k for k, one in enumerate(fates_on(plan, "radio", taken[-1] + 1)) if one]
+    assert taken == through[-40:]
+    assert taken[-1] - taken[0] > 39
+
+
+def test_a_key_that_is_never_lost(tmp_path: Path) -> None:
+    """Neither losses nor events of the wire concern it."""
+    scenario = changed(wire(lossless=["robot/pose"], event=EVENTS))
+    assert scenario.wire is None
+    assert not scenario.event
+    assert {scenario.link(name).model.quality for name in scenario.receivers} == {1.0}
+    assert montecarlo(scenario, trials=1, out=tmp_path / "run").summary["links"]["eve"]["delivered"] == 300
+
+
+def refusal(plan: WirePlan, scenario: Scenario, key: str | None = KEY, **sides: str) -> str:
+    """Why the scenario cannot have this wire."""
+    with pytest.raises(UsageError) as caught:
+        over_wire(scenario, plan, key, {**SIDES, **sides})
+    return str(caught.value)
+
+
+def test_what_a_run_cannot_have_is_refused() -> None:
+    """Each with the receiver and the link."""
+    assert "the key of the packets is not known" in refusal(wire(), scenario_of(), None)
+    assert "robot/* is not a key without wildcards" in refusal(wire(), scenario_of(), "robot/*")
+    assert "/robot is not a key without wildcards" in refusal(wire(), scenario_of(), "/robot")
+    assert "eve is on no side of the wire, whose sides are robot, base or listener" in refusal(
+        wire(), scenario_of(), eve="x"
+    )
+    assert "mallory is not sensor, legitimate or eve" in refusal(wire(), scenario_of(), mallory="base")
+    assert "no link of the wire takes robot/pose from robot to robot, where eve is" in refusal(
+        wire(), scenario_of(), eve="robot"
+    )
+    rate = refusal(wire(radio={"rate": "1 kB/s"}), scenario_of())
+    assert "radio, the link of legitimate, has a rate in bytes per second" in rate
+    apart = [{"at": "1 s", "partition": ["robot", "base"]}]
+    assert "the scenario has no slot_seconds" in refusal(wire(event=apart), scenario_of(slot_seconds=None))
+    both = refusal(tied_to_a_third(), scenario_of())
+    assert "tap, the link of eve, is tied to third, which is no other receiver's link" in both
+    several = {"eve": {"strategy": "colluding", "reads_as": "smart", "links": [{"quality": 0.5}, {"quality": 0.5}]}}
+    assert "eve has several links" in refusal(wire(), scenario_of(eavesdroppers=several))
+
+
+def tied_to_a_third() -> WirePlan:
+    """A wire whose tap is tied to a link that takes no packets of the run."""
+    half = {"loss": {"model": "bernoulli", "quality": 0.5}}
+    radio = {"name": "radio", "from": "robot", "to": "base", "keys": "robot/**", **half}
+    tap = {"name": "tap", "from": "robot", "to": "listener", "correlation": {"with": "third", "strength": 0.5}, **half}
+    third = {"name": "third", "from": "robot", "to": "base", **half}
+    return wire_of({"side": {"robot": {}, "base": {}, "listener": {}}, "link": [radio, tap, third]})
+
+
+def test_the_key_of_the_program_is_the_default() -> None:
+    """A run whose states come from a program knows the key already."""
+    program = {"source": "zenoh", "zenoh": {"key": "robot/scan", "connect": "tcp/127.0.0.1:1"}, "states": ["x", "v"]}
+    scenario = scenario_of(process={**process_table(MARGINAL), **program})
+    assert over_wire(scenario, wire(), None, SIDES)["wire"]["key"] == "robot/scan"
+
+
+def test_wires_in_scenarios_are_checked() -> None:
+    """Receivers that are none, and those with several links."""
+    several = {"eve": {"strategy": "colluding", "reads_as": "smart", "links": [{"quality": 0.5}, {"quality": 0.5}]}}
+    links = {"mallory": "tap", "eve": "tap"}
+    with pytest.raises(ScenarioError) as caught:
+        scenario_of(eavesdroppers=several, wire={"seed": 1, "key": KEY, "links": links})
+    assert caught.value.mistakes == [
+        "wire.links.mallory: is not a receiver; expected legitimate or eve",
+        "wire.links.eve: is a receiver with several links; expected one with a single link",
+    ]
+
+
+def test_the_command_takes_a_wire(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The results folder has the links of the wire, and does not need its file."""
+    file, out = tmp_path / "radio.toml", tmp_path / "out"
+    file.write_text(
+        '[side.sensor]\n[side.base]\n[[link]]\nname = "radio"\nfrom = "sensor"\nto = "base"\nquality = 0.25\n'
+    )
+    sides = [one for name in ("legitimate", "smart", "naive", "suspicious") for one in ("--wire-side", f"{name}=base")]
+    rest = ["--wire-key", KEY, *sides, "--slots", "40", "--trials", "2", "--out", str(out), "--set", "expect=[]"]
+    assert main(["montecarlo", "eavesdroppers", "--wire", str(file), *rest]) == 0
+    found = load(out)
+    assert found.wire is not None
+    assert found.wire.links == dict.fromkeys(found.receivers, "radio")
+    assert set(found.quality.values()) == {0.25}
+    assert main(["montecarlo", "eavesdroppers", "--wire-key", KEY]) == 2
+    assert main(["montecarlo", "eavesdroppers", "--wire", str(file), "--wire-side", "eve"]) == 2
+    assert main(["montecarlo", "eavesdroppers", "--wire", str(tmp_path / "none.toml")]) == 2
+    said = capsys.readouterr().err
+    assert "give --wire FILE as well" in said
+    assert "--wire-side eve: expected PROCESS=SIDE" in said
