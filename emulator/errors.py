@@ -17,6 +17,8 @@ EvedropError                    exit status
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 MOST_MISTAKES = 100
 """The most mistakes of a scenario in one message: more would not be read."""
 
@@ -42,11 +44,17 @@ class ScenarioError(UsageError):
 
     def __init__(self, source: str, mistakes: list[str]) -> None:
         self.source = source
+        self._all = mistakes
         more = len(mistakes) - MOST_MISTAKES
         short = [line if len(line) <= LONGEST_LINE else f"{line[:LONGEST_LINE]}…" for line in mistakes[:MOST_MISTAKES]]
         self.mistakes = short if more <= 0 else [*short, f"and {more} more"]
         count = "1 mistake" if len(mistakes) == 1 else f"{len(mistakes)} mistakes"
         super().__init__("\n".join([f"{source}: {count}, nothing was started", *(f"  {line}" for line in mistakes)]))
+
+    def numbered(self, line_of: Callable[[str], int | None]) -> ScenarioError:
+        """The same with the line of each mistake's entry; line_of: dotted path → line, None if the file has no such entry."""
+        lines = [(mistake, line_of(mistake.partition(":")[0])) for mistake in self._all]
+        return ScenarioError(self.source, [one if line is None else f"{one} (line {line})" for one, line in lines])
 
 
 class TraceError(UsageError):

@@ -17,6 +17,7 @@ from pydantic import ValidationError
 
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.files import Unreadable, is_folder, is_there, shown, text_of
+from evedrop.loading.line_numbers import with_line_numbers
 from evedrop.loading.mistakes import mistakes_across
 from evedrop.model.registry import near, place_of
 from evedrop.plugins import named_in
@@ -126,7 +127,8 @@ def parse(
     for entry in ("secret_file", "modules"):
         if isinstance(tables.get(entry), str):
             tables[entry] = str((folder / tables[entry]).absolute())
-    return checked(tables, source, changes, beyond_horizon=beyond_horizon, folder=folder)
+    with with_line_numbers(text, changes or ()):
+        return checked(tables, source, changes, beyond_horizon=beyond_horizon, folder=folder)
 
 
 def tables_in(text: str, source: str) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from pydantic import ValidationError
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.files import Unreadable, shown, text_of
 from evedrop.loading import set_entry, tables_in
+from evedrop.loading.line_numbers import with_line_numbers
 from evedrop.scenario.input_files import read_recordings, recordings_located
 from evedrop.scenario.sentences import sentences
 from evedrop.scenario.values import unusable
@@ -38,7 +39,9 @@ def load_wire(path: str | Path, changes: Mapping[str, Any] | None = None) -> Wir
     except Unreadable as error:
         example = "a wire file is a TOML file; `evedrop wire --example` prints one"
         raise UsageError(f"{shown(path)} cannot be read ({error}); {example}") from error
-    return wire_of(tables_in(text, shown(path)), shown(path), changes, folder=path.parent)
+    tables = tables_in(text, shown(path))
+    with with_line_numbers(text, changes or ()):
+        return wire_of(tables, shown(path), changes, folder=path.parent)
 
 
 def example_wire() -> str:

@@ -63,7 +63,7 @@ def test_an_event_on_pooled_links_is_looked_at_too() -> None:
     text = BASE + POOLED + event("{ corrupt = 0.1 }", "pool") + event('{ loss = { model = "nope" } }', "pool", 5)
     found = mistakes(text)
     assert (
-        found[0]
+        found[0].partition(" (line")[0]
         == "event.0.set: pool has several links; expected a quality or a loss, for the one link that replaces them"
     )
     assert found[1].startswith('event.1.set.loss.model: is "nope"; expected bernoulli')

@@ -1,0 +1,88 @@
+"""The lines of entries in a file, for messages."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from evedrop.errors import ScenarioError
+from evedrop.loading import load, shipped
+from evedrop.loading.line_numbers import line_of, lines_of_entries
+
+TEXT = '''# a comment with [brackets]
+a = 1
+event = [{ x = 1 },
+         { y = 2 }]
+[[link]]
+from = "r"        # = here
+[[link]]
+keys = """
+[no.table]
+"""
+[link.loss]
+good.bad = 0.5
+[x."a b".c]
+d = [
+  [1.0,
+   2.0],
+]
+'''
+
+
+def test_every_entry_has_its_line() -> None:
+    """Also after values of several lines, in lists of tables, and with dotted and quoted keys."""
+    assert lines_of_entries(TEXT) == {
+        "a": 2,
+        "event": 3,
+        "link.0": 5,
+        "link.0.from": 6,
+        "link.1": 7,
+        "link.1.keys": 8,
+        "link.1.loss": 11,
+        "link.1.loss.good.bad": 12,
+        "x.a b.c": 13,
+        "x.a b.c.d": 14,
+    }
+
+
+def test_what_is_inside_a_value_has_the_line_of_the_value() -> None:
+    """And what is nowhere has none."""
+    lines = lines_of_entries(TEXT)
+    assert line_of("event.1.y", lines) == 3
+    assert line_of("link.1.loss.model", lines) == 11
+    assert line_of("nowhere.at.all", lines) is None
+
+
+def paths(value: Any, path: str) -> set[str]:
+    """The paths of all entries that are no tables."""
+    if isinstance(value, list) and value and all(isinstance(one, dict) for one in value):
+        return {place for i, one in enumerate(value) for place in paths(one, f"{path}.{i}")}
+    if not isinstance(value, dict):
+        return {path}
+    return {place for name, inner in value.items() for place in paths(inner, f"{path}.{name}" if path else name)}
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_every_entry_of_a_built_in_scenario_is_found(name: str) -> None:
+    """Itself, or the value or table that holds it."""
+    text = shipped()[name].read_text(encoding="utf-8")
+    lines = lines_of_entries(text)
+    for path in paths(tomllib.loads(text), ""):
+        line = line_of(path, lines)
+        assert line is not None
+        assert path not in lines or path.split(".")[-1] in text.splitlines()[line - 1]
+
+
+def test_a_mistake_names_its_line_and_a_changed_entry_none(tmp_path: Path) -> None:
+    """The line is that of the file; `--set` has no line."""
+    path = tmp_path / "mine.toml"
+    path.write_text(shipped()["numerical"].read_text(encoding="utf-8").replace('"smart"', '"smrt"'), encoding="utf-8")
+    with pytest.raises(ScenarioError) as found:
+        load(path, {"slots": 0})
+    line = path.read_text(encoding="utf-8").splitlines().index('strategy = "smrt"') + 1
+    told = {mistake.partition(":")[0]: mistake for mistake in found.value.mistakes}
+    assert told["eavesdroppers.smart.strategy"].endswith(f" (line {line})")
+    assert "(line" not in told["slots"]
