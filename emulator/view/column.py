@@ -12,6 +12,8 @@ from evedrop.model.process import Floats
 
 TIMELINE = "slot_number"
 """Rerun makes the events' first column as wide as this name, and "slot" is too narrow for a number."""
+ELAPSED = "elapsed"
+"""The time line of a wire, which has no slots: seconds since its start."""
 
 
 @dataclass(frozen=True)

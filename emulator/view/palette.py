@@ -38,6 +38,9 @@ SILENT: Colour = (34, 37, 44)  # dark
 LANES: tuple[Colour, ...] = (STATE, DECODED, DISCARDED, MISLED, DROPPED, SILENT)
 """The outcomes of a packet."""
 
+WIRE_LANES: tuple[Colour, ...] = (STATE, DECODED, DISCARDED, MISLED, DROPPED, SILENT, TRUTH)
+"""What became of the messages of a wire's link; white is cut."""
+
 BLUE: Colour = (0, 114, 178)
 RED: Colour = (193, 39, 45)
 GREEN: Colour = (79, 191, 139)
@@ -58,6 +61,7 @@ PANELS: dict[str, tuple[Colour, ...]] = {
     "curves": (*RECEIVERS, TRUTH_CURVE),
     "plant": PLANT,
     "lanes": LANES,
+    "lanes of a wire": WIRE_LANES,
     "figures": FIGURES,
     "verdicts": VERDICTS,
 }

@@ -20,19 +20,23 @@ from rerun.experimental import ViewerClient
 from evedrop.environment import viewer_environment
 from evedrop.errors import UsageError
 from evedrop.ports import free_port
-from evedrop.view.column import TIMELINE
+from evedrop.view.column import ELAPSED, TIMELINE
 from evedrop.view.viewer_process import end, guarded, spawn
 
+SIZE = (1600, 950)
+"""Width and height of a picture in pixels."""
 _LOAD_SECONDS = 60.0
 _SETTLE_SECONDS = 30.0
 
 
-def picture(rrd: Path, png: Path, size: tuple[int, int] = (1600, 950), slot: int | None = None) -> list[str]:
+def picture(rrd: Path, png: Path, size: tuple[int, int] = SIZE, moment: float | None = None) -> list[str]:
     """Draw a moment of a recording, by default its last, to a PNG file; returns the panels' complaints.
+
+    moment: a slot of a run, or seconds since the start of a wire.
 
     Raises UsageError if there is no Vulkan driver, the recording cannot be loaded, or the file cannot be written.
     """
-    with opened(rrd, size, slot) as viewer:
+    with opened(rrd, size, moment) as viewer:
         try:
             png.write_bytes(viewer.take_screenshot())
         except OSError as error:
@@ -40,7 +44,7 @@ def picture(rrd: Path, png: Path, size: tuple[int, int] = (1600, 950), slot: int
         return reports(viewer)
 
 
-def picture_apart(rrd: Path, png: Path, slot: int | None = None) -> list[str]:
+def picture_apart(rrd: Path, png: Path, moment: float | None = None, size: tuple[int, int] = SIZE) -> list[str]:
     """Draw as `picture` does, in a separate process; in a separate network, too, if the system allows that.
 
     Otherwise anybody who finds the port of the headless viewer could control it.
@@ -52,7 +56,8 @@ def picture_apart(rrd: Path, png: Path, slot: int | None = None) -> list[str]:
         "evedrop.view.picture",
         str(rrd),
         str(png),
-        *([] if slot is None else [str(slot)]),
+        *map(str, size),
+        *([] if moment is None else [str(moment)]),
     ]
     done = subprocess.run(
         guarded(command, apart=True), capture_output=True, text=True, check=False, env=dict(viewer_environment())
@@ -64,9 +69,10 @@ def picture_apart(rrd: Path, png: Path, slot: int | None = None) -> list[str]:
 
 def main(words: Sequence[str]) -> int:
     """Draw what `picture_apart` asks for; returns the exit status."""
-    rrd, png, *slot = words
+    rrd, png, width, height, *moment = words
+    size = int(width), int(height)
     try:
-        for complaint in picture(Path(rrd), Path(png), slot=int(slot[0]) if slot else None):
+        for complaint in picture(Path(rrd), Path(png), size, float(moment[0]) if moment else None):
             print(complaint)  # noqa: T201 - read by the process that started this one
     except UsageError as error:
         print(error, file=sys.stderr)  # noqa: T201 - the same
@@ -98,7 +104,7 @@ def check(rrd: Path) -> None:
 
 
 @contextmanager
-def opened(rrd: Path, size: tuple[int, int], slot: int | None = None) -> Iterator[ViewerClient]:
+def opened(rrd: Path, size: tuple[int, int], moment: float | None = None) -> Iterator[ViewerClient]:
     """A headless viewer that has loaded a recording and shows a moment of it, by default the last, ready to be drawn.
 
     Raises UsageError as `picture` does.
@@ -116,7 +122,7 @@ def opened(rrd: Path, size: tuple[int, int], slot: int | None = None) -> Iterato
             raise UsageError(_without_driver(str(error)) or str(error)) from error
         try:
             viewer = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
-            _show(viewer, slot)
+            _show(viewer, moment)
             yield viewer
         except (RuntimeError, ConnectionError) as error:
             log = (logs / "viewer.log").read_text(errors="replace")
@@ -125,15 +131,22 @@ def opened(rrd: Path, size: tuple[int, int], slot: int | None = None) -> Iterato
             end(process)
 
 
-def _show(viewer: ViewerClient, slot: int | None) -> None:
+def _show(viewer: ViewerClient, moment: float | None) -> None:
     deadline = time.monotonic() + _LOAD_SECONDS
-    while (last := _last_slot(viewer)) is None:
+    while (end := _end(viewer)) is None:
         if time.monotonic() > deadline:
             raise RuntimeError(f"the recording was not loaded within {_LOAD_SECONDS:.0f} s")
         time.sleep(0.05)
-    if slot is not None and not 0 <= slot <= last:
-        raise UsageError(f"--slot {slot} is not in the run; give one from 0 to {last}")
-    viewer.set_time(TIMELINE, sequence=last if slot is None else slot, play_state="paused")
+    timeline, last = end
+    if timeline == ELAPSED:
+        seconds = last / 1e9
+        if moment is not None and not 0.0 <= moment <= seconds:
+            raise UsageError(f"--time {moment:g} is not a time of the wire; give one from 0 to {seconds:g}, in seconds")
+        viewer.set_time(ELAPSED, duration=seconds if moment is None else moment, play_state="paused")
+    else:
+        if moment is not None and not 0 <= moment <= last:
+            raise UsageError(f"--slot {moment:.0f} is not in the run; give one from 0 to {last}")
+        viewer.set_time(TIMELINE, sequence=last if moment is None else int(moment), play_state="paused")
     deadline = time.monotonic() + _SETTLE_SECONDS
     before, now = b"", viewer.take_screenshot()
     while now != before and time.monotonic() < deadline:
@@ -141,13 +154,13 @@ def _show(viewer: ViewerClient, slot: int | None) -> None:
         before, now = now, viewer.take_screenshot()
 
 
-def _last_slot(viewer: ViewerClient) -> int | None:
-    """The recording's last slot, once recording and layout are loaded."""
+def _end(viewer: ViewerClient) -> tuple[str, int] | None:
+    """The recording's time line and its last slot, or its last nanosecond, once recording and layout are loaded."""
     state = viewer.get_state()
     if state.loading or not state.views:
         return None
-    ends = [line.end for recording in state.recordings for line in recording.timelines if line.name == TIMELINE]
-    return int(ends[0]) if ends and ends[0] is not None else None
+    lines = [line for recording in state.recordings for line in recording.timelines if line.name in {TIMELINE, ELAPSED}]
+    return (lines[0].name, int(lines[0].end)) if lines and lines[0].end is not None else None
 
 
 def _without_driver(log: str) -> str | None:

@@ -7,11 +7,13 @@ and writes the file. Viewers read the file as it grows; the run does not know of
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import final
+from typing import Generic, TypeVar, final
 
 import rerun as rr
+import rerun.blueprint as rrb
 
 from evedrop.output import warn
 from evedrop.results.folder import private_file
@@ -19,7 +21,7 @@ from evedrop.view.events import Event, introduction
 from evedrop.view.panel_set import PanelSet
 from evedrop.view.scene import PeerSlots, Scene, SceneSlots, Shown
 
-__all__ = ["PeerSlots", "Scene", "SceneSlots", "Shown", "ViewRecording"]
+__all__ = ["PeerSlots", "RecordingThread", "Scene", "SceneSlots", "Shown", "ViewRecording"]
 
 _APPLICATION = "evedrop"
 _PERIOD = 0.1  # seconds between batches at most
@@ -27,48 +29,56 @@ _MOST_SLOTS = 1024  # in a batch
 _MOST_WAITING = 20_000  # slots that the file may be behind before the run waits for it
 _FILE_TIMEOUT = 5.0  # seconds that the run waits for the file before it continues without one
 
+T = TypeVar("T")
 
-@final
-class ViewRecording:
-    """Writes the recording of one run to `path`. Neither disk nor panels can make any method raise: see `failure`."""
 
-    def __init__(self, path: Path, scene: Scene, warn: Callable[[str], None] = warn) -> None:
-        """warn: tells the user about a panel that is left out; called from any thread."""
+class RecordingThread(ABC, Generic[T]):
+    """A thread that writes a recording to `path`. Neither disk nor panels can make any method raise: see `failure`.
+
+    A subclass says what is recorded. The constructor calls `_layout` and `_style`, the thread calls `_send`.
+    """
+
+    def __init__(self, path: Path, name: str, notes: Sequence[Event] = ()) -> None:
+        """name: identifies the recording: recordings of the same name are shown as one. notes: the first lines."""
         self.failure: str | None = None
         """Why there is no recording on disk, or an incomplete one."""
-        self._waiting: list[SceneSlots] = []
-        self._waiting_slots = 0
-        self._notes = introduction(scene)
+        self._waiting: list[T] = []
+        self._waiting_size = 0
+        self._notes = list(notes)
         self._closing = False
         self._changed = threading.Condition()
-        self._file = rr.RecordingStream(_APPLICATION, recording_id=scene.run)
+        self._file = rr.RecordingStream(_APPLICATION, recording_id=name)
         try:
-            self._panels = PanelSet(scene, warn)
-            self._file.save(private_file(path), default_blueprint=self._panels.layout())
-            self._panels.send_styles(self._file)
+            self._file.save(private_file(path), default_blueprint=self._layout())
+            self._style(self._file)
         except Exception as error:
             self._give_up(str(error))
         self._writer = threading.Thread(target=self._write, name="recording", daemon=True)
         self._writer.start()
 
-    def add(self, slots: SceneSlots) -> None:
-        """Record the next slots. Waits only for a disk that is thousands of slots behind, and for a few seconds at most."""
-        if not slots.count:
-            return
+    @abstractmethod
+    def _layout(self) -> rrb.Blueprint:
+        """The views."""
+
+    @abstractmethod
+    def _style(self, to: rr.RecordingStream) -> None:
+        """Record names, colours and the like, once."""
+
+    @abstractmethod
+    def _send(self, chunks: list[T], notes: list[Event], to: rr.RecordingStream) -> bool:
+        """Record what came since the last call, about ten times a second; returns whether anything was recorded."""
+
+    def _append(self, chunk: T, size: int, most: int, patience: float) -> None:
+        """Append to the list. With more than `most` in it, wait, and after `patience` seconds do without a recording."""
         with self._changed:
-            if self._waiting_slots > _MOST_WAITING:
-                in_time = self._changed.wait_for(lambda: self._waiting_slots <= _MOST_WAITING, _FILE_TIMEOUT)
+            if self._waiting_size > most:
+                in_time = self._changed.wait_for(lambda: self._waiting_size <= most, patience)
                 if not in_time:
                     self._give_up("the disk did not keep up with the run")
             if self.failure is None:
-                self._waiting.append(slots)
-                self._waiting_slots += slots.count
+                self._waiting.append(chunk)
+                self._waiting_size += size
                 self._changed.notify_all()
-
-    def note(self, k: int, level: str, text: str) -> None:
-        """Add a line to the events: level is INFO, WARN or ERROR."""
-        with self._changed:
-            self._notes.append(Event(k, level, text))
 
     def close(self) -> bool:
         """Finish the file, within a time limit.
@@ -90,8 +100,8 @@ class ViewRecording:
     def _write(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._closing or self._waiting_slots >= _MOST_SLOTS, _PERIOD)
-                chunks, self._waiting, self._waiting_slots = self._waiting, [], 0
+                self._changed.wait_for(lambda: self._closing or self._waiting_size >= _MOST_SLOTS, _PERIOD)
+                chunks, self._waiting, self._waiting_size = self._waiting, [], 0
                 notes, self._notes = self._notes, []
                 closing = self._closing
                 self._changed.notify_all()
@@ -104,15 +114,45 @@ class ViewRecording:
         if self.failure is None:
             self._file.disconnect()
 
-    def _put(self, chunks: list[SceneSlots], notes: list[Event]) -> None:
-        if self.failure is not None or not (chunks or notes):
+    def _put(self, chunks: list[T], notes: list[Event]) -> None:
+        if self.failure is not None or not self._send(chunks, notes, self._file):
             return
-        if chunks:
-            self._panels.send(SceneSlots.joined(chunks), self._file)
-        if notes:
-            self._panels.send_notes(notes, self._file)
         try:
             # When Rerun cannot write a file any more, the only sign is that it never finishes.
             self._file.flush(timeout_sec=_FILE_TIMEOUT)
         except RuntimeError:
             self._give_up("the file could not be written")
+
+
+@final
+class ViewRecording(RecordingThread[SceneSlots]):
+    """Writes the recording of one run."""
+
+    def __init__(self, path: Path, scene: Scene, warn: Callable[[str], None] = warn) -> None:
+        """warn: tells the user about a panel that is left out; called from any thread."""
+        self._scene, self._warn = scene, warn
+        super().__init__(path, scene.run, introduction(scene))
+
+    def add(self, slots: SceneSlots) -> None:
+        """Record the next slots. Waits only for a disk that is thousands of slots behind, and for a few seconds at most."""
+        if slots.count:
+            self._append(slots, slots.count, _MOST_WAITING, _FILE_TIMEOUT)
+
+    def note(self, k: int, level: str, text: str) -> None:
+        """Add a line to the events: level is INFO, WARN or ERROR."""
+        with self._changed:
+            self._notes.append(Event(k, level, text))
+
+    def _layout(self) -> rrb.Blueprint:
+        self._panels = PanelSet(self._scene, self._warn)
+        return self._panels.layout()
+
+    def _style(self, to: rr.RecordingStream) -> None:
+        self._panels.send_styles(to)
+
+    def _send(self, chunks: list[SceneSlots], notes: list[Event], to: rr.RecordingStream) -> bool:
+        if chunks:
+            self._panels.send(SceneSlots.joined(chunks), to)
+        if notes:
+            self._panels.send_notes(notes, to)
+        return bool(chunks or notes)

@@ -46,6 +46,10 @@ class WireHistory:
     """How many messages each stream had numbered at the end of the latest start that ended."""
     links: dict[int, list[str]] = field(default_factory=dict)
     """Start → the names of its links, in the order of their codes."""
+    began: float = 0.0
+    """When the latest start began, in seconds since 1970."""
+    said: list[tuple[float, str]] = field(default_factory=list)
+    """The events since the latest start: when, in seconds since 1970, and a line for each."""
     _seed: int | None = None
     _settings: dict[str, list[_Settings]] = field(default_factory=dict)
 
@@ -82,6 +86,10 @@ class WireHistory:
         rows = [[*stream, n] for stream, n in since.items()]
         self._write({"change": link, "time": now, "settings": dict(settings), "since": rows})
 
+    def note(self, line: str, now: float) -> None:
+        """Note an event. Raises OSError."""
+        self._write({"said": line, "time": now})
+
     def end(self, counts: Mapping[Numbered, int], now: float, missing: int = 0) -> None:
         """End the latest start. missing: the number of rows for which the disk had no room. Raises OSError."""
         self._write(
@@ -109,6 +117,7 @@ class WireHistory:
     def _take(self, entry: Mapping[str, Any]) -> None:
         if "start" in entry:
             self.start, self.ended, self._seed = int(entry["start"]), False, int(entry["seed"])
+            self.began, self.said = float(entry["time"]), []
             self.links[self.start] = list(entry["links"])
             for name, settings in entry["links"].items():
                 self._add(name, settings, {})
@@ -116,6 +125,8 @@ class WireHistory:
             self._add(
                 entry["change"], entry["settings"], {(str(k), str(kind)): int(n) for k, kind, n in entry["since"]}
             )
+        elif "said" in entry:
+            self.said.append((float(entry["time"]), str(entry["said"])))
         elif int(entry["end"]) == self.start:
             self.ended = True
             self.counts = {(str(link), str(key), str(kind)): int(n) for link, key, kind, n in entry["counts"]}

@@ -59,6 +59,9 @@ Listener = Callable[[Records], None]
 AmendmentListener = Callable[[Records, Crossing], None]
 """Gets records that it got before, and the fate that they have now."""
 
+EventListener = Callable[[float, str], None]
+"""Gets the time of an event, in seconds since 1970, and a line about it."""
+
 
 @final
 class WireJournal:
@@ -77,6 +80,7 @@ class WireJournal:
         """
         self.listeners: list[Listener] = []
         self.amendment_listeners: list[AmendmentListener] = []
+        self.event_listeners: list[EventListener] = []
         self.incomplete_since: float | None = None
         """The time from which on the disk had no room for something; None: the journal is complete."""
         self.recorded = 0
@@ -164,6 +168,16 @@ class WireJournal:
                 self._history.change(link, settings, since, time.time())
             except OSError as error:
                 self._miss(error, time.time())
+
+    def note(self, line: str) -> None:
+        """Note an event that happens now, and tell the listeners."""
+        now = time.time()
+        with self._state:
+            try:
+                self._history.note(line, now)
+            except OSError as error:
+                self._miss(error, now)
+        self._hear(self.event_listeners, now, line)
 
     def amend(self, row: int, fate: Crossing) -> None:
         """Change the fate of a row that was recorded."""

@@ -26,8 +26,10 @@ UNFINISHED = "unfinished"
 """The folder inside it for records that are not yet in a Parquet file."""
 
 
-def journal_tables(folder: Path) -> Iterator[pa.Table]:
+def journal_tables(folder: Path, start: int | None = None) -> Iterator[pa.Table]:
     """The journal of a wire's folder in the order of its rows, a table for each part; also of a wire that goes on or was killed.
+
+    start: the number of a start of the wire, from 1, of which only the rows are given.
 
     Raises UsageError if there is no journal, or a part cannot be read.
     """
@@ -38,6 +40,8 @@ def journal_tables(folder: Path) -> Iterator[pa.Table]:
         )
     links = WireHistory.read(journal).links
     for name in part_names(journal):
+        if start not in {None, _start_of(name)}:
+            continue
         try:
             yield _table(journal, name, links)
         except (OSError, pa.ArrowException) as error:
@@ -48,9 +52,14 @@ def _table(journal: Path, name: str, links: dict[int, list[str]]) -> pa.Table:
     path = journal / UNFINISHED / f"{name}.rows"
     with contextlib.suppress(FileNotFoundError):  # a wire that goes on may just have made the Parquet file
         if not parquet_path(journal, name).exists():
-            start = int(name.partition("-")[0])
+            start = _start_of(name)
             return table_of(records_in(path), words_in(path.parent, start, links.get(start, [])))
     return pq.read_table(parquet_path(journal, name), schema=PARQUET)
+
+
+def _start_of(name: str) -> int:
+    """The number of the start that made a part."""
+    return int(name.partition("-")[0])
 
 
 def part_names(journal: Path) -> list[str]:

@@ -17,16 +17,19 @@ from evedrop.wire.control import WireControl
 from evedrop.wire.file import resolved_wire
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_reader import JOURNAL_FOLDER
+from evedrop.wire.live_view import live_view
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.relay import WireRelay
 from evedrop.wire.summary import WireSummary
 
 
-def run_wire(plan: WirePlan, out: Path, *, seconds: float | None = None, say: Callable[[str], None] = print) -> int:
+def run_wire(
+    plan: WirePlan, out: Path, *, seconds: float | None = None, say: Callable[[str], None] = print, view: str = "off"
+) -> int:
     """Run a wire until a signal, or for some seconds; returns the exit status.
 
     out: its results folder, empty or that of an earlier start; say: for a line about each side and each event, and for the
-    summary. Raises UsageError if the folder or a side cannot be used.
+    summary; view: as `live_view` takes it. Raises UsageError if the folder or a side cannot be used.
     """
     if (out / JOURNAL_FOLDER).is_dir():
         make_private(out)
@@ -34,26 +37,30 @@ def run_wire(plan: WirePlan, out: Path, *, seconds: float | None = None, say: Ca
         new_folder(out)
     events: list[str] = []
 
-    def happened(line: str) -> None:
-        events.append(line)
-        say(line)
-
     with stop_on_signals() as stop:
-        with WireJournal(out, plan) as journal:
+        with live_view(plan, out, view, say) as shown, WireJournal(out, plan) as journal:
             summary = WireSummary(plan, journal)
+            if shown is not None:
+                shown.follow(journal)
+
+            def happened(line: str) -> None:
+                events.append(line)
+                journal.note(line.partition(": ")[2])
+                say(line)
+
             _write_plan(out, plan)
             if journal.recovered:
                 say(
                     f"{journal.recovered:,} messages were recovered from an earlier start, which was killed; their numbers go on"
                 )
-            with (
-                WireRelay(plan, journal, warn) as relay,
-                WireConductor(plan, relay, happened) as conductor,
-                WireControl(out, relay, conductor, summary, journal, events),
-            ):
+            with WireRelay(plan, journal, warn) as relay:
                 for name, endpoints in relay.endpoints.items():
                     say(f"{name} {' '.join(endpoints)}")
-                stop.wait(seconds)
+                with (
+                    WireConductor(plan, relay, happened) as conductor,
+                    WireControl(out, relay, conductor, summary, journal, events),
+                ):
+                    stop.wait(seconds)
         status = summary.finish(out)
     for line in closing_lines(summary.as_dict()):
         say(line)

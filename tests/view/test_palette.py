@@ -8,7 +8,7 @@ import pytest
 from coloraide import Color
 
 from evedrop.view import lanes
-from evedrop.view.palette import DROPPED, LANES, PANELS, Colour, hexadecimal
+from evedrop.view.palette import DROPPED, LANES, PANELS, WIRE_LANES, Colour, hexadecimal
 
 _LEAST = 15.0  # CIEDE2000; 1 is just noticeable side by side
 _VISIONS = (None, "deutan", "protan", "tritan")
@@ -28,9 +28,10 @@ def test_colours_that_share_a_panel_differ(panel: str, vision: str | None) -> No
         assert found >= _LEAST, f"{hexadecimal(one)} and {hexadecimal(other)} differ by {found:.1f}"
 
 
-def test_lanes_differ_in_brightness() -> None:
+@pytest.mark.parametrize("colours", [LANES, WIRE_LANES])
+def test_lanes_differ_in_brightness(colours: tuple[Colour, ...]) -> None:
     """By at least 6 of 100 in CIE lightness, so that a grey print shows them too."""
-    lightness = sorted(Color(hexadecimal(one)).convert("lab-d65")["l"] for one in LANES)
+    lightness = sorted(Color(hexadecimal(one)).convert("lab-d65")["l"] for one in colours)
     assert min(after - before for before, after in pairwise(lightness)) >= 6.0
 
 

@@ -1,4 +1,4 @@
-"""`evedrop view`: a finished run, on the screen, in a picture or as a table."""
+"""`evedrop view`: a finished run or wire, on the screen, in a picture or as a table."""
 
 from __future__ import annotations
 
@@ -6,14 +6,25 @@ import argparse
 import sys
 import tempfile
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from evedrop.cli.holding import hold
 from evedrop.cli.options import argument, served
 from evedrop.command import Command
+from evedrop.errors import UsageError
+
+if TYPE_CHECKING:
+    from evedrop.view.viewer import Viewer
 
 
 def view(options: argparse.Namespace) -> int:
-    """Open a finished run, draw it, or print its closing report again."""
+    """Open a finished run or wire, draw it, or print its closing report again."""
+    from evedrop.wire.folder import is_wire
+
+    if is_wire(options.run):
+        return _view_wire(options)
+    if options.time is not None:
+        raise UsageError("--time is for wires; a run has slots, so give --slot")
     if options.table:
         from evedrop.cli.closing_report import print_results
 
@@ -36,12 +47,7 @@ def view(options: argparse.Namespace) -> int:
         elif not recording.is_file():
             recording = replay(options.run)
         if options.picture is None:
-            viewer = open_run(options.run, options.view, stand, recording)
-            where = f" at {viewer.address}, to anybody who has this address" if viewer.address else ""
-            print(f"the run is shown{where}; Ctrl-C ends it", flush=True)
-            if viewer.warning is not None:
-                print(f"evedrop: warning: {viewer.warning}", file=sys.stderr)
-            hold(viewer)
+            _hold("run", open_run(options.run, options.view, stand, recording))
             return 0
         from evedrop.view.picture import picture_apart
 
@@ -50,21 +56,56 @@ def view(options: argparse.Namespace) -> int:
     return 0
 
 
+def _view_wire(options: argparse.Namespace) -> int:
+    """Show or draw a wire, from its journal, or print its table."""
+    from evedrop.signals import raise_on_signals
+    from evedrop.view.picture import picture_apart
+    from evedrop.view.viewer import WebAddress, open_run
+    from evedrop.wire.closing import closing_lines
+    from evedrop.wire.replay import PICTURE_SIZE, replay_wire, summary_of_wire
+
+    if options.slot is not None:
+        raise UsageError(f"--slot is for runs, and {options.run} is the folder of a wire; give --time")
+    if options.table:
+        print("\n".join(closing_lines(summary_of_wire(options.run))))
+        return 0
+    stand = None if options.serve is None else WebAddress.of(options.serve)
+    with raise_on_signals(), tempfile.TemporaryDirectory(prefix="evedrop-view-") as temporary:
+        recording = replay_wire(options.run, Path(temporary) / "recording.rrd")
+        if options.picture is None:
+            _hold("wire", open_run(options.run, options.view, stand, recording))
+            return 0
+        for complaint in picture_apart(recording, options.picture, options.time, PICTURE_SIZE):
+            print(complaint, file=sys.stderr)
+    return 0
+
+
+def _hold(what: str, viewer: Viewer) -> None:
+    """Say where a viewer is, and wait until it is closed."""
+    where = f" at {viewer.address}, to anybody who has this address" if viewer.address else ""
+    print(f"the {what} is shown{where}; Ctrl-C ends it", flush=True)
+    if viewer.warning is not None:
+        print(f"evedrop: warning: {viewer.warning}", file=sys.stderr)
+    hold(viewer)
+
+
 def _shown(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--view", choices=("auto", "native", "web"), default="auto", help="default auto")
     instead = parser.add_mutually_exclusive_group()
     instead.add_argument(
         "--picture", type=Path, metavar="FILE.png", help="draw the run into a file instead; needs no screen"
     )
-    instead.add_argument("--table", action="store_true", help="print the run's table and verdict instead")
-    parser.add_argument("--slot", type=int, metavar="K", help="the slot to draw; default the last")
+    instead.add_argument("--table", action="store_true", help="print its table and sentences instead")
+    moment = parser.add_mutually_exclusive_group()
+    moment.add_argument("--slot", type=int, metavar="K", help="the slot to draw; default the last")
+    moment.add_argument("--time", type=float, metavar="SECONDS", help="for a wire: the time to draw; default the end")
 
 
 COMMANDS = (
     Command(
         "view",
         view,
-        "open a finished run, draw it, or print its report again",
+        "open a finished run or wire, draw it, or print its report again",
         (argument("run", "RUN"), _shown, served),
         section="inspect",
         example="view runs/vehicle --picture vehicle.png",

@@ -43,7 +43,7 @@ def wire(options: argparse.Namespace) -> int:
     from evedrop.wire.run import run_wire
 
     with results_folder(options.out, f"wire-{options.file.stem}") as folder:
-        return run_wire(plan, folder, seconds=seconds, say=_hush if options.quiet else _say)
+        return run_wire(plan, folder, seconds=seconds, say=_hush if options.quiet else _say, view=options.view)
 
 
 def _say(line: str) -> None:
@@ -82,6 +82,12 @@ def _changes(parser: argparse.ArgumentParser) -> None:
 def _course(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="results folder; that of an earlier wire, to go on with its fates"
+    )
+    parser.add_argument(
+        "--view",
+        default="off",
+        metavar="VIEW",
+        help="auto, native or web: show the wire; FILE.rrd: write the view to a file; default off",
     )
     parser.add_argument("--quiet", action="store_true", help="print only warnings and errors")
     parser.add_argument(

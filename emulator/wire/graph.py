@@ -1,0 +1,102 @@
+"""The graph of a wire's sides: a box for each side, and on the way from one to another a box for each link with its losses.
+
+Rerun draws no labels on edges, so a link is a node between its sides.
+
+Source: docs/wire.md, the view.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import final
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from evedrop.view.palette import TRUTH
+from evedrop.wire.lane_states import share_of
+from evedrop.wire.plan import WirePlan
+from evedrop.wire.step_counts import DELIVERED, Counts
+
+GRAPH = "graph"
+"""The graph's path in the recording."""
+_LETTER, _LINE = 7.0, 38.0  # width of a letter and distance of boxes in Rerun's drawing
+_LONGEST = ": 12.3 % lost"
+
+
+@final
+class WireGraph:
+    """The nodes and edges of one wire; their places are fixed."""
+
+    def __init__(self, plan: WirePlan) -> None:
+        self._links = plan.links
+        self._sides = tuple(plan.sides)
+        self._ids = [*(f"side {name}" for name in self._sides), *(f"link {link.name}" for link in plan.links)]
+        self._places = _places(plan)
+
+    def view(self, title: str) -> rrb.GraphView:
+        """The view of the graph."""
+        margin = _LETTER * (4 + max(len(name) for name in self._sides)) / 2
+        across, down = (max(abs(place[axis]) for place in self._places) for axis in (0, 1))
+        bounds = rrb.VisualBounds2D(
+            x_range=(-across - margin, across + margin), y_range=(-down - _LINE / 2, down + _LINE / 2)
+        )
+        return rrb.GraphView(name=title, origin=GRAPH, visual_bounds=bounds)
+
+    def style(self, to: rr.RecordingStream) -> None:
+        """Record the edges, and which nodes are where."""
+        edges = []
+        for link in self._links:
+            edges += [(f"side {link.source}", f"link {link.name}"), (f"link {link.name}", f"side {link.target}")]
+        to.log(GRAPH, rr.GraphEdges(edges, graph_type="directed"), static=True, strict=True)
+        nodes = rr.GraphNodes(self._ids, positions=self._places, radii=[4.0] * len(self._ids))
+        to.log(GRAPH, nodes, static=True, strict=True)
+
+    def columns(self, recent: Sequence[Counts]) -> rr.ComponentColumnList:
+        """Labels and colours of the nodes at c times.
+
+        recent: what became of messages in the recent past, c times (links or more, outcomes).
+        """
+        labels, colours = [], []
+        for counts in recent:
+            labels += [*self._sides, *(f"{link.name}: {loss_of(counts[at])}" for at, link in enumerate(self._links))]
+            colours += [TRUTH] * len(self._sides)
+            colours += [share_of(counts[at]).text for at in range(len(self._links))]
+        lengths = [len(self._ids)] * len(recent)
+        return rr.GraphNodes.columns(labels=labels, colors=colours).partition(lengths)
+
+
+def loss_of(counts: Counts) -> str:
+    """The share of messages that were not delivered, as a text; counts: (outcomes,)."""
+    heard = int(counts.sum())
+    if not heard:
+        return "silent"
+    lost = 1.0 - int(counts[DELIVERED]) / heard
+    digits = 0 if lost in {0.0, 1.0} or 0.0995 <= lost < 0.99 else 1 if lost >= 0.00095 else 3
+    return f"{100.0 * lost:.{digits}f} % lost"
+
+
+def _places(plan: WirePlan) -> list[tuple[float, float]]:
+    """The places of all sides, on an ellipse around the origin, then of all links, between their sides."""
+    sides = [*plan.sides]
+    turns = [2.0 * math.pi * i / len(sides) for i in range(len(sides))]
+    across, down = [-math.cos(turn) for turn in turns], [-math.sin(turn) for turn in turns]
+    pairs = [frozenset((link.source, link.target)) for link in plan.links]
+    label = max([len(link.name) for link in plan.links], default=0) + len(_LONGEST) + max(len(name) for name in sides)
+    width = _LETTER * label / 2 + 60.0
+    height = _LINE * max(1.6, *(0.6 * pairs.count(pair) for pair in pairs)) if pairs else _LINE
+    xs, ys = _spread(across, width), _spread(down, height if len(sides) > 2 else 0.0)
+    at = dict(zip(sides, zip(xs, ys, strict=True), strict=True))
+    places = [*at.values()]
+    for i, link in enumerate(plan.links):
+        rank, of = pairs[:i].count(pairs[i]), pairs.count(pairs[i])
+        (x0, y0), (x1, y1) = at[link.source], at[link.target]
+        places.append(((x0 + x1) / 2, (y0 + y1) / 2 + _LINE * (rank - (of - 1) / 2)))
+    return places
+
+
+def _spread(values: list[float], reach: float) -> list[float]:
+    """The values, moved and scaled so that they go from -reach to reach."""
+    low, high = min(values), max(values)
+    return [reach * (2.0 * (value - low) / (high - low) - 1.0) if high - low > 1e-9 else 0.0 for value in values]

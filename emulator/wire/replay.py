@@ -1,0 +1,109 @@
+"""Makes the recording of a wire from its journal.
+
+Source: docs/wire.md, the view.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import rerun as rr
+from numpy.typing import NDArray
+
+from evedrop.errors import UsageError
+from evedrop.results.folder import private_file
+from evedrop.wire.crossing import RECORD, UNLINKED, Crossing
+from evedrop.wire.file import load_wire
+from evedrop.wire.folder import WIRE_FILE
+from evedrop.wire.history import WireHistory
+from evedrop.wire.journal_part import REASONS
+from evedrop.wire.journal_reader import JOURNAL_FOLDER, journal_tables
+from evedrop.wire.notices import Notice, level_of
+from evedrop.wire.panels import Pace, WirePanels
+from evedrop.wire.plan import WirePlan
+from evedrop.wire.step_counts import StepCounter
+
+PICTURE_SIZE = (1200, 720)
+"""Width and height of a picture of a wire, in pixels."""
+_WRITE_SECONDS = 60.0  # for the disk to take what was recorded
+
+
+def replay_wire(folder: Path, path: Path) -> Path:
+    """Write the recording of the latest start of a wire to a path, from the journal in its folder; returns the path.
+
+    Raises UsageError if the folder cannot be read, if nothing has crossed the wire, or if the path cannot be written.
+    """
+    plan, history = load_wire(folder / WIRE_FILE), WireHistory.read(folder / JOURNAL_FOLDER)
+    ends = [pc.max(table["time"]).as_py() for table in journal_tables(folder, history.start) if table.num_rows]
+    if not ends:
+        raise UsageError(f"{folder} shows nothing: no message came to the wire since its latest start")
+    pace = Pace.of_length(max(0.0, max(ends) - history.began))
+    panels, counter = WirePanels(plan, pace), StepCounter(len(plan.links), pace.step, history.began)
+    file = rr.RecordingStream("evedrop", recording_id=folder.resolve().name)
+    try:
+        file.save(private_file(path), default_blueprint=panels.layout())
+        panels.style(file)
+        panels.notes([*_notices(plan, history)], file)
+        for table in journal_tables(folder, history.start):
+            for steps in counter.add(_records(table, plan)):
+                panels.send(steps, file)
+        for steps in counter.finish():
+            panels.send(steps, file)
+        panels.end(file)
+        file.flush(timeout_sec=_WRITE_SECONDS)
+    except (OSError, RuntimeError) as error:
+        path.unlink(missing_ok=True)
+        raise UsageError(f"{path} cannot be written ({error}); make room on its disk") from error
+    finally:
+        file.disconnect()
+    return path
+
+
+def summary_of_wire(folder: Path) -> dict[str, Any]:
+    """The entries of a wire's summary.json. Raises UsageError if there is none."""
+    try:
+        found: dict[str, Any] = json.loads((folder / "summary.json").read_bytes())
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{folder} has no summary.json of a wire ({error}); a wire writes it when it ends") from error
+    return found
+
+
+def introduction(plan: WirePlan) -> str:
+    """The first line of the events."""
+    return f"a wire of {len(plan.sides)} sides and {len(plan.links)} links, seed {plan.seed}"
+
+
+def _notices(plan: WirePlan, history: WireHistory) -> Iterator[Notice]:
+    """The lines of the events that messages do not tell."""
+    again = "" if history.start == 1 else f"; start {history.start} in this folder"
+    yield Notice(0.0, "INFO", introduction(plan) + again)
+    for time, line in history.said:
+        yield Notice(max(0.0, time - history.began), level_of(line), line)
+
+
+def _records(table: pa.Table, plan: WirePlan) -> NDArray[Any]:
+    """The rows of a table as `RECORD` rows, with what the view needs."""
+    rows = np.zeros(table.num_rows, RECORD)
+    rows["time"], rows["delay"] = table["time"].to_numpy(), table["delay"].to_numpy()
+    links = {link.name: link.number for link in plan.links}
+    rows["link"] = _codes(table["link"], links, UNLINKED)
+    rows["fate"] = _codes(
+        table["reason"], {reason: int(fate) for fate, reason in REASONS.items()}, int(Crossing.DELIVERED)
+    )
+    return rows
+
+
+def _codes(column: pa.ChunkedArray, codes: dict[str, int], none: int) -> NDArray[np.uint16]:
+    """The codes of words in a dictionary column; none: the code of null and of an unknown word."""
+    parts = [np.empty(0, np.uint16)]
+    for chunk in column.chunks:
+        of_word = np.array([*(codes.get(word, none) for word in chunk.dictionary.to_pylist()), none], np.uint16)
+        places = chunk.indices.fill_null(len(of_word) - 1).to_numpy(zero_copy_only=False)
+        parts.append(of_word[places])
+    return np.concatenate(parts)

@@ -1,0 +1,408 @@
+"""The view of a wire shows what its messages tell, live and from the journal, and cannot hold up the wire."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from threading import Event, Thread
+from typing import Any
+from unittest.mock import patch
+
+import matplotlib.image
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from rerun.chunk import RrdReader
+
+from evedrop.cli.main import main
+from evedrop.errors import UsageError
+from evedrop.view import recording
+from evedrop.view.column import ELAPSED
+from evedrop.wire.crossing import UNLINKED, Crossing, Kind
+from evedrop.wire.file import resolved_wire
+from evedrop.wire.folder import WIRE_FILE
+from evedrop.wire.graph import loss_of
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.lane_states import LaneState, legend, state_of
+from evedrop.wire.live_view import live_view
+from evedrop.wire.notices import CutWatcher, LinkWatcher
+from evedrop.wire.panels import Pace
+from evedrop.wire.plan import WireEvent
+from evedrop.wire.replay import PICTURE_SIZE, replay_wire
+from evedrop.wire.run import run_wire
+from evedrop.wire.step_counts import DELIVERED, OUTCOMES, WireSteps
+from evedrop.wire.view import WireView
+from tests.conftest import LIMIT, wait_until
+from tests.wire.wire_at_work import LOSSY, both_ways, program
+from tests.wire.wire_rows import START, plan_of, robot_plan, traffic
+
+RATES = {"scan": 100.0, "command": 20.0, "listener": 100.0}
+SECONDS = 12.0
+CUT = (6.0, 8.0)
+
+
+class Clocks:
+    """The system's clock and a steady clock, as a test sets them."""
+
+    def __init__(self) -> None:
+        self._now = (START, 77.0)
+
+    def __call__(self) -> tuple[float, float]:
+        """What both show."""
+        return self._now
+
+    def advance(self, by: float) -> None:
+        """Let the time go on."""
+        self._now = (self._now[0] + by, self._now[1] + by)
+
+    def set(self, by: float) -> None:
+        """Set the system's clock."""
+        self._now = (self._now[0] + by, self._now[1])
+
+
+def shown(rrd: Path, entity: str, component: str) -> list[tuple[float, Any]]:
+    """The component's values of one entity, with their times in seconds, in order of time."""
+    found = []
+    for chunk in RrdReader(rrd).stream().filter(content=f"/{entity}", is_static=False):
+        columns = chunk.to_record_batch().to_pydict()
+        times = [one.total_seconds() for one in columns[ELAPSED]]
+        found += list(zip(times, columns[component], strict=True))
+    return sorted(found, key=lambda one: one[0])
+
+
+def texts(rrd: Path) -> list[tuple[float, str]]:
+    """The lines of the events."""
+    return [(round(seconds, 6), text[0]) for seconds, text in shown(rrd, "events", "TextLog:text")]
+
+
+def states(rrd: Path, lane: str, step: float, steps: int) -> list[str]:
+    """The lane's word in each step."""
+    changes = shown(rrd, f"links/{lane}", "StateChange:state")
+    words = []
+    for k in range(steps):
+        words.append([state for seconds, state in changes if seconds <= (k + 0.5) * step][-1][0])
+    return words
+
+
+@pytest.fixture(scope="module")
+def rows() -> NDArray[Any]:
+    """Messages of a robot, its base and a listener; robot and base are apart for a while."""
+    return traffic(robot_plan(), SECONDS, RATES, CUT)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def unhurried() -> Any:
+    """However busy the machine is, it gets the time to finish the file of a recording."""
+    with patch.object(recording, "_FILE_TIMEOUT", LIMIT):
+        yield
+
+
+@pytest.fixture(scope="module")
+def rrd(rows: NDArray[Any], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Their recording, as made while the wire ran."""
+    path, clocks = tmp_path_factory.mktemp("wire_view") / "recording.rrd", Clocks()
+    view = WireView(path, robot_plan(), "wire", START, Pace(0.2, SECONDS, True), clocks)
+    view.note(START + 6.0, "WARN", "a note")
+    for block in np.array_split(rows, 30):
+        view.add(block)
+    clocks.advance(SECONDS)
+    assert view.close()
+    assert view.failure is None
+    return path
+
+
+def test_lanes_say_what_became_of_messages(rows: NDArray[Any], rrd: Path) -> None:
+    """Each lane has in each step the word for the messages of its link, and the first lane says what is cut."""
+    for link, name in enumerate(RATES):
+        at = np.floor((rows["time"] - START) / 0.2).astype(int)
+        words = []
+        for k in range(60):
+            fates = rows[(at == k) & (rows["link"] == link)]["fate"]
+            lost = np.mean(fates != 0)
+            word = "all delivered" if not lost else "some lost" if lost < 0.5 else "most lost"
+            words.append("cut" if (fates == Crossing.CUT).any() else word)
+        assert states(rrd, f"{link + 1}_{name}", 0.2, 60) == words
+        assert set(words) >= ({"all delivered", "some lost", "cut"} if link == 0 else {"some lost"})
+        assert shown(rrd, f"links/{link + 1}_{name}", "StateChange:state")[-1][1] == ["no message"]
+    assert states(rrd, "0_cut", 0.2, 60) == [*["–"] * 30, *["robot|base"] * 10, *["–"] * 20]
+
+
+def test_rates_and_delays_are_those_of_the_messages(rows: NDArray[Any], rrd: Path) -> None:
+    """Heard and delivered messages per second, and the median and 99 % of the delays, over 0.6 seconds that end then."""
+    rates, delays = shown(rrd, "rates", "Scalars:scalars"), shown(rrd, "delays", "Scalars:scalars")
+    assert [round(seconds, 6) for seconds, _ in rates] == [round(0.2 * k, 6) for k in range(3, 61)]
+    for (end, rate), (_, delay) in zip(rates, delays, strict=True):
+        recent = rows[(rows["time"] - START >= end - 0.6) & (rows["time"] - START < end)]
+        for link in range(3):
+            of = recent[recent["link"] == link]
+            there = of[of["fate"] == Crossing.DELIVERED]
+            np.testing.assert_allclose([rate[3 + link], rate[link]], np.array([len(of), len(there)]) / 0.6)
+            if not len(there):
+                assert np.isnan([delay[link], delay[3 + link]]).all()
+            elif link < 2:
+                expected = [1e3 * np.quantile(there["delay"], share, method="inverted_cdf") for share in (0.99, 0.5)]
+                np.testing.assert_allclose([delay[3 + link], delay[link]], expected, rtol=0.04)
+
+
+def test_graph_and_table_state_the_losses(rows: NDArray[Any], rrd: Path) -> None:
+    """At the end, they have what became of all messages of each link, and the table says why."""
+    label = shown(rrd, "graph", "GraphNodes:labels")[-1][1]
+    table = shown(rrd, "table", "TextDocument:text")[-1][1][0]
+    assert label[:3] == ["robot", "base", "listener"]
+    for link, name in enumerate(RATES):
+        fates = rows[rows["link"] == link]["fate"]
+        cut, lost = int(np.sum(fates == Crossing.CUT)), int(np.sum(fates == Crossing.LOST))
+        assert label[3 + link] == f"{name}: {100 * (cut + lost) / len(fates):.0f} % lost"
+        (line,) = [one for one in table.splitlines() if one.startswith(f"| {name} ")]
+        assert f"| {len(fates):,} |" in line
+        assert f"{lost:,} lost" in line
+        assert (f"{cut:,} cut" in line) == (link < 2)
+
+
+def test_events_tell_of_stretches_and_notes(rrd: Path) -> None:
+    """A line for the note, one when nothing has come for a while, and one when messages arrive again."""
+    lines = texts(rrd)
+    assert (6.0, "a note") in lines
+    assert (6.6, "scan: nothing arrives for 0.6 s (60 cut)") in lines
+    assert (8.0, "scan: messages arrive again after 2.0 s (200 cut)") in lines
+    assert not [text for _, text in lines if text.startswith("listener")]
+
+
+def test_time_goes_on_without_messages(tmp_path: Path) -> None:
+    """A live view shows a silence as it lasts, and no rate from before it."""
+    clocks = Clocks()
+    view = WireView(tmp_path / "r.rrd", robot_plan(), "wire", START, None, clocks)
+    view.add(traffic(robot_plan(), 2.0, RATES))
+    clocks.advance(2.0)
+    for _ in range(6):
+        clocks.advance(1.0)
+        wait_until(lambda: view._sent == clocks()[0], "the thread has seen the time")
+    assert view.close()
+    rates = shown(tmp_path / "r.rrd", "rates", "Scalars:scalars")
+    assert rates[-1][0] > 6.0
+    assert {tuple(rate) for seconds, rate in rates if seconds > 3.0} == {(0.0,) * 6}
+    changes = shown(tmp_path / "r.rrd", "links/1_scan", "StateChange:state")
+    assert next(state for seconds, state in changes if seconds >= 2.0) == ["no message"]
+
+
+@pytest.mark.parametrize("by", [3600.0, -3600.0])
+def test_a_clock_that_is_set_does_not_stop_the_view(by: float, tmp_path: Path) -> None:
+    """The view goes on as if the clock had not been set, and a line says so."""
+    clocks = Clocks()
+    rows = traffic(robot_plan(), 4.0, RATES)
+    before, after = rows[rows["time"] < START + 2.0], rows[rows["time"] >= START + 2.0]
+    view = WireView(tmp_path / "r.rrd", robot_plan(), "wire", START, None, clocks)
+    view.add(before)
+    clocks.advance(2.0)
+    wait_until(lambda: view._sent == clocks()[0], "the thread has the messages")
+    clocks.set(by)
+    wait_until(lambda: view._shift == by, "the thread has noticed")
+    after["time"] += by
+    view.add(after)
+    clocks.advance(2.0)
+    assert view.close()
+    rates = shown(tmp_path / "r.rrd", "rates", "Scalars:scalars")
+    assert abs(rates[-1][0] - 4.0) < 0.3
+    assert all(rate[3] == pytest.approx(100.0) for _, rate in rates)
+    way = "forward" if by > 0 else "back"
+    assert [text for _, text in texts(tmp_path / "r.rrd")] == [
+        f"the system's clock was set 3600.0 s {way}; the view goes on"
+    ]
+
+
+def test_a_disk_that_takes_nothing_harms_only_the_view(tmp_path: Path, rows: NDArray[Any]) -> None:
+    """No method raises, and the reason is kept."""
+    view = WireView(tmp_path / "nowhere" / "r.rrd", robot_plan(), "wire", START)
+    view.add(rows)
+    view.amend(rows[:1], Crossing.UNDERWAY)
+    view.note(START, "INFO", "a note")
+    assert not view.close()
+    assert "the recording is incomplete" in str(view.failure)
+
+
+def test_a_view_that_is_far_behind_gives_up(tmp_path: Path, rows: NDArray[Any]) -> None:
+    """Instead of taking ever more memory, or holding up the wire."""
+    view = WireView(tmp_path / "r.rrd", robot_plan(), "wire", START)
+    with view._changed, patch("evedrop.wire.view._MOST_ROWS", 5000):  # the thread stands still
+        for _ in range(10):
+            view.add(rows)
+        assert len(view._waiting) <= 5000 // len(rows) + 2
+    assert "did not keep up" in str(view.failure)
+    view.close()
+
+
+def test_amended_fates_are_in_the_table(tmp_path: Path) -> None:
+    """A message that was still delayed when the wire ended is not shown as delivered."""
+    clocks, rows = Clocks(), traffic(robot_plan(), 1.0, {"scan": 100.0})
+    view = WireView(tmp_path / "r.rrd", robot_plan(), "wire", START, None, clocks)
+    clocks.advance(1.0)
+    view.add(rows)
+    for row in np.flatnonzero(rows["fate"] == 0)[-5:]:
+        view.amend(rows[row : row + 1], Crossing.UNDERWAY)
+    assert view.close()
+    table = shown(tmp_path / "r.rrd", "table", "TextDocument:text")[-1][1][0]
+    assert "5 underway" in table
+
+
+@pytest.fixture
+def folder(tmp_path: Path, rows: NDArray[Any]) -> Path:
+    """The folder of a wire that ended, with the rows in its journal."""
+    plan = robot_plan()
+    (tmp_path / WIRE_FILE).write_text(resolved_wire(plan))
+    for _ in range(2):  # only the second start is shown
+        with WireJournal(tmp_path, plan, part_rows=1000) as journal:
+            key, later = journal.key_code("robot/scan"), time.time() - START
+            for now, n, sequence, delay, _, _, size, link, kind, fate in rows.tolist():
+                journal.record(now + later, n, sequence, delay, key, 0, size, link, kind, fate)
+            journal.note("partition robot, base")
+            journal.note("heal robot, base")
+            journal.record(START + later + 1.0, -1, -1, 0.0, key, 0, 5, UNLINKED, Kind.PUT, Crossing.UNLINKED)
+    return tmp_path
+
+
+def test_a_replay_shows_the_whole_journal_of_the_latest_start(folder: Path, rows: NDArray[Any]) -> None:
+    """Every message of it is in the table, the events are those that came to pass, and the window is the whole time."""
+    rrd = replay_wire(folder, folder / "view.rrd")
+    table = shown(rrd, "table", "TextDocument:text")[-1][1][0]
+    for link, name in enumerate(RATES):
+        assert f"| {name} | " in table
+        assert f"| {int(np.sum(rows['link'] == link)):,} |" in table
+    assert "| no link | | 1 | | 1 no link |" in table
+    lines = [text for _, text in texts(rrd)]
+    assert lines[0] == "a wire of 3 sides and 3 links, seed 7; start 2 in this folder"
+    assert [line for line in lines if line.endswith("robot, base")] == ["partition robot, base", "heal robot, base"]
+    assert 11.5 < shown(rrd, "rates", "Scalars:scalars")[-1][0] < 13.0
+
+
+@pytest.mark.long
+def test_a_picture_of_a_wire(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """`evedrop view OUT --picture` draws it, no panel complains, and a moment that is not there is refused."""
+    assert main(["view", str(folder), "--picture", str(folder / "w.png"), "--slot", "3"]) == 2
+    assert "--slot is for runs" in capfd.readouterr().err
+    status = main(["view", str(folder), "--picture", str(folder / "w.png")])
+    said = capfd.readouterr()
+    if "no Vulkan driver" in said.err:
+        pytest.skip(said.err)
+    assert (status, said.err) == (0, "")
+    pixels = np.asarray(matplotlib.image.imread(folder / "w.png"))
+    assert pixels.shape[1::-1] == PICTURE_SIZE
+    colours = {tuple(round(255 * part) for part in one) for one in np.unique(pixels[:, :, :3].reshape(-1, 3), axis=0)}
+    for state in (LaneState.DELIVERED, LaneState.SOME, LaneState.CUT):  # Rerun draws lanes darker
+        assert any(all(abs(a - 0.8 * b) < 14 for a, b in zip(one, state.colour, strict=True)) for one in colours), state
+
+
+def test_a_wire_that_nothing_crossed_is_refused(tmp_path: Path) -> None:
+    """With the reason, not with an empty view."""
+    (tmp_path / WIRE_FILE).write_text(resolved_wire(robot_plan()))
+    with WireJournal(tmp_path, robot_plan()):
+        pass
+    with pytest.raises(UsageError, match="no message came to the wire"):
+        replay_wire(tmp_path, tmp_path / "view.rrd")
+
+
+def steps_of(*counts: dict[Crossing, int]) -> WireSteps:
+    """Steps of one link."""
+    made = np.zeros((len(counts), 2, len(OUTCOMES)), np.int64)
+    for k, one in enumerate(counts):
+        for fate, number in one.items():
+            made[k, 0, OUTCOMES.index(fate)] = number
+    return WireSteps(0, made, np.zeros((len(counts), 2, 3), np.int64))
+
+
+def test_losses_of_the_wire_itself_are_told_once() -> None:
+    """For each reason, and as errors: they are not what the file asked for."""
+    steps = steps_of({Crossing.HELD_UP: 3}, {Crossing.HELD_UP: 3, Crossing.REFUSED: 1}, {Crossing.LOST: 4})
+    watcher = LinkWatcher(["scan"], 0.2)
+    lines = watcher.watch(steps)
+    assert [(round(one.seconds, 6), one.level) for one in lines if "does not cross" in one.text] == [
+        (0.0, "ERROR"),
+        (0.2, "ERROR"),
+    ]
+    assert not [one for one in watcher.watch(steps) if "does not cross" in one.text]
+
+
+def test_frequent_stretches_get_few_lines() -> None:
+    """A link that fails for a second out of two gets a few lines in an hour, not thousands."""
+    watcher = LinkWatcher(["scan"], 0.2)
+    lines = watcher.watch(steps_of(*([{Crossing.DELIVERED: 5}] * 5 + [{Crossing.LOST: 5}] * 5) * 1800))
+    assert 2 <= len(lines) < 200
+
+
+def test_pairs_of_sides_are_cut_when_all_their_links_are() -> None:
+    """Otherwise the links are named; a link without messages stays as it was."""
+    plan = plan_of(("up", "a", "b", {}), ("down", "b", "a", {}), ("tap", "a", "c", {}))
+    watcher = CutWatcher(plan.links)
+    counts = np.zeros((4, len(OUTCOMES)), np.int64)
+    counts[0, OUTCOMES.index(Crossing.CUT)] = counts[1, DELIVERED] = counts[2, DELIVERED] = 5
+    watcher.watch(counts)
+    assert watcher.cut() == ["up"]
+    counts[:] = 0
+    counts[1, OUTCOMES.index(Crossing.CUT)] = 5
+    watcher.watch(counts)
+    assert watcher.cut() == ["a|b"]
+
+
+@pytest.mark.parametrize(
+    ("heard", "lost", "text"),
+    [(0, 0, "silent"), (7, 0, "0 % lost"), (7, 7, "100 % lost"), (1000, 213, "21 % lost"), (1000, 13, "1.3 % lost"),
+     (100_000, 7, "0.007 % lost"), (1000, 999, "99.9 % lost")],
+)  # fmt: skip
+def test_shares_are_rounded_but_never_to_nothing_or_all(heard: int, lost: int, text: str) -> None:
+    """A link that lost one message of many has not lost 0 %."""
+    counts = np.zeros(len(OUTCOMES), np.int64)
+    counts[DELIVERED], counts[OUTCOMES.index(Crossing.LOST)] = heard - lost, lost
+    assert loss_of(counts) == text
+
+
+def test_the_main_reason_decides_on_a_lane() -> None:
+    """Also for a full queue and for losses of the wire's own; the legend has the queue only for links with a rate."""
+    expected = {
+        Crossing.CORRUPTED: LaneState.SOME, Crossing.OVERFLOW: LaneState.FULL, Crossing.CUT: LaneState.CUT,
+        Crossing.REFUSED: LaneState.OWN, Crossing.HELD_UP: LaneState.OWN,
+    }  # fmt: skip
+    for fate, state in expected.items():
+        assert state_of(steps_of({Crossing.DELIVERED: 9, Crossing.LOST: 1, fate: 3}).counts[0, 0]) is state
+    assert state_of(steps_of({Crossing.UNDERWAY: 3}).counts[0, 0]) is LaneState.QUIET
+    assert "queue" not in legend(robot_plan())
+    assert "purple: queue full" in legend(plan_of(("a", "b", "c", {"rate": 1000.0})))
+
+
+def test_a_view_follows_a_running_wire(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """With `--view FILE.rrd`, the file has what crossed and the events; the journal, too, keeps the events."""
+    plan = both_ways(LOSSY, events=(WireEvent(0.5, None, partition=("robot", "base")),))
+    out, path = tmp_path / "out", tmp_path / "wire.rrd"
+    said: list[str] = []
+    ended = Event()
+
+    def send() -> None:
+        wait_until(lambda: any(line.startswith("robot ") for line in said), "the wire's endpoints")
+        with program([next(line for line in said if line.startswith("robot ")).split(" ")[1]]) as session:
+            while not ended.wait(0.01):
+                session.put("scan", b"x")
+
+    sender = Thread(target=send)
+    sender.start()
+    try:
+        assert run_wire(plan, out, seconds=1.5, say=said.append, view=str(path)) == 0
+    finally:
+        ended.set()
+        sender.join(LIMIT)
+    table = shown(path, "table", "TextDocument:text")[-1][1][0]
+    assert "cut" in table
+    assert "partition robot, base" in [text for _, text in texts(path)]
+    capfd.readouterr()
+    assert main(["view", str(out), "--table"]) == 0
+    printed = capfd.readouterr().out
+    assert printed.strip() == "\n".join(said[-1 - printed.count("\n") : -1]).strip()
+    replayed = replay_wire(out, tmp_path / "replayed.rrd")
+    assert "partition robot, base" in [text for _, text in texts(replayed)]
+    assert shown(replayed, "table", "TextDocument:text")[-1][1][0] == table
+
+
+def test_a_word_that_is_not_a_view_is_refused(tmp_path: Path) -> None:
+    """Before the wire starts."""
+    with pytest.raises(UsageError, match="is not a way to view"), live_view(robot_plan(), tmp_path, "pdf", print):
+        pass
+    with live_view(robot_plan(), tmp_path, "off", print) as view:
+        assert view is None
+    assert not [*tmp_path.iterdir()]
