@@ -168,9 +168,16 @@ class QueryRelay:
         complete = self._responsible(asked.side, key) is not None
         for target in dict.fromkeys(one.link.target for one in self._states if one.link.source == asked.side):
             querier = self._querier(target, asked.query, asked.key, complete)
-            if not _matching(querier):
-                continue  # nobody there can hear it
+            if not self._hears(target, querier, asked.key):
+                continue
             self._cross(Kind.QUERY, asked, (asked.side, target), asked.key, key, self._question(asked, querier, target))
+
+    def _hears(self, target: str, querier: zenoh.Querier, key: str) -> bool:
+        """Whether a queryable of a side matches a query: otherwise the query goes nowhere, and nobody waits for a reply."""
+        if "*" not in key:
+            return _matching(querier)
+        # The matching status knows only queryables that include the key, and routers do not list those with an `@`.
+        return "@" in key or any(querier.key_expr.intersects(one) for one in self._sides[target].sources("queryable"))
 
     def _question(self, asked: _Asked, querier: zenoh.Querier, target: str) -> _Message:
         query = asked.query

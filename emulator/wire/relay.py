@@ -66,6 +66,11 @@ class WireRelay:
         """Side → where programs connect."""
         return {name: side.endpoints for name, side in self.sides.items()}
 
+    @property
+    def tokens(self) -> Mapping[str, frozenset[str]]:
+        """Side → the liveliness tokens that its programs hold."""
+        return self._liveliness.tokens
+
     def apply(self, moment: Moment) -> None:
         """Cut the links that are cut from now on, let the others go on, and give all of them their settings."""
         for name, state in self.links.items():

@@ -1,0 +1,251 @@
+"""What a wire carries: messages a second, what it adds to the latency, large messages, and whether it accounts for all.
+
+    python benchmarks/wire.py [--quick]
+    python benchmarks/wire.py --full          # also ten million messages, of which none may be unaccounted for
+
+Everything runs on this machine: a sender and a receiver in plain zenoh-python (wire_peers.py), and the wire with its journal in
+this process. The yardstick of the rate is a bare relay: two sessions and a loop that puts what it hears.
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zenoh
+from table import Row, judged, run_alone
+from wire_peers import Carried, Traffic, carry
+
+from evedrop.wire.crossing import Crossing
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal_part import Records
+from evedrop.wire.law import bounds, expected
+from evedrop.wire.plan import Side, WireLink, WirePlan
+from evedrop.wire.relay import WireRelay
+from evedrop.wire.side import SideSession
+
+_ANYWHERE = ("tcp/127.0.0.1:0",)
+PERFECT: Mapping[str, Any] = {"loss": {"model": "bernoulli", "quality": 1.0}}
+BURSTS: Mapping[str, Any] = {"loss": {"model": "gilbert-elliott", "p": 0.01, "r": 0.2}}
+MODELS: dict[str, Mapping[str, Any]] = {
+    "bernoulli": {"model": "bernoulli", "quality": 0.8},
+    "distance": {
+        "model": "distance",
+        "sender": [0, 0],
+        "receiver": [[0, 60.0, 20.0], [4000, 150.0, 20.0]],
+        "reference_snr": 75.0,
+        "exponent": 3.0,
+        "threshold": 10.0,
+        "fading_block": 20,
+    },
+    "gilbert-elliott": {"model": "gilbert-elliott", "p": 0.02, "r": 0.1, "good": 0.01, "bad": 0.9},
+    "markov": {
+        "model": "markov",
+        "transitions": [[0.9, 0.02, 0.08, 0.0], [1.0, 0.0, 0.0, 0.0], [0.3, 0.0, 0.5, 0.2], [0.0, 0.0, 0.4, 0.6]],
+        "loss": [0.0, 1.0, 1.0, 0.0],
+    },
+    "pattern": {"model": "pattern", "outcomes": "1101001"},
+    "trace": {"model": "trace", "outcomes": "1" * 300 + "10" * 40 + "0" * 37},
+}
+
+
+class Measured:
+    """A wire in this process: where to connect, and the fates of the messages so far."""
+
+    def __init__(self, relay: WireRelay, journal: WireJournal) -> None:
+        self.robot, self.base = relay.endpoints["robot"][0], relay.endpoints["base"][0]
+        self.fates: dict[tuple[int, int], int] = {}
+        self.first, self.last = float("inf"), 0.0
+        self._journal = journal
+        journal.listeners.append(self._hear)
+
+    def _hear(self, block: Records) -> None:
+        block = block[(block["link"] == 0) | (block["size"] > 10)]
+        for link in np.unique(block["link"]).tolist():
+            found, counts = np.unique(block["fate"][block["link"] == link], return_counts=True)
+            for fate, count in zip(found.tolist(), counts.tolist(), strict=True):
+                self.fates[link, fate] = self.fates.get((link, fate), 0) + count
+        if len(block):
+            self.first = min(self.first, float(block["time"].min()))
+            self.last = max(self.last, float(block["time"].max()))
+
+    def reset(self) -> None:
+        """Count from now on."""
+        self._journal.flush()
+        self.fates, self.first, self.last = {}, float("inf"), 0.0
+
+    def count(self, *fates: Crossing) -> int:
+        """How many messages had one of these fates, or any."""
+        self._journal.flush()
+        return sum(count for (_, fate), count in self.fates.items() if not fates or fate in fates)
+
+
+@contextmanager
+def a_wire(*links: tuple[str, Mapping[str, Any]]) -> Iterator[Measured]:
+    """A wire from robot to base with these links: key expression, settings."""
+    made = [WireLink(f"link-{at}", at, "robot", "base", keys, settings) for at, (keys, settings) in enumerate(links)]
+    made.append(WireLink("rest", len(made), "robot", "base", "**", PERFECT))
+    plan = WirePlan(7, {name: Side(name, _ANYWHERE) for name in ("robot", "base")}, tuple(made))
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        WireJournal(Path(folder), plan) as journal,
+        WireRelay(plan, journal) as relay,
+    ):
+        yield Measured(relay, journal)
+
+
+@contextmanager
+def bare_relay() -> Iterator[tuple[str, str]]:
+    """Two router sessions and a loop between them; the endpoints."""
+    with SideSession(Side("a", _ANYWHERE), 2**30) as one, SideSession(Side("b", _ANYWHERE), 2**30) as other:
+        channel: Any = zenoh.handlers.FifoChannel(8192)
+        heard = one.session.declare_subscriber("**", channel, allowed_origin=zenoh.Locality.REMOTE)
+
+        def pass_on() -> None:
+            for sample in heard:
+                other.session.put(
+                    sample.key_expr,
+                    sample.payload,
+                    encoding=sample.encoding,
+                    congestion_control=sample.congestion_control,
+                    attachment=sample.attachment,
+                )
+
+        thread = threading.Thread(target=pass_on, daemon=True)
+        thread.start()
+        yield one.endpoints[0], other.endpoints[0]
+        heard.undeclare()
+        thread.join()
+
+
+@contextmanager
+def a_router() -> Iterator[str]:
+    """Zenoh's router alone; its endpoint."""
+    with SideSession(Side("a", _ANYWHERE), 2**30) as one:
+        yield one.endpoints[0]
+
+
+def per_second(carried: Carried) -> float:
+    """Messages a second."""
+    return carried.received / carried.seconds
+
+
+def rates(rounds: int, count: int) -> Iterator[Row]:
+    """Messages a second through a link that loses in bursts, and through a bare relay, in turns."""
+    wires, relays = [], []
+    for _ in range(rounds):
+        with a_wire(("robot/**", BURSTS)) as wire:
+            carry(wire.robot, wire.base, Traffic(count, 64))
+            heard = wire.count()
+            wires.append(heard / (wire.last - wire.first))
+        with bare_relay() as (one, other):
+            relays.append(per_second(carry(one, other, Traffic(count, 64))))
+    rate, ratio = statistics.median(wires), statistics.median(w / r for w, r in zip(wires, relays, strict=True))
+    yield Row(
+        "wire, 64 bytes through a lossy link, journal on",
+        f"{rate:,.0f} messages/s, {ratio:.2f} of the bare relay",
+        f"{statistics.median(relays):,.0f} messages/s (bare relay)",
+        "70,000 messages/s and 0.6 of the bare relay",
+        "100,000 messages/s",
+        judged(rate >= 70_000 and ratio >= 0.6, rate >= 100_000 and ratio >= 0.6),
+    )
+
+
+def latencies(rounds: int, count: int) -> Iterator[Row]:
+    """What a wire adds to the one-way latency of Zenoh's router, at a thousand messages a second."""
+    traffic = Traffic(count, 64, rate=1000.0)
+    through, raw = [], []
+    for _ in range(rounds):
+        with a_wire(("robot/**", BURSTS)) as wire:
+            through.append(carry(wire.robot, wire.base, traffic).median)
+        with a_router() as endpoint:
+            raw.append(carry(endpoint, endpoint, traffic).median)
+    added = statistics.median(t - r for t, r in zip(through, raw, strict=True))
+    yield Row(
+        "wire, latency added at 1,000 messages/s, median",
+        f"{added:.0f} µs",
+        f"{statistics.median(raw):.0f} µs (one router of Zenoh)",
+        "below 200 µs",
+        "below 100 µs",
+        judged(added < 200, added < 100),
+    )
+
+
+def large(rounds: int, count: int, size: int) -> Iterator[Row]:
+    """Bytes a second in large messages, beside Zenoh's router alone."""
+    through, raw = [], []
+    for _ in range(rounds):
+        with a_wire(("robot/**", PERFECT)) as wire:
+            through.append(per_second(carry(wire.robot, wire.base, Traffic(count, size))) * size / 1e9)
+        with a_router() as endpoint:
+            raw.append(per_second(carry(endpoint, endpoint, Traffic(count, size))) * size / 1e9)
+    rate, alone = statistics.median(through), statistics.median(raw)
+    yield Row(
+        f"wire, messages of {size / 2**20:.0f} MB",
+        f"{rate:.2f} GB/s",
+        f"{alone:.2f} GB/s (one router of Zenoh)",
+        "0.5 GB/s",
+        "1 GB/s",
+        judged(rate >= 0.5, rate >= 1.0),
+    )
+
+
+def accounted(count: int) -> Iterator[Row]:
+    """All messages of a sender are in the journal, and those that were delivered arrive."""
+    with a_wire(("robot/**", BURSTS)) as wire:
+        received = carry(wire.robot, wire.base, Traffic(count, 64), patience=60 + count / 5000).received
+        heard, delivered = wire.count(), wire.count(Crossing.DELIVERED)
+    missing = abs(count - heard) + abs(delivered - received)
+    yield Row(
+        f"wire, messages unaccounted for, of {count:,}",
+        f"{missing}",
+        f"{heard:,} recorded, {delivered:,} delivered, {received:,} arrived",
+        "0",
+        "0",
+        judged(missing == 0, missing == 0),
+    )
+
+
+def losses(count: int) -> Iterator[Row]:
+    """The messages that each model lets through, beside its 99 % bounds."""
+    links = [(f"robot/{name}", {"loss": model}) for name, model in MODELS.items()]
+    with a_wire(*links) as wire:
+        keys = tuple(key for key, _ in links)
+        carry(wire.robot, wire.base, Traffic(count, 64, keys=keys))
+        wire.count()
+        fates = dict(wire.fates)
+    outside, said = [], []
+    for at, (name, model) in enumerate(MODELS.items()):
+        low, high = bounds(*expected({"loss": model}, (), [range(count)]), count)
+        found = fates.get((at, Crossing.DELIVERED), 0)
+        said.append(f"{name} {found / count:.4f}")
+        if not low <= found <= high:
+            outside.append(f"{name} outside {low / count:.4f} to {high / count:.4f}")
+    yield Row(
+        f"wire, delivered by each model, of {count:,}",
+        ", ".join(said),
+        "99 % bounds",
+        "all within",
+        "all within",
+        "; ".join(outside) or judged(True, True),
+    )
+
+
+def rows(quick: bool) -> Iterator[Row]:
+    """All figures."""
+    yield from rates(1 if quick else 5, 5_000 if quick else 300_000)
+    yield from latencies(1 if quick else 3, 300 if quick else 5_000)
+    yield from large(1 if quick else 3, 10 if quick else 400, 2**22)
+    yield from accounted(10_000 if quick else 10_000_000 if "--full" in sys.argv else 500_000)
+    yield from losses(500 if quick else 20_000)
+
+
+if __name__ == "__main__":
+    run_alone(rows)
