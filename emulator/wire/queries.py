@@ -107,6 +107,11 @@ class QueryRelay:
                 querier.undeclare()
         self._patience.close()
 
+    def mirrored(self, side: str) -> frozenset[str]:
+        """The keys of the complete queryables at a side that stand for those of other sides."""
+        with self._lock:
+            return frozenset(self._mirrored[side])
+
     def update(self, further: Iterable[tuple[str, str]] = ()) -> None:
         """Offer at each side what is complete at other sides now. further: sides and keys to look at that routers do not list."""
         found = {name: self._complete_at(name, (key for side, key in further if side == name)) for name in self._sides}

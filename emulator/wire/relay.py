@@ -71,6 +71,10 @@ class WireRelay:
         """Side → the liveliness tokens that its programs hold."""
         return self._liveliness.tokens
 
+    def mirrored(self, side: str) -> frozenset[str]:
+        """The keys of the complete queryables that the wire offers at a side for those of other sides."""
+        return self._queries.mirrored(side)
+
     def apply(self, moment: Moment) -> None:
         """Cut the links that are cut from now on, let the others go on, and give all of them their settings."""
         for name, state in self.links.items():

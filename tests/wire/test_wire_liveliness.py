@@ -21,7 +21,7 @@ def test_a_token_crosses_with_its_history_and_goes_with_its_program(tmp_path: Pa
     """Even over links that lose everything, and to programs that come later."""
     with at_work(both_ways(DEAD, DEAD), tmp_path) as wire, wire.program("base") as watcher:
         seen: list[tuple[str, bool]] = []
-        expression = key.split("/")[0] + "/**"
+        expression = key.split("/", maxsplit=1)[0] + "/**"
         watcher.liveliness().declare_subscriber(
             expression, lambda one: seen.append((str(one.key_expr), one.kind == zenoh.SampleKind.PUT))
         )
@@ -57,14 +57,18 @@ def test_the_same_token_of_programs_at_both_sides_lives_as_long_as_one_of_them(t
 def test_a_tap_shows_tokens_and_hides_the_listener(tmp_path: Path) -> None:
     """What listens is not seen by those it listens to."""
     plan = plan_of(link("robot", "base"), link("robot", "listener", tap=True))
-    with at_work(plan, tmp_path) as wire, wire.program("robot") as robot:
-        with wire.program("base") as base, wire.program("listener") as listener:
-            programs = {"robot": robot, "base": base, "listener": listener}
-            tokens = [one.liveliness().declare_token(name) for name, one in programs.items()]
-            wait_until(lambda: alive(robot) == ["base", "robot"], "the base's token crosses against its link")
-            wait_until(lambda: alive(listener) == ["listener", "robot"], "the listener sees the robot")
-            wait_until(lambda: alive(base) == ["base", "robot"], "the base sees the robot")
-            del tokens
+    with (
+        at_work(plan, tmp_path) as wire,
+        wire.program("robot") as robot,
+        wire.program("base") as base,
+        wire.program("listener") as listener,
+    ):
+        programs = {"robot": robot, "base": base, "listener": listener}
+        tokens = [one.liveliness().declare_token(name) for name, one in programs.items()]
+        wait_until(lambda: alive(robot) == ["base", "robot"], "the base's token crosses against its link")
+        wait_until(lambda: alive(listener) == ["listener", "robot"], "the listener sees the robot")
+        wait_until(lambda: alive(base) == ["base", "robot"], "the base sees the robot")
+        del tokens
 
 
 def test_a_token_of_a_program_that_is_killed_vanishes(tmp_path: Path) -> None:

@@ -163,26 +163,35 @@ def test_each_query_is_asked_once(tmp_path: Path) -> None:
 def test_local_queryables_are_not_hidden_by_those_of_the_other_side(tmp_path: Path) -> None:
     """A query gets replies from its own side too, and three sides answer together."""
     plan = plan_of(*(link(one, other) for one in ("a", "b", "c") for other in ("a", "b", "c") if one != other))
-    with at_work(plan, tmp_path) as wire, wire.program("a") as asker:
-        with wire.program("a") as near, wire.program("b") as far, wire.program("c") as third:
-            offer(near, "where/near", b"near")
-            offer(far, "where/far", b"far")
-            offer(third, "where/third", b"third")
-            everywhere = [b"far", b"near", b"third"]
-            wait_until(lambda: answers(asker, "where/*") == everywhere, "all answer")
-            assert answers(asker, "where/*", target=ALL) == everywhere
+    with (
+        at_work(plan, tmp_path) as wire,
+        wire.program("a") as asker,
+        wire.program("a") as near,
+        wire.program("b") as far,
+        wire.program("c") as third,
+    ):
+        offer(near, "where/near", b"near")
+        offer(far, "where/far", b"far")
+        offer(third, "where/third", b"third")
+        everywhere = [b"far", b"near", b"third"]
+        wait_until(lambda: answers(asker, "where/*") == everywhere, "all answer")
+        assert answers(asker, "where/*", target=ALL) == everywhere
 
 
 def test_a_tap_carries_no_queries(tmp_path: Path) -> None:
     """Nor replies: a listener is not noticed."""
     plan = plan_of(link("robot", "base"), link("base", "robot"), link("robot", "listener", tap=True))
-    with at_work(plan, tmp_path) as wire, wire.program("robot") as asker:
-        with wire.program("base") as base, wire.program("listener") as listener:
-            offer(listener, "tap", b"no")
-            offer(base, "base", b"yes")
-            wait_until(lambda: answers(asker, "base"), "the base answers")
-            assert not answers(asker, "tap")
-            assert not answers(listener, "base")
+    with (
+        at_work(plan, tmp_path) as wire,
+        wire.program("robot") as asker,
+        wire.program("base") as base,
+        wire.program("listener") as listener,
+    ):
+        offer(listener, "tap", b"no")
+        offer(base, "base", b"yes")
+        wait_until(lambda: answers(asker, "base"), "the base answers")
+        assert not answers(asker, "tap")
+        assert not answers(listener, "base")
 
 
 @pytest.mark.parametrize(
@@ -190,7 +199,10 @@ def test_a_tap_carries_no_queries(tmp_path: Path) -> None:
 )
 def test_delayed_and_doubled_queries_are_answered(tmp_path: Path, settings: dict[str, Any]) -> None:
     """A query waits for replies that are under way; of two equal replies the asker keeps one."""
-    with at_work(both_ways(settings, settings), tmp_path) as wire:
-        with wire.program("robot") as asker, wire.program("base") as server:
-            offer(server, "map", b"x")
-            assert wait_until(lambda: answers(asker, "map"), "it answers") == [b"x"]
+    with (
+        at_work(both_ways(settings, settings), tmp_path) as wire,
+        wire.program("robot") as asker,
+        wire.program("base") as server,
+    ):
+        offer(server, "map", b"x")
+        assert wait_until(lambda: answers(asker, "map"), "it answers") == [b"x"]

@@ -1,0 +1,153 @@
+"""The sides of a wire: where they listen, whom they let in, and what joins them outside the wire."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from evedrop.errors import UsageError
+from evedrop.live.launch.authority import Authority
+from evedrop.ports import free_port
+from evedrop.wire.crossing import Crossing
+from evedrop.wire.plan import Side, SideTls
+from evedrop.wire.side import SideSession
+from tests.conftest import wait_until
+from tests.wire.test_wire_publications import reader, ready
+from tests.wire.wire_at_work import ANYWHERE, at_work, both_ways, link, plan_of, program
+
+
+def a_router(**config: Any) -> zenoh.Session:
+    """A router outside the wire."""
+    quiet = {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}}
+    return zenoh.open(zenoh.Config.from_json5(json.dumps({"mode": "router", "scouting": quiet, **config})))
+
+
+def test_the_endpoint_has_the_real_port() -> None:
+    """And a fixed port is told as it is."""
+    port = free_port()
+    with (
+        SideSession(Side("a", (ANYWHERE,)), 100) as one,
+        SideSession(Side("b", (f"tcp/127.0.0.1:{port}",)), 100) as other,
+    ):
+        assert one.endpoints[0].startswith("tcp/127.0.0.1:")
+        assert not one.endpoints[0].endswith(":0")
+        assert other.endpoints == (f"tcp/127.0.0.1:{port}",)
+
+
+def test_a_port_that_is_taken_is_reported(tmp_path: Path) -> None:
+    """With the name of the side and the remedy, and nothing stays open."""
+    with SideSession(Side("first", (ANYWHERE,)), 100) as first:
+        plan = plan_of(link("a", "b"), sides={"b": Side("b", first.endpoints)})
+        with pytest.raises(UsageError, match=r"side b cannot listen at tcp/127\.0\.0\.1:\d+ .*; end the program"):
+            at_work(plan, tmp_path).__enter__()
+        with SideSession(Side("later", (ANYWHERE,)), 100):
+            pass
+
+
+def test_a_side_that_cannot_connect_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After some seconds."""
+    monkeypatch.setattr("evedrop.wire.side._CONNECT_SECONDS", 0.2)
+    nobody = f"tcp/127.0.0.1:{free_port()}"
+    with pytest.raises(UsageError, match="side a cannot connect to tcp"):
+        SideSession(Side("a", (), (nobody,)), 100)
+
+
+def test_a_side_may_attach_to_a_router_that_is_there(tmp_path: Path) -> None:
+    """Programs of that router are at the side."""
+    port = free_port()
+    with a_router(listen={"endpoints": [f"tcp/127.0.0.1:{port}"]}):
+        plan = plan_of(
+            link("robot", "base"),
+            link("base", "robot"),
+            sides={"robot": Side("robot", (), (f"tcp/127.0.0.1:{port}",))},
+        )
+        with at_work(plan, tmp_path) as wire, program([f"tcp/127.0.0.1:{port}"]) as robot, wire.program("base") as base:
+            ready(wire, robot, base)
+            ready(wire, base, robot)
+
+
+def test_a_router_that_joins_two_sides_is_reported_and_nothing_goes_round(tmp_path: Path) -> None:
+    """Until it is gone: then messages cross again."""
+    with at_work(both_ways(), tmp_path) as wire, wire.program("robot") as robot, wire.program("base") as base:
+        ready(wire, robot, base)
+        endpoints = [wire.relay.endpoints[name][0] for name in ("robot", "base")]
+        with a_router(connect={"endpoints": endpoints}, listen={"endpoints": []}):
+            wait_until(lambda: any("outside the wire" in line for line in wire.told), "it is reported")
+            wait_until(lambda: robot.put("x", b"") or Crossing.LOOPED in wire.fates(), "messages do not go round")
+        wait_until(lambda: any("no longer joins" in line for line in wire.told), "its end is reported")
+        got = reader(base, "y")
+        wait_until(lambda: robot.put("y", b"") or got, "messages cross again")
+
+
+def test_a_program_at_two_sides_is_reported(tmp_path: Path) -> None:
+    """By its Zenoh id; messages cross nevertheless."""
+    with at_work(both_ways(), tmp_path) as wire:
+        endpoints = [wire.relay.endpoints[name][0] for name in ("robot", "base")]
+        with program(endpoints, mode="peer") as both, wire.program("robot") as robot, wire.program("base") as base:
+            zid = str(both.zid())
+            wait_until(lambda: any(zid in line and "robot and base" in line for line in wire.told), "it is reported")
+            ready(wire, robot, base)
+
+
+def test_only_users_with_their_password_may_connect(tmp_path: Path) -> None:
+    """Their messages cross."""
+    sides = {"robot": Side("robot", (ANYWHERE,), users={"ann": "secret"})}
+    with at_work(plan_of(link("robot", "base"), sides=sides), tmp_path) as wire, wire.program("base") as base:
+        with pytest.raises(zenoh.ZError):
+            wire.program("robot", connect={"endpoints": list(wire.relay.endpoints["robot"]), "timeout_ms": 0})
+        login = {"auth": {"usrpwd": {"user": "ann", "password": "secret"}}}
+        with wire.program("robot", transport=login) as ann:
+            ready(wire, ann, base)
+
+
+def test_programs_may_use_only_the_keys_of_their_side(tmp_path: Path) -> None:
+    """In both directions; tokens and queryables too."""
+    sides = {"robot": Side("robot", (ANYWHERE,), keys=("ready", "robot/**"))}
+    plan = plan_of(link("robot", "base"), link("base", "robot"), sides=sides)
+    with at_work(plan, tmp_path) as wire, wire.program("robot") as robot, wire.program("base") as base:
+        ready(wire, robot, base)
+        ready(wire, base, robot)
+        here, there, everything = reader(robot, "robot/down"), reader(base, "**"), reader(robot, "secret/**")
+        token = robot.liveliness().declare_token("robot/alive")
+        wait_until(lambda: [one for one in base.liveliness().get("robot/*") if one.ok], "its token crosses")
+        for n in range(3):
+            robot.put("secret/up", str(n))
+            base.put("secret/down", str(n))
+            robot.put("robot/up", str(n))
+            base.put("robot/down", str(n))
+        wait_until(lambda: sum(str(one.key_expr) == "robot/up" for one in there) == 3, "what is allowed crosses")
+        wait_until(lambda: sum(str(one.key_expr) == "robot/down" for one in here) == 3, "in both directions")
+        assert "secret/up" not in {str(one.key_expr) for one in there}
+        assert "secret/down" not in {str(one.key_expr) for one in everything}
+        del token
+
+
+def test_a_side_with_tls_wants_certificates_of_its_authority(tmp_path: Path) -> None:
+    """A program without one is refused; with one, its messages cross."""
+    certificates = Authority("wire")
+
+    def files_of(name: str) -> tuple[str, str, str]:
+        """Paths of the certificate, the key and the authority's certificate of a process."""
+        identity = certificates.identity(name, ["127.0.0.1"])
+        paths = []
+        for part in ("certificate", "key", "authority"):
+            path = tmp_path / f"{name}-{part}.pem"
+            path.write_text(getattr(identity, part), encoding="utf-8")
+            paths.append(str(path))
+        return paths[0], paths[1], paths[2]
+
+    tls = SideTls(*files_of("side"))
+    sides = {"robot": Side("robot", ("tls/127.0.0.1:0",), tls=tls)}
+    with at_work(plan_of(link("robot", "base"), sides=sides), tmp_path / "out") as wire, wire.program("base") as base:
+        endpoint = {"endpoints": list(wire.relay.endpoints["robot"]), "timeout_ms": 0}
+        certificate, key, authority = files_of("robot")
+        known = {"root_ca_certificate": authority}
+        with pytest.raises(zenoh.ZError):
+            wire.program("robot", connect=endpoint, transport={"link": {"tls": known}})
+        own = {**known, "enable_mtls": True, "connect_certificate": certificate, "connect_private_key": key}
+        with wire.program("robot", transport={"link": {"tls": own}}) as robot:
+            ready(wire, robot, base)
