@@ -137,14 +137,15 @@ def test_a_late_reader_gets_the_history_of_an_advanced_publisher(tmp_path: Path)
 def test_an_advanced_reader_recovers_what_a_link_lost(tmp_path: Path) -> None:
     """Some of it: it asks for each missing sample once, on keys with `@adv`, and the replies may be lost too."""
     with at_work(both_ways(LOSSY), tmp_path) as wire, wire.program("robot", timestamping={"enabled": True}) as robot:
-        detection = MissDetectionConfig(heartbeat=0.1)
+        detection = MissDetectionConfig(heartbeat=0.1, sporadic_heartbeat=None)
+        recovery = RecoveryConfig(heartbeat=True, periodic_queries=None)
         publisher = advanced_publisher(
             robot, "scan", cache=CacheConfig(max_samples=100), publisher_detection=True, sample_miss_detection=detection
         )
         with wire.program("base") as base:
             got: list[str] = []
             subscriber: Any = advanced_subscriber(
-                base, "scan", lambda one: got.append(one.payload.to_string()), recovery=RecoveryConfig(heartbeat=True)
+                base, "scan", lambda one: got.append(one.payload.to_string()), recovery=recovery
             )
             wait_until(lambda: publisher.put("first") or got, "the reader is known")
             for n in range(30):
