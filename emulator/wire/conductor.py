@@ -13,7 +13,7 @@ from typing import Any, Self, final
 
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.relay import WireRelay
-from evedrop.wire.timeline import moment_at, moments, with_change, with_cut_ended, with_partition_ended
+from evedrop.wire.timeline import moment_at, times, with_change, with_cut_ended, with_partition_ended
 
 
 @final
@@ -25,7 +25,7 @@ class WireConductor:
         self._plan, self._relay, self._say = plan, relay, say
         self._changed = threading.Condition(threading.RLock())
         self._ended = False
-        self._done = 0.0  # the time up to which all events are carried out
+        self._done = -1.0  # the time up to which all events are carried out
         self._begun = time.monotonic()
         self._relay.apply(moment_at(plan, 0.0))
         self._thread = threading.Thread(target=self._run, name="events", daemon=True)
@@ -78,16 +78,17 @@ class WireConductor:
 
     def _carry_out(self, now: float) -> None:
         """Carry out the events that are due."""
-        for moment in moments(self._plan):
-            if self._done < moment.time <= now:
-                self._done = moment.time
+        for due in times(self._plan):
+            if self._done < due <= now:
+                moment = moment_at(self._plan, due)
+                self._done = due
                 self._relay.apply(moment)
                 for line in moment.said:
-                    self._say(f"{moment.time:.1f} s: {line}")
+                    self._say(f"{due:.1f} s: {line}")
 
     def _run(self) -> None:
         with self._changed:
             while not self._ended:
                 self._carry_out(self.seconds)
-                following = [one.time for one in moments(self._plan) if one.time > self._done]
+                following = [one for one in times(self._plan) if one > self._done]
                 self._changed.wait(max(0.0, following[0] - self.seconds) if following else None)

@@ -37,10 +37,15 @@ class Moment:
     """Of every link, by name."""
 
 
+def times(plan: WirePlan) -> list[float]:
+    """The times at which something changes, in order; the first one is the start."""
+    ends = (event.stop for event in plan.events if event.stop is not None)
+    return sorted({0.0, *(event.start for event in plan.events), *ends})
+
+
 def moments(plan: WirePlan) -> tuple[Moment, ...]:
     """All moments of a wire, in order of time; the first one is its start."""
-    times = {0.0, *(event.start for event in plan.events), *(one.stop for one in plan.events if one.stop is not None)}
-    return tuple(moment_at(plan, time) for time in sorted(times))
+    return tuple(moment_at(plan, time) for time in times(plan))
 
 
 def moment_at(plan: WirePlan, time: float) -> Moment:

@@ -186,15 +186,17 @@ def test_the_events_of_the_page() -> None:
 def test_the_command_runs_a_wire(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """It prints the endpoint of each side and each event, warns, and ends after the given time."""
     path = tmp_path / "wire.toml"
-    path.write_text(
-        '[side.robot]\n[side.base]\n[[link]]\nfrom = "robot"\nto = "base"\n[[event]]\nat = 0.01\ncut = "robot-base"\n'
-    )
+    link, event = 'from = "robot"\nto = "base"', 'at = 0.01\ncut = "robot-base"\n[[event]]\nat = 0\nnote = "off we go"'
+    path.write_text(f"[side.robot]\n[side.base]\n[[link]]\n{link}\n[[event]]\n{event}\n")
     assert main(["wire", str(path), "--for", "100 ms", "--out", str(tmp_path / "out")]) == 0
     printed = capsys.readouterr()
-    endpoints = dict(line.split() for line in printed.out.splitlines() if " tcp/" in line)
+    endpoints = dict(line.split() for line in printed.out.splitlines()[:2])
     assert endpoints.keys() == {"robot", "base"}
     assert all(re.fullmatch(r"tcp/127\.0\.0\.1:[1-9]\d*", one) for one in endpoints.values())
-    assert "0.0 s: cut robot-base" in printed.out
+    assert [line for line in printed.out.splitlines() if " s: " in line] == [
+        "0.0 s: off we go",
+        "0.0 s: cut robot-base",
+    ]
     assert printed.err == "evedrop: warning: no link leads from base back to robot: queries from robot get no replies\n"
     assert (tmp_path / "out" / "summary.json").is_file()
     assert main(["wire", str(path), "--for", "10 ms", "--out", str(tmp_path / "again"), "--quiet"]) == 0
