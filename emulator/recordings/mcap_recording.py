@@ -5,10 +5,12 @@ Source: docs/links.md, recordings of messages.
 
 from __future__ import annotations
 
+import struct
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, final
 
@@ -22,9 +24,13 @@ from evedrop.recordings.message_numbers import WRAP, MessageArrivals, MessageSer
 from evedrop.recordings.message_recording import MessageRecording, check_parts
 
 if TYPE_CHECKING:
+    from mcap.records import Chunk
     from mcap.stream_reader import StreamReader
 
 SUFFIX = ".mcap"
+_RECORD = struct.Struct("<BQ")  # its kind, and its length
+_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, time of publication
+_CHANNEL_RECORD, _MESSAGE_RECORD = 4, 5
 _MOST_SHOWN = 10  # topics that a message lists
 _MOST_OFF = 0.01  # of the messages of a periodic sender, which may be a quarter of a period early or late
 _SHARED = 0.9  # of the missing numbers, which another topic has: then one counter numbers all topics
@@ -141,7 +147,7 @@ class _Reader:
         for number, path in enumerate(self._files()):
             try:
                 with opened(path) as file:
-                    reader = StreamReader(file, record_size_limit=2**30)
+                    reader = StreamReader(file, emit_chunks=True, record_size_limit=2**30)
                     _keep(self._records(path, reader), channels, number)
             except Unreadable as error:
                 self._no(f"cannot be read ({why_of(error)}); expected an MCAP recording", error)
@@ -156,14 +162,20 @@ class _Reader:
         return sorted(self._path.glob(f"*{SUFFIX}"), key=lambda path: (len(path.name), path.name))
 
     def _records(self, path: Path, reader: StreamReader) -> Iterator[Any]:
-        """The records up to the end, or up to where the file breaks off."""
+        """Channels, and messages as tuples as in `_MESSAGE`, up to the end or up to where the file breaks off."""
         from mcap.exceptions import EndOfFile, InvalidMagic, McapError  # noqa: PLC0415 - an optional extra
+        from mcap.records import Channel, Chunk, Message  # noqa: PLC0415 - the same
 
         read = False
         try:
             for record in reader.records:
                 read = True
-                yield record
+                if isinstance(record, Chunk):
+                    yield from _in_chunk(record)
+                elif isinstance(record, Channel):
+                    yield record
+                elif isinstance(record, Message):
+                    yield record.channel_id, record.sequence, record.log_time, record.publish_time
         except InvalidMagic as error:
             if not read:
                 self._no("does not begin as an MCAP recording does; expected one, decompressed", error)
@@ -300,19 +312,37 @@ class _Reader:
         raise TraceError(str(self._path), "file", what) from cause
 
 
+def _in_chunk(chunk: Chunk) -> Iterator[Any]:
+    """The channels and messages of a chunk. The library would copy the contents of every message."""
+    from mcap.data_stream import ReadDataStream  # noqa: PLC0415 - an optional extra
+    from mcap.records import Channel  # noqa: PLC0415 - the same
+    from mcap.stream_reader import get_chunk_data_stream  # noqa: PLC0415 - the same
+
+    stream, size = get_chunk_data_stream(chunk)
+    content = stream.read(size)
+    at = 0
+    while at < size:
+        kind, length = _RECORD.unpack_from(content, at)
+        at += _RECORD.size
+        if kind == _MESSAGE_RECORD:
+            yield _MESSAGE.unpack_from(content, at)
+        elif kind == _CHANNEL_RECORD:
+            yield Channel.read(ReadDataStream(BytesIO(content[at : at + length])))
+        at += length
+
+
 def _keep(records: Iterator[Any], channels: dict[tuple[int, int], _Channel], file: int) -> None:
     """Keep the numbers and times of all messages, by file and channel."""
     for record in records:
-        name = type(record).__name__
-        if name == "Channel":
+        if isinstance(record, tuple):
+            with suppress(KeyError):  # a message without a channel is a mistake of the recorder's
+                channel = channels[file, record[0]]
+                channel.sequences.append(record[1])
+                channel.logged.append(record[2])
+                channel.published.append(record[3])
+        else:
             metadata = "\n".join(record.metadata.values())
             channels.setdefault((file, record.id), _Channel(record.topic, f"{metadata}\n"))
-        elif name == "Message":
-            with suppress(KeyError):  # a message without a channel is a mistake of the recorder's
-                channel = channels[file, record.channel_id]
-                channel.sequences.append(record.sequence)
-                channel.logged.append(record.log_time)
-                channel.published.append(record.publish_time)
 
 
 def _joined_by_topic(channels: Iterable[tuple[tuple[int, int], _Channel]]) -> list[_Messages]:

@@ -6,9 +6,10 @@ Source: docs/links.md, recordings of messages.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import final
 
-from evedrop.errors import TraceError
+from evedrop.errors import TraceError, UsageError
 from evedrop.model.process import Floats
 from evedrop.recordings.message_numbers import MessageSeries
 
@@ -46,3 +47,12 @@ def check_parts(name: str, series: MessageSeries, why: str) -> None:
             f"its {count} outcomes are in {series.parts} parts, {count / series.parts:.3g} outcomes long on average: {why}; "
             f"expected parts of {_SHORTEST_PART} or more",
         )
+
+
+def save_outcomes(recording: MessageRecording, path: Path) -> None:
+    """Write the outcomes as a CSV file that the loss model `trace` can read. Raises UsageError if it cannot be written."""
+    lines = ["received", *map(str, recording.series.outcomes.tolist())]
+    try:
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"--save {path} cannot be written ({error.strerror}); give another file") from error

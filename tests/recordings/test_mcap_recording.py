@@ -23,6 +23,8 @@ from evedrop.model.links.link import Fate
 from evedrop.recordings.link_recording import Outcomes
 from evedrop.recordings.mcap_recording import mcap_recording
 from evedrop.recordings.message_numbers import MessageArrivals, numbers_of_times, series_of
+from evedrop.wire.fates import KeyFates
+from evedrop.wire.file import wire_of
 from tests.conftest import Evedrop
 
 SECOND = 10**9
@@ -48,7 +50,9 @@ def write(path: Path, recorded: Iterable[Recorded], compression: CompressionType
 
 
 def _write(file: BinaryIO, recorded: Sequence[Recorded], compression: CompressionType) -> None:
-    writer = Writer(file, chunk_size=4096, compression=compression)
+    writer = Writer(
+        file, chunk_size=4096, compression=compression, use_chunking=compression is not CompressionType.NONE
+    )
     writer.start("ros2", "libmcap")
     schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
     rows = []
@@ -350,6 +354,21 @@ def test_the_command_prints_links_for_both(evedrop: Evedrop) -> None:
     found = json.loads(evedrop("links", "fit", "tuesday.mcap", "--slot", "0.03", "--json").out)
     assert found["settings"]["loss"] == wire["loss"]
     assert found["link"]["delay"]["mean"] == pytest.approx(1.0, abs=0.04)
+
+
+def test_the_outcomes_are_saved_as_a_trace(evedrop: Evedrop) -> None:
+    """In a wire file, the very messages are lost that were lost on the day of the recording."""
+    outcomes = lossy(BURSTS, 500)
+    write(evedrop.folder / "tuesday.mcap", [Recorded("/scan", heard(outcomes))])
+    assert evedrop("links", "fit", "tuesday.mcap", "--save", "tuesday.csv").status == 0
+    link = {"from": "robot", "to": "base", "loss": {"model": "trace", "file": "tuesday.csv", "column": "received"}}
+    wire = wire_of({"side": {"robot": {}, "base": {}}, "link": [link]}, folder=evedrop.folder)
+    fates = KeyFates(wire.links[0], "0/scan/a", "put", 7)
+    word = trimmed(outcomes)
+    assert [int(fates.next()[0] == Fate.DELIVERED) for _ in word] == word
+    done = evedrop("links", "fit", "tuesday.mcap", "--save", "missing/tuesday.csv")
+    assert (done.status, done.out) == (2, "")
+    assert "--save missing/tuesday.csv cannot be written (No such file or directory)" in done.err
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from evedrop.cli.options import argument, as_json
@@ -42,7 +43,7 @@ def _mcap(options: argparse.Namespace) -> tuple[dict[str, Any], Sequence[str]]:
     """The fit of a topic of an MCAP recording."""
     from evedrop.recordings.mcap_recording import mcap_recording
 
-    _refuse_others(options, "an MCAP recording", ("topic", "period", "outage", "slot"))
+    _refuse_others(options, "an MCAP recording", ("topic", "period", "outage", "slot", "save"))
     return _messages(mcap_recording(options.trace, options.topic, options.period, options.outage), options)
 
 
@@ -50,7 +51,7 @@ def _journal(options: argparse.Namespace) -> tuple[dict[str, Any], Sequence[str]
     """The fit of a link of a wire."""
     from evedrop.wire.recorded_link import journal_recording
 
-    _refuse_others(options, "a folder", ("link", "key", "gaps", "outage", "slot"))
+    _refuse_others(options, "a folder", ("link", "key", "gaps", "outage", "slot", "save"))
     if options.outage is not None and not options.gaps:
         raise UsageError("--outage: expected --gaps with it; what a wire itself cuts is never counted as lost")
     recording = journal_recording(options.trace, options.link, options.key, gaps=options.gaps, longest=options.outage)
@@ -60,7 +61,10 @@ def _journal(options: argparse.Namespace) -> tuple[dict[str, Any], Sequence[str]
 def _messages(recording: MessageRecording, options: argparse.Namespace) -> tuple[dict[str, Any], Sequence[str]]:
     """The fit of messages that were recorded."""
     from evedrop.fitting.message_fit import fit_messages, message_lines
+    from evedrop.recordings.message_recording import save_outcomes
 
+    if options.save is not None:
+        save_outcomes(recording, options.save)
     found = fit_messages(recording, options.slot)
     return found.as_dict(), message_lines(found)
 
@@ -75,6 +79,7 @@ _ONLY = {
     "gaps": "the folder of a wire",
     "outage": "a recording of messages",
     "slot": "a recording of messages",
+    "save": "a recording of messages",
 }
 """Option → the recordings that it is for."""
 
@@ -113,6 +118,13 @@ def _fits(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--slot", type=float, metavar="S", help="seconds of a scenario's slot; default the median time between messages"
+    )
+
+    parser.add_argument(
+        "--save",
+        type=Path,
+        metavar="FILE",
+        help="write the outcomes of messages to a CSV file, for the loss model trace",
     )
 
 
