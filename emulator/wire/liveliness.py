@@ -1,8 +1,8 @@
 """Liveliness that crosses: a token of a program at one side is mirrored at the other sides, and is never lost.
 
 A token lives at a side as long as a program there, or at a side joined to it, holds it. Zenoh reports the first token with a key
-and the end of the last, among them those of the wire. The administration space of the side's router says who holds a token, so
-the wire finds out when programs at two sides hold the same token.
+and the end of the last, among them those of the wire, and does not say who holds one. So the wire mirrors no token at a side
+whose programs hold it already; and when it gives up a mirrored token, it looks whether a program there holds the same one.
 
 Source: docs/wire.md, liveliness.
 """
@@ -10,13 +10,16 @@ Source: docs/wire.md, liveliness.
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Callable, Mapping
-from typing import Any, final
+from typing import final
 
 import zenoh
 
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.side import SideSession, expressions_of
+
+_ANSWER_SECONDS = 10.0
 
 
 def joined(plan: WirePlan) -> dict[str, tuple[str, ...]]:
@@ -35,10 +38,11 @@ class LivelinessRelay:
     def __init__(self, sides: Mapping[str, SideSession], plan: WirePlan, changed: Callable[[], None]) -> None:
         self._sides, self._joined, self._changed = sides, joined(plan), changed
         self._lock = threading.Lock()
-        self._events: list[tuple[str, str, bool]] = []
+        self._events: deque[tuple[str, str, bool]] = deque()
         self._held: dict[str, set[str]] = {name: set() for name in sides}
         self._mirrored: dict[str, dict[str, zenoh.LivelinessToken]] = {name: {} for name in sides}
-        self._echoes: dict[str, set[str]] = {name: set() for name in sides}
+        self._doubtful: dict[str, set[str]] = {name: set() for name in sides}
+        """Side → tokens that the wire mirrored there: what Zenoh reports of them may be the wire's own doing."""
         self._subscribers = [
             side.session.liveliness().declare_subscriber(
                 expression, zenoh.handlers.Callback(self._heard(name), indirect=True), history=True
@@ -53,16 +57,32 @@ class LivelinessRelay:
         with self._lock:
             return {name: frozenset(held) for name, held in self._held.items()}
 
-    def update(self, ask: bool) -> None:
-        """Mirror what has changed. ask: whether to ask every router who holds which token."""
+    def note(self) -> None:
+        """Take in what Zenoh has reported since the last time."""
         with self._lock:
-            events, self._events = self._events, []
-            for name, key, alive in events:
-                self._note(name, key, alive)
-            if ask:
-                for name, side in self._sides.items():
-                    self._compare(name, side.sources("token"))
-            self._mirror()
+            for _ in range(len(self._events)):
+                name, key, alive = self._events.popleft()
+                if not alive:
+                    self._held[name].discard(key)
+                    self._doubtful[name].discard(key)
+                elif key not in self._mirrored[name] and (key not in self._doubtful[name] or self._lives(name, key)):
+                    self._held[name].add(key)
+
+    def mirror(self) -> None:
+        """Mirror the tokens that were noted, and give up those that are gone; later reports wait for the next `note`."""
+        with self._lock:
+            for name, side in self._sides.items():
+                elsewhere = (self._held[other] for other in self._sides if name in self._joined[other])
+                wanted = set[str]().union(*elsewhere) - self._held[name]
+                mirrored = self._mirrored[name]
+                for key in mirrored.keys() - wanted:
+                    mirrored.pop(key).undeclare()
+                    if self._lives(name, key):
+                        self._held[name].add(key)
+                        self._changed()
+                for key in wanted - mirrored.keys():
+                    self._doubtful[name].add(key)
+                    mirrored[key] = side.session.liveliness().declare_token(key)
 
     def close(self) -> None:
         """End, and give up all mirrored tokens."""
@@ -76,39 +96,21 @@ class LivelinessRelay:
 
     def _heard(self, name: str) -> Callable[[zenoh.Sample], None]:
         def heard(sample: zenoh.Sample) -> None:
-            with self._lock:
-                self._events.append((name, str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
+            # Without the lock: whoever declares a token waits until Zenoh has reported it.
+            self._events.append((name, str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
             self._changed()
 
         return heard
 
-    def _note(self, name: str, key: str, alive: bool) -> None:
-        """Take an event of Zenoh's into account: it may be an echo of a mirrored token."""
-        if not alive:
-            self._held[name].discard(key)
-            self._echoes[name].discard(key)
-        elif key in self._echoes[name]:
-            self._echoes[name].discard(key)
-        elif key not in self._mirrored[name]:
-            self._held[name].add(key)
+    def _lives(self, name: str, key: str) -> bool:
+        """Whether a token lives at a side at which the wire does not hold it: then a program there does."""
+        found, over = threading.Event(), threading.Event()
 
-    def _compare(self, name: str, sources: Mapping[str, Any]) -> None:
-        """Replace the tokens that programs hold by those that the router knows, as far as it tells."""
-        kept = {key for key in self._held[name] if _is_hidden(key)}
-        self._held[name] = kept | set(sources)
+        def take(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                found.set()
 
-    def _mirror(self) -> None:
-        for name, side in self._sides.items():
-            wanted = set().union(*(self._held[other] for other in self._sides if name in self._joined[other]))
-            mirrored = self._mirrored[name]
-            for key in mirrored.keys() - wanted:
-                mirrored.pop(key).undeclare()
-            for key in wanted - mirrored.keys():
-                if key not in self._held[name]:
-                    self._echoes[name].add(key)
-                mirrored[key] = side.session.liveliness().declare_token(key)
-
-
-def _is_hidden(key: str) -> bool:
-    """Whether the administration space does not list a token."""
-    return any(chunk.startswith("@") for chunk in key.split("/"))
+        handler = zenoh.handlers.Callback(take, drop=over.set, indirect=False)
+        self._sides[name].session.liveliness().get(key, handler, timeout=_ANSWER_SECONDS)
+        over.wait(_ANSWER_SECONDS)
+        return found.is_set()

@@ -1,14 +1,16 @@
 """Programs that are connected to several sides, and routers that join sides outside the wire.
 
-A program at two sides gets a message from each. A router at two sides passes messages between them by itself, and every message
-that the wire passed on would come back to it: the links between such sides carry nothing.
+A program at two sides gets a message from each. Routers that join two sides pass messages between them by themselves, and every
+message that the wire passed on would come back to it: the links between such sides carry nothing. Where routers are connected to
+several sides, the wire finds this out with a message of its own.
 
 Source: docs/wire.md, no loops.
 """
 
 from __future__ import annotations
 
-import re
+import secrets
+import time
 from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
 from typing import final
@@ -16,9 +18,9 @@ from typing import final
 import zenoh
 
 from evedrop.wire.lanes import LinkState
-from evedrop.wire.side import SideSession
+from evedrop.wire.side import PROBES, SideSession
 
-_LABEL = re.compile(rb'label = "([0-9a-f]+)"')
+_PROBE_SECONDS = 2.0  # after which a probe that was heard says nothing any more
 
 
 @final
@@ -30,6 +32,12 @@ class Neighbours:
     ) -> None:
         self._sides, self._states, self._tell = sides, states, tell
         self._told: set[tuple[str, str, str]] = set()
+        self._heard: dict[tuple[str, str], float] = {}
+        self._probes = {name: f"@evedrop/{secrets.token_hex(8)}/{at}" for at, name in enumerate(sides)}
+        self._subscribers = [
+            side.session.declare_subscriber(PROBES, self._listener(name), allowed_origin=zenoh.Locality.REMOTE)
+            for name, side in sides.items()
+        ]
 
     def update(self) -> None:
         """Look again; cut the links between sides that are joined outside the wire, and let those go on that no longer are."""
@@ -37,37 +45,53 @@ class Neighbours:
         for name, side in self._sides.items():
             transports = side.session.info.transports()
             programs[name] = {str(one.zid) for one in transports if one.whatami != zenoh.WhatAmI.ROUTER}
-            routers[name] = {str(one.zid) for one in transports if one.whatami == zenoh.WhatAmI.ROUTER} | self._reached(
-                side
-            )
+            routers[name] = {str(one.zid) for one in transports if one.whatami == zenoh.WhatAmI.ROUTER}
+        if sum(map(bool, routers.values())) > 1:
+            for name, side in self._sides.items():
+                side.session.put(self._probes[name], b"")
         found = set()
         for one, other in combinations(self._sides, 2):
-            joined = routers[one] & (routers[other] | {self._sides[other].zid}) or routers[other] & {
-                self._sides[one].zid
-            }
+            ends = {self._sides[one].zid, self._sides[other].zid}
+            joined = (routers[one] | ends) & routers[other] | routers[one] & ends
+            if not joined and self._passes(one, other):
+                joined = routers[one] | routers[other]
             for state in self._states:
                 if {state.link.source, state.link.target} == {one, other}:
                     state.looped = bool(joined)
-            found |= {(f"router {zid}", one, other) for zid in joined}
+            if joined:
+                found.add((f"routers {', '.join(sorted(joined))}", one, other))
             found |= {(f"program {zid}", one, other) for zid in programs[one] & programs[other]}
         for who, one, other in sorted(found - self._told):
             self._tell(_sentence(who, one, other))
         for who, one, other in sorted(self._told - found):
-            self._tell(f"the {who} no longer joins the sides {one} and {other}")
+            self._tell(
+                f"the {who} no longer join the sides {one} and {other}"
+                if who.startswith("routers")
+                else f"the {who} is no longer connected to the sides {one} and {other}"
+            )
         self._told = found
 
-    @staticmethod
-    def _reached(side: SideSession) -> set[str]:
-        """The other routers that a side's router knows a way to."""
-        graphs = side.ask("/linkstate/north").values()
-        return {label.decode() for graph in graphs for label in _LABEL.findall(graph)} - {side.zid}
+    def _listener(self, name: str) -> Callable[[zenoh.Sample], None]:
+        sources = {key: source for source, key in self._probes.items()}
+
+        def heard(sample: zenoh.Sample) -> None:
+            source = sources.get(str(sample.key_expr))
+            if source is not None:
+                self._heard[source, name] = time.monotonic()
+
+        return heard
+
+    def _passes(self, one: str, other: str) -> bool:
+        """Whether messages pass between two sides outside the wire, in either direction."""
+        since = time.monotonic() - _PROBE_SECONDS
+        return any(self._heard.get(way, 0.0) > since for way in ((one, other), (other, one)))
 
 
 def _sentence(who: str, one: str, other: str) -> str:
-    if who.startswith("router"):
+    if who.startswith("routers"):
         return (
-            f"the {who} joins the sides {one} and {other} outside the wire, so messages would go round; the links between them "
-            f"carry nothing (fate LOOPED) until it is disconnected from one of them"
+            f"messages pass between the sides {one} and {other} outside the wire, through the {who}, so they would go round; the "
+            "links between these sides carry nothing (fate LOOPED) until the routers are disconnected from one of them"
         )
     return (
         f"the {who} is connected to the sides {one} and {other}: it gets a message from both, and its own messages come back to "

@@ -1,9 +1,9 @@
 """Queries that cross: a query at one side is asked at the other sides too, and their replies come back, as the links decide.
 
-At each side the wire offers a queryable for everything, which is not complete, and a complete one for each key for which another
-side has a complete one: ROS 2 asks only these. Zenoh hands a query to all queryables of a session that match it, except that one
-for complete queryables goes to the complete ones alone. So one queryable is responsible for each query, and the others ignore it:
-the first complete one whose expression includes the query's key, or else the one for everything.
+At each side the wire offers a queryable for everything, which is not complete, and a complete one for each service of ROS 2 that
+another side has, since ROS 2 asks complete queryables only. Zenoh hands a query to all queryables of a session that match it,
+except that one for complete queryables goes to the complete ones alone. So one queryable is responsible for each query, and the
+others ignore it: the first complete one whose expression includes the query's key, or else the one for everything.
 
 Source: docs/wire.md, queries.
 """
@@ -71,7 +71,7 @@ class QueryRelay:
         self._states = [state for state in states if not state.link.tap]
         self._lanes: dict[tuple[str, str, str], Lane] = {}
         self._queriers: dict[tuple[str, str, bool, bool], zenoh.Querier] = {}
-        self._complete: dict[str, dict[str, zenoh.Querier]] = {name: {} for name in sides}
+        self._services: tuple[frozenset[tuple[str, str]], tuple[bool, ...]] | None = None
         self._mirrored: dict[str, dict[str, tuple[zenoh.KeyExpr, Any]]] = {name: {} for name in sides}
         self._lock = threading.RLock()
         self._read = SourceReader(journal.source_code)
@@ -100,22 +100,20 @@ class QueryRelay:
                 for _, queryable in mirrored.values():
                     queryable.undeclare()
                 mirrored.clear()
-            for querier in [
-                *self._queriers.values(),
-                *(one for found in self._complete.values() for one in found.values()),
-            ]:
+            for querier in self._queriers.values():
                 querier.undeclare()
         self._patience.close()
 
-    def mirrored(self, side: str) -> frozenset[str]:
-        """The keys of the complete queryables at a side that stand for those of other sides."""
-        with self._lock:
-            return frozenset(self._mirrored[side])
-
-    def update(self, further: Iterable[tuple[str, str]] = ()) -> None:
-        """Offer at each side what is complete at other sides now. further: sides and keys to look at that routers do not list."""
-        found = {name: self._complete_at(name, (key for side, key in further if side == name)) for name in self._sides}
-        for name, side in self._sides.items():
+    def update(self, services: Iterable[tuple[str, str]]) -> None:
+        """Offer the services of each side, given as side and key, at the others: there each gets a complete queryable."""
+        now = (frozenset(services), tuple(state.looped for state in self._states))
+        if now == self._services:
+            return
+        self._services = now
+        found: dict[str, dict[str, zenoh.KeyExpr]] = {name: {} for name in self._sides}
+        for side, key in now[0]:
+            found[side][key] = zenoh.KeyExpr(key)
+        for name, session in ((name, side.session) for name, side in self._sides.items()):
             others = {state.link.target for state in self._states if state.link.source == name and not state.looped}
             wanted = {
                 key: expression
@@ -129,23 +127,16 @@ class QueryRelay:
                     _, queryable = mirrored.pop(key)
                 queryable.undeclare()
             for key in wanted.keys() - mirrored.keys():
-                queryable = side.session.declare_queryable(
+                queryable = session.declare_queryable(
                     wanted[key], self._taker(name, key), complete=True, allowed_origin=_REMOTE
                 )
                 with self._lock:
                     mirrored[key] = (wanted[key], queryable)
 
-    def _complete_at(self, name: str, further: Iterable[str]) -> dict[str, zenoh.KeyExpr]:
-        """The keys of the queryables of a side's programs that are complete."""
-        queriers = self._complete[name]
-        listed = {*self._sides[name].sources("queryable"), *further}
-        for key in queriers.keys() - listed:
-            queriers.pop(key).undeclare()
-        for key in listed - queriers.keys():
-            queriers[key] = self._sides[name].session.declare_querier(
-                key, target=zenoh.QueryTarget.ALL_COMPLETE, allowed_destination=_REMOTE
-            )
-        return {key: one.key_expr for key, one in queriers.items() if _matching(one)}
+    def mirrored(self, side: str) -> frozenset[str]:
+        """The keys of the complete queryables at a side that stand for services of other sides."""
+        with self._lock:
+            return frozenset(self._mirrored[side])
 
     def _taker(self, name: str, key: str | None) -> Any:
         # On the thread that Zenoh calls it on: the queries of a program stay in order.
@@ -173,16 +164,10 @@ class QueryRelay:
         complete = self._responsible(asked.side, key) is not None
         for target in dict.fromkeys(one.link.target for one in self._states if one.link.source == asked.side):
             querier = self._querier(target, asked.query, asked.key, complete)
-            if not self._hears(target, querier, asked.key):
-                continue
+            # The matching status knows only queryables that include the key.
+            if "*" not in asked.key and not _matching(querier):
+                continue  # nobody there can hear it
             self._cross(Kind.QUERY, asked, (asked.side, target), asked.key, key, self._question(asked, querier, target))
-
-    def _hears(self, target: str, querier: zenoh.Querier, key: str) -> bool:
-        """Whether a queryable of a side matches a query: otherwise the query goes nowhere, and nobody waits for a reply."""
-        if "*" not in key:
-            return _matching(querier)
-        # The matching status knows only queryables that include the key, and routers do not list those with an `@`.
-        return "@" in key or any(querier.key_expr.intersects(one) for one in self._sides[target].sources("queryable"))
 
     def _question(self, asked: _Asked, querier: zenoh.Querier, target: str) -> _Message:
         query = asked.query

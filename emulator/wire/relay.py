@@ -29,7 +29,6 @@ from evedrop.wire.side import SideSession
 from evedrop.wire.timeline import Moment
 
 _LOOK_SECONDS = 0.2
-_MOST_SHARE = 0.1  # of a processor's time, for looking
 
 
 @final
@@ -68,11 +67,11 @@ class WireRelay:
 
     @property
     def tokens(self) -> Mapping[str, frozenset[str]]:
-        """Side → the liveliness tokens that its programs hold."""
+        """Side → the liveliness tokens that its programs hold, as far as the wire knows."""
         return self._liveliness.tokens
 
     def mirrored(self, side: str) -> frozenset[str]:
-        """The keys of the complete queryables that the wire offers at a side for those of other sides."""
+        """The keys of the complete queryables that the wire offers at a side for services of other sides."""
         return self._queries.mirrored(side)
 
     def apply(self, moment: Moment) -> None:
@@ -115,29 +114,24 @@ class WireRelay:
         for row in scheduler.close():
             self._journal.amend(row, Crossing.UNDERWAY)
 
-    def _look(self, ask: bool = True) -> None:
+    def _look(self) -> None:
         """Follow what programs declare. Queryables come before tokens: who sees a service's token may ask it at once."""
-        if ask:
-            self._neighbours.update()
-        tokens = self._liveliness.tokens
-        services = [
-            (side, key) for side, held in tokens.items() for token in held if (key := service_key(token)) is not None
-        ]
-        self._queries.update(services)
-        self._liveliness.update(ask)
+        self._liveliness.note()
+        held = self._liveliness.tokens.items()
+        found = ((side, service_key(token)) for side, tokens in held for token in tokens)
+        self._queries.update((side, key) for side, key in found if key is not None)
+        self._liveliness.mirror()
 
     def _keep_up(self) -> None:
-        pause, due = _LOOK_SECONDS, 0.0
+        due = 0.0
         while not self._ended.is_set():
             self._woken.wait(max(0.0, due - time.monotonic()))
             self._woken.clear()
-            begun = time.monotonic()
-            ask = begun >= due
             try:
-                self._look(ask)
+                self._look()
+                if time.monotonic() >= due:
+                    self._neighbours.update()
+                    due = time.monotonic() + _LOOK_SECONDS
             except zenoh.ZError as error:
                 if not self._ended.is_set():
                     self._tell(f"Zenoh does not say what programs declare ({error}); trying again")
-            if ask:
-                pause = max(_LOOK_SECONDS, (time.monotonic() - begun) / _MOST_SHARE)
-                due = time.monotonic() + pause

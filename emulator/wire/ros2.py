@@ -32,6 +32,8 @@ _ENTITY_PARTS = 13
 _KINDS = {"NN": "node", "MP": "publisher", "MS": "subscription", "SS": "service", "SC": "client"}
 _SERVICE = "/SS/"
 _NUMBER = re.compile("[0-9]{1,20}")
+_KEY = re.compile(r"[^/#?$*@]+(/[^/#?$*@]+)*")
+"""A Zenoh key without wildcards and verbatim chunks."""
 _RELIABILITY = {"": "reliable", "0": "system default", "1": "reliable", "2": "best effort"}
 _DURABILITY = {"": "volatile", "0": "system default", "1": "transient local", "2": "volatile"}
 _HISTORY = {"": "keep last", "0": "system default", "1": "keep last", "2": "keep all"}
@@ -170,7 +172,8 @@ def service_key(token: str) -> str | None:
     if not token.startswith(_TOKENS) or _SERVICE not in token:
         return None
     entity = read_token(token)
-    return entity.key if entity is not None and entity.kind == "service" else None
+    key = entity.key if entity is not None and entity.kind == "service" else None
+    return key if key is not None and _KEY.fullmatch(key) else None
 
 
 def reply_seconds(key: str, seconds: float) -> float:

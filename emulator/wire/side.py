@@ -20,6 +20,8 @@ from evedrop.errors import UsageError
 from evedrop.wire.plan import Side, SideTls, WireLink
 
 ZenohConfig = dict[str, Any]
+PROBES = "@evedrop/*/*"
+"""The keys of messages with which the wire finds out whether sides are joined outside it; `**` does not include them."""
 HIDDEN = ("@ros2_lv/**", "@/*/@ros2_lv/**", "**/@adv/**")
 """Keys that `**` does not match although programs use them: the graph of ROS 2, and the histories of advanced publishers."""
 _CONNECT_SECONDS = 10.0
@@ -62,30 +64,15 @@ class SideSession:
     ) -> None:
         self.session.close()
 
-    def ask(self, below: str) -> dict[str, bytes]:
-        """What the administration space of this router says under `@/ZID/router` and below: key without this prefix → value."""
-        prefix = f"@/{self.zid}/router"
-        found = (reply.ok for reply in self.session.get(f"{prefix}{below}"))
-        return {str(one.key_expr)[len(prefix) :]: one.payload.to_bytes() for one in found if one is not None}
-
-    def sources(self, what: str) -> dict[str, set[str]]:
-        """The keys that others have declared here, with the Zenoh ids of who did. what: `token`, `queryable` and so on.
-
-        Keys with a verbatim chunk, such as `@adv`, are not found.
-        """
-        found: dict[str, set[str]] = {}
-        for key, value in self.ask(f"/{what}/**").items():
-            told = json.loads(value)
-            ids = {zid for kind in ("routers", "peers", "clients") for zid in told.get(kind, ())} - {self.zid}
-            if ids:
-                found[key.removeprefix(f"/{what}/")] = ids
-        return found
-
     def _endpoints(self) -> tuple[str, ...]:
         if all(not one.split("?")[0].split("#")[0].endswith(":0") for one in self.side.listen):
             return self.side.listen
-        told = json.loads(self.ask("")[""])
-        return tuple(told["locators"])
+        # Asked once, before programs can connect. Zenoh answers most questions about a router while it holds a lock that it needs
+        # again for the answer: a declaration that comes in between stops the router for ever.
+        told = [
+            json.loads(reply.ok.payload.to_bytes()) for reply in self.session.get(f"@/{self.zid}/router") if reply.ok
+        ]
+        return tuple(told[0]["locators"])
 
 
 def expressions_of(side: Side, links: Iterable[WireLink] = ()) -> tuple[str, ...]:
@@ -123,7 +110,7 @@ def side_config(side: Side, largest: int, users_file: str | None) -> ZenohConfig
     if users_file is not None:
         config["transport"]["auth"] = {"usrpwd": {"dictionary_file": users_file}}
     if side.keys != ("**",):
-        config["access_control"] = _access(expressions_of(side))
+        config["access_control"] = _access((*expressions_of(side), PROBES))
     return config
 
 

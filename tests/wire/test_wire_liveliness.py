@@ -39,21 +39,6 @@ def test_a_token_crosses_with_its_history_and_goes_with_its_program(tmp_path: Pa
         del token
 
 
-def test_the_same_token_of_programs_at_both_sides_lives_as_long_as_one_of_them(tmp_path: Path) -> None:
-    """Whichever of them goes first, no side sees it vanish before."""
-    with at_work(both_ways(), tmp_path) as wire, wire.program("robot") as one, wire.program("base") as other:
-        for first, second in ((one, other), (other, one)):
-            token = first.liveliness().declare_token("both")
-            wait_until(lambda: alive(one) == alive(other) == ["both"], "both see it")
-            further = second.liveliness().declare_token("both")
-            wait_until(lambda: all("both" in held for held in wire.relay.tokens.values()), "the wire knows both")
-            token.undeclare()
-            wait_until(lambda: sum("both" in held for held in wire.relay.tokens.values()) == 1, "the wire knows one")
-            assert alive(one) == alive(other) == ["both"]
-            further.undeclare()
-            wait_until(lambda: not alive(one) and not alive(other), "it is gone")
-
-
 def test_a_tap_shows_tokens_and_hides_the_listener(tmp_path: Path) -> None:
     """What listens is not seen by those it listens to."""
     plan = plan_of(link("robot", "base"), link("robot", "listener", tap=True))

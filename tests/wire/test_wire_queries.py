@@ -127,22 +127,28 @@ def test_whoever_loses_a_query_waits_for_nothing_and_a_lost_reply_is_missing(tmp
         assert wire.fates("back") == [Crossing.LOST]
 
 
-def test_ros_finds_a_complete_queryable_of_the_other_side(tmp_path: Path) -> None:
+SERVICE = "0/add/example::srv::dds_::Add_/RIHS01_x"
+SERVER = "@ros2_lv/0/abc/0/1/SS/%/%/server/%add/example::srv::dds_::Add_/RIHS01_x/::,10:,:,:,,"
+
+
+def test_ros_finds_a_service_of_the_other_side(tmp_path: Path) -> None:
     """Queries for complete queryables alone reach it, and it is gone when its program is."""
     with at_work(both_ways(), tmp_path) as wire, wire.program("robot") as asker:
         with wire.program("base") as server:
             offer(server, "open", b"open")
-            offer(server, "whole", b"whole", complete=True)
-            wait_until(lambda: answers(asker, "whole", target=COMPLETE) == [b"whole"], "it is mirrored")
-            assert answers(asker, "whole") == [b"whole"]
-            assert answers(asker, "whole", target=ALL) == [b"whole"]
+            offer(server, SERVICE, b"sum", complete=True)
+            token = server.liveliness().declare_token(SERVER)
+            wait_until(lambda: answers(asker, SERVICE, target=COMPLETE) == [b"sum"], "it is mirrored")
+            assert answers(asker, SERVICE) == [b"sum"]
+            assert answers(asker, SERVICE, target=ALL) == [b"sum"]
             assert answers(asker, "open") == [b"open"]
             assert not answers(asker, "open", target=COMPLETE)
-        wait_until(lambda: not list(asker.get("whole", target=COMPLETE)), "it is gone")
+            del token
+        wait_until(lambda: not list(asker.get(SERVICE, target=COMPLETE)), "it is gone")
 
 
 def test_each_query_is_asked_once(tmp_path: Path) -> None:
-    """Although several mirrored queryables and the one for everything hear it."""
+    """Although the mirrored queryable and the one for everything hear it."""
     heard: list[str] = []
     with at_work(both_ways(), tmp_path) as wire, wire.program("robot") as asker, wire.program("base") as server:
 
@@ -151,13 +157,14 @@ def test_each_query_is_asked_once(tmp_path: Path) -> None:
                 heard.append(str(query.parameters))
                 query.reply(query.key_expr, b"x")
 
-        server.declare_queryable("all/**", reply, complete=True)
-        offer(server, "all/1/**", b"y", complete=True)
-        wait_until(lambda: b"y" in answers(asker, "all/1", target=COMPLETE), "both are mirrored")
+        server.declare_queryable(SERVICE, reply, complete=True)
+        token = server.liveliness().declare_token(SERVER)
+        wait_until(lambda: answers(asker, SERVICE, target=COMPLETE), "it is mirrored")
         heard.clear()
         for n in range(20):
-            list(asker.get(f"all/1?n={n}", target=[COMPLETE, ALL, zenoh.QueryTarget.BEST_MATCHING][n % 3]))
+            list(asker.get(f"{SERVICE}?n={n}", target=[COMPLETE, ALL, zenoh.QueryTarget.BEST_MATCHING][n % 3]))
         assert heard == [f"n={n}" for n in range(20)]
+        del token
 
 
 def test_local_queryables_are_not_hidden_by_those_of_the_other_side(tmp_path: Path) -> None:

@@ -5,6 +5,9 @@ References: tokens as rmw_zenoh documents them, and attachments by the serialize
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import pytest
 import zenoh
 from hypothesis import given
@@ -12,8 +15,9 @@ from hypothesis import strategies as st
 from xxhash import xxh3_128_hexdigest
 from zenoh import ext
 
-from evedrop.wire import ros2
+from evedrop.wire import ros2, ros2_entities
 from evedrop.wire.ros2 import Entity, Qos, SourceReader, read_token, reply_seconds, service_key
+from evedrop.wire.ros2_entities import EntityLog
 
 HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 NODE = "@ros2_lv/0/aac3178e146ba6f1fc6e6a4085e77f21/0/0/NN/%/%/listener"
@@ -180,6 +184,12 @@ def test_only_services_need_a_complete_queryable() -> None:
     assert service_key(NODE.replace("/%/%/listener", "/SS/%/listener")) is None
 
 
+@pytest.mark.parametrize("name", ["%", "%%add", "%robot%%add", "%**", "%a$*b", "%@adv%x"])
+def test_a_service_whose_name_is_no_key_is_not_offered(name: str) -> None:
+    """A token can be valid, and the key of its service not, or have wildcards that would take the queries of others."""
+    assert service_key(SERVICE.replace("%robot%add_two_ints", name)) is None
+
+
 @pytest.mark.parametrize(
     ("key", "seconds"),
     [
@@ -194,3 +204,38 @@ def test_services_and_actions_have_time_to_reply(key: str, seconds: float) -> No
     """A wire that gave up sooner than the client would turn a slow service into a lost call."""
     assert reply_seconds(key, 10.0) == seconds
     assert reply_seconds(key, 10 * ros2.RESULT_SECONDS) == 10 * ros2.RESULT_SECONDS
+
+
+def test_each_entity_is_written_down_once(tmp_path: Path) -> None:
+    """A line for each entity that a side shows, however often its token comes; other tokens are no entities."""
+    log = EntityLog(tmp_path)
+    for token in [NODE, SERVICE, NODE, "other/token", SERVICE]:
+        log.add("robot", token)
+    log.add("base", NODE)
+    lines = [json.loads(line) for line in (tmp_path / "ros2.jsonl").read_text().splitlines()]
+    assert [(line["side"], line["kind"], line["node"]) for line in lines] == [
+        ("robot", "node", "/listener"),
+        ("robot", "service", "/robot/arm/adder"),
+        ("base", "node", "/listener"),
+    ]
+    assert lines[1]["gid"] == gid_of(SERVICE)
+    assert lines[1]["topic"] == "/robot/add_two_ints"
+    assert lines[1]["qos"]["depth"] == 10
+
+
+def test_a_log_that_cannot_be_written_is_reported_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The wire goes on without it."""
+    log = EntityLog(tmp_path / "gone")
+    log.add("robot", NODE)
+    log.add("robot", SERVICE)
+    said = capsys.readouterr().err
+    assert said.count("lacks entities of ROS 2 from now on (No such file or directory)") == 1
+
+
+def test_a_log_does_not_grow_without_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A program that declares ever new tokens fills no disk."""
+    monkeypatch.setattr(ros2_entities, "MOST_ENTITIES", 2)
+    log = EntityLog(tmp_path)
+    for n in range(4):
+        log.add("robot", f"{NODE}{n}")
+    assert len((tmp_path / "ros2.jsonl").read_text().splitlines()) == 2

@@ -78,7 +78,7 @@ def test_a_router_that_joins_two_sides_is_reported_and_nothing_goes_round(tmp_pa
         with a_router(connect={"endpoints": endpoints}, listen={"endpoints": []}):
             wait_until(lambda: any("outside the wire" in line for line in wire.told), "it is reported")
             wait_until(lambda: robot.put("x", b"") or Crossing.LOOPED in wire.fates(), "messages do not go round")
-        wait_until(lambda: any("no longer joins" in line for line in wire.told), "its end is reported")
+        wait_until(lambda: any("no longer join" in line for line in wire.told), "its end is reported")
         got = reader(base, "y")
         wait_until(lambda: robot.put("y", b"") or got, "messages cross again")
 

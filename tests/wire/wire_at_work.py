@@ -95,5 +95,18 @@ def program(endpoints: Sequence[str], **config: Any) -> zenoh.Session:
     return zenoh.open(zenoh.Config.from_json5(json.dumps({**base, **config})))
 
 
+def is_declared(wire: WireAtWork, side: str, what: str, key: str) -> bool:
+    """Whether a program at a side has declared a `subscriber` or `queryable` that includes a key."""
+    session, remote = wire.relay.sides[side].session, zenoh.Locality.REMOTE
+    declared: zenoh.Publisher | zenoh.Querier
+    if what == "subscriber":
+        declared = session.declare_publisher(key, allowed_destination=remote)
+    else:
+        declared = session.declare_querier(key, target=zenoh.QueryTarget.ALL, allowed_destination=remote)
+    with declared:
+        status: Any = declared.matching_status
+        return bool(status.matching)
+
+
 def _fields(one: WireLink) -> dict[str, Any]:
     return {name: getattr(one, name) for name in one.__dataclass_fields__}

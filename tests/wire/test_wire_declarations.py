@@ -1,0 +1,108 @@
+"""What programs declare crosses a wire, however much it is and while others declare; routers that join sides are found."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+
+import zenoh
+
+from evedrop.wire.crossing import Crossing
+from evedrop.wire.plan import Side
+from tests.conftest import wait_until
+from tests.wire.wire_at_work import ANYWHERE, WireAtWork, at_work, both_ways, link, plan_of
+
+
+def alive(session: zenoh.Session, key: str = "**") -> list[str]:
+    """The tokens that a program sees."""
+    replies = session.liveliness().get(key, zenoh.handlers.FifoChannel(10_000), timeout=5.0)
+    return sorted({str(one.ok.key_expr) for one in replies if one.ok is not None})
+
+
+def test_more_tokens_cross_than_a_channel_of_zenoh_holds(tmp_path: Path) -> None:
+    """A side that shows 600 tokens while programs of both sides declare more stays alive, and everything crosses."""
+    with at_work(both_ways(), tmp_path) as wire, wire.program("robot") as robot, wire.program("base") as base:
+        held: list[zenoh.LivelinessToken] = []
+
+        def declare(session: zenoh.Session, name: str) -> None:
+            held.extend(session.liveliness().declare_token(f"{name}/{n}") for n in range(300))
+
+        threads = [threading.Thread(target=declare, args=way) for way in ((robot, "a"), (base, "b"), (robot, "c"))]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        wait_until(lambda: len(alive(robot)) == len(alive(base)) == 900, "all tokens are seen from both sides")
+        held.clear()
+    assert not wire.told
+
+
+def wire_knows(wire: WireAtWork, side: str) -> bool:
+    """Whether the wire knows that a program at a side holds the token."""
+    return "both" in wire.relay.tokens[side]
+
+
+def test_the_same_token_at_both_sides_lives_as_long_as_one_of_its_programs(tmp_path: Path) -> None:
+    """Whichever ends first, the token of the other is seen from both sides in the end, and then it is gone."""
+    with at_work(both_ways(), tmp_path) as wire, wire.program("robot") as one, wire.program("base") as other:
+        for first, second in ((one, other), (other, one)):
+            token = first.liveliness().declare_token("both")
+            wait_until(lambda: alive(one) == alive(other) == ["both"], "both see it")
+            further = second.liveliness().declare_token("both")
+            token.undeclare()
+            found = partial(wire_knows, wire, "base" if second is other else "robot")
+            wait_until(found, "the wire finds the second")
+            wait_until(lambda: alive(one) == alive(other) == ["both"], "both see that of the second")
+            further.undeclare()
+            wait_until(lambda: not alive(one) and not alive(other), "it is gone")
+
+
+@contextmanager
+def router(*connect: str) -> Iterator[tuple[zenoh.Session, str]]:
+    """A router outside the wire, and where to reach it."""
+    config = {
+        "mode": "router",
+        "listen": {"endpoints": [ANYWHERE]},
+        "connect": {"endpoints": list(connect)},
+        "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "adminspace": {"enabled": True},
+    }
+    with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
+        told = [one.ok.payload.to_bytes() for one in session.get(f"@/{session.zid()}/router") if one.ok is not None]
+        yield session, json.loads(told[0])["locators"][0]
+
+
+def test_sides_that_routers_join_outside_the_wire_carry_nothing(tmp_path: Path) -> None:
+    """Each side has a router of its own, and these are connected with each other: without the wire, too, everything passes."""
+    with router() as (_, first), router(first) as (_, second):
+        sides = {"robot": Side("robot", (ANYWHERE,), (first,)), "base": Side("base", (ANYWHERE,), (second,))}
+        plan = plan_of(link("robot", "base"), link("base", "robot"), sides=sides)
+        with at_work(plan, tmp_path) as wire, wire.program("robot") as robot:
+            wait_until(lambda: wire.told, "the wire says so")
+            assert (
+                "messages pass between the sides robot and base outside the wire, through the routers" in wire.told[0]
+            )
+            robot.put("a", b"x")
+            wait_until(lambda: Crossing.LOOPED in wire.fates("robot-base"), "the journal calls it looped")
+            assert all(fate == Crossing.LOOPED for fate in wire.fates())
+
+
+def test_routers_that_do_not_join_sides_are_no_loop(tmp_path: Path) -> None:
+    """Each side may have a router of its own, as robots have."""
+    with router() as (one, first), router() as (other, second):
+        sides = {"robot": Side("robot", (ANYWHERE,), (first,)), "base": Side("base", (ANYWHERE,), (second,))}
+        with at_work(plan_of(link("robot", "base"), sides=sides), tmp_path) as wire:
+            heard: list[bytes] = []
+            other.declare_subscriber("a", lambda sample: heard.append(sample.payload.to_bytes()))
+
+            def crossed() -> bool:
+                one.put("a", b"x")
+                return bool(heard)
+
+            wait_until(crossed, "a message crosses from router to router")
+            assert not wire.told
+            assert set(wire.fates()) == {Crossing.DELIVERED}
