@@ -111,7 +111,7 @@ def test_events_cut_and_part_links_and_change_them_while_the_wire_runs(tmp_path:
         wait_until(lambda: robot.put("x", b"") or 0 in wire.fates()[count + 1 :], "it passes again")
         conductor.change({"link": "robot-base", "set": {"quality": 0.0}})
         wait_until(lambda: robot.put("x", b"") or Crossing.LOST in wire.fates(), "the link loses everything")
-    assert [line.partition(": ")[2] for line in said][:2] == ["partition robot, base", "heal robot, base"]
+    assert [line.partition(": ")[2] for line in said][:3] == ["go", "partition robot, base", "heal robot, base"]
 
 
 def test_a_late_reader_gets_the_history_of_an_advanced_publisher(tmp_path: Path) -> None:
