@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, final
+from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -148,7 +148,7 @@ class _Reader:
             try:
                 with opened(path) as file:
                     reader = StreamReader(file, emit_chunks=True, record_size_limit=2**30)
-                    _keep(self._records(path, reader), channels, number)
+                    _keep(self._records(path, reader, file), channels, number)
             except Unreadable as error:
                 self._no(f"cannot be read ({why_of(error)}); expected an MCAP recording", error)
         found = _joined_by_topic(channels.items())
@@ -161,10 +161,9 @@ class _Reader:
             return [self._path]
         return sorted(self._path.glob(f"*{SUFFIX}"), key=lambda path: (len(path.name), path.name))
 
-    def _records(self, path: Path, reader: StreamReader) -> Iterator[Any]:
+    def _records(self, path: Path, reader: StreamReader, file: BinaryIO) -> Iterator[Any]:
         """Channels, and messages as tuples as in `_MESSAGE`, up to the end or up to where the file breaks off."""
-        from mcap.exceptions import EndOfFile, InvalidMagic, McapError  # noqa: PLC0415 - an optional extra
-        from mcap.records import Channel, Chunk, Message  # noqa: PLC0415 - the same
+        from mcap.records import Channel, Chunk, Message  # noqa: PLC0415 - an optional extra
 
         read = False
         try:
@@ -176,18 +175,14 @@ class _Reader:
                     yield record
                 elif isinstance(record, Message):
                     yield record.channel_id, record.sequence, record.log_time, record.publish_time
-        except InvalidMagic as error:
-            if not read:
-                self._no("does not begin as an MCAP recording does; expected one, decompressed", error)
-            self._notes.append(f"{path.name} breaks off: fitted up to there")
-        except EndOfFile:
-            self._notes.append(f"{path.name} breaks off: fitted up to there")
-        except McapError as error:
-            self._no(f"cannot be read ({why_of(error)}); expected an MCAP recording", error)
         except Exception as error:  # a damaged file makes the library and its decompressors raise errors of many kinds
-            self._no(
-                f"is damaged ({why_of(error)}); expected an MCAP recording, such as mcap recover makes of it", error
-            )
+            if read and not file.read(1):
+                self._notes.append(f"{path.name} breaks off: fitted up to there")
+            elif not read:
+                self._no("does not begin as an MCAP recording does; expected one, decompressed", error)
+            else:
+                what = f"is damaged ({why_of(error)}); expected an MCAP recording, such as mcap recover makes of it"
+                self._no(what, error)
 
     def _chosen(self, topic: str | None, period: float | None) -> _Messages:
         """The messages of the topic that was named, or of the only one that can be fitted."""
