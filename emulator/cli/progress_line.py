@@ -66,6 +66,7 @@ class ProgressLine:
             MofNCompleteColumn(),
             TextColumn(f"{unit} · {{task.fields[rate]}}"),
             TimeRemainingColumn(compact=True),
+            TextColumn("left"),
             TextColumn("{task.fields[errors]}"),
             console=self.console,
             transient=True,

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+from evedrop.cli.narrow import fitted
 from evedrop.figures import all_figures, columns, error_column, shown_figure, unloadable_figures, z_column
 from evedrop.figures.text import estimate, figure_text
 from evedrop.scenario.application import applications_in
@@ -259,6 +260,10 @@ class _Console(Console):
     def on_broken_pipe(self) -> None:
         """Re-raise: a closed pipe is not a failure of the program, and main.py handles it."""
         raise  # noqa: PLE0704 - rich calls this where it has caught the error
+
+    def print(self, *objects: Any, **named: Any) -> None:
+        """Show a table that is wider than the terminal row by row."""
+        super().print(*(fitted(one, self) if isinstance(one, Table) else one for one in objects), **named)
 
 
 def terminal() -> Console:

@@ -1,0 +1,51 @@
+"""Tables on narrow terminals: nothing is cut off."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+from rich.console import Console
+from rich.table import Table
+
+from evedrop.cli.narrow import fitted
+
+
+def table() -> Table:
+    """Two rows, of which the second repeats the first cell."""
+    made = Table(title="A comparison")
+    for head in ("scheme", "adversary", "its error", "ratio"):
+        made.add_column(head, no_wrap=True)
+    made.add_row("innovation", "bayesian", "0.123 ± 0.004", "1.2e+05 ± 3e+03")
+    made.add_row("", "naive", "56.7 ± 8.9", "")
+    return made
+
+
+def said(columns: int) -> list[str]:
+    """What a terminal of this width shows."""
+    out = io.StringIO()
+    console = Console(file=out, width=columns)
+    console.print(fitted(table(), console))
+    return [line.rstrip() for line in out.getvalue().splitlines()]
+
+
+@pytest.mark.parametrize("columns", [32, 44])
+def test_a_table_that_does_not_fit_is_shown_row_by_row(columns: int) -> None:
+    """Every entry is there in full, on a line of its own, under the first cell of its row."""
+    assert said(columns) == [
+        "A comparison",
+        "",
+        "scheme innovation",
+        "  adversary  bayesian",
+        "  its error  0.123 ± 0.004",
+        "  ratio      1.2e+05 ± 3e+03",
+        "",
+        "scheme innovation",
+        "  adversary  naive",
+        "  its error  56.7 ± 8.9",
+    ]
+
+
+def test_a_table_that_fits_stays_a_table() -> None:
+    """On a terminal of 80 columns it has its heads in one line."""
+    assert any("scheme" in line and "ratio" in line for line in said(80))
