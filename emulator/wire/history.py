@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, final
 
 from evedrop.errors import UsageError
-from evedrop.model.slot.link import Change
+from evedrop.model.slot.link import NEVER, Change
 from evedrop.wire.plan import WirePlan
 
 Numbered = tuple[str, str, str]
@@ -67,7 +67,7 @@ class WireHistory:
         for at, line in enumerate(lines, start=1):
             try:
                 history._take(json.loads(line))
-            except (ValueError, TypeError, KeyError, AttributeError) as error:
+            except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
                 raise UsageError(f"{path}, line {at}, is not the history of a wire; give another --out") from error
         return history
 
@@ -116,27 +116,36 @@ class WireHistory:
 
     def _take(self, entry: Mapping[str, Any]) -> None:
         if "start" in entry:
-            self.start, self.ended, self._seed = int(entry["start"]), False, int(entry["seed"])
+            self.start, self.ended, self._seed = _number(entry["start"]), False, int(entry["seed"])
             self.began, self.said = float(entry["time"]), []
             self.links[self.start] = list(entry["links"])
             for name, settings in entry["links"].items():
                 self._add(name, settings, {})
         elif "change" in entry:
             self._add(
-                entry["change"], entry["settings"], {(str(k), str(kind)): int(n) for k, kind, n in entry["since"]}
+                entry["change"], entry["settings"], {(str(k), str(kind)): _number(n) for k, kind, n in entry["since"]}
             )
         elif "said" in entry:
             self.said.append((float(entry["time"]), str(entry["said"])))
         elif int(entry["end"]) == self.start:
             self.ended = True
-            self.counts = {(str(link), str(key), str(kind)): int(n) for link, key, kind, n in entry["counts"]}
+            self.counts = {(str(link), str(key), str(kind)): _number(n) for link, key, kind, n in entry["counts"]}
 
     def _add(self, link: str, settings: Mapping[str, Any], since: Mapping[tuple[str, str], int]) -> None:
         """Settings come into force; those of a start, at the present counts of all streams."""
+        str(settings["loss"]["model"])  # raises an error unless they are settings
         known = self._settings.setdefault(link, [])
         counted = {(key, kind): n for (name, key, kind), n in self.counts.items() if name == link}
         if not known or known[-1].settings != settings:
             known.append(_Settings(settings, {**counted, **since}))
+
+
+def _number(found: Any) -> int:
+    """A number of a start or a message. Raises ValueError or TypeError."""
+    number = int(found)
+    if not 0 <= number < NEVER:
+        raise ValueError(number)
+    return number
 
 
 def highest(counts: dict[Numbered, int], stream: Numbered, n: int) -> None:

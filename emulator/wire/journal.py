@@ -291,19 +291,24 @@ class WireJournal:
         """The thread: blocks for the listeners, room for the next records, Parquet files."""
         while not self._ended.wait(_TICK):
             self.flush()
-            self._beat()
+            with contextlib.suppress(OSError):  # a wire that is killed then has less to say of delayed messages
+                self._beat()
             with self._state, contextlib.suppress(OSError):  # `_room` tries again, and tells of it
                 part = self._parts.get(self._next)
                 if part is not None and 2 * part.handed > self._rows and self._next + 1 not in self._buffers:
                     self._add_part(self._next + 1)
             now = time.time()
+            over = sorted(at for at, part in self._parts.items() if part.full and part.settled + _PATIENCE < now)
+            for at in over:
+                if self._parts[at].path is None:  # it was in memory alone, where there is no room for many
+                    self._convert(at)
             if now < self._convert_after:
                 continue
             try:
                 self._amend_converted()
-                over = [at for at, part in self._parts.items() if part.full and part.settled + _PATIENCE < now]
-                for at in sorted(over)[:1]:
-                    self._convert(at)
+                for at in over[:1]:
+                    if at in self._parts:
+                        self._convert(at)
             except OSError:  # the records are safe where they are
                 self._convert_after = now + _PATIENCE
 
@@ -346,14 +351,21 @@ class WireJournal:
 
     def _amend_converted(self) -> None:
         """Change fates in Parquet files. Raises OSError if the disk is full."""
-        while self._amended_late:
-            row, fate = self._amended_late[0]
+        parts: dict[int, dict[int, Crossing]] = {}
+        for row, fate in [self._amended_late.popleft() for _ in range(len(self._amended_late))]:
             at, place = divmod(row, self._rows)
+            parts.setdefault(at, {})[place] = fate
+        for at, fates in parts.items():
             path = parquet_path(self._folder, f"{self._history.start:03d}-{at + 1:04d}")
-            if path.exists():  # not if its records were in memory alone
-                before = amend_parquet(path, place, fate)
-                self._hear(self.amendment_listeners, self._record_of(before), fate)
-            self._amended_late.popleft()
+            if not path.exists():  # its records were in memory alone
+                continue
+            try:
+                before = amend_parquet(path, fates)
+            except OSError:
+                self._amended_late.extend((at * self._rows + place, fate) for place, fate in fates.items())
+                raise
+            for amended, fate in zip(before, fates.values(), strict=True):
+                self._hear(self.amendment_listeners, self._record_of(amended), fate)
 
     def _record_of(self, row: Mapping[str, Any]) -> Records:
         """The record of a row of a table."""

@@ -208,13 +208,14 @@ def write_parquet(path: Path, table: pa.Table) -> None:
         raise
 
 
-def amend_parquet(path: Path, row: int, fate: Crossing) -> dict[str, Any]:
-    """Change the fate of one row of a Parquet file; returns the row as it was. Raises OSError if the file cannot be written."""
+def amend_parquet(path: Path, fates: Mapping[int, Crossing]) -> list[dict[str, Any]]:
+    """Change the fates of some rows of a Parquet file; returns the rows as they were. Raises OSError if it cannot be written."""
     table = pq.read_table(path)
-    before: dict[str, Any] = table.slice(row, 1).to_pylist()[0]
-    for name, text in (("fate", word_of(fate)), ("reason", REASONS.get(fate))):
+    before: list[dict[str, Any]] = table.take(list(fates)).to_pylist()
+    for name, text_of in (("fate", word_of), ("reason", REASONS.get)):
         texts = table[name].cast(pa.string()).to_pylist()
-        texts[row] = text
+        for row, fate in fates.items():
+            texts[row] = text_of(fate)
         at, column = table.schema.get_field_index(name), PARQUET.field(name)
         table = table.set_column(at, column, pa.array(texts, pa.string()).cast(column.type))
     write_parquet(path, table)

@@ -9,19 +9,22 @@ import contextlib
 import json
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from evedrop.errors import UsageError
-from evedrop.wire.crossing import Crossing
+from evedrop.model.slot.link import NEVER
+from evedrop.wire.crossing import UNLINKED, Crossing, Kind
 from evedrop.wire.history import WireHistory
 from evedrop.wire.journal_part import PARQUET, Records, Words, records_in, table_of
 
 JOURNAL_FOLDER = "journal"
 """The folder inside a wire's folder that contains its journal."""
+_LATEST = 1e15  # seconds
 UNFINISHED = "unfinished"
 """The folder inside it for records that are not yet in a Parquet file."""
 
@@ -45,21 +48,43 @@ def journal_tables(folder: Path, start: int | None = None) -> Iterator[pa.Table]
         try:
             yield _table(journal, name, links)
         except (OSError, pa.ArrowException) as error:
-            raise UsageError(f"part {name} of the journal in {journal} cannot be read ({error})") from error
+            raise damaged(journal, name, error) from error
 
 
 def _table(journal: Path, name: str, links: dict[int, list[str]]) -> pa.Table:
     path = journal / UNFINISHED / f"{name}.rows"
     with contextlib.suppress(FileNotFoundError):  # a wire that goes on may just have made the Parquet file
         if not parquet_path(journal, name).exists():
-            start = _start_of(name)
-            return table_of(records_in(path), words_in(path.parent, start, links.get(start, [])))
+            return unfinished_table(path, links)
     return pq.read_table(parquet_path(journal, name), schema=PARQUET)
 
 
 def _start_of(name: str) -> int:
     """The number of the start that made a part."""
     return int(name.partition("-")[0])
+
+
+def damaged(journal: Path, name: str, why: object) -> UsageError:
+    """The error about a part that cannot be read."""
+    return UsageError(
+        f"part {name} of the journal in {journal} cannot be read ({why}); remove its file, or give another --out"
+    )
+
+
+def unfinished_table(path: Path, links: Mapping[int, list[str]], alive: float | None = None) -> pa.Table:
+    """The records that are not yet in a Parquet file, as a table. Raises OSError, and UsageError if they are damaged.
+
+    links: as in `WireHistory`; alive: as in `lost_with_the_process`, for the records of a wire that was killed.
+    """
+    start = _start_of(path.stem)
+    words, records = words_in(path.parent, start, links.get(start, [])), records_in(path)
+    wrong = ~np.isin(records["fate"], [*Crossing]) | ((records["kind"] & 0x7F) > max(Kind)) | (records["n"] >= NEVER)
+    wrong |= (records["link"] != UNLINKED) & (records["link"] >= len(words.links))
+    for name in ("time", "delay"):
+        wrong |= ~(np.abs(records[name]) < _LATEST)  # not a number, too
+    if wrong.any():
+        raise damaged(path.parents[1], path.stem, f"record {int(wrong.argmax())} is not one of this wire")
+    return table_of(records if alive is None else lost_with_the_process(records, alive), words)
 
 
 def part_names(journal: Path) -> list[str]:
@@ -79,9 +104,11 @@ def words_in(unfinished: Path, start: int, links: list[str]) -> Words:
     words = Words(links, {}, {})
     with contextlib.suppress(FileNotFoundError):
         for line in (unfinished / f"{start:03d}.words").read_bytes().splitlines():
-            with contextlib.suppress(ValueError, TypeError):  # the last line may be torn
+            with contextlib.suppress(ValueError, TypeError, OverflowError, RecursionError):  # the last line may be torn
                 what, code, text = json.loads(line)
-                (words.keys if what == "key" else words.sources)[int(code)] = str(text)
+                (words.keys if what == "key" else words.sources)[int(code)] = (
+                    str(text).encode("utf-8", "replace").decode()
+                )
     return words
 
 

@@ -9,14 +9,15 @@ import fcntl
 import os
 from pathlib import Path
 
+import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from evedrop.errors import UsageError
 from evedrop.wire.crossing import Kind
 from evedrop.wire.history import Numbered, WireHistory, highest
-from evedrop.wire.journal_part import records_in, table_of, write_parquet
-from evedrop.wire.journal_reader import UNFINISHED, last_beat, lost_with_the_process, parquet_path, part_names, words_in
+from evedrop.wire.journal_part import write_parquet
+from evedrop.wire.journal_reader import UNFINISHED, damaged, last_beat, parquet_path, part_names, unfinished_table
 
 
 def locked(folder: Path) -> int:
@@ -35,21 +36,23 @@ def locked(folder: Path) -> int:
 def recover(journal: Path, history: WireHistory) -> int:
     """Make Parquet files from all that an earlier start left behind, and end that start; returns the number of such records.
 
-    Raises OSError if the disk is full; then nothing is lost.
+    Raises OSError if the disk is full, and UsageError if a file is damaged; then nothing is lost.
     """
     place = journal / UNFINISHED
     recovered, alive = 0, last_beat(place)
     names = [name for name in part_names(journal) if int(name.partition("-")[0]) == history.start]
     if not history.ended:
         counts = dict(history.counts)
-        words = words_in(place, history.start, history.links[history.start])
         for name in names:
-            path = place / f"{name}.rows"
-            if not parquet_path(journal, name).exists():
-                records = lost_with_the_process(records_in(path), alive)
-                recovered += len(records)
-                write_parquet(parquet_path(journal, name), table_of(records, words))
-            _count_table(counts, parquet_path(journal, name))
+            path = parquet_path(journal, name)
+            try:
+                if not path.exists():
+                    table = unfinished_table(place / f"{name}.rows", history.links, alive)
+                    recovered += table.num_rows
+                    write_parquet(path, table)
+                _count_table(counts, path)
+            except (pa.ArrowException, KeyError) as error:
+                raise damaged(journal, name, error) from error
         history.end(counts, alive)
     for path in (*journal.glob("*.new"), *place.iterdir()):
         path.unlink()

@@ -46,10 +46,13 @@ from evedrop.view.replay import replay
 from evedrop.wire.check import key_lines, warnings_of_wire, wire_lines
 from evedrop.wire.fates import KeyFates
 from evedrop.wire.file import example_wire, load_wire, resolved_wire, wire_of
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal_reader import journal_tables
 from evedrop.wire.law import expected
 from evedrop.wire.timeline import moments
 from tests.fuzz.mutation import Mutator, words_of
 from tests.live.network import golden
+from tests.wire.wire_plans import wire_plan
 
 Change = Callable[[Mutator, bytes], bytes]
 _EXAMPLES = Path(__file__).with_name("examples")
@@ -386,6 +389,43 @@ def _every_message() -> Iterator[tuple[str, Reader]]:
 MESSAGES: dict[str, Reader] = dict(_every_message())
 """Of every message with golden bytes in docs/protocol.md."""
 
+
+# The folder of a wire
+
+
+@cache
+def _killed_wire() -> dict[str, bytes]:
+    """The files of a wire that was killed in its second start, by their paths."""
+    with TemporaryDirectory() as name:
+        for start in range(2):
+            journal = WireJournal(Path(name), wire_plan(), part_rows=8)
+            for n in range(8 * start, 8 * start + 12):
+                key, source = journal.key_code(f"scan/{n % 2}"), journal.source_code("gid")
+                journal.record(1e9 + n, n // 2, n, 0.25, key, source, 64, 0, 0, n % 3)
+            journal.change("scan", {"loss": {"model": "bernoulli", "quality": 0.5}}, {("scan/0", "put"): 4})
+            if start == 0:
+                journal.close()
+        found = {str(path.relative_to(name)): path.read_bytes() for path in Path(name).rglob("*") if path.is_file()}
+        journal.close()
+    return found
+
+
+def _in_wire(file: str) -> Callable[[bytes, Path], None]:
+    """Read the journal with other bytes in one of its files, and start the wire again."""
+
+    def look(data: bytes, folder: Path) -> None:
+        for path, content in (*_killed_wire().items(), (file, data)):
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+            (folder / path).write_bytes(content)
+        with contextlib.suppress(EvedropError):
+            for table in journal_tables(folder):
+                table.to_pylist()
+        with WireJournal(folder, wire_plan()) as journal:
+            journal.changes_of("scan", "scan/0", "put")
+
+    return look
+
+
 _DAY = b"time [s],P_solar [kW],P_load [kW]\n0,0.5,0.2\n1,0.6,0.2\n2,0.7,1.25\n"
 _WALK = b"k,received,delay\n0,1,2.5\n1,0,\n2,1,3\n"
 
@@ -415,6 +455,17 @@ FILES: dict[str, Reader] = {
         _results_of("trials.parquet"), _in_results("trials.parquet", look=_replayed), (raw, _as_parquet)
     ),
     "view-summary": Reader(_results_of("summary.json"), _in_results("summary.json", look=_replayed), (_as_json,)),
+    **{
+        f"wire-{file.rpartition('.')[2]}": Reader(
+            partial(lambda file: [_killed_wire()[f"journal/{file}"]], file), _in_wire(f"journal/{file}"), changes
+        )
+        for file, changes in (
+            ("history.jsonl", (raw, _lines)),
+            ("001-0001.parquet", (raw, _as_parquet)),
+            ("unfinished/002-0001.rows", (raw,)),
+            ("unfinished/002.words", (raw, _lines)),
+        )
+    },
     "unfinished-rounds": Reader(
         lambda: [_cut_short()["unfinished/rounds"]], _in_results("unfinished/rounds", _cut_short), (raw, _lines)
     ),

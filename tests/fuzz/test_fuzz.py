@@ -27,9 +27,10 @@ CHEAP = {"change", "disturbances", "disturbances-gz", "trace", "trace-parquet", 
 """Readers of files that take less than a millisecond or two."""
 QUICK = {**dict.fromkeys(READERS, 100), **dict.fromkeys(CHEAP, 200), "scenario": 60, "wire": 100, "summary": 30}
 QUICK |= {name: 15 for name in FILES if name.startswith(("results-", "unfinished-", "view-"))}
+QUICK |= {name: 5 for name in FILES if name.startswith("wire-")}
 """How many changed examples `make test` has each reader read."""
 LONG_FILES = {"scenario": 10_000, "wire": 10_000, "change": 20_000, "summary": 5_000}
-LONG_FILES |= {name: 2_000 for name in FILES if name.startswith(("results-", "unfinished-", "view-"))}
+LONG_FILES |= {name: 2_000 for name in FILES if name.startswith(("results-", "unfinished-", "view-", "wire-"))}
 LONG_FILES |= dict.fromkeys(CHEAP - {"change"}, 25000)
 LONG_MESSAGES = (1_000_000 - sum(LONG_FILES.values())) // len(MESSAGES) + 1
 LONG = {**dict.fromkeys(MESSAGES, LONG_MESSAGES), **LONG_FILES}
