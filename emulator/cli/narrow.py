@@ -17,8 +17,8 @@ _ENDLESS = 10_000  # columns
 def fitted(table: Table, console: Console) -> Table | Group:
     """The table if the console is wide enough for it; otherwise its rows, each with its first cell as a heading."""
     for column in table.columns:
-        if column.no_wrap:  # Rich would rather cut such a cell off than make the table wider
-            column.min_width = max(map(cell_len, (str(column.header), *map(str, column.cells))))
+        if column.no_wrap:  # Rich would rather cut such a cell off than make the table wider; it wraps the head
+            column.min_width = max(map(cell_len, (*str(column.header).split(), *map(str, column.cells))), default=0)
     wanted = Measurement.get(console, console.options.update(width=_ENDLESS), table).minimum
     if wanted <= console.width:
         return table

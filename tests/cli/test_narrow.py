@@ -49,3 +49,13 @@ def test_a_table_that_does_not_fit_is_shown_row_by_row(columns: int) -> None:
 def test_a_table_that_fits_stays_a_table() -> None:
     """On a terminal of 80 columns it has its heads in one line."""
     assert any("scheme" in line and "ratio" in line for line in said(80))
+
+
+def test_a_head_may_be_wrapped() -> None:
+    """A table fits if its cells and the words of its heads do."""
+    made = Table()
+    for head in ("receiver", "mean squared error of all trials"):
+        made.add_column(head, no_wrap=True)
+    made.add_row("smart", "0.5 ± 0.1")
+    console = Console(file=io.StringIO(), width=30)
+    assert fitted(made, console) is made
