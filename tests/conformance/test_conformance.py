@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from evedrop.conformance import eavesdroppers
 from evedrop.conformance.eavesdroppers import Listening, eavesdropper_verdicts
 from evedrop.conformance.examine import examined
 from evedrop.conformance.links import DelayChecks, LossChecks
+from evedrop.conformance.problems import Problem, small
 from evedrop.conformance.rules import Broken
 from evedrop.conformance.schemes import scheme_verdicts
 from evedrop.errors import UsageError
@@ -46,9 +48,11 @@ EVERY = [
 ]
 
 
-@pytest.mark.parametrize(("option", "name"), EVERY)
-def test_built_in_classes_keep_every_rule(option: str, name: str) -> None:
-    """On the same small problems as anybody's own."""
+LEARNERS = sorted(name for name in STRATEGIES if STRATEGIES[name].costly)
+
+
+def keeps_every_rule(option: str, name: str) -> None:
+    """Examine a built-in class, an eavesdropper together with a scheme that it is for."""
     schemes = {
         "reference": {"scheme": "acknowledged"},
         "clear-states": {"scheme": "partial-encryption"},
@@ -58,6 +62,27 @@ def test_built_in_classes_keep_every_rule(option: str, name: str) -> None:
     for one in examined({option: name, **(schemes.get(name, {}) if option == "eavesdropper" else {})}, {}):
         assert [verdict for verdict in one.verdicts if verdict.broken is not None] == [], one.title
         assert len(one.verdicts) >= 4
+
+
+@pytest.mark.parametrize(
+    ("option", "name"),
+    [pytest.param(*one, marks=[pytest.mark.long] if one[1] in LEARNERS else []) for one in EVERY],
+)
+def test_built_in_classes_keep_every_rule(option: str, name: str) -> None:
+    """On the same small problems as anybody's own."""
+    keeps_every_rule(option, name)
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_learners_keep_every_rule_for_a_while(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On the same problems with fewer slots, for a learner's slot takes a thousand times as long as another eavesdropper's."""
+
+    def shorter(slots: int = 0) -> list[Problem]:
+        found = small(slots)
+        return [replace(one, batch=replace(one.batch, slots=min(one.slots, 12))) for one in found]
+
+    monkeypatch.setattr(eavesdroppers, "small", shorter)
+    keeps_every_rule("eavesdropper", name)
 
 
 class Sent(PlainEncoder):

@@ -268,8 +268,18 @@ def test_who_reads_packets_is_refused(plan: Plan, strategy: str, tmp_path: Path)
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("option", ["--covariance-only", "--error-coordinates"])
-@pytest.mark.parametrize("name", ["acknowledged", "bayesian", "heated-room", "late", "restart", "twin-track"])
+@pytest.mark.parametrize(
+    ("name", "option"),
+    [
+        *((name, "--covariance-only") for name in ("acknowledged", "bayesian", "late", "restart", "twin-track")),
+        *((name, "--error-coordinates") for name in ("bayesian", "heated-room")),
+        *(
+            pytest.param(name, "--error-coordinates", marks=pytest.mark.long)
+            for name in ("acknowledged", "late", "restart", "twin-track")
+        ),
+        pytest.param("heated-room", "--covariance-only", marks=pytest.mark.long),
+    ],
+)
 def test_a_refused_study_runs_as_advised(name: str, option: str, evedrop: Evedrop) -> None:
     """Every option that the message names is one of the command, and the command runs with each change that it advises."""
     command = ("montecarlo", name, "--trials", "2")

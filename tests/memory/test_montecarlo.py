@@ -43,8 +43,15 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Study:
     return made
 
 
-@pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("workers", [2, 3])
+@pytest.mark.parametrize(
+    ("case", "workers"),
+    [
+        ("two blocks and a part", 3),
+        ("whole blocks, later trials", 2),
+        pytest.param("two blocks and a part", 2, marks=pytest.mark.long),
+        pytest.param("whole blocks, later trials", 3, marks=pytest.mark.long),
+    ],
+)
 def test_results_do_not_depend_on_the_number_of_workers(case: str, workers: int, study: Study) -> None:
     """Digests, tables to the last bit, and the whole summary but its times."""
     alone, spread = study(case, 1), study(case, workers)

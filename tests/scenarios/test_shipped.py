@@ -46,7 +46,7 @@ def blocks(results: Results) -> set[tuple[str, int, int, bytes]]:
     return set(zip(*(results.digests[name].to_pylist() for name in ("peer", "trial", "block", "digest")), strict=True))
 
 
-ALONE = {"acknowledged", "eavesdroppers", "microgrid-mpc", "vehicle"}
+ALONE = {"acknowledged", "eavesdroppers", "learning", "microgrid-mpc", "vehicle"}
 """By `make test` these run with one trial, and all others with forty; the other way round it takes `make test-long`."""
 
 

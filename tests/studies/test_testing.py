@@ -168,7 +168,7 @@ def test_a_report_holds_what_xml_cannot() -> None:
     assert (case[1].tag, case[1].get("message"), case[1].text) == ("error", known, f"{known}\nsecond")
 
 
-@pytest.mark.parametrize("jobs", ["1", "2"])
+@pytest.mark.parametrize("jobs", [pytest.param("1", marks=pytest.mark.long), "2"])
 def test_an_interrupt_ends_the_tests_and_leaves_no_process(evedrop: Evedrop, jobs: str) -> None:
     """Ctrl-C in the middle of a live run: exit 130, a report of what was done, no process and no brief left."""
     written(evedrop.folder / "cases", a=HOLDS, b=ENDLESS)

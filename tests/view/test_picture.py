@@ -74,7 +74,10 @@ def filled(png: bytes) -> float:
     return float(np.mean(inside != np.bincount(inside.ravel()).argmax()))
 
 
-@pytest.mark.parametrize(("n", "growth"), [(1, 1.0), (2, 1.12), (4, 1.0)])
+@pytest.mark.parametrize(
+    ("n", "growth"),
+    [pytest.param(1, 1.0, marks=pytest.mark.long), (2, 1.12), pytest.param(4, 1.0, marks=pytest.mark.long)],
+)
 def test_every_panel_is_filled(n: int, growth: float, simulated: Callable[..., Simulated], tmp_path: Path) -> None:
     """Whatever the process, each panel draws something, in more than one colour, and complains of nothing."""
     rrd = recorded(simulated(120, n=n, growth=growth), tmp_path / "r.rrd")

@@ -235,7 +235,7 @@ def parts() -> st.SearchStrategy[Any]:
     )
 
 
-@settings(deadline=None, max_examples=400)
+@settings(deadline=None, max_examples=150)
 @given(st.data(), st.sampled_from(sorted(READERS)))
 def test_anything_else_is_an_error_of_ours(data: st.DataObject, name: str) -> None:
     """Whatever arrives, a reader gives values or raises one of the two errors of messages, which names the key and its writer."""
