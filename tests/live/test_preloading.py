@@ -54,7 +54,7 @@ class Bench:
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[Bench]:
     """Processes of a test; those that it leaves end with their standard input."""
-    with preloaded(), ExitStack() as stack:
+    with process_starter(), ExitStack() as stack:
         yield Bench(tmp_path, stack)
 
 

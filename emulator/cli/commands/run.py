@@ -25,9 +25,9 @@ def demo(options: argparse.Namespace) -> int:
 
 def run(options: argparse.Namespace) -> int:
     """Run a scenario live."""
-    from evedrop.live.launch.preloading import preloaded
+    from evedrop.live.launch.preloading import preloaded_for_one_run
 
-    with preloaded():  # the servers make their imports while the scenario is read
+    with preloaded_for_one_run():  # the servers make their imports while the scenario is read
         ended = _run(options)
     if ended.viewer is not None:
         _keep_open(ended.viewer)

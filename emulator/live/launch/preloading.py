@@ -38,6 +38,8 @@ OF_OTHERS = (*_EVERY_ROLE, "evedrop.peers.eavesdropper", "evedrop.peers.legitima
 """What the processes of most roles import; not the modules of sensor and router, which have no place in an eavesdropper."""
 OF_OBSERVERS = ("evedrop.live.observer.observer",)
 """What an observer imports in addition."""
+OF_SUMMARIES = ("scipy.special",)
+"""What it imports once it makes a summary, which takes an eighth of a second."""
 
 
 @final
@@ -260,25 +262,39 @@ def process_starter() -> Iterator[Starter]:
     if _kept and _kept[-1].usable:
         yield _kept[-1].starter
         return
-    with preloaded() as starter:
+    with preloaded_for_one_run() as starter:
         yield starter
 
 
 @contextmanager
 def preloaded() -> Iterator[Starter]:
-    """Make the imports of live runs once for all runs in the block, which then start faster.
+    """Make the imports of live runs once for all runs in the block, which then start and end faster.
 
     Two more processes wait meanwhile. Raises OSError if they cannot be started.
 
     >>> with preloaded():                                                               # doctest: +SKIP
     ...     found = [run("eavesdroppers", slots=1000, seed=seed) for seed in range(10)]
     """
+    with _kept_servers(OF_OTHERS, (*OF_OBSERVERS, *OF_SUMMARIES)) as starter:
+        yield starter
+
+
+@contextmanager
+def preloaded_for_one_run() -> Iterator[Starter]:
+    """The same without what only a summary needs, so that one run starts as early as it can."""
+    with _kept_servers(OF_OTHERS, OF_OBSERVERS) as starter:
+        yield starter
+
+
+@contextmanager
+def _kept_servers(of_others: Sequence[str], of_observers: Sequence[str]) -> Iterator[Starter]:
+    """Fork servers that import these modules, for all runs in the block. Raises OSError."""
     try:
         os.close(os.pidfd_open(os.getpid()))
     except (AttributeError, OSError):  # not Linux, or a sandbox that forbids it
         yield start_process
         return
-    with fork_servers(OF_OTHERS, OF_OBSERVERS) as (others, observers):
+    with fork_servers(of_others, of_observers) as (others, observers):
         starter = PreloadedStarter(observers, others)
         kept = _Kept((others, observers), starter, _inherited())
         _kept.append(kept)
