@@ -11,7 +11,7 @@ from typing import NamedTuple, final
 import numpy as np
 
 from evedrop.wire.crossing import Crossing
-from evedrop.wire.plan import WireLink
+from evedrop.wire.plan import WireLink, WirePlan
 from evedrop.wire.step_counts import CUT, DELIVERED, OUTCOMES, Counts, WireSteps
 
 WORDS = {
@@ -158,3 +158,8 @@ def why(counts: Counts) -> str:
 def level_of(line: str) -> str:
     """The level of an event's line: a warning if it makes anything worse."""
     return "INFO" if line.startswith("heal ") or line.endswith(" as before") else "WARN"
+
+
+def introduction(plan: WirePlan) -> str:
+    """The first line of the events."""
+    return f"a wire of {len(plan.sides)} sides and {len(plan.links)} links, seed {plan.seed}"

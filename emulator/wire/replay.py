@@ -24,7 +24,7 @@ from evedrop.wire.folder import WIRE_FILE
 from evedrop.wire.history import WireHistory
 from evedrop.wire.journal_part import REASONS
 from evedrop.wire.journal_reader import JOURNAL_FOLDER, journal_tables
-from evedrop.wire.notices import Notice, level_of
+from evedrop.wire.notices import Notice, introduction, level_of
 from evedrop.wire.panels import Pace, WirePanels
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.step_counts import StepCounter
@@ -72,11 +72,6 @@ def summary_of_wire(folder: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise UsageError(f"{folder} has no summary.json of a wire ({error}); a wire writes it when it ends") from error
     return found
-
-
-def introduction(plan: WirePlan) -> str:
-    """The first line of the events."""
-    return f"a wire of {len(plan.sides)} sides and {len(plan.links)} links, seed {plan.seed}"
 
 
 def _notices(plan: WirePlan, history: WireHistory) -> Iterator[Notice]:

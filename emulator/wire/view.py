@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from evedrop.view.events import Event
 from evedrop.view.recording import RecordingThread
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.notices import Notice, level_of
+from evedrop.wire.notices import Notice, introduction, level_of
 from evedrop.wire.panels import Pace, WirePanels
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.step_counts import StepCounter
@@ -56,7 +56,7 @@ class WireView(RecordingThread[NDArray[Any]]):
         now, steady = clocks()
         self._ahead, self._shift = now - steady, 0.0
         self._amended: list[tuple[NDArray[Any], int]] = []
-        self._lines: list[Notice] = []
+        self._lines = [Notice(0.0, "INFO", introduction(plan))]
         self._sent = 0.0
         super().__init__(path, name)
 
@@ -74,12 +74,14 @@ class WireView(RecordingThread[NDArray[Any]]):
     def note(self, time: float, level: str, text: str) -> None:
         """Add a line to the events, at a time in seconds since 1970; level: INFO, WARN or ERROR."""
         with self._changed:
-            self._lines.append(Notice(self._elapsed(time), level, text))
+            if self.failure is None:
+                self._lines.append(Notice(self._elapsed(time), level, text))
 
     def amend(self, rows: NDArray[Any], fate: int) -> None:
         """Change the fate of rows that were added."""
         with self._changed:
-            self._amended.append((rows, fate))
+            if self.failure is None:
+                self._amended.append((rows, fate))
 
     def _elapsed(self, time: float) -> float:
         return max(0.0, time - self._start - self._shift)
