@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from evedrop.model.checks import as_toml
 from evedrop.scenario.sentences import sentences
 from evedrop.scenario.words import listed, near
-from evedrop.wire.endpoints import Place, place_of
+from evedrop.wire.endpoints import EndpointPlace, place_of
 from evedrop.wire.expect import expectation_mistakes
 from evedrop.wire.tables import CHANGEABLE, WireLinkTable, WireSettingsTable, changed_settings
 
@@ -105,7 +105,7 @@ class _Placed(NamedTuple):
     path: str
     side: str
     endpoint: str
-    place: Place
+    place: EndpointPlace
 
     @property
     def said(self) -> str:

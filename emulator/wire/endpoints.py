@@ -22,7 +22,7 @@ _EVERY_HOST = frozenset({"0.0.0.0", "[::]"})  # noqa: S104 - recognised, not bou
 _LOOPBACK = re.compile(r"127\.\d+\.\d+\.\d+|\[::1\]|localhost")
 
 
-class Place(NamedTuple):
+class EndpointPlace(NamedTuple):
     """Where an endpoint is."""
 
     protocol: str
@@ -36,7 +36,7 @@ class Place(NamedTuple):
         """Whether only programs on this machine can reach it."""
         return self.port is None or _LOOPBACK.fullmatch(self.host) is not None
 
-    def overlaps(self, other: Place) -> bool:
+    def overlaps(self, other: EndpointPlace) -> bool:
         """Whether a program that listens on one keeps others from listening on the other."""
         if (self.port is None) != (other.port is None) or (self.protocol == "quic") != (other.protocol == "quic"):
             return False
@@ -46,18 +46,18 @@ class Place(NamedTuple):
         return self.port == other.port != 0 and same
 
 
-def place_of(endpoint: str) -> Place | None:
+def place_of(endpoint: str) -> EndpointPlace | None:
     """The place of an endpoint; None if it is malformed."""
     found = _ENDPOINT.fullmatch(endpoint)
     if found is None or found[1] not in RELIABLE:
         return None
     if found[1] == "unixsock-stream":
-        return Place(found[1], found[2], None)
+        return EndpointPlace(found[1], found[2], None)
     address = _HOST_AND_PORT.fullmatch(found[2])
     if address is None or int(address[2]) > 65_535:
         return None
     host = "127.0.0.1" if address[1] == "localhost" else address[1]
-    return Place(found[1], host, int(address[2]))
+    return EndpointPlace(found[1], host, int(address[2]))
 
 
 def checked_endpoint(endpoint: str) -> str:
