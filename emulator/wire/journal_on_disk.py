@@ -5,19 +5,17 @@ Source: docs/wire.md, from Python.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, final
+from typing import final
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from evedrop.model.slot.link import Change
 from evedrop.wire.crossing import AGAIN, RECORD, UNLINKED, Crossing, Kind
 from evedrop.wire.history import WireHistory
 from evedrop.wire.journal import AmendmentListener, Listener
-from evedrop.wire.journal_part import REASONS, Records
+from evedrop.wire.journal_part import REASONS, Records, codes_of
 from evedrop.wire.journal_reader import JOURNAL_FOLDER, journal_tables
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.summary import WireSummary
@@ -64,7 +62,7 @@ class JournalOnDisk:
 
     def read(self) -> None:
         """Hand all records to the listeners. Raises UsageError if there is no journal."""
-        for table in journal_tables(self._folder):
+        for table in journal_tables(self._folder, self.start):
             records = self._records(table)
             self.recorded += len(records)
             for listener in self.listeners if len(records) else ():
@@ -79,22 +77,13 @@ class JournalOnDisk:
         for name, none in (("time", None), ("n", -1), ("sequence", -1), ("delay", None), ("size", None)):
             column = table[name] if none is None else table[name].fill_null(none)
             rows[name] = column.to_numpy()
-        rows["key"] = _codes(table["key"], self._codes, 0)
-        rows["link"] = _codes(table["link"], self._links, UNLINKED)
-        rows["fate"] = _codes(table["reason"], _FATES, Crossing.DELIVERED)
-        rows["kind"] = _codes(table["kind"], _KINDS, Kind.PUT) | np.where(table["again"].to_numpy(), AGAIN, 0)
+        rows["key"] = codes_of(table["key"], self._codes, 0)
+        rows["link"] = codes_of(table["link"], self._links, UNLINKED)
+        rows["fate"] = codes_of(table["reason"], _FATES, Crossing.DELIVERED)
+        rows["kind"] = codes_of(table["kind"], _KINDS, Kind.PUT) | np.where(table["again"].to_numpy(), AGAIN, 0)
         return rows
 
 
 def _words(column: pa.ChunkedArray) -> list[str]:
     """The words that a dictionary column may contain."""
     return [word for chunk in column.chunks for word in chunk.dictionary.to_pylist()]
-
-
-def _codes(column: pa.ChunkedArray, codes: Mapping[str, int], none: int) -> NDArray[np.int64]:
-    """The codes of the words of a dictionary column; none: of null, and of an unknown word."""
-    parts = [np.empty(0, np.int64)]
-    for chunk in column.chunks:
-        table: list[Any] = [*(codes.get(word, none) for word in chunk.dictionary.to_pylist()), none]
-        parts.append(np.array(table, np.int64)[chunk.indices.fill_null(len(table) - 1).to_numpy(zero_copy_only=False)])
-    return np.concatenate(parts)

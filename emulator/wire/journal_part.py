@@ -195,6 +195,15 @@ def _words(codes: NDArray[np.uint32], words: Mapping[int, str], what: str) -> pa
     )
 
 
+def codes_of(column: pa.ChunkedArray, codes: Mapping[str, int], none: int) -> NDArray[np.int64]:
+    """The codes of the words of a dictionary column; none: of null, and of an unknown word."""
+    parts = [np.empty(0, np.int64)]
+    for chunk in column.chunks:
+        of_word = np.array([*(codes.get(word, none) for word in chunk.dictionary.to_pylist()), none], np.int64)
+        parts.append(of_word[chunk.indices.fill_null(len(of_word) - 1).to_numpy(zero_copy_only=False)])
+    return np.concatenate(parts)
+
+
 def write_parquet(path: Path, table: pa.Table) -> None:
     """Write a Parquet file, which is complete under its name. Raises OSError if the disk is full."""
     unfinished = path.with_suffix(".new")

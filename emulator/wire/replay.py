@@ -22,7 +22,7 @@ from evedrop.wire.crossing import RECORD, UNLINKED, Crossing
 from evedrop.wire.file import load_wire
 from evedrop.wire.folder import WIRE_FILE
 from evedrop.wire.history import WireHistory
-from evedrop.wire.journal_part import REASONS
+from evedrop.wire.journal_part import REASONS, codes_of
 from evedrop.wire.journal_reader import JOURNAL_FOLDER, journal_tables
 from evedrop.wire.notices import Notice, introduction, level_of
 from evedrop.wire.panels import Pace, WirePanels
@@ -87,18 +87,8 @@ def _records(table: pa.Table, plan: WirePlan) -> NDArray[Any]:
     rows = np.zeros(table.num_rows, RECORD)
     rows["time"], rows["delay"] = table["time"].to_numpy(), table["delay"].to_numpy()
     links = {link.name: link.number for link in plan.links}
-    rows["link"] = _codes(table["link"], links, UNLINKED)
-    rows["fate"] = _codes(
+    rows["link"] = codes_of(table["link"], links, UNLINKED)
+    rows["fate"] = codes_of(
         table["reason"], {reason: int(fate) for fate, reason in REASONS.items()}, int(Crossing.DELIVERED)
     )
     return rows
-
-
-def _codes(column: pa.ChunkedArray, codes: dict[str, int], none: int) -> NDArray[np.uint16]:
-    """The codes of words in a dictionary column; none: the code of null and of an unknown word."""
-    parts = [np.empty(0, np.uint16)]
-    for chunk in column.chunks:
-        of_word = np.array([*(codes.get(word, none) for word in chunk.dictionary.to_pylist()), none], np.uint16)
-        places = chunk.indices.fill_null(len(of_word) - 1).to_numpy(zero_copy_only=False)
-        parts.append(of_word[places])
-    return np.concatenate(parts)

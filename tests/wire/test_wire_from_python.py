@@ -147,6 +147,11 @@ def test_figures_from_the_disk_are_those_of_the_wire(tmp_path: Path) -> None:
         assert on_disk["links"] == live["links"]
         assert on_disk["heard"] == 600
     assert summary_on_disk(tmp_path, plan).as_dict()["links"] == summary.as_dict()["links"]
+    with WireJournal(tmp_path, plan) as journal:
+        journal.record(1e9, 50, -1, 0.0, journal.key_code("scan/0"), 0, 64, 0, Kind.PUT, Crossing.DELIVERED)
+        journal.flush()
+        found = summary_on_disk(tmp_path, plan).as_dict()
+    assert (found["start"], found["heard"], found["links"]["scan"]["delivered"]) == (2, 1, 1)
 
 
 def test_the_page_shows_the_example_and_every_method() -> None:
