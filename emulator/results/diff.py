@@ -14,7 +14,7 @@ from evedrop.names import CONTROLLER
 from evedrop.results.writer import Results
 
 _COMPARED = ("sent", "action", "x", "x_hat", "P")
-_INPUTS = ("u", "d", "failed")
+_INPUTS = ("u", "d", "failed", "watermark", "statistic")
 
 
 @dataclass(frozen=True)
@@ -43,12 +43,30 @@ def difference(a: Results, b: Results) -> RunDifference:
     if first is not None and (not unequal or first.slot < unequal[0][0] + BLOCK_SLOTS):
         return RunDifference(False, first.text + rest)
     if not unequal:
+        other = _unequal_digests(a, b)
+        if other:
+            remedy = "record all trials in both runs to see the slot and the values"
+            return RunDifference(
+                False, f"the digest of {' and of '.join(other)} differs, in trials not recorded; {remedy}{rest}"
+            )
         peers = ", ".join(sorted({peer for peer, _, _ in common}))
         return RunDifference(True, f"no difference in {len(common)} blocks of 256 slots: {peers}{rest}")
     block, trial, peer = unequal[0]
     slots = f"slots {block} to {ends_a[peer, block] - 1}"
     remedy = f"record it with --first-trial {trial} --trials 1 in both runs to see the slot and the values"
     return RunDifference(False, f"{peer} differs in trial {trial} within {slots}, not recorded; {remedy}{rest}")
+
+
+def _unequal_digests(a: Results, b: Results) -> list[str]:
+    """The entries of the summaries, such as `integrity`, whose digests differ although both are of the same slots and trials."""
+    one, other = a.summary, b.summary
+    if any(one[name] != other[name] for name in ("slots", "trials", "first_trial")):
+        return []
+    digests = [
+        {name: entry["digest"] for name, entry in summary.items() if isinstance(entry, dict) and entry.get("digest")}
+        for summary in (one, other)
+    ]
+    return sorted(name for name in digests[0].keys() & digests[1].keys() if digests[0][name] != digests[1][name])
 
 
 def _ends(results: Results, blocks: Iterable[tuple[str, int, int]]) -> dict[tuple[str, int], int]:

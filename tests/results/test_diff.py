@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -193,3 +194,25 @@ def test_runs_of_different_processes_differ(runs: dict[str, Results], tmp_path: 
     found = difference(runs["whole"], other)
     assert not found.same
     assert found.text.startswith("first difference: slot 0, trial 0, legitimate: ")
+
+
+def test_what_a_detector_says_is_compared(tmp_path: Path) -> None:
+    """Watermark and statistic of recorded trials row by row, and those of all trials by the digest of the summary."""
+    loop: dict[str, Any] = {"trials": 3, "expect": []}
+    known = montecarlo("replay-attack", out=tmp_path / "a", **loop)
+    again = montecarlo("replay-attack", out=tmp_path / "b", **loop)
+    assert difference(known, again).same
+    changed = shutil.copytree(tmp_path / "b", tmp_path / "changed")
+    summary = json.loads((changed / "summary.json").read_text(encoding="utf-8"))
+    summary["integrity"]["digest"] = "0" * 64
+    (changed / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
+    found = difference(known, load_results(changed))
+    assert not found.same
+    assert found.text.startswith("the digest of integrity differs, in trials not recorded; record all trials")
+    rows = known.inputs
+    assert rows is not None
+    place = rows.column_names.index("statistic")
+    raised = pc.add(rows["statistic"], pc.cast(pc.greater(rows["slot"], 30), pa.float64()))
+    pq.write_table(rows.set_column(place, "statistic", raised), changed / "inputs.parquet")
+    found = difference(known, load_results(changed))
+    assert found.text.startswith("first difference: slot 31, trial 0, controller: statistic ")
