@@ -109,10 +109,11 @@ def test_amended_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         for fate in block["fate"]:
             tally[Crossing(fate)] += 1
 
-    def amend(record: Records, fate: Crossing) -> None:
-        assert (record["n"][0], journal.key_of(record["key"][0]), record["size"][0]) == (2, "scan/1", 64)
-        tally[Crossing(record["fate"][0])] -= 1
-        tally[fate] += 1
+    def amend(records: Records, fate: Crossing) -> None:
+        for record in records:
+            assert (record["n"], journal.key_of(record["key"]), record["size"]) == (2, "scan/1", 64)
+            tally[Crossing(record["fate"])] -= 1
+            tally[fate] += 1
 
     with WireJournal(tmp_path, wire_plan(), part_rows=4) as journal:
         journal.listeners.append(add)
