@@ -15,7 +15,7 @@ import numpy as np
 
 from evedrop.errors import UsageError
 from evedrop.model.checks import toml_of
-from evedrop.model.given_states import deviations
+from evedrop.model.given_states import LARGEST, deviations
 from evedrop.model.process import Floats, mistakes_of
 from evedrop.recordings.disturbance_file import StateRecording, recorded_states
 
@@ -130,6 +130,8 @@ def fit_process(path: Path, names: Sequence[str] | None = None, reference: Seque
         )
     around = np.zeros(n) if reference is None else np.array(reference, np.float64)
     x = deviations(np.array(recording.rows), around)
+    if not np.all(np.abs(x) <= LARGEST):
+        raise UsageError(f"{path} has {np.abs(x).max():g}; expected numbers of at most {LARGEST:g}")
     size = np.sqrt(np.mean(x * x, axis=0))
     scaled = x[:-1] / np.where(size > 0.0, size, 1.0)
     found, _, rank, _ = np.linalg.lstsq(scaled, x[1:], rcond=None)
@@ -139,12 +141,13 @@ def fit_process(path: Path, names: Sequence[str] | None = None, reference: Seque
             f"{', '.join(recording.names)} out, by --states"
         )
     A = (found / size[:, None]).T
-    residuals = x[1:] - x[:-1] @ A.T
+    with np.errstate(over="ignore", invalid="ignore"):  # of states that are tiny: then A is refused
+        residuals = x[1:] - x[:-1] @ A.T
     noisy = np.sqrt(np.mean(residuals * residuals, axis=0)) > _EXACT * size
     residuals = residuals * noisy
     Q = residuals.T @ residuals / (count - n)
     Q = 0.5 * (Q + Q.T)
-    spread = np.diag(np.linalg.inv(scaled.T @ scaled)) / size**2
+    spread = np.sum(np.linalg.inv(np.linalg.qr(scaled, mode="r")) ** 2, axis=1) / size**2  # the diagonal of (X Xᵀ)⁻¹
     own = np.diag(Q)
     initial = np.diag(np.where(x[0] == 0.0, np.where(own > 0.0, 0.0, size**2), x[0] ** 2)) + Q
     wrong = mistakes_of(A, Q, initial, not noisy.all())

@@ -125,6 +125,8 @@ def recorded_states(path: Path, names: Sequence[str] | None = None) -> StateReco
     if columns[0].name == _TIME and _TIME not in names:
         times, numbers = [row[0] for row in numbers], [row[1:] for row in numbers]
         seconds = (times[-1] - times[0]) / (len(times) - 1) if len(times) > 1 else 0.0
+        if len(times) > 1 and not 0.0 < seconds < math.inf:
+            raise DisturbanceError(str(path), ["has times that do not grow from line to line; expected seconds"])
         if mistakes := list(_few(_time_mistakes(found.lines, times, seconds, recorded=True), "times")):
             raise DisturbanceError(str(path), mistakes)
     units = [match["unit"].strip() for cell in head.cells if (match := _HEADER.match(cell)) and match["name"] in names]

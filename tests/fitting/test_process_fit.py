@@ -118,6 +118,13 @@ def test_other_files_and_options_are_refused(tmp_path: Path, capsys: pytest.Capt
     path.write_text("x,y\n1,2\n1,a\n")
     with pytest.raises(DisturbanceError, match="line 3: y is"):
         fit_process(path)
+    path.write_text("time,x\n0,1\n1,2\n0,3\n")
+    with pytest.raises(DisturbanceError, match="times that do not grow"):
+        fit_process(path)
+    path.write_text("x\n" + "1e101\n-2\n" * 10)
+    with pytest.raises(UsageError, match=r"has 1e\+101; expected numbers of at most 1e\+100"):
+        fit_process(path)
+    path.write_text("x,y\n1,2\n")
     with pytest.raises(UsageError, match='has no column "z"'):
         fit_process(path, ["z"])
     path.write_text(table_text(["x"], None, path_of(1)[:, :1].tolist()))

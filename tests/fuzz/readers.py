@@ -13,7 +13,7 @@ import re
 import tomllib
 import traceback
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -25,12 +25,15 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import tomli_w
 
-from evedrop.errors import EvedropError
+from evedrop.errors import EvedropError, RunError
 from evedrop.expected.estimates import warnings_of
+from evedrop.fitting.process_fit import fit_process
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.network.control_file import Control, read_controls
 from evedrop.live.protocol.brief import read_brief
+from evedrop.live.protocol.brief_parts import ProgramEntry
 from evedrop.live.protocol.brief_use import expect_usable
+from evedrop.live.protocol.state_message import read_state
 from evedrop.loading import load, parse, shipped, value_of
 from evedrop.memory.montecarlo import simulate
 from evedrop.news import silent
@@ -216,6 +219,20 @@ def _wire(data: bytes, folder: Path) -> None:
 def _disturbances(data: bytes, folder: Path, name: str = "day.csv") -> None:
     (folder / name).write_bytes(data)
     read_disturbances(folder / name, ("P_solar", "P_load"), ("kW", "kW"), 3, 1.0)
+
+
+def _states(data: bytes, folder: Path) -> None:
+    (folder / "pose.csv").write_bytes(data)
+    fit_process(folder / "pose.csv")
+
+
+def _state_message(entry: ProgramEntry, data: bytes, _folder: Path) -> None:
+    try:
+        read_state(data, entry)
+    except ValueError as error:
+        if "expected" not in str(error):  # it was not raised on purpose
+            raise
+        raise RunError(str(error)) from error
 
 
 def _trace(data: bytes, folder: Path, name: str = "walk.csv") -> None:
@@ -427,6 +444,8 @@ def _in_wire(file: str) -> Callable[[bytes, Path], None]:
 
 
 _DAY = b"time [s],P_solar [kW],P_load [kW]\n0,0.5,0.2\n1,0.6,0.2\n2,0.7,1.25\n"
+_POSE = ("time,x [m],v\n" + "".join(f"{5 + 0.1 * k:.1f},{k % 7},{0.1 * (k % 5)}\n" for k in range(30))).encode()
+_NAMED = ProgramEntry("robot/pose", ["x", "y"], [0.0, 1.5], "tcp/127.0.0.1:7447")
 _WALK = b"k,received,delay\n0,1,2.5\n1,0,\n2,1,3\n"
 
 FILES: dict[str, Reader] = {
@@ -441,6 +460,13 @@ FILES: dict[str, Reader] = {
     "disturbances": Reader(lambda: [_DAY], _disturbances, (raw, _cells)),
     "disturbances-gz": Reader(
         lambda: [gzip.compress(_DAY, mtime=0)], lambda data, folder: _disturbances(data, folder, "day.csv.gz"), (raw,)
+    ),
+    "states": Reader(lambda: [_POSE], _states, (raw, _cells)),
+    "state-message": Reader(
+        lambda: [b'{"x": 0.5, "y": -2.25e3}', b"[1.0, 2.0]"], partial(_state_message, _NAMED), (raw, _as_json), status=3
+    ),
+    "state-bytes": Reader(
+        lambda: [bytes(24)], partial(_state_message, replace(_NAMED, offsets=[4, 12])), (raw,), status=3
     ),
     "trace": Reader(lambda: [_WALK, b"1\n0\n1\n"], _trace, (raw, _cells)),
     "trace-parquet": Reader(_recordings, lambda data, folder: _trace(data, folder, "walk.parquet"), (raw,)),

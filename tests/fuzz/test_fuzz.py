@@ -24,6 +24,7 @@ from tests.fuzz.mutation import REALS
 from tests.fuzz.readers import FILES, MESSAGES, READERS
 
 CHEAP = {"change", "disturbances", "disturbances-gz", "trace", "trace-parquet", "brief", "control"}
+CHEAP |= {"states", "state-message", "state-bytes"}
 """Readers of files that take less than a millisecond or two."""
 QUICK = {**dict.fromkeys(READERS, 100), **dict.fromkeys(CHEAP, 200), "scenario": 60, "wire": 100, "summary": 30}
 QUICK |= {name: 15 for name in FILES if name.startswith(("results-", "unfinished-", "view-"))}
