@@ -46,7 +46,5 @@ class GivenStates:
         """The states of the next slots and the predictions A x_{k−1} of each, (c, n, R); the prediction of slot 0 is 0."""
         x = self._take(slots)[:, :, None]
         predicted = product(self._A, np.concatenate([self._last[None], x[:-1]]))
-        if slots.start == 0:
-            predicted[0] = 0.0
         self._last = x[-1]
         return np.repeat(x, self._trials, axis=2), np.repeat(predicted, self._trials, axis=2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -11,10 +12,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import zenoh
 
 from evedrop.api import montecarlo, run
 from evedrop.errors import RunError
 from evedrop.live.launch.preloading import preloaded
+from evedrop.live.network.program import ProgramStates
+from evedrop.live.protocol.brief_parts import ProgramEntry
 from evedrop.loading import checked
 from evedrop.memory.montecarlo import Plan
 from evedrop.ports import free_port
@@ -23,6 +27,7 @@ from evedrop.results.diff import difference
 from evedrop.results.writer import Results, load_results
 from evedrop.scenario import Scenario
 from tests.builders import MARGINAL, digests_of, process_table
+from tests.conftest import wait_until
 
 PLAYER = Path(__file__).parents[2] / "docs" / "examples" / "csv_player.py"
 ROWS = np.random.default_rng(5).standard_normal((80, 2)).cumsum(axis=0).tolist()
@@ -112,6 +117,32 @@ def test_a_paced_run_takes_the_newest_state(tmp_path: Path) -> None:
     assert taken[-1] > 40.0
     again = montecarlo(tmp_path / "live", trials=2, out=tmp_path / "again", plan=Plan(workers=1))
     assert difference(live, again).same
+
+
+def test_states_are_taken_from_messages_as_they_come() -> None:
+    """The newest for a paced run, which leaves older ones out; otherwise each in its turn, and not too many."""
+    quiet = {"multicast": {"enabled": False}, "gossip": {"enabled": False}}
+    samples: list[zenoh.Sample] = []
+    with zenoh.open(
+        zenoh.Config.from_json5(json.dumps({"mode": "peer", "listen": {"endpoints": []}, "scouting": quiet}))
+    ) as session:
+        session.declare_subscriber("robot/*", samples.append)
+        for k in range(3):
+            session.put("robot/pose", f"[{k}, 0]")
+        session.put("robot/other", "[7, 0]")
+        session.delete("robot/pose")
+        wait_until(lambda: len(samples) == 5, "all messages arrive")
+    entry = ProgramEntry("robot/pose", ["x", "v"], [0.0, 0.0], listen="tcp/127.0.0.1:0")
+    for newest, expected in ((True, [2.0]), (False, [0.0, 1.0, 2.0])):
+        with ProgramStates(entry, newest, 5.0) as states:
+            for sample in samples:
+                states._hear(sample)
+            assert [states.take(range(k, k + 1))[0, 0] for k in range(len(expected))] == expected
+            for _ in range(100_001):
+                states._hear(samples[0])
+            if not newest:
+                with pytest.raises(RunError, match="more than 100000 states wait at slot 3"):
+                    states.take(range(3, 4))
 
 
 def test_a_message_that_is_no_state_ends_the_run(tmp_path: Path) -> None:
