@@ -90,6 +90,8 @@ class WireJournal:
         self.links = [link.name for link in plan.links]
         """The names of the links, in the order of their codes."""
         self._tell = tell
+        self.folder = folder
+        """The wire's folder."""
         self._folder = folder / JOURNAL_FOLDER
         self._place = self._folder / UNFINISHED
         self._rows = part_rows

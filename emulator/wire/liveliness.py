@@ -33,10 +33,19 @@ def joined(plan: WirePlan) -> dict[str, tuple[str, ...]]:
 
 @final
 class LivelinessRelay:
-    """Mirrors the tokens of all sides. `changed` is called, on a thread of Zenoh's, when tokens appear or vanish."""
+    """Mirrors the tokens of all sides.
 
-    def __init__(self, sides: Mapping[str, SideSession], plan: WirePlan, changed: Callable[[], None]) -> None:
-        self._sides, self._joined, self._changed = sides, joined(plan), changed
+    `changed` is called, on a thread of Zenoh's, when tokens appear or vanish; `noted` gets side and token of each that is noted.
+    """
+
+    def __init__(
+        self,
+        sides: Mapping[str, SideSession],
+        plan: WirePlan,
+        changed: Callable[[], None],
+        noted: Callable[[str, str], None],
+    ) -> None:
+        self._sides, self._joined, self._changed, self._noted = sides, joined(plan), changed, noted
         self._lock = threading.Lock()
         self._events: deque[tuple[str, str, bool]] = deque()
         self._held: dict[str, set[str]] = {name: set() for name in sides}
@@ -67,6 +76,7 @@ class LivelinessRelay:
                     self._doubtful[name].discard(key)
                 elif key not in self._mirrored[name] and (key not in self._doubtful[name] or self._lives(name, key)):
                     self._held[name].add(key)
+                    self._noted(name, key)
 
     def mirror(self) -> None:
         """Mirror the tokens that were noted, and give up those that are gone; later reports wait for the next `note`."""
@@ -79,6 +89,7 @@ class LivelinessRelay:
                     mirrored.pop(key).undeclare()
                     if self._lives(name, key):
                         self._held[name].add(key)
+                        self._noted(name, key)
                         self._changed()
                 for key in wanted - mirrored.keys():
                     self._doubtful[name].add(key)

@@ -129,5 +129,7 @@ class WirePlan:
         return {link.name: link for link in self.links}[name]
 
     def is_lossless(self, key: zenoh.KeyExpr) -> bool:
-        """Whether messages with this key are never lost."""
-        return any(zenoh.KeyExpr(one).includes(key) for one in self.lossless)
+        """Whether messages with this key are never lost: it is named, or it is `KEY/@adv/…` and KEY is named."""
+        before, verbatim, _ = str(key).partition("/@adv/")
+        keys = (key, zenoh.KeyExpr(before)) if verbatim else (key,)
+        return any(zenoh.KeyExpr(one).includes(each) for one in self.lossless for each in keys)

@@ -24,6 +24,7 @@ from evedrop.wire.plan import WirePlan
 from evedrop.wire.publications import PublicationRelay, Publishers
 from evedrop.wire.queries import QueryRelay
 from evedrop.wire.ros2 import service_key
+from evedrop.wire.ros2_entities import EntityLog
 from evedrop.wire.scheduler import Scheduler
 from evedrop.wire.side import SideSession
 from evedrop.wire.timeline import Moment
@@ -97,7 +98,7 @@ class WireRelay:
         for relay in relays:
             stack.callback(relay.close)
         self._neighbours = Neighbours(self.sides, states, self._tell)
-        self._liveliness = LivelinessRelay(self.sides, plan, self._woken.set)
+        self._liveliness = LivelinessRelay(self.sides, plan, self._woken.set, EntityLog(journal.folder).add)
         stack.callback(self._liveliness.close)
         self._look()
         self._queries.start()

@@ -6,7 +6,11 @@ References: tokens as rmw_zenoh documents them, and attachments by the serialize
 from __future__ import annotations
 
 import json
+import runpy
+import sys
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import pytest
 import zenoh
@@ -15,7 +19,9 @@ from hypothesis import strategies as st
 from xxhash import xxh3_128_hexdigest
 from zenoh import ext
 
+from evedrop.cli import main as cli
 from evedrop.wire import ros2, ros2_entities
+from evedrop.wire.file import load_wire
 from evedrop.wire.ros2 import Entity, Qos, SourceReader, read_token, reply_seconds, service_key
 from evedrop.wire.ros2_entities import EntityLog
 
@@ -239,3 +245,37 @@ def test_a_log_does_not_grow_without_limit(tmp_path: Path, monkeypatch: pytest.M
     for n in range(4):
         log.add("robot", f"{NODE}{n}")
     assert len((tmp_path / "ros2.jsonl").read_text().splitlines()) == 2
+
+
+def test_the_launch_file_starts_its_wire_and_puts_nodes_on_its_sides(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The endpoints of the launch file are those of the wire file, which is valid; stand-ins take the place of ROS."""
+    folder = Path(__file__).parents[2] / "docs" / "ros2"
+    plan = load_wire(folder / "robot.toml")
+
+    def keep(**fields: Any) -> dict[str, Any]:
+        return fields
+
+    stands: dict[str, dict[str, Any]] = {
+        "launch": {"LaunchDescription": list},
+        "launch.actions": {"ExecuteProcess": keep},
+        "launch_ros": {},
+        "launch_ros.actions": {"Node": keep},
+    }
+    for name, members in stands.items():
+        module = ModuleType(name)
+        vars(module).update(members)
+        monkeypatch.setitem(sys.modules, name, module)
+    launched = runpy.run_path(str(folder / "robot.launch.py"))
+    wire, talker, listener = launched["generate_launch_description"]()
+    assert wire["cmd"][:3] == ["evedrop", "wire", str(folder / "robot.toml")]
+    assert cli.parser_of().parse_args(wire["cmd"][1:]).command is not None
+    for node, side in ((talker, "robot"), (listener, "base")):
+        override = node["additional_env"]["ZENOH_CONFIG_OVERRIDE"]
+        config = zenoh.Config()
+        for entry in override.split(";"):
+            config.insert_json5(*entry.split("=", 1))
+        assert json.loads(config.get_json("mode")) == "client"
+        assert tuple(json.loads(config.get_json("connect/endpoints"))) == plan.sides[side].listen
+    assert plan.is_lossless(zenoh.KeyExpr("0/tf_static/T/H"))
+    assert plan.is_lossless(zenoh.KeyExpr("0/tf_static/T/H/@adv/pub/1/2/_"))
+    assert not plan.is_lossless(zenoh.KeyExpr("0/map/T/H/@adv/**"))
