@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import sys
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -214,6 +215,23 @@ def test_two_clocks_give_no_delays(tmp_path: Path, offset: float) -> None:
     assert any("did not use one clock" in note for note in found.notes)
 
 
+def test_two_topics_with_counters_of_their_own_are_not_one_counter(tmp_path: Path) -> None:
+    """A topic that lost nothing has all numbers that the other one lacks, and most of those that it has."""
+    outcomes = lossy(BURSTS, 500)
+    topics = [Recorded("/scan", heard(outcomes)), Recorded("/odom", heard(np.ones(500, np.uint8)))]
+    found = mcap_recording(write(tmp_path / "bag.mcap", topics), "/scan")
+    assert found.series.outcomes.tolist() == trimmed(outcomes)
+
+
+def test_the_second_copy_of_a_message_has_no_delay(tmp_path: Path) -> None:
+    """The delay of a message is that of its first copy."""
+    outcomes = lossy(BURSTS, 500)
+    copies = [(number, sent, logged + 1.0) for number, sent, logged in heard(outcomes)[::3]]
+    found = mcap_recording(write(tmp_path / "bag.mcap", [Recorded("/scan", [*heard(outcomes), *copies])]))
+    assert (found.series.repeated, len(found.delays)) == (len(copies), outcomes.sum())
+    assert found.delays.max() < 0.01
+
+
 def test_a_recorder_that_counts_by_itself_shows_no_loss(tmp_path: Path) -> None:
     """One counter for all topics, and one for each topic: both refused, and two publishers that count alike are not."""
     random = np.random.default_rng(6)
@@ -390,3 +408,11 @@ def test_mistakes_of_the_command_are_said(evedrop: Evedrop, arguments: tuple[str
     assert (done.status, done.out) == (2, "")
     (line,) = done.err.splitlines()
     assert said in line
+
+
+def test_without_the_library_the_message_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The extra, by its name."""
+    path = write(tmp_path / "bag.mcap", [Recorded("/scan", heard(lossy(BURSTS, 300)))])
+    monkeypatch.setitem(sys.modules, "mcap.stream_reader", None)
+    with pytest.raises(TraceError, match=r"expected pip install 'evedrop\[mcap\]' first"):
+        mcap_recording(path)
