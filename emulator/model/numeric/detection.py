@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import lru_cache
 from typing import final
 
 import numpy as np
@@ -76,6 +77,7 @@ class CusumBatch:
         return self._chart.alarms(self._S) & ~before
 
 
+@lru_cache(maxsize=32)  # a study asks for the same one for each batch of its trials, a comparison for each scheme
 def chart_for(normal: float, attacked: float, mean_packets: float) -> Chart:
     """The chart for a change of rate, with the least threshold whose false alarms are `mean_packets` or more apart.
 
