@@ -7,6 +7,7 @@ declared first, with what options, and what is attached was read from rmw_zenoh'
 from __future__ import annotations
 
 import json
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -87,6 +88,8 @@ class Node:
     def __post_init__(self) -> None:
         """Declare the node's token, and follow the graph."""
         self.graph: dict[str, bool] = {}
+        self.news = threading.Event()
+        """Set whenever the graph changes."""
         self._id = next(self._ids)
         self._held.append(self.session.liveliness().declare_token(self._token(self._id, "NN")))
         everything = f"@ros2_lv/{self.domain}/**"
@@ -96,6 +99,7 @@ class Node:
 
         def changed(sample: zenoh.Sample) -> None:
             self.graph[str(sample.key_expr)] = sample.kind == zenoh.SampleKind.PUT
+            self.news.set()
 
         self._held.append(self.session.liveliness().declare_subscriber(everything, changed, history=True))
 

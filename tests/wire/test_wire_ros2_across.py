@@ -18,7 +18,7 @@ from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_reader import journal_tables
 from evedrop.wire.plan import Side, WireLink, WirePlan
 from evedrop.wire.relay import WireRelay
-from tests.conftest import wait_until
+from tests.conftest import LIMIT, wait_until
 from tests.wire.rmw import Heard, Node, ros_context
 
 LOSSY = {"loss": {"model": "gilbert-elliott", "p": 0.2, "r": 0.4}}
@@ -96,7 +96,9 @@ def test_a_service_answers_as_soon_as_it_is_seen(field: Field) -> None:
         name = f"/add_{n}"
         send, responses = caller.client(name)
         server.service(name)
-        wait_until(partial(caller.sees, "SS", name), "the graph shows the service")
+        while not caller.sees("SS", name):  # at once: a pause would hide that the service cannot be asked yet
+            assert caller.news.wait(LIMIT), "the graph shows the service"
+            caller.news.clear()
         sequence = send(n, 40)
         wait_until(responses.__len__, "the response")
         assert [(one.sequence, one.text) for one in responses] == [(sequence, n + 40)]
