@@ -39,6 +39,7 @@ class LinkState:
         self._seed, self._largest = plan.seed, plan.largest
         self._journal = journal
         self._fates: dict[tuple[str, str], KeyFates] = {}
+        self._numbers: dict[tuple[str, str], int] = {}
         self._lock = threading.Lock()
         self._free = 0.0  # when the queue will have sent all its messages
         self._set(link.settings)
@@ -48,13 +49,21 @@ class LinkState:
         with self._lock:
             if settings == self._settings:
                 return
-            since = {(key, kind): fates.change(settings) for (kind, key), fates in self._fates.items()}
+            since = {(key, kind): n for (kind, key), n in self._numbers.items()}
+            since |= {(key, kind): fates.change(settings) for (kind, key), fates in self._fates.items()}
             self._set(settings)
             self._journal.change(self.link.name, settings, since)
 
     def lane(self, kind: str, key: str, lossless: bool) -> Lane:
         """What decides on the messages of a key and kind."""
         return self._never(kind, key) if lossless else self._decide(kind, key)
+
+    def forget(self, kind: str, key: str) -> None:
+        """Keep only the number of the next message of a key and kind, until there is one."""
+        with self._lock:
+            fates = self._fates.pop((kind, key), None)
+            if fates is not None:
+                self._numbers[kind, key] = fates.n
 
     def _decide(self, kind: str, key: str) -> Lane:
         fates = self._fates_of(kind, key)
@@ -99,7 +108,8 @@ class LinkState:
             fates = self._fates.get((kind, key))
             if fates is None:
                 name = self.link.name
-                start = self._journal.counts.get((name, key, kind), 0)
+                counted = self._journal.counts.get((name, key, kind), 0)
+                start = self._numbers.pop((kind, key), counted)
                 fates = KeyFates(self.link, key, kind, self._seed, start, self._journal.changes_of(name, key, kind))
                 self._fates[kind, key] = fates
             return fates

@@ -24,7 +24,8 @@ from evedrop.wire.side import SideSession, expressions_of
 
 WAITING = 8192
 """Messages of a side that may wait for the wire; then the side's programs wait, or Zenoh drops, as each message says."""
-_MOST_PUBLISHERS = 16_384
+MOST_KEYS = 8192
+"""Keys that a subscription keeps everything ready for; a key takes some 10 kB."""
 _REMOTE = zenoh.Locality.REMOTE
 
 
@@ -42,7 +43,7 @@ class Publishers:
         name = (key, str(sample.priority), str(sample.congestion_control), sample.express)
         with self._lock:
             if name not in self._declared:
-                if len(self._declared) >= _MOST_PUBLISHERS:
+                if len(self._declared) >= MOST_KEYS:
                     self._declared.pop(next(iter(self._declared)))
                 self._declared[name] = self._session.declare_publisher(
                     sample.key_expr,
@@ -58,12 +59,15 @@ class Publishers:
 class _Way:
     """The way of a key's messages over one link."""
 
-    def __init__(self, state: LinkState, key: str, code: int, publishers: Publishers, lossless: bool) -> None:
+    def __init__(self, state: LinkState, key: str, publishers: Publishers, lossless: bool) -> None:
         self.decide = state.lane("put", key, lossless)
         self.link = state.link.number
-        self._key, self._publishers = key, publishers
-        self.code = code
+        self._key, self._publishers, self._state = key, publishers, state
         self._last: tuple[zenoh.Publisher, Any, Any, bool] | None = None
+
+    def forget(self) -> None:
+        """Give up what the key needs; its next message gets the next fate all the same."""
+        self._state.forget("put", self._key)
 
     def publisher(self, sample: zenoh.Sample) -> zenoh.Publisher:
         """The publisher for a message; nearly always that of the message before."""
@@ -80,6 +84,10 @@ class _Way:
         return found
 
 
+_Ways = tuple[tuple[_Way, ...], int]
+"""Of a key: its ways, and its code in the journal."""
+
+
 @final
 class PublicationRelay:
     """Takes the publications of a side from Zenoh, and gives them to the other sides."""
@@ -92,12 +100,15 @@ class PublicationRelay:
         plan: WirePlan,
         journal: WireJournal,
         scheduler: Scheduler,
+        tell: Callable[[str], None],
     ) -> None:
-        """states: the links from this side, in the order of the file; publishers: by the name of their side."""
+        """states: the links from this side, in the order of the file; publishers: by the name of their side.
+
+        tell: for what the user must know.
+        """
         self._states, self._publishers, self._plan = states, publishers, plan
         self._journal, self._scheduler = journal, scheduler
-        self._ways: dict[str, tuple[tuple[_Way, ...], int]] = {}
-        self._lock = threading.Lock()
+        self._name, self._tell = side.name, tell
         expressions = [zenoh.KeyExpr(one) for one in expressions_of(side.side, plan.links)]
         self._subscribers = []
         self._threads = []
@@ -123,6 +134,12 @@ class PublicationRelay:
             thread.join()
 
     def _run(self, samples: Any, earlier: tuple[zenoh.KeyExpr, ...]) -> None:
+        try:
+            self._take_all(samples, earlier)
+        except Exception as error:  # whatever it is: nothing may stop to cross silently
+            self._tell(f"messages from the side {self._name} no longer cross ({error!r}); end the wire and report this")
+
+    def _take_all(self, samples: Any, earlier: tuple[zenoh.KeyExpr, ...]) -> None:
         take = self._taker()
         if earlier:  # a message that several subscriptions hear belongs to the first
             for sample in samples:
@@ -134,7 +151,8 @@ class PublicationRelay:
 
     def _taker(self) -> Callable[[zenoh.Sample], None]:
         """The function that is called for every message: it looks up as little as possible."""
-        now, ways_of, way_to = time.time, self._ways, self._way_to
+        ways_of: dict[str, _Ways] = {}
+        now, way_to = time.time, self._way_to
         record, hold, failed = self._journal.record, self._scheduler.hold, self._refused
         read = SourceReader(self._journal.source_code)
         put, put_kind, delete_kind = zenoh.SampleKind.PUT, int(Kind.PUT), int(Kind.DELETE)
@@ -145,7 +163,7 @@ class PublicationRelay:
             heard = now()
             key = str(sample.key_expr)
             found = ways_of.get(key)
-            ways, code = way_to(key, sample.key_expr) if found is None else found
+            ways, code = way_to(ways_of, key, sample.key_expr) if found is None else found
             payload, attachment, source = sample.payload, sample.attachment, sample.source_info
             size = len(payload)
             sender, sequence = 0, -1
@@ -190,22 +208,21 @@ class PublicationRelay:
 
         return take
 
-    def _way_to(self, key: str, expression: zenoh.KeyExpr) -> tuple[tuple[_Way, ...], int]:
-        """The ways of a key that is heard for the first time, and its code."""
-        with self._lock:
-            found = self._ways.get(key)
-            if found is None:
-                code = self._journal.key_code(key)
-                lossless = self._plan.is_lossless(expression)
-                taken: dict[str, LinkState] = {}
-                for state in self._states:
-                    if state.link.target not in taken and state.link.takes(expression):
-                        taken[state.link.target] = state
-                ways = tuple(
-                    _Way(state, key, code, self._publishers[target], lossless) for target, state in taken.items()
-                )
-                self._ways[key] = found = (ways, code)
-            return found
+    def _way_to(self, ways_of: dict[str, _Ways], key: str, expression: zenoh.KeyExpr) -> _Ways:
+        """The ways of a key that is heard for the first time, or again after many other keys, and its code."""
+        while len(ways_of) >= MOST_KEYS:
+            oldest = next(iter(ways_of))
+            for way in ways_of.pop(oldest)[0]:
+                way.forget()
+        code = self._journal.key_code(key)
+        lossless = self._plan.is_lossless(expression)
+        taken: dict[str, LinkState] = {}
+        for state in self._states:
+            if state.link.target not in taken and state.link.takes(expression):
+                taken[state.link.target] = state
+        ways = tuple(_Way(state, key, self._publishers[target], lossless) for target, state in taken.items())
+        ways_of[key] = (ways, code)
+        return ways, code
 
     def _refused(self, row: int) -> None:
         self._journal.amend(row, Crossing.REFUSED)

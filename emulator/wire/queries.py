@@ -20,14 +20,14 @@ import zenoh
 
 from evedrop.wire.crossing import AGAIN, UNLINKED, Crossing, Kind
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.lanes import Lane, LinkState
+from evedrop.wire.lanes import Decision, Lane, LinkState
 from evedrop.wire.plan import WirePlan
+from evedrop.wire.publications import MOST_KEYS
 from evedrop.wire.ros2 import SourceReader, reply_seconds
 from evedrop.wire.scheduler import Scheduler
 from evedrop.wire.side import SideSession, expressions_of
 
 _REMOTE = zenoh.Locality.REMOTE
-_MOST_QUERIERS = 4096
 _MOST_WAITING = 100_000
 
 
@@ -66,10 +66,13 @@ class QueryRelay:
         plan: WirePlan,
         journal: WireJournal,
         scheduler: Scheduler,
+        tell: Callable[[str], None],
     ) -> None:
+        """tell: for what the user must know."""
+        self._tell = tell
         self._sides, self._plan, self._journal, self._scheduler = sides, plan, journal, scheduler
         self._states = [state for state in states if not state.link.tap]
-        self._lanes: dict[tuple[str, str, str], Lane] = {}
+        self._lanes: dict[tuple[str, str, str], tuple[Lane, LinkState]] = {}
         self._queriers: dict[tuple[str, str, bool, bool], zenoh.Querier] = {}
         self._services: tuple[frozenset[tuple[str, str]], tuple[bool, ...]] | None = None
         self._mirrored: dict[str, dict[str, tuple[zenoh.KeyExpr, Any]]] = {name: {} for name in sides}
@@ -145,13 +148,13 @@ class QueryRelay:
     def _run(self) -> None:
         while (heard := self._heard.get()) is not None:
             name, key, query = heard
+            asked = _Asked(query, name)
             try:
-                asked = _Asked(query, name)
                 if self._responsible(name, query.key_expr) == key:
                     self._ask(asked)
-                asked.release()
-            except zenoh.ZError:
-                query.drop()
+            except Exception as error:  # whatever it is: the next query must be asked
+                self._tell(f"a query on {asked.key} at the side {name} was not asked at the other sides ({error!r})")
+            asked.release()
 
     def _responsible(self, name: str, key: zenoh.KeyExpr) -> str | None:
         """The mirrored queryable that answers for a key; None: the one for everything."""
@@ -236,7 +239,7 @@ class QueryRelay:
         if state is None:
             self._journal.record(now, -1, sequence, 0.0, code, sender, size, UNLINKED, kind, Crossing.UNLINKED)
             return
-        n, fate, delay, again = self._lane(state, kind.stream, key, expression)(now, size)
+        n, fate, delay, again = self._decided(state, kind.stream, key, expression, size)
         mark = int(kind) | AGAIN if again else int(kind)
         row = self._journal.record(now, n, sequence, delay, code, sender, size, state.link.number, mark, fate)
         if fate:
@@ -277,12 +280,16 @@ class QueryRelay:
             None,
         )
 
-    def _lane(self, state: LinkState, kind: str, key: str, expression: zenoh.KeyExpr) -> Lane:
+    def _decided(self, state: LinkState, kind: str, key: str, expression: zenoh.KeyExpr, size: int) -> Decision:
         with self._lock:
             name = (state.link.name, kind, key)
             if name not in self._lanes:
-                self._lanes[name] = state.lane(kind, key, self._plan.is_lossless(expression))
-            return self._lanes[name]
+                if len(self._lanes) >= MOST_KEYS:
+                    oldest, forget = next(iter(self._lanes.items()))
+                    forget[1].forget(*oldest[1:])
+                    del self._lanes[oldest]
+                self._lanes[name] = (state.lane(kind, key, self._plan.is_lossless(expression)), state)
+            return self._lanes[name][0](time.time(), size)
 
     def _querier(self, target: str, query: zenoh.Query, key: str, complete: bool) -> zenoh.Querier:
         accepts = query.accepts_replies()
@@ -290,7 +297,7 @@ class QueryRelay:
         name = (target, key, complete, anything)
         with self._lock:
             if name not in self._queriers:
-                if len(self._queriers) >= _MOST_QUERIERS:
+                if len(self._queriers) >= MOST_KEYS:
                     self._queriers.pop(next(iter(self._queriers)))
                 self._queriers[name] = self._sides[target].session.declare_querier(
                     query.key_expr,

@@ -87,11 +87,17 @@ class WireRelay:
         scheduler = Scheduler(plan.held_messages, plan.held_bytes, lambda row: journal.amend(row, Crossing.REFUSED))
         stack.callback(self._end_delays, scheduler)
         publishers = {name: Publishers(side.session) for name, side in self.sides.items()}
-        self._queries = QueryRelay(self.sides, states, plan, journal, scheduler)
+        self._queries = QueryRelay(self.sides, states, plan, journal, scheduler, self._tell)
         stack.callback(self._queries.close)
         relays = [
             PublicationRelay(
-                side, [one for one in states if one.link.source == name], publishers, plan, journal, scheduler
+                side,
+                [one for one in states if one.link.source == name],
+                publishers,
+                plan,
+                journal,
+                scheduler,
+                self._tell,
             )
             for name, side in self.sides.items()
         ]
@@ -133,6 +139,6 @@ class WireRelay:
                 if time.monotonic() >= due:
                     self._neighbours.update()
                     due = time.monotonic() + _LOOK_SECONDS
-            except zenoh.ZError as error:
+            except Exception as error:  # whatever it is: the next look may succeed
                 if not self._ended.is_set():
-                    self._tell(f"Zenoh does not say what programs declare ({error}); trying again")
+                    self._tell(f"Zenoh does not say what programs declare ({error!r}); trying again")

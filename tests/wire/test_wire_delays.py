@@ -49,7 +49,7 @@ def test_a_delayed_message_comes_later_and_in_order(tmp_path: Path) -> None:
         assert [one.payload.to_string() for one in got] == [*(str(n) for n in range(20)), ""]
         assert got[-1].kind == zenoh.SampleKind.DELETE
         assert got[0].attachment is not None
-        delayed = wire.rows[wire.rows["key"] == wire.journal.key_code("x")]
+        delayed = wire.rows_of("x")
         assert set(delayed["delay"].tolist()) == {0.2}
 
 
@@ -73,7 +73,7 @@ def test_a_doubled_message_comes_twice(tmp_path: Path) -> None:
         robot.delete("x")
         wait_until(lambda: len(got) == 4, "four come")
         assert [one.kind == zenoh.SampleKind.PUT for one in got] == [True, True, False, False]
-        doubled = wire.rows[wire.rows["key"] == wire.journal.key_code("x")]
+        doubled = wire.rows_of("x")
         assert doubled["kind"].tolist() == [Kind.PUT | AGAIN, Kind.DELETE | AGAIN]
 
 
@@ -82,11 +82,10 @@ def test_a_link_of_limited_rate_queues_messages_and_drops_what_does_not_fit(tmp_
     plan = plan_of(READY, link("robot", "base", {**PERFECT, "rate": 100.0, "queue": 500}))
     with at_work(plan, tmp_path) as wire, wire.program("robot") as robot, wire.program("base") as base:
         ready(wire, robot, base)
-        before = len(wire.rows)
         for _ in range(8):
             robot.put("x", b"x" * 100, congestion_control=BLOCK)
-        wait_until(lambda: len(wire.rows) == before + 8, "the wire hears")
-        rows = wire.rows[before:]
+        wait_until(lambda: len(wire.rows_of("x")) == 8, "the wire hears")
+        rows = wire.rows_of("x")
         assert rows["fate"].tolist() == [Crossing.DELIVERED] * 5 + [Crossing.OVERFLOW] * 3
         assert [round(one) for one in rows["delay"].tolist()] == [1, 2, 3, 4, 5, 0, 0, 0]
 

@@ -180,3 +180,20 @@ def test_why_a_message_does_not_cross(
     """The journal says so."""
     with at_work(both_ways(settings, **fields), tmp_path) as wire, wire.program("robot") as sender:
         wait_until(lambda: sender.put("a", b"x" * 11) or fate in [*wire.fates(), *wire.amended], "the wire hears")
+
+
+def test_a_key_that_was_forgotten_goes_on_with_its_next_fate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With room for two keys, three in turns have the fates that each would have alone, with the settings of their link."""
+    monkeypatch.setattr("evedrop.wire.publications.MOST_KEYS", 2)
+    plan = both_ways({"loss": {"model": "gilbert-elliott", "p": 0.2, "r": 0.3}})
+    keys = ("a", "b", "c")
+    with at_work(plan, tmp_path) as wire, wire.program("robot") as sender:
+        for _ in range(40):
+            for key in keys:
+                sender.put(key, b"", congestion_control=zenoh.CongestionControl.BLOCK)
+        wait_until(lambda: len(wire.rows) == 120, "the wire hears all")
+        for key in keys:
+            rows = wire.rows_of(key)
+            fates = KeyFates(plan.links[0], key, "put", plan.seed)
+            assert rows["n"].tolist() == list(range(40))
+            assert rows["fate"].tolist() == [fates.next()[0] for _ in range(40)]

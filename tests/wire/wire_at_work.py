@@ -64,6 +64,12 @@ class WireAtWork:
         found: Records = np.concatenate([np.empty(0, RECORD), *self._rows])
         return found
 
+    def rows_of(self, key: str) -> Records:
+        """The rows of a key so far."""
+        rows = self.rows
+        found: Records = rows[rows["key"] == self.journal.key_code(key)]
+        return found
+
     def fates(self, link_name: str | None = None) -> list[Crossing]:
         """The fates of all messages so far, or of those on one link."""
         rows = self.rows
