@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evedrop.model.block_sums import BlockSums
+from evedrop.model.block_sums import BlockSums, added_in_order
 
 SLOTS, CUTS = 700, (300, 310)
 STARTS = [0, 256, 300, 310, 512]
@@ -36,3 +36,13 @@ def test_another_process_continues_with_a_block() -> None:
     whole = BlockSums(2, SLOTS, CUTS).add(range(SLOTS), numbers)
     later = BlockSums(2, SLOTS, CUTS).add(range(310, SLOTS), numbers[310:])
     assert all(np.array_equal(later[start], whole[start]) for start in STARTS[3:])
+
+
+def test_few_and_many_trials_are_added_in_the_same_order() -> None:
+    """A trial's sum has the same bits alone and among many: one slot after the other, however it is computed."""
+    rng = np.random.default_rng(5)
+    numbers = rng.standard_normal((40, 200)) * 10.0 ** rng.integers(-8, 9, (40, 200))
+    total = rng.standard_normal(200)
+    together = added_in_order(total, numbers)
+    alone = [added_in_order(total[[i]], numbers[:, [i]])[0] for i in range(200)]
+    assert together.tolist() == alone
