@@ -51,7 +51,7 @@ def closing_lines(summary: Mapping[str, Any]) -> list[str]:
 
 
 def wire_sentences(summary: Mapping[str, Any]) -> Iterator[str]:
-    """What the table does not say: why messages did not arrive, links outside their bounds, what is incomplete."""
+    """What the table does not say: why messages did not arrive, and which expectations were met."""
     for name, link in summary["links"].items():
         lost = _counted(link["lost_by"])
         dropped = _counted(link["dropped_by"])
@@ -59,19 +59,25 @@ def wire_sentences(summary: Mapping[str, Any]) -> Iterator[str]:
             yield f"{name} lost {lost}"
         if dropped:
             yield f"{name}: the wire itself, or Zenoh, dropped {dropped}"
+    if summary["unlinked"]:
+        yield f"no link of the file takes {_messages(summary['unlinked'])}; add a link, or let programs not publish them"
+    yield from (Judged(**one).sentence for one in summary["expectations"] if one["held"] is not False)
+
+
+def wire_failures(summary: Mapping[str, Any]) -> Iterator[str]:
+    """What went wrong: links outside their bounds, messages that are unaccounted for, and expectations that failed."""
+    for name, link in summary["links"].items():
         if link["within_bounds"] is False:
             low, high = link["bounds"]
             yield (
                 f"{name} is outside the 99 % bounds of its model: it let {link['rate']:.4f} of the messages through, where "
                 f"{low:.4f} to {high:.4f} were expected"
             )
-    if summary["unlinked"]:
-        yield f"no link of the file takes {_messages(summary['unlinked'])}; add a link, or let programs not publish them"
     if summary["unaccounted"]:
         yield f"{_messages(summary['unaccounted'])} are unaccounted for: this is a fault of Evedrop"
     if summary["journal"]["missing"]:
         yield f"the journal lacks {_messages(summary['journal']['missing'])}, because the disk was full"
-    yield from (Judged(**one).sentence for one in summary["expectations"])
+    yield from (Judged(**one).sentence for one in summary["expectations"] if one["held"] is False)
 
 
 def _counted(reasons: Mapping[str, int]) -> str:

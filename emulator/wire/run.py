@@ -11,7 +11,7 @@ from pathlib import Path
 from evedrop.output import warn
 from evedrop.results.folder import make_private, new_folder, write_private
 from evedrop.signals import stop_on_signals
-from evedrop.wire.closing import closing_lines
+from evedrop.wire.closing import closing_lines, wire_failures
 from evedrop.wire.conductor import WireConductor
 from evedrop.wire.control import WireControl
 from evedrop.wire.file import resolved_wire
@@ -24,12 +24,19 @@ from evedrop.wire.summary import WireSummary
 
 
 def run_wire(
-    plan: WirePlan, out: Path, *, seconds: float | None = None, say: Callable[[str], None] = print, view: str = "off"
+    plan: WirePlan,
+    out: Path,
+    *,
+    seconds: float | None = None,
+    say: Callable[[str], None] = print,
+    complain: Callable[[str], None] | None = None,
+    view: str = "off",
 ) -> int:
     """Run a wire until a signal, or for some seconds; returns the exit status.
 
     out: its results folder, empty or that of an earlier start; say: for a line about each side and each event, and for the
-    summary; view: as `live_view` takes it. Raises UsageError if the folder or a side cannot be used.
+    summary; complain: for what went wrong, by default as `say`; view: as `live_view` takes it. Raises UsageError if the
+    folder or a side cannot be used.
     """
     if (out / JOURNAL_FOLDER).is_dir():
         make_private(out)
@@ -64,6 +71,8 @@ def run_wire(
         status = summary.finish(out)
     for line in closing_lines(summary.as_dict()):
         say(line)
+    for line in wire_failures(summary.as_dict()):
+        (say if complain is None else complain)(line)
     say(f"results: {out}")
     return status
 

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evedrop.errors import ScenarioError
-from evedrop.wire.closing import closing_lines, wire_sentences
+from evedrop.wire.closing import closing_lines, wire_failures, wire_sentences
 from evedrop.wire.crossing import AGAIN, RECORD, UNLINKED, Crossing, Kind
 from evedrop.wire.fates import KeyFates
 from evedrop.wire.file import resolved_wire, wire_of
@@ -84,7 +84,7 @@ def test_a_wrong_model_is_told(tmp_path: Path, model: str, wrong: dict[str, Any]
     actual = wire_plan(link={"loss": {**LOSSES[model], **wrong}})
     found, _ = run(tmp_path, wire_plan(link={"loss": LOSSES[model]}), actual)
     assert found["links"]["link"]["within_bounds"] is False
-    assert any(line.startswith("link is outside the 99 % bounds of its model") for line in wire_sentences(found))
+    assert any(line.startswith("link is outside the 99 % bounds of its model") for line in wire_failures(found))
 
 
 def test_changes_and_cuts_are_part_of_the_law(tmp_path: Path) -> None:
@@ -201,7 +201,7 @@ link = "scan"
     assert [one["held"] for one in found["expectations"]] == [True, True, False, False, True]
     said = list(wire_sentences(found))
     assert "expected 0.9 quantile of scan.latency below 0.025: held, found 0.02" in said
-    assert any(line.startswith("expected scan.gap_messages below 3: FAILED") for line in said)
+    assert any(line.startswith("expected scan.gap_messages below 3: FAILED") for line in wire_failures(found))
     nothing, status = run(tmp_path / "silent", plan, messages=0)
     assert status == 0
     assert {one["held"] for one in nothing["expectations"]} == {None}

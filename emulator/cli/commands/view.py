@@ -61,13 +61,14 @@ def _view_wire(options: argparse.Namespace) -> int:
     from evedrop.signals import raise_on_signals
     from evedrop.view.picture import picture_apart
     from evedrop.view.viewer import WebAddress, open_run
-    from evedrop.wire.closing import closing_lines
+    from evedrop.wire.closing import closing_lines, wire_failures
     from evedrop.wire.replay import PICTURE_SIZE, replay_wire, summary_of_wire
 
     if options.slot is not None:
         raise UsageError(f"--slot is for runs, and {options.run} is the folder of a wire; give --time")
     if options.table:
-        print("\n".join(closing_lines(summary_of_wire(options.run))))
+        summary = summary_of_wire(options.run)
+        print("\n".join([*closing_lines(summary), *wire_failures(summary)]))
         return 0
     stand = None if options.serve is None else WebAddress.of(options.serve)
     with raise_on_signals(), tempfile.TemporaryDirectory(prefix="evedrop-view-") as temporary:

@@ -9,6 +9,7 @@ from pathlib import Path
 from evedrop.cli.options import changes_of
 from evedrop.command import Command
 from evedrop.errors import UsageError
+from evedrop.output import say as complain
 
 
 def wire(options: argparse.Namespace) -> int:
@@ -43,7 +44,8 @@ def wire(options: argparse.Namespace) -> int:
     from evedrop.wire.run import run_wire
 
     with results_folder(options.out, f"wire-{options.file.stem}") as folder:
-        return run_wire(plan, folder, seconds=seconds, say=_hush if options.quiet else _say, view=options.view)
+        said = {"say": _hush, "complain": complain} if options.quiet else {"say": _say}
+        return run_wire(plan, folder, seconds=seconds, view=options.view, **said)
 
 
 def _say(line: str) -> None:
