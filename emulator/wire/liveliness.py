@@ -107,7 +107,7 @@ class LivelinessRelay:
 
     def _heard(self, name: str) -> Callable[[zenoh.Sample], None]:
         def heard(sample: zenoh.Sample) -> None:
-            # Without the lock: whoever declares a token waits until Zenoh has reported it.
+            # Without the lock: a program that declares a token waits until Zenoh has reported it.
             self._events.append((name, str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
             self._changed()
 
