@@ -86,7 +86,7 @@ def changes_of(options: argparse.Namespace) -> dict[str, Any]:
     for change in options.changes:
         key, equals, value = change.partition("=")
         if not equals or not key:
-            raise UsageError(f"--set {change}: expected KEY=VALUE, such as --set legitimate.link.quality=0.8")
+            raise UsageError(f"--set {change}: expected KEY=VALUE, such as --set seed=3")
         changes[key] = value_of(value)
     for name in ("seed", "slots", "trials", "first_trial", "record_trials", "pace"):
         value = getattr(options, name, None)

@@ -29,22 +29,25 @@ UNFINISHED = "unfinished"
 """The folder inside it for records that are not yet in a Parquet file."""
 
 
-def journal_tables(folder: Path, start: int | None = None) -> Iterator[pa.Table]:
+def journal_tables(folder: Path | str, start: int | None = None) -> Iterator[pa.Table]:
     """The journal of a wire's folder in the order of its rows, a table for each part; also of a wire that goes on or was killed.
+
+    A journal without messages is one empty table.
 
     start: the number of a start of the wire, from 1, of which only the rows are given.
 
     Raises UsageError if there is no journal, or a part cannot be read.
     """
-    journal = folder / JOURNAL_FOLDER
+    journal = Path(folder) / JOURNAL_FOLDER
     if not journal.is_dir():
         raise UsageError(
             f"{folder} is not the folder of a wire: it has no folder {JOURNAL_FOLDER}; give the --out of a wire"
         )
     links = WireHistory.read(journal).links
-    for name in part_names(journal):
-        if start not in {None, _start_of(name)}:
-            continue
+    names = [name for name in part_names(journal) if start in {None, _start_of(name)}]
+    if not names:
+        yield PARQUET.empty_table()
+    for name in names:
         try:
             yield _table(journal, name, links)
         except (OSError, pa.ArrowException) as error:

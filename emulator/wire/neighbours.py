@@ -59,14 +59,14 @@ class Neighbours:
                 if {state.link.source, state.link.target} == {one, other}:
                     state.looped = bool(joined)
             if joined:
-                found.add((f"routers {', '.join(sorted(joined))}", one, other))
+                found.add((f"router{'s' if len(joined) > 1 else ''} {', '.join(sorted(joined))}", one, other))
             found |= {(f"program {zid}", one, other) for zid in programs[one] & programs[other]}
         for who, one, other in sorted(found - self._told):
             self._tell(_sentence(who, one, other))
         for who, one, other in sorted(self._told - found):
             self._tell(
-                f"the {who} no longer join the sides {one} and {other}"
-                if who.startswith("routers")
+                f"messages no longer pass between the sides {one} and {other} through the {who}; the links between them go on"
+                if who.startswith("router")
                 else f"the {who} is no longer connected to the sides {one} and {other}"
             )
         self._told = found
@@ -88,10 +88,10 @@ class Neighbours:
 
 
 def _sentence(who: str, one: str, other: str) -> str:
-    if who.startswith("routers"):
+    if who.startswith("router"):
         return (
             f"messages pass between the sides {one} and {other} outside the wire, through the {who}, so they would go round; the "
-            "links between these sides carry nothing (fate LOOPED) until the routers are disconnected from one of them"
+            "links between these sides carry nothing (dropped as looped) until this way is gone"
         )
     return (
         f"the {who} is connected to the sides {one} and {other}: it gets a message from both, and its own messages come back to "

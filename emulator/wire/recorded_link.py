@@ -23,7 +23,7 @@ from evedrop.recordings.message_recording import MessageRecording, check_parts
 from evedrop.wire.crossing import Crossing, Kind
 from evedrop.wire.file import load_wire
 from evedrop.wire.history import WireHistory
-from evedrop.wire.journal_part import PARQUET, REASONS
+from evedrop.wire.journal_part import REASONS
 from evedrop.wire.journal_reader import JOURNAL_FOLDER, journal_tables
 from evedrop.wire.plan import WireLink
 
@@ -58,9 +58,7 @@ class _Reader:
     def __init__(self, folder: Path, link: str | None, key: str | None) -> None:
         """Raises UsageError or TraceError."""
         self._folder = folder
-        table = pa.concat_tables(
-            [one.select(_COLUMNS) for one in journal_tables(folder)] or [PARQUET.empty_table().select(_COLUMNS)]
-        )
+        table = pa.concat_tables([one.select(_COLUMNS) for one in journal_tables(folder)])
         self._link = self._chosen(table, link)
         rows = table.filter(pc.equal(table["link"].cast(pa.string()), self._link))
         rows = rows.unify_dictionaries().combine_chunks()

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -25,6 +26,8 @@ PROBES = "@evedrop/*/*"
 HIDDEN = ("@ros2_lv/**", "@/*/@ros2_lv/**", "**/@adv/**")
 """Keys that `**` does not match although programs use them: the graph of ROS 2, and the histories of advanced publishers."""
 _CONNECT_SECONDS = 10.0
+_IN_SOURCE = re.compile(r" at \S+\.rs:\d+\.")
+"""Where in its source Zenoh raised an error, as its messages say it."""
 _CLIENT_MESSAGES = (
     "put",
     "delete",
@@ -169,7 +172,8 @@ def _refusal(side: Side, why: str) -> str:
             ),
         )
     )
+    why = _IN_SOURCE.sub("", why.splitlines()[0])
     return (
-        f"side {side.name} cannot {where} ({why.splitlines()[0]}); end the program that listens there already, start the router "
+        f"side {side.name} cannot {where} ({why}); end the program that listens there already, start the router "
         "that it must connect to, or give the side other endpoints"
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -32,6 +33,30 @@ def rows_of(folder: Path) -> list[dict[str, Any]]:
     """All rows of a wire's journal."""
     rows: list[dict[str, Any]] = pa.concat_tables(journal_tables(folder)).to_pylist()
     return rows
+
+
+def test_the_lines_of_the_page_read_a_journal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As they stand in docs/wire.md: of a wire that has heard nothing yet, and of one that goes on."""
+    page = (Path(__file__).parents[2] / "docs" / "wire.md").read_text(encoding="utf-8")
+    (lines,) = (block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "journal_tables" in block)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs" / "robot").mkdir(parents=True)
+    for heard in (0, 3):
+        with WireJournal(Path("runs/robot"), wire_plan()) as journal:
+            for n in range(heard):
+                put(journal, n)
+            if heard:
+                found = read_as_the_page(lines)
+        assert read_as_the_page(lines).num_rows == heard
+    assert found.num_rows == 3
+
+
+def read_as_the_page(lines: str) -> pa.Table:
+    """What the lines of the page call `journal`."""
+    names: dict[str, Any] = {}
+    exec(lines, names)  # noqa: S102 - the page's own lines
+    table: pa.Table = names["journal"]
+    return table
 
 
 def put(
