@@ -70,7 +70,10 @@ def summary_of_wire(folder: Path) -> dict[str, Any]:
     try:
         found: dict[str, Any] = json.loads((folder / "summary.json").read_bytes())
     except (OSError, ValueError) as error:
-        raise UsageError(f"{folder} has no summary.json of a wire ({error}); a wire writes it when it ends") from error
+        why = (error.strerror if isinstance(error, OSError) else None) or error
+        raise UsageError(
+            f"{folder} has no summary.json of a wire ({why}); a wire writes it when it ends, and not if it is killed"
+        ) from error
     return found
 
 

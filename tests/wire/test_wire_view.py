@@ -293,6 +293,15 @@ def test_a_picture_of_a_wire(folder: Path, capfd: pytest.CaptureFixture[str]) ->
         assert any(all(abs(a - 0.8 * b) < 14 for a, b in zip(one, state.colour, strict=True)) for one in colours), state
 
 
+def test_a_killed_wire_has_no_table(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """It wrote no summary; the message says when a wire does."""
+    assert main(["view", str(folder), "--table"]) == UsageError.exit_status
+    assert (
+        f"evedrop: {folder} has no summary.json of a wire (No such file or directory); a wire writes it when it ends, and not "
+        "if it is killed\n"
+    ) == capfd.readouterr().err
+
+
 def test_a_wire_that_nothing_crossed_is_refused(tmp_path: Path) -> None:
     """With the reason, not with an empty view."""
     (tmp_path / WIRE_FILE).write_text(resolved_wire(robot_plan()))

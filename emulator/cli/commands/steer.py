@@ -106,7 +106,7 @@ def _answer(run: Path, control: Control, request: Request, what: str, patience: 
         found = ask(control, request, patience)
     except zenoh.ZError as error:
         raise no_run(
-            run, f"no router answers at {control.router}; if the router was lost, it is being restarted"
+            run, f"no router answers at {control.router}: it was killed, or it lost its router and is restarting it"
         ) from error
     if found is None and time.monotonic() - began >= patience:
         raise UsageError(f"{what}: no answer from the run in {run}; look at its logs, or end it")
