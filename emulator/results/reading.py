@@ -70,6 +70,7 @@ class Results:
             else:
                 table = pa.Table.from_batches(batches_of(self.folder, name), schema)
             columns = table.column_names  # which are read only here, and need not be text
+            table.validate(full=True)  # a damaged column of words may name words that are not there
         except Exception as error:  # pyarrow raises many kinds of errors for a damaged file
             raise UsageError(f"{path} cannot be read ({_one_line(error)}); run the scenario again") from error
         wanted = trials_schema(_states_in(table.schema)) if expected is None else expected
