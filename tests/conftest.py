@@ -116,7 +116,9 @@ class Live:
         for pid, command in with_mark(str(self.temporary)).items():
             words = command.split()
             if pid != self.process.pid and words and words[-1].endswith(".json"):
-                found[Path(words[-1]).stem] = pid
+                name = Path(words[-1]).stem
+                # A process that has just forked, to start another program, is there twice: the first is itself.
+                found[name] = min(pid, found.get(name, pid))
         return found
 
     def child(self, name: str) -> int:
