@@ -112,7 +112,7 @@ class Live:
 
     def children(self) -> dict[str, int]:
         """Process name → process id."""
-        found = {}
+        found: dict[str, int] = {}
         for pid, command in with_mark(str(self.temporary)).items():
             words = command.split()
             if pid != self.process.pid and words and words[-1].endswith(".json"):
