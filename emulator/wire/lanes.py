@@ -1,7 +1,7 @@
 """What a link does with messages at this moment: it is cut or not, its queue has room or not, and each key has its fates.
 
-A message meets, in this order: the limit of its size, the queue of a link of limited rate, a cut, and the fate that the link's
-models give it.
+A message meets, in this order: the queue of a link of limited rate, the limit of its size, sides that are joined outside the
+wire, a cut, and the fate that the link's models give it. A message that is never lost meets the limit and joined sides only.
 
 Source: docs/wire.md, what becomes of a message.
 """
@@ -91,7 +91,7 @@ class LinkState:
         return decide
 
     def _never(self, kind: str, key: str) -> Lane:
-        """For messages that are never lost: they take no fates, but they are numbered."""
+        """For messages that no link loses: they take no fates, but they are numbered."""
         n, lock, largest = self._journal.counts.get((self.link.name, key, kind), 0), self._lock, self._largest
 
         def decide(_now: float, size: int) -> Decision:
@@ -99,7 +99,8 @@ class LinkState:
             with lock:
                 at = n
                 n = at + 1
-            return at, 0 if size <= largest else _TOO_LARGE, 0.0, False
+            # Where sides are joined, a message that crossed would come back, and cross again, for ever.
+            return at, _TOO_LARGE if size > largest else _LOOPED if self.looped else 0, 0.0, False
 
         return decide
 

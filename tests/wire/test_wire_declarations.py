@@ -6,9 +6,11 @@ import json
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import pytest
 import zenoh
 
 from evedrop.wire.crossing import Crossing
@@ -76,11 +78,15 @@ def router(*connect: str) -> Iterator[tuple[zenoh.Session, str]]:
         yield session, json.loads(told[0])["locators"][0]
 
 
-def test_sides_that_routers_join_outside_the_wire_carry_nothing(tmp_path: Path) -> None:
-    """Each side has a router of its own, and these are connected with each other: without the wire, too, everything passes."""
+@pytest.mark.parametrize("lossless", [(), ("a",)], ids=["lossy", "lossless"])
+def test_sides_that_routers_join_outside_the_wire_carry_nothing(tmp_path: Path, lossless: tuple[str, ...]) -> None:
+    """Each side has a router of its own, and these are connected with each other: without the wire, too, everything passes.
+
+    What is never lost does not cross either: it would go round for ever.
+    """
     with router() as (_, first), router(first) as (_, second):
         sides = {"robot": Side("robot", (ANYWHERE,), (first,)), "base": Side("base", (ANYWHERE,), (second,))}
-        plan = plan_of(link("robot", "base"), link("base", "robot"), sides=sides)
+        plan = replace(plan_of(link("robot", "base"), link("base", "robot"), sides=sides), lossless=lossless)
         with at_work(plan, tmp_path) as wire, wire.program("robot") as robot:
             wait_until(lambda: wire.told, "the wire says so")
             assert (
