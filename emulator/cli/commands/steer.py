@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from evedrop.live.network.operator import Answer, Request
 
 _PATIENCE = 60.0  # seconds; a hold may wait for a process that the scenario has restarted
+_AWAY_SECONDS = 5.0  # for which a run may have no observer at its router
+_AGAIN_SECONDS = 0.2
+_REPEATABLE = frozenset({"pause", "resume", "status"})
 _STEP_PATIENCE = 30 * 86_400.0  # a step takes as long as its slots do
 
 
@@ -91,7 +94,7 @@ def _answer(run: Path, control: Control, request: Request, what: str, patience: 
     """The answer of the observer of a run or a shard. Raises UsageError if it does not answer, or refuses."""
     import zenoh
 
-    from evedrop.live.network.control_file import no_run
+    from evedrop.live.network.control_file import no_run, read_controls
     from evedrop.live.network.operator import ask
 
     began = time.monotonic()
@@ -104,6 +107,11 @@ def _answer(run: Path, control: Control, request: Request, what: str, patience: 
             raise UsageError(f"{run / 'control.json'}: {error}") from error
     try:
         found = ask(control, request, patience)
+        # An observer that has lost its connection is back in a moment; these requests may be carried out twice.
+        while found is None and request.do in _REPEATABLE and time.monotonic() - began < _AWAY_SECONDS:
+            read_controls(run)  # raises UsageError when the run is over
+            time.sleep(_AGAIN_SECONDS)
+            found = ask(control, request, patience)
     except zenoh.ZError as error:
         raise no_run(
             run, f"no router answers at {control.router}: it was killed, or it lost its router and is restarting it"

@@ -1,0 +1,72 @@
+"""A request to a run whose observer has lost its connection for a moment."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from evedrop.cli.main import main
+from evedrop.live.network.control_file import Control, remove_control
+from evedrop.live.network.operator import Answer
+from evedrop.live.protocol.envelope import enclosed
+from evedrop.live.protocol.keys import RunKeys
+from evedrop.names import OBSERVER
+from evedrop.ports import free_port
+
+KEY = RunKeys("one").control(OBSERVER)
+
+
+class Observer:
+    """A router, and an observer there that lets the first requests go unanswered."""
+
+    def __init__(self, folder: Path, unanswered: int) -> None:
+        port = free_port()
+        config = zenoh.Config()
+        config.insert_json5("mode", '"router"')
+        config.insert_json5("listen/endpoints", f'["tcp/127.0.0.1:{port}"]')
+        config.insert_json5("scouting", "{delay: 0, multicast: {enabled: false}, gossip: {enabled: false}}")
+        users = folder / "users.txt"
+        users.write_text("operator:secret\n")
+        config.insert_json5("transport/auth/usrpwd", json.dumps({"dictionary_file": str(users)}))
+        self.session = zenoh.open(config)
+        self.asked, self.unanswered, self.folder = 0, unanswered, folder
+        self._queryable = self.session.declare_queryable(KEY, self._take)
+        Control("one", f"tcp/127.0.0.1:{port}", "operator", "secret").write(folder)
+
+    def _take(self, query: zenoh.Query) -> None:
+        self.asked += 1
+        with query:
+            if self.asked > self.unanswered:
+                query.reply(KEY, enclosed(KEY, Answer(3, "held before slot 3").pack()))
+            elif self.unanswered == 1:
+                remove_control(self.folder)  # the run is over
+
+
+def test_a_request_that_may_be_repeated_is_asked_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Until the observer is back."""
+    observer = Observer(tmp_path, unanswered=2)
+    with observer.session:
+        assert main(["pause", str(tmp_path)]) == 0
+    assert observer.asked == 3
+    assert capsys.readouterr().out == "held before slot 3\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "unanswered", "said"),
+    [
+        (["step", "4"], 2, "it ended before it answered"),  # steps are counted: a second request would be another step
+        (["pause"], 1, "no run is going on"),
+    ],
+)
+def test_a_request_is_asked_once(
+    words: list[str], unanswered: int, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """If it may not be repeated, or the run is over."""
+    observer = Observer(tmp_path, unanswered)
+    with observer.session:
+        assert main([words[0], str(tmp_path), *words[1:]]) == 2
+    assert observer.asked == 1
+    assert said in capsys.readouterr().err
