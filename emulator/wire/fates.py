@@ -9,7 +9,6 @@ Source: docs/wire.md, the same traffic, the same losses.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterable, Mapping
 from itertools import repeat
 from typing import Any, final
@@ -35,7 +34,7 @@ class KeyFates:
     kind: `put` (deletes are puts), `query` or `reply`; start: the number of the first message to decide; changes: earlier
     changes of the settings, each at the number of the first message that had them.
 
-    Threads may call its methods at the same time: no fate is given twice.
+    Only one thread may call its methods at a time: `LinkState` holds its lock.
     """
 
     def __init__(
@@ -48,49 +47,30 @@ class KeyFates:
         root = root_of_seed(seed)
         keys = {name: wire_stream_key(root, name, kind, key) for name in streams_of(link.name, schedule)}
         self._link = Link(schedule, link.name, keys, Batch(NEVER, 1))
-        self._lock = threading.Lock()
         self._start = self._stop = start  # `_stop`: the end of the fates in `_ready`
         self._block = 0
         self._ready: list[MessageFate] = []  # the next fates, the last one first
 
     def next(self) -> MessageFate:
         """The fate of the next message."""
-        while True:
-            try:
-                return self._ready.pop()
-            except IndexError:
-                self._refill()
+        try:
+            return self._ready.pop()
+        except IndexError:
+            self._ready = self._planned()
+            return self._ready.pop()
 
     @property
     def n(self) -> int:
         """The number of the next message."""
-        with self._lock:
-            return self._stop - len(self._ready)
+        return self._stop - len(self._ready)
 
     def change(self, settings: Mapping[str, Any]) -> int:
         """Give the link other settings, as in `WireLink.settings`. Returns the number of the first message that has them."""
-        with self._lock:
-            left = self._emptied()
-            if left == 0:
-                left = len(self._planned())
-            at = self._stop - left
-            self._ready.extend(_rows(self._link.amended(at, [Change(at, _timeless(settings))])))
+        if not self._ready:
+            self._ready = self._planned()
+        at = self.n
+        self._ready = _rows(self._link.amended(at, [Change(at, _timeless(settings))]))
         return at
-
-    def _refill(self) -> None:
-        with self._lock:
-            if not self._ready:
-                self._ready.extend(self._planned())
-
-    def _emptied(self) -> int:
-        """Discard the fates that are ready, and count them; another thread may take some of them at the same time."""
-        count = 0
-        while True:
-            try:
-                self._ready.pop()
-            except IndexError:
-                return count
-            count += 1
 
     def _planned(self) -> list[MessageFate]:
         """The fates of the next block, the last one first."""

@@ -3,7 +3,7 @@
 A message meets, in this order: the queue of a link of limited rate, the limit of its size, sides that are joined outside the
 wire, a cut, and the fate that the link's models give it. A message that is never lost meets the limit and joined sides only.
 
-Source: docs/wire.md, what becomes of a message.
+Source: docs/wire.md, how messages cross.
 """
 
 from __future__ import annotations
@@ -66,8 +66,10 @@ class LinkState:
                 self._numbers[kind, key] = fates.n
 
     def _decide(self, kind: str, key: str) -> Lane:
-        fates = self._fates_of(kind, key)
-        n, lock, largest, after = fates.n, self._lock, self._largest, fates.next
+        lock, largest = self._lock, self._largest
+        with lock:
+            fates = self._fates_of(kind, key)
+            n, after = fates.n, fates.next
 
         def decide(now: float, size: int) -> Decision:
             nonlocal n
@@ -91,29 +93,33 @@ class LinkState:
         return decide
 
     def _never(self, kind: str, key: str) -> Lane:
-        """For messages that no link loses: they take no fates, but they are numbered."""
-        n, lock, largest = self._journal.counts.get((self.link.name, key, kind), 0), self._lock, self._largest
+        """For messages that are never lost: they take no fates, but they are numbered, and must not go round."""
+        lock, largest, numbers, stream = self._lock, self._largest, self._numbers, (kind, key)
+        with lock:
+            numbers.setdefault(stream, self._counted(kind, key))
 
         def decide(_now: float, size: int) -> Decision:
-            nonlocal n
             with lock:
-                at = n
-                n = at + 1
-            # Where sides are joined, a message that crossed would come back, and cross again, for ever.
-            return at, _TOO_LARGE if size > largest else _LOOPED if self.looped else 0, 0.0, False
+                at = numbers[stream]
+                numbers[stream] = at + 1
+            if size > largest:
+                return at, _TOO_LARGE, 0.0, False
+            return at, _LOOPED if self.looped else 0, 0.0, False
 
         return decide
 
     def _fates_of(self, kind: str, key: str) -> KeyFates:
-        with self._lock:
-            fates = self._fates.get((kind, key))
-            if fates is None:
-                name = self.link.name
-                counted = self._journal.counts.get((name, key, kind), 0)
-                start = self._numbers.pop((kind, key), counted)
-                fates = KeyFates(self.link, key, kind, self._seed, start, self._journal.changes_of(name, key, kind))
-                self._fates[kind, key] = fates
-            return fates
+        """The fates of a key and kind. The lock is held."""
+        fates = self._fates.get((kind, key))
+        if fates is None:
+            start = self._numbers.pop((kind, key), self._counted(kind, key))
+            changes = self._journal.changes_of(self.link.name, key, kind)
+            fates = self._fates[kind, key] = KeyFates(self.link, key, kind, self._seed, start, changes)
+        return fates
+
+    def _counted(self, kind: str, key: str) -> int:
+        """How many messages of a key and kind earlier starts of the wire numbered."""
+        return self._journal.counts.get((self.link.name, key, kind), 0)
 
     def _set(self, settings: Mapping[str, Any]) -> None:
         self._settings = settings

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-import threading
 from typing import Any
 
 import numpy as np
@@ -148,31 +146,3 @@ def test_correlated_links_lose_together() -> None:
     assert taken(tied[0.0], 500) == taken(KeyFates(wire_link(loss), "k", "put", SEED), 500)
     alike = np.mean([a == b for a, b in zip(taken(tied[0.5], 500), other, strict=True)])
     assert alike == pytest.approx(0.75, abs=0.1)
-
-
-def test_threads_share_the_fates() -> None:
-    """Threads that take fates at the same time get each of them once, also while the settings change."""
-    pattern = {
-        "loss": {"model": "bernoulli", "quality": 1.0},
-        "delay": {"model": "trace", "values": [n / 8 for n in range(40_000)]},
-    }
-    fates = of_scan(pattern)
-    found: list[list[float]] = [[], [], []]
-
-    def take(into: list[float]) -> None:
-        for _ in range(10_000):
-            into.append(fates.next()[1])
-
-    threads = [threading.Thread(target=take, args=(into,)) for into in found]
-    before = sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)
-    try:
-        for thread in threads:
-            thread.start()
-        numbers = []
-        while any(thread.is_alive() for thread in threads):
-            numbers.append(fates.change(pattern))
-    finally:
-        sys.setswitchinterval(before)
-    assert sorted(one for into in found for one in into) == [n / 8 for n in range(30_000)]
-    assert numbers == sorted(numbers)

@@ -74,8 +74,9 @@ def test_a_side_may_attach_to_a_router_that_is_there(tmp_path: Path) -> None:
 
 
 def test_a_router_that_joins_two_sides_is_reported_and_nothing_goes_round(tmp_path: Path) -> None:
-    """Until it is gone: then messages cross again."""
-    with at_work(both_ways(), tmp_path) as wire, wire.program("robot") as robot, wire.program("base") as base:
+    """Until it is gone: then messages cross again. Lossless ones would go round as well."""
+    plan = both_ways(lossless=("stop",))
+    with at_work(plan, tmp_path) as wire, wire.program("robot") as robot, wire.program("base") as base:
         ready(wire, robot, base)
         endpoints = [wire.relay.endpoints[name][0] for name in ("robot", "base")]
         with a_router(connect={"endpoints": endpoints}, listen={"endpoints": []}):
@@ -83,6 +84,9 @@ def test_a_router_that_joins_two_sides_is_reported_and_nothing_goes_round(tmp_pa
                 lambda: any("outside the wire, through the router " in line for line in wire.told), "it is reported"
             )
             wait_until(lambda: robot.put("x", b"") or Crossing.LOOPED in wire.fates(), "messages do not go round")
+            robot.put("stop", b"")
+            wait_until(lambda: len(wire.rows_of("stop")), "the wire hears a lossless one")
+            assert set(wire.rows_of("stop")["fate"]) == {Crossing.LOOPED}
         wait_until(lambda: any("no longer pass between the sides" in line for line in wire.told), "its end is reported")
         got = reader(base, "y")
         wait_until(lambda: robot.put("y", b"") or got, "messages cross again")

@@ -1,0 +1,101 @@
+"""What a link does with the messages of a key: their numbers, and which reason comes first."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from evedrop.wire.crossing import Crossing
+from evedrop.wire.fates import KeyFates
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.lanes import Decision, LinkState
+from tests.wire.wire_at_work import DEAD, LOSSY, both_ways
+
+LARGEST = 100
+
+
+@pytest.fixture
+def lossy(tmp_path: Path) -> Iterator[LinkState]:
+    """A link that loses 40 %, and queues what comes faster than 1000 bytes a second."""
+    plan = both_ways({**LOSSY, "rate": 1000.0, "queue": 50}, largest=LARGEST)
+    with WireJournal(tmp_path, plan) as journal:
+        yield LinkState(plan.links[0], plan, journal)
+
+
+def test_the_reasons_have_an_order(lossy: LinkState) -> None:
+    """Its queue, its size, a loop, a cut, and then the models; whatever it is, the next message has the next number."""
+    decide = lossy.lane("put", "scan", lossless=False)
+    fates = KeyFates(lossy.link, "scan", "put", 7)
+    due = [fates.next()[0] for _ in range(100)]
+    assert decide(0.0, 40)[:2] == (0, due[0])
+    lossy.cut = lossy.looped = True
+    assert decide(0.0, LARGEST + 1)[:2] == (1, Crossing.OVERFLOW)
+    assert decide(1.0, LARGEST + 1)[:2] == (2, Crossing.TOO_LARGE)
+    assert decide(2.0, 1)[:2] == (3, Crossing.LOOPED)
+    lossy.looped = False
+    assert decide(3.0, 1)[:2] == (4, Crossing.CUT)
+    lossy.cut = False
+    assert [decide(4.0 + n, 1)[:2] for n in range(95)] == [(5 + n, fate) for n, fate in enumerate(due[5:])]
+
+
+def test_what_is_lossless_is_not_cut_but_does_not_go_round(lossy: LinkState) -> None:
+    """Nor does a queue hold it up; it is numbered all the same."""
+    lossy.change(DEAD)
+    decide = lossy.lane("put", "stop", lossless=True)
+    lossy.cut = True
+    assert [decide(0.0, LARGEST) for _ in range(3)] == [(n, Crossing.DELIVERED, 0.0, False) for n in range(3)]
+    assert decide(0.0, LARGEST + 1)[:2] == (3, Crossing.TOO_LARGE)
+    lossy.looped = True
+    assert decide(0.0, 1)[:2] == (4, Crossing.LOOPED)
+
+
+@pytest.mark.parametrize("lossless", [False, True])
+def test_a_key_that_was_forgotten_goes_on(lossy: LinkState, lossless: bool) -> None:
+    """With the next number, and its fate; other keys and kinds have numbers of their own."""
+    decide = lossy.lane("put", "scan", lossless)
+    before = [decide(float(n), 1) for n in range(50)]
+    lossy.forget("put", "scan")
+    lossy.change({**LOSSY, "rate": 1000.0, "queue": 60})
+    decide = lossy.lane("put", "scan", lossless)
+    found = before + [decide(float(n), 1) for n in range(50, 100)]
+    fates = KeyFates(lossy.link, "scan", "put", 7)
+    assert [one[:2] for one in found] == [(n, 0 if lossless else fates.next()[0]) for n in range(100)]
+    assert lossy.lane("query", "scan", lossless)(0.0, 1)[0] == 0
+    assert lossy.lane("put", "pose", lossless)(0.0, 1)[0] == 0
+
+
+def test_threads_share_the_messages_of_a_key(tmp_path: Path) -> None:
+    """Each number, with its fate, is given once, also while the settings change."""
+    delays: dict[str, Any] = {
+        "loss": {"model": "bernoulli", "quality": 1.0},
+        "delay": {"model": "trace", "values": [n / 8 for n in range(40_000)]},
+    }
+    plan = both_ways(delays)
+    found: list[list[Decision]] = [[], [], []]
+    before = sys.getswitchinterval()
+    with WireJournal(tmp_path, plan) as journal:
+        state = LinkState(plan.links[0], plan, journal)
+        decide = state.lane("put", "scan", lossless=False)
+
+        def take(into: list[Decision]) -> None:
+            for _ in range(10_000):
+                into.append(decide(0.0, 1))
+
+        threads = [threading.Thread(target=take, args=(into,)) for into in found]
+        sys.setswitchinterval(1e-6)
+        try:
+            for thread in threads:
+                thread.start()
+            changes = 0
+            while any(thread.is_alive() for thread in threads):
+                changes += 1
+                state.change({**delays, "queue": changes})
+        finally:
+            sys.setswitchinterval(before)
+    assert changes > 1
+    assert sorted(one for into in found for one in into) == [(n, 0, n / 8, False) for n in range(30_000)]
