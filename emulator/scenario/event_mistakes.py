@@ -15,7 +15,7 @@ from evedrop.model.links.link import Fate
 from evedrop.model.registry import place_of
 from evedrop.scenario.events.effects import Leave, LinkCut, LinkHealed, LinkSettings, Return
 from evedrop.scenario.events.event import Act, EventKind, Surroundings
-from evedrop.scenario.link_table import LinkTable, changed_link
+from evedrop.scenario.link_table import CHANGEABLE, OTHER_MODEL, LinkTable, changed_link, unchangeable
 from evedrop.scenario.sentences import sentences
 from evedrop.scenario.valid import ValidTables
 from evedrop.scenario.words import as_toml, listed
@@ -101,19 +101,16 @@ def _change_mistakes(path: str, name: str, changes: Mapping[str, Any], tables: V
             yield f"{path}: {name} has several links; expected a quality or a loss, for the one link that replaces them"
             return
         link = LinkTable(quality=1.0)
-    known = [entry for entry in LinkTable.model_fields if entry != "correlation"]
-    for entry in changes:
-        if entry not in known:
-            yield f"{path}.{entry}: is not a link setting that can be changed; expected {listed(known)}"
+    yield from (f"{path}.{line}" for line in unchangeable(changes))
     try:
-        changed = changed_link(link, {entry: value for entry, value in changes.items() if entry in known})
+        changed = changed_link(link, {entry: value for entry, value in changes.items() if entry in CHANGEABLE})
     except ValidationError as error:
         yield from (f"{path}.{line}" for line in sentences(error, LinkTable))
         return
     if changed.in_seconds and "slot_seconds" not in tables.given:
         yield f"{path}.delay.unit: is seconds; expected slot_seconds = 0.02 at the top of the file"
     if link.correlation is not None and changed.loss_spec["model"] != link.loss_spec["model"]:
-        yield f"{path}.loss.model: differs from the first one, but the link's losses are tied to another link's"
+        yield f"{path}.{OTHER_MODEL}"
 
 
 def _order_mistakes(tables: ValidTables) -> Iterator[str]:

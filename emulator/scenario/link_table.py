@@ -5,7 +5,7 @@ Source: docs/scenario.md, links.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any
 
 from pydantic import Field
@@ -14,7 +14,7 @@ from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.links import LOSS_MODELS, loss_of
 from evedrop.model.links.link import LossModel
 from evedrop.scenario.table import Found, Probability, Table, model_mistakes
-from evedrop.scenario.words import as_toml
+from evedrop.scenario.words import as_toml, listed, near
 
 _QUEUE = 100  # default for the packets that wait before a link of limited rate
 
@@ -99,8 +99,21 @@ class LinkTable(Table):
         return made
 
 
+CHANGEABLE = tuple(entry for entry in LinkTable.model_fields if entry != "correlation")
+"""The entries of a link that an event can change."""
+OTHER_MODEL = (
+    "loss.model: differs from the first one, but the link's losses are tied to another link's; expected the same model"
+)
+"""The mistake of a change that gives a correlated link another loss model."""
 LinkField = Annotated[LinkTable, Field(examples=[{"quality": 0.9}])]
 WindowField = Annotated[int, Field(strict=True, ge=0, le=10_000, examples=[8])]
+
+
+def unchangeable(changes: Mapping[str, Any]) -> Iterator[str]:
+    """Mistakes for all entries that an event cannot change."""
+    for entry in changes:
+        if entry not in CHANGEABLE:
+            yield f"{entry}: is not a link setting that can be changed; expected {listed(CHANGEABLE)}{near(entry, CHANGEABLE)}"
 
 
 def changed_link(link: LinkTable, changes: Mapping[str, Any]) -> LinkTable:

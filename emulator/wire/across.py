@@ -12,11 +12,12 @@ from typing import Any, NamedTuple
 from pydantic import ValidationError
 
 from evedrop.model.checks import as_toml
+from evedrop.scenario.link_table import CHANGEABLE, OTHER_MODEL, unchangeable
 from evedrop.scenario.sentences import sentences
 from evedrop.scenario.words import listed, near
 from evedrop.wire.endpoints import EndpointPlace, place_of
 from evedrop.wire.expect import expectation_mistakes
-from evedrop.wire.tables import CHANGEABLE, WireLinkTable, WireSettingsTable, changed_settings
+from evedrop.wire.tables import WireLinkTable, WireSettingsTable, changed_settings
 
 Tables = Sequence[Mapping[str, Any]]
 LinkNow = tuple[Mapping[str, Any], bool]
@@ -57,16 +58,14 @@ def link_names(links: Tables) -> list[str]:
 
 def change_mistakes(settings: Mapping[str, Any], correlated: bool, changes: Mapping[str, Any]) -> Iterator[str]:
     """Mistakes in changed entries of a link with these settings. correlated: whether its losses are tied to another link's."""
-    for entry in changes:
-        if entry not in CHANGEABLE:
-            yield f"{entry}: is not a link setting that can be changed; expected {listed(CHANGEABLE)}{near(entry, CHANGEABLE)}"
+    yield from unchangeable(changes)
     try:
         made = changed_settings(settings, {entry: changes[entry] for entry in changes if entry in CHANGEABLE}, settings)
     except ValidationError as error:
         yield from sentences(error, WireSettingsTable)
         return
     if correlated and made.get("loss", settings["loss"])["model"] != settings["loss"]["model"]:
-        yield "loss.model: differs from the first one, but the link's losses are tied to another link's; expected the same model"
+        yield OTHER_MODEL
 
 
 def _settings_of(links: Mapping[str, Mapping[str, Any]], name: str) -> LinkNow | None:

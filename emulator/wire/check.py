@@ -14,10 +14,8 @@ import zenoh
 from evedrop.errors import UsageError
 from evedrop.model.checks import as_toml
 from evedrop.wire.endpoints import ENCRYPTED, place_of
-from evedrop.wire.plan import HISTORY, Side, WireLink, WirePlan
-from evedrop.wire.tables import key_expression_mistake
-
-_UNTOLD = {"loss": {"model": "bernoulli", "quality": 1.0}}
+from evedrop.wire.plan import Side, WireLink, WirePlan
+from evedrop.wire.tables import NOTHING_LOST, key_expression_mistake
 
 
 def wire_lines(plan: WirePlan) -> Iterator[str]:
@@ -70,7 +68,7 @@ def warnings_of_wire(plan: WirePlan) -> Iterator[str]:
 def _taken(link: WireLink, key: zenoh.KeyExpr) -> str:
     """The link that takes a key, and what is special about that."""
     notes = ["a copy of publications, no queries"] if link.tap else []
-    if not link.expression.includes(str(key).partition(HISTORY)[0]):
+    if not link.takes_all(key):
         notes.append("which takes only some of these keys")
     return f"{link.name} ({'; '.join(notes)})" if notes else link.name
 
@@ -78,7 +76,7 @@ def _taken(link: WireLink, key: zenoh.KeyExpr) -> str:
 def _effects(link: WireLink) -> str:
     """The settings of a link, without those that do nothing."""
     settings: Mapping[str, Any] = link.settings
-    told = [f"{name} = {as_toml(value)}" for name, value in settings.items() if _UNTOLD.get(name) != value]
+    told = [f"{name} = {as_toml(value)}" for name, value in settings.items() if (name, value) != ("loss", NOTHING_LOST)]
     if link.correlation is not None:
         told.append(f"losses tied to {link.correlation[0]} with strength {link.correlation[1]}")
     return ", ".join(told) or "no faults"

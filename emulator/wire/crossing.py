@@ -32,7 +32,7 @@ class Crossing(IntEnum):
     HELD_UP = 18
     """The wire already held as many delayed messages as it may."""
     LOOPED = 19
-    """A program is connected to both sides, so the message would go round."""
+    """A router outside the wire joins both sides, so the message would go round."""
     UNDERWAY = 20
     """Still delayed when the wire ended."""
     REFUSED = 21

@@ -12,7 +12,7 @@ from typing import Any
 
 import zenoh
 
-HISTORY = "/@adv/"
+_HISTORY = "/@adv/"
 """What follows the key of an advanced publisher in the keys of its history."""
 
 
@@ -73,11 +73,11 @@ class WireLink:
 
         The history of an advanced publisher, `KEY/@adv/…`, goes where its key goes.
         """
-        return self.expression.intersects(key) or self._takes_history(str(key))
+        return any(self.expression.intersects(one) for one in _with_published(key))
 
-    def _takes_history(self, key: str) -> bool:
-        before, verbatim, _ = key.partition(HISTORY)
-        return bool(verbatim) and self.expression.intersects(zenoh.KeyExpr(before))
+    def takes_all(self, key: zenoh.KeyExpr) -> bool:
+        """Whether all messages with this key, which may contain wildcards, are this link's."""
+        return any(self.expression.includes(one) for one in _with_published(key))
 
 
 @dataclass(frozen=True)
@@ -119,10 +119,13 @@ class WirePlan:
     """Their most bytes."""
     expectations: tuple[Mapping[str, Any], ...] = ()
 
-    def link_of(self, source: str, target: str, key: zenoh.KeyExpr) -> WireLink | None:
-        """The first link that takes the messages of a key from one side to another; None if there is none."""
+    def link_of(self, source: str, target: str, key: zenoh.KeyExpr, *, query: bool = False) -> WireLink | None:
+        """The first link that takes the messages of a key from one side to another; None if there is none.
+
+        query: whether they are queries or replies, which no tap carries.
+        """
         links = (link for link in self.links if (link.source, link.target) == (source, target))
-        return next((link for link in links if link.takes(key)), None)
+        return next((link for link in links if link.takes(key) and not (query and link.tap)), None)
 
     def named(self, name: str) -> WireLink:
         """The link with this name. Raises KeyError if there is none."""
@@ -130,6 +133,10 @@ class WirePlan:
 
     def is_lossless(self, key: zenoh.KeyExpr) -> bool:
         """Whether messages with this key are never lost: it is named, or it is `KEY/@adv/…` and KEY is named."""
-        before, verbatim, _ = str(key).partition("/@adv/")
-        keys = (key, zenoh.KeyExpr(before)) if verbatim else (key,)
-        return any(zenoh.KeyExpr(one).includes(each) for one in self.lossless for each in keys)
+        return any(zenoh.KeyExpr(one).includes(each) for one in self.lossless for each in _with_published(key))
+
+
+def _with_published(key: zenoh.KeyExpr) -> tuple[zenoh.KeyExpr, ...]:
+    """The key; and KEY as well if it is the history of an advanced publisher, `KEY/@adv/…`."""
+    published, verbatim, _ = str(key).partition(_HISTORY)
+    return (key, zenoh.KeyExpr(published)) if verbatim else (key,)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, final
 
 import zenoh
@@ -85,7 +85,7 @@ class _Way:
 
 
 _Ways = tuple[tuple[_Way, ...], int]
-"""Of a key: its ways, and its code in the journal."""
+"""The ways of a key, and its code in the journal."""
 
 
 @final
@@ -95,18 +95,15 @@ class PublicationRelay:
     def __init__(
         self,
         side: SideSession,
-        states: Sequence[LinkState],
+        links: Mapping[str, LinkState],
         publishers: Mapping[str, Publishers],
         plan: WirePlan,
         journal: WireJournal,
         scheduler: Scheduler,
         tell: Callable[[str], None],
     ) -> None:
-        """states: the links from this side, in the order of the file; publishers: by the name of their side.
-
-        tell: for what the user must know.
-        """
-        self._states, self._publishers, self._plan = states, publishers, plan
+        """links, publishers: by the names of links and of sides; tell: for what the user must know."""
+        self._links, self._publishers, self._plan = links, publishers, plan
         self._journal, self._scheduler = journal, scheduler
         self._name, self._tell = side.name, tell
         expressions = [zenoh.KeyExpr(one) for one in expressions_of(side.side, plan.links)]
@@ -153,11 +150,15 @@ class PublicationRelay:
         """The function that is called for every message: it looks up as little as possible."""
         ways_of: dict[str, _Ways] = {}
         now, way_to = time.time, self._way_to
-        record, hold, failed = self._journal.record, self._scheduler.hold, self._refused
+        record, hold, amend = self._journal.record, self._scheduler.hold, self._journal.amend
         read = SourceReader(self._journal.source_code)
         put, put_kind, delete_kind = zenoh.SampleKind.PUT, int(Kind.PUT), int(Kind.DELETE)
-        unlinked, held_up = int(Crossing.UNLINKED), Crossing.HELD_UP
-        amend, zenoh_error = self._journal.amend, zenoh.ZError
+        unlinked, held_up, refused, zenoh_error = (
+            int(Crossing.UNLINKED),
+            Crossing.HELD_UP,
+            Crossing.REFUSED,
+            zenoh.ZError,
+        )
 
         def take(sample: zenoh.Sample) -> None:
             heard = now()
@@ -204,7 +205,7 @@ class PublicationRelay:
                         if again:
                             _send(publisher, sample, is_put)
                 except zenoh_error:
-                    failed(row)
+                    amend(row, refused)
 
         return take
 
@@ -216,16 +217,14 @@ class PublicationRelay:
                 way.forget()
         code = self._journal.key_code(key)
         lossless = self._plan.is_lossless(expression)
-        taken: dict[str, LinkState] = {}
-        for state in self._states:
-            if state.link.target not in taken and state.link.takes(expression):
-                taken[state.link.target] = state
-        ways = tuple(_Way(state, key, self._publishers[target], lossless) for target, state in taken.items())
+        taken = (self._plan.link_of(self._name, target, expression) for target in self._publishers)
+        ways = tuple(
+            _Way(self._links[link.name], key, self._publishers[link.target], lossless)
+            for link in taken
+            if link is not None
+        )
         ways_of[key] = (ways, code)
         return ways, code
-
-    def _refused(self, row: int) -> None:
-        self._journal.amend(row, Crossing.REFUSED)
 
 
 @final

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from queue import SimpleQueue
 from typing import Any, final
 
@@ -62,16 +62,17 @@ class QueryRelay:
     def __init__(
         self,
         sides: Mapping[str, SideSession],
-        states: Sequence[LinkState],
+        links: Mapping[str, LinkState],
         plan: WirePlan,
         journal: WireJournal,
         scheduler: Scheduler,
         tell: Callable[[str], None],
     ) -> None:
-        """tell: for what the user must know."""
+        """links: by their names; tell: for what the user must know."""
         self._tell = tell
         self._sides, self._plan, self._journal, self._scheduler = sides, plan, journal, scheduler
-        self._states = [state for state in states if not state.link.tap]
+        self._links = links
+        self._states = [state for state in links.values() if not state.link.tap]
         self._lanes: dict[tuple[str, str, str], tuple[Lane, LinkState]] = {}
         self._queriers: dict[tuple[str, str, bool, bool], zenoh.Querier] = {}
         self._services: tuple[frozenset[tuple[str, str]], tuple[bool, ...]] | None = None
@@ -271,14 +272,8 @@ class QueryRelay:
             asked.release()
 
     def _link(self, source: str, target: str, key: zenoh.KeyExpr) -> LinkState | None:
-        return next(
-            (
-                one
-                for one in self._states
-                if (one.link.source, one.link.target) == (source, target) and one.link.takes(key)
-            ),
-            None,
-        )
+        found = self._plan.link_of(source, target, key, query=True)
+        return None if found is None else self._links[found.name]
 
     def _decided(self, state: LinkState, kind: str, key: str, expression: zenoh.KeyExpr, size: int) -> Decision:
         with self._lock:

@@ -82,28 +82,20 @@ class WireRelay:
             state.change(moment.settings[name])
 
     def _open(self, stack: contextlib.ExitStack) -> None:
-        plan, journal, states = self.plan, self._journal, list(self.links.values())
+        plan, journal, links = self.plan, self._journal, self.links
         self.sides = {name: stack.enter_context(SideSession(side, plan.largest)) for name, side in plan.sides.items()}
         scheduler = Scheduler(plan.held_messages, plan.held_bytes, lambda row: journal.amend(row, Crossing.REFUSED))
         stack.callback(self._end_delays, scheduler)
         publishers = {name: Publishers(side.session) for name, side in self.sides.items()}
-        self._queries = QueryRelay(self.sides, states, plan, journal, scheduler, self._tell)
+        self._queries = QueryRelay(self.sides, links, plan, journal, scheduler, self._tell)
         stack.callback(self._queries.close)
         relays = [
-            PublicationRelay(
-                side,
-                [one for one in states if one.link.source == name],
-                publishers,
-                plan,
-                journal,
-                scheduler,
-                self._tell,
-            )
-            for name, side in self.sides.items()
+            PublicationRelay(side, links, publishers, plan, journal, scheduler, self._tell)
+            for side in self.sides.values()
         ]
         for relay in relays:
             stack.callback(relay.close)
-        self._neighbours = Neighbours(self.sides, states, self._tell)
+        self._neighbours = Neighbours(self.sides, [*links.values()], self._tell)
         self._liveliness = LivelinessRelay(self.sides, plan, self._woken.set, EntityLog(journal.folder).add)
         stack.callback(self._liveliness.close)
         self._look()

@@ -1,6 +1,6 @@
 """Holds messages back until their delay is over, and gives them on in the order of their times.
 
-Source: docs/wire.md, delays.
+Source: docs/wire.md, how messages cross.
 """
 
 from __future__ import annotations

@@ -24,6 +24,8 @@ from evedrop.wire.units import Rate, Seconds, Size, in_seconds
 
 DEFAULT_QUEUE = 256_000
 """Bytes that may wait before a link of limited rate."""
+NOTHING_LOST: Mapping[str, Any] = {"model": "bernoulli", "quality": 1.0}
+"""The loss model of a link for which the file gives none."""
 _LINK_NAME = re.compile(r"[a-z][a-z0-9_-]{0,79}")
 
 
@@ -119,8 +121,8 @@ class WireSettingsTable(LinkTable):
         """Those of a scenario's link; but a link without losses needs no loss model."""
         delay, found = delay_in_seconds(table.get("delay"))
         said = {entry for entry, _ in found}
-        lossless = {"quality": 1.0} if table.get("quality") is None and table.get("loss") is None else {}
-        of_link = super().mistakes({**table, **lossless, "delay": delay})
+        perfect = {"loss": NOTHING_LOST} if table.get("quality") is None and table.get("loss") is None else {}
+        of_link = super().mistakes({**table, **perfect, "delay": delay})
         found += [one for one in of_link if one[0] not in said]
         loss = table.get("loss")
         if isinstance(loss, Mapping) and loss.get("once") is True:
@@ -132,9 +134,7 @@ class WireSettingsTable(LinkTable):
     @property
     def loss_spec(self) -> dict[str, Any]:
         """The loss model and its parameters; without either, nothing is lost."""
-        return (
-            {"model": "bernoulli", "quality": 1.0} if self.quality is None and self.loss is None else super().loss_spec
-        )
+        return dict(NOTHING_LOST) if self.quality is None and self.loss is None else super().loss_spec
 
     def wire_settings(self) -> dict[str, Any]:
         """The settings for `WireLink.settings`."""
@@ -259,10 +259,6 @@ class WireFile(Table):
     query_seconds: Annotated[Seconds, Field(examples=["10 s"])] = 10.0
     held_messages: Annotated[int, Field(strict=True, ge=1, le=10_000_000, examples=[100_000])] = 100_000
     held_bytes: Annotated[Size, Field(examples=["1 GB"])] = 2**30
-
-
-CHANGEABLE = tuple(entry for entry in WireSettingsTable.model_fields if entry != "correlation")
-"""The entries of a link that can change while the wire runs."""
 
 
 _NEEDS = {"rate": "queue", "queue": "rate", "reorder": "delay"}

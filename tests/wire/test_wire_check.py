@@ -153,6 +153,9 @@ def test_the_history_of_a_key() -> None:
     plan = plan_of({**TO_BASE, "keys": "a/*"})
     assert list(key_lines(plan, ["a/b/@adv/pub/1"]))[1] == "  robot → base  robot-base"
     assert list(key_lines(plan, ["b/@adv/pub/1"]))[1] == "  robot → base  no link takes it"
+    named = plan_of({**TO_BASE, "keys": "a/b/@adv/**"})
+    assert list(key_lines(named, ["a/b/@adv/pub/1"]))[1] == "  robot → base  robot-base"
+    assert "only some of these keys" in list(key_lines(named, ["a/*/@adv/**"]))[1]
 
 
 def test_the_page_shows_what_the_command_prints(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

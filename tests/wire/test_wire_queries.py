@@ -107,7 +107,7 @@ def test_nobody_waits_for_a_queryable_that_is_not_there(tmp_path: Path) -> None:
         assert not kinds(wire)
 
 
-def test_whoever_loses_a_query_waits_for_nothing_and_a_lost_reply_is_missing(tmp_path: Path) -> None:
+def test_the_asker_of_a_lost_query_waits_and_a_lost_reply_is_missing(tmp_path: Path) -> None:
     """A lost query leaves its asker waiting for as long as the wire does; after a lost reply the asker goes on."""
     plan = plan_of(
         link("robot", "base", DEAD, "there/**", name="there"),
@@ -186,8 +186,13 @@ def test_local_queryables_are_not_hidden_by_those_of_the_other_side(tmp_path: Pa
 
 
 def test_a_tap_carries_no_queries(tmp_path: Path) -> None:
-    """Nor replies: a listener is not noticed."""
-    plan = plan_of(link("robot", "base"), link("base", "robot"), link("robot", "listener", tap=True))
+    """Nor replies: a listener is not noticed. They go over the next link that takes their key."""
+    plan = plan_of(
+        link("robot", "base", tap=True, name="copy"),
+        link("robot", "base"),
+        link("base", "robot"),
+        link("robot", "listener", tap=True),
+    )
     with (
         at_work(plan, tmp_path) as wire,
         wire.program("robot") as asker,
@@ -197,6 +202,7 @@ def test_a_tap_carries_no_queries(tmp_path: Path) -> None:
         offer(listener, "tap", b"no")
         offer(base, "base", b"yes")
         wait_until(lambda: answers(asker, "base"), "the base answers")
+        assert not wire.fates("copy")
         assert not answers(asker, "tap")
         assert not answers(listener, "base")
 
