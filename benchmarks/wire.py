@@ -1,7 +1,7 @@
 """What a wire carries: messages a second, what it adds to the latency, large messages, and whether it accounts for all.
 
     python benchmarks/wire.py [--quick]
-    python benchmarks/wire.py --full          # also ten million messages, of which none may be unaccounted for
+    python benchmarks/wire.py --full          # also ten million messages: each must be accounted for
 
 Everything runs on this machine: a sender and a receiver in plain zenoh-python (wire_peers.py), and the wire with its journal in
 this process. The yardstick of the rate is a bare relay: two sessions and a loop that puts what it hears.
@@ -13,6 +13,7 @@ import statistics
 import sys
 import tempfile
 import threading
+import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -34,26 +35,7 @@ from evedrop.wire.side import SideSession
 _ANYWHERE = ("tcp/127.0.0.1:0",)
 PERFECT: Mapping[str, Any] = {"loss": {"model": "bernoulli", "quality": 1.0}}
 BURSTS: Mapping[str, Any] = {"loss": {"model": "gilbert-elliott", "p": 0.01, "r": 0.2}}
-MODELS: dict[str, Mapping[str, Any]] = {
-    "bernoulli": {"model": "bernoulli", "quality": 0.8},
-    "distance": {
-        "model": "distance",
-        "sender": [0, 0],
-        "receiver": [[0, 60.0, 20.0], [4000, 150.0, 20.0]],
-        "reference_snr": 75.0,
-        "exponent": 3.0,
-        "threshold": 10.0,
-        "fading_block": 20,
-    },
-    "gilbert-elliott": {"model": "gilbert-elliott", "p": 0.02, "r": 0.1, "good": 0.01, "bad": 0.9},
-    "markov": {
-        "model": "markov",
-        "transitions": [[0.9, 0.02, 0.08, 0.0], [1.0, 0.0, 0.0, 0.0], [0.3, 0.0, 0.5, 0.2], [0.0, 0.0, 0.4, 0.6]],
-        "loss": [0.0, 1.0, 1.0, 0.0],
-    },
-    "pattern": {"model": "pattern", "outcomes": "1101001"},
-    "trace": {"model": "trace", "outcomes": "1" * 300 + "10" * 40 + "0" * 37},
-}
+_LOSSES = Path(__file__).parents[1] / "tests" / "wire" / "losses.toml"
 
 
 class Measured:
@@ -215,14 +197,16 @@ def accounted(count: int) -> Iterator[Row]:
 
 def losses(count: int) -> Iterator[Row]:
     """The messages that each model lets through, beside its 99 % bounds."""
-    links = [(f"robot/{name}", {"loss": model}) for name, model in MODELS.items()]
-    with a_wire(*links) as wire:
-        keys = tuple(key for key, _ in links)
-        carry(wire.robot, wire.base, Traffic(count, 64, keys=keys))
+    models = {
+        name: {"model": name, **found} for name, found in tomllib.loads(_LOSSES.read_text(encoding="utf-8")).items()
+    }
+    links = {f"robot/{name}": {"loss": model} for name, model in models.items()}
+    with a_wire(*links.items()) as wire:
+        carry(wire.robot, wire.base, Traffic(count, 64, keys=tuple(links)))
         wire.count()
         fates = dict(wire.fates)
     outside, said = [], []
-    for at, (name, model) in enumerate(MODELS.items()):
+    for at, (name, model) in enumerate(models.items()):
         low, high = bounds(*expected({"loss": model}, (), [range(count)]), count)
         found = fates.get((at, Crossing.DELIVERED), 0)
         said.append(f"{name} {found / count:.4f}")

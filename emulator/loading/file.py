@@ -132,7 +132,7 @@ def parse(
 
 
 def tables_in(text: str, source: str) -> dict[str, Any]:
-    """The tables of a TOML text, of which no entry is checked yet. Raises ScenarioError if a value cannot be used at all."""
+    """The tables of a TOML text, before their entries are checked. Raises ScenarioError if a value cannot be used at all."""
     if (values := text.count(",")) > MOST_VALUES:
         large = f"has about {values} values; expected at most {MOST_VALUES}"
         raise ScenarioError(source, [f"{large}: put disturbances and recordings into files of their own"])

@@ -78,7 +78,7 @@ class LinkWatcher:
 
 @final
 class CutWatcher:
-    """Tells from what became of messages which links are cut. A link without messages is thought to be as it was."""
+    """Tells which links are cut, by the fates of their messages. A link without messages keeps its state."""
 
     def __init__(self, links: Sequence[WireLink]) -> None:
         self._links = links

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from threading import Event, Thread
 from typing import Any
 from unittest.mock import patch
 
@@ -33,7 +32,7 @@ from evedrop.wire.run import run_wire
 from evedrop.wire.step_counts import DELIVERED, OUTCOMES, WireSteps
 from evedrop.wire.view import WireView
 from tests.conftest import LIMIT, wait_until
-from tests.wire.wire_at_work import LOSSY, both_ways, program
+from tests.wire.wire_at_work import LOSSY, both_ways, sending
 from tests.wire.wire_rows import START, plan_of, robot_plan, traffic
 
 RATES = {"scan": 100.0, "command": 20.0, "listener": 100.0}
@@ -383,21 +382,8 @@ def test_a_view_follows_a_running_wire(tmp_path: Path, capfd: pytest.CaptureFixt
     plan = both_ways(LOSSY, events=(WireEvent(0.5, None, partition=("robot", "base")),))
     out, path = tmp_path / "out", tmp_path / "wire.rrd"
     said: list[str] = []
-    ended = Event()
-
-    def send() -> None:
-        wait_until(lambda: any(line.startswith("robot ") for line in said), "the wire's endpoints")
-        with program([next(line for line in said if line.startswith("robot ")).split(" ")[1]]) as session:
-            while not ended.wait(0.01):
-                session.put("scan", b"x")
-
-    sender = Thread(target=send)
-    sender.start()
-    try:
+    with sending(said):
         assert run_wire(plan, out, seconds=1.5, say=said.append, view=str(path)) == 0
-    finally:
-        ended.set()
-        sender.join(LIMIT)
     table = shown(path, "table", "TextDocument:text")[-1][1][0]
     assert "cut" in table
     assert "partition robot, base" in [text for _, text in texts(path)]

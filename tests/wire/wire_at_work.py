@@ -6,6 +6,7 @@ import contextlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from threading import Event, Thread
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_part import Records
 from evedrop.wire.plan import Side, WireLink, WirePlan
 from evedrop.wire.relay import WireRelay
-from tests.conftest import wait_until
+from tests.conftest import LIMIT, wait_until
 
 PERFECT: Mapping[str, Any] = {"loss": {"model": "bernoulli", "quality": 1.0}}
 DEAD: Mapping[str, Any] = {"loss": {"model": "bernoulli", "quality": 0.0}}
@@ -92,6 +93,31 @@ def at_work(plan: WirePlan, folder: Path) -> Iterator[WireAtWork]:
         journal.listeners.append(lambda block: rows.append(block.copy()))
         with WireRelay(plan, journal, told.append) as relay:
             yield WireAtWork(relay, journal, told, rows)
+
+
+@contextlib.contextmanager
+def sending(said: list[str]) -> Iterator[None]:
+    """A program that publishes `scan` at the side robot of a wire from the moment at which `run_wire` says its endpoint.
+
+    said: the list into which the wire says its lines.
+    """
+    ended = Event()
+
+    def endpoints() -> list[str]:
+        return [line.split(" ")[1] for line in said if line.startswith("robot ")]
+
+    def send() -> None:
+        with program(wait_until(endpoints, "the wire's endpoints")) as session:
+            while not ended.wait(0.01):
+                session.put("scan", b"x")
+
+    sender = Thread(target=send)
+    sender.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        sender.join(LIMIT)
 
 
 def program(endpoints: Sequence[str], **config: Any) -> zenoh.Session:

@@ -2,32 +2,16 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from evedrop.wire.plan import WireLink
 
 LOSSES: dict[str, dict[str, Any]] = {
-    "bernoulli": {"model": "bernoulli", "quality": 0.8},
-    "distance": {
-        "model": "distance",
-        "sender": [0, 0],
-        "receiver": [[0, 60.0, 20.0], [4000, 150.0, 20.0]],
-        "reference_snr": 75.0,
-        "exponent": 3.0,
-        "threshold": 10.0,
-        "shadowing": 4.0,
-        "shadowing_block": 60,
-        "fading_block": 20,
-    },
-    "gilbert-elliott": {"model": "gilbert-elliott", "p": 0.02, "r": 0.1, "good": 0.01, "bad": 0.9},
-    "markov": {
-        "model": "markov",
-        "transitions": [[0.9, 0.02, 0.08, 0.0], [1.0, 0.0, 0.0, 0.0], [0.3, 0.0, 0.5, 0.2], [0.0, 0.0, 0.4, 0.6]],
-        "loss": [0.0, 1.0, 1.0, 0.0],
-    },
-    "pattern": {"model": "pattern", "outcomes": "1101001"},
-    "trace": {"model": "trace", "outcomes": "1" * 300 + "10" * 40 + "0" * 37, "random_start": True},
+    name: {"model": name, **parameters}
+    for name, parameters in tomllib.loads(Path(__file__).with_name("losses.toml").read_text(encoding="utf-8")).items()
 }
 DELAYS: dict[str, dict[str, Any]] = {
     "constant": {"model": "constant", "value": 0.25},
