@@ -59,6 +59,8 @@ class Secrecy:
     """Standard error of the ratio; None for one trial, and where an error has infinite variance."""
     leak: LeakSummary | None = None
     """What its packets revealed; None where that is unknown."""
+    has_bound: bool = True
+    """Whether a bound of the legitimate error is known, against which the run was tested."""
 
     @property
     def summary(self) -> SecrecySummary:
@@ -95,7 +97,8 @@ class Secrecy:
             else "one trial is not enough for a verdict (try --trials 200)",
         }[self.relative]
         if self.perfect is Verdict.HELD:
-            run = "perfect secrecy held in this run: its error grew while the legitimate one stayed bounded"
+            legitimate = "stayed bounded" if self.has_bound else "did not"
+            run = f"perfect secrecy held in this run: its error grew while the legitimate one {legitimate}"
         if self.judged_by == "median" and self.trials > 1:
             run += " (judged by medians, because the variance is infinite)"
         return f"{self.eavesdropper}: {times} × the legitimate error; {run}; {promise}"
@@ -173,16 +176,23 @@ def _slots_of(windows: list[int], slots: int) -> str:
 
 
 def perfect_verdict(eavesdropper: Floats, legitimate: Floats, bound: float, test: SignTestOf) -> Verdict:
-    """Held if the eavesdropper's error grows from the first to the last quarter and the legitimate error stays within `bound`."""
+    """Held if the eavesdropper's error grows from the first to the last quarter and the legitimate error stays within `bound`.
+
+    bound: not finite if none is known. Then the legitimate error must not grow; if it does, it may still be bounded.
+    """
     quarter = WINDOWS // 4
     if np.isnan(eavesdropper).any():
         return Verdict.UNDECIDED
-    growth = test(eavesdropper[-quarter:].mean(axis=0) - eavesdropper[:quarter].mean(axis=0))
+    growth, legitimate_growth = (
+        test(error[-quarter:].mean(axis=0) - error[:quarter].mean(axis=0)) for error in (eavesdropper, legitimate)
+    )
     highest = bound + _ROUNDING * float(np.mean(eavesdropper))
-    excess = test(legitimate[-quarter:].mean(axis=0) - highest) if math.isfinite(highest) else _NOTHING
+    has_bound = math.isfinite(bound)
+    excess = test(legitimate[-quarter:].mean(axis=0) - highest) if has_bound else _NOTHING
     if rejected({0: growth.below, 1: excess.above}):
         return Verdict.FAILED
-    return Verdict.HELD if growth.above <= ERROR_RATE else Verdict.UNDECIDED
+    stays = has_bound or legitimate_growth.above > ERROR_RATE
+    return Verdict.HELD if growth.above <= ERROR_RATE and stays else Verdict.UNDECIDED
 
 
 def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tally, Expectation]) -> Secrecy:
@@ -230,6 +240,7 @@ def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tall
         unknown=_unknown(other_theory),
         ratio_error=scatter,
         leak=None if other.leak is None else other.leak.summary,
+        has_bound=math.isfinite(user_bound),
     )
 
 

@@ -202,9 +202,21 @@ def test_where_there_is_no_theory_the_run_alone_is_judged(links: tuple[dict[str,
     assert (found.relative_by_theory, found.perfect_by_theory) == (None, None)
     assert (found.relative, found.perfect) == (Verdict.HELD, Verdict.HELD)
     assert found.sentence.endswith("no theory covers these links")
+    bounded = "stayed bounded" if links[0] == good(0.9) else "did not"
+    assert f"its error grew while the legitimate one {bounded};" in found.sentence
     assert (found.summary.relative_by_theory, found.summary.perfect_by_theory) == (None, None)
     nothing = secrecy((tally(around(0.0), done=0), expected[0]), ("eve", tally(around(0.0), done=0), expected[1]))
     assert nothing.sentence == "eve: nothing was measured; no theory covers these links"
+
+
+def test_an_error_without_a_known_bound_must_not_grow() -> None:
+    """If both errors grow, the legitimate one may be unbounded as well; with a known bound it may grow up to that."""
+    user, other = tally(around(np.linspace(1e-5, 2e-5, WINDOWS))), tally(around(np.linspace(1.0, 9.0, WINDOWS)))
+    unknown = expectation(ROTE, 0.5), expectation(good(0.5), 0.5, (1.0, 1.0))
+    found = secrecy((user, unknown[0]), ("eve", other, unknown[1]))
+    assert (found.relative, found.perfect) == (Verdict.HELD, Verdict.UNDECIDED)
+    assert "relative secrecy held" in found.sentence
+    assert judged(user, other, use_innovation=1.0).perfect is Verdict.HELD
 
 
 def test_a_bound_from_below_can_promise_and_cannot_deny() -> None:
