@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from evedrop.errors import UsageError
+from evedrop.kernels.elementary import normal_quantile
 from evedrop.model.checks import toml_of
 from evedrop.model.given_states import LARGEST, deviations
 from evedrop.model.process import Floats, mistakes_of
@@ -59,7 +60,8 @@ class ProcessFit:
     @property
     def unexplained(self) -> list[str]:
         """The states whose residuals depend on those before, so that noise that is white does not explain them."""
-        limit = _quantile(1.0 - 0.5 * _LEVEL / len(self.A)) / math.sqrt(self.transitions)
+        quantile = normal_quantile(np.array([1.0 - 0.5 * _LEVEL / len(self.A)])).item()
+        limit = quantile / math.sqrt(self.transitions)
         found = zip(self.recording.names, np.abs(self.correlation), strict=True)
         return [name for name, size in found if size > limit]
 
@@ -167,10 +169,3 @@ def fit_process(path: Path, names: Sequence[str] | None = None, reference: Seque
         initial,
         correlation,
     )
-
-
-def _quantile(probability: float) -> float:
-    """The quantile of the standard normal law."""
-    from scipy.special import ndtri  # noqa: PLC0415 - slow to import, and seldom needed
-
-    return float(ndtri(probability))

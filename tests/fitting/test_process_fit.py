@@ -49,6 +49,26 @@ def test_the_standard_errors_are_those_of_many_fits(tmp_path: Path) -> None:
     assert sum(bool(one.unexplained) for one in fits) <= 4
 
 
+def test_the_estimates_are_those_of_the_normal_equations(tmp_path: Path) -> None:
+    """A, Q and their standard errors, for states of very different sizes, by a regression of each state on its own."""
+    rows = path_of(4, 60) * np.array([1e-3, 50.0])
+    found = fitted(tmp_path, rows)
+    X, count = rows[:-1], len(rows) - 1
+    inverse = np.linalg.inv(X.T @ X)
+    residuals = np.empty_like(X)
+    for i in range(2):
+        a = inverse @ X.T @ rows[1:, i]
+        residuals[:, i] = rows[1:, i] - X @ a
+        variance = np.sum(residuals[:, i] ** 2) / (count - 2)
+        assert found.A[i] == pytest.approx(a, rel=1e-8)
+        assert found.A_error[i] == pytest.approx(np.sqrt(variance * np.diag(inverse)), rel=1e-8)
+    Q = np.einsum("ki,kj->ij", residuals, residuals) / (count - 2)
+    assert pytest.approx(Q, rel=1e-8) == found.Q
+    for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        spread = Q[i, i] * Q[j, j] + Q[i, j] ** 2
+        assert found.Q_error[i, j] == pytest.approx(np.sqrt(spread / (count - 2)), rel=1e-8)
+
+
 def test_the_fit_is_a_scenario(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """What the command prints is read, remarks included; with a reference, and units."""
     (tmp_path / "pose.csv").write_text(
