@@ -6,90 +6,24 @@ import contextlib
 import json
 import sys
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType
 
 from evedrop.errors import TraceError
 from evedrop.fitting.message_fit import fit_messages
 from evedrop.model.links import loss_of
 from evedrop.model.links.link import Fate
-from evedrop.recordings.link_recording import Outcomes
 from evedrop.recordings.mcap_recording import mcap_recording
-from evedrop.recordings.message_numbers import MessageArrivals, numbers_of_times, series_of
 from evedrop.wire.fates import KeyFates
 from evedrop.wire.file import wire_of
 from tests.conftest import Evedrop
-
-SECOND = 10**9
-BEGAN = 1_700_000_000 * SECOND
-
-
-@dataclass
-class Recorded:
-    """The messages of a publisher, as a recorder heard them: number, time of sending and of recording in seconds."""
-
-    topic: str
-    messages: Sequence[tuple[int, float, float]]
-    metadata: Mapping[str, str] = field(default_factory=dict)
-    own_times: bool = True
-    """False: the recorder writes its own time as the time of publication, as rosbag2 did before Jazzy."""
-
-
-def write(path: Path, recorded: Iterable[Recorded], compression: CompressionType = CompressionType.ZSTD) -> Path:
-    """A recording of several publishers, each on a channel of its own, in the order of recording."""
-    with path.open("wb") as file:
-        _write(file, list(recorded), compression)
-    return path
-
-
-def _write(file: BinaryIO, recorded: Sequence[Recorded], compression: CompressionType) -> None:
-    writer = Writer(
-        file, chunk_size=4096, compression=compression, use_chunking=compression is not CompressionType.NONE
-    )
-    writer.start("ros2", "libmcap")
-    schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
-    rows = []
-    for one in recorded:
-        channel = writer.register_channel(one.topic, "cdr", schema, dict(one.metadata))
-        for number, sent, heard in one.messages:
-            logged = BEGAN + round(heard * SECOND)
-            rows.append((logged, channel, number, BEGAN + round(sent * SECOND) if one.own_times else logged))
-    for logged, channel, number, published in sorted(rows, key=lambda row: row[0]):
-        writer.add_message(channel, logged, b"\x00\x01\x00\x00", published, number % 2**32)
-    writer.finish()
-
-
-def lossy(spec: Mapping[str, Any], count: int, seed: int = 1) -> Outcomes:
-    """What a link does to messages, (count,)."""
-    loss = loss_of(dict(spec))
-    uniforms = np.random.default_rng(seed).random((count, loss.uniforms_per_slot, 1))
-    delivered: Outcomes = (loss.fates(0, uniforms)[:, 0] == Fate.DELIVERED).astype(np.uint8)
-    return delivered
-
-
-def heard(
-    outcomes: Outcomes, period: float = 0.1, first: int = 1, delay: float = 0.005
-) -> list[tuple[int, float, float]]:
-    """The messages that arrived of those that were sent regularly, from the number `first` on."""
-    return [(first + i, i * period, i * period + delay) for i in np.flatnonzero(outcomes).tolist()]
-
-
-def trimmed(outcomes: Outcomes) -> list[int]:
-    """From the first to the last delivered: nobody can see what was lost before or after."""
-    places = np.flatnonzero(outcomes)
-    found: list[int] = outcomes[places[0] : places[-1] + 1].tolist()
-    return found
-
-
-BURSTS = {"model": "gilbert-elliott", "p": 0.05, "r": 0.3}
+from tests.recordings.recorded_messages import BURSTS, Recorded, heard, lossy, trimmed, write
 
 
 @pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD])
@@ -108,76 +42,6 @@ def test_missing_numbers_are_losses(tmp_path: Path, compression: CompressionType
     assert found.delays == pytest.approx(0.005, abs=1e-9)
     assert len(found.delays) == outcomes.sum()
     assert found.keys == "*/scan/**"
-
-
-@given(
-    st.lists(st.integers(0, 1), min_size=2, max_size=60).filter(lambda word: sum(word) > 1),
-    st.integers(0, 2**32 - 1),
-    st.randoms(use_true_random=False),
-)
-def test_late_and_repeated_messages_are_no_losses(word: list[int], first: int, random: Any) -> None:
-    """Whatever is late or comes twice, and wherever the numbers wrap: the outcomes are those of the link."""
-    places = [i for i, outcome in enumerate(word) if outcome]
-    arrived = places + [place for place in places if random.random() < 0.3]
-    arrived.sort(key=lambda place: place + random.random() * 5.0)
-    numbers = np.array([(first + place) % 2**32 for place in arrived], np.int64)
-    sent = np.array(arrived, np.float64)
-    found = series_of(MessageArrivals(numbers, np.arange(len(arrived), dtype=np.float64), sent), wrap=2**32)
-    assert found.outcomes.tolist() == trimmed(np.array(word, np.uint8))
-    assert found.repeated == len(arrived) - len(places)
-    assert found.parts == 1
-    assert found.kept.sum() == len(places)
-
-
-@pytest.mark.parametrize("times_known", [True, False])
-@pytest.mark.parametrize("before", [200, 40])
-def test_a_sender_that_starts_again_loses_nothing(before: int, times_known: bool) -> None:
-    """Its numbers go back to 1: two parts, between which nothing is known; a late message is not taken for that."""
-    first, second = lossy(BURSTS, before, 3), lossy(BURSTS, 300, 4)
-    numbers = [number for number, *_ in [*heard(first), *heard(second)]]
-    numbers[10], numbers[11] = numbers[11], numbers[10]
-    sent = np.arange(len(numbers), dtype=np.float64)
-    sent[10], sent[11] = sent[11], sent[10]
-    clock = np.arange(len(numbers), dtype=np.float64)
-    found = series_of(MessageArrivals(np.array(numbers), clock, sent if times_known else None), wrap=2**32)
-    assert (found.parts, found.restarts, found.late, found.repeated) == (2, 1, 1, 0)
-    assert found.outcomes.tolist() == trimmed(first) + trimmed(second)
-
-
-def test_a_counter_that_leaps_is_no_loss() -> None:
-    """100 000 numbers in the time of one message: the counter was set; in the time of as many messages: they were lost."""
-    numbers = np.concatenate([np.arange(200), 100_000 + np.arange(200)])
-    leapt = series_of(MessageArrivals(numbers, np.arange(400.0)))
-    assert (leapt.leaps, leapt.parts, leapt.outcomes.tolist()) == (1, 2, [1] * 400)
-    away = series_of(MessageArrivals(numbers, numbers.astype(np.float64)))
-    assert (away.leaps, away.parts, len(away.outcomes), away.outcomes.sum()) == (0, 1, 100_200, 400)
-
-
-def test_a_long_silence_can_be_left_out() -> None:
-    """With a limit, a recorder that paused or a robot that was away for a minute loses no messages; short gaps still do."""
-    numbers = np.concatenate([np.arange(0, 100, 2), 700 + np.arange(0, 100, 2)])
-    arrivals = MessageArrivals(numbers, numbers / 10.0)
-    assert series_of(arrivals).outcomes.sum() == len(numbers)
-    found = series_of(arrivals, longest=30.0)
-    assert found.outages == pytest.approx((60.2,))
-    assert found.outcomes.tolist() == ([1, 0] * 49 + [1]) * 2
-
-
-def test_too_many_outcomes_are_refused() -> None:
-    """Before memory is taken for them."""
-    arrivals = MessageArrivals(np.array([0, 1, 10**9]), np.array([0.0, 1.0, 1e9]))
-    with pytest.raises(ValueError, match="more than 10000000 outcomes"):
-        series_of(arrivals)
-
-
-def test_regular_messages_are_numbered_by_their_times() -> None:
-    """Up to a quarter of a period of jitter; messages further away are counted."""
-    random = np.random.default_rng(5)
-    kept = np.flatnonzero(lossy(BURSTS, 2000))
-    numbers, off = numbers_of_times(kept * 0.1 + random.uniform(-0.01, 0.01, len(kept)), 0.1)
-    assert numbers.tolist() == (kept - kept[0]).tolist()
-    assert off == 0.0
-    assert numbers_of_times(np.sort(random.uniform(0.0, 200.0, 2000)), 0.1)[1] > 0.3
 
 
 def test_a_recording_without_numbers_needs_a_period(tmp_path: Path) -> None:
