@@ -103,7 +103,7 @@ def over_wire(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--wire-key",
         metavar="KEY",
-        help="the key of the packets on the wire; default that of the program of the states",
+        help="the key that the packets have on the wire; default the key of the program that gives the states",
     )
     parser.add_argument(
         "--wire-side",

@@ -229,7 +229,7 @@ def test_the_key_of_the_program_is_the_default() -> None:
 
 
 def test_wires_in_scenarios_are_checked() -> None:
-    """Receivers that are none, and those with several links."""
+    """Names that are not receivers, and receivers with several links."""
     several = {"eve": {"strategy": "colluding", "reads_as": "smart", "links": [{"quality": 0.5}, {"quality": 0.5}]}}
     links = {"mallory": "tap", "eve": "tap"}
     with pytest.raises(ScenarioError) as caught:

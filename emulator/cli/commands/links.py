@@ -106,20 +106,24 @@ def _fits(parser: argparse.ArgumentParser) -> None:
         "--topic", metavar="T", help="the topic of an MCAP recording; default the only one with numbers"
     )
     parser.add_argument(
-        "--period", type=float, metavar="S", help="seconds between two messages, of a sender that does not number them"
+        "--period", type=float, metavar="S", help="seconds between two messages of a sender that does not number them"
     )
     parser.add_argument("--link", metavar="NAME", help="the link of a wire; default the only one with messages")
     parser.add_argument("--key", metavar="K", help="only messages of a wire with keys that this key expression takes")
     parser.add_argument(
-        "--gaps", action="store_true", help="what was lost before a wire: numbers that are missing in its journal"
+        "--gaps",
+        action="store_true",
+        help="fit what was lost before the wire: the numbers that are missing in its journal",
     )
     parser.add_argument(
-        "--outage", type=float, metavar="S", help="a silence of more than so many seconds is not counted as losses"
+        "--outage",
+        type=float,
+        metavar="S",
+        help="do not count silences longer than this many seconds as losses",
     )
     parser.add_argument(
         "--slot", type=float, metavar="S", help="seconds of a scenario's slot; default the median time between messages"
     )
-
     parser.add_argument(
         "--save",
         type=Path,

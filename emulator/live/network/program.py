@@ -78,7 +78,7 @@ class ProgramStates:
         self._session.close()
 
     def _hear(self, sample: zenoh.Sample) -> None:
-        """Keep a message; called on a thread of Zenoh's. Deletions, and messages of another key, are no states."""
+        """Keep a message; called on a thread of Zenoh's. Deletions, and messages of another key, are not states."""
         if sample.kind != zenoh.SampleKind.PUT or str(sample.key_expr) != self._entry.key:
             return
         large = len(sample.payload) > MOST_BYTES
