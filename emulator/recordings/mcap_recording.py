@@ -159,7 +159,7 @@ class _Reader:
     def _files(self) -> Sequence[Path]:
         if not is_folder(self._path):
             return [self._path]
-        return sorted(self._path.glob(f"*{SUFFIX}"), key=lambda path: (len(path.name), path.name))
+        return sorted(self._path.glob(f"*{SUFFIX}"))
 
     def _records(self, path: Path, reader: StreamReader, file: BinaryIO) -> Iterator[Any]:
         """Channels, and messages as tuples as in `_MESSAGE`, up to the end or up to where the file breaks off."""
@@ -255,8 +255,7 @@ class _Reader:
 
     def _periodic(self, messages: _Messages, period: float, longest: float | None) -> MessageSeries:
         """What became of messages that are sent regularly."""
-        in_order = np.argsort(messages.sent, kind="stable")
-        sent = messages.of(in_order).sent
+        sent = np.sort(messages.sent)
         numbers, off = numbers_of_times(sent, period)
         if off > _MOST_OFF:
             self._no(
@@ -268,10 +267,7 @@ class _Reader:
             f"numbered by their times, {period:g} s apart ({100 * off:.2g} % are more than a quarter of that off): "
             "a message that the publisher left out counts as lost"
         )
-        series = self._series(MessageArrivals(numbers, sent, sent), longest, None)
-        kept = np.zeros(len(sent), np.bool_)
-        kept[in_order] = series.kept
-        return replace(series, kept=kept)
+        return self._series(MessageArrivals(numbers, sent, sent), longest, None)  # which keeps all, in any order
 
     def _series(self, arrivals: MessageArrivals, longest: float | None, wrap: int | None) -> MessageSeries:
         try:

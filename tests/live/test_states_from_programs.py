@@ -145,6 +145,17 @@ def test_states_are_taken_from_messages_as_they_come() -> None:
                     states.take(range(3, 4))
 
 
+def test_a_silent_program_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With key, endpoint, slot and how long it was silent."""
+    monkeypatch.setattr("evedrop.live.network.program.LEAST_SECONDS", 0.0)
+    entry = ProgramEntry("robot/pose", ["x", "v"], [0.0, 0.0], listen="tcp/127.0.0.1:0")
+    with ProgramStates(entry, False, 0.01) as states:
+        with pytest.raises(RunError, match=r"robot/pose at tcp/127.0.0.1:0: no state came for 0 s; check that"):
+            states.take(range(1))
+        with pytest.raises(RunError, match="no state came after that of slot 6 for 0 s"):
+            states.take(range(7, 8))
+
+
 def test_a_message_that_is_no_state_ends_the_run(tmp_path: Path) -> None:
     """The message names key, endpoint, slot and value; the slots so far can be repeated."""
     source = program()

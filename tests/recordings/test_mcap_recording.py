@@ -145,7 +145,7 @@ def test_reliable_delivery_is_told(tmp_path: Path) -> None:
 
 
 def test_a_split_bag_is_one_recording(tmp_path: Path) -> None:
-    """The files of a bag's folder follow each other, the tenth after the ninth."""
+    """The files of a bag's folder follow each other, the tenth after the ninth, by the times in them."""
     messages = heard(lossy(BURSTS, 1100))
     (tmp_path / "bag").mkdir()
     for at in range(11):

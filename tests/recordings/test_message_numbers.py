@@ -15,7 +15,7 @@ from tests.recordings.recorded_messages import BURSTS, heard, lossy, trimmed
 
 @given(
     st.lists(st.integers(0, 1), min_size=2, max_size=60).filter(lambda word: sum(word) > 1),
-    st.integers(0, 2**32 - 1),
+    st.integers(0, 2**32 - 1) | st.integers(2**32 - 60, 2**32 - 1),
     st.randoms(use_true_random=False),
 )
 def test_late_and_repeated_messages_are_no_losses(word: list[int], first: int, random: Any) -> None:
@@ -28,6 +28,8 @@ def test_late_and_repeated_messages_are_no_losses(word: list[int], first: int, r
     found = series_of(MessageArrivals(numbers, np.arange(len(arrived), dtype=np.float64), sent), wrap=2**32)
     assert found.outcomes.tolist() == trimmed(np.array(word, np.uint8))
     assert found.repeated == len(arrived) - len(places)
+    firsts = list(dict.fromkeys(arrived))
+    assert found.late == sum(place < max(firsts[: i + 1]) for i, place in enumerate(firsts))
     assert found.parts == 1
     assert found.kept.sum() == len(places)
 
@@ -45,6 +47,15 @@ def test_a_sender_that_starts_again_loses_nothing(before: int, times_known: bool
     found = series_of(MessageArrivals(np.array(numbers), clock, sent if times_known else None), wrap=2**32)
     assert (found.parts, found.restarts, found.late, found.repeated) == (2, 1, 1, 0)
     assert found.outcomes.tolist() == trimmed(first) + trimmed(second)
+
+
+@pytest.mark.parametrize(("behind", "restarts"), [(50, 0), (80, 1)])
+def test_a_number_far_behind_is_a_restart(behind: int, restarts: int) -> None:
+    """Without times of sending, even if the number that was due follows: what is 64 numbers behind or less is late."""
+    numbers = np.delete(np.arange(300), 200 - behind).tolist()
+    numbers.insert(199, 200 - behind)
+    found = series_of(MessageArrivals(np.array(numbers), np.arange(300.0)))
+    assert (found.restarts, found.late) == (restarts, 1 - restarts)
 
 
 def test_a_counter_that_leaps_is_no_loss() -> None:

@@ -71,6 +71,7 @@ def test_slots_may_last_longer(tmp_path: Path) -> None:
         (GOOD.replace("1,0.6,0.2", "1,,0.2"), "line 3: P_solar is empty; expected a finite number"),
         (GOOD.replace("1,0.6,0.2", "1,nan,0.2"), 'line 3: P_solar is "nan"; expected a finite number'),
         (GOOD.replace("1,0.6,0.2\n", ""), "line 3: the time is 2 s after 0 s; expected 1 s, for slots of 1 s: a gap of 1 slot:"),
+        (GOOD.replace("2,0.7", "2.05,0.7"), "line 4: the time is 2.05 s after 1 s; expected 2 s, for slots of 1 s"),
         (GOOD.replace("2,0.7", "1,0.7"), "line 4: the time is 1 s after 1 s; expected 2 s, for slots of 1 s: times must grow"),
         (GOOD.replace("0,0.5,0.2\n", ""), "line 2: the time starts at 1 s; expected 0"),
         (GOOD.replace("2,0.7,1.25\n", ""), "has 2 rows; expected slots, which is 3, or more: a longer file, or --slots 2"),

@@ -175,12 +175,12 @@ def test_the_scenarios_of_a_comparison_can_be_run(tmp_path: Path) -> None:
 
 def test_a_program_cannot_be_asked_in_memory(tmp_path: Path) -> None:
     """The message says what can be done; a file that the scenario names as well is used if it says so."""
-    (tmp_path / "pose.csv").write_text("x,v\n" + "".join(f"{x},{v}\n" for x, v in ROWS))
-    entries = {"source": "zenoh", "zenoh": PROGRAM, "state_file": str(tmp_path / "pose.csv")}
+    entries = {"source": "zenoh", "zenoh": PROGRAM, "state_file": str(tmp_path / "pose.csv")}  # not read, nor there
     with pytest.raises(UsageError, match="only a live run can take states from a program"):
         montecarlo(checked(tables(entries), "file"), trials=2, out=tmp_path / "refused")
     assert not (tmp_path / "refused").exists()
     with pytest.raises(UsageError, match="the states are given"):
         montecarlo(checked(tables(entries), "file"), out=tmp_path / "refused", plan=Plan(Mode.ERROR_COORDINATES))
+    (tmp_path / "pose.csv").write_text("x,v\n" + "".join(f"{x},{v}\n" for x, v in ROWS))
     found = states_of(checked(tables({**entries, "source": "file"}), "file"))
     assert np.array_equal(np.array(found), ROWS)

@@ -1,0 +1,77 @@
+"""When a sensor takes the states of a program."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evedrop.live.launch.briefs import ObserverTask, briefs_of
+from evedrop.live.protocol.brief import Flow
+from evedrop.live.protocol.commands import End, Start
+from evedrop.loading import checked
+from evedrop.model.process import Floats
+from evedrop.peers.sensor import sense
+from tests.builders import MARGINAL, process_table
+from tests.clock import TestClock
+from tests.conftest import LIMIT, wait_until
+from tests.live.in_memory import Stage
+
+
+class LateProgram:
+    """A program whose state of slot 3 comes 7 seconds late."""
+
+    def __init__(self, clock: TestClock) -> None:
+        self.clock, self.waited = clock, 0.0
+        self.taken: list[float] = []
+
+    def __enter__(self) -> LateProgram:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Nothing to close."""
+
+    def take(self, slots: range) -> Floats:
+        """The state of a slot; notes when the sensor asked for it."""
+        self.taken.append(self.clock.now)
+        self.waited = 7.0 if slots.start == 3 else 0.0
+        self.clock.now += self.waited
+        return np.zeros((1, 2))
+
+
+def test_slots_after_a_late_state_are_due_that_much_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They do not hurry to make up for it: each takes its state a pace after the slot before."""
+    clock, stage = TestClock(), Stage()
+    program = LateProgram(clock)
+    asked: list[bool] = []
+
+    def opened(_: Any, newest: bool, __: float) -> LateProgram:
+        asked.append(newest)
+        return program
+
+    monkeypatch.setattr("evedrop.peers.sensor.ProgramStates", opened)
+    monkeypatch.setattr("evedrop.peers.sensor.time", clock)
+    link = {"link": {"quality": 0.8}}
+    source = {"source": "zenoh", "states": ["x", "v"], "zenoh": {"key": "pose", "connect": "tcp/127.0.0.1:1"}}
+    tables = {
+        "title": "Late",
+        "slots": 8,
+        "pace": 0.5,
+        "process": {**process_table(MARGINAL), **source},
+        "encoding": {"scheme": "plain"},
+        "legitimate": link,
+    }
+    made = briefs_of(checked(tables, "file"), "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False))["sensor"]
+    thread = threading.Thread(target=sense, args=(replace(made, flow=Flow(12, 4)), stage.session), daemon=True)
+    thread.start()
+    stage.commands.put(Start().pack())
+    wait_until(lambda: len(program.taken) == 8, "all slots have a state")
+    stage.commands.put(End().pack())
+    thread.join(LIMIT)
+    late = [0.0 if k <= 3 else 7.0 for k in range(8)]
+    assert program.taken == pytest.approx([1000.0 + 0.5 * k + more for k, more in enumerate(late)])
+    assert asked == [True]
