@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import json
 import os
 import shutil
 import struct
@@ -31,21 +30,17 @@ from evedrop.results.folder import make_private
 from evedrop.wire.crossing import RECORD, UNLINKED, Crossing, Kind
 from evedrop.wire.history import Numbered, WireHistory, highest
 from evedrop.wire.journal_part import (
-    REASONS,
     STORED,
     JournalPart,
     Records,
-    Words,
     amend_parquet,
+    records_of,
     table_of,
     write_parquet,
 )
-from evedrop.wire.journal_reader import (
-    JOURNAL_FOLDER,
-    UNFINISHED,
-    parquet_path,
-)
+from evedrop.wire.journal_reader import JOURNAL_FOLDER, UNFINISHED, parquet_path
 from evedrop.wire.journal_recovery import locked, recover
+from evedrop.wire.journal_words import JournalWords
 from evedrop.wire.plan import WirePlan
 
 PART_ROWS = 2**17
@@ -82,11 +77,11 @@ class WireJournal:
         self.amendment_listeners: list[AmendmentListener] = []
         self.event_listeners: list[EventListener] = []
         self.incomplete_since: float | None = None
-        """The time from which on the disk had no room for something; None: the journal is complete."""
+        """When the disk had no room for something for the first time; None: it always had room."""
         self.recorded = 0
         """The number of all records, when it is closed."""
         self.missing = 0
-        """The number of records for which the disk had no room; listeners got them."""
+        """The number of records that are not on the disk, because it had no room for them; listeners got them."""
         self.links = [link.name for link in plan.links]
         """The names of the links, in the order of their codes."""
         self._tell = tell
@@ -97,9 +92,6 @@ class WireJournal:
         self._rows = part_rows
         self._state = threading.RLock()  # guards the parts
         self._handing = threading.RLock()  # so that listeners get blocks in order
-        self._naming = threading.Lock()
-        self._codes: dict[str, dict[str, int]] = {"key": {"": 0}, "source": {"": 0}}
-        self._texts: dict[str, list[str]] = {"key": [""], "source": [""]}
         self._parts: dict[int, JournalPart] = {}
         self._buffers: dict[int, Any] = {}
         self._next = 0  # the part whose rows are handed over now
@@ -127,13 +119,11 @@ class WireJournal:
     def _begin(self, plan: WirePlan) -> None:
         self._history = WireHistory.read(self._folder)
         self.recovered = recover(self._folder, self._history)
-        """The number of records that were left behind by an earlier start, because it was killed or the disk was full."""
+        """The number of records that an earlier start left behind, because it was killed or the disk was full."""
         self.counts: dict[Numbered, int] = dict(self._history.counts)
         """(link, key, kind of stream) → the number of its next message, as of the records handed to the listeners."""
         self._history.begin(plan, time.time())
-        self._words = os.open(
-            self._place / f"{self._history.start:03d}.words", os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600
-        )
+        self._words = JournalWords(self._place, self.start, self._miss)
         self._alive = os.open(self._place / "alive", os.O_WRONLY | os.O_CREAT, 0o600)
         self._beat()
         self._add_part(0)
@@ -145,19 +135,15 @@ class WireJournal:
 
     def key_code(self, key: str) -> int:
         """The code of a key in records."""
-        return self._codes["key"].get(key) or self._new_code("key", key)
+        return self._words.key_code(key)
 
     def source_code(self, source: str) -> int:
         """The code of a sender in records; 0 for "", a sender that is not known."""
-        return self._codes["source"].get(source) or self._new_code("source", source)
+        return self._words.source_code(source)
 
     def key_of(self, code: int) -> str:
         """The key that has a code."""
-        return self._texts["key"][code]
-
-    def source_of(self, code: int) -> str:
-        """The sender that has a code."""
-        return self._texts["source"][code]
+        return self._words.key_of(code)
 
     def changes_of(self, link: str, key: str, kind: str) -> tuple[Change, ...]:
         """The settings that the messages of a stream had, from message 0 on: what `KeyFates` needs to go on."""
@@ -169,7 +155,7 @@ class WireJournal:
             try:
                 self._history.change(link, settings, since, time.time())
             except OSError as error:
-                self._miss(error, time.time())
+                self._miss(error)
 
     def note(self, line: str) -> None:
         """Note an event that happens now, and tell the listeners."""
@@ -178,7 +164,7 @@ class WireJournal:
             try:
                 self._history.note(line, now)
             except OSError as error:
-                self._miss(error, now)
+                self._miss(error)
         self._hear(self.event_listeners, now, line)
 
     def amend(self, row: int, fate: Crossing) -> None:
@@ -232,7 +218,8 @@ class WireJournal:
                 f"the journal's last Parquet files cannot be written ({error.strerror}); its records stay in {self._place}, "
                 "where all commands read them; make room, and the next start of the wire makes the files"
             )
-        for descriptor in (self._words, self._alive, self._lock):
+        self._words.close()
+        for descriptor in (self._alive, self._lock):
             os.close(descriptor)
 
     def __enter__(self) -> WireJournal:
@@ -263,7 +250,7 @@ class WireJournal:
             row = number()  # atomic
             part = row // rows
             if part not in buffers:
-                room(part, time)
+                room(part)
             at, stored = row % rows * width, fate + STORED
             try:
                 write(buffers[part], at, time, n, sequence, delay, key, source, size, link, kind, stored)
@@ -274,26 +261,30 @@ class WireJournal:
 
         return record
 
-    def _room(self, at: int, now: float) -> None:
+    def _room(self, at: int) -> None:
         """Make a part in the thread that records, because the journal's own thread could not do so in time."""
         with self._state:
             if at not in self._buffers:
                 try:
                     self._add_part(at)
                 except OSError as error:
-                    self._miss(error, now)
+                    self._miss(error)
                     self._parts[at] = JournalPart(None, self._rows)
                     self._buffers[at] = self._parts[at].buffer
 
     def _add_part(self, at: int) -> None:
-        self._parts[at] = JournalPart(self._place / f"{self._history.start:03d}-{at + 1:04d}.rows", self._rows)
+        self._parts[at] = JournalPart(self._place / f"{self._name(at)}.rows", self._rows)
         self._buffers[at] = self._parts[at].buffer
+
+    def _name(self, at: int) -> str:
+        """The name of a part."""
+        return f"{self.start:03d}-{at + 1:04d}"
 
     def _tend(self) -> None:
         """The thread: blocks for the listeners, room for the next records, Parquet files."""
         while not self._ended.wait(_TICK):
             self.flush()
-            with contextlib.suppress(OSError):  # a wire that is killed then has less to say of delayed messages
+            with contextlib.suppress(OSError):  # if the wire is killed, more of the delayed messages count as underway
                 self._beat()
             with self._state, contextlib.suppress(OSError):  # `_room` tries again, and tells of it
                 part = self._parts.get(self._next)
@@ -302,7 +293,7 @@ class WireJournal:
             now = time.time()
             over = sorted(at for at, part in self._parts.items() if part.full and part.settled + _PATIENCE < now)
             for at in over:
-                if self._parts[at].path is None:  # it was in memory alone, where there is no room for many
+                if self._parts[at].path is None:  # memory has no room for many parts
                     self._convert(at)
             if now < self._convert_after:
                 continue
@@ -338,15 +329,26 @@ class WireJournal:
             highest(self.counts, name, n)
 
     def _convert(self, at: int) -> None:
-        """Make the Parquet file of a part, and forget the part. Raises OSError if the disk is full: it stays as it is."""
-        part = self._parts[at]
+        """Make the Parquet file of a part, and forget the part.
+
+        Raises OSError if the disk is full: the part stays as it is. A part in memory is forgotten all the same.
+        """
+        part, path = self._parts[at], parquet_path(self._folder, self._name(at))
         while True:
             with self._state:
                 amendments, records = part.amendments, part.whole()
-            if part.path is not None and len(records):
-                write_parquet(parquet_path(self._folder, part.path.stem), table_of(records, self._all_words()))
+            try:
+                if len(records):
+                    write_parquet(path, table_of(records, self._words.words(self.links)))
+                written = len(records)
+            except OSError:
+                if part.path is not None:
+                    raise
+                written = 0
             with self._state:
                 if amendments == part.amendments:
+                    if part.path is None:
+                        self.missing -= written
                     part.remove()
                     del self._parts[at], self._buffers[at]
                     return
@@ -357,56 +359,24 @@ class WireJournal:
         for row, fate in [self._amended_late.popleft() for _ in range(len(self._amended_late))]:
             at, place = divmod(row, self._rows)
             parts.setdefault(at, {})[place] = fate
+        links = {name: code for code, name in enumerate(self.links)}
         for at, fates in parts.items():
-            path = parquet_path(self._folder, f"{self._history.start:03d}-{at + 1:04d}")
-            if not path.exists():  # its records were in memory alone
+            path = parquet_path(self._folder, self._name(at))
+            if not path.exists():  # the disk had no room for this part
                 continue
             try:
-                before = amend_parquet(path, fates)
+                before = records_of(amend_parquet(path, fates), links, self._words.key_codes)
             except OSError:
                 self._amended_late.extend((at * self._rows + place, fate) for place, fate in fates.items())
                 raise
-            for amended, fate in zip(before, fates.values(), strict=True):
-                self._hear(self.amendment_listeners, self._record_of(amended), fate)
+            for i, fate in enumerate(fates.values()):
+                self._hear(self.amendment_listeners, before[i : i + 1], fate)
 
-    def _record_of(self, row: Mapping[str, Any]) -> Records:
-        """The record of a row of a table."""
-        fates = {reason: fate for fate, reason in REASONS.items()}
-        record = np.zeros(1, RECORD)
-        record["link"] = UNLINKED if row["link"] is None else self.links.index(row["link"])
-        record["key"], record["source"] = self.key_code(row["key"]), self.source_code(row["source"] or "")
-        record["fate"], record["kind"] = fates.get(row["reason"], Crossing.DELIVERED), Kind[row["kind"].upper()]
-        record["sequence"], record["n"] = (-1 if row[name] is None else row[name] for name in ("sequence", "n"))
-        for name in ("time", "delay", "size"):
-            record[name] = row[name]
-        return record
-
-    def _new_code(self, what: str, text: str) -> int:
-        with self._naming:
-            codes, texts = self._codes[what], self._texts[what]
-            if text not in codes:
-                texts.append(text)
-                self._write_word(json.dumps([what, len(texts) - 1, text]).encode() + b"\n")
-                codes[text] = len(texts) - 1  # last, because other threads read it without the lock
-            return codes[text]
-
-    def _write_word(self, line: bytes) -> None:
-        before = os.fstat(self._words).st_size
-        try:
-            if os.write(self._words, line) != len(line):
-                os.ftruncate(self._words, before)
-                raise OSError(28, os.strerror(28))  # ENOSPC: only a full disk accepts part of a line
-        except OSError as error:
-            self._miss(error, time.time())
-
-    def _all_words(self) -> Words:
-        return Words(self.links, dict(enumerate(self._texts["key"])), dict(enumerate(self._texts["source"])))
-
-    def _miss(self, error: OSError, now: float) -> None:
-        """Note that the disk did not take something, and tell so the first time."""
+    def _miss(self, error: OSError) -> None:
+        """Note that the disk had no room for something, and tell so the first time."""
         if self.incomplete_since is None:
-            self.incomplete_since = now
-            at = time.strftime("%H:%M:%S", time.localtime(now))
+            self.incomplete_since = time.time()
+            at = time.strftime("%H:%M:%S", time.localtime(self.incomplete_since))
             self._tell(
                 f"the journal is incomplete from {at} on, because {self._folder} cannot be written ({error.strerror}); the wire "
                 "goes on; make room"

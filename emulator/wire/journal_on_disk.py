@@ -8,20 +8,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import final
 
-import numpy as np
 import pyarrow as pa
 
 from evedrop.model.slot.link import Change
-from evedrop.wire.crossing import AGAIN, RECORD, UNLINKED, Crossing, Kind
 from evedrop.wire.history import WireHistory
 from evedrop.wire.journal import AmendmentListener, Listener
-from evedrop.wire.journal_part import REASONS, Records, codes_of
+from evedrop.wire.journal_part import records_of
 from evedrop.wire.journal_reader import JOURNAL_FOLDER, journal_tables
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.summary import WireSummary
-
-_FATES = {reason: int(fate) for fate, reason in REASONS.items()}
-_KINDS = {one.name.lower(): int(one) for one in Kind}
 
 
 def summary_on_disk(folder: Path, plan: WirePlan) -> WireSummary:
@@ -63,25 +58,13 @@ class JournalOnDisk:
     def read(self) -> None:
         """Hand all records to the listeners. Raises UsageError if there is no journal."""
         for table in journal_tables(self._folder, self.start):
-            records = self._records(table)
+            for key in {*_words(table["key"])} - {*self._codes}:
+                self._codes[key] = len(self._keys)
+                self._keys.append(key)
+            records = records_of(table, self._links, self._codes)
             self.recorded += len(records)
             for listener in self.listeners if len(records) else ():
                 listener(records)
-
-    def _records(self, table: pa.Table) -> Records:
-        """The rows of a table as records; senders are left out."""
-        for key in {*_words(table["key"])} - {*self._keys}:
-            self._codes[key] = len(self._keys)
-            self._keys.append(key)
-        rows = np.zeros(table.num_rows, RECORD)
-        for name, none in (("time", None), ("n", -1), ("sequence", -1), ("delay", None), ("size", None)):
-            column = table[name] if none is None else table[name].fill_null(none)
-            rows[name] = column.to_numpy()
-        rows["key"] = codes_of(table["key"], self._codes, 0)
-        rows["link"] = codes_of(table["link"], self._links, UNLINKED)
-        rows["fate"] = codes_of(table["reason"], _FATES, Crossing.DELIVERED)
-        rows["kind"] = codes_of(table["kind"], _KINDS, Kind.PUT) | np.where(table["again"].to_numpy(), AGAIN, 0)
-        return rows
 
 
 def _words(column: pa.ChunkedArray) -> list[str]:

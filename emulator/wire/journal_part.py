@@ -35,6 +35,7 @@ REASONS: dict[Crossing, str] = {
     one: "loss" if one is Crossing.LOST else one.name.lower() for one in Crossing if one is not Crossing.DELIVERED
 }
 """The reason for each fate, as it is called in tables."""
+_FATES = {reason: int(fate) for fate, reason in REASONS.items()}
 _WORDS = ("delivered", "lost", "dropped")
 
 
@@ -47,7 +48,7 @@ _WORD_CODES = np.zeros(256, np.int8)
 _REASON_CODES = np.zeros(256, np.int8)
 for _at, _fate in enumerate(REASONS):
     _WORD_CODES[_fate], _REASON_CODES[_fate] = _WORDS.index(word_of(_fate)), _at
-_KINDS = tuple(one.name.lower() for one in Kind)
+_KINDS = {one.name.lower(): int(one) for one in Kind}
 
 PARQUET = pa.schema(
     [
@@ -95,7 +96,7 @@ class JournalPart:
         self.amendments = 0
         """How many times a fate was changed."""
         self.settled = 0.0
-        """The time from which on none of these rows is delayed any more."""
+        """When the last delay of these rows is over, in seconds since 1970."""
 
     def take(self) -> Records:
         """A copy of the rows that are whole and were not taken yet, up to the first that is not whole."""
@@ -151,7 +152,7 @@ def _mapped(path: Path, size: int) -> mmap.mmap:
 
 
 def _whole(stored: Records) -> Records:
-    """A copy of the whole ones of stored records, with their fates."""
+    """A copy of those of the stored records that are whole, with their fates."""
     records: Records = stored[stored["fate"] != 0]
     records["fate"] -= STORED
     return records
@@ -179,7 +180,7 @@ def table_of(records: Records, words: Words) -> pa.Table:
         pa.array(records["delay"]),
         pa.array(records["n"], mask=records["n"] < 0),
         pa.DictionaryArray.from_arrays(
-            pa.array((records["kind"] & ~np.uint8(AGAIN)).astype(np.int8)), pa.array(_KINDS)
+            pa.array((records["kind"] & ~np.uint8(AGAIN)).astype(np.int8)), pa.array(list(_KINDS))
         ),
         pa.array((records["kind"] & AGAIN) != 0),
     )
@@ -195,7 +196,20 @@ def _words(codes: NDArray[np.uint32], words: Mapping[int, str], what: str) -> pa
     )
 
 
-def codes_of(column: pa.ChunkedArray, codes: Mapping[str, int], none: int) -> NDArray[np.int64]:
+def records_of(table: pa.Table, links: Mapping[str, int], keys: Mapping[str, int] | None = None) -> Records:
+    """The rows of a table as records, without their senders. links, keys: name → code; without keys, all keys have code 0."""
+    rows = np.zeros(table.num_rows, RECORD)
+    for name, null in (("time", None), ("n", -1), ("sequence", -1), ("delay", None), ("size", None)):
+        column = table[name] if null is None else table[name].fill_null(null)
+        rows[name] = column.to_numpy()
+    rows["key"] = 0 if keys is None else _codes(table["key"], keys, 0)
+    rows["link"] = _codes(table["link"], links, UNLINKED)
+    rows["fate"] = _codes(table["reason"], _FATES, Crossing.DELIVERED)
+    rows["kind"] = _codes(table["kind"], _KINDS, Kind.PUT) | np.where(table["again"].to_numpy(), AGAIN, 0)
+    return rows
+
+
+def _codes(column: pa.ChunkedArray, codes: Mapping[str, int], none: int) -> NDArray[np.int64]:
     """The codes of the words of a dictionary column; none: of null, and of an unknown word."""
     parts = [np.empty(0, np.int64)]
     for chunk in column.chunks:
@@ -217,10 +231,10 @@ def write_parquet(path: Path, table: pa.Table) -> None:
         raise
 
 
-def amend_parquet(path: Path, fates: Mapping[int, Crossing]) -> list[dict[str, Any]]:
+def amend_parquet(path: Path, fates: Mapping[int, Crossing]) -> pa.Table:
     """Change the fates of some rows of a Parquet file; returns the rows as they were. Raises OSError if it cannot be written."""
     table = pq.read_table(path)
-    before: list[dict[str, Any]] = table.take(list(fates)).to_pylist()
+    before = table.take(list(fates))
     for name, text_of in (("fate", word_of), ("reason", REASONS.get)):
         texts = table[name].cast(pa.string()).to_pylist()
         for row, fate in fates.items():

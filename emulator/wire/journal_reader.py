@@ -6,7 +6,6 @@ Source: docs/wire.md, the journal.
 from __future__ import annotations
 
 import contextlib
-import json
 import re
 import struct
 from collections.abc import Iterator, Mapping
@@ -20,7 +19,8 @@ from evedrop.errors import UsageError
 from evedrop.model.slot.link import NEVER
 from evedrop.wire.crossing import UNLINKED, Crossing, Kind
 from evedrop.wire.history import WireHistory
-from evedrop.wire.journal_part import PARQUET, Records, Words, records_in, table_of
+from evedrop.wire.journal_part import PARQUET, Records, records_in, table_of
+from evedrop.wire.journal_words import words_in
 
 JOURNAL_FOLDER = "journal"
 """The folder inside a wire's folder that contains its journal."""
@@ -30,11 +30,11 @@ UNFINISHED = "unfinished"
 
 
 def journal_tables(folder: Path | str, start: int | None = None) -> Iterator[pa.Table]:
-    """The journal of a wire's folder in the order of its rows, a table for each part; also of a wire that goes on or was killed.
+    """The journal of a wire's folder in the order of its rows, a table for each part.
 
-    A journal without messages is one empty table.
+    The wire may still run, or may have been killed. A journal without messages is one empty table.
 
-    start: the number of a start of the wire, from 1, of which only the rows are given.
+    start: only the rows of this start of the wire, from 1; None: the rows of all starts.
 
     Raises UsageError if there is no journal, or a part cannot be read.
     """
@@ -100,19 +100,6 @@ def part_names(journal: Path) -> list[str]:
 def parquet_path(journal: Path, name: str) -> Path:
     """The Parquet file of a part."""
     return journal / f"{name}.parquet"
-
-
-def words_in(unfinished: Path, start: int, links: list[str]) -> Words:
-    """The words of the codes in records of a start that did not end."""
-    words = Words(links, {}, {})
-    with contextlib.suppress(FileNotFoundError):
-        for line in (unfinished / f"{start:03d}.words").read_bytes().splitlines():
-            with contextlib.suppress(ValueError, TypeError, OverflowError, RecursionError):  # the last line may be torn
-                what, code, text = json.loads(line)
-                (words.keys if what == "key" else words.sources)[int(code)] = (
-                    str(text).encode("utf-8", "replace").decode()
-                )
-    return words
 
 
 def lost_with_the_process(records: Records, alive: float) -> Records:

@@ -10,19 +10,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pyarrow as pa
 import pyarrow.compute as pc
 import rerun as rr
-from numpy.typing import NDArray
 
 from evedrop.errors import UsageError
 from evedrop.results.folder import private_file
-from evedrop.wire.crossing import RECORD, UNLINKED, Crossing
 from evedrop.wire.file import load_wire
 from evedrop.wire.folder import WIRE_FILE
 from evedrop.wire.history import WireHistory
-from evedrop.wire.journal_part import REASONS, codes_of
+from evedrop.wire.journal_part import records_of
 from evedrop.wire.journal_reader import JOURNAL_FOLDER, journal_tables
 from evedrop.wire.notices import Notice, introduction, level_of
 from evedrop.wire.panels import Pace, WirePanels
@@ -45,13 +41,14 @@ def replay_wire(folder: Path, path: Path) -> Path:
         raise UsageError(f"{folder} shows nothing: no message came to the wire since its latest start")
     pace = Pace.of_length(max(0.0, max(ends) - history.began))
     panels, counter = WirePanels(plan, pace), StepCounter(len(plan.links), pace.step, history.began)
+    links = {link.name: link.number for link in plan.links}
     file = rr.RecordingStream("evedrop", recording_id=folder.resolve().name)
     try:
         file.save(private_file(path), default_blueprint=panels.layout())
         panels.style(file)
         panels.notes([*_notices(plan, history)], file)
         for table in journal_tables(folder, history.start):
-            for steps in counter.add(_records(table, plan)):
+            for steps in counter.add(records_of(table, links)):
                 panels.send(steps, file)
         for steps in counter.finish():
             panels.send(steps, file)
@@ -78,20 +75,8 @@ def summary_of_wire(folder: Path) -> dict[str, Any]:
 
 
 def _notices(plan: WirePlan, history: WireHistory) -> Iterator[Notice]:
-    """The lines of the events that messages do not tell."""
+    """The lines of the events panel that do not come from messages."""
     again = "" if history.start == 1 else f"; start {history.start} in this folder"
     yield Notice(0.0, "INFO", introduction(plan) + again)
     for time, line in history.said:
         yield Notice(max(0.0, time - history.began), level_of(line), line)
-
-
-def _records(table: pa.Table, plan: WirePlan) -> NDArray[Any]:
-    """The rows of a table as `RECORD` rows, with what the view needs."""
-    rows = np.zeros(table.num_rows, RECORD)
-    rows["time"], rows["delay"] = table["time"].to_numpy(), table["delay"].to_numpy()
-    links = {link.name: link.number for link in plan.links}
-    rows["link"] = codes_of(table["link"], links, UNLINKED)
-    rows["fate"] = codes_of(
-        table["reason"], {reason: int(fate) for fate, reason in REASONS.items()}, int(Crossing.DELIVERED)
-    )
-    return rows

@@ -1,0 +1,91 @@
+"""The keys and senders of a wire's messages, each with the code that stands for it in records.
+
+A line of the file `NNN.words` has a code and its text, so the records of a wire that was killed can be read.
+
+Source: docs/wire.md, the journal.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import final
+
+from evedrop.wire.journal_part import Words
+
+
+@final
+class JournalWords:
+    """The keys and senders of one start of a wire. Threads may call its methods at the same time."""
+
+    def __init__(self, unfinished: Path, start: int, miss: Callable[[OSError], None]) -> None:
+        """unfinished: the folder of the file; miss: called when the disk has no room for a word. Raises OSError."""
+        self._file = os.open(_path(unfinished, start), os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600)
+        self._miss = miss
+        self._naming = threading.Lock()
+        self._codes: dict[str, dict[str, int]] = {"key": {"": 0}, "source": {"": 0}}
+        self._texts: dict[str, list[str]] = {"key": [""], "source": [""]}
+
+    def key_code(self, key: str) -> int:
+        """The code of a key."""
+        return self._codes["key"].get(key) or self._new_code("key", key)
+
+    def source_code(self, source: str) -> int:
+        """The code of a sender; 0 for "", a sender that is not known."""
+        return self._codes["source"].get(source) or self._new_code("source", source)
+
+    def key_of(self, code: int) -> str:
+        """The key that has a code."""
+        return self._texts["key"][code]
+
+    @property
+    def key_codes(self) -> Mapping[str, int]:
+        """Key → code."""
+        return self._codes["key"]
+
+    def words(self, links: list[str]) -> Words:
+        """All codes so far and what they stand for. links: the names of the links, in the order of their codes."""
+        return Words(links, dict(enumerate(self._texts["key"])), dict(enumerate(self._texts["source"])))
+
+    def close(self) -> None:
+        """Close the file."""
+        os.close(self._file)
+
+    def _new_code(self, what: str, text: str) -> int:
+        with self._naming:
+            codes, texts = self._codes[what], self._texts[what]
+            if text not in codes:
+                texts.append(text)
+                self._write(json.dumps([what, len(texts) - 1, text]).encode() + b"\n")
+                codes[text] = len(texts) - 1  # last, because other threads read it without the lock
+            return codes[text]
+
+    def _write(self, line: bytes) -> None:
+        before = os.fstat(self._file).st_size
+        try:
+            if os.write(self._file, line) != len(line):
+                os.ftruncate(self._file, before)
+                raise OSError(28, os.strerror(28))  # ENOSPC: only a full disk accepts part of a line
+        except OSError as error:
+            self._miss(error)
+
+
+def words_in(unfinished: Path, start: int, links: list[str]) -> Words:
+    """The words of a start that has not ended, from its file."""
+    words = Words(links, {}, {})
+    with contextlib.suppress(FileNotFoundError):
+        for line in _path(unfinished, start).read_bytes().splitlines():
+            with contextlib.suppress(ValueError, TypeError, OverflowError, RecursionError):  # the last line may be torn
+                what, code, text = json.loads(line)
+                (words.keys if what == "key" else words.sources)[int(code)] = (
+                    str(text).encode("utf-8", "replace").decode()
+                )
+    return words
+
+
+def _path(unfinished: Path, start: int) -> Path:
+    return unfinished / f"{start:03d}.words"
