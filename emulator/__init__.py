@@ -30,8 +30,10 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOMES:
+    if name in __all__:
         import importlib  # noqa: PLC0415 - as above
 
+        if name == "wire":
+            return importlib.import_module("evedrop.wire")
         return getattr(importlib.import_module(_HOMES[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

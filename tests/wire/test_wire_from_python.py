@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import subprocess
+import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import pytest
 import zenoh
@@ -21,6 +24,29 @@ from evedrop.wire.running import ExpectationFailed, RunningWire
 from evedrop.wire.summary import WireSummary
 from tests.conftest import wait_until
 from tests.wire.wire_plans import wire_plan
+
+FAILING = """
+import pytest, time, zenoh
+
+WIRE = {"side": ["robot", "base"], "link": [{"name": "scan", "from": "robot", "to": "base", "quality": 0.0}],
+        "expect": [{"figure": "scan.delivery", "above": 0.9}]}
+
+
+def hear(radio):
+    with zenoh.open(radio.config("robot")) as robot:
+        while not radio.status().links["scan"].heard:
+            robot.put("a", b"")
+            time.sleep(0.01)
+
+
+def test_that_fails(evedrop_wire):
+    hear(evedrop_wire(**WIRE))
+    raise RuntimeError("the test's own error")
+
+
+def test_that_expects(evedrop_wire):
+    hear(evedrop_wire(**WIRE))
+"""
 
 LINK = {"name": "scan", "from": "robot", "to": "base", "quality": 0.6}
 
@@ -91,6 +117,47 @@ def used(running: RunningWire, got: list[int]) -> None:
         running.endpoint("moon")
     series = journal_recording(running.folder, "scan").series
     assert series.outcomes.tolist() == [int(row["reason"] is None) for row in rows if row["reason"] != "cut"]
+
+
+@pytest.mark.long
+def test_the_fixture_ends_the_wires_of_a_test_that_fails(tmp_path: Path) -> None:
+    """In order, and it fails a test whose wire does not meet an expectation."""
+    (tmp_path / "test_radio.py").write_text(FAILING)
+    options = ["-p", "evedrop.pytest_plugin", "-p", "no:cacheprovider", "--basetemp", "kept"]
+    command = [sys.executable, "-m", "pytest", *options, "."]
+    environment = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False, timeout=300
+    )
+    assert re.search(r"1 failed, 1 passed, 2 errors", done.stdout), done.stdout
+    assert "the test's own error" in done.stdout
+    assert "expected scan.delivery above 0.9: FAILED, found 0" in done.stdout
+    folders = [tmp_path / "kept" / name / "wire-1" for name in ("test_that_fails0", "test_that_expects0")]
+    for folder in folders:
+        assert (folder / "summary.json").is_file()
+        assert not (folder / "control.json").exists()
+
+
+def test_the_error_of_the_with_block_comes_first(tmp_path: Path) -> None:
+    """An expectation that failed as well does not hide it."""
+    expectation = {"figure": "scan.delivery", "above": 0.9}
+    entries: dict[str, Any] = {"side": ["robot", "base"], "link": [{**LINK, "quality": 0.0}], "expect": [expectation]}
+    running = wire(**entries, out=tmp_path / "wire")
+
+    def fail() -> NoReturn:
+        with zenoh.open(running.config("robot")) as robot:
+            wait_until(lambda: robot.put("a", b"") or heard(running), "the wire hears a message")
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError), running:
+        fail()
+    assert running.summary()["expectations"][0]["held"] is False
+
+
+def test_every_name_of_the_package_is_loaded_when_it_is_used() -> None:
+    """Without an import of its module: `evedrop.wire(...)` works after `import evedrop`."""
+    code = "import evedrop; assert all(callable(getattr(evedrop, name)) for name in evedrop.__all__)"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=100)
 
 
 def test_a_wire_that_cannot_begin_says_why(tmp_path: Path) -> None:
