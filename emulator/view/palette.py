@@ -41,6 +41,11 @@ LANES: tuple[Colour, ...] = (STATE, DECODED, DISCARDED, MISLED, DROPPED, SILENT)
 WIRE_LANES: tuple[Colour, ...] = (STATE, DECODED, DISCARDED, MISLED, DROPPED, SILENT, TRUTH)
 """What became of the messages of a wire's link; white is cut."""
 
+DROPPED_TEXT: Colour = (230, 78, 44)
+"""`DROPPED` for letters on the background of the theme, which need to be brighter than a lane."""
+WIRE_TEXTS: tuple[Colour, ...] = (STATE, MISLED, DROPPED_TEXT, TRUTH_CURVE, TRUTH)
+"""The links of a wire's graph by what they lost, those without messages, and the sides."""
+
 BLUE: Colour = (0, 114, 178)
 RED: Colour = (193, 39, 45)
 GREEN: Colour = (79, 191, 139)
@@ -62,6 +67,7 @@ PANELS: dict[str, tuple[Colour, ...]] = {
     "plant": PLANT,
     "lanes": LANES,
     "lanes of a wire": WIRE_LANES,
+    "graph of a wire": WIRE_TEXTS,
     "figures": FIGURES,
     "verdicts": VERDICTS,
 }

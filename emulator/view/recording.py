@@ -29,23 +29,26 @@ _MOST_SLOTS = 1024  # in a batch
 _MOST_WAITING = 20_000  # slots that the file may be behind before the run waits for it
 _FILE_TIMEOUT = 5.0  # seconds that the run waits for the file before it continues without one
 
-T = TypeVar("T")
+Chunk = TypeVar("Chunk")
+Note = TypeVar("Note")
 
 
-class RecordingThread(ABC, Generic[T]):
+class RecordingThread(ABC, Generic[Chunk, Note]):
     """A thread that writes a recording to `path`. Neither disk nor panels can make any method raise: see `failure`.
 
     A subclass says what is recorded. The constructor calls `_layout` and `_style`, the thread calls `_send`.
     """
 
-    def __init__(self, path: Path, name: str, notes: Sequence[Event] = ()) -> None:
+    def __init__(self, path: Path, name: str, notes: Sequence[Note]) -> None:
         """name: identifies the recording: recordings of the same name are shown as one. notes: the first lines."""
         self.failure: str | None = None
         """Why there is no recording on disk, or an incomplete one."""
-        self._waiting: list[T] = []
+        self._waiting: list[Chunk] = []
         self._waiting_size = 0
         self._notes = list(notes)
         self._closing = False
+        self._last = False
+        """Whether the present call of `_send` is the last one."""
         self._changed = threading.Condition()
         self._file = rr.RecordingStream(_APPLICATION, recording_id=name)
         try:
@@ -65,10 +68,10 @@ class RecordingThread(ABC, Generic[T]):
         """Record names, colours and the like, once."""
 
     @abstractmethod
-    def _send(self, chunks: list[T], notes: list[Event], to: rr.RecordingStream) -> bool:
+    def _send(self, chunks: list[Chunk], notes: list[Note], to: rr.RecordingStream) -> bool:
         """Record what came since the last call, about ten times a second; returns whether anything was recorded."""
 
-    def _append(self, chunk: T, size: int, most: int, patience: float) -> None:
+    def _append(self, chunk: Chunk, size: int, most: int, patience: float) -> None:
         """Append to the list. With more than `most` in it, wait, and after `patience` seconds do without a recording."""
         with self._changed:
             if self._waiting_size > most:
@@ -103,18 +106,18 @@ class RecordingThread(ABC, Generic[T]):
                 self._changed.wait_for(lambda: self._closing or self._waiting_size >= _MOST_SLOTS, _PERIOD)
                 chunks, self._waiting, self._waiting_size = self._waiting, [], 0
                 notes, self._notes = self._notes, []
-                closing = self._closing
+                self._last = self._closing
                 self._changed.notify_all()
             try:
                 self._put(chunks, notes)
             except Exception as error:  # if the thread died, the run would wait for it
                 self._give_up(repr(error))
-            if closing:
+            if self._last:
                 break
         if self.failure is None:
             self._file.disconnect()
 
-    def _put(self, chunks: list[T], notes: list[Event]) -> None:
+    def _put(self, chunks: list[Chunk], notes: list[Note]) -> None:
         if self.failure is not None or not self._send(chunks, notes, self._file):
             return
         try:
@@ -125,7 +128,7 @@ class RecordingThread(ABC, Generic[T]):
 
 
 @final
-class ViewRecording(RecordingThread[SceneSlots]):
+class ViewRecording(RecordingThread[SceneSlots, Event]):
     """Writes the recording of one run."""
 
     def __init__(self, path: Path, scene: Scene, warn: Callable[[str], None] = warn) -> None:

@@ -14,8 +14,8 @@ from typing import final
 import rerun as rr
 import rerun.blueprint as rrb
 
-from evedrop.view.palette import TRUTH
-from evedrop.wire.lane_states import share_of
+from evedrop.view.palette import DROPPED_TEXT, TRUTH, TRUTH_CURVE
+from evedrop.wire.lane_states import LaneState, share_of
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.step_counts import DELIVERED, Counts
 
@@ -23,6 +23,7 @@ GRAPH = "graph"
 """The graph's path in the recording."""
 _LETTER, _LINE = 7.0, 38.0  # width of a letter and distance of boxes in Rerun's drawing
 _LONGEST = ": 12.3 % lost"
+_TEXTS = {LaneState.QUIET: TRUTH_CURVE, LaneState.MOST: DROPPED_TEXT}  # for states whose lane is too dark for letters
 
 
 @final
@@ -62,7 +63,8 @@ class WireGraph:
         for counts in recent:
             labels += [*self._sides, *(f"{link.name}: {loss_of(counts[at])}" for at, link in enumerate(self._links))]
             colours += [TRUTH] * len(self._sides)
-            colours += [share_of(counts[at]).text for at in range(len(self._links))]
+            states = [share_of(counts[at]) for at in range(len(self._links))]
+            colours += [_TEXTS.get(state, state.colour) for state in states]
         lengths = [len(self._ids)] * len(recent)
         return rr.GraphNodes.columns(labels=labels, colors=colours).partition(lengths)
 

@@ -11,27 +11,24 @@ from evedrop.view import palette
 from evedrop.view.palette import Colour
 from evedrop.wire.crossing import Crossing
 from evedrop.wire.plan import WirePlan
-from evedrop.wire.step_counts import DELIVERED, OUTCOMES, Counts
-
-_UNDERWAY = OUTCOMES.index(Crossing.UNDERWAY)
+from evedrop.wire.step_counts import DELIVERED, OUTCOMES, UNDERWAY, Counts
 
 
 class LaneState(Enum):
-    """A word for a step of a lane, its colour, the colour's name, and a colour for text."""
+    """A word for a step of a lane, its colour, and the colour's name."""
 
-    QUIET = ("no message", palette.SILENT, "dark", palette.TRUTH_CURVE)
-    DELIVERED = ("all delivered", palette.STATE, "blue", palette.STATE)
-    SOME = ("some lost", palette.MISLED, "amber", palette.MISLED)
-    MOST = ("most lost", palette.DROPPED, "red", (246, 110, 78))
-    CUT = ("cut", palette.TRUTH, "white", palette.TRUTH)
-    FULL = ("queue full", palette.DISCARDED, "purple", (196, 150, 235))
-    OWN = ("not by the link", palette.DECODED, "green", (60, 190, 165))
+    QUIET = ("no message", palette.SILENT, "dark")
+    DELIVERED = ("all delivered", palette.STATE, "blue")
+    SOME = ("some lost", palette.MISLED, "amber")
+    MOST = ("most lost", palette.DROPPED, "red")
+    CUT = ("cut", palette.TRUTH, "white")
+    FULL = ("queue full", palette.DISCARDED, "purple")
+    OWN = ("not by the link", palette.DECODED, "green")
 
-    def __init__(self, word: str, colour: Colour, name_of_colour: str, text: Colour) -> None:
+    def __init__(self, word: str, colour: Colour, name_of_colour: str) -> None:
         self.word = word
         self.colour = colour
         self.name_of_colour = name_of_colour
-        self.text = text
 
 
 def state_of(counts: Counts) -> LaneState:
@@ -40,7 +37,7 @@ def state_of(counts: Counts) -> LaneState:
     Messages that were still underway when the wire ended do not count.
     """
     reasons = counts.copy()
-    reasons[[DELIVERED, _UNDERWAY]] = 0
+    reasons[[DELIVERED, UNDERWAY]] = 0
     if not reasons.any():
         return LaneState.DELIVERED if counts[DELIVERED] else LaneState.QUIET
     reason = OUTCOMES[int(reasons.argmax())]

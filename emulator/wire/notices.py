@@ -12,7 +12,7 @@ import numpy as np
 
 from evedrop.wire.crossing import Crossing
 from evedrop.wire.plan import WireLink, WirePlan
-from evedrop.wire.step_counts import CUT, DELIVERED, OUTCOMES, Counts, WireSteps
+from evedrop.wire.step_counts import CUT, DELIVERED, OUTCOMES, UNDERWAY, Counts, WireSteps
 
 WORDS = {
     Crossing.LOST: "lost",
@@ -29,13 +29,8 @@ WORDS = {
 """What became of messages that were not delivered, in a word or two."""
 
 _SECONDS, _MESSAGES = 0.5, 3  # a shorter stretch, or one of fewer messages, deserves no line
-_OFTEN = (
-    10.0  # seconds between the stretches of a link that get a line; if they are more frequent, only longer ones get it
-)
+_OFTEN = 10.0  # seconds between stretches of a link; if they come more often, only longer ones get a line
 _FIRST = 3  # stretches of a link that always get a line
-
-
-_UNDERWAY = OUTCOMES.index(Crossing.UNDERWAY)
 
 
 class Notice(NamedTuple):
@@ -50,7 +45,7 @@ class Notice(NamedTuple):
 
 @final
 class LinkWatcher:
-    """Finds the notices of all links, steps by steps. names: of the links; step: seconds."""
+    """Finds the notices of all links, block of steps by block. names: of the links; step: seconds."""
 
     def __init__(self, names: Iterable[str], step: float) -> None:
         self._step = step
@@ -122,7 +117,7 @@ class _Stretch:
         """Notices of steps from `first` on, by counts (c, outcomes)."""
         for at in np.flatnonzero(counts.any(1)).tolist():
             k = first + at
-            if counts[at, DELIVERED] or counts[at, _UNDERWAY]:
+            if counts[at, DELIVERED] or counts[at, UNDERWAY]:
                 yield from self._end(k)
                 continue
             if not self._lost.any():

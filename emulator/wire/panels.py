@@ -165,7 +165,7 @@ class WirePanels:
             _send(to, path, [self._next * self._pace.step], rr.StateChange.columns(state=[word]))
 
     def _reset(self, steps: WireSteps) -> None:
-        """At the beginning nothing is known of the time before; after a silence, there were no messages."""
+        """Forget the steps before these: at the beginning they are not known, and after a silence they had no messages."""
         before = 0 if self._total is None else self._pace.steps_per_rate - 1
         self._last_counts = np.zeros((before, *steps.counts.shape[1:]), np.int64)
         self._last_delays = np.zeros((before, *steps.delays.shape[1:]), np.int64)
@@ -249,7 +249,7 @@ def _curves(title: str, path: str, axis: rrb.TimeAxis, *, named: bool) -> rrb.Ti
 def _sliding(before: Counts | None, counts: Counts, over: int) -> tuple[Counts, Counts]:
     """Sums of `over` consecutive steps that end with each of the new ones, and the steps that the next call needs.
 
-    There is no sum for a new step before which fewer steps are known.
+    A step that has fewer than `over` - 1 known steps before it has no sum.
     """
     assert before is not None  # noqa: S101 - send makes it
     joined = np.concatenate([before, counts])

@@ -22,6 +22,7 @@ OUTCOMES: tuple[Crossing, ...] = tuple(Crossing)
 """The last axis of `WireSteps.counts`."""
 DELIVERED = OUTCOMES.index(Crossing.DELIVERED)
 CUT = OUTCOMES.index(Crossing.CUT)
+UNDERWAY = OUTCOMES.index(Crossing.UNDERWAY)
 
 _SPAN = 64  # steps that may be open at a time
 _BY_CODE = np.zeros(256, np.int64)
@@ -69,7 +70,7 @@ class StepCounter:
         self._delays = np.zeros((_SPAN, links + 1, _BUCKETS), np.int64)
 
     def add(self, rows: NDArray[Any]) -> Iterator[WireSteps]:
-        """Count the rows of a block, a `RECORD` array; gives the steps that are closed to make room, after a silence not all."""
+        """Count the rows of a block, a `RECORD` array; gives the steps that are closed to make room; of a silence, only a few."""
         at = np.floor((rows["time"] - self._start) / self._step).astype(np.int64)
         links = np.where(rows["link"] == UNLINKED, self._links, np.minimum(rows["link"], self._links)).astype(np.int64)
         outcomes, delays = _BY_CODE[rows["fate"]], rows["delay"]

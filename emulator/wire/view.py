@@ -18,7 +18,6 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from evedrop.view.events import Event
 from evedrop.view.recording import RecordingThread
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.notices import Notice, introduction, level_of
@@ -33,7 +32,7 @@ _JUMP = 1.0  # seconds by which the system's clock and a steady clock may differ
 
 
 @final
-class WireView(RecordingThread[NDArray[Any]]):
+class WireView(RecordingThread[NDArray[Any], Notice]):
     """Writes the recording of a wire to `path`. No method waits, and none raises: see `failure`."""
 
     def __init__(
@@ -56,9 +55,8 @@ class WireView(RecordingThread[NDArray[Any]]):
         now, steady = clocks()
         self._ahead, self._shift = now - steady, 0.0
         self._amended: list[tuple[NDArray[Any], int]] = []
-        self._lines = [Notice(0.0, "INFO", introduction(plan))]
         self._sent = 0.0
-        super().__init__(path, name)
+        super().__init__(path, name, [Notice(0.0, "INFO", introduction(plan))])
 
     def add(self, rows: NDArray[Any]) -> None:
         """Record a block of `RECORD` rows, which must not change afterwards."""
@@ -75,7 +73,7 @@ class WireView(RecordingThread[NDArray[Any]]):
         """Add a line to the events, at a time in seconds since 1970; level: INFO, WARN or ERROR."""
         with self._changed:
             if self.failure is None:
-                self._lines.append(Notice(self._elapsed(time), level, text))
+                self._notes.append(Notice(self._elapsed(time), level, text))
 
     def amend(self, rows: NDArray[Any], fate: int) -> None:
         """Change the fate of rows that were added."""
@@ -92,15 +90,12 @@ class WireView(RecordingThread[NDArray[Any]]):
     def _style(self, to: rr.RecordingStream) -> None:
         self._panels.style(to)
 
-    def _send(self, chunks: list[NDArray[Any]], notes: list[Event], to: rr.RecordingStream) -> bool:
-        del notes
+    def _send(self, chunks: list[NDArray[Any]], notes: list[Notice], to: rr.RecordingStream) -> bool:
         with self._changed:
             amended, self._amended = self._amended, []
-            lines, self._lines = self._lines, []
-            closing = self._closing
-        now = self._now(lines)
-        self._panels.notes(lines, to)
-        found = bool(lines)
+        now = self._now(notes)
+        self._panels.notes(notes, to)
+        found = bool(notes)
         for rows in chunks:
             timed = rows.copy()
             timed["time"] = np.minimum(rows["time"] - self._shift, now)  # rows from before the clock was set
@@ -109,22 +104,22 @@ class WireView(RecordingThread[NDArray[Any]]):
                 found = True
         for rows, fate in amended:
             self._counter.amend(rows, fate)
-        if closing or not 0.0 <= now - self._sent < _BATCH:
+        if self._last or not 0.0 <= now - self._sent < _BATCH:
             self._sent = now
-            for steps in (*self._counter.close(now - _LATE), *(self._counter.finish() if closing else ())):
+            for steps in (*self._counter.close(now - _LATE), *(self._counter.finish() if self._last else ())):
                 self._panels.send(steps, to)
                 found = True
-        if closing:
+        if self._last:
             self._panels.end(to)
-        return found or closing
+        return found or self._last
 
-    def _now(self, lines: list[Notice]) -> float:
-        """The time as if the system's clock had never been set, in seconds since 1970; adds a line when it was set."""
+    def _now(self, notes: list[Notice]) -> float:
+        """The time as if the system's clock had never been set, in seconds since 1970; adds a note when it was set."""
         now, steady = self._clocks()
         by = now - steady - self._ahead
         if abs(by - self._shift) >= _JUMP:
             moved, self._shift = by - self._shift, by
             way = "forward" if moved > 0 else "back"
             text = f"the system's clock was set {abs(moved):.1f} s {way}; the view goes on"
-            lines.append(Notice(self._elapsed(now), "WARN", text))
+            notes.append(Notice(self._elapsed(now), "WARN", text))
         return now - self._shift

@@ -20,20 +20,17 @@ from evedrop.view.column import ELAPSED
 from evedrop.wire.crossing import UNLINKED, Crossing, Kind
 from evedrop.wire.file import resolved_wire
 from evedrop.wire.folder import WIRE_FILE
-from evedrop.wire.graph import loss_of
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.lane_states import LaneState, legend, state_of
+from evedrop.wire.lane_states import LaneState
 from evedrop.wire.live_view import live_view
-from evedrop.wire.notices import CutWatcher, LinkWatcher
 from evedrop.wire.panels import Pace
 from evedrop.wire.plan import WireEvent
 from evedrop.wire.replay import PICTURE_SIZE, replay_wire
 from evedrop.wire.run import run_wire
-from evedrop.wire.step_counts import DELIVERED, OUTCOMES, WireSteps
 from evedrop.wire.view import WireView
 from tests.conftest import LIMIT, wait_until
 from tests.wire.wire_at_work import LOSSY, both_ways, sending
-from tests.wire.wire_rows import START, plan_of, robot_plan, traffic
+from tests.wire.wire_rows import START, robot_plan, traffic
 
 RATES = {"scan": 100.0, "command": 20.0, "listener": 100.0}
 SECONDS = 12.0
@@ -210,13 +207,45 @@ def test_a_clock_that_is_set_does_not_stop_the_view(by: float, tmp_path: Path) -
     ]
 
 
+def test_rows_from_before_the_clock_was_set_back_are_not_in_the_future(tmp_path: Path) -> None:
+    """They count for the present step: the window does not move to a time that has not come."""
+    clocks = Clocks()
+    view = WireView(tmp_path / "r.rrd", robot_plan(), "wire", START, None, clocks)
+    clocks.advance(2.0)
+    clocks.set(-3600.0)
+    wait_until(lambda: view._shift == -3600.0, "the thread has noticed")
+    view.add(traffic(robot_plan(), 2.0, RATES))
+    assert view.close()
+    assert shown(tmp_path / "r.rrd", "rates", "Scalars:scalars")[-1][0] < 3.0
+
+
+@pytest.mark.parametrize("pause", [0.0, 100.0])
+def test_the_graph_of_a_running_wire_forgets_what_is_old(pause: float, tmp_path: Path) -> None:
+    """It shows the losses in its window of time, also after a silence; the table counts from the start."""
+    clocks, path = Clocks(), tmp_path / "r.rrd"
+    rows = traffic(robot_plan(), 6.0, {"scan": 100.0})
+    early, late = rows[:300], rows[300:]
+    early["fate"], late["fate"] = Crossing.LOST, Crossing.DELIVERED
+    late["time"] += pause
+    if pause:  # so that only the silence is longer than the window
+        late = late[:50]
+    view = WireView(path, robot_plan(), "wire", START, Pace(0.2, 2.0), clocks)
+    for part in (early, late):
+        view.add(part)
+        clocks.advance(float(part["time"][-1]) - clocks()[0] + 0.01)
+        wait_until(lambda: not view._waiting, "the thread has the messages")
+    assert view.close()
+    assert shown(path, "graph", "GraphNodes:labels")[-1][1][3] == "scan: 0 % lost"
+    assert "300 lost" in shown(path, "table", "TextDocument:text")[-1][1][0]
+
+
 def test_a_disk_that_takes_nothing_harms_only_the_view(tmp_path: Path, rows: NDArray[Any]) -> None:
     """No method raises, and the reason is kept."""
     view = WireView(tmp_path / "nowhere" / "r.rrd", robot_plan(), "wire", START)
     view.add(rows)
     view.amend(rows[:1], Crossing.UNDERWAY)
     view.note(START, "INFO", "a note")
-    assert not [*view._waiting, *view._amended, *view._lines[1:]]
+    assert not [*view._waiting, *view._amended, *view._notes[1:]]
     assert not view.close()
     assert "the recording is incomplete" in str(view.failure)
 
@@ -308,73 +337,6 @@ def test_a_wire_that_nothing_crossed_is_refused(tmp_path: Path) -> None:
         pass
     with pytest.raises(UsageError, match="no message came to the wire"):
         replay_wire(tmp_path, tmp_path / "view.rrd")
-
-
-def steps_of(*counts: dict[Crossing, int]) -> WireSteps:
-    """Steps of one link."""
-    made = np.zeros((len(counts), 2, len(OUTCOMES)), np.int64)
-    for k, one in enumerate(counts):
-        for fate, number in one.items():
-            made[k, 0, OUTCOMES.index(fate)] = number
-    return WireSteps(0, made, np.zeros((len(counts), 2, 3), np.int64))
-
-
-def test_losses_of_the_wire_itself_are_told_once() -> None:
-    """For each reason, and as errors: they are not what the file asked for."""
-    steps = steps_of({Crossing.HELD_UP: 3}, {Crossing.HELD_UP: 3, Crossing.REFUSED: 1}, {Crossing.LOST: 4})
-    watcher = LinkWatcher(["scan"], 0.2)
-    lines = watcher.watch(steps)
-    assert [(round(one.seconds, 6), one.level) for one in lines if "does not cross" in one.text] == [
-        (0.0, "ERROR"),
-        (0.2, "ERROR"),
-    ]
-    assert not [one for one in watcher.watch(steps) if "does not cross" in one.text]
-
-
-def test_frequent_stretches_get_few_lines() -> None:
-    """A link that fails for a second out of two gets a few lines in an hour, not thousands."""
-    watcher = LinkWatcher(["scan"], 0.2)
-    lines = watcher.watch(steps_of(*([{Crossing.DELIVERED: 5}] * 5 + [{Crossing.LOST: 5}] * 5) * 1800))
-    assert 2 <= len(lines) < 200
-
-
-def test_pairs_of_sides_are_cut_when_all_their_links_are() -> None:
-    """Otherwise the links are named; a link without messages stays as it was."""
-    plan = plan_of(("up", "a", "b", {}), ("down", "b", "a", {}), ("tap", "a", "c", {}))
-    watcher = CutWatcher(plan.links)
-    counts = np.zeros((4, len(OUTCOMES)), np.int64)
-    counts[0, OUTCOMES.index(Crossing.CUT)] = counts[1, DELIVERED] = counts[2, DELIVERED] = 5
-    watcher.watch(counts)
-    assert watcher.cut() == ["up"]
-    counts[:] = 0
-    counts[1, OUTCOMES.index(Crossing.CUT)] = 5
-    watcher.watch(counts)
-    assert watcher.cut() == ["a|b"]
-
-
-@pytest.mark.parametrize(
-    ("heard", "lost", "text"),
-    [(0, 0, "silent"), (7, 0, "0 % lost"), (7, 7, "100 % lost"), (1000, 213, "21 % lost"), (1000, 13, "1.3 % lost"),
-     (100_000, 7, "0.007 % lost"), (1000, 999, "99.9 % lost")],
-)  # fmt: skip
-def test_shares_are_rounded_but_never_to_nothing_or_all(heard: int, lost: int, text: str) -> None:
-    """A link that lost one message of many has not lost 0 %."""
-    counts = np.zeros(len(OUTCOMES), np.int64)
-    counts[DELIVERED], counts[OUTCOMES.index(Crossing.LOST)] = heard - lost, lost
-    assert loss_of(counts) == text
-
-
-def test_the_main_reason_decides_on_a_lane() -> None:
-    """Also for a full queue and for losses of the wire's own; the legend has the queue only for links with a rate."""
-    expected = {
-        Crossing.CORRUPTED: LaneState.SOME, Crossing.OVERFLOW: LaneState.FULL, Crossing.CUT: LaneState.CUT,
-        Crossing.REFUSED: LaneState.OWN, Crossing.HELD_UP: LaneState.OWN,
-    }  # fmt: skip
-    for fate, state in expected.items():
-        assert state_of(steps_of({Crossing.DELIVERED: 9, Crossing.LOST: 1, fate: 3}).counts[0, 0]) is state
-    assert state_of(steps_of({Crossing.UNDERWAY: 3}).counts[0, 0]) is LaneState.QUIET
-    assert "queue" not in legend(robot_plan())
-    assert "purple: queue full" in legend(plan_of(("a", "b", "c", {"rate": 1000.0})))
 
 
 def test_a_view_follows_a_running_wire(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,80 @@
+"""What the view of a wire says of its messages: lines of the events, states of lanes, and shares of losses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from evedrop.wire.crossing import Crossing
+from evedrop.wire.graph import loss_of
+from evedrop.wire.lane_states import LaneState, legend, state_of
+from evedrop.wire.notices import CutWatcher, LinkWatcher
+from evedrop.wire.step_counts import DELIVERED, OUTCOMES, WireSteps
+from tests.wire.wire_rows import plan_of, robot_plan
+
+
+def steps_of(*counts: dict[Crossing, int]) -> WireSteps:
+    """Steps of one link."""
+    made = np.zeros((len(counts), 2, len(OUTCOMES)), np.int64)
+    for k, one in enumerate(counts):
+        for fate, number in one.items():
+            made[k, 0, OUTCOMES.index(fate)] = number
+    return WireSteps(0, made, np.zeros((len(counts), 2, 3), np.int64))
+
+
+def test_losses_of_the_wire_itself_are_told_once() -> None:
+    """For each reason, and as errors: they are not what the file asked for."""
+    steps = steps_of({Crossing.HELD_UP: 3}, {Crossing.HELD_UP: 3, Crossing.REFUSED: 1}, {Crossing.LOST: 4})
+    watcher = LinkWatcher(["scan"], 0.2)
+    lines = watcher.watch(steps)
+    assert [(round(one.seconds, 6), one.level) for one in lines if "does not cross" in one.text] == [
+        (0.0, "ERROR"),
+        (0.2, "ERROR"),
+    ]
+    assert not [one for one in watcher.watch(steps) if "does not cross" in one.text]
+
+
+def test_frequent_stretches_get_few_lines() -> None:
+    """A link that fails for a second out of two gets a few lines in an hour, not thousands."""
+    watcher = LinkWatcher(["scan"], 0.2)
+    lines = watcher.watch(steps_of(*([{Crossing.DELIVERED: 5}] * 5 + [{Crossing.LOST: 5}] * 5) * 1800))
+    assert 2 <= len(lines) < 200
+
+
+def test_pairs_of_sides_are_cut_when_all_their_links_are() -> None:
+    """Otherwise the links are named; a link without messages stays as it was."""
+    plan = plan_of(("up", "a", "b", {}), ("down", "b", "a", {}), ("tap", "a", "c", {}))
+    watcher = CutWatcher(plan.links)
+    counts = np.zeros((4, len(OUTCOMES)), np.int64)
+    counts[0, OUTCOMES.index(Crossing.CUT)] = counts[1, DELIVERED] = counts[2, DELIVERED] = 5
+    watcher.watch(counts)
+    assert watcher.cut() == ["up"]
+    counts[:] = 0
+    counts[1, OUTCOMES.index(Crossing.CUT)] = 5
+    watcher.watch(counts)
+    assert watcher.cut() == ["a|b"]
+
+
+@pytest.mark.parametrize(
+    ("heard", "lost", "text"),
+    [(0, 0, "silent"), (7, 0, "0 % lost"), (7, 7, "100 % lost"), (1000, 213, "21 % lost"), (1000, 13, "1.3 % lost"),
+     (100_000, 7, "0.007 % lost"), (1000, 999, "99.9 % lost")],
+)  # fmt: skip
+def test_shares_are_rounded_but_never_to_nothing_or_all(heard: int, lost: int, text: str) -> None:
+    """A link that lost one message of many has not lost 0 %."""
+    counts = np.zeros(len(OUTCOMES), np.int64)
+    counts[DELIVERED], counts[OUTCOMES.index(Crossing.LOST)] = heard - lost, lost
+    assert loss_of(counts) == text
+
+
+def test_the_main_reason_decides_on_a_lane() -> None:
+    """Also for a full queue and for losses of the wire's own; the legend has the queue only for links with a rate."""
+    expected = {
+        Crossing.CORRUPTED: LaneState.SOME, Crossing.OVERFLOW: LaneState.FULL, Crossing.CUT: LaneState.CUT,
+        Crossing.REFUSED: LaneState.OWN, Crossing.HELD_UP: LaneState.OWN,
+    }  # fmt: skip
+    for fate, state in expected.items():
+        assert state_of(steps_of({Crossing.DELIVERED: 9, Crossing.LOST: 1, fate: 3}).counts[0, 0]) is state
+    assert state_of(steps_of({Crossing.UNDERWAY: 3}).counts[0, 0]) is LaneState.QUIET
+    assert "queue" not in legend(robot_plan())
+    assert "purple: queue full" in legend(plan_of(("a", "b", "c", {"rate": 1000.0})))
