@@ -74,9 +74,11 @@ def wire_failures(summary: Mapping[str, Any]) -> Iterator[str]:
                 f"{low:.4f} to {high:.4f} were expected"
             )
     if summary["unaccounted"]:
-        yield f"{_messages(summary['unaccounted'])} are unaccounted for: this is a fault of Evedrop"
+        yield f"unaccounted for: {_messages(summary['unaccounted'])}; this is a fault of Evedrop"
     if summary["journal"]["missing"]:
         yield f"the journal lacks {_messages(summary['journal']['missing'])}, because the disk was full"
+    elif summary["journal"]["incomplete_since"] is not None:
+        yield "the disk was full for some time: the journal has all messages, but perhaps not all changes and events"
     yield from (Judged(**one).sentence for one in summary["expectations"] if one["held"] is False)
 
 

@@ -67,10 +67,7 @@ UNLINKED = 2**16 - 1
 RECORD = np.dtype(
     [
         ("time", "<f8"),  # seconds since 1970, when the wire heard it
-        (
-            "n",
-            "<i8",
-        ),  # its number among the messages of its key and kind on its link, from 0; -1 if no model decides on it
+        ("n", "<i8"),  # its number among the messages of its key and kind on its link, from 0; -1 if it has none
         ("sequence", "<i8"),  # its sender's own number for it; -1 if it has none
         ("delay", "<f8"),  # seconds that the link holds it back, its queue included
         ("key", "<u4"),  # code of the key

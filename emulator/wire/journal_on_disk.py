@@ -1,4 +1,4 @@
-"""The journal of a wire as it is on disk, in place of the one that the wire keeps: for figures of a wire in another process.
+"""The journal of a wire that runs in another process, read from the disk: for its figures so far.
 
 Source: docs/wire.md, from Python.
 """

@@ -15,6 +15,7 @@ from evedrop.wire.closing import closing_lines, wire_failures
 from evedrop.wire.conductor import WireConductor
 from evedrop.wire.control import WireControl
 from evedrop.wire.file import resolved_wire
+from evedrop.wire.folder import WIRE_FILE
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_reader import JOURNAL_FOLDER
 from evedrop.wire.live_view import live_view
@@ -80,6 +81,6 @@ def run_wire(
 def _write_plan(out: Path, plan: WirePlan) -> None:
     """Write wire.toml, the complete file of the wire."""
     try:
-        write_private(out / "wire.toml", resolved_wire(plan))
+        write_private(out / WIRE_FILE, resolved_wire(plan))
     except OSError as error:
         warn(f"wire.toml cannot be written ({error}); the wire goes on")

@@ -35,7 +35,7 @@ _QUANTILES = (0.5, 0.9, 0.99)
 
 
 class SummarisedJournal(Protocol):
-    """What a summary needs of a journal: `WireJournal` has it, and so has a journal that is only read."""
+    """What a summary needs of a journal: `WireJournal` has it, and so has `JournalOnDisk`."""
 
     listeners: list[Listener]
     amendment_listeners: list[AmendmentListener]
@@ -69,7 +69,7 @@ class WireLinkSummary:
     bytes: int
     delivered: int
     again: int
-    """How many of the messages met with a second copy."""
+    """How many messages were delivered twice."""
     lost_by: Mapping[str, int]
     """Reason → messages that the link's settings stopped."""
     dropped_by: Mapping[str, int]

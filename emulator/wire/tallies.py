@@ -1,4 +1,4 @@
-"""What a wire's summary counts while it runs: the fates of each link's messages, their delays, and runs of missing messages.
+"""What the summary of a wire counts while the wire runs: fates, delays and runs of missing messages of each link.
 
 Source: docs/wire.md, the summary.
 """
@@ -124,7 +124,7 @@ class LinkTally:
         return int(self.fates[Crossing.DELIVERED])
 
     def lost_by(self) -> Iterator[tuple[Crossing, int]]:
-        """The reasons for which messages were not delivered, with their numbers, but those that did not occur."""
+        """Each reason for which messages were not delivered, and how many."""
         for fate in Crossing:
             if fate is not Crossing.DELIVERED and self.fates[fate]:
                 yield fate, int(self.fates[fate])

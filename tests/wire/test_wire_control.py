@@ -54,6 +54,7 @@ def test_a_wire_is_steered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
         assert said("link", "robot-base", "cut") == "0 cut robot-base"
         assert wire.relay.links["robot-base"].cut
         assert said("partition", "robot", "base") == "0 partition robot, base"
+        assert said("link", "base-robot", "cut") == "0 cut base-robot"
         assert said("link", "robot-base", "heal") == "0 heal robot-base"
         wait_until(lambda: sender.put("a", b"") or len(wire.rows), "a message is heard")
         status = said("status").splitlines()
@@ -63,6 +64,8 @@ def test_a_wire_is_steered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
         assert status[-1].endswith(" s: heal robot-base")
         assert said("heal", "base", "robot") == "0 heal robot, base"
         assert not wire.relay.links["robot-base"].cut
+        assert wire.relay.links["base-robot"].cut
+        assert said("link", "base-robot", "heal") == "0 heal base-robot"
         found = json.loads(said("status", "--json").removeprefix("0 "))
         assert found["links"]["base-robot"] == {"heard": 0, "delivered": 0, "cut": False}
     assert not (tmp_path / "control.json").exists()

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from evedrop.errors import ScenarioError
 from evedrop.wire.closing import closing_lines, wire_failures, wire_sentences
 from evedrop.wire.crossing import AGAIN, RECORD, UNLINKED, Crossing, Kind
+from evedrop.wire.expect import WireExpectTable
 from evedrop.wire.fates import KeyFates
 from evedrop.wire.file import resolved_wire, wire_of
 from evedrop.wire.journal import WireJournal
@@ -245,6 +246,42 @@ below = 0.5
         assert line in said, said
 
 
+@pytest.mark.parametrize(("bound", "found", "holds"), [
+    ("below", 0.4, True), ("below", 0.5, False), ("below", 0.6, False),
+    ("above", 0.4, False), ("above", 0.5, False), ("above", 0.6, True),
+])  # fmt: skip
+def test_a_bound_itself_is_neither_below_nor_above(bound: str, found: float, holds: bool) -> None:
+    """A figure must be on its side of the bound."""
+    assert WireExpectTable.model_validate({"figure": "scan.delivery", bound: 0.5}).holds(found) is holds
+
+
+def test_a_latency_is_that_of_its_quantile(tmp_path: Path) -> None:
+    """Of 100 different delays, the 90th."""
+    plan = expecting('[[expect]]\nfigure = "scan.latency"\nquantile = 0.9\nbelow = 1\n')
+    with WireJournal(tmp_path, plan) as journal:
+        summary = WireSummary(plan, journal)
+        for n in range(100):
+            journal.record(1.0, n, -1, (n + 1) / 1000, journal.key_code("a"), 0, 0, 0, Kind.PUT, Crossing.DELIVERED)
+    (judged,) = summary.judged(summary.links())
+    assert judged.found == 0.09
+
+
+def test_the_exit_status_tells_of_an_incomplete_journal_and_of_unaccounted_messages(tmp_path: Path) -> None:
+    """1 and 3, each with a line."""
+    with WireJournal(tmp_path, wire_plan()) as journal:
+        summary = WireSummary(wire_plan(), journal)
+    assert summary.finish(tmp_path) == 0
+    assert list(wire_failures(summary.as_dict())) == []
+    journal.incomplete_since = 5.0
+    assert summary.finish(tmp_path) == 1
+    assert "the journal has all messages" in "".join(wire_failures(summary.as_dict()))
+    journal.missing = 7
+    assert list(wire_failures(summary.as_dict())) == ["the journal lacks 7 messages, because the disk was full"]
+    journal.recorded += 1
+    assert summary.finish(tmp_path) == 3
+    assert "unaccounted for: 1 message; this is a fault of Evedrop" in wire_failures(summary.as_dict())
+
+
 def by_hand(rows: list[tuple[float, bool]]) -> tuple[int, float]:
     """The longest run of missing messages, and the longest silence, of (time, delivered)."""
     longest, silence, run, since = 0, 0.0, 0, rows[0][0]
@@ -299,3 +336,17 @@ def test_quantiles_of_delays_are_exact_until_there_are_too_many_to_keep() -> Non
     assert found is not None
     assert found == pytest.approx(0.9, abs=0.005)
     assert LinkTally().delay_quantile(0.5) is None
+
+
+def test_the_delays_that_are_kept_are_evenly_spaced() -> None:
+    """Whatever the sizes of the blocks, and without the messages that were not delivered."""
+    tally, rng, count = LinkTally(), np.random.default_rng(5), 1_000_000
+    records = np.zeros(count, RECORD)
+    records["delay"] = np.arange(count)
+    lost = np.zeros(count, RECORD)
+    lost["fate"], lost["delay"] = Crossing.LOST, -1.0
+    for places in np.split(np.arange(count), np.cumsum(rng.integers(1, 9000, 150))):
+        tally.add(np.concatenate([records[places], lost[places]]))
+    kept = np.arange(0, count, 8)
+    for at in (0, 1, 1000, 30_001, 60_000, len(kept) - 1):
+        assert tally.delay_quantile((at + 0.5) / len(kept)) == kept[at]
