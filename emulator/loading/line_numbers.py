@@ -1,4 +1,4 @@
-"""The lines of a TOML file in which its entries are, for messages about them. Which text is one entry, tomllib decides."""
+"""The lines of a TOML file in which its entries are, for messages about them."""
 
 from __future__ import annotations
 
@@ -10,9 +10,15 @@ from typing import Any
 
 from evedrop.errors import ScenarioError
 
-_HEADER = re.compile(r"\s*\[(\[?)(.*?)\]?\]\s*(#.*)?$")
-_FEW = 50  # lines of an entry after each of which tomllib is asked; of a longer one, only where it may end
-_ENDS = ("]", "}", '"""', "'''")
+# All that a bracket, an equals sign or the end of a line may mean in a valid text; strings and comments hide others.
+_TOKEN = re.compile(
+    r"""
+    (?P<string> \"""(?: [^"\\]++ | \\. | "{1,2}(?!") )*+"{3,5} | '''.*?'{3,5}
+              | "(?: [^"\\]++ | \\. )*+" | '[^']*+' )
+    | (?P<opens> [\[{] ) | (?P<closes> [\]}] ) | (?P<equals> = ) | (?P<end> (?:\#[^\n]*+)?\n )
+    """,
+    re.DOTALL | re.VERBOSE,
+)
 
 
 def lines_of_entries(text: str) -> dict[str, int]:
@@ -20,13 +26,13 @@ def lines_of_entries(text: str) -> dict[str, int]:
     found: dict[str, int] = {}
     counts: dict[str, int] = {}
     table = ""
-    for line, statement in _statements(text.splitlines()):
-        header = _HEADER.match(statement)
-        if header is not None and (named := _path(statement)) is not None:
-            table = _with_places(named, counts, many=bool(header[1]))
-            found.setdefault(table, line)
-        elif (named := _path(statement)) is not None:
-            found.setdefault(f"{table}.{named}" if table else named, line)
+    for line, statement in _statements(text):
+        if statement.startswith("["):
+            path = table = _with_places(_parts(statement), counts, many=statement.startswith("[["))
+        else:
+            named = ".".join(_parts(f"{statement} = 0"))
+            path = f"{table}.{named}" if table else named
+        found.setdefault(path, line)
     return found
 
 
@@ -36,10 +42,7 @@ def with_line_numbers(text: str, changed: Iterable[str] = ()) -> Iterator[None]:
     try:
         yield
     except ScenarioError as error:
-        try:
-            lines = lines_of_entries(text)
-        except RecursionError:
-            lines = {}
+        lines = lines_of_entries(text)
         begins = tuple(f"{path}." for path in changed)
         numbered = error.numbered(lambda path: None if f"{path}.".startswith(begins) else line_of(path, lines))
         raise numbered from error.__cause__
@@ -54,53 +57,44 @@ def line_of(path: str, lines: Mapping[str, int]) -> int | None:
     return None
 
 
-def _statements(lines: list[str]) -> Iterator[tuple[int, str]]:
-    """Each table header and each entry with its value, with the line on which it begins."""
-    first = 0
-    while first < len(lines):
-        stop = first + 1
-        while stop < len(lines) and not _is_whole("\n".join(lines[first:stop])):
-            stop += 1
-            while stop < len(lines) and stop - first > _FEW and not lines[stop - 1].strip().endswith(_ENDS):
-                stop += 1
-        yield first + 1, "\n".join(lines[first:stop])
-        first = stop
+def _statements(text: str) -> Iterator[tuple[int, str]]:
+    """Each table header and the key of each entry, with its line."""
+    line, begin, depth, has_key = 1, 0, 0, False
+    for token in _TOKEN.finditer(f"{text}\n"):
+        kind = token.lastgroup
+        depth += (kind == "opens") - (kind == "closes")
+        if depth:
+            continue
+        if kind == "equals":
+            yield line, text[begin : token.start()].strip()
+            has_key = True
+        elif kind == "end":
+            if not has_key and (header := text[begin : token.start()].strip()):
+                yield line, header
+            line += text.count("\n", begin, token.end())
+            begin, has_key = token.end(), False
 
 
-def _is_whole(text: str) -> bool:
-    try:
-        tomllib.loads(text)
-    except ValueError:
-        return False
-    return True
-
-
-def _path(statement: str) -> str | None:
-    """The dotted path that a statement names; None if it names none, such as a comment."""
-    try:
-        inner: Any = tomllib.loads(statement)
-    except ValueError:
-        return None
+def _parts(statement: str) -> list[str]:
+    """The parts of the path that a header, or an entry whose value is a number, names."""
+    inner: Any = tomllib.loads(statement)
     parts: list[str] = []
-    # A header makes empty tables, and an entry with a dotted key makes tables of one entry, around its value.
-    depth = statement.partition("=")[0].count(".") + 1 if _HEADER.match(statement) is None else 1000
-    while len(parts) < depth and isinstance(inner := inner[0] if _is_list_of_table(inner) else inner, dict) and inner:
-        name, inner = next(iter(inner.items()))
-        parts.append(name)
-    return ".".join(parts) or None
+    while isinstance(inner, (dict, list)) and inner:
+        if isinstance(inner, list):
+            inner = inner[0]
+        else:
+            name, inner = next(iter(inner.items()))
+            parts.append(name)
+    return parts
 
 
-def _is_list_of_table(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 1 and isinstance(value[0], dict)
-
-
-def _with_places(named: str, counts: dict[str, int], many: bool) -> str:
+def _with_places(parts: list[str], counts: dict[str, int], many: bool) -> str:
     """The path of a table, with the place of each list of tables that it is in; many: whether it is the next of such a list."""
-    if many:
-        counts[named] = counts.get(named, -1) + 1
-    parts: list[str] = []
-    plain = ""
-    for part in named.split("."):
-        plain = f"{plain}.{part}" if plain else part
-        parts += [part, str(counts[plain])] if plain in counts else [part]
-    return ".".join(parts)
+    path = ""
+    for i, part in enumerate(parts):
+        path = f"{path}.{part}" if path else part
+        if many and i == len(parts) - 1:
+            counts[path] = counts.get(path, -1) + 1
+        if path in counts:
+            path = f"{path}.{counts[path]}"
+    return path

@@ -48,6 +48,30 @@ def test_every_entry_has_its_line() -> None:
     }
 
 
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("a = [\n" + "1,\n" * 60 + "] # ]\nb = 1\n[t]\nc = 1", {"a": 1, "b": 63, "t": 64, "t.c": 65}),
+        ("[[a]]\n[[a.b]]\n[[a]]\n[[a.b]]\nx=1\n", {"a.0": 1, "a.0.b.0": 2, "a.1": 3, "a.1.b.0": 4, "a.1.b.0.x": 5}),
+        ('"a.b" = { x = 1 }\nc.d = { e = 1 }\n', {"a.b": 1, "c.d": 2}),
+        ("# a \u2028 b\na = 1\n", {"a": 2}),
+        ("a = 1\r\n\r\n[b] # [c]\r\nc = 2", {"a": 1, "b": 3, "b.c": 4}),
+        ("""a = '''[\n = ''''\nb = \"""\n\\\"""[ "" \"""\"\nc = "\\"["\nd = '#'""", {"a": 1, "b": 3, "c": 5, "d": 6}),
+        ('[ a . "]=" ] # x\nb = 2020-01-01 # = \n', {"a.]=": 1, "a.]=.b": 2}),
+    ],
+)
+def test_brackets_and_signs_count_only_outside_of_strings_and_comments(text: str, expected: dict[str, int]) -> None:
+    """Lines end where editors end them, and each list of tables counts its own tables."""
+    tomllib.loads(text)
+    assert lines_of_entries(text) == expected
+
+
+def test_a_long_value_takes_time_that_grows_with_its_length() -> None:
+    """A list whose every line may be its last one; a reader that asked at each of them would need hours."""
+    text = "a = [\n[1.0]\n" + ", [1.0]\n" * 100_000 + "]\nb = 1\n"
+    assert lines_of_entries(text) == {"a": 1, "b": 100_004}
+
+
 def test_what_is_inside_a_value_has_the_line_of_the_value() -> None:
     """And what is nowhere has none."""
     lines = lines_of_entries(TEXT)
