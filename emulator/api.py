@@ -54,7 +54,7 @@ def run(
 ) -> Results:
     """Run a scenario live, with sensor, router, estimators and observer in separate processes.
 
-    scenario: a shipped name, a file, or a checked `Scenario`; out: the results folder, new or empty; view: auto, native,
+    scenario: a built-in name, a file, or a checked `Scenario`; out: the results folder, new or empty; view: auto, native,
     web or off; listen: the router's loopback endpoint, tcp/127.0.0.1:PORT; tell: called with each item of news; changes: entries
     of the scenario by dotted key, with `__` for the dot, such as `slots=500` or `legitimate__link__quality=0.5`.
 

@@ -31,7 +31,7 @@ def argument(name: str, shown: str) -> Option:
 
 def scenario(parser: argparse.ArgumentParser) -> None:
     """Add the argument for the scenario."""
-    parser.add_argument("scenario", metavar="SCENARIO", help="a shipped name, a file, or a results folder")
+    parser.add_argument("scenario", metavar="SCENARIO", help="a built-in scenario, a file, or a results folder")
 
 
 def changes(parser: argparse.ArgumentParser) -> None:

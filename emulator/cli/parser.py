@@ -8,15 +8,10 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from typing import Any, NoReturn
 
+from evedrop.hints import near
+
 _WIDEST = 100
 _NARROWEST = 30
-
-
-def _hint(word: str, names: Iterable[str]) -> str:
-    import difflib
-
-    close = difflib.get_close_matches(word, list(names), 1)
-    return f"; did you mean {close[0]}?" if close else ""
 
 
 def _columns() -> int:
@@ -25,10 +20,36 @@ def _columns() -> int:
 
 
 class _Help(argparse.RawDescriptionHelpFormatter):
-    """Leaves the lines of an example as they are."""
+    """Keeps within the width, and breaks an example as a shell reads it."""
 
     def __init__(self, prog: str) -> None:
         super().__init__(prog, width=_columns())
+
+    def add_usage(
+        self,
+        usage: str | None,
+        actions: Iterable[argparse.Action],
+        groups: Iterable[Any],
+        prefix: str | None = None,
+    ) -> None:
+        """Without the options that may be left out, which are listed below it."""
+        if prefix is None:
+            options = argparse.Action([], "options", metavar="[options]")
+            actions = [options, *(one for one in actions if one.required or not one.option_strings)]
+        super().add_usage(usage, actions, groups if prefix is not None else [], prefix)
+
+    def add_text(self, text: str | None) -> None:
+        """A description, or an example after it, whose lines are indented."""
+        super().add_text(text and "\n".join(map(_broken, text.splitlines())))
+
+
+def _broken(line: str) -> str:
+    """A line of a description, or an indented line of a command, in lines that fit."""
+    if not line.startswith(" "):
+        return textwrap.fill(line, _columns())
+    return " \\\n".join(
+        textwrap.wrap(line, _columns() - 2, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
+    )
 
 
 class Parser(argparse.ArgumentParser):
@@ -63,20 +84,18 @@ class Parser(argparse.ArgumentParser):
             word = unknown[0]
             known = [name for name in parser._option_string_actions if name.startswith("--")]
             what = "option" if word.startswith("-") else "argument"
-            parser.error(f"unknown {what} {word}{_hint(word.partition('=')[0], known)}")
+            parser.error(f"unknown {what} {word}{near(word.partition('=')[0], known)}")
         return options
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
-        """Name the nearest choice instead of listing all of them."""
-        if action.choices is not None and value not in action.choices:
-            names = [str(one) for one in action.choices]
-            what = (
-                "unknown command" if isinstance(action, argparse._SubParsersAction) else f"{value!r} is not a choice:"
-            )
-            said = f"{what} {value}" if what.startswith("unknown") else f"{what} expected one of {', '.join(names)}"
-            raise argparse.ArgumentError(
-                None if what.startswith("unknown") else action, f"{said}{_hint(str(value), names)}"
-            )
+        """Name the nearest choice, and of commands no other."""
+        if action.choices is None or value in action.choices:
+            return
+        names = [str(one) for one in action.choices]
+        hint = near(value, names)
+        if isinstance(action, argparse._SubParsersAction):
+            raise argparse.ArgumentError(None, f"unknown command {value}{hint}")
+        raise argparse.ArgumentError(action, f"is {value!r}; expected one of {', '.join(names)}{hint}")
 
     def error(self, message: str) -> NoReturn:
         """Print the mistake and where to read more, and exit with status 2."""

@@ -8,13 +8,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from evedrop.errors import UsageError
+from evedrop.hints import near
 from evedrop.literature.crimson2023 import Crimson2023
 from evedrop.literature.kennedy2022 import Kennedy2022
 from evedrop.literature.luecke2022 import Luecke2022
 from evedrop.literature.naha2021 import Naha2021
 from evedrop.literature.paper import Paper, Progress
 from evedrop.literature.reproduction import Reproduction
-from evedrop.model.registry import near
 
 PAPERS: Mapping[str, type[Paper]] = {
     "kennedy2022": Kennedy2022,

@@ -17,9 +17,10 @@ from pydantic import ValidationError
 
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.files import Unreadable, is_folder, is_there, shown, text_of
+from evedrop.hints import near
 from evedrop.loading.line_numbers import with_line_numbers
 from evedrop.loading.mistakes import mistakes_across
-from evedrop.model.registry import near, place_of
+from evedrop.model.registry import place_of
 from evedrop.plugins import named_in
 from evedrop.scenario.drawn import with_faults
 from evedrop.scenario.dry_run import dry_run, foreign
@@ -57,7 +58,7 @@ def built_in_text(name: str) -> str:
     """The file of a built-in scenario. Raises UsageError if there is no scenario of this name."""
     if name not in shipped():
         raise UsageError(
-            f"{name}: there is no built-in scenario of this name{near(name, shipped()) or '; evedrop list prints them'}"
+            f"there is no built-in scenario {name}{near(name, shipped()) or '; evedrop list prints the names'}"
         )
     return shipped()[name].read_text(encoding="utf-8")
 
@@ -79,20 +80,20 @@ def write_new(path: Path, origin: str | None = None) -> None:
 
 
 def load(source: str | Path, changes: Mapping[str, Any] | None = None, *, beyond_horizon: bool = False) -> Scenario:
-    """Load a shipped scenario by name, or a file, with changes by dotted key.
+    """Load a built-in scenario by name, or a file, with changes by dotted key.
 
     beyond_horizon: allow more slots than float64 can follow exactly, for commands that do not follow states.
 
     Raises ScenarioError with every mistake, UsageError if there is no such scenario.
     """
     path = shipped().get(str(source), Path(source))
-    # A shipped scenario names no files beside it, so the names in a change refer to the current folder.
+    # A built-in scenario names no files beside it, so the names in a change refer to the current folder.
     folder = Path() if str(source) in shipped() else path if is_folder(path) else path.parent
     return parse(read(source), shown(source), changes, beyond_horizon=beyond_horizon, folder=folder)
 
 
 def read(source: str | Path) -> str:
-    """The text of a shipped scenario or a file."""
+    """The text of a built-in scenario or a file."""
     path = shipped().get(str(source), Path(source))
     if is_folder(path):
         path = path / "scenario.toml"
@@ -105,7 +106,7 @@ def read(source: str | Path) -> str:
             raise UsageError(f"{shown(path)} cannot be read ({error}); a scenario is a TOML file") from error
         hint = near(source, shipped()) or ";"
         raise UsageError(
-            f"no scenario {shown(source)} ({error}){hint} `evedrop list` shows the shipped ones"
+            f"no scenario {shown(source)} ({error}){hint} `evedrop list` shows the built-in ones"
         ) from error
 
 
@@ -132,7 +133,10 @@ def parse(
 
 
 def tables_in(text: str, source: str) -> dict[str, Any]:
-    """The tables of a TOML text, before their entries are checked. Raises ScenarioError if a value cannot be used at all."""
+    """The tables of a TOML text, before their entries are checked.
+
+    Raises ScenarioError if the text is not TOML, or a value cannot be used at all.
+    """
     if (values := text.count(",")) > MOST_VALUES:
         large = f"has about {values} values; expected at most {MOST_VALUES}"
         raise ScenarioError(source, [f"{large}: put disturbances and recordings into files of their own"])

@@ -5,17 +5,17 @@ Source: docs/your-own.md.
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import re
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Generic, TypeVar, final
 
 from evedrop.errors import NoAnswer, NotRegistered
+from evedrop.hints import near
 
 T = TypeVar("T")
 
@@ -189,15 +189,6 @@ def _imported(name: str, target: str, said: str) -> tuple[Any, str]:
         where = f" ({file})" if file else ""
         raise NotRegistered(name, f"{said}, and the module {module_name}{where} has no {class_name}{choice}")
     return found, said
-
-
-def near(found: object, names: Iterable[str], before: str = "") -> str:
-    """A hint, `; did you mean NAME?`, if the value found is close to one of the names; otherwise an empty string.
-
-    before: what to write before the name.
-    """
-    close = difflib.get_close_matches(str(found), list(names), 1)
-    return f"; did you mean {before}{close[0]}?" if close else ""
 
 
 @lru_cache(maxsize=32)

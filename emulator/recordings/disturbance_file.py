@@ -38,7 +38,7 @@ _ROWS_UNASKED = 10_000  # for a scenario without a number of slots, which is rep
 
 
 def found_file(name: str, folder: Path) -> Path:
-    """The path of a file that a scenario in this folder names: in the folder, or otherwise among the shipped files."""
+    """The path of a file that a scenario in this folder names: in the folder, or otherwise among the built-in files."""
     own = folder / name
     shipped = Path(str(resources.files("evedrop.scenarios"))) / name
     try:

@@ -15,10 +15,11 @@ from pydantic import AfterValidator, Field
 
 from evedrop.figures import expectable_figures, figures_of, unloadable_figures
 from evedrop.figures.links import LINK_FIGURES
+from evedrop.hints import near
 from evedrop.model.checks import is_number
 from evedrop.scenario.application import APPLICATIONS, Application
 from evedrop.scenario.table import Found, Number, Table, expected, one_of
-from evedrop.scenario.words import as_toml, listed, near
+from evedrop.scenario.words import as_toml, listed
 
 SECRECY = ("relative", "perfect")
 

@@ -10,11 +10,12 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
+from evedrop.hints import near
 from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.links import LOSS_MODELS, loss_of
 from evedrop.model.links.link import LossModel
 from evedrop.scenario.table import Found, Probability, Table, model_mistakes
-from evedrop.scenario.words import as_toml, listed, near
+from evedrop.scenario.words import as_toml, listed
 
 _QUEUE = 100  # default for the packets that wait before a link of limited rate
 

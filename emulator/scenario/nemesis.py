@@ -10,11 +10,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
+from evedrop.hints import near
 from evedrop.model.registry import is_own
 from evedrop.scenario.events import EVENTS
 from evedrop.scenario.events.event import Fault, Slot
 from evedrop.scenario.table import Found, Table, expected
-from evedrop.scenario.words import as_toml, listed, near
+from evedrop.scenario.words import as_toml, listed
 
 NEMESIS = "nemesis"
 

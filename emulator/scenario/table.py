@@ -18,8 +18,9 @@ from pydantic import (
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
 from evedrop.errors import NotRegistered
+from evedrop.hints import near
 from evedrop.model.checks import is_number
-from evedrop.model.registry import Registry, asked, near
+from evedrop.model.registry import Registry, asked
 from evedrop.names import RESERVED
 from evedrop.scenario.words import as_toml, listed
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from evedrop.hints import near
 from evedrop.model.checks import as_toml
-from evedrop.model.registry import near
 
-__all__ = ["as_toml", "listed", "near", "no_entry"]
+__all__ = ["as_toml", "listed", "no_entry"]
 
 
 def no_entry(name: str, known: Sequence[str]) -> str:

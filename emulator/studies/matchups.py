@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from evedrop.errors import NotRegistered, ScenarioError, UsageError
+from evedrop.hints import near
 from evedrop.loading import checked
 from evedrop.model.acknowledgements import OVERHEARING
 from evedrop.model.eavesdroppers import STRATEGIES
@@ -25,7 +26,7 @@ from evedrop.scenario import Scenario
 from evedrop.scenario.across import lacking_streams
 from evedrop.scenario.events.effects import Jamming
 from evedrop.scenario.singular_noise import unsuited
-from evedrop.scenario.words import listed, near
+from evedrop.scenario.words import listed
 
 ATTACKERS: Mapping[str, str] = {
     "blocks-critical": "critical",

@@ -75,7 +75,7 @@ class Finding:
 
 
 def scenarios_of(places: Sequence[str]) -> list[str]:
-    """The scenarios in files, folders and shipped names, each once. Raises UsageError if there is none."""
+    """The scenarios in files, folders and built-in names, each once. Raises UsageError if there is none."""
     found: dict[Path, str] = {}
     for place in places:
         paths: Sequence[Path] = [Path(place)]

@@ -11,10 +11,11 @@ from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
+from evedrop.hints import near
 from evedrop.model.checks import as_toml
 from evedrop.scenario.link_table import CHANGEABLE, OTHER_MODEL, unchangeable
 from evedrop.scenario.sentences import sentences
-from evedrop.scenario.words import listed, near
+from evedrop.scenario.words import listed
 from evedrop.wire.endpoints import EndpointPlace, place_of
 from evedrop.wire.expect import expectation_mistakes
 from evedrop.wire.tables import WireLinkTable, WireSettingsTable, changed_settings

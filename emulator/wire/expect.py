@@ -10,9 +10,10 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
+from evedrop.hints import near
 from evedrop.model.checks import as_toml
 from evedrop.scenario.table import Found, Table, expected
-from evedrop.scenario.words import listed, near
+from evedrop.scenario.words import listed
 from evedrop.wire.units import in_seconds
 
 WIRE_FIGURES = ("delivery", "latency", "gap_messages", "gap_seconds")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import shlex
 import subprocess
@@ -26,15 +27,20 @@ def commands() -> list[Command]:
     return [one for name in names for one in import_module(f"evedrop.cli.commands.{name}").COMMANDS]
 
 
+def parsed(command: Command) -> argparse.Namespace:
+    """The options in the example of a command, which has no others; among them the command's `parser`."""
+    words = shlex.split(command.example.partition(" >>")[0])
+    options, unknown = parser_of(words[0]).parse_known_args(words)
+    assert not unknown
+    assert command.name in words[:2]
+    return options
+
+
 @pytest.mark.parametrize("command", commands(), ids=lambda one: one.name)
 def test_every_command_has_a_section_and_an_example_that_is_understood(command: Command) -> None:
     """The example names the command, and the parser takes all of it."""
     assert command.section in SECTIONS
-    words = shlex.split(command.example.partition(" >>")[0])
-    assert command.name in words[:2]
-    options, unknown = parser_of(words[0]).parse_known_args(words)
-    assert not unknown
-    assert options.command is command.run
+    assert parsed(command).command is command.run
 
 
 @pytest.mark.parametrize("command", commands(), ids=lambda one: one.name)
@@ -56,9 +62,18 @@ def test_help_lists_all_commands_in_sections(capsys: pytest.CaptureFixture[str])
 
 @pytest.mark.parametrize("columns", [40, 80])
 def test_help_fits_a_narrow_terminal(columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No line is wider than the terminal."""
+    """No line is wider than the terminal: neither of the help of all commands, nor of one of them."""
     monkeypatch.setenv("COLUMNS", str(columns))
-    assert max(map(len, parser_of().format_help().splitlines())) <= columns
+    for parser in [parser_of(), *(parsed(one).parser for one in commands())]:
+        assert max(map(len, parser.format_help().splitlines())) <= columns, parser.prog
+
+
+def test_an_example_that_is_broken_stays_the_same_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A shell reads its lines as one."""
+    monkeypatch.setenv("COLUMNS", "40")
+    for command in commands():
+        example = parsed(command).parser.format_help().partition("example:\n")[2].partition("\n\n")[0]
+        assert shlex.split(example.replace("\\\n", ""))[1:] == shlex.split(command.example)
 
 
 @pytest.mark.parametrize(
@@ -70,8 +85,8 @@ def test_help_fits_a_narrow_terminal(columns: int, monkeypatch: pytest.MonkeyPat
         (["run", "vehicle", "--slot", "4"], "unknown option --slot; did you mean --slots?"),
         (["run", "vehicle", "--slot=4"], "unknown option --slot=4; did you mean --slots?"),
         (["run", "vehicle", "--view", "wob"], "expected one of auto, native, web, off; did you mean web?"),
-        (["show", "vehicel"], "there is no built-in scenario of this name; did you mean vehicle?"),
-        (["docs", "lnks"], "there is no page of this name; did you mean links?"),
+        (["show", "vehicel"], "there is no built-in scenario vehicel; did you mean vehicle?"),
+        (["docs", "lnks"], "there is no page lnks; did you mean links?"),
     ],
 )
 def test_a_mistyped_word_gets_a_hint(given: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:

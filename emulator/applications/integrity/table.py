@@ -11,11 +11,11 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field
 
+from evedrop.hints import near
 from evedrop.kernels.elementary import semidefinite_factor
 from evedrop.model.checks import is_number
 from evedrop.model.integrity import POLICIES, SENSOR_ATTACKS
 from evedrop.model.process import Floats
-from evedrop.model.registry import near
 from evedrop.scenario.table import Found, Matrix, Table, numbers, one_of
 from evedrop.scenario.words import as_toml, listed
 

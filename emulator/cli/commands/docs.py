@@ -8,6 +8,7 @@ from pathlib import Path
 
 from evedrop.command import Command
 from evedrop.errors import UsageError
+from evedrop.hints import near
 
 _SHELLS = ("bash", "zsh", "fish")
 
@@ -22,9 +23,7 @@ def docs(options: argparse.Namespace) -> int:
         return 0
     name = str(options.page).removesuffix(".md")
     if name not in pages:
-        from evedrop.model.registry import near
-
-        raise UsageError(f"{name}: there is no page of this name{near(name, pages) or '; evedrop docs lists them'}")
+        raise UsageError(f"there is no page {name}{near(name, pages) or '; evedrop docs lists them'}")
     print(pages[name].read_text(encoding="utf-8"), end="")
     return 0
 

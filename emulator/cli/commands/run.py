@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def demo(options: argparse.Namespace) -> int:
-    """Run the shipped scenario `vehicle` live."""
+    """Run the built-in scenario `vehicle` live."""
     options.scenario = "vehicle"
     return run(options)
 

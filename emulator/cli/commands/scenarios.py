@@ -9,7 +9,7 @@ from evedrop.command import Command
 
 
 def list_scenarios(_: argparse.Namespace) -> int:
-    """Print a line for each shipped scenario, even if it needs an extra that is not installed."""
+    """Print a line for each built-in scenario, even if it needs an extra that is not installed."""
     import tomllib
 
     from evedrop.loading import shipped

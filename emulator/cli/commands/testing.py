@@ -38,7 +38,10 @@ def test(options: argparse.Namespace) -> int:
 
 def _places(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "places", nargs="+", metavar="PATH", help="a scenario, a folder that contains scenarios, or a shipped name"
+        "places",
+        nargs="+",
+        metavar="PATH",
+        help="a scenario, a folder that contains scenarios, or the name of a built-in one",
     )
 
 
