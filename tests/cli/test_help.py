@@ -73,7 +73,8 @@ def test_an_example_that_is_broken_stays_the_same_command(monkeypatch: pytest.Mo
     monkeypatch.setenv("COLUMNS", "40")
     for command in commands():
         example = parsed(command).parser.format_help().partition("example:\n")[2].partition("\n\n")[0]
-        assert shlex.split(example.replace("\\\n", ""))[1:] == shlex.split(command.example)
+        (line,) = example.replace("\\\n", "").splitlines()
+        assert shlex.split(line)[1:] == shlex.split(command.example)
 
 
 @pytest.mark.parametrize(
@@ -97,6 +98,13 @@ def test_a_mistyped_word_gets_a_hint(given: list[str], said: str, capsys: pytest
         status = int(str(error.code))
     assert status == 2
     assert said in capsys.readouterr().err
+
+
+def test_a_word_that_resembles_no_other_gets_no_hint(capsys: pytest.CaptureFixture[str]) -> None:
+    """A hint that is wrong would mislead."""
+    with pytest.raises(SystemExit):
+        main(["xyzzy"])
+    assert capsys.readouterr().err.splitlines()[0] == "evedrop: unknown command xyzzy"
 
 
 def test_docs_lists_every_page(capsys: pytest.CaptureFixture[str]) -> None:

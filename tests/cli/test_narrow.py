@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import io
+import sys
 
 import pytest
 from rich.console import Console
 from rich.table import Table
 
 from evedrop.cli.narrow import fitted
+from evedrop.cli.report import terminal
 
 
 def table() -> Table:
@@ -49,6 +51,23 @@ def test_a_table_that_does_not_fit_is_shown_row_by_row(columns: int) -> None:
 def test_a_table_that_fits_stays_a_table() -> None:
     """On a terminal of 80 columns it has its heads in one line."""
     assert any("scheme" in line and "ratio" in line for line in said(80))
+
+
+def test_a_table_stays_a_table_as_long_as_it_fits() -> None:
+    """On a terminal that is as wide as its widest line, and not on one that is a column narrower."""
+    wide = max(map(len, said(80)))
+    assert len({len(line) for line in said(wide)[1:]} & {wide}) == 1
+    assert said(wide - 1)[2] == "scheme innovation"
+
+
+def test_a_report_fits_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What commands print their tables with shows them row by row."""
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "32")
+    console = terminal()
+    with console.capture() as caught:
+        console.print(table())
+    assert "scheme innovation" in caught.get()
 
 
 def test_a_head_may_be_wrapped() -> None:

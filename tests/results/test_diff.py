@@ -197,11 +197,17 @@ def test_runs_of_different_processes_differ(runs: dict[str, Results], tmp_path: 
 
 
 def test_what_a_detector_says_is_compared(tmp_path: Path) -> None:
-    """Watermark and statistic of recorded trials row by row, and those of all trials by the digest of the summary."""
+    """Watermark and statistic of recorded trials row by row, and those of all trials by the digest of the summary.
+
+    Not with the digest of other trials.
+    """
     loop: dict[str, Any] = {"trials": 3, "expect": []}
     known = montecarlo("replay-attack", out=tmp_path / "a", **loop)
     again = montecarlo("replay-attack", out=tmp_path / "b", **loop)
     assert difference(known, again).same
+    fewer = montecarlo("replay-attack", out=tmp_path / "fewer", **{**loop, "trials": 2})
+    assert fewer.summary["integrity"]["digest"] != known.summary["integrity"]["digest"]
+    assert difference(known, fewer).same
     changed = shutil.copytree(tmp_path / "b", tmp_path / "changed")
     summary = json.loads((changed / "summary.json").read_text(encoding="utf-8"))
     summary["integrity"]["digest"] = "0" * 64
