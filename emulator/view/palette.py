@@ -1,4 +1,6 @@
-"""All colours of Evedrop, by what they stand for: view, figures and tables take theirs from here.
+"""The colours of Evedrop, by what they stand for: view, figures and comparisons take theirs from here.
+
+Not here are those of text and grids, and those that a figure takes from the paper that it repeats.
 
 Two colours of one panel differ by at least 15 (CIEDE2000) for full colour vision, deuteranopia, protanopia and tritanopia;
 the colours of a lane differ in brightness, too. tests/view/test_palette.py checks both.
@@ -27,7 +29,7 @@ RECEIVERS: tuple[Colour, ...] = (
 """The legitimate estimator first, then the eavesdroppers in the scenario's order; the same in the view and in sweeps."""
 
 PLANT: tuple[Colour, ...] = (*RECEIVERS[1:], TRUTH_CURVE)
-"""Disturbances and inputs of a closed loop, in order."""
+"""Disturbances and inputs of a closed loop, and other curves of its plant, in order."""
 
 STATE: Colour = (83, 148, 249)  # blue
 DECODED: Colour = (36, 112, 99)  # green

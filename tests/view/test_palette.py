@@ -7,8 +7,11 @@ from itertools import combinations, pairwise
 import pytest
 from coloraide import Color
 
+from evedrop.loading import load
+from evedrop.scenario.application import APPLICATIONS
+from evedrop.scenario.controlled import controlled_plant
 from evedrop.view import lanes
-from evedrop.view.palette import DROPPED, LANES, PANELS, WIRE_LANES, Colour, hexadecimal
+from evedrop.view.palette import DROPPED, LANES, PANELS, PLANT, WIRE_LANES, Colour, hexadecimal
 
 _LEAST = 15.0  # CIEDE2000; 1 is just noticeable side by side
 _VISIONS = (None, "deutan", "protan", "tritan")
@@ -41,3 +44,17 @@ def test_lanes_use_the_colours_of_the_table() -> None:
         assert set(lane.colours) <= set(LANES)
         assert len(set(lane.colours)) == len(lane.words)
     assert lanes.EAVESDROPPER.colours[0] == DROPPED
+
+
+@pytest.mark.parametrize("name", ["microgrid", "heated-room", "replay-attack"])
+def test_panels_of_applications_use_the_colours_of_the_table(name: str) -> None:
+    """Curves that are not of receivers have colours of the plant, each another one."""
+    scenario = load(name)
+    loop = controlled_plant(scenario)
+    assert loop is not None
+    panels = [one for key, table in scenario.applications.items() for one in APPLICATIONS[key].panels(loop, table)]
+    assert panels
+    for panel in panels:
+        colours = [curve.colour for curve in panel.curves if curve.colour is not None]
+        assert set(colours) <= set(PLANT)
+        assert len(set(colours)) == len(colours)

@@ -25,6 +25,7 @@ from evedrop.scenario.application import (
     Summary,
 )
 from evedrop.scenario.table import Found, Number, Table
+from evedrop.view.palette import PLANT
 
 _HOUR = 3600.0
 _ENERGY, _DISCOMFORT = "heating", "discomfort"
@@ -180,7 +181,7 @@ class Comfort(Application):
         """The heater's energy, and the discomfort that each receiver believes."""
         del table
         return (
-            Panel(_ENERGY, "Heating energy (kWh)", (PanelCurve("energy", (222, 92, 82)),)),
+            Panel(_ENERGY, "Heating energy (kWh)", (PanelCurve("energy", PLANT[0]),)),
             Panel(
                 _DISCOMFORT,
                 "Discomfort that each believes (K h)",

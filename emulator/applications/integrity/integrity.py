@@ -30,9 +30,9 @@ from evedrop.scenario.application import (
     Summary,
 )
 from evedrop.scenario.table import Table
+from evedrop.view.palette import PLANT, TRUTH_CURVE
 
 _EVIDENCE, _WATERMARK = "evidence", "watermark"
-_COLOURS = ((226, 178, 40), (80, 150, 235), (60, 180, 120), (170, 120, 230))
 
 
 @final
@@ -136,14 +136,14 @@ class Integrity(Application):
             _EVIDENCE,
             "Evidence of an attack: statistic, threshold, alarm",
             (
-                PanelCurve("statistic", (80, 150, 235)),
-                PanelCurve("threshold", (140, 140, 140), width=1.0),
-                PanelCurve("alarm", (222, 60, 60), "points", 7.0),
+                PanelCurve("statistic", PLANT[0]),
+                PanelCurve("threshold", TRUTH_CURVE, width=1.0),
+                PanelCurve("alarm", PLANT[2], "points", 7.0),
             ),
         )
         if _own(table).watermark is None:
             return (evidence,)
-        curves = [PanelCurve(f"e{i}", _COLOURS[i % len(_COLOURS)], "steps", 1.0) for i in range(loop.plant.inputs)]
+        curves = [PanelCurve(f"e{i}", PLANT[i % len(PLANT)], "steps", 1.0) for i in range(loop.plant.inputs)]
         return evidence, Panel(_WATERMARK, "Watermark: what is added to the inputs", tuple(curves))
 
     @classmethod

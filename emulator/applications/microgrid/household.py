@@ -27,12 +27,11 @@ from evedrop.scenario.application import (
     Summary,
 )
 from evedrop.scenario.table import Table
+from evedrop.view.palette import PLANT, TRUTH_CURVE
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-BOUGHT, SOLD, TRUTH = (222, 92, 82), (60, 180, 120), (138, 144, 156)
-"""Colours of curves."""
 ENERGY, GUESSES = "energy", "guesses"
 """Paths of panels."""
 
@@ -91,11 +90,13 @@ class Household(Application):
         # Points: a guess that jumps appears as a cloud, and hides no other.
         guesses = tuple(PanelCurve(name, drawn="points", width=1.6) for name in loop.receivers)
         return (
-            Panel(ENERGY, "Energy bought and sold (kWh)", (PanelCurve("bought", BOUGHT), PanelCurve("sold", SOLD))),
+            Panel(
+                ENERGY, "Energy bought and sold (kWh)", (PanelCurve("bought", PLANT[0]), PanelCurve("sold", PLANT[1]))
+            ),
             Panel(
                 GUESSES,
                 f"{loop.disturbance_labels[loop.disturbance(house.load)]}, and what each would guess from its estimate",
-                (PanelCurve("truth", TRUTH, "steps", 1.4), *guesses),
+                (PanelCurve("truth", TRUTH_CURVE, "steps", 1.4), *guesses),
                 (-0.1 * most, 1.15 * most),
                 with_beliefs=True,
             ),
