@@ -5,8 +5,9 @@ BIN := $(VENV)/bin
 # Every worker of pytest, and every process that a test starts, would otherwise compile the same modules again.
 unexport PYTHONDONTWRITEBYTECODE
 READY := $(VENV)/.ready
+DOCS_READY := $(VENV)/.docs-ready
 
-.PHONY: demo test bench coverage test-long test-hosts test-compose test-faults lint setup clean
+.PHONY: demo test bench coverage test-long test-hosts test-compose test-faults docs lint setup clean
 
 demo: $(READY)
 	$(BIN)/evedrop demo
@@ -45,6 +46,12 @@ COUNT ?= $(if $(SEED),1,60)
 test-faults: $(READY)
 	$(BIN)/python -m tests.faults.campaign --seed $(or $(SEED),1) --count $(COUNT)
 
+# The pages as a site, in build/site. Fails on broken links, and on pages that the navigation does not have. The environment gets
+# what builds the site only here, so that the other targets do not wait for it.
+docs: $(DOCS_READY)
+	NO_MKDOCS_2_WARNING=1 PYTHONPATH=tools/site $(BIN)/python -m mkdocs build --clean
+	@echo "the site is in build/site; to read it: python3 -m http.server --bind 127.0.0.1 --directory build/site"
+
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -63,5 +70,10 @@ $(READY): constraints.txt pyproject.toml hatch_build.py $(wildcard emulator/kern
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	touch $(READY)
 
+# Versions of the packages that build the site, each checked against its hash.
+$(DOCS_READY): $(READY) constraints-docs.txt
+	$(BIN)/python -m pip install --quiet --require-hashes --requirement constraints-docs.txt
+	touch $(DOCS_READY)
+
 clean:
-	rm -rf $(VENV) emulator/kernels/_compiled.* .mypy_cache .ruff_cache .pytest_cache .hypothesis build/test-base-*.tar*
+	rm -rf $(VENV) build/site emulator/kernels/_compiled.* .mypy_cache .ruff_cache .pytest_cache .hypothesis build/test-base-*.tar*

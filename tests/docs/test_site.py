@@ -1,0 +1,34 @@
+"""What the site needs of the pages, without building it: `make docs` checks the rest."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.docs.test_documents import heading
+
+ROOT = Path(__file__).parents[2]
+MADE = {"index.md", "contributing.md", "security.md", "changelog.md"}
+"""Pages of the site that tools/site/pages.py makes, besides those in reference/."""
+
+
+def test_the_navigation_has_every_page_once() -> None:
+    """A page without a place in mkdocs.yml cannot be found, and one that is not there cannot be built."""
+    settings = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    named = re.findall(r"^ +- .*: (\S+\.md)$", settings, re.MULTILINE)
+    pages = {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")}
+    assert sorted(name for name in named if name not in MADE and not name.startswith("reference/")) == sorted(pages)
+
+
+@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md"])
+def test_links_of_pages_outside_docs_lead_somewhere(name: str) -> None:
+    """The file is there, and the heading in it."""
+    for target in re.findall(r"\]\(([^):\s]+)\)", (ROOT / name).read_text(encoding="utf-8")):
+        path, _, anchor = target.partition("#")
+        other = ROOT / (path or name)
+        assert other.exists(), target
+        if anchor:
+            titles = re.findall(r"^#+ (.*)$", other.read_text(encoding="utf-8"), re.MULTILINE)
+            assert anchor in {heading(title) for title in titles}, target

@@ -1,0 +1,24 @@
+"""An extension of Griffe: examples in docstrings, which begin with >>>, become code blocks."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from griffe import Extension, Object
+
+_EXAMPLE = re.compile(r"(?:^>>> .*\n?(?:^(?!\s*$).*\n?)*)+", re.MULTILINE)
+
+
+class Doctests(Extension):
+    """Puts a fence around each example."""
+
+    def on_object(self, *, obj: Object, **_: Any) -> None:
+        """For the docstring of an object."""
+        if obj.docstring is not None:
+            obj.docstring.value = _EXAMPLE.sub(_fenced, obj.docstring.value)
+
+
+def _fenced(found: re.Match[str]) -> str:
+    code = re.sub(r" +# doctest: .*", "", found[0].rstrip())
+    return f"```python\n{code}\n```\n"

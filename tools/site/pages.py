@@ -1,0 +1,105 @@
+"""Hooks of MkDocs: pages that the program makes, formulas as MathML, links that work in the repository and on the site."""
+
+from __future__ import annotations
+
+import html
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+from commands import commands_page
+from keys import keys_page
+from latex2mathml.converter import convert
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.exceptions import PluginError
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+
+ROOT = Path(__file__).parents[2]
+_OF_THE_ROOT = {
+    "README.md": "index.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "SECURITY.md": "security.md",
+    "CHANGELOG.md": "changelog.md",
+}
+"""Pages outside docs/, and their names on the site."""
+
+_ENTRY = re.compile(r"(^```.*?^```|`[^`\n]*`)|\]\[", re.DOTALL | re.MULTILINE)
+"""The middle of M[i][j], which would be read as a link, outside of code."""
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the pages that are not in docs/."""
+    made = {there: (ROOT / name).read_text(encoding="utf-8") for name, there in _OF_THE_ROOT.items()}
+    made |= {
+        "reference/scenario-keys.md": keys_page(),
+        "reference/commands.md": commands_page(),
+        "reference/evedrop.md": "# The module `evedrop`\n\n::: evedrop\n\n## wire\n\n::: evedrop.wire.running.wire\n",
+        "reference/extend.md": "# The module `evedrop.extend`\n\n::: evedrop.extend\n",
+        "site.css": (Path(__file__).parent / "site.css").read_text(encoding="utf-8"),
+    }
+    for name, text in made.items():
+        files.append(File.generated(config, name, content=text))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
+    """Make links between docs/ and the folder above it, as they are in the repository, lead to the site's."""
+    for name, there in _OF_THE_ROOT.items():
+        markdown = re.sub(rf"\]\((\.\./)?{re.escape(name)}(?=[)#])", f"]({there}", markdown)
+    if page.file.src_uri in _OF_THE_ROOT.values():
+        markdown = re.sub(r"\]\(docs/", "](", markdown)
+    markdown = re.sub(r"^```golden .*$", "```text", markdown, flags=re.MULTILINE)
+    return _ENTRY.sub(lambda found: found[1] or "]&#91;", markdown)
+
+
+def on_page_content(page_html: str, **_: Any) -> str:
+    """Write formulas as MathML, which browsers show without a script."""
+    return re.sub(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', _formula, page_html, flags=re.DOTALL)
+
+
+def _formula(found: re.Match[str]) -> str:
+    display = "block" if found[2] == "[" else "inline"
+    return f'<{found[1]} class="formula">{convert(html.unescape(found[3]), display=display)}</{found[1]}>'
+
+
+def floors(source: str, *_: Any, **__: Any) -> str:
+    """The floor plan's drawing as rows of rooms: the script that draws Mermaid's would come from another host."""
+    rows = re.findall(r"subgraph \w+.*?\n(.*?)\n\s*end", source, re.DOTALL)
+    rooms = (re.findall(r"\[(\w+)\]", row) for row in rows)
+    return '<div class="floors">{}</div><p>The site shows the floors without the arrows.</p>'.format(
+        "".join("<p>{}</p>".format(" ".join(f"<code>{html.escape(room)}</code>" for room in row)) for row in rooms)
+    )
+
+
+_LOADS = {"src", "href", "srcset", "data", "poster"}
+
+
+class _Requests(HTMLParser):
+    """Finds what a page loads from other hosts."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Everything but a link that a reader follows is loaded by itself."""
+        given = {name: value or "" for name, value in attrs}
+        if tag != "a" and given.get("rel") != "canonical":
+            self.found += [
+                value for name, value in given.items() if name in _LOADS and re.match(r"(https?:)?//", value)
+            ]
+
+
+def on_post_build(config: MkDocsConfig, **_: Any) -> None:
+    """Fail if a page or a style sheet loads anything from another host."""
+    site = Path(config.site_dir)
+    for page in site.rglob("*.html"):
+        requests = _Requests()
+        requests.feed(page.read_text(encoding="utf-8"))
+        if requests.found:
+            raise PluginError(f"{page}: loads {', '.join(requests.found)}; pages may ask no other host for anything")
+    for sheet in site.rglob("*.css"):
+        if found := re.findall(r"(?:url\(|@import )[\"']?((?:https?:)?//[^)\"']+)", sheet.read_text(encoding="utf-8")):
+            raise PluginError(f"{sheet}: loads {', '.join(found)}; pages may ask no other host for anything")
