@@ -87,15 +87,13 @@ def parser_of(first: str = "") -> Parser:
         epilog="evedrop COMMAND --help describes a command; evedrop docs lists the pages of the documentation.",
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
-    top = parser.add_subparsers(title="commands", required=True, metavar="COMMAND", parser_class=Parser)
+    top = parser.add_commands()
     groups: dict[str, _Parsers] = {}
     for command in _commands(first):
         where, does = top, command.does
         if command.group is not None:
             if command.group not in groups:
-                groups[command.group] = _added(top, command.group, f"commands about {command.group}").add_subparsers(
-                    title="commands", required=True, metavar="COMMAND", parser_class=Parser
-                )
+                groups[command.group] = _added(top, command.group, f"commands about {command.group}").add_commands()
             where = groups[command.group]
         one = _added(where, command.name, does, _epilog(command))
         one.set_defaults(command=command.run, parser=one)

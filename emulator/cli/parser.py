@@ -1,14 +1,20 @@
-"""The parser of the command line: argparse, with a hint for a mistyped word, no abbreviations, and help in sections."""
+"""The parser of the command line: argparse, with a hint for a mistyped word, no abbreviations, and help in sections.
+
+Of argparse it uses one name that is not public, `_option_string_actions`, and does without hints for options if that is gone.
+"""
 
 from __future__ import annotations
 
 import argparse
 import shutil
 import textwrap
-from collections.abc import Iterable, Sequence
-from typing import Any, NoReturn
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from evedrop.hints import near
+
+if TYPE_CHECKING:
+    from argparse import _SubParsersAction
 
 _WIDEST = 100
 _NARROWEST = 30
@@ -22,8 +28,9 @@ def _columns() -> int:
 class _Help(argparse.RawDescriptionHelpFormatter):
     """Keeps within the width, and breaks an example as a shell reads it."""
 
-    def __init__(self, prog: str) -> None:
-        super().__init__(prog, width=_columns())
+    def __init__(self, prog: str, **more: Any) -> None:
+        """more: what a later Python may add."""
+        super().__init__(prog, **{**more, "width": _columns()})
 
     def add_usage(
         self,
@@ -58,6 +65,19 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, *given: Any, **named: Any) -> None:
         super().__init__(*given, **{"formatter_class": _Help, "allow_abbrev": False, **named})
         self.sections: dict[str, dict[str, str]] = {}
+        self._commands: Mapping[str, Parser] = {}
+
+    def add_commands(self) -> _SubParsersAction[Parser]:
+        """Begin the commands of this parser; each is then added to what this returns."""
+        added = self.add_subparsers(title="commands", required=True, metavar="COMMAND", parser_class=Parser)
+        self._commands = added.choices
+        return added
+
+    def add_argument(self, *given: Any, **named: Any) -> argparse.Action:
+        """Add an argument as argparse does. A word that is not among its choices gets a hint."""
+        if "choices" in named and "type" not in named:
+            named["type"] = _choice(named["choices"])
+        return super().add_argument(*given, **named)
 
     def format_help(self) -> str:
         """For a parser with sections, the commands under their titles; otherwise as argparse writes it."""
@@ -78,25 +98,37 @@ class Parser(argparse.ArgumentParser):
 
     def parse_whole(self, given: Sequence[str]) -> argparse.Namespace:
         """The options; exits with a hint if an argument is unknown."""
+        self._check_commands(given)
         options, unknown = self.parse_known_args(given)
         if unknown:
             parser: Parser = getattr(options, "parser", self)
             word = unknown[0]
-            known = [name for name in parser._option_string_actions if name.startswith("--")]
+            known = [name for name in getattr(parser, "_option_string_actions", ()) if name.startswith("--")]
             what = "option" if word.startswith("-") else "argument"
             parser.error(f"unknown {what} {word}{near(word.partition('=')[0], known)}")
         return options
 
-    def _check_value(self, action: argparse.Action, value: Any) -> None:
-        """Name the nearest choice, and of commands no other."""
-        if action.choices is None or value in action.choices:
-            return
-        names = [str(one) for one in action.choices]
-        hint = near(value, names)
-        if isinstance(action, argparse._SubParsersAction):
-            raise argparse.ArgumentError(None, f"unknown command {value}{hint}")
-        raise argparse.ArgumentError(action, f"is {value!r}; expected one of {', '.join(names)}{hint}")
+    def _check_commands(self, given: Sequence[str]) -> None:
+        """Exit with a hint if a word that must be a command is not one. After an option, argparse finds out by itself."""
+        parser = self
+        for word in given:
+            if not parser._commands or word.startswith("-"):
+                return
+            if word not in parser._commands:
+                parser.error(f"unknown command {word}{near(word, parser._commands)}")
+            parser = parser._commands[word]
 
     def error(self, message: str) -> NoReturn:
         """Print the mistake and where to read more, and exit with status 2."""
         self.exit(2, f"{self.prog}: {message}\ntry: {self.prog} --help\n")
+
+
+def _choice(names: Iterable[str]) -> Callable[[str], str]:
+    """The type of an argument that must be one of these names."""
+
+    def checked(word: str) -> str:
+        if word in names:
+            return word
+        raise argparse.ArgumentTypeError(f"is {word!r}; expected one of {', '.join(names)}{near(word, names)}")
+
+    return checked

@@ -86,6 +86,7 @@ def test_an_example_that_is_broken_stays_the_same_command(monkeypatch: pytest.Mo
         (["run", "vehicle", "--slot", "4"], "unknown option --slot; did you mean --slots?"),
         (["run", "vehicle", "--slot=4"], "unknown option --slot=4; did you mean --slots?"),
         (["run", "vehicle", "--view", "wob"], "expected one of auto, native, web, off; did you mean web?"),
+        (["completion", "fsh"], "'fsh'; expected one of bash, zsh, fish; did you mean fish?"),
         (["show", "vehicel"], "there is no built-in scenario vehicel; did you mean vehicle?"),
         (["docs", "lnks"], "there is no page lnks; did you mean links?"),
     ],
@@ -105,6 +106,20 @@ def test_a_word_that_resembles_no_other_gets_no_hint(capsys: pytest.CaptureFixtu
     with pytest.raises(SystemExit):
         main(["xyzzy"])
     assert capsys.readouterr().err.splitlines()[0] == "evedrop: unknown command xyzzy"
+
+
+@pytest.mark.parametrize(
+    ("given", "said"), [([], "COMMAND"), (["--version", "rn"], "evedrop "), (["links", "--help", "fitt"], "links")]
+)
+def test_argparse_finds_what_comes_before_a_command(
+    given: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An option in its place is carried out, and a command that is missing is named."""
+    with pytest.raises(SystemExit):
+        main(given)
+    told = capsys.readouterr()
+    assert said in told.out + told.err
+    assert "unknown command" not in told.err
 
 
 def test_docs_lists_every_page(capsys: pytest.CaptureFixture[str]) -> None:
