@@ -1,6 +1,6 @@
 """Evedrop: a network emulator for secrecy in remote state estimation.
 
-    from evedrop import run, preloaded, montecarlo, compare, design, load_results, wire
+    from evedrop import Scenario, run, preloaded, montecarlo, compare, design, load_results, wire
 
 These names are loaded when they are used: a peer imports this package, too, and needs none of them.
 """
@@ -14,12 +14,14 @@ if TYPE_CHECKING:
 
     from evedrop.api import compare, design, montecarlo, run
     from evedrop.live.launch.preloading import preloaded
+    from evedrop.loading import Scenario
     from evedrop.results.writer import load_results
     from evedrop.wire.running import wire  # the package `wire`, which can be called: see there
 
-__all__ = ["compare", "design", "load_results", "montecarlo", "preloaded", "run", "wire"]
+__all__ = ["Scenario", "compare", "design", "load_results", "montecarlo", "preloaded", "run", "wire"]
 
 _HOMES = {
+    "Scenario": "evedrop.loading",
     "compare": "evedrop.api",
     "design": "evedrop.api",
     "load_results": "evedrop.results.writer",

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from evedrop.errors import UsageError
-from evedrop.loading import checked, load
+from evedrop.loading import Scenario, prepared
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.slot.link_law import law_of
@@ -17,8 +17,7 @@ from evedrop.names import LEGITIMATE
 from evedrop.news import Tell, silent
 from evedrop.results.folder import results_folder
 from evedrop.results.writer import Results, load_results
-from evedrop.scenario import Scenario
-from evedrop.scenario.words import listed
+from evedrop.scenario.words import dotted, listed
 
 if TYPE_CHECKING:
     from evedrop.expected.energy_budget import BudgetDesign
@@ -54,7 +53,7 @@ def run(
 ) -> Results:
     """Run a scenario live, with sensor, router, estimators and observer in separate processes.
 
-    scenario: a built-in name, a file, or a checked `Scenario`; out: the results folder, new or empty; view: auto, native,
+    scenario: a built-in name, a file, or a `Scenario`; out: the results folder, new or empty; view: auto, native,
     web or off; listen: the router's loopback endpoint, tcp/127.0.0.1:PORT; tell: called with each item of news; changes: entries
     of the scenario by dotted key, with `__` for the dot, such as `slots=500` or `legitimate__link__quality=0.5`.
 
@@ -283,11 +282,7 @@ def _not_for(scheme: str) -> str:
 
 
 def _prepared(scenario: str | Path | Scenario, changes: Mapping[str, Any], beyond_horizon: bool = False) -> Scenario:
-    dotted = {name.replace("__", "."): value for name, value in changes.items()}
-    if isinstance(scenario, Scenario):
-        tables = scenario.model_dump(mode="json", exclude_none=True)
-        return checked(tables, scenario.title, dotted, beyond_horizon=beyond_horizon)
-    return load(scenario, dotted, beyond_horizon=beyond_horizon)
+    return prepared(scenario, dotted(changes), beyond_horizon=beyond_horizon)
 
 
 def _name(scenario: str | Path | Scenario) -> str | Path:

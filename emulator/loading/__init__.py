@@ -15,12 +15,16 @@ from evedrop.loading.file import (
     value_of,
     write_new,
 )
+from evedrop.loading.python_scenario import prepared, register
+from evedrop.scenario.tables import Scenario
 
 __all__ = [
+    "Scenario",
     "built_in_text",
     "checked",
     "load",
     "parse",
+    "prepared",
     "read",
     "set_entry",
     "shipped",
@@ -28,3 +32,5 @@ __all__ = [
     "value_of",
     "write_new",
 ]
+
+register()

@@ -123,13 +123,18 @@ def parse(
     folder: where the files are that the text names; files that a change names are in the current folder.
     """
     tables = tables_in(text, source)
+    located(tables, folder)
+    with with_line_numbers(text, changes or ()):
+        return checked(tables, source, changes, beyond_horizon=beyond_horizon, folder=folder)
+
+
+def located(tables: dict[str, Any], folder: Path) -> None:
+    """Replace the names of files in tables with their paths, in place; folder: that of the scenario."""
     recordings_located(tables, folder)
     tables_located(tables, folder)
     for entry in ("secret_file", "modules"):
         if isinstance(tables.get(entry), str):
             tables[entry] = str((folder / tables[entry]).absolute())
-    with with_line_numbers(text, changes or ()):
-        return checked(tables, source, changes, beyond_horizon=beyond_horizon, folder=folder)
 
 
 def tables_in(text: str, source: str) -> dict[str, Any]:

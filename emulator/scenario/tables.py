@@ -5,10 +5,11 @@ Source: docs/scenario.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, ClassVar, Self, TypedDict, Unpack
 
 from pydantic import (
     AfterValidator,
@@ -24,6 +25,7 @@ from pydantic import (
 )
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
+from evedrop.errors import UsageError
 from evedrop.model.acknowledgements import ATTACKS, OVERHEARING
 from evedrop.model.controllers import Assignment
 from evedrop.model.eavesdroppers import ANSWERS, STRATEGIES
@@ -47,8 +49,11 @@ from evedrop.scenario.table import Found, Probability, ProcessName, Table, again
 from evedrop.scenario.timeline import Timeline
 from evedrop.scenario.values import MOST_EAVESDROPPERS
 from evedrop.scenario.wire_table import WireTable
-from evedrop.scenario.words import as_toml, listed
+from evedrop.scenario.words import as_toml, dotted, listed
 from evedrop.streams import MOST_SLOTS
+
+Entries = Mapping[str, Any]
+"""A table, as a dict."""
 
 
 class EncodingTable(Table):
@@ -165,8 +170,67 @@ class NetworkTable(Table):
     routers: Annotated[int, Field(ge=1, le=2, strict=True, examples=[2])] = 1
 
 
+class ScenarioEntries(TypedDict, total=False):
+    """The entries of a scenario as Python values, for editors and type checkers; docs/scenario.md describes each."""
+
+    title: str
+    slots: int
+    seed: int
+    trials: int
+    first_trial: int
+    record_trials: int
+    shards: int
+    pace: float
+    longest_outage: float
+    slot_seconds: float | None
+    secret_file: str | Path | None
+    modules: str | Path | None
+    process: Entries
+    encoding: Entries
+    legitimate: Entries
+    eavesdroppers: Mapping[str, Entries]
+    plant: Entries | None
+    controller: Entries | None
+    acknowledgements: Entries | None
+    energy: Entries | None
+    wire: Entries | None
+    network: Entries | None
+    event: Sequence[Entries]
+    nemesis: Entries | None
+    expect: Sequence[Entries]
+
+
+@dataclass(frozen=True)
+class Builders:
+    """The functions of a higher floor that check whole scenarios, which compare the tables, too."""
+
+    build: Callable[[Mapping[str, Any]], Scenario]
+    """Takes entries."""
+    load: Callable[[str | Path, Mapping[str, Any]], Scenario]
+    """Takes a name or file, and changes."""
+    change: Callable[[Scenario, Mapping[str, Any]], Scenario]
+    """Takes a scenario, and changes."""
+
+
 class Scenario(Table):
-    """A scenario whose tables are valid by themselves; `evedrop.loading` makes it, and also compares the tables."""
+    """A scenario: every entry of docs/scenario.md as an argument; tables are dicts, matrices lists or numpy arrays.
+
+    A class in the place of a name is a scheme, an eavesdropper, a loss model or a delay model of your own.
+
+    `Scenario.read` makes one whose tables are valid by themselves; `evedrop.loading`, which also compares the tables, uses it.
+
+    >>> Scenario(
+    ...     title="One eavesdropper",
+    ...     slots=500,
+    ...     process={"A": [[1.0]], "Q": [[0.1]], "initial_covariance": [[1.0]]},
+    ...     encoding={"scheme": "innovation", "state_probability": 0.4},
+    ...     legitimate={"link": {"quality": 0.9}},
+    ...     eavesdroppers={"antenna": {"strategy": "smart", "link": {"quality": 0.97}}},
+    ... )  # doctest: +SKIP
+    """
+
+    builders: ClassVar[Builders | None] = None
+    """Set by `evedrop.loading` when it is imported."""
 
     title: Annotated[str, Field(min_length=1, max_length=200, examples=["Two eavesdroppers beside a planar vehicle"])]
     slots: Annotated[int, Field(ge=1, le=MOST_SLOTS, strict=True, examples=[2000])]
@@ -206,6 +270,50 @@ class Scenario(Table):
     ] = Field(default_factory=list)
     made_with: Annotated[dict[str, str], Field(exclude=True)] = Field(default_factory=dict)
     _applications: dict[str, Table] = PrivateAttr(default_factory=dict)
+
+    def __init__(self, entries: Mapping[str, Any] | None = None, /, **others: Unpack[ScenarioEntries]) -> None:
+        """Check the entries as those of a file are checked; entries: further ones, such as the table of an application.
+
+        Raises ScenarioError with every mistake: its key, what was found, what was expected.
+        """
+        self.__setstate__(_builders().build({**(entries or {}), **others}).__getstate__())
+
+    # Pydantic calls a model's own constructor for every table that it validates, unless the constructor has this mark.
+    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
+
+    @classmethod
+    def load(cls, source: str | Path, changes: Mapping[str, Any] | None = None, /, **others: Any) -> Scenario:
+        """A built-in scenario by its name, or one of a file or a results folder, with changes.
+
+        changes: entries by dotted key, such as `{"eavesdroppers.smart.link.quality": 0.8}`; as keywords they have `__` for the
+        dot, such as `legitimate__link__quality=0.8`.
+
+        Raises ScenarioError with every mistake, UsageError if there is no such scenario.
+        """
+        return _builders().load(source, {**(changes or {}), **dotted(others)})
+
+    def replace(self, changes: Mapping[str, Any] | None = None, /, **others: Any) -> Scenario:
+        """The same scenario with changes, given as for `load`; None removes an entry. Raises ScenarioError with every mistake."""
+        return _builders().change(self, {**(changes or {}), **dotted(others)})
+
+    def to_toml(self) -> str:
+        """The scenario as the text of a file; loading the file gives an equal scenario, which gives equal digests."""
+        import tomli_w  # noqa: PLC0415 - a live run does not wait for it
+
+        made_with = {"made_with": self.made_with} if self.made_with else {}
+        return tomli_w.dumps({**self.as_tables(), **made_with})
+
+    def as_tables(self) -> dict[str, Any]:
+        """The tables of its file, with the entries that were given."""
+        return self.model_dump(mode="json", exclude_none=True, exclude_unset=True)
+
+    def __repr__(self) -> str:
+        others = [f"{name} ({one.strategy})" for name, one in self.eavesdroppers.items()]
+        facts = [f"{self.slots} slots", f"{len(self.process.A)} states", f"scheme {self.encoding.scheme}"]
+        return f"<Scenario {as_toml(self.title)}: {', '.join([*facts, *others])}>"
+
+    def __str__(self) -> str:
+        return repr(self)
 
     @classmethod
     def read(cls, tables: Mapping[str, Any]) -> Self:
@@ -370,3 +478,9 @@ class Scenario(Table):
         if receiver == CONTROLLER:
             return []
         return sorted({slot for one in self.timeline.outages[receiver] for slot in (one.start, one.stop)})
+
+
+def _builders() -> Builders:
+    if Scenario.builders is None:
+        raise UsageError("this class only checks single tables; give `from evedrop import Scenario` instead")
+    return Scenario.builders

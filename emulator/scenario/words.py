@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from evedrop.hints import near
 from evedrop.model.checks import as_toml
 
-__all__ = ["as_toml", "listed", "no_entry"]
+__all__ = ["as_toml", "dotted", "listed", "no_entry"]
 
 
 def no_entry(name: str, known: Sequence[str]) -> str:
@@ -19,3 +20,8 @@ def no_entry(name: str, known: Sequence[str]) -> str:
 def listed(names: Sequence[str]) -> str:
     """Names as a choice: a, b or c."""
     return ", ".join(names[:-1]) + (" or " if len(names) > 1 else "") + names[-1]
+
+
+def dotted(keywords: Mapping[str, Any]) -> dict[str, Any]:
+    """Changes by dotted key, of keywords in which `__` stands for the dot."""
+    return {name.replace("__", "."): value for name, value in keywords.items()}
