@@ -28,6 +28,7 @@ MARGINAL = 1e-7
 MOST_STATES = 64
 """The most states of a process: some computations before a run take a time that grows with n³ or faster."""
 _SLOTS_AT_ONCE = 1024  # whose factors are passed over
+_ALLOWS_SINGULAR = "; or singular_noise = true, which allows a Q without variance in some directions"
 _SINGULAR = 1e-13  # smallest eigenvalue of a correlation matrix that is not mere rounding
 
 
@@ -244,6 +245,9 @@ def mistakes_of(
                 ("Q", f"the pair (A, √Q) is not controllable: the noise reaches {reached} of {A.shape[0]} directions; "
                  "expected process noise that moves every state, such as Q = 1e-3 times the identity")
             )  # fmt: skip
+        with suppress(ValueError):  # an eigenvalue is below 0
+            semidefinite_factor(Q)
+            found = [(name, f"{sentence}{_ALLOWS_SINGULAR}" if name == "Q" else sentence) for name, sentence in found]
     return found
 
 

@@ -22,6 +22,11 @@ from evedrop.scenario.plant import PlantTable, plant_of
 from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.valid import ValidTables
 
+_WAYS_ON = (
+    "another strategy, such as smart, or noise in every direction: add a small variance to the diagonal of Q and leave out "
+    'singular_noise, or with Q = "filter" have as many measurements as states'
+)
+
 
 class Unsuited(NamedTuple):
     """A reason why a strategy cannot work with a process and its plant."""
@@ -59,13 +64,13 @@ def unsuited(table: ProcessTable, plant: PlantTable | None, strategy: str) -> It
     if kind is None or not table.singular_noise:
         return
     if kind.inverts_noise:
-        yield Unsuited("uses the inverse of Q, and Q may be singular", "another strategy, or a Q that is not")
+        yield Unsuited("uses the inverse of Q, and Q may be singular", _WAYS_ON)
     if not kind.reads_leaks:
         return
     try:
         stairs = Staircase(table.process)
     except ValueError as error:
-        yield Unsuited(f"uses what innovations leak, but {error}", "another strategy, or a regular Q")
+        yield Unsuited(f"uses what innovations leak, but {error}", _WAYS_ON)
         return
     if kind.tests_range and stairs.singular and plant is not None and not measured_mistakes(plant, len(table.A)):
         with suppress(ValueError):  # matrices of the plant do not fit the process, which is reported elsewhere
@@ -82,7 +87,7 @@ def _outside(process: Process, plant: Plant, stairs: Staircase) -> Iterator[Unsu
         part = float(stairs.outside(matrix).max(initial=0.0))
         if part > NOT_REACHED:
             why = f"{told}, but plant.{name} moves the state out of it, by {part:.1e} of its size, {bound}"
-            yield Unsuited(why, "another strategy, such as genie, or a regular Q")
+            yield Unsuited(why, f"genie, or {_WAYS_ON}")
     if plant.output_matrix is None:
         return
     settled(process, plant)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from evedrop.model.process import MOST_STATES, Process, StateFactors, Trajectory, mistakes_of, product
+from evedrop.model.process import MOST_STATES, Floats, Process, StateFactors, Trajectory, mistakes_of, product
 from evedrop.model.theory.covariances import state_covariances
 from evedrop.model.theory.horizon import horizon
 from evedrop.streams import Batch, root_of_seed, stream_key
@@ -186,6 +186,17 @@ def test_a_process_of_too_many_states_is_refused() -> None:
     ((entry, what),) = mistakes_of(np.eye(MOST_STATES + 1), np.eye(2), np.eye(2))
     assert entry == "A"
     assert what.startswith(f"has {MOST_STATES + 1} rows; expected at most {MOST_STATES} states")
+
+
+@pytest.mark.parametrize("A", [np.array([[1.0, 0.1], [0.0, 1.0]]), np.eye(2)])
+def test_a_singular_Q_is_refused_with_the_entry_that_allows_it(A: Floats) -> None:
+    """Such as that of a double integrator; a Q with a negative eigenvalue is not allowed by any entry."""
+    Q = np.diag([0.0, 0.01])
+    found = mistakes_of(A, Q, np.eye(2))
+    assert found
+    assert all(entry == "Q" and "; or singular_noise = true" in what for entry, what in found)
+    assert mistakes_of(A, Q, np.eye(2), singular_noise=True) == []
+    assert "singular_noise" not in str(mistakes_of(A, -Q, np.eye(2)))
 
 
 def test_noise_that_may_be_singular_is_still_a_covariance() -> None:

@@ -142,6 +142,39 @@ def test_a_mistake_says_where_what_and_what_instead(case: str) -> None:
     assert any(line.startswith(sentence) for line in mistakes(**changes)), mistakes(**changes)
 
 
+REGULAR: dict[str, Any] = {
+    "process__Q": [[2.5e-5 + 1e-9, 5e-4], [5e-4, 1e-2 + 1e-9]],
+    "process__singular_noise": None,
+}
+SETTLED = {"plant__output_matrix": [[1.0, 0.0], [0.0, 1.0]], "plant__measurement_noise": [[0.01, 0.0], [0.0, 0.01]]}
+TRACKER: dict[str, Any] = {"eavesdroppers": {"eve": {**EVE["eve"], "strategy": "tracker"}}}
+
+
+@pytest.mark.parametrize(
+    ("refused", "strategy", "more"),
+    [
+        (WRONG["a track of its own"][0], "smart", REGULAR),
+        (
+            {**WRONG["singular twice"][0], "eavesdroppers": {"eve": {**EVE["eve"], "strategy": "genie"}}},
+            "smart",
+            REGULAR,
+        ),
+        ({**WRONG["another noise"][0], "eavesdroppers": EVE}, "genie", REGULAR),
+        (TRACKER, "smart", SETTLED),
+    ],
+)
+def test_a_strategy_that_cannot_use_a_singular_Q_is_refused_with_what_can_be_done(
+    refused: dict[str, Any], strategy: str, more: dict[str, Any]
+) -> None:
+    """Another strategy, noise in every direction, or as many measurements as states: what the message names works."""
+    (line,) = mistakes(**refused)
+    assert strategy in line.partition("; expected ")[2]
+    assert "add a small variance to the diagonal of Q and leave out singular_noise" in line
+    assert "as many measurements as states" in line
+    assert mistakes(**{**refused, "eavesdroppers": {"eve": {**EVE["eve"], "strategy": strategy}}}) == []
+    assert mistakes(**{**refused, **more}) == []
+
+
 RIGHT: dict[str, dict[str, Any]] = {
     "as it is": {},
     "a genie before the filter has settled": {
