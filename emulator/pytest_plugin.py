@@ -2,7 +2,8 @@
 
 Its fixture `evedrop_wire` gives a test wires between programs (docs/wire.md, from pytest).
 
-pytest loads this plugin in every project of an environment that has Evedrop installed, so it makes no slow imports itself.
+pytest loads this plugin in every project of an environment that has Evedrop installed. So it imports nothing of Evedrop before it
+finds a TOML file, and only what runs a scenario when a scenario is run.
 
 Source: docs/testing.md.
 """
@@ -16,8 +17,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
 import pytest
-
-from evedrop.discovery import is_scenario
 
 if TYPE_CHECKING:
     from evedrop.studies.scenario_tests import Finding
@@ -41,6 +40,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
     """A collector for a scenario file; None for any other file."""
+    if file_path.suffix != ".toml":
+        return None
+    from evedrop.discovery import is_scenario  # noqa: PLC0415 - most projects have no scenario
+
     return ScenarioFile.from_parent(parent, path=file_path) if is_scenario(file_path) else None
 
 

@@ -30,6 +30,8 @@ _MOST_BYTES = 2**20  # in one answer
 _MODULE = "evedrop.conformance.answering"
 # Where libraries are, if not in the system's folders; nothing else of our environment is passed on.
 _NEEDED = ("LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH", "DYLD_FALLBACK_LIBRARY_PATH", "PYTHONHOME")
+_PYTHON = str(Path(os.__file__).parent)
+"""The folder of Python's own modules."""
 
 
 @final
@@ -107,7 +109,8 @@ class _Child:
 
     def __init__(self, folder: str | None, seconds: float) -> None:
         self._seconds = seconds
-        places = json.dumps([str(Path(place).absolute()) for place in sys.path])
+        # Python's own modules first: pytest puts folders of tests before them, which may have files of the same names.
+        places = json.dumps([_PYTHON, *(str(Path(place).absolute()) for place in sys.path)])
         command = (
             "import json, sys; sys.path[:] = json.loads(sys.stdin.buffer.raw.readline()); "
             f"from {_MODULE} import answer; answer(json.loads(sys.stdin.buffer.raw.readline()))"

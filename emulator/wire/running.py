@@ -250,7 +250,7 @@ class RunningWire:
 def _started(*arguments: str) -> subprocess.Popen[str]:
     """A process of Evedrop that Ctrl-C in the terminal does not reach; the program that started it ends it."""
     return subprocess.Popen(
-        [sys.executable, "-m", "evedrop", *arguments],
+        [sys.executable, "-P", "-m", "evedrop", *arguments],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
