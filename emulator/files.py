@@ -1,4 +1,4 @@
-"""Reads files that users name: only regular files, and only up to a limit.
+"""Files that users name: read only if they are regular files, and only up to a limit; written completely or not at all.
 
 A pipe or a device may never end, and some megabytes of a compressed file may expand to many gigabytes. Every reader here
 stops as soon as it has read more than its limit, and reports the limit.
@@ -10,11 +10,15 @@ import gzip
 import io
 import os
 import stat
+import tempfile
 import zlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
+
+from evedrop.errors import UsageError
 
 LINE_CHARACTERS = 65_536
 """The longest line of a table."""
@@ -128,3 +132,38 @@ def why_of(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return next(iter(str(error).splitlines()), type(error).__name__)
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A temporary file beside a path, which takes its place when the block ends, and is removed if the block raises an error.
+
+    Raises UsageError if it cannot be written, also for an OSError of the block that names no other file.
+    """
+    real = Path(os.path.realpath(path))
+    if is_there(real) and not real.is_file():
+        raise UsageError(f"{path} is not a file; give the name of one, or a new name")
+    try:
+        # Not by mkstemp's mode: a file whose name the user chose is not private.
+        descriptor, name = tempfile.mkstemp(suffix=real.suffix, prefix=f".{real.name[:100]}-", dir=real.parent)
+        os.close(descriptor)
+    except OSError as error:
+        raise UsageError(f"{path} cannot be written ({error.strerror}); give another file") from error
+    temporary = Path(name)
+    try:
+        yield temporary
+        temporary.chmod(0o666 & ~_mask())
+        os.replace(temporary, real)
+    except OSError as error:
+        if error.filename not in {None, name}:
+            raise
+        raise UsageError(f"{path} cannot be written ({error.strerror or error}); give another file") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _mask() -> int:
+    """The process's umask, which can only be read by changing it."""
+    mask = os.umask(0o077)
+    os.umask(mask)
+    return mask

@@ -1,172 +1,134 @@
-"""Takes a picture of a finished recording without a screen.
-
-Needs a Vulkan driver; a software driver is enough, such as Debian's mesa-vulkan-drivers.
-"""
+"""Takes pictures of a finished recording without a screen."""
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
 import tempfile
-import time
-import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import suppress
 from pathlib import Path
-
-from rerun.chunk import RrdReader
-from rerun.experimental import ViewerClient
+from typing import IO
 
 from evedrop.environment import viewer_environment
 from evedrop.errors import UsageError
-from evedrop.ports import free_port
-from evedrop.view.column import ELAPSED, TIMELINE
-from evedrop.view.viewer_process import end, guarded, spawn
+from evedrop.files import whole_file
+from evedrop.signals import raise_on_signals
+from evedrop.view.headless import check, opened
+from evedrop.view.viewer_process import end, guarded
+
+__all__ = ["SIZE", "check_picture_name", "frames_apart", "opened", "picture_apart"]
 
 SIZE = (1600, 950)
 """Width and height of a picture in pixels."""
-_LOAD_SECONDS = 60.0
-_SETTLE_SECONDS = 30.0
+_LENGTH_BYTES = 8
+_LAST = "last"
 
 
-def picture(rrd: Path, png: Path, size: tuple[int, int] = SIZE, moment: float | None = None) -> list[str]:
-    """Draw a moment of a recording, by default its last, to a PNG file; returns the panels' complaints.
-
-    moment: a slot of a run, or seconds since the start of a wire.
-
-    Raises UsageError if there is no Vulkan driver, the recording cannot be loaded, or the file cannot be written.
-    """
-    with opened(rrd, size, moment) as viewer:
-        try:
-            png.write_bytes(viewer.take_screenshot())
-        except OSError as error:
-            raise UsageError(f"{png} cannot be written ({error.strerror}); give another file") from error
-        return reports(viewer)
+def check_picture_name(path: Path) -> None:
+    """Raise UsageError if a picture cannot be written to a file of this name."""
+    if path.suffix.lower() == ".svg":
+        raise UsageError(
+            f"--picture {path}: the viewer draws pixels, not the lines of an SVG; give a name that ends in .png. "
+            "evedrop figures and evedrop compare draw theirs as PDF, too"
+        )
+    if path.suffix.lower() != ".png":
+        raise UsageError(f"--picture {path} is not the name of a PNG file; give one that ends in .png")
 
 
 def picture_apart(rrd: Path, png: Path, moment: float | None = None, size: tuple[int, int] = SIZE) -> list[str]:
-    """Draw as `picture` does, in a separate process; in a separate network, too, if the system allows that.
+    """Draw a moment of a recording, by default its last, to a PNG file; returns the panels' complaints.
 
-    Otherwise anybody who finds the port of the headless viewer could control it.
+    moment: a slot of a run, or seconds since the start of a wire. The file appears when it is complete.
+
+    Raises UsageError if there is no Vulkan driver, the recording cannot be loaded, or the file cannot be written.
     """
-    command = [
-        sys.executable,
-        "-P",
-        "-m",
-        "evedrop.view.picture",
-        str(rrd),
-        str(png),
-        *map(str, size),
-        *([] if moment is None else [str(moment)]),
-    ]
-    done = subprocess.run(
-        guarded(command, apart=True), capture_output=True, text=True, check=False, env=dict(viewer_environment())
-    )
-    if done.returncode:
-        raise UsageError(done.stderr.strip() or f"the process that draws ended with status {done.returncode}")
-    return done.stdout.splitlines()
+    complaints: list[str] = []
+    with whole_file(png) as temporary:
+        for frame in frames_apart(rrd, None if moment is None else [moment], size, complaints):
+            temporary.write_bytes(frame)
+    return complaints
+
+
+def frames_apart(
+    rrd: Path, moments: Sequence[float] | None, size: tuple[int, int], complaints: list[str]
+) -> Iterator[bytes]:
+    """Pictures of some moments, or of the last one, as PNG; the panels' complaints about the last are added to `complaints`.
+
+    A separate process draws them, one at a time; in a separate network, too, if the system allows that. Otherwise anybody who
+    finds the port of the headless viewer could control it.
+
+    Raises UsageError as `picture_apart` does.
+    """
+    check(rrd)
+    command = [sys.executable, "-P", "-m", "evedrop.view.picture", str(rrd), *map(str, size)]
+    with tempfile.TemporaryFile() as told:
+        process = subprocess.Popen(
+            guarded(command, apart=True),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=told,
+            env=dict(viewer_environment()),
+        )
+        assert process.stdin is not None and process.stdout is not None  # noqa: S101, PT018 - they are pipes
+        try:
+            for moment in [None] if moments is None else moments:
+                frame = _asked(process.stdin, process.stdout, moment)
+                if frame is None:
+                    raise UsageError(_why(process, told))
+                yield frame
+            process.stdin.close()
+            complaints += process.stdout.read().decode().splitlines()
+        finally:
+            end(process)
+            process.stdout.close()
+            with suppress(BrokenPipeError):
+                process.stdin.close()
+
+
+def _asked(to: IO[bytes], back: IO[bytes], moment: float | None) -> bytes | None:
+    """The picture of a moment; None if the process ended."""
+    try:
+        to.write(f"{_LAST if moment is None else repr(moment)}\n".encode())
+        to.flush()
+    except BrokenPipeError:
+        return None
+    length = int.from_bytes(back.read(_LENGTH_BYTES))
+    frame = back.read(length)
+    return frame if length and len(frame) == length else None
+
+
+def _why(process: subprocess.Popen[bytes], told: IO[bytes]) -> str:
+    status = process.wait()
+    told.seek(0)
+    return told.read().decode(errors="replace").strip() or f"the process that draws ended with status {status}"
 
 
 def main(words: Sequence[str]) -> int:
-    """Draw what `picture_apart` asks for; returns the exit status."""
-    rrd, png, width, height, *moment = words
-    size = int(width), int(height)
+    """Draw what `frames_apart` asks for; returns the exit status."""
+    rrd, width, height = words
+    out = sys.stdout.buffer
     try:
-        for complaint in picture(Path(rrd), Path(png), size, float(moment[0]) if moment else None):
-            print(complaint)  # noqa: T201 - read by the process that started this one
+        with raise_on_signals():
+            first = sys.stdin.readline().strip()
+            with opened(Path(rrd), (int(width), int(height)), _moment(first)) as viewer:
+                later = (viewer.frame(float(line)) for line in sys.stdin)
+                for frame in itertools.chain([viewer.take()], later):
+                    out.write(len(frame).to_bytes(_LENGTH_BYTES) + frame)
+                    out.flush()
+                out.write("\n".join(viewer.reports).encode())
+                out.flush()
     except UsageError as error:
-        print(error, file=sys.stderr)  # noqa: T201 - the same
+        print(error, file=sys.stderr)  # noqa: T201 - read by the process that started this one
         return error.exit_status
+    except (BrokenPipeError, KeyboardInterrupt):  # no picture is wanted any more
+        return 1
     return 0
 
 
-def reports(viewer: ViewerClient) -> list[str]:
-    """The complaints of the panels, such as "Events: …"."""
-    return [f"{view.name}: {report}" for view in viewer.get_state().views for report in view.reports]
-
-
-def check(rrd: Path) -> None:
-    """Read a recording to its end. Raises UsageError if it does not exist, is not a recording, or is broken.
-
-    The viewer itself would report nothing, and show nothing.
-    """
-    if not rrd.is_file():
-        raise UsageError(f"{rrd} does not exist; give the recording.rrd of a results folder")
-    try:
-        with warnings.catch_warnings():
-            # A recording that was cut short between two messages is shown up to that point.
-            warnings.simplefilter("ignore")
-            for _ in RrdReader(rrd).stream():
-                pass
-    except (RuntimeError, OSError) as error:
-        why = " ".join(str(error).split())
-        raise UsageError(f"{rrd} is broken ({why}); remove it, and it is made again from the tables") from error
-
-
-@contextmanager
-def opened(rrd: Path, size: tuple[int, int], moment: float | None = None) -> Iterator[ViewerClient]:
-    """A headless viewer that has loaded a recording and shows a moment of it, by default the last, ready to be drawn.
-
-    Raises UsageError as `picture` does.
-    """
-    check(rrd)
-    port = free_port()
-    shown = ["--window-size", f"{size[0]}x{size[1]}", "--hide-welcome-screen", str(rrd.resolve())]
-    arguments = ["--headless", "--port", str(port), *shown]
-    with tempfile.TemporaryDirectory() as folder:
-        logs = Path(folder)
-        try:
-            # Otherwise the viewer would write into the picture that it is drawing without a graphics card.
-            process = spawn(port, arguments, logs, environment={"RUST_LOG": "error"})
-        except UsageError as error:
-            raise UsageError(_without_driver(str(error)) or str(error)) from error
-        try:
-            viewer = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
-            _show(viewer, moment)
-            yield viewer
-        except (RuntimeError, ConnectionError) as error:
-            log = (logs / "viewer.log").read_text(errors="replace")
-            raise UsageError(_without_driver(log) or f"the headless viewer failed: {error}; its log:\n{log}") from error
-        finally:
-            end(process)
-
-
-def _show(viewer: ViewerClient, moment: float | None) -> None:
-    deadline = time.monotonic() + _LOAD_SECONDS
-    while (end := _end(viewer)) is None:
-        if time.monotonic() > deadline:
-            raise RuntimeError(f"the recording was not loaded within {_LOAD_SECONDS:.0f} s")
-        time.sleep(0.05)
-    timeline, last = end
-    if timeline == ELAPSED:
-        seconds = last / 1e9
-        if moment is not None and not 0.0 <= moment <= seconds:
-            raise UsageError(f"--time {moment:g} is not a time of the wire; give one from 0 to {seconds:g}, in seconds")
-        viewer.set_time(ELAPSED, duration=seconds if moment is None else moment, play_state="paused")
-    else:
-        if moment is not None and not 0 <= moment <= last:
-            raise UsageError(f"--slot {moment:.0f} is not in the run; give one from 0 to {last}")
-        viewer.set_time(TIMELINE, sequence=last if moment is None else int(moment), play_state="paused")
-    deadline = time.monotonic() + _SETTLE_SECONDS
-    before, now = b"", viewer.take_screenshot()
-    while now != before and time.monotonic() < deadline:
-        time.sleep(0.2)
-        before, now = now, viewer.take_screenshot()
-
-
-def _end(viewer: ViewerClient) -> tuple[str, int] | None:
-    """The recording's time line and its last slot, or its last nanosecond, once recording and layout are loaded."""
-    state = viewer.get_state()
-    if state.loading or not state.views:
-        return None
-    lines = [line for recording in state.recordings for line in recording.timelines if line.name in {TIMELINE, ELAPSED}]
-    return (lines[0].name, int(lines[0].end)) if lines and lines[0].end is not None else None
-
-
-def _without_driver(log: str) -> str | None:
-    if "graphics adapter" not in log and "render context" not in log:
-        return None
-    return "no Vulkan driver to draw with; install one, on Debian: apt-get install mesa-vulkan-drivers"
+def _moment(line: str) -> float | None:
+    return None if line == _LAST else float(line)
 
 
 if __name__ == "__main__":

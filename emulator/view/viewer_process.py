@@ -90,10 +90,11 @@ def spawn(
     stdin: int = subprocess.DEVNULL,
     apart: bool = False,
     environment: Mapping[str, str] | None = None,
+    patience: float = _START_SECONDS,
 ) -> subprocess.Popen[bytes]:
     """Start Rerun's command with these arguments, only on `host`; returns when it listens on `port`.
 
-    apart: with a network of its own, if the system allows it.
+    apart: with a network of its own, if the system allows it. patience: seconds to wait until it listens.
 
     Raises UsageError, with the last lines of its log, if it ends first or is not ready in time.
     """
@@ -109,7 +110,7 @@ def spawn(
             env={**viewer_environment(), "XDG_CONFIG_HOME": str(_CONFIG), **(environment or {})},
         )
         try:
-            if _listens(process, host, port):
+            if _listens(process, host, port, patience):
                 return process
         except BaseException:
             end(process)
@@ -141,8 +142,8 @@ def executable() -> Path:
     return folder / ("rerun.exe" if sys.platform == "win32" else "rerun")
 
 
-def _listens(process: subprocess.Popen[bytes], host: str, port: int) -> bool:
-    deadline = time.monotonic() + _START_SECONDS
+def _listens(process: subprocess.Popen[bytes], host: str, port: int, patience: float) -> bool:
+    deadline = time.monotonic() + patience
     while process.poll() is None and time.monotonic() < deadline:
         if _is_there(process, host, port):
             return True

@@ -44,7 +44,7 @@ def test_every_command_of_the_documents_is_one(page: str) -> None:
 OTHER_OPTIONS = {
     "emulator/applications/microgrid/day.py",  # a program of its own
     "emulator/pytest_plugin.py",
-    "emulator/view/picture.py",  # the viewer's
+    "emulator/view/headless.py",  # the viewer's
     "emulator/view/viewer.py",
     "emulator/view/viewer_process.py",  # the sandbox's
 }

@@ -98,8 +98,8 @@ def test_every_panel_of_a_house_is_filled(day: Path) -> None:
     path = replay(day)
     try:
         with opened(path, (1600, 950)) as viewer:
-            views = viewer.get_state().views
-            shares = {str(view.name): filled(viewer.take_screenshot(view.view_id)) for view in views}
+            views = viewer.state().views
+            shares = {str(view.name): filled(viewer.take(view.view_id)) for view in views}
             complaints = [view.reports for view in views if view.reports]
     except UsageError as error:
         if "no Vulkan driver" not in str(error):

@@ -5,13 +5,16 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import matplotlib.image
 import numpy as np
 import pytest
 
 from evedrop.errors import UsageError
-from evedrop.view.picture import opened, picture, picture_apart
+from evedrop.view.headless import HeadlessViewer
+from evedrop.view.picture import check_picture_name, opened, picture_apart
 from evedrop.view.recording import ViewRecording
 from evedrop.view.viewer_process import guarded
 from tests.conftest import wait_until
@@ -83,8 +86,8 @@ def test_every_panel_is_filled(n: int, growth: float, simulated: Callable[..., S
     rrd = recorded(simulated(120, n=n, growth=growth), tmp_path / "r.rrd")
     try:
         with opened(rrd, (1600, 950)) as viewer:
-            views = viewer.get_state().views
-            shares = {str(view.name): filled(viewer.take_screenshot(view.view_id)) for view in views}
+            views = viewer.state().views
+            shares = {str(view.name): filled(viewer.take(view.view_id)) for view in views}
             complaints = [view.reports for view in views if view.reports]
     except UsageError as error:
         if "no Vulkan driver" not in str(error):
@@ -99,7 +102,7 @@ def test_picture_is_a_png_of_that_size(simulated: Callable[..., Simulated], tmp_
     """A picture is written in the size asked for, without complaints."""
     rrd = recorded(simulated(60), tmp_path / "r.rrd")
     try:
-        assert picture(rrd, tmp_path / "r.png", (1200, 800)) == []
+        assert picture_apart(rrd, tmp_path / "r.png", size=(1200, 800)) == []
     except UsageError as error:
         if "no Vulkan driver" not in str(error):
             raise
@@ -115,7 +118,64 @@ def test_missing_driver_is_named(
     monkeypatch.setenv("VK_DRIVER_FILES", "/nonexistent")
     rrd = recorded(simulated(20), tmp_path / "r.rrd")
     with pytest.raises(UsageError, match="mesa-vulkan-drivers"):
-        picture(rrd, tmp_path / "r.png")
+        picture_apart(rrd, tmp_path / "r.png")
+    assert [path.name for path in tmp_path.iterdir()] == ["r.rrd"]
+
+
+class SlowClient:
+    """A viewer's client on a busy machine: it refuses every question as often as `refusals` says, and then answers."""
+
+    def __init__(self, refusals: int) -> None:
+        self.refusals = self.left = refusals
+
+    def _refuse(self) -> None:
+        if self.left:
+            self.left -= 1
+            raise TimeoutError("Deadline expired before operation could complete")
+        self.left = self.refusals
+
+    def get_state(self) -> SimpleNamespace:
+        """A recording that is loaded."""
+        self._refuse()
+        line = SimpleNamespace(name="slot_number", end=9)
+        return SimpleNamespace(loading=[], views=[object()], recordings=[SimpleNamespace(timelines=[line])])
+
+    def take_screenshot(self, *_: object) -> bytes:
+        """A picture."""
+        self._refuse()
+        return b"picture"
+
+    def set_time(self, *_: object, **__: object) -> None:
+        """Show another moment."""
+        self._refuse()
+
+
+def viewer_with(client: SlowClient, status: int | None = None) -> HeadlessViewer:
+    """A viewer of this client, whose process has ended with this status, if any."""
+    return HeadlessViewer(cast(Any, client), cast(Any, SimpleNamespace(poll=lambda: status, returncode=status)))
+
+
+def test_a_busy_machine_does_not_end_a_picture() -> None:
+    """The viewer refuses what takes more than 15 seconds; the question is put again."""
+    viewer = viewer_with(SlowClient(3))
+    viewer.show(4)
+    assert viewer.settle() == b"picture"
+
+
+def test_a_viewer_that_has_ended_is_not_asked_again() -> None:
+    """Its status is reported instead."""
+    with pytest.raises(RuntimeError, match="ended with status 7"):
+        viewer_with(SlowClient(1), status=7)
+
+
+@pytest.mark.parametrize(
+    ("name", "advice"), [("r.svg", "pixels"), ("r.SVG", "pixels"), ("r.jpg", r"\.png$"), ("r", r"\.png$")]
+)
+def test_other_kinds_of_pictures_are_refused(name: str, advice: str) -> None:
+    """The error says what to do."""
+    with pytest.raises(UsageError, match=advice):
+        check_picture_name(Path(name))
+    check_picture_name(Path(f"{name}.PNG"))
 
 
 def _end_of_a_message(whole: bytes) -> int:
@@ -139,11 +199,11 @@ def test_a_broken_recording_is_said_before_a_viewer_is_started(
     what: str, simulated: Callable[..., Simulated], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One line with the file, what is wrong and a remedy; the viewer would wait for ever."""
-    monkeypatch.setattr("evedrop.view.picture.spawn", lambda *_, **__: pytest.fail("a viewer was started"))
+    monkeypatch.setattr("evedrop.view.picture.subprocess", None)  # no process is started
     rrd = recorded(simulated(60), tmp_path / "r.rrd")
     rrd.write_bytes(BROKEN[what](rrd.read_bytes()))
     with pytest.raises(UsageError, match="is broken") as told:
-        picture(rrd, tmp_path / "r.png")
+        picture_apart(rrd, tmp_path / "r.png")
     assert str(told.value).startswith(f"{rrd} is broken (")
     assert "\n" not in str(told.value)
 
@@ -151,4 +211,4 @@ def test_a_broken_recording_is_said_before_a_viewer_is_started(
 def test_missing_recording_is_named(tmp_path: Path) -> None:
     """A recording that is not there is a mistake of the user's, and told so."""
     with pytest.raises(UsageError, match="does not exist"):
-        picture(tmp_path / "r.rrd", tmp_path / "r.png")
+        picture_apart(tmp_path / "r.rrd", tmp_path / "r.png")

@@ -16,6 +16,8 @@ from evedrop.errors import UsageError
 if TYPE_CHECKING:
     from evedrop.view.viewer import Viewer
 
+_LEAST, _MOST = 320, 3840  # pixels; the viewer takes more than its time limit for larger pictures
+
 
 def view(options: argparse.Namespace) -> int:
     """Open a finished run or wire, draw it, or print its closing report again."""
@@ -25,6 +27,7 @@ def view(options: argparse.Namespace) -> int:
         return _view_wire(options)
     if options.time is not None:
         raise UsageError("--time is for wires; a run has slots, so give --slot")
+    _check_names(options)
     if options.table:
         from evedrop.cli.closing_report import print_results
 
@@ -49,11 +52,31 @@ def view(options: argparse.Namespace) -> int:
         if options.picture is None:
             _hold("run", open_run(options.run, options.view, stand, recording))
             return 0
-        from evedrop.view.picture import picture_apart
+        from evedrop.view.picture import SIZE, picture_apart
 
-        for complaint in picture_apart(recording, options.picture, options.slot):
+        slot = _chosen_slot(options.run) if options.slot is None else options.slot
+        for complaint in picture_apart(recording, options.picture, slot, options.size or SIZE):
             print(complaint, file=sys.stderr)
     return 0
+
+
+def _check_names(options: argparse.Namespace) -> None:
+    """Raise UsageError for a picture that cannot be written, before anything is drawn."""
+    if options.picture is not None:
+        from evedrop.view.picture import check_picture_name
+
+        check_picture_name(options.picture)
+
+
+def _chosen_slot(run: Path) -> int | None:
+    """The slot that tells most, which is printed; None for the last one."""
+    from evedrop.results.writer import load_results
+    from evedrop.view.telling_slot import telling_slot
+
+    slot = telling_slot(load_results(run))
+    if slot is not None:
+        print(f"slot {slot} is drawn; --slot chooses another")
+    return slot
 
 
 def _view_wire(options: argparse.Namespace) -> int:
@@ -64,6 +87,7 @@ def _view_wire(options: argparse.Namespace) -> int:
     from evedrop.wire.closing import closing_lines, wire_failures
     from evedrop.wire.replay import PICTURE_SIZE, replay_wire, summary_of_wire
 
+    _check_names(options)
     if options.slot is not None:
         raise UsageError(f"--slot is for runs, and {options.run} is the folder of a wire; give --time")
     if options.table:
@@ -76,7 +100,7 @@ def _view_wire(options: argparse.Namespace) -> int:
         if options.picture is None:
             _hold("wire", open_run(options.run, options.view, stand, recording))
             return 0
-        for complaint in picture_apart(recording, options.picture, options.time, PICTURE_SIZE):
+        for complaint in picture_apart(recording, options.picture, options.time, options.size or PICTURE_SIZE):
             print(complaint, file=sys.stderr)
     return 0
 
@@ -90,6 +114,20 @@ def _hold(what: str, viewer: Viewer) -> None:
     hold(viewer)
 
 
+def _size(text: str) -> tuple[int, int]:
+    """A width and a height. Raises ArgumentTypeError."""
+    width, _, height = text.partition("x")
+    try:
+        size = int(width), int(height)
+    except ValueError:
+        size = 0, 0
+    if not (_LEAST <= size[0] <= _MOST and _LEAST <= size[1] <= _MOST):
+        raise argparse.ArgumentTypeError(
+            f"{text} is not a width and a height from {_LEAST} to {_MOST} pixels, such as 1200x720"
+        )
+    return size
+
+
 def _shown(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--view", choices=("auto", "native", "web"), default="auto", help="default auto")
     instead = parser.add_mutually_exclusive_group()
@@ -98,8 +136,9 @@ def _shown(parser: argparse.ArgumentParser) -> None:
     )
     instead.add_argument("--table", action="store_true", help="print its table and sentences instead")
     moment = parser.add_mutually_exclusive_group()
-    moment.add_argument("--slot", type=int, metavar="K", help="the slot to draw; default the last")
+    moment.add_argument("--slot", type=int, metavar="K", help="the slot to draw; default one that tells much")
     moment.add_argument("--time", type=float, metavar="SECONDS", help="for a wire: the time to draw; default the end")
+    parser.add_argument("--size", type=_size, metavar="WxH", help="of the picture, in pixels; default 1600x950")
 
 
 COMMANDS = (

@@ -1,0 +1,63 @@
+"""Chooses the slot of a run that a picture shows.
+
+Source: docs/view.md, the slot of a picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pyarrow.compute as pc
+
+from evedrop.loading import load
+from evedrop.model.process import Floats
+from evedrop.names import LEGITIMATE
+from evedrop.results.reading import Results
+
+_BEFORE, _AFTER = 105, 25  # slots that the panels show on either side, so that the picture is filled
+_FOOLED = 9.0  # times the trace that it believes: an error of three standard deviations
+
+
+def telling_slot(results: Results) -> int | None:
+    """The slot of a run whose picture tells most; None for the last one.
+
+    Raises UsageError if the folder's tables cannot be read.
+    """
+    scenario = load(results.folder / "scenario.toml", beyond_horizon=True)
+    if scenario.controller is not None:  # its panels show the whole run, up to the slot
+        return None
+    trials = results.trials
+    if not trials.num_rows:
+        return None
+    first = trials.filter(pc.equal(trials["trial"], pc.min(trials["trial"])))
+    errors, traces = {}, {}
+    for name in scenario.receivers:
+        rows = first.filter(pc.equal(first["peer"], name)).sort_by("slot")
+        errors[name], traces[name] = rows["squared_error"].to_numpy(), rows["trace_covariance"].to_numpy()
+    return most_telling(errors, traces, float(np.trace(scenario.process.process.Q)))
+
+
+def most_telling(errors: Mapping[str, Floats], traces: Mapping[str, Floats], noise: float) -> int:
+    """The slot with the largest separation between the eavesdroppers that are fooled and the legitimate estimator.
+
+    errors, traces: receiver → its squared error, and the trace of the covariance that it believes, (slots,). noise: trace of Q.
+    """
+    legitimate = errors[LEGITIMATE]
+    others = [name for name in errors if name != LEGITIMATE]
+    if others:
+        fooled = {name: errors[name] > _FOOLED * (traces[name] + noise) for name in others}
+        some = any(flags[_candidates(len(flags))].any() for flags in fooled.values())
+        separation = sum(
+            np.log10((errors[name] + noise) / (legitimate + noise)) * (fooled[name] if some else 1.0) for name in others
+        )
+    else:
+        separation = legitimate
+    candidates = _candidates(len(legitimate))
+    return int(candidates.start) + int(np.argmax(np.nan_to_num(separation, nan=-np.inf)[candidates]))
+
+
+def _candidates(slots: int) -> slice:
+    """The slots that may be chosen: not the first, in which receivers begin, and so that the panels are filled."""
+    first = min(_BEFORE, slots - 1)
+    return slice(first, max(first + 1, slots - _AFTER))
