@@ -1,11 +1,11 @@
 #!/bin/sh
-# Writes the briefs of a run, and gives each service of docker-compose.yml its own: as /brief/brief.json, of its volume.
+# Writes the briefs of a run, and gives each service of docker-compose.yml its own: as /brief/brief.json, in its volume.
 #
-# It runs once, before all others and without a network: it is the only one that ever has all briefs. As root, for the
-# folders are Docker's; what it leaves belongs to the user of the other services.
+# It runs once, before all others and without a network, and is the only one that ever has all briefs. It runs as root, because
+# the folders are Docker's; the files that it leaves belong to the user of the other services.
 set -eu
 
-scenario=${EVEDROP_SCENARIO:-two-eavesdroppers}
+scenario=${EVEDROP_SCENARIO:?the scenario of docker-compose.yml}
 owner=${EVEDROP_USER:-1000:1000}
 name=$(basename "$scenario" .toml)-$(date +%Y%m%d-%H%M%S)
 
@@ -16,45 +16,45 @@ case $owner in
     ;;
 esac
 
-cd /here # a scenario of one's own is named as it is seen from the checkout
-# shellcheck disable=SC2086 - options are words
-evedrop brief "$scenario" ${EVEDROP_OPTIONS:-} --out /tmp/briefs --results "/runs/$name" \
-  --listen tls/0.0.0.0:7447 --connect tls/router:7447 >/tmp/written
-
-eavesdroppers=
-for brief in $(cat /tmp/written); do
-  process=$(basename "$brief" .json)
-  case $process in
-    router | sensor | legitimate | observer) ;;
-    controller | relay)
-      echo "evedrop: $scenario has a $process; docker-compose.yml has no service for one: add it (docs/containers.md), or start" \
-        "the run with \`evedrop run\` or, on several hosts, by \`evedrop brief\`" >&2
-      exit 2
-      ;;
-    *) eavesdroppers="$eavesdroppers $process" ;;
-  esac
-done
-# shellcheck disable=SC2086 - names are words
-set -- $eavesdroppers
-if [ $# -ne 2 ]; then
-  echo "evedrop: $scenario has eavesdroppers:${eavesdroppers:- none}; docker-compose.yml has services for two: give" \
-    "EVEDROP_SCENARIO one that has two, or change the services (docs/containers.md)" >&2
-  exit 2
+# The folders are those of the processes that docker-compose.yml has services for.
+services=$(cd /briefs && echo *)
+set -- --listen tls/0.0.0.0:7447 --connect tls/router:7447
+if [ -d /briefs/relay ]; then
+  set -- "$@" --relay tls/0.0.0.0:7447 --relay-connect tls/relay:7447
 fi
 
-give() { # process, service
-  install --mode 600 "/tmp/briefs/$1.json" "/briefs/$2/brief.json"
-  chown "$owner" "/briefs/$2/brief.json"
+other() { # what is wrong
+  echo "evedrop: $scenario $1, and docker-compose.yml has services for: $services; write files for this scenario with" \
+    "\`evedrop brief $scenario --compose DIR\` (docs/containers.md)" >&2
+  exit 2
 }
-for process in router sensor legitimate observer; do
-  give "$process" "$process"
+
+cd /here # a scenario of one's own is named as it is seen from the folder of docker-compose.yml
+# shellcheck disable=SC2086 - options are words
+if ! evedrop brief "$scenario" ${EVEDROP_OPTIONS:-} --out /tmp/briefs --results "/runs/$name" "$@" >/tmp/written 2>/tmp/said; then
+  if grep -q -e --relay /tmp/said; then
+    if [ -d /briefs/relay ]; then other "has one router"; else other "has two routers"; fi
+  fi
+  cat /tmp/said >&2
+  exit 2
+fi
+cat /tmp/said >&2
+processes=$(cd /tmp/briefs && for brief in *.json; do echo "${brief%.json}"; done)
+
+# shellcheck disable=SC2086 - names are words
+if [ "$(printf '%s\n' $services | sort)" != "$(printf '%s\n' $processes | sort)" ]; then
+  # shellcheck disable=SC2086,SC2116
+  other "has the processes: $(echo $processes)"
+fi
+
+for process in $processes; do
+  install --mode 600 "/tmp/briefs/$process.json" "/briefs/$process/brief.json"
+  chown "$owner" "/briefs/$process/brief.json"
 done
-give "$1" eavesdropper-1
-give "$2" eavesdropper-2
 mkdir -m 700 "/runs/$name"
 chown "$owner" "/runs/$name"
-# Docker makes ./runs as root where it was not there, and then nobody else could start a run in this folder.
+# Docker makes ./runs as root if it does not exist, and then no other user could start a run in this folder.
 if [ "$(stat -c %u /runs)" = 0 ]; then
   chown "$owner" /runs
 fi
-echo "$scenario: eavesdropper-1 is $1, eavesdropper-2 is $2; results go to runs/$name, readable for user $owner alone"
+echo "$scenario: results go to runs/$name, readable for user $owner alone"

@@ -18,7 +18,7 @@ from tests.containers.base import ROOT
 from tests.containers.machine import Docker
 from tests.privileged import run
 
-ROLES = ("router", "sensor", "legitimate", "eavesdropper-1", "eavesdropper-2", "observer")
+ROLES = ("router", "sensor", "legitimate", "suspicious", "smart", "observer")
 """The services that are processes of a run."""
 
 ENDLESS = "--slots 1000000 --pace 0.002 --set longest_outage=2.0"
@@ -43,8 +43,9 @@ class Project:
 
     @classmethod
     def of(cls, folder: Path, docker: Docker, **variables: str) -> Project:
-        """A project whose services are those of the checkout."""
-        shutil.copy(ROOT / "docker-compose.yml", folder)
+        """A project whose services are those of the checkout, unless the folder has a docker-compose.yml."""
+        if not (folder / "docker-compose.yml").exists():
+            shutil.copy(ROOT / "docker-compose.yml", folder)
         names = {"COMPOSE_PROJECT_NAME": folder.name.replace("_", "-"), "DOCKER_HOST": docker.address}
         return cls(folder, docker, {**os.environ, **names, **variables})
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
 from evedrop.api import montecarlo
+from evedrop.live.launch.compose import write_compose
+from evedrop.loading import load
 from tests.builders import digests_of
 from tests.conftest import wait_until
 from tests.containers.project import ENDLESS, ROLES, Project
@@ -21,13 +25,13 @@ LONG = "--slots 3000 --pace 0.005"
 Make = Callable[..., Project]
 
 
-def complete(project: Project, slots: int) -> None:
+def complete(project: Project, slots: int, scenario: str | Path = "two-eavesdroppers") -> None:
     """Check that the newest results are those of the same trials, computed here in memory."""
     results = project.results()
     summary = results.summary
     assert summary["ended"] == "complete"
     folder = project.folder / f"memory-{len(list((project.folder / 'runs').iterdir()))}"
-    memory = montecarlo("two-eavesdroppers", slots=slots, trials=1, out=folder)
+    memory = montecarlo(scenario, slots=slots, trials=1, out=folder)
     assert digests_of(results) == digests_of(memory)
     assert not any(link["unexplained"] for link in summary["links"].values())
 
@@ -72,10 +76,28 @@ def test_a_scenario_of_ones_own(project: Make) -> None:
     complete(own, 600)
 
 
+def test_files_for_a_scenario_with_controller_and_relay(tmp_path: Path, project: Make) -> None:
+    """Files made for a scenario of one's own run it: with two routers, a controller, and a receiver named as a service is."""
+    text = Path("scenarios/microgrid.toml").read_text(encoding="utf-8")
+    own = tmp_path / "own.toml"
+    own.write_text(re.sub(r"\bsmart(?=[.\]])", "view", text), encoding="utf-8")
+    changes = {"network.routers": 2, "slots": 96, "expect": []}
+    write_compose(load(own, changes), str(own), True, tmp_path / "grid", False)
+    grid = Project.of(tmp_path / "grid", project().docker, EVEDROP_OPTIONS="--pace 0")
+    try:
+        grid.compose("up")
+        processes = ("router", "relay", "sensor", "legitimate", "controller", "eavesdropper-view", "observer")
+        assert {service: grid.state(service)["ExitCode"] for service in processes} == dict.fromkeys(processes, 0)
+        complete(grid, 96, grid.folder / "own.toml")
+    finally:
+        grid.down()
+
+
+SERVICES = "docker-compose.yml has services for: legitimate observer router sensor smart suspicious; write files"
 WRONG = {
-    "one.toml": "one.toml has eavesdroppers: smart; docker-compose.yml has services for two",
-    "vehicle": "vehicle has eavesdroppers: naive suspicious smart; docker-compose.yml has services for two",
-    "microgrid": "microgrid has a controller; docker-compose.yml has no service for one",
+    "one.toml": f"one.toml has the processes: legitimate observer router sensor smart, and {SERVICES}",
+    "vehicle": f"vehicle has the processes: legitimate naive observer router sensor smart suspicious, and {SERVICES}",
+    "two.toml": f"two.toml has two routers, and {SERVICES}",
     "two-eavesdropers": "no scenario two-eavesdropers",
 }
 """Scenario → what is said of it."""
@@ -85,6 +107,8 @@ def test_of_a_scenario_that_does_not_fit_nothing_is_started(project: Make) -> No
     """It is said why, in one line; so it is of a user that is none."""
     one = project()
     shutil.copy("scenarios/cut.toml", one.folder / "one.toml")
+    two = Path("scenarios/two-eavesdroppers.toml").read_text(encoding="utf-8")
+    (one.folder / "two.toml").write_text(f"{two}\n[network]\nrouters = 2\n", encoding="utf-8")
     for scenario, reason in WRONG.items():
         one.environment["EVEDROP_SCENARIO"] = scenario
         done = one.compose("up", may_fail=True)
@@ -104,11 +128,11 @@ def test_a_killed_container_ends_the_run_and_the_next_one_goes_well(project: Mak
     one = project(EVEDROP_OPTIONS=ENDLESS)
     one.compose("up", "--detach")
     one.running()
-    one.docker("kill", one.container("eavesdropper-2"))
+    one.docker("kill", one.container("smart"))
     assert one.ended("observer") == 3
     assert "smart cut off from the network for 2 s" in one.said("observer")
     assert one.results().slots.num_rows > 0
-    assert {service: one.ended(service) for service in ROLES} == {**dict.fromkeys(ROLES, 3), "eavesdropper-2": 137}
+    assert {service: one.ended(service) for service in ROLES} == {**dict.fromkeys(ROLES, 3), "smart": 137}
     again = project(EVEDROP_OPTIONS=SHORT)
     again.compose("up")
     complete(again, 600)
@@ -122,7 +146,7 @@ def test_a_router_started_again_and_a_network_that_was_away_change_nothing(proje
     one.docker("kill", one.container("router"))
     one.docker("start", one.container("router"))
     one.running(one.progress())
-    smart, network = one.container("eavesdropper-2"), f"{one.environment['COMPOSE_PROJECT_NAME']}_to-eavesdropper-2"
+    smart, network = one.container("smart"), f"{one.environment['COMPOSE_PROJECT_NAME']}_to-smart"
     one.docker("network", "disconnect", network, smart)
     health = ("docker", "-H", one.docker.address, "exec", smart, "evedrop", "health", "/brief/brief.json")
     wait_until(lambda: subprocess.run(health, capture_output=True, check=False).returncode, "an eavesdropper cut off")

@@ -43,6 +43,7 @@ def test_every_command_of_the_documents_is_one(page: str) -> None:
 
 OTHER_OPTIONS = {
     "emulator/applications/microgrid/day.py",  # a program of its own
+    "emulator/live/launch/compose.py",  # those of docker compose
     "emulator/pytest_plugin.py",
     "emulator/view/headless.py",  # the viewer's
     "emulator/view/viewer.py",

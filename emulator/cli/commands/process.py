@@ -8,12 +8,13 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from evedrop.cli.commands import ROLES
-from evedrop.cli.options import argument, entries, loaded, scenario, served
+from evedrop.cli.options import argument, changes_of, entries, loaded, scenario, served
 from evedrop.command import Command, Option
 from evedrop.errors import BriefError, UsageError
 
@@ -22,20 +23,51 @@ if TYPE_CHECKING:
     from evedrop.live.protocol.brief_parts import ObserverPart
 
 
+_BY_HAND = ("results", "listen", "connect", "relay", "relay_connect", "wait", "insecure", "paused")
+"""Options that determine the briefs of processes that are started by hand."""
 _MOST_TOLD = 5  # mistakes of a scenario in a brief, which is not written by hand
 
 
 def brief(options: argparse.Namespace) -> int:
-    """Write the briefs of a scenario's processes."""
+    """Write the briefs of a scenario's processes, or the files of their containers."""
     from evedrop.live.launch.briefs import write_briefs
     from evedrop.live.launch.ports import places_at
 
+    if options.compose is not None:
+        return _compose(options)
+    if options.overwrite:
+        raise UsageError("--overwrite belongs to --compose; leave it out, or give another --out")
     if not 1 <= options.wait <= 30 * 86_400:
         raise UsageError(f"--wait {options.wait}: expected 1 or more seconds, and 2592000 at most")
     scenario = loaded(options)
     places = places_at(options.listen, options.connect, options.relay, options.relay_connect, options.insecure)
     for path in write_briefs(scenario, places, options.results, options.out, options.wait, paused=options.paused):
         print(path)
+    return 0
+
+
+def _compose(options: argparse.Namespace) -> int:
+    """Write the files with which Docker Compose starts a run."""
+    from evedrop.live.launch.compose import MOST_NETWORKS, network_count, write_compose
+
+    for name in _BY_HAND:
+        if getattr(options, name) != options.parser.get_default(name):
+            option = f"--{name.replace('_', '-')}"
+            raise UsageError(
+                f"{option} belongs to briefs for processes that are started by hand; leave it out, or give --out instead of "
+                "--compose"
+            )
+    scenario = loaded(options)
+    for path in write_compose(
+        scenario, options.scenario, bool(changes_of(options)), options.compose, options.overwrite
+    ):
+        print(path)
+    if (networks := network_count(scenario)) > MOST_NETWORKS:
+        print(
+            f"evedrop: warning: the containers have {networks} networks, and Docker's default address pools have room for "
+            f"about {MOST_NETWORKS}; enlarge them (evedrop docs containers)",
+            file=sys.stderr,
+        )
     return 0
 
 
@@ -156,7 +188,14 @@ def _observed(parser: argparse.ArgumentParser) -> None:
 
 
 def _briefs(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the briefs")
+    where = parser.add_mutually_exclusive_group(required=True)
+    where.add_argument("--out", type=Path, metavar="DIR", help="folder for the briefs")
+    where.add_argument(
+        "--compose", type=Path, metavar="DIR", help="write the files with which Docker Compose starts the run, instead"
+    )
+    parser.add_argument(
+        "--overwrite", action="store_true", help="with --compose: DIR may have files; replace those of the same names"
+    )
     parser.add_argument(
         "--results",
         type=Path,
@@ -200,7 +239,7 @@ COMMANDS = (
     Command(
         "brief",
         brief,
-        "write the files with which each process of a run is started by hand",
+        "write the files with which each process of a run is started by hand, or by Docker Compose",
         (scenario, entries, _briefs),
         section="processes",
         example="brief vehicle --out briefs",
