@@ -1,6 +1,6 @@
 """Evedrop: a network emulator for secrecy in remote state estimation.
 
-    from evedrop import Scenario, run, preloaded, montecarlo, compare, design, load_results, wire
+    from evedrop import Scenario, run, preloaded, montecarlo, sweep, compare, design, load_results, wire
 
 These names are loaded when they are used: a peer imports this package, too, and needs none of them.
 """
@@ -12,22 +12,22 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from evedrop.api import compare, design, montecarlo, run
+    from evedrop.api import compare, design, load_results, montecarlo, run, sweep
     from evedrop.live.launch.preloading import preloaded
     from evedrop.loading import Scenario
-    from evedrop.results.writer import load_results
     from evedrop.wire.running import wire  # the package `wire`, which can be called: see there
 
-__all__ = ["Scenario", "compare", "design", "load_results", "montecarlo", "preloaded", "run", "wire"]
+__all__ = ["Scenario", "compare", "design", "load_results", "montecarlo", "preloaded", "run", "sweep", "wire"]
 
 _HOMES = {
     "Scenario": "evedrop.loading",
     "compare": "evedrop.api",
     "design": "evedrop.api",
-    "load_results": "evedrop.results.writer",
+    "load_results": "evedrop.api",
     "montecarlo": "evedrop.api",
     "preloaded": "evedrop.live.launch.preloading",
     "run": "evedrop.api",
+    "sweep": "evedrop.api",
 }
 
 

@@ -67,7 +67,7 @@ class _Reader:
         elif isinstance(value, Mapping):
             inner = {name: self.plain(f"{path}.{name}", one) for name, one in value.items()}
             found = {name: one for name, one in inner.items() if one is not None}
-        elif isinstance(value, (list, tuple)):
+        elif isinstance(value, (list, tuple, range)):
             found = [self.plain(f"{path}.{i}", one) for i, one in enumerate(value)]
         elif isinstance(value, (Path, str)):  # texts of numpy, and members of an enumeration
             found = str(value)

@@ -18,6 +18,7 @@ from evedrop.figures.links import LinkAccount
 from evedrop.figures.text import estimate
 from evedrop.news import ConnectionOutage, RunEvent
 from evedrop.scenario import application
+from evedrop.score.built_in_figures import BuiltInFigures
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
@@ -64,8 +65,8 @@ class RareEstimate:
 
 
 @dataclass(frozen=True)
-class PeerSummary:
-    """The entry of a receiver."""
+class PeerSummary(BuiltInFigures):
+    """The entry of a receiver; its built-in figures are attributes."""
 
     figures: Mapping[str, float | None]
     """Name of the figure → its value; None if it has none."""

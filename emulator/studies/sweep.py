@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 
 from evedrop.errors import Interrupted, RunError, ScenarioError, UsageError
 from evedrop.figures import all_figures, error_column, estimated_figures, z_column
-from evedrop.loading import load, value_of
+from evedrop.loading import prepared, value_of
 from evedrop.memory.montecarlo import Merger, Plan, check_mode, disk_errors, results_of, teller
 from evedrop.memory.trials import BatchResult, tasks_of
 from evedrop.memory.workers import connected
@@ -35,7 +35,8 @@ from evedrop.signals import stop_on_signals
 Grid = Mapping[str, Sequence[Any]]
 Point = Mapping[str, Any]
 
-_MOST_POINTS = 10_000
+MOST_POINTS = 10_000
+"""The most combinations of values."""
 _WRITE_SECONDS = 3.0  # from one table of the points so far to the next
 _RANGE = re.compile(r"[^\[\]{}\"',]*:[^\[\]{}\"',]*")  # a colon, and no character of a list or string
 _WHOLE = re.compile(r"[+-]?\d+")
@@ -54,8 +55,8 @@ def grid_of(texts: Sequence[str]) -> dict[str, list[Any]]:
         if key in grid:
             raise UsageError(f"--over {text}: {key} is given twice; give all its values in one option")
         grid[key] = _range(text, values) if _RANGE.fullmatch(values) else _listed(values)
-    if math.prod(len(values) for values in grid.values()) > _MOST_POINTS:
-        raise UsageError(f"--over asks for more than {_MOST_POINTS} points; take wider steps")
+    if math.prod(len(values) for values in grid.values()) > MOST_POINTS:
+        raise UsageError(f"--over asks for more than {MOST_POINTS} points; take wider steps")
     return grid
 
 
@@ -73,15 +74,15 @@ def _range(text: str, values: str) -> list[Any]:
         raise UsageError(f"--over {text}: expected three numbers first:last:step, such as 0.1:0.9:0.1") from None
     if not all(number.is_finite() for number in (first, last, step)) or not step or (last - first) / step < 0:
         raise UsageError(f"--over {text}: the range is empty; expected first:last:step with the step towards last")
-    if (last - first) / step >= _MOST_POINTS:
-        raise UsageError(f"--over {text} asks for more than {_MOST_POINTS} values; take a wider step")
+    if (last - first) / step >= MOST_POINTS:
+        raise UsageError(f"--over {text} asks for more than {MOST_POINTS} values; take a wider step")
     found = [first + i * step for i in range(int((last - first) / step) + 1)]
     whole = all(_WHOLE.fullmatch(value.strip()) for value in values.split(":"))
     return [int(value) if whole else float(value) for value in found]
 
 
 def sweep_over(
-    source: str | Path,
+    source: str | Path | Scenario,
     changes: Mapping[str, Any],
     grid: Grid,
     folder: Path,
@@ -101,7 +102,7 @@ def sweep_over(
     rows: list[dict[str, Any]] = []
     failure: RunError | None = None
     done = 0
-    description = {"scenario": str(source), "changes": dict(changes), "over": dict(grid), "mode": plan.mode.value}
+    description = {"scenario": _title(source), "changes": dict(changes), "over": dict(grid), "mode": plan.mode.value}
     with stop_on_signals() as stop, connected(plan.scheduler, plan.patience) as client:
         new_folder(folder)
         told = teller(tell, total)
@@ -168,22 +169,28 @@ def _summary(scenario: Scenario, plan: Plan, results: Iterator[BatchResult]) -> 
     return summary
 
 
-def _checked(source: str | Path, changes: Mapping[str, Any], grid: Grid, plan: Plan) -> list[tuple[Point, Scenario]]:
+def _checked(
+    source: str | Path | Scenario, changes: Mapping[str, Any], grid: Grid, plan: Plan
+) -> list[tuple[Point, Scenario]]:
     """Every point with its scenario. Raises ScenarioError with the mistakes of all points."""
     points: list[Point] = [dict(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())]
     found: list[tuple[Point, Scenario]] = []
     mistakes: dict[str, None] = {}
     for point in points:
         try:
-            scenario = load(source, {**changes, **point}, beyond_horizon=plan.mode.value != "exact")
+            scenario = prepared(source, {**changes, **point}, beyond_horizon=plan.mode.value != "exact")
         except ScenarioError as error:
             mistakes.update(dict.fromkeys(error.mistakes))
             continue
         check_mode(scenario, plan.mode)
         found.append((point, scenario))
     if mistakes:
-        raise ScenarioError(str(source), list(mistakes))
+        raise ScenarioError(_title(source), list(mistakes))
     return found
+
+
+def _title(source: str | Path | Scenario) -> str:
+    return source.title if isinstance(source, Scenario) else str(source)
 
 
 def _rows(point: Point, scenario: Scenario, summary: Summary) -> Iterator[dict[str, Any]]:

@@ -1,4 +1,7 @@
-"""The Python API: a function for each command that computes, with the same name and arguments."""
+"""The functions that design: μ_d, one for each slot, when to send, when to encrypt.
+
+Source: docs/design.md.
+"""
 
 from __future__ import annotations
 
@@ -8,127 +11,23 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from evedrop.api.given import scenario_of
 from evedrop.errors import UsageError
-from evedrop.loading import Scenario, prepared
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.slot.link_law import law_of
 from evedrop.names import LEGITIMATE
-from evedrop.news import Tell, silent
-from evedrop.results.folder import results_folder
-from evedrop.results.writer import Results, load_results
-from evedrop.scenario.words import dotted, listed
+from evedrop.scenario import Scenario
+from evedrop.scenario.words import listed
 
 if TYPE_CHECKING:
     from evedrop.expected.energy_budget import BudgetDesign
     from evedrop.expected.policies import PolicyDesign
-    from evedrop.memory.montecarlo import Plan
     from evedrop.model.theory.design import Adversary, Design
     from evedrop.model.theory.schedules import ScheduleDesign
-    from evedrop.results.comparison import Comparison
 
 _LONGEST_SCHEDULE = 100  # designed in a minute
 _TWENTIETHS = tuple(float(i) / 20 for i in range(21))
-
-__all__ = [
-    "compare",
-    "design",
-    "design_budget",
-    "design_policy",
-    "design_schedule",
-    "load_results",
-    "montecarlo",
-    "run",
-]
-
-
-def run(
-    scenario: str | Path | Scenario,
-    *,
-    out: str | Path | None = None,
-    view: str = "off",
-    listen: str | None = None,
-    tell: Tell = silent,
-    **changes: Any,
-) -> Results:
-    """Run a scenario live, with sensor, router, estimators and observer in separate processes.
-
-    scenario: a built-in name, a file, or a `Scenario`; out: the results folder, new or empty; view: auto, native,
-    web or off; listen: the router's loopback endpoint, tcp/127.0.0.1:PORT; tell: called with each item of news; changes: entries
-    of the scenario by dotted key, with `__` for the dot, such as `slots=500` or `legitimate__link__quality=0.5`.
-
-    Raises ScenarioError with every mistake of the scenario, UsageError for an unusable folder or port, RunError if a
-    process failed, Interrupted on Ctrl-C; after the last two the folder holds the results so far.
-
-    >>> results = run("eavesdroppers", slots=1000, out="my-run")        # doctest: +SKIP
-    >>> results.summary["peers"]["smart"]["mean_squared_error"]         # doctest: +SKIP
-    >>> results.slots.to_pandas()                                       # doctest: +SKIP
-    """
-    from evedrop.live.launch.launcher import launch  # noqa: PLC0415 - Monte Carlo does not need it
-
-    made = _prepared(scenario, changes)
-    with results_folder(out, _name(scenario)) as folder:
-        ended = launch(made, folder, view, listen, tell)
-        if ended.viewer is not None:
-            ended.viewer.stop()
-        return load_results(ended.folder)
-
-
-def montecarlo(
-    scenario: str | Path | Scenario,
-    *,
-    trials: int = 1000,
-    out: str | Path | None = None,
-    plan: Plan | None = None,
-    tell: Tell = silent,
-    **changes: Any,
-) -> Results:
-    """Run the trials of a scenario in memory; in the exact mode, the default, to the same bits as a live run.
-
-    Arguments and errors as for `run`; trials: how many, from `first_trial` on; plan: the mode and the workers.
-    """
-    from evedrop.memory.montecarlo import Plan, simulate  # noqa: PLC0415 - a live run does not need it
-    from evedrop.memory.simulation import Mode  # noqa: PLC0415 - the same
-
-    plan = plan or Plan()
-    made = _prepared(scenario, {**changes, "trials": trials}, plan.mode is not Mode.EXACT)
-    with results_folder(out, _name(scenario)) as folder:
-        simulate(made, folder, tell, plan)
-        return load_results(folder)
-
-
-def compare(
-    scenario: str | Path | Scenario,
-    *,
-    schemes: Sequence[str] | None = None,
-    adversaries: Sequence[str] | None = None,
-    parameters: Mapping[str, Any] | None = None,
-    trials: int = 200,
-    out: str | Path | None = None,
-    plan: Plan | None = None,
-    tell: Tell = silent,
-    **changes: Any,
-) -> Comparison:
-    """Compare every scheme against every adversary, on a scenario's process and links.
-
-    schemes, adversaries: names, by default all; parameters: of schemes other than the scenario's own, such as
-    `{"innovation.state_probability": 0.7}`; all else as for `montecarlo`. Source: docs/compare.md.
-
-    Raises UsageError with every unknown name, ScenarioError with every mistake of the scenario, RunError if a worker
-    fails, Interrupted on Ctrl-C; after the last two the folder holds the completed schemes.
-
-    >>> found = compare("acknowledged", schemes=["acknowledged", "innovation"])        # doctest: +SKIP
-    >>> found.cell("acknowledged", "blocks-critical").eavesdropper.theory.last         # doctest: +SKIP
-    >>> found.table.to_pandas()                                                        # doctest: +SKIP
-    """
-    from evedrop.memory.montecarlo import Plan  # noqa: PLC0415 - a live run does not need it
-    from evedrop.studies.compare import compare_all  # noqa: PLC0415 - no other call needs it
-    from evedrop.studies.matchups import matchups_of  # noqa: PLC0415 - the same
-
-    made = _prepared(scenario, {**changes, "trials": trials})
-    matchups = matchups_of(made, schemes, adversaries, parameters)
-    with results_folder(out, f"compare-{Path(_name(scenario)).name}") as folder:
-        return compare_all(matchups, folder, tell, plan or Plan())
 
 
 def design(
@@ -144,7 +43,7 @@ def design(
     """
     from evedrop.model.theory.design import design as design_of  # noqa: PLC0415 - a run does not need it
 
-    made = _prepared(scenario, changes or {}, beyond_horizon=True)
+    made = scenario_of(scenario, changes or {}, beyond_horizon=True)
     if not SCHEMES[made.encoding.scheme].sends_states_and_innovations:
         raise UsageError(_not_for(made.encoding.scheme))
     if max_trace == math.inf:
@@ -203,7 +102,7 @@ def design_schedule(
     """
     from evedrop.model.theory.schedules import ScheduleDesign, best_schedule  # noqa: PLC0415 - a run does not need it
 
-    made = _prepared(scenario, changes or {}, beyond_horizon=True)
+    made = scenario_of(scenario, changes or {}, beyond_horizon=True)
     if not SCHEMES[made.encoding.scheme].sends_states_and_innovations:
         raise UsageError(_not_for(made.encoding.scheme))
     if not 2 <= slots <= _LONGEST_SCHEDULE:
@@ -247,7 +146,7 @@ def design_policy(
     """
     from evedrop.expected.policies import policies_of  # noqa: PLC0415 - a run does not need it
 
-    return policies_of(_prepared(scenario, changes or {}, beyond_horizon=True), weights, prices, states)
+    return policies_of(scenario_of(scenario, changes or {}, beyond_horizon=True), weights, prices, states)
 
 
 def design_budget(
@@ -262,7 +161,7 @@ def design_budget(
     """
     from evedrop.expected.energy_budget import budget_of  # noqa: PLC0415 - a run does not need it
 
-    return budget_of(_prepared(scenario, changes or {}, beyond_horizon=True), budget)
+    return budget_of(scenario_of(scenario, changes or {}, beyond_horizon=True), budget)
 
 
 def _not_for(scheme: str) -> str:
@@ -279,12 +178,3 @@ def _not_for(scheme: str) -> str:
         )
         return f"{why}, and this scenario has {scheme}; {instead}"
     return f"{why}, and this scenario has {scheme}; {instead}, or measure {scheme} by evedrop compare"
-
-
-def _prepared(scenario: str | Path | Scenario, changes: Mapping[str, Any], beyond_horizon: bool = False) -> Scenario:
-    return prepared(scenario, dotted(changes), beyond_horizon=beyond_horizon)
-
-
-def _name(scenario: str | Path | Scenario) -> str | Path:
-    """The name from which a results folder's name is made."""
-    return "scenario" if isinstance(scenario, Scenario) else scenario

@@ -1,0 +1,22 @@
+"""The Python API: a function for each command that computes, with the same name and arguments.
+
+Source: docs/python.md.
+"""
+
+from evedrop.api.designs import design, design_budget, design_policy, design_schedule
+from evedrop.api.results import RunResults, SweepResults, load_results
+from evedrop.api.running import compare, montecarlo, run, sweep
+
+__all__ = [
+    "RunResults",
+    "SweepResults",
+    "compare",
+    "design",
+    "design_budget",
+    "design_policy",
+    "design_schedule",
+    "load_results",
+    "montecarlo",
+    "run",
+    "sweep",
+]

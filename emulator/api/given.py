@@ -1,0 +1,102 @@
+"""What calls are given: a scenario, a folder for the results or none, workers, and who is told of progress."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import shutil
+import tempfile
+import weakref
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, final
+
+from evedrop.errors import EvedropError, UsageError
+from evedrop.loading import prepared
+from evedrop.memory.montecarlo import Plan
+from evedrop.results.growing_tables import goes_on
+from evedrop.scenario import Scenario
+from evedrop.scenario.words import dotted
+
+_OF_RESULTS = ("summary.json", "unfinished", "shards", "sweep.json", "compare.json")
+"""Files and folders by which a results folder is known."""
+
+
+def scenario_of(scenario: str | Path | Scenario, changes: Mapping[str, Any], beyond_horizon: bool = False) -> Scenario:
+    """The scenario of a call, with its changes. Raises ScenarioError with every mistake."""
+    return prepared(scenario, dotted(changes), beyond_horizon=beyond_horizon)
+
+
+def plan_of(plan: Plan | None, workers: int | None) -> Plan:
+    """The plan of a call. Raises UsageError if workers is not positive."""
+    if workers is None:
+        return plan or Plan()
+    if workers < 1:
+        raise UsageError(f"workers={workers}: expected 1 or more")
+    return replace(plan or Plan(), workers=workers)
+
+
+@final
+@dataclass
+class ResultsPlace:
+    """Where a call writes: the folder that it was given, or a temporary one."""
+
+    folder: Path
+    temporary: bool
+    _kept: bool = field(default=False, init=False)
+
+    def keep_for(self, results: object) -> None:
+        """Keep a temporary folder as long as the results object exists, and this program runs."""
+        if self.temporary:
+            self._kept = True
+            weakref.finalize(results, shutil.rmtree, self.folder, ignore_errors=True)
+
+    def end(self, error: EvedropError | None = None) -> None:
+        """Remove a temporary folder that nothing keeps; after an error, results so far stay until this program ends."""
+        if not self.temporary or self._kept:
+            return
+        if error is not None and self.folder.is_dir() and any(self.folder.iterdir()):
+            atexit.register(shutil.rmtree, self.folder, ignore_errors=True)
+            error.add_note(f"Until this program ends, load_results({str(self.folder)!r}) reads the results so far.")
+        else:
+            shutil.rmtree(self.folder, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def place_for(out: str | Path | None, overwrite: bool) -> Iterator[ResultsPlace]:
+    """Where to write: `out`, which must be new or empty unless `overwrite`, or a temporary folder without `out`.
+
+    Raises UsageError if `out` is in use and must not be overwritten, or is not a results folder.
+    """
+    if out is None:
+        place = ResultsPlace(Path(tempfile.mkdtemp(prefix="evedrop-")), temporary=True)
+    else:
+        place = ResultsPlace(Path(out), temporary=False)
+        _clear(place.folder, overwrite)
+    try:
+        yield place
+    except EvedropError as error:
+        place.end(error)
+        raise
+    except BaseException:
+        place.end()
+        raise
+    place.end()
+
+
+def _clear(folder: Path, overwrite: bool) -> None:
+    """Empty a results folder that may be overwritten."""
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return
+    if not overwrite:
+        raise UsageError(f"{folder} is not empty; give another out, or overwrite=True to replace the results in it")
+    if not any((folder / name).exists() for name in _OF_RESULTS):
+        raise UsageError(f"{folder} is not a results folder, and overwrite=True replaces only those; give another out")
+    if goes_on(folder):
+        raise UsageError(f"{folder} belongs to a run that goes on; wait for its end, or give another out")
+    for inside in folder.iterdir():
+        if inside.is_dir() and not inside.is_symlink():
+            shutil.rmtree(inside)
+        else:
+            inside.unlink()

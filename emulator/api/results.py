@@ -1,0 +1,137 @@
+"""The results of calls: read from their folder, typed, short when printed, and tables in a notebook."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Self
+
+import pyarrow as pa
+
+from evedrop.api.notebook import table_text
+from evedrop.figures import columns, error_column, shown_figure
+from evedrop.figures.text import estimate, figure_text
+from evedrop.results.reading import Results
+from evedrop.results.reading import load_results as read_results
+from evedrop.score.summary import Judged, LinkSummary, PeerSummary, SecrecySummary, Summary
+
+_MOST_ROWS = 40  # of a table in a notebook
+
+
+@dataclass(frozen=True, repr=False)
+class RunResults(Results):
+    """The results of a run or of trials in memory: typed figures, and tables as Arrow.
+
+    Results in a temporary folder are removed with this object, or when the program ends.
+    """
+
+    @classmethod
+    def read(cls, folder: str | Path) -> Self:
+        """Read a results folder. Raises UsageError if it is not one."""
+        found = read_results(folder)
+        return cls(found.folder, found.summary)
+
+    @cached_property
+    def _typed(self) -> Summary:
+        return self.typed_summary
+
+    @property
+    def peers(self) -> Mapping[str, PeerSummary]:
+        """Receiver → its figures, the legitimate estimator first."""
+        return self._typed.peers
+
+    @property
+    def links(self) -> Mapping[str, LinkSummary]:
+        """Receiver → the account of its link."""
+        return self._typed.links
+
+    @property
+    def secrecy(self) -> Mapping[str, SecrecySummary]:
+        """Eavesdropper → the verdict."""
+        return self._typed.secrecy
+
+    @property
+    def expectations(self) -> list[Judged]:
+        """The expectations of the scenario, and whether each held."""
+        return list(self._typed.expectations)
+
+    @property
+    def _facts(self) -> str:
+        one = self._typed
+        trials = "1 trial" if one.trials == 1 else f"{one.trials:,} trials"
+        return f"{one.slots:,} slots, {trials}, {'live' if one.mode == 'live' else f'in memory ({one.mode})'}"
+
+    def _rows(self) -> Iterator[list[str]]:
+        for name, peer in self.peers.items():
+            figures = (
+                estimate(
+                    shown_figure(peer.all_figures, names), shown_figure(peer.standard_errors, names), column.format
+                )
+                for column, names in columns("column", self._typed.mode).items()
+            )
+            z = next((z for z in peer.z.values() if z is not None), None)
+            yield [name, *figures, figure_text(z, "+.1f")]
+
+    def _notes(self) -> Iterator[str]:
+        if self.remark is not None:
+            yield self.remark
+        yield from (f"{name}: {verdict.sentence}" for name, verdict in self.secrecy.items())
+        yield from (one.sentence for one in self.expectations)
+
+    def __repr__(self) -> str:
+        error = ("mean_squared_error", "mean_actual_trace_covariance")
+        errors = [
+            f"{name} {figure_text(shown_figure(one.all_figures, error), '.3g')}" for name, one in self.peers.items()
+        ]
+        remark = "" if self.remark is None else "; incomplete"
+        return f"<RunResults of {self._typed.scenario!r}: {self._facts}; mean error: {', '.join(errors)}{remark}>"
+
+    def _repr_html_(self) -> str:
+        heads = ["receiver", *(column.heading for column in columns("column", self._typed.mode)), "z"]
+        return table_text(f"{self._typed.scenario} · {self._facts}", heads, [*self._rows()], [*self._notes()])
+
+
+@dataclass(frozen=True, repr=False)
+class SweepResults:
+    """The results of a sweep: `table` has a row for each point and receiver, with every figure and its standard error."""
+
+    folder: Path
+    table: pa.Table
+    keys: tuple[str, ...]
+    """The entries that were swept, by dotted key."""
+
+    @property
+    def points(self) -> int:
+        """The number of combinations of values."""
+        return len({tuple(row[key] for key in self.keys) for row in self.table.to_pylist()})
+
+    def __repr__(self) -> str:
+        return (
+            f"<SweepResults over {', '.join(self.keys)}: {self.points} points, a table of {self.table.num_rows} rows>"
+        )
+
+    def _repr_html_(self) -> str:
+        shown = columns("sweep_column")
+        rows = [
+            [*(row[key] for key in self.keys), row["peer"], *self._figures(row)]
+            for row in self.table.slice(0, _MOST_ROWS).to_pylist()
+        ]
+        more = self.table.num_rows - _MOST_ROWS
+        notes = [f"and {more} rows more: .table has all of them"] if more > 0 else []
+        return table_text("", [*self.keys, "receiver", *(column.heading for column in shown)], rows, notes)
+
+    @staticmethod
+    def _figures(row: Mapping[str, Any]) -> Iterator[str]:
+        for column, names in columns("sweep_column").items():
+            errors = [error_column(name) for name in names]
+            yield estimate(shown_figure(row, names), shown_figure(row, errors), column.format)
+
+
+def load_results(folder: str | Path) -> RunResults:
+    """Read a results folder, also one of a run that goes on or was killed: `ended` in its summary says so.
+
+    Raises UsageError naming the missing or broken file if it is not a results folder.
+    """
+    return RunResults.read(folder)

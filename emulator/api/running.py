@@ -1,0 +1,158 @@
+"""The functions that simulate: a run, thousands of trials, a grid, a comparison."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from evedrop.api.given import place_for, plan_of, scenario_of
+from evedrop.api.notebook import progress
+from evedrop.api.results import RunResults, SweepResults
+from evedrop.errors import UsageError
+from evedrop.loading.python_values import plain_tables
+from evedrop.memory.montecarlo import Plan
+from evedrop.memory.simulation import Mode
+from evedrop.news import Tell
+from evedrop.results.comparison import Comparison
+from evedrop.scenario import Scenario
+from evedrop.scenario.words import dotted
+
+
+def run(
+    scenario: str | Path | Scenario,
+    *,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+    view: str = "off",
+    listen: str | None = None,
+    tell: Tell | None = None,
+    **changes: Any,
+) -> RunResults:
+    """Run a scenario live, with sensor, router, estimators and observer in separate processes.
+
+    scenario: a built-in name, a file, or a `Scenario`; out: the results folder, new or empty, by default a temporary one that is
+    removed with the results; overwrite: replace the results in `out`; view: auto, native, web or off; listen: the router's
+    loopback endpoint, tcp/127.0.0.1:PORT; tell: called with each item of news, by default a progress bar in a notebook; changes:
+    entries of the scenario by dotted key, with `__` for the dot, such as `slots=500` or `legitimate__link__quality=0.5`.
+
+    Raises ScenarioError with every mistake of the scenario, UsageError for an unusable folder or port, RunError if a
+    process failed, Interrupted on Ctrl-C; after the last two the folder holds the results so far.
+
+    >>> results = run("eavesdroppers", slots=1000, out="my-run")        # doctest: +SKIP
+    >>> results.peers["smart"].mean_squared_error                       # doctest: +SKIP
+    >>> results.slots.to_pandas()                                       # doctest: +SKIP
+    """
+    from evedrop.live.launch.launcher import launch  # noqa: PLC0415 - Monte Carlo does not need it
+
+    made = scenario_of(scenario, changes)
+    with place_for(out, overwrite) as place, progress(tell, made.slots) as told:
+        ended = launch(made, place.folder, view, listen, told)
+        if ended.viewer is not None:
+            ended.viewer.stop()
+        results = RunResults.read(ended.folder)
+        place.keep_for(results)
+        return results
+
+
+def montecarlo(
+    scenario: str | Path | Scenario,
+    *,
+    trials: int = 1000,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+    workers: int | None = None,
+    plan: Plan | None = None,
+    tell: Tell | None = None,
+    **changes: Any,
+) -> RunResults:
+    """Run the trials of a scenario in memory; in the exact mode, the default, to the same bits as a live run.
+
+    Arguments and errors as for `run`; trials: how many, from `first_trial` on; workers: processes, by default chosen for this
+    machine and the amount of work; plan: the mode.
+    """
+    from evedrop.memory.montecarlo import simulate  # noqa: PLC0415 - a live run does not need it
+
+    plan = plan_of(plan, workers)
+    made = scenario_of(scenario, {**changes, "trials": trials}, plan.mode is not Mode.EXACT)
+    with place_for(out, overwrite) as place, progress(tell, made.trials * made.slots) as told:
+        simulate(made, place.folder, told, plan)
+        results = RunResults.read(place.folder)
+        place.keep_for(results)
+        return results
+
+
+def sweep(
+    scenario: str | Path | Scenario,
+    over: Mapping[str, Any],
+    *,
+    trials: int = 1000,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+    workers: int | None = None,
+    plan: Plan | None = None,
+    tell: Tell | None = None,
+    **changes: Any,
+) -> SweepResults:
+    """Run the trials of a scenario in memory for every combination of values of some entries.
+
+    over: dotted key → its values, a list or a numpy array; all else as for `montecarlo`. Source: docs/montecarlo.md, sweeps.
+
+    Raises ScenarioError with the mistakes of all points, before any is run; UsageError, RunError and Interrupted as `run` does.
+
+    >>> sweep("numerical", {"encoding.state_probability": [0.4, 0.6, 0.8]}, trials=200).table.to_pandas()  # doctest: +SKIP
+    """
+    from evedrop.studies.sweep import MOST_POINTS, sweep_over  # noqa: PLC0415 - no other call needs it
+
+    values = plain_tables(dotted(over), "over")
+    given = {**dotted(changes), "trials": trials}
+    if isinstance(folder := values.pop("modules", None), str):
+        given.setdefault("modules", folder)
+    for key, found in values.items():
+        if not isinstance(found, list) or not found:
+            raise UsageError(f"over: {key} is {found!r}; expected a list of values, such as [0.2, 0.4]")
+    if not values or math.prod(map(len, values.values())) > MOST_POINTS:
+        raise UsageError(f"over: expected 1 to {MOST_POINTS} points, such as {{'slots': [100, 200]}}")
+    with place_for(out, overwrite) as place, progress(tell, 0) as told:
+        table = sweep_over(scenario, given, values, place.folder, told, plan_of(plan, workers))
+        results = SweepResults(place.folder, table, tuple(values))
+        place.keep_for(results)
+        return results
+
+
+def compare(
+    scenario: str | Path | Scenario,
+    *,
+    schemes: Sequence[str] | None = None,
+    adversaries: Sequence[str] | None = None,
+    parameters: Mapping[str, Any] | None = None,
+    trials: int = 200,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+    workers: int | None = None,
+    plan: Plan | None = None,
+    tell: Tell | None = None,
+    **changes: Any,
+) -> Comparison:
+    """Compare every scheme against every adversary, on a scenario's process and links.
+
+    schemes, adversaries: names, by default all; parameters: of schemes other than the scenario's own, such as
+    `{"innovation.state_probability": 0.7}`; all else as for `montecarlo`. Source: docs/compare.md.
+
+    Raises UsageError with every unknown name, ScenarioError with every mistake of the scenario, RunError if a worker
+    fails, Interrupted on Ctrl-C; after the last two the folder holds the completed schemes.
+
+    >>> found = compare("acknowledged", schemes=["acknowledged", "innovation"])        # doctest: +SKIP
+    >>> found.cell("acknowledged", "blocks-critical").eavesdropper.theory.last         # doctest: +SKIP
+    >>> found.table.to_pandas()                                                        # doctest: +SKIP
+    """
+    from evedrop.studies.compare import compare_all  # noqa: PLC0415 - no other call needs it
+    from evedrop.studies.matchups import matchups_of  # noqa: PLC0415 - the same
+
+    made = scenario_of(scenario, {**changes, "trials": trials})
+    matchups = matchups_of(made, schemes, adversaries, parameters)
+    with place_for(out, overwrite) as place, progress(tell, 0) as told:
+        found = compare_all(matchups, place.folder, told, plan_of(plan, workers))
+        place.keep_for(found)
+        return found
