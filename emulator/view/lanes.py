@@ -11,9 +11,13 @@ from evedrop.view import palette
 from evedrop.view.palette import Colour
 from evedrop.view.scene import SceneSlots, Shown
 
-LEGEND = (
-    "blue: state · green: innovation decoded · amber: misled by one · purple: innovation sent, discarded · red: dropped · "
-    "dark: silence"
+_LEGEND = (
+    ("state", palette.STATE),
+    ("innovation decoded", palette.DECODED),
+    ("misled by innovation", palette.MISLED),
+    ("innovation sent, or discarded", palette.DISCARDED),
+    ("dropped", palette.DROPPED),
+    ("silence", palette.SILENT),
 )
 
 
@@ -35,6 +39,11 @@ SILENT = 4
 """Code of a slot in which nothing was sent, so that nothing could be lost."""
 MISLED = 5
 """Code of the only outcome that an eavesdropper does not know itself."""
+
+
+def legend() -> list[tuple[str, Colour]]:
+    """What the colours of all lanes stand for."""
+    return [*_LEGEND]
 
 
 def lane_of(shown: Shown) -> Lane:

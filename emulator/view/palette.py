@@ -40,6 +40,9 @@ SILENT: Colour = (34, 37, 44)  # dark
 LANES: tuple[Colour, ...] = (STATE, DECODED, DISCARDED, MISLED, DROPPED, SILENT)
 """The outcomes of a packet."""
 
+KNOWLEDGE: tuple[Colour, ...] = (DECODED, MISLED, DROPPED)
+"""What a receiver knows: in track, drifting, fooled."""
+
 WIRE_LANES: tuple[Colour, ...] = (STATE, DECODED, DISCARDED, MISLED, DROPPED, SILENT, TRUTH)
 """What became of the messages of a wire's link; white is cut."""
 
@@ -68,6 +71,7 @@ PANELS: dict[str, tuple[Colour, ...]] = {
     "curves": (*RECEIVERS, TRUTH_CURVE),
     "plant": PLANT,
     "lanes": LANES,
+    "who knows what": KNOWLEDGE,
     "lanes of a wire": WIRE_LANES,
     "graph of a wire": WIRE_TEXTS,
     "figures": FIGURES,

@@ -15,13 +15,18 @@ from rerun.blueprint.api import create_in_memory_blueprint
 
 from evedrop.errors import NotRegistered
 from evedrop.model.registry import place_of
+from evedrop.scenario.words import listed
 from evedrop.view.column import TIMELINE, Column
 from evedrop.view.events import Event
 from evedrop.view.panels import PANELS
-from evedrop.view.panels.panel import PlacedView, ViewPanel
+from evedrop.view.panels.panel import COLUMNS, ROWS_ABOVE, ROWS_BELOW, PlacedView, ViewPanel
 from evedrop.view.scene import Scene, SceneSlots
 
 T = TypeVar("T")
+
+_WIDTHS = (1.2, 1.0, 1.0)  # of the columns, from the left; packets are on the left, and need four pixels for each slot
+_LEAST_REST = 0.3  # of the height, for the columns, however many receivers there are
+_LEAST_ROW = 0.05
 
 
 @final
@@ -40,18 +45,14 @@ class PanelSet:
         return [panel(self._scene)] if panel.applies(self._scene) else []
 
     def layout(self) -> rrb.Blueprint:
-        """The views of all panels on two sides."""
+        """The views of all panels: rows over the whole width, and columns between them."""
         placed = [
             one
             for name, panel in [*self._panels.items()]
             for one in self._tried(name, partial(_views, panel, _drawable if PANELS.foreign(name) else _placed))
         ]
-        sides = []
-        for side in ("left", "right"):
-            here = [one for one in placed if one.side == side]
-            sides.append(rrb.Vertical(*(one.view for one in here), row_shares=[one.share for one in here]))
         return rrb.Blueprint(
-            rrb.Horizontal(*sides, column_shares=[1.2 if self._scene.moving else 1.35, 1.0]),
+            _arranged(placed),
             rrb.TopPanel(state="hidden"),
             rrb.BlueprintPanel(state="hidden"),
             rrb.SelectionPanel(state="hidden"),
@@ -88,14 +89,39 @@ class PanelSet:
             return ()
 
 
+def _arranged(placed: Sequence[PlacedView]) -> rrb.Container:
+    """Rows above, columns, and rows below; each takes the share of the height that its views need, and columns the rest."""
+    sides = {side: [one for one in placed if one.side == side] for side in (*ROWS_ABOVE, *COLUMNS, *ROWS_BELOW)}
+    columns = [
+        (rrb.Vertical(*(one.view for one in sides[side]), row_shares=[one.share for one in sides[side]]), width)
+        for side, width in zip(COLUMNS, _WIDTHS, strict=True)
+        if sides[side]
+    ]
+    heights = {side: max((one.height for one in sides[side]), default=0.0) for side in (*ROWS_ABOVE, *ROWS_BELOW)}
+    rest = max(_LEAST_REST, 1.0 - sum(heights.values()))
+    rows: list[tuple[rrb.Container, float]] = []
+    for side in (*ROWS_ABOVE, None, *ROWS_BELOW):
+        if side is None:
+            rows.append(
+                (rrb.Horizontal(*(one for one, _ in columns), column_shares=[width for _, width in columns]), rest)
+            )
+        elif sides[side]:
+            row = rrb.Horizontal(*(one.view for one in sides[side]), column_shares=[one.share for one in sides[side]])
+            rows.append((row, max(heights[side], _LEAST_ROW)))
+    return rrb.Vertical(*(row for row, _ in rows), row_shares=[share for _, share in rows])
+
+
 def _views(panel: ViewPanel, check: Callable[[PlacedView], PlacedView]) -> list[PlacedView]:
     return [check(one) for one in panel.views()]
 
 
 def _placed(one: PlacedView) -> PlacedView:
     """The same view, if a layout can contain it. Raises an error otherwise."""
-    if not isinstance(one, PlacedView) or one.side not in {"left", "right"} or not one.share > 0.0:
-        raise TypeError(f"views() gave {one!r}; expected a PlacedView, left or right, with a share above 0")
+    sides = (*ROWS_ABOVE, *COLUMNS, *ROWS_BELOW)
+    if not isinstance(one, PlacedView) or one.side not in sides or not one.share > 0.0 or not 0.0 <= one.height < 1.0:
+        raise TypeError(
+            f"views() gave {one!r}; expected a PlacedView, {listed(sides)}, with a share above 0 and a height below 1"
+        )
     return one
 
 

@@ -52,6 +52,8 @@ class Scene:
     """Labels of the states, such as "SOC (%)"; none, or one for each."""
     moving: tuple[str, ...] = ()
     """Labels of a closed loop's disturbances, then inputs, such as "P_load (kW)"."""
+    units: tuple[str, ...] = ()
+    """Units of the states, such as "m"; none, or one for each."""
     panels: tuple[Panel, ...] = ()
     """The panels of applications."""
 

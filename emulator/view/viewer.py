@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 _ATTEMPTS = 3
 _WINDOW = ("--hide-welcome-screen",)
+_DARK = "theme=dark"
+"""Whatever the browser's theme, the page has the one that the colours of the panels are made for."""
 _NOTHING = f"rerun+http://{HOST}:9/proxy"
 """The page's default source: with it Rerun serves only the page, and opens no port for recordings."""
 
@@ -117,7 +119,7 @@ class Viewer:
         if served is not None:
             host = page.partition(":")[0]
             data = quote(f"http://{host}:{served.port}{served.path}", safe="")
-            self.address = f"http://{page}/?url={data}"
+            self.address = f"http://{page}/?url={data}&{_DARK}"
 
     @property
     def pid(self) -> int:

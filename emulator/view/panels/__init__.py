@@ -6,12 +6,15 @@ from evedrop.model.registry import Registry
 from evedrop.view.panels.applications import ApplicationPanels
 from evedrop.view.panels.error import SquaredError
 from evedrop.view.panels.events import Events
+from evedrop.view.panels.knowledge import WhoKnowsWhat
+from evedrop.view.panels.legend import Legend
 from evedrop.view.panels.levels import Levels
 from evedrop.view.panels.packets import Packets
 from evedrop.view.panels.panel import ViewPanel
 from evedrop.view.panels.plant import WhatMovesThePlant
 from evedrop.view.panels.state import StateOverTime
 from evedrop.view.panels.state_plane import StatePlane
+from evedrop.view.panels.title import Title
 from evedrop.view.panels.trace import TraceOfP
 
 PANELS: Registry[ViewPanel] = Registry(
@@ -19,6 +22,8 @@ PANELS: Registry[ViewPanel] = Registry(
     ViewPanel,  # type: ignore[type-abstract]
     "evedrop.panels",
     {
+        "title": Title,
+        "knowledge": WhoKnowsWhat,
         "plant": WhatMovesThePlant,
         "levels": Levels,
         "applications": ApplicationPanels,
@@ -28,6 +33,7 @@ PANELS: Registry[ViewPanel] = Registry(
         "plane": StatePlane,
         "state": StateOverTime,
         "events": Events,
+        "legend": Legend,
     },
 )
-"""In the order in which they are placed, from the top of each side; those of packages follow."""
+"""In the order in which they are placed, from the top of each column and the left of each row; those of packages follow."""

@@ -29,7 +29,7 @@ class ApplicationPanels(ViewPanel):
         """Panels of the plant on the left, panels of the receivers' beliefs on the right."""
         for panel in self.scene.panels:
             span = None if panel.span is None else rrb.ScalarAxis(range=panel.span, zoom_lock=True)
-            view = curves_view(panel.title, panel.path, whole_run(self.scene), span)
+            view = curves_view(panel.title, panel.path, whole_run(self.scene), span, legend=not panel.with_beliefs)
             yield PlacedView(view, "right", 1.2) if panel.with_beliefs else PlacedView(view, "left")
 
     def styles(self) -> dict[str, rr.SeriesLines | rr.SeriesPoints]:

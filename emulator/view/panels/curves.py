@@ -16,7 +16,7 @@ from evedrop.view.palette import Colour
 from evedrop.view.scene import Scene
 
 _WINDOW = 105  # slots; below four pixels a slot, Rerun merges neighbouring slots into grey
-_ROOM = 25  # slots to the right of the present, kept free for the legend
+_ROOM = 3  # slots to the right of the present, so that the newest slot is not at the border
 _MOST_POINTS = 20_000  # of a curve over a run: a day of one-second slots is drawn every five seconds
 
 # For slots that share a pixel: the mean of their logarithms would be far below the logarithm of their mean.
@@ -40,24 +40,26 @@ def whole_run(scene: Scene) -> rrb.TimeAxis:
     return rrb.TimeAxis(view_range=whole, zoom_lock=True)
 
 
-def receivers_view(title: str, kinds: list[str], axis: rrb.TimeAxis, *, legend: bool) -> rrb.TimeSeriesView:
-    """A view of the curves below some paths, with or without the legend of receivers.
-
-    One legend serves all panels: a receiver has the same colour in each.
-    """
+def receivers_view(title: str, kinds: list[str], axis: rrb.TimeAxis) -> rrb.TimeSeriesView:
+    """A view of the curves below some paths, in the receivers' colours, which the legend of the whole view explains."""
     return rrb.TimeSeriesView(
         name=title,
         origin="/",
         contents=[f"/{kind}/**" for kind in kinds],
         axis_x=axis,
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=legend),
+        plot_legend=rrb.PlotLegend(visible=False),
     )
 
 
-def curves_view(title: str, path: str, axis: rrb.TimeAxis, values: rrb.ScalarAxis | None = None) -> rrb.TimeSeriesView:
-    """A view of the curves below a path, with a legend; axis: horizontal; values: the vertical axis, by default automatic."""
-    legend = rrb.PlotLegend(rrb.Corner2D.LeftTop)
-    return rrb.TimeSeriesView(name=title, origin=f"/{path}", axis_x=axis, axis_y=values, plot_legend=legend)
+def curves_view(
+    title: str, path: str, axis: rrb.TimeAxis, values: rrb.ScalarAxis | None = None, *, legend: bool = True
+) -> rrb.TimeSeriesView:
+    """A view of the curves below a path; axis: horizontal; values: the vertical axis, by default automatic.
+
+    legend: whether it names its curves, which those of truth and receivers do not need.
+    """
+    corner = rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend)
+    return rrb.TimeSeriesView(name=title, origin=f"/{path}", axis_x=axis, axis_y=values, plot_legend=corner)
 
 
 def line_style(label: str, bright: Colour, width: float, *, steps: bool = False) -> rr.SeriesLines:

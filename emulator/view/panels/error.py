@@ -25,14 +25,13 @@ class SquaredError(ViewPanel):
     """|x − x̂|² on a logarithmic scale: in recent slots, or in the whole run of a closed loop."""
 
     def views(self) -> Iterator[PlacedView]:
-        """One view, with the legend of receivers unless an application's panel above it has one."""
-        title = "Squared error |x − x̂|²   log10"
+        """One view: of the whole run for a closed loop, otherwise of the recent slots."""
+        title = "Squared error   log10"
         if self.scene.moving:
-            legend = not any(panel.with_beliefs for panel in self.scene.panels)
-            yield PlacedView(receivers_view(title, self._paths, whole_run(self.scene), legend=legend), "right")
+            yield PlacedView(receivers_view(title, self._paths, whole_run(self.scene)), "right")
         else:
-            title += ", bottom: exact" + (", dim: ± 1.96 standard errors" if self._with_bands else "")
-            yield PlacedView(receivers_view(title, self._paths, recent_slots(self.scene), legend=True), "left")
+            title += ", dim: ± 1.96 standard errors" if self._with_bands else ""
+            yield PlacedView(receivers_view(title, self._paths, recent_slots(self.scene)), "middle")
 
     @property
     def _with_bands(self) -> bool:

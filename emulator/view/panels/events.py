@@ -29,7 +29,7 @@ class Events(ViewPanel):
         self._watchers = [(shown, Watcher(shown, scene)) for shown in scene.receivers]
 
     def views(self) -> Iterator[PlacedView]:
-        """One view, at the bottom of the right side."""
+        """One view: below the packets, or at the bottom right for a closed loop."""
         view = rrb.TextLogView(
             name="Events",
             origin=_PATH,
@@ -39,7 +39,10 @@ class Events(ViewPanel):
             ),
             format_options=rrb.TextLogFormat(monospace_body=True),
         )
-        yield PlacedView(view, "right", 0.7 if self.scene.moving else 1.0)
+        if self.scene.moving:
+            yield PlacedView(view, "right", 0.7)
+        else:
+            yield PlacedView(view, "left")
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
         """The events that the watcher of each receiver noticed."""

@@ -30,8 +30,8 @@ class Levels(ViewPanel):
         """A view for each of the first two states, on the left side."""
         for i in range(min(self.scene.n, _VIEWS)):
             label = self.scene.states[i] if self.scene.states else f"state {i}"
-            title = f"{label}   grey: truth · others coloured as their curves: what they believe"
-            yield PlacedView(curves_view(title, f"{_PATH}/{i}", whole_run(self.scene)), "left")
+            title = f"{label}   grey: truth"
+            yield PlacedView(curves_view(title, f"{_PATH}/{i}", whole_run(self.scene), legend=False), "left")
 
     def styles(self) -> dict[str, rr.SeriesLines]:
         """Each estimate in its receiver's colour; the truth grey and wide."""

@@ -12,11 +12,11 @@ import rerun.blueprint as rrb
 from evedrop.view import lanes
 from evedrop.view.column import Column
 from evedrop.view.panels.curves import recent_slots
+from evedrop.view.panels.heights import FIXED_HEIGHT, crowded, lanes_height
 from evedrop.view.panels.panel import PlacedView, ViewPanel
 from evedrop.view.scene import Scene, SceneSlots
 
 _PATH = "packets"
-_LANES_OF_A_SCREEN = 23.0  # lanes that would fill the usual window from top to bottom
 
 
 @final
@@ -33,17 +33,18 @@ class Packets(ViewPanel):
         self._last = [-1] * len(names)
 
     def views(self) -> Iterator[PlacedView]:
-        """One view, as high as the lanes need; on the left side, below two views of curves, at most half of the window."""
-        view = rrb.StateTimelineView(name=f"Packets   {lanes.LEGEND}", origin=_PATH, time_view=recent_slots(self.scene))
+        """One view, as high as the lanes need: above the events, or, with many receivers or a closed loop, at the top."""
+        view = rrb.StateTimelineView(name="Packets", origin=_PATH, time_view=recent_slots(self.scene))
         receivers = len(self.scene.receivers)
-        if self.scene.moving:
-            yield PlacedView(view, "right", 0.4 + 0.22 * receivers)
+        height = lanes_height(receivers + 1)
+        if self.scene.moving or crowded(self.scene):
+            yield PlacedView(view, "top", height=height)
         else:
-            height = min(0.5, (3.0 + receivers) / _LANES_OF_A_SCREEN)
-            yield PlacedView(view, "left", 2.0 * height / (1.0 - height))
+            column = 1.0 - FIXED_HEIGHT - lanes_height(receivers)
+            yield PlacedView(view, "left", height / (column - height))
 
     def styles(self) -> dict[str, rr.StateConfiguration]:
-        """Blank labels: a slot is too narrow for a word, and the title says what the colours mean."""
+        """Blank labels: a slot is too narrow for a word, and the legend says what the colours mean."""
         return {
             path: rr.StateConfiguration(values=lane.words, labels=[" "] * len(lane.words), colors=lane.colours)
             for path, lane in zip(self._paths, self._lanes, strict=True)

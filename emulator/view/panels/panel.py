@@ -17,15 +17,23 @@ from evedrop.view.column import Column
 from evedrop.view.events import Event
 from evedrop.view.scene import Scene, SceneSlots
 
+Side = Literal["title", "top", "left", "middle", "right", "legend"]
+"""`title`, `top` and `legend` are rows; `left`, `middle` and `right` are columns between them."""
+ROWS_ABOVE: tuple[Side, ...] = ("title", "top")
+COLUMNS: tuple[Side, ...] = ("left", "middle", "right")
+ROWS_BELOW: tuple[Side, ...] = ("legend",)
+
 
 @dataclass(frozen=True)
 class PlacedView:
-    """A Rerun view and its place. The views of each side are stacked."""
+    """A Rerun view and its place: in a row over the whole width, or in a column between the rows."""
 
     view: rrb.View
-    side: Literal["left", "right"]
+    side: Side
     share: float = 1.0
-    """Its height, compared with the other views of this side; most have 1."""
+    """Its height, compared with the other views of its column, or its width, compared with those of its row; most have 1."""
+    height: float = 0.0
+    """Of a view in a row: the share of the window's height that it needs. The row is as high as its highest view."""
 
 
 class ViewPanel(ABC):

@@ -27,15 +27,15 @@ class StateOverTime(ViewPanel):
         return scene.n == 1
 
     def views(self) -> Iterator[PlacedView]:
-        """One view, at the top of the right side."""
+        """One view, on the right."""
         if not self.scene.moving:
             view = rrb.TimeSeriesView(
                 name="State and estimates",
                 origin=_PATH,
                 axis_x=recent_slots(self.scene),
-                plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
+                plot_legend=rrb.PlotLegend(visible=False),
             )
-            yield PlacedView(view, "right", 1.75)
+            yield PlacedView(view, "right")
 
     def styles(self) -> dict[str, rr.SeriesLines]:
         """Each estimate in its receiver's colour; the truth grey and wide."""

@@ -40,7 +40,7 @@ class StatePlane(ViewPanel):
         return scene.n > 1
 
     def views(self) -> Iterator[PlacedView]:
-        """One view, at the top of the right side."""
+        """One view, on the right."""
         if self.scene.moving:
             return
         trails: dict[str, rrb.VisibleTimeRanges] = {
@@ -48,12 +48,12 @@ class StatePlane(ViewPanel):
         }
         trails[_trail(TRUTH)] = self._past(_TRUTH_TRAIL)
         view = rrb.Spatial2DView(
-            name="State plane   white: truth · others coloured as their curves · ellipses: 2σ believed",
+            name="State plane   ellipses: 2σ believed",
             origin=_PATH,
             background=list(GROUND),
             overrides=trails,  # type: ignore[arg-type]
         )
-        yield PlacedView(view, "right", 1.75)
+        yield PlacedView(view, "right")
 
     def _past(self, slots: int) -> rrb.VisibleTimeRanges:
         # A piece of a trail is recorded at its end, so the oldest piece shown begins a frame earlier.

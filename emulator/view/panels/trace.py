@@ -21,12 +21,10 @@ class TraceOfP(ViewPanel):
     """tr P on a logarithmic scale. Recorded but not shown for a closed loop."""
 
     def views(self) -> Iterator[PlacedView]:
-        """One view, below the squared error, whose legend serves both."""
+        """One view, below the squared error."""
         if not self.scene.moving:
-            title = "tr P   log10, bright: believed · dim: theory · bottom: 0"
-            yield PlacedView(
-                receivers_view(title, [_BELIEVED, _THEORY], recent_slots(self.scene), legend=False), "left"
-            )
+            title = "tr P   log10, dim: theory"
+            yield PlacedView(receivers_view(title, [_BELIEVED, _THEORY], recent_slots(self.scene)), "middle")
 
     def styles(self) -> dict[str, rr.SeriesLines]:
         """Each receiver's colour: bright for its belief, dim for theory."""

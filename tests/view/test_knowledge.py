@@ -1,0 +1,124 @@
+"""What a receiver knows, and the lanes that say so."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from evedrop.model.process import Floats
+from evedrop.view.glyphs import drawable
+from evedrop.view.knowledge import FACTOR, KNOWLEDGE, Distance, Knowledge, knowledge
+from evedrop.view.panels.knowledge import WhoKnowsWhat
+from evedrop.view.panels.title import Title
+from evedrop.view.recording import ViewRecording
+from evedrop.view.scene import PeerSlots, Scene, Shown
+from tests.view.read_back import lane
+from tests.view.simulated_run import Simulated
+
+SCENE = Scene("", "r", 10, 1, 2, 0.0, (Shown("smart", "eavesdropper", "smart", 1.0),), noise=0.05, units=("m", "m"))
+
+
+def known(error: float, trace: float, scene: Scene = SCENE) -> Knowledge:
+    """What a receiver knows with this squared error and tr P."""
+    none = np.zeros(1)
+    P = np.diag([trace / 2, trace / 2])[None]
+    peer = PeerSlots(np.array([[np.sqrt(error), 0.0]]), P, none.astype(np.uint8), none, none, none, none)
+    return KNOWLEDGE[int(knowledge(scene, np.zeros((1, 2)), peer)[0])]
+
+
+@pytest.mark.parametrize(
+    ("error", "trace", "expected"),
+    [
+        (0.0, 0.0, Knowledge.IN_TRACK),
+        (0.99, 0.0, Knowledge.IN_TRACK),  # 20 times the noise of a step is 1
+        (1.01, 0.0, Knowledge.FOOLED),
+        (1.01, 0.1, Knowledge.DRIFTING),
+        (0.0, 1.01, Knowledge.DRIFTING),  # near the truth by chance
+        (99.0, 5.0, Knowledge.DRIFTING),
+        (101.0, 5.0, Knowledge.FOOLED),
+        (np.nan, 5.0, Knowledge.FOOLED),
+        (np.inf, 5.0, Knowledge.FOOLED),
+    ],
+)
+def test_a_word_for_error_and_covariance(error: float, trace: float, expected: Knowledge) -> None:
+    """The bounds of docs/view.md."""
+    assert known(error, trace) is expected
+
+
+def test_a_right_covariance_is_hardly_ever_called_fooled() -> None:
+    """The bound of the docstring; errors in one direction exceed it most often, and those in several hardly ever."""
+    assert stats.chi2.sf(FACTOR, 1) < 1e-5
+    for n in (2, 4, 10):
+        assert stats.chi2.sf(FACTOR * n, n) < stats.chi2.sf(FACTOR, 1)
+
+
+def walk(errors: list[float], levels: list[int], distance: Distance) -> list[str]:
+    """The words for distances along the first state."""
+    x: Floats = np.array([[one, 0.0] for one in errors])
+    codes = distance.codes(np.array(levels, np.uint8), distance.of(x, np.zeros_like(x)))
+    return [distance.words[code] for code in codes]
+
+
+def test_words_say_the_largest_distance_of_a_stretch() -> None:
+    """They name powers of ten, do not flicker, and continue over calls."""
+    distance = Distance(SCENE)
+    first = walk([0.2, 3.0, 30.0, 9.0], [0, 2, 2, 2], distance)
+    more = "off by more than"
+    assert first == ["in track, within 1 m", f"fooled, {more} 1 m", f"fooled, {more} 10 m", f"fooled, {more} 10 m"]
+    assert walk([9.0, 0.5, 0.9, 5.0], [2, 1, 0, 1], distance) == [
+        f"fooled, {more} 10 m",
+        "drifting, off by less than 1 m",
+        "in track, within 1 m",
+        f"drifting, {more} 1 m",
+    ]
+    assert walk([np.inf, np.nan], [2, 2], distance)[0] == f"fooled, {more} 1e+09 m"
+    assert len(set(distance.words)) == len(distance.words) == len(distance.meanings)
+    assert all(word.startswith(what.word) for word, what in zip(distance.words, distance.meanings, strict=True))
+
+
+def test_distances_have_a_unit() -> None:
+    """Only states with the unit of the first count; without units, all do."""
+    moving = replace(SCENE, n=3, units=("m", "m", "m/s"))
+    x: Floats = np.array([[3.0, 4.0, 12.0]])
+    assert Distance(moving).of(x, np.zeros((1, 3)))[0] == 5.0
+    assert Distance(replace(moving, units=())).of(x, np.zeros((1, 3)))[0] == 13.0
+    texts = [Distance(moving).text(one) for one in (0.0, 0.316, 12.34, 4567.0, 1e9, np.inf)]
+    assert texts == ["0 m", "0.32 m", "12 m", "4,600 m", "1e+09 m", "everything"]
+
+
+def test_the_strip_shows_who_knows_what(simulated: Callable[..., Simulated], tmp_path: Path) -> None:
+    """However slots are handed over, a lane has the words of its receiver; a naive eavesdropper is fooled, a smart one is not."""
+    run, lanes = simulated(300), {}
+    for length in (7, 300):
+        recording = ViewRecording(tmp_path / f"{length}.rrd", run.scene)
+        for slots in run.chunks(length):
+            recording.add(slots)
+        assert recording.close()
+        for i, shown in enumerate(run.scene.receivers):
+            lanes[shown.name, length] = lane(tmp_path / f"{length}.rrd", f"knows/{i + 1}_{shown.name}", 300)
+    for shown in run.scene.receivers:
+        assert lanes[shown.name, 7] == lanes[shown.name, 300]
+        expected = knowledge(run.scene, run.slots.x, run.slots.peers[shown.name])
+        assert [word.split(",")[0] for word in lanes[shown.name, 7]] == [KNOWLEDGE[code].word for code in expected]
+    words = {name: " ".join(found) for (name, _), found in lanes.items()}
+    assert "fooled" in words["naive"]
+    assert "fooled" not in words["smart"]
+    assert "drifting" in words["smart"]
+    assert set(words["legitimate"].split()) & {"fooled", "drifting"} == set()
+    assert set(WhoKnowsWhat(run.scene).styles()) == {
+        f"knows/{i + 1}_{s.name}" for i, s in enumerate(run.scene.receivers)
+    }
+
+
+def test_titles_in_any_letters_are_drawn() -> None:
+    """Letters that the viewer's font lacks become question marks, and Markdown stays as it was typed."""
+    assert drawable("Größe σ² ≥ 1 Ж x\u0302") == "Größe σ² ≥ 1 Ж x\u0302"
+    assert drawable("東 🚗") == "? ?"
+    text = Title(replace(SCENE, title="a *b* # c")).styles()["title"].text
+    assert text is not None
+    assert text.as_arrow_array().to_pylist() == [r"**a \*b\* \# c**"]
