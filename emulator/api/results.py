@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import pyarrow as pa
 
@@ -17,6 +17,10 @@ from evedrop.results.reading import Results
 from evedrop.results.reading import load_results as read_results
 from evedrop.score.summary import Judged, LinkSummary, PeerSummary, SecrecySummary, Summary
 
+if TYPE_CHECKING:
+    from evedrop.view.shown_figure import ShownFigure
+
+Panels = Literal["errors", "lanes", "plane"]
 _MOST_ROWS = 40  # of a table in a notebook
 
 
@@ -80,6 +84,19 @@ class RunResults(Results):
         yield from (f"{name}: {verdict.sentence}" for name, verdict in self.secrecy.items())
         yield from (one.sentence for one in self.expectations)
 
+    def plot(self, *panels: Panels, slots: range | None = None, trial: int | None = None) -> ShownFigure:
+        """A figure: the errors of all trials with bands, and the lanes and the plane of one recorded trial.
+
+        panels: some of `errors`, `lanes` and `plane`, by default all; slots: those shown, by default all errors and at most the
+        last 300 slots of lanes and plane; trial: by default the first recorded one. The figure is one of matplotlib:
+        `savefig` writes it to a file. Source: docs/python.md.
+
+        Raises UsageError if there is no such panel, slot or recorded trial.
+        """
+        from evedrop.view.run_picture import run_figure  # noqa: PLC0415 - matplotlib takes half a second
+
+        return run_figure(self, panels, slots, trial)
+
     def __repr__(self) -> str:
         error = ("mean_squared_error", "mean_actual_trace_covariance")
         errors = [
@@ -106,6 +123,12 @@ class SweepResults:
     def points(self) -> int:
         """The number of combinations of values."""
         return len({tuple(row[key] for key in self.keys) for row in self.table.to_pylist()})
+
+    def plot(self) -> ShownFigure:
+        """A figure of matplotlib: each receiver's error against the first entry, with a panel for each value of the others."""
+        from evedrop.view.sweep_picture import sweep_figure  # noqa: PLC0415 - matplotlib takes half a second
+
+        return sweep_figure(self.table, self.keys)
 
     def __repr__(self) -> str:
         return (

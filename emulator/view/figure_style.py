@@ -12,6 +12,8 @@ from evedrop.view.palette import FIGURES, hexadecimal
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from evedrop.view.shown_figure import ShownFigure
+
 BLUE, RED, GREEN, ORANGE, GREY = map(hexadecimal, FIGURES)
 """The colours of `FIGURES`, as matplotlib writes them."""
 
@@ -39,16 +41,23 @@ _STYLE: Any = {
 
 
 @contextmanager
+def drawing(width: float, height: float) -> Iterator[ShownFigure]:
+    """A figure to draw on, in inches. Needs no display, and leaves no global state changed."""
+    import matplotlib as mpl  # noqa: PLC0415 - slow to import, and needed only for figures
+
+    from evedrop.view.shown_figure import ShownFigure  # noqa: PLC0415 - as above
+
+    with mpl.rc_context(_STYLE):
+        yield ShownFigure(figsize=(width, height), layout="constrained")
+
+
+@contextmanager
 def panels(path: Path, columns: int, width: float, height: float) -> Iterator[list[Axes]]:
     """Axes to draw on, side by side; width and height in inches. Saved as `path`.png and `path`.pdf at the end.
 
     Uses no windowing toolkit, and leaves no global state changed.
     """
-    import matplotlib as mpl  # noqa: PLC0415 - slow to import, and needed only for figures
-    from matplotlib.figure import Figure  # noqa: PLC0415 - as above
-
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(width, height), layout="constrained")
+    with drawing(width, height) as figure:
         axes = figure.subplots(1, columns, squeeze=False)
         yield list(axes[0])
         figure.savefig(path.with_suffix(".png"), dpi=180)

@@ -1,0 +1,94 @@
+"""The figures of results: what they show, and that they need no display."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+
+from evedrop import Scenario, montecarlo
+from evedrop.api import RunResults, SweepResults, sweep
+from evedrop.errors import UsageError
+from evedrop.memory.montecarlo import Plan
+from evedrop.memory.simulation import Mode
+from evedrop.view.palette import DROPPED, colour, hexadecimal
+from tests.scenario.good import GOOD
+
+SCENARIO = Scenario(GOOD).replace(slots=30, trials=2, record_trials=2)
+
+
+@pytest.fixture(scope="module")
+def results() -> RunResults:
+    """A small study with two recorded trials."""
+    return montecarlo(SCENARIO, trials=5)
+
+
+def test_errors_are_those_of_the_table_in_the_colours_of_the_view(results: RunResults) -> None:
+    """A curve and a dashed one of theory for each receiver, and a band around it."""
+    (axes,) = results.plot("errors").axes
+    curves = {str(line.get_label()): line for line in axes.get_lines()}
+    for i, name in enumerate(results.peers):
+        rows = [row for row in results.slots.to_pylist() if row["peer"] == name]
+        assert np.array_equal(np.asarray(curves[name].get_ydata()), [row["mean_squared_error"] for row in rows])
+        assert to_hex(curves[name].get_color()) == hexadecimal(colour(i))
+    assert (len(axes.get_lines()), len(axes.collections), axes.get_yscale()) == (4, 2, "log")
+
+
+def test_lanes_have_the_outcome_of_every_packet(results: RunResults) -> None:
+    """A row for each receiver; a lost packet has the colour that it has in the view."""
+    (axes,) = results.plot("lanes", slots=range(5, 25), trial=1).axes
+    (image,) = axes.get_images()
+    codes = np.asarray(image.get_array())
+    rows = [row for row in results.trials.to_pylist() if row["trial"] == 1 and 5 <= row["slot"] < 25]
+    lost = [[row["action"] == "dropped" for row in rows if row["peer"] == name] for name in results.peers]
+    assert np.array_equal(codes == 0, lost)
+    assert to_hex(image.get_cmap()(0)) == hexadecimal(DROPPED)
+    assert [one.get_text() for one in axes.get_yticklabels()] == list(results.peers)
+    assert "trial 1, slots 5 to 24" in axes.get_title("left")
+
+
+def test_the_plane_shows_the_truth_and_who_follows_it(results: RunResults) -> None:
+    """Far estimates leave the picture; a process of one state is drawn against the slot."""
+    (axes,) = results.plot("plane").axes
+    truth = np.array([row["x"] for row in results.trials.to_pylist() if row["trial"] == 0 and row["peer"] == "smart"])
+    drawn = {str(line.get_label()): np.array(line.get_data()).T for line in axes.get_lines()}
+    assert np.array_equal(drawn["truth"], truth)
+    assert list(drawn) == ["truth", *results.peers]
+    low, high = axes.get_xlim()
+    assert low < truth[:, 0].min() <= truth[:, 0].max() < high < truth[:, 0].max() + np.ptp(truth[:, 0])
+    one = {"A": [[0.9]], "Q": [[0.1]], "initial_covariance": [[1.0]]}
+    (axes,) = montecarlo(SCENARIO, trials=2, process=one).plot("plane").axes
+    assert axes.get_xlabel() == "slot"
+
+
+def test_a_figure_shows_itself_in_a_notebook_without_a_display(
+    results: RunResults, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a PNG, which pyplot and its windows have no part in."""
+    monkeypatch.delenv("DISPLAY", raising=False)
+    figure = results.plot()
+    assert len(figure.axes) == 3
+    assert figure._repr_png_().startswith(b"\x89PNG")
+
+
+def test_what_cannot_be_drawn_is_refused(results: RunResults) -> None:
+    """With what can be; errors alone need no recorded trial."""
+    with pytest.raises(UsageError, match="there is no panel 'error'; expected errors, lanes, plane"):
+        results.plot("error")  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match="trial 7 is not recorded; recorded are 0, 1"):
+        results.plot(trial=7)
+    for slots in (range(31), range(0), range(0, 9, 2)):
+        with pytest.raises(UsageError, match=r"expected some such as range\(0, 30\)"):
+            results.plot("errors", slots=slots)
+    covariances = montecarlo(SCENARIO.replace(record_trials=1), trials=2, plan=Plan(Mode.COVARIANCE_ONLY))
+    with pytest.raises(UsageError, match="the run has recorded none, and 'errors' needs none"):
+        covariances.plot()
+    assert len(covariances.plot("errors", slots=range(10)).axes) == 1
+
+
+def test_a_sweep_is_drawn_as_its_file_is() -> None:
+    """Errors against the first entry, a panel for each value of the second."""
+    found: SweepResults = sweep(SCENARIO, {"encoding.state_probability": [0.3, 0.7], "slots": [4, 6]}, trials=3)
+    axes = found.plot().axes
+    assert [one.get_title("left") for one in axes] == ["slots = 4", "slots = 6"]
+    assert axes[0].get_xlabel() == "encoding.state_probability"
