@@ -56,12 +56,12 @@ class HeadlessViewer:
         if self._timeline == ELAPSED:
             end = self._last / 1e9
             if moment is not None and not 0.0 <= moment <= end:
-                raise UsageError(f"--time {moment:g} is not a time of the wire; give one from 0 to {end:g}, in seconds")
+                raise UsageError(f"{moment:g} s is not a time of the wire; give one from 0 to {end:g}, in seconds")
             seconds = end if moment is None else moment
             self._answer(lambda: self._client.set_time(ELAPSED, duration=seconds, play_state="paused"))
         else:
             if moment is not None and not 0 <= moment <= self._last:
-                raise UsageError(f"--slot {moment:.0f} is not in the run; give one from 0 to {self._last}")
+                raise UsageError(f"slot {moment:.0f} is not in the run; give one from 0 to {self._last}")
             slot = self._last if moment is None else int(moment)
             self._answer(lambda: self._client.set_time(TIMELINE, sequence=slot, play_state="paused"))
 

@@ -6,7 +6,7 @@ import itertools
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import IO
@@ -53,7 +53,7 @@ def picture_apart(rrd: Path, png: Path, moment: float | None = None, size: tuple
 
 def frames_apart(
     rrd: Path, moments: Sequence[float] | None, size: tuple[int, int], complaints: list[str]
-) -> Iterator[bytes]:
+) -> Generator[bytes, None, None]:
     """Pictures of some moments, or of the last one, as PNG; the panels' complaints about the last are added to `complaints`.
 
     A separate process draws them, one at a time; in a separate network, too, if the system allows that. Otherwise anybody who

@@ -159,6 +159,8 @@ def test_a_busy_machine_does_not_end_a_picture() -> None:
     """The viewer refuses what takes more than 15 seconds; the question is put again."""
     viewer = viewer_with(SlowClient(3))
     viewer.show(4)
+    with pytest.raises(UsageError, match="slot 10 is not in the run; give one from 0 to 9"):
+        viewer.show(10)
     assert viewer.settle() == b"picture"
 
 

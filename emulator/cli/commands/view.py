@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import tempfile
+import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +19,8 @@ from evedrop.errors import UsageError
 if TYPE_CHECKING:
     from evedrop.view.viewer import Viewer
 
+_MOST_RATE = 60
+_BEFORE, _AFTER = 60, 20  # slots of a video around the slot that tells most
 _LEAST, _MOST = 320, 3840  # pixels; the viewer takes more than its time limit for larger pictures
 
 
@@ -49,6 +54,8 @@ def view(options: argparse.Namespace) -> int:
             recording = replay(options.run, Path(temporary) / "recording.rrd")
         elif not recording.is_file():
             recording = replay(options.run)
+        if options.video is not None:
+            return _film(recording, options, _slots_of(options))
         if options.picture is None:
             _hold("run", open_run(options.run, options.view, stand, recording))
             return 0
@@ -61,11 +68,67 @@ def view(options: argparse.Namespace) -> int:
 
 
 def _check_names(options: argparse.Namespace) -> None:
-    """Raise UsageError for a picture that cannot be written, before anything is drawn."""
+    """Raise UsageError for a picture or a video that cannot be made, before anything is drawn."""
     if options.picture is not None:
         from evedrop.view.picture import check_picture_name
 
         check_picture_name(options.picture)
+    if options.video is not None:
+        from evedrop.view.video import FRAME_RATE, VIDEO_SIZE, check_video
+
+        check_video(options.video, options.size or VIDEO_SIZE, options.fps or FRAME_RATE)
+        if options.slot is not None or options.time is not None:
+            raise UsageError("a video shows more than one moment; give --slots for a run, and --times for a wire")
+    elif options.slots is not None or options.times is not None:
+        raise UsageError("--slots and --times are for a video; give --video, or --slot or --time for a picture")
+
+
+def _slots_of(options: argparse.Namespace) -> Sequence[int]:
+    """The slots of a video."""
+    if options.times is not None:
+        raise UsageError("--times is for wires; a run has slots, so give --slots")
+    if options.slots is None:
+        from evedrop.results.writer import load_results
+
+        last = int(load_results(options.run).summary["slots"]) - 1
+        slot = _chosen_slot(options.run)
+        middle = last if slot is None else slot
+        return range(max(0, middle - _BEFORE), min(last, middle + _AFTER) + 1)
+    first, last, step = options.slots
+    if not all(float(part).is_integer() for part in options.slots if part is not None):
+        raise UsageError("--slots has a fraction of a slot; give whole numbers")
+    return range(int(first), int(last) + 1, int(step or 1))
+
+
+def _times_of(options: argparse.Namespace) -> Sequence[float]:
+    """The times of a video of a wire: by default in real time."""
+    from evedrop.view.video import FRAME_RATE
+
+    if options.slots is not None:
+        raise UsageError(f"--slots is for runs, and {options.run} is the folder of a wire; give --times")
+    if options.times is None:
+        raise UsageError("a video of a wire needs --times FIRST:LAST, in seconds, such as --times 0:10")
+    first, last, step = options.times
+    step = 1.0 / (options.fps or FRAME_RATE) if step is None else step
+    return [first + number * step for number in range(int((last - first) / step + 1e-9) + 1)]
+
+
+def _film(recording: Path, options: argparse.Namespace, moments: Sequence[float]) -> int:
+    """Draw some moments as a video."""
+    from evedrop.cli.progress_line import ProgressLine
+    from evedrop.news import RunProgress
+    from evedrop.view.video import FRAME_RATE, VIDEO_SIZE, video_apart
+
+    start = time.monotonic()
+    with ProgressLine(len(moments), "frames") as line:
+
+        def tell(done: int) -> None:
+            line.tell(RunProgress(done, done / (time.monotonic() - start), "frames/s", {}))
+
+        size, rate = options.size or VIDEO_SIZE, options.fps or FRAME_RATE
+        complaints = video_apart(recording, options.video, moments, size, rate, tell)
+    print("\n".join([*complaints, f"{len(moments)} frames are in {options.video}"]))
+    return 0
 
 
 def _chosen_slot(run: Path) -> int | None:
@@ -75,7 +138,7 @@ def _chosen_slot(run: Path) -> int | None:
 
     slot = telling_slot(load_results(run))
     if slot is not None:
-        print(f"slot {slot} is drawn; --slot chooses another")
+        print(f"slot {slot} tells most")
     return slot
 
 
@@ -97,6 +160,8 @@ def _view_wire(options: argparse.Namespace) -> int:
     stand = None if options.serve is None else WebAddress.of(options.serve)
     with raise_on_signals(), tempfile.TemporaryDirectory(prefix="evedrop-view-") as temporary:
         recording = replay_wire(options.run, Path(temporary) / "recording.rrd")
+        if options.video is not None:
+            return _film(recording, options, _times_of(options))
         if options.picture is None:
             _hold("wire", open_run(options.run, options.view, stand, recording))
             return 0
@@ -128,17 +193,54 @@ def _size(text: str) -> tuple[int, int]:
     return size
 
 
+def _moments(text: str) -> tuple[float, float, float | None]:
+    """First, last and step of slots or times; the step is None if it is not given. Raises ArgumentTypeError."""
+    try:
+        first, last, *step = (float(part) for part in text.split(":"))
+    except ValueError:
+        first, last, step = 0.0, -1.0, []
+    if not (0 <= first <= last < math.inf and len(step) <= 1 and all(0 < one < math.inf for one in step)):
+        raise argparse.ArgumentTypeError(f"{text} is not FIRST:LAST or FIRST:LAST:STEP, such as 100:200 or 100:200:2")
+    return first, last, step[0] if step else None
+
+
+def _rate(text: str) -> float:
+    """Frames per second. Raises ArgumentTypeError."""
+    try:
+        rate = float(text)
+    except ValueError:
+        rate = 0.0
+    if not 1 <= rate <= _MOST_RATE:
+        raise argparse.ArgumentTypeError(f"{text} is not a number of frames per second from 1 to {_MOST_RATE}")
+    return rate
+
+
 def _shown(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--view", choices=("auto", "native", "web"), default="auto", help="default auto")
     instead = parser.add_mutually_exclusive_group()
     instead.add_argument(
         "--picture", type=Path, metavar="FILE.png", help="draw the run into a file instead; needs no screen"
     )
+    instead.add_argument(
+        "--video", type=Path, metavar="FILE.mp4|gif", help="draw some slots as a video instead; needs no screen"
+    )
     instead.add_argument("--table", action="store_true", help="print its table and sentences instead")
     moment = parser.add_mutually_exclusive_group()
     moment.add_argument("--slot", type=int, metavar="K", help="the slot to draw; default one that tells much")
     moment.add_argument("--time", type=float, metavar="SECONDS", help="for a wire: the time to draw; default the end")
-    parser.add_argument("--size", type=_size, metavar="WxH", help="of the picture, in pixels; default 1600x950")
+    moment.add_argument(
+        "--slots",
+        type=_moments,
+        metavar="A:B[:STEP]",
+        help="the slots of a video; default 80 around one that tells much",
+    )
+    moment.add_argument(
+        "--times", type=_moments, metavar="A:B[:STEP]", help="for a wire: the times of a video, in seconds"
+    )
+    parser.add_argument("--fps", type=_rate, metavar="F", help="frames per second of a video; default 15")
+    parser.add_argument(
+        "--size", type=_size, metavar="WxH", help="in pixels; default 1600x950 for a picture, 1200x720 for a video"
+    )
 
 
 COMMANDS = (
