@@ -45,6 +45,7 @@ MODULES: Mapping[str, str] = {
     "selftest": "selftest",
     "brief": "process",
     "health": "process",
+    "host": "host",
     **dict.fromkeys(ROLES, "process"),
 }
 """First word of a command → its module in this package, in the order of `--help`."""

@@ -5,15 +5,18 @@ from __future__ import annotations
 import argparse
 import contextlib
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from evedrop.cli.holding import hold
 from evedrop.cli.options import entries, loaded, output, over_wire, print_so_far, scenario
 from evedrop.command import Command
-from evedrop.errors import Interrupted, RunError
+from evedrop.errors import Interrupted, RunError, UsageError
 
 if TYPE_CHECKING:
+    from evedrop.live.launch.hosts_file import HostsPlan
     from evedrop.live.launch.process_set import Ended
+    from evedrop.scenario import Scenario
     from evedrop.view.viewer import Viewer
 
 
@@ -40,11 +43,19 @@ def _run(options: argparse.Namespace) -> Ended:
     from evedrop.results.folder import results_folder
 
     scenario = loaded(options)
+    hosts = _hosts_of(options, scenario)
     with results_folder(options.out, options.scenario) as folder:
         with ProgressLine(scenario.slots, "slots", options.json) as line:
             try:
                 ended = launch(
-                    scenario, folder, options.view, options.listen, line.tell, options.relay, paused=options.paused
+                    scenario,
+                    folder,
+                    options.view,
+                    options.listen,
+                    line.tell,
+                    options.relay,
+                    paused=options.paused,
+                    hosts=hosts,
                 )
             except (RunError, Interrupted):
                 with contextlib.suppress(OSError):  # the reader of the output may have got the same Ctrl-C
@@ -52,6 +63,18 @@ def _run(options: argparse.Namespace) -> Ended:
                 raise
         print_so_far(ended.folder, options.json)
     return ended
+
+
+def _hosts_of(options: argparse.Namespace, scenario: Scenario) -> HostsPlan | None:
+    """The hosts of `--hosts`; None without it."""
+    path: Path | None = getattr(options, "hosts", None)
+    if path is None:
+        return None
+    if options.listen is not None or options.relay is not None:
+        raise UsageError(f"--listen and --relay: {path} says where the routers listen; leave them out")
+    from evedrop.live.launch.hosts_file import load_hosts
+
+    return load_hosts(path, scenario)
 
 
 def _keep_open(viewer: Viewer) -> None:
@@ -75,6 +98,12 @@ def _live(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _over_ssh(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--hosts", type=Path, metavar="FILE", help="start processes on other hosts, over ssh, as FILE says"
+    )
+
+
 _LIVE = (entries, output, _live)
 
 
@@ -92,7 +121,7 @@ COMMANDS = (
         "run",
         run,
         "run a scenario live: separate processes over a network, with a view and results",
-        (scenario, over_wire, *_LIVE),
+        (scenario, over_wire, *_LIVE, _over_ssh),
         section="run",
         example="run vehicle --view web",
         page="scenario",

@@ -41,7 +41,7 @@ from evedrop.score.acknowledging import chart_of, way_back_of
 _WINDOW_BYTES = 64 * 2**20
 _MOST_SLOTS_AHEAD = 4096
 _REPORT_SECONDS = 0.04
-_LAUNCHED_PATIENCE = 30  # seconds
+LAUNCHED_PATIENCE = 30  # seconds
 
 
 def flow_of(scenario: Scenario) -> Flow:
@@ -107,7 +107,7 @@ def briefs_of(
     places: RouterEndpoints | str,
     observation: ObserverTask,
     ends_with_stdin: bool = True,
-    patience: int = _LAUNCHED_PATIENCE,
+    patience: int = LAUNCHED_PATIENCE,
 ) -> dict[str, AnyBrief]:
     """Process name → brief, with a new run name, new passwords and, if the router takes them, new certificates.
 

@@ -16,7 +16,14 @@ from typing import final
 from evedrop.environment import SINGLE_THREADED, lock_step_environment, own_environment
 from evedrop.errors import RunError
 from evedrop.interrupts import INTERRUPTED
-from evedrop.live.launch.starter import StartedProcess, Starter, start_process
+from evedrop.live.launch.starter import (
+    CONNECTION_LOST,
+    GRACE_SECONDS,
+    StartedProcess,
+    Starter,
+    end_all,
+    start_process,
+)
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.brief_parts import ReceiverPart, RoutingPart
 from evedrop.live.protocol.keys import writer_of
@@ -24,10 +31,8 @@ from evedrop.live.protocol.news import Alive, Finishing, ProcessRequest, RunOver
 from evedrop.names import OBSERVER, RELAY, ROUTER, SENSOR, ProcessAction
 from evedrop.news import News, RunEnded, Started, Tell
 from evedrop.results.folder import HeldFolder, private_opener
-from evedrop.signals import SHOW_STACKS, held_back
+from evedrop.signals import held_back
 
-GRACE_SECONDS = 3.0  # for all processes to leave
-_STACKS_SECONDS = 0.3  # for a process that does not leave to write the stacks of its threads into its log
 ROUTER_RESTARTS = 3  # how often routers that were ended by a signal are restarted in a run
 SILENCE_SECONDS = 30.0  # after which the launcher gives up on a silent observer, which sends a heartbeat every second
 _BEGIN_SECONDS = 30.0  # for a living observer to begin to write its results
@@ -62,6 +67,8 @@ class Exit:
             return f"was ended by signal {-self.status}"
         if self.status == INTERRUPTED:
             return "was interrupted by a signal"
+        if self.status == CONNECTION_LOST:
+            return "was lost with its host"
         return f"ended with status {self.status}" if self.status else "left before the run ended"
 
 
@@ -94,22 +101,7 @@ class Children:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for name, process in self._processes.items():
-            with contextlib.suppress(ProcessLookupError):
-                process.send_signal(signal.SIGCONT)  # a paused process could not end
-            self.terminate(name, 0.0)
-        deadline = time.monotonic() + GRACE_SECONDS
-        for process in self._processes.values():
-            try:
-                process.wait(max(0.0, deadline - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                process.send_signal(SHOW_STACKS)
-                with contextlib.suppress(subprocess.TimeoutExpired):
-                    process.wait(_STACKS_SECONDS)
-                process.kill()
-                process.wait()
-            if process.stdin is not None:
-                process.stdin.close()
+        end_all(self._processes.values())
 
     def start(self, brief: AnyBrief, again: bool = False) -> None:
         """Start the process of a brief, or restart it (`again`). Its output goes to its log, an observer's news to the launcher.
@@ -270,6 +262,8 @@ class Children:
             named, head = [first.process], f"{first.process} {first.manner}"
             words = reversed(self._log(first.process))
             why = next((line for line in words if line.startswith(_COMPLAINT)), "")
+            if first.status == CONNECTION_LOST and why:
+                head = f"{first.process} was lost: {why.removeprefix(_COMPLAINT)}"
         elif suspects:
             named, head = suspects, f"{', '.join(suspects)} stopped responding: hung, suspended or cut off"
         else:

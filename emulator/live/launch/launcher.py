@@ -5,7 +5,9 @@ It imports neither zenoh nor rerun. It alone decides how the run ended.
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from evedrop.errors import UsageError
 from evedrop.live.launch.ports import loopback_places
@@ -15,6 +17,12 @@ from evedrop.news import Tell
 from evedrop.scenario import Scenario
 from evedrop.signals import stop_on_signals
 from evedrop.view.viewer import choose
+
+if TYPE_CHECKING:
+    from evedrop.live.launch.hosts_file import HostsPlan
+    from evedrop.live.launch.starter import Starter
+
+_HOSTS_PATIENCE = 120  # seconds; some hosts take long to start Python
 
 
 def launch(
@@ -26,17 +34,21 @@ def launch(
     relay: str | None = None,
     *,
     paused: bool = False,
+    hosts: HostsPlan | None = None,
 ) -> Ended:
     """Run a scenario live into a results folder; `tell` gets the observer's news as they come.
 
     view: auto, native, web or off; listen, relay: the endpoints of router and relay, if there is one; free ports by default;
-    paused: whether the run is held before slot 0, until the operator lets it go on.
+    paused: whether the run is held before slot 0, until the operator lets it go on; hosts: the hosts of processes that are not
+    on this machine, and the endpoints of the routers then.
 
     Raises UsageError before any process is started, RunError if the run failed, Interrupted on Ctrl-C or SIGTERM; in the
     last two cases the results so far are in the folder and no process is left.
     """
     view = choose(view)
     with stop_on_signals() as stop, process_starter() as start:
+        if hosts is not None:
+            return _on_hosts(scenario, folder, view, tell, stop, start, hosts, paused)
         if scenario.shards == 1:
             places = loopback_places(listen, relay, scenario.relayed)
             return launch_one(scenario, folder, view, places, tell, stop, start, paused=paused)
@@ -52,3 +64,26 @@ def launch(
         if paused:
             raise UsageError(f"--paused: a run in {scenario.shards} shards cannot be steered; give --set shards=1")
         return launch_shards(scenario, folder, view, tell, stop, start)
+
+
+def _on_hosts(
+    scenario: Scenario,
+    folder: Path,
+    view: str,
+    tell: Tell,
+    stop: threading.Event,
+    here: Starter,
+    hosts: HostsPlan,
+    paused: bool,
+) -> Ended:
+    """Run a scenario as `launch` does, with processes on other hosts."""
+    from evedrop.live.launch.ssh_starter import ssh_starter  # noqa: PLC0415 - not needed on one machine
+
+    if scenario.shards > 1:
+        raise UsageError(
+            f"--hosts: the scenario has {scenario.shards} shards, and hosts carry one run; give --set shards=1"
+        )
+    with ssh_starter(hosts, here, stop, scenario.longest_outage) as start:
+        return launch_one(
+            scenario, folder, view, hosts.places, tell, stop, start, paused=paused, patience=_HOSTS_PATIENCE
+        )

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from evedrop.errors import EvedropError, Interrupted, RunError, UsageError
 from evedrop.interrupts import INTERRUPTED
-from evedrop.live.launch.briefs import ObserverTask, briefs_of
+from evedrop.live.launch.briefs import LAUNCHED_PATIENCE, ObserverTask, briefs_of
 from evedrop.live.launch.children import SILENCE_SECONDS, Children, Exit
 from evedrop.live.launch.ports import RouterEndpoints
 from evedrop.live.launch.private_folder import private_folder
@@ -55,16 +55,18 @@ def launch_one(
     *,
     shard: bool = False,
     paused: bool = False,
+    patience: int = LAUNCHED_PATIENCE,
 ) -> Ended:
     """Run a scenario as `launch` does, in one set of processes, until `stop` is set.
 
-    shard: whether other sets of processes carry further trials.
+    shard: whether other sets of processes carry further trials; patience: seconds for which processes wait for each other.
     """
     with private_folder() as private, contextlib.closing(HeldFolder(new_folder(folder))) as held:
         make_private(folder / "logs")
         viewer = None
         try:
-            briefs = briefs_of(scenario, places, ObserverTask(folder.absolute(), view != "off", shard, paused))
+            task = ObserverTask(folder.absolute(), view != "off", shard, paused)
+            briefs = briefs_of(scenario, places, task, patience=patience)
             observer = briefs.pop(OBSERVER)
             with Children(held, private, scenario.controller is not None, starter) as children:
                 for brief in briefs.values():

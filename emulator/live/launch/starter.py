@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
+import signal
 import subprocess
 import sys
-from collections.abc import Mapping
+import time
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import IO, Protocol
 
 from evedrop.names import OBSERVER
+from evedrop.signals import SHOW_STACKS
+
+GRACE_SECONDS = 3.0  # for all processes to leave
+CONNECTION_LOST = 1000
+"""The status of a process on another host if the connection with the host ended; no process ends with it."""
+_STACKS_SECONDS = 0.3  # for a process that does not leave to write the stacks of its threads into its log
 
 
 class StartedProcess(Protocol):
@@ -60,3 +69,24 @@ def start_process(role: str, brief: Path, log: IO[bytes], environment: Mapping[s
         env=environment,
         umask=0o077,
     )
+
+
+def end_all(processes: Collection[StartedProcess]) -> None:
+    """Ask processes to end, and end those that still run after `GRACE_SECONDS`."""
+    for process in processes:
+        with contextlib.suppress(ProcessLookupError):
+            process.send_signal(signal.SIGCONT)  # a paused process could not end
+        if process.poll() is None:
+            process.terminate()
+    deadline = time.monotonic() + GRACE_SECONDS
+    for process in processes:
+        try:
+            process.wait(max(0.0, deadline - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            process.send_signal(SHOW_STACKS)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(_STACKS_SECONDS)
+            process.kill()
+            process.wait()
+        if process.stdin is not None:
+            process.stdin.close()

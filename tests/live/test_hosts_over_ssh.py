@@ -1,0 +1,294 @@
+"""A run whose processes are started over ssh, on loopback: the same digests, no secret on a wrong host, and nothing left behind.
+
+A folder for temporary files stands for each host: every process there has it in its environment.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+from evedrop.errors import ScenarioError
+from evedrop.live.launch.hosts_file import load_hosts
+from evedrop.live.launch.ssh_starter import ssh_command
+from evedrop.loading import load
+from evedrop.ports import free_port
+from evedrop.scenario.stream_keys import StreamKeys
+from tests.builders import digests_of
+from tests.conftest import LIMIT, Evedrop, Live, wait_until, with_mark
+from tests.privileged import CannotRun, skip
+from tests.processes import parent_of
+from tests.sshd import Sshd, sshd
+
+ENDLESS = ("--slots", "1000000", "--pace", "0.002")
+OURS = shlex.join([sys.executable, "-m", "evedrop"])
+PLACES = {"alpha": ("router", "sensor", "legitimate", "smart"), "beta": ("naive",)}
+"""Host → its processes. The scenario gives the schedule to the receiver `smart`, and not to `naive`."""
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sshd]:
+    """An sshd for all tests of this module."""
+    try:
+        with sshd(tmp_path_factory.mktemp("sshd")) as one:
+            yield one
+    except CannotRun as error:
+        skip(error)
+
+
+def temporary(evedrop: Evedrop, host: str) -> Path:
+    """The folder for temporary files of a host."""
+    folder = evedrop.temporary / host
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
+def hosts(evedrop: Evedrop, server: Sshd, command: str = OURS, port: int | None = None) -> Path:
+    """A file of two hosts, both of which are this one; all that each receives is kept in its folder."""
+    text = [f'ssh_config = "{server.config}"', "[router]", f'listen = "tls/127.0.0.1:{free_port()}"']
+    for host, processes in PLACES.items():
+        script = evedrop.folder / f"{host}.sh"
+        received = shlex.quote(str(evedrop.folder / f"{host}.received"))
+        script.write_text(
+            f'export TMPDIR={shlex.quote(str(temporary(evedrop, host)))}\ntee {received} | {command} "$@"\n'
+        )
+        text += [f"[hosts.{host}]", 'address = "127.0.0.1"', f"processes = {json.dumps(processes)}"]
+        text += [f'command = ["sh", {json.dumps(str(script))}]', f"port = {port or server.port}"]
+    path = evedrop.folder / "hosts.toml"
+    path.write_text("\n".join(text))
+    return path
+
+
+def nothing_left(evedrop: Evedrop) -> None:
+    """No process is left on any host, and no file of one."""
+    wait_until(lambda: not with_mark(str(evedrop.temporary)), "no process left on any host")
+    assert sorted(path.name for path in evedrop.temporary.rglob("*")) == sorted(PLACES)
+
+
+def test_over_ssh_it_is_the_same_run(evedrop: Evedrop, server: Sshd) -> None:
+    """Receivers are killed, started again and paused; each host gets what its own processes may know, and not the schedule."""
+    changes = ("--trials", "3", "--set", "event.1.state=last", "--set", "expect=[]")
+    path = hosts(evedrop, server)
+    done = evedrop("run", "restart", *changes, "--hosts", str(path), "--view", "off", "--out", "run")
+    assert done.status == 0, done.err
+    nothing_left(evedrop)
+    assert evedrop("montecarlo", "restart", *changes, "--out", "memory").status == 0
+    assert digests_of(evedrop.folder / "run") == digests_of(evedrop.folder / "memory")
+    logs = {log.stem for log in (evedrop.folder / "run" / "logs").iterdir()}
+    assert logs == {"router", "sensor", "legitimate", "smart", "naive", "observer"}
+    secret = [key.hex() for key in StreamKeys.of(load("restart")).secret(("schedule", "noise")).values()]
+    received = {host: (evedrop.folder / f"{host}.received").read_text() for host in PLACES}
+    assert all(key in received["alpha"] and key not in received["beta"] for key in secret)
+    assert "schedule" in received["alpha"]
+    assert "schedule" not in received["beta"]
+    for host, text in received.items():
+        orders = [json.loads(line) for line in text.splitlines()]
+        assert {order["brief"]["process"] for order in orders if "start" in order} == set(PLACES[host])
+
+
+def running(evedrop: Evedrop, server: Sshd) -> Live:
+    """A run that does not end by itself, under way."""
+    words = ("--set", "event=[]", "--set", "expect=[]", "--hosts", str(hosts(evedrop, server)))
+    live = evedrop.live("restart", *ENDLESS, *words)
+    live.running()
+    return live
+
+
+def test_ctrl_c_ends_everything_on_all_hosts(evedrop: Evedrop, server: Sshd) -> None:
+    """The results so far are here."""
+    live = running(evedrop, server)
+    live.process.send_signal(signal.SIGINT)
+    assert live.end().status == 130
+    nothing_left(evedrop)
+    assert live.results.slots.num_rows > 0
+
+
+def test_a_killed_launcher_leaves_nothing_on_any_host(evedrop: Evedrop, server: Sshd) -> None:
+    """Its connections close, and the hosts end their processes; even one that is paused."""
+    live = running(evedrop, server)
+    paused = live.child("smart")
+    os.kill(paused, signal.SIGSTOP)
+    live.process.kill()
+    live.process.wait()
+    nothing_left(evedrop)
+
+
+def test_a_host_that_dies_in_the_middle_is_named(evedrop: Evedrop, server: Sshd) -> None:
+    """Kill -9 of what serves its connection: the run ends, the sentence names process and host, and the results are kept."""
+    live = running(evedrop, server)
+    ours = [pid for pid, command in with_mark(str(temporary(evedrop, "beta"))).items() if command.split()[-1] == "host"]
+    above = ours[0]
+    while parent_of(above) != server.process.pid:
+        above = parent_of(above)
+    sessions = [pid for pid in server.sessions() if pid == above]
+    assert len(sessions) == 1
+    os.kill(sessions[0], signal.SIGKILL)
+    done = live.end()
+    assert done.status == 3
+    assert "the connection with host beta ended" in done.err
+    assert done.err.startswith("evedrop: naive was lost"), done.err
+    nothing_left(evedrop)
+    assert live.results.slots.num_rows > 0
+    assert "host beta" in live.results.summary["ended"]
+
+
+def nobody_listens(evedrop: Evedrop, server: Sshd) -> Path:
+    """Hosts at a port where no sshd listens."""
+    return hosts(evedrop, server, port=free_port())
+
+
+def no_such_key(evedrop: Evedrop, server: Sshd) -> Path:
+    """Hosts whose sshd does not know the key."""
+    path = hosts(evedrop, server)
+    config = evedrop.folder / "client"
+    config.write_text(server.config.read_text().replace(f"{server.folder}/user", str(evedrop.folder / "none")))
+    path.write_text(path.read_text().replace(str(server.config), str(config)))
+    return path
+
+
+def no_program(evedrop: Evedrop, server: Sshd) -> Path:
+    """Hosts without Evedrop."""
+    path = hosts(evedrop, server)
+    path.write_text(re.sub(r"(?m)^command = .*$", 'command = ["/nowhere/evedrop"]', path.read_text()))
+    return path
+
+
+def other_version(evedrop: Evedrop, server: Sshd) -> Path:
+    """Hosts with another version of Evedrop."""
+    return hosts(evedrop, server, """(echo Welcome; echo '{"evedrop": "0.0.9"}'; exec cat >/dev/null) #""")
+
+
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        (nobody_listens, "Connection refused"),
+        (no_such_key, "Permission denied"),
+        (no_program, "/nowhere/evedrop"),
+        (other_version, "evedrop 0.0.9 is installed there"),
+    ],
+)
+def test_a_host_that_cannot_be_used_is_named(
+    made: Callable[[Evedrop, Sshd], Path], said: str, evedrop: Evedrop, server: Sshd
+) -> None:
+    """One line with its name and the reason, exit status 2; nothing is started, and there are no results."""
+    done = evedrop("run", "restart", "--hosts", str(made(evedrop, server)), "--view", "off", "--out", "run")
+    assert done.status == 2
+    assert done.err.startswith("evedrop: host alpha: ")
+    assert said in done.err
+    assert done.err.count("\n") == 1
+    nothing_left(evedrop)
+    assert not (evedrop.folder / "run").exists()
+
+
+WRONG = """
+[router]
+listen = "tcp/0.0.0.0:7447"
+[hosts.alpha]
+address = "-oProxyCommand=x"
+port = 0
+processes = ["router"]
+speed = 3
+"""
+UNFIT = """
+[router]
+listen = "tcp/0.0.0.0:7447"
+connect = "tcp/alpha.lan:7447"
+[relay]
+listen = "tls/beta.lan:7447"
+[hosts.alpha]
+address = "alpha.lan"
+processes = ["router", "smrt", "observer"]
+[hosts.beta]
+address = "beta.lan"
+processes = ["router"]
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "mistakes"),
+    [
+        (
+            WRONG,
+            [
+                'hosts.alpha.address: is "-oProxyCommand=x"; expected a word that does not begin with a dash, and has no spaces, '
+                'such as "beta.lan" (line 5)',
+                "hosts.alpha.port: is 0; expected a number at least 1, such as 22 (line 6)",
+                "hosts.alpha.speed: is not an entry of this table; expected one of address, user, port, processes, command, "
+                "folder, modules (line 8)",
+            ],
+        ),
+        (
+            UNFIT,
+            [
+                "hosts.alpha.processes: names smrt; expected router, sensor, legitimate, smart or naive; did you mean smart? "
+                "(line 9)",
+                "hosts.alpha.processes: names observer, which is always on this machine, where it writes the results (line 9)",
+                "hosts.beta.processes: names router, which is on alpha already; expected one host for it (line 12)",
+                "router.listen: tcp/0.0.0.0:7447 is not encrypted, and other machines can reach it: they could read everything, "
+                "and pose as the router; give tls/0.0.0.0:7447, or add insecure = true (line 3)",
+                "relay: the scenario has one router; leave it out, or add --set network.routers=2 (line 5)",
+            ],
+        ),
+    ],
+)
+def test_mistakes_in_the_file_are_all_listed(text: str, mistakes: list[str], tmp_path: Path) -> None:
+    """Each with its line."""
+    (tmp_path / "hosts.toml").write_text(text)
+    with pytest.raises(ScenarioError) as error:
+        load_hosts(tmp_path / "hosts.toml", load("restart"))
+    assert error.value.mistakes == mistakes
+
+
+def test_what_ssh_is_given_never_asks_and_has_no_secret(tmp_path: Path) -> None:
+    """A host's table determines every word of the command line."""
+    (tmp_path / "hosts.toml").write_text(
+        '[router]\nlisten = "tls/alpha.lan:7447"\n[hosts.beta]\naddress = "beta.lan"\nuser = "lab"\nport = 2222\n'
+        'processes = ["smart"]\nfolder = "/a b"\ncommand = ["/opt/my env/evedrop"]\n'
+    )
+    plan = load_hosts(tmp_path / "hosts.toml", load("restart"))
+    words = ssh_command(plan.hosts["beta"], plan.ssh_config, 30.0)
+    assert words[0] == "ssh"
+    assert words[words.index("BatchMode=yes") - 1] == "-o"
+    assert "ServerAliveCountMax=8" in words
+    assert words[-7:] == ["-l", "lab", "-p", "2222", "--", "beta.lan", "cd '/a b' && exec '/opt/my env/evedrop' host"]
+
+
+def test_ctrl_c_while_a_host_does_not_answer_ends_at_once(evedrop: Evedrop, server: Sshd) -> None:
+    """A host that accepts the connection and says nothing: status 130, and no ssh is left."""
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        path = hosts(evedrop, server, port=silent.getsockname()[1])
+        live = evedrop.live("restart", "--hosts", str(path))
+        connection, _ = silent.accept()
+        live.process.send_signal(signal.SIGINT)
+        done = live.end()
+        connection.close()
+    assert done.status == 130
+    assert "nothing was started" in done.err
+    nothing_left(evedrop)
+    assert not (evedrop.folder / "run").exists()
+
+
+def test_a_host_ends_when_its_launcher_is_silent(evedrop: Evedrop) -> None:
+    """Although its standard input is still open."""
+    host = evedrop.start(["-m", "evedrop"], ("host",), {"stdin": subprocess.PIPE})
+    assert host.stdin is not None
+    assert host.stdout is not None
+    assert json.loads(host.stdout.readline()) == {"evedrop": version("evedrop")}
+    host.stdin.write('{"silence": 0.2}\n')
+    host.stdin.flush()
+    assert host.wait(LIMIT) == 130
+    for stream in (host.stdin, host.stdout, host.stderr):
+        assert stream is not None
+        stream.close()
+    assert list(evedrop.temporary.iterdir()) == []
