@@ -46,10 +46,14 @@ COUNT ?= $(if $(SEED),1,60)
 test-faults: $(READY)
 	$(BIN)/python -m tests.faults.campaign --seed $(or $(SEED),1) --count $(COUNT)
 
-# The pages as a site, in build/site. Fails on broken links, and on pages that the navigation does not have. The environment gets
+# The pages as a site, in build/site. Fails on broken links, on pages that the navigation does not have, and on commands that do
+# not print what a page shows; BUILD_ONLY=1 leaves out the commands, which take minutes. The environment gets
 # what builds the site only here, so that the other targets do not wait for it.
 docs: $(DOCS_READY)
 	NO_MKDOCS_2_WARNING=1 PYTHONPATH=tools/site $(BIN)/python -m mkdocs build --clean
+ifndef BUILD_ONLY
+	$(BIN)/python -m pytest -n 2 tests/docs/test_consoles.py
+endif
 	@echo "the site is in build/site; to read it: python3 -m http.server --bind 127.0.0.1 --directory build/site"
 
 lint: $(READY)

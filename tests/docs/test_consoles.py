@@ -1,0 +1,89 @@
+"""The command blocks of the pages are carried out, and print what the pages show."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.docs.consoles import ROOT, blocks, carry_out, matches
+
+PAGES = {
+    path.relative_to(ROOT).as_posix(): path for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+}
+QUICK = {"docs/links.md"}
+"""Pages whose commands take few seconds; those of the others are carried out by `make docs`."""
+RUN = [name for name, path in PAGES.items() if any(block.is_run for block in blocks(path))]
+NOT_RUN = {
+    "README.md": 2,
+    "docs/compare.md": 1,
+    "docs/containers.md": 6,
+    "docs/control.md": 2,
+    "docs/hosts.md": 5,
+    "docs/integrity.md": 1,
+    "docs/mathematics.md": 1,
+    "docs/microgrid.md": 8,
+    "docs/montecarlo.md": 1,
+    "docs/papers.md": 1,
+    "docs/programs.md": 2,
+    "docs/scale.md": 1,
+    "docs/testing.md": 4,
+    "docs/tutorial.md": 1,
+    "docs/upstream.md": 2,
+    "docs/wire.md": 5,
+}
+"""How many blocks of commands of each page are not carried out; those of other pages need a reason."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.long]) for name in RUN]
+)
+def test_the_commands_of_a_page_print_what_it_shows(name: str, tmp_path: Path) -> None:
+    """In order, in one folder. `python -m tests.docs.consoles PAGE` writes what they print into the page."""
+    wrong = [str(one) for _, done in carry_out(PAGES[name], tmp_path) for one in done if not one.is_right]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_no_further_block_of_commands_is_left_out() -> None:
+    """Those that are not carried out are counted."""
+    left_out = {name: sum(one.has_commands and not one.is_run for one in blocks(path)) for name, path in PAGES.items()}
+    assert {name: count for name, count in left_out.items() if count} == NOT_RUN
+
+
+def test_what_is_shown_only_says_why() -> None:
+    """A console that is not carried out names its reason."""
+    consoles = [block for path in PAGES.values() for block in blocks(path) if block.language == "console"]
+    assert consoles
+    assert all(block.is_run or block.not_run for block in consoles)
+    assert all(list(block.commands()) for block in consoles)
+
+
+@pytest.mark.parametrize(
+    ("printed", "shown", "same"),
+    [
+        ("found 0.25 \n", "found 0.25\n", True),
+        ("found 0.25\n", "found 0.26\n", False),
+        ("took 0.7 s\n", "took … s\n", True),
+        ("took 0.7 s\n2 failed\n", "took … s\n", False),
+        ("a\nb\nc\nd\n", "a\n…\nd\n", True),
+        ("a\nd\n", "a\n…\nd\n", True),
+        ("a\nb\nc\n", "a\n…\nd\n", False),
+        ("a\nb\n", "a\n", False),
+        ("a.b\n", "a+b\n", False),
+    ],
+)
+def test_output_is_compared(printed: str, shown: str, same: bool) -> None:
+    """To the last character, but for spaces at the ends of lines and for what is left out."""
+    assert matches(printed, shown) is same
+
+
+def test_a_page_that_is_wrong_is_found(tmp_path: Path) -> None:
+    """A file, a wrong number, a status other than the stated one, and a command that fails without a word."""
+    page = tmp_path / "page.md"
+    page.write_text(
+        "<!-- file: a.txt -->\n```text\n1\n```\n\n```console\n$ cat a.txt\n1\n$ cat a.txt; echo \\\n  3\n1\n2\n$ false\n```\n"
+        "<!-- exit status: 3 -->\n```console\n$ true\n$ exit 3\n```\n"
+        "<!-- not run: it never ends -->\n```console\n$ sleep 1000\n```\n"
+    )
+    done = [[one.is_right for one in commands] for _, commands in carry_out(page, tmp_path)]
+    assert done == [[True, False, False], [True, True]]
