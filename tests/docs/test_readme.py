@@ -51,8 +51,8 @@ def test_python_runs(tmp_path: Path) -> None:
 
 def test_every_command_is_one() -> None:
     """The parser takes each `evedrop` command that the README quotes."""
-    lines = [line.removeprefix("$ ").split("  #")[0] for line in README.splitlines()]
-    quoted = [shlex.split(line) for line in lines if line.startswith("evedrop ")]
+    lines = [line.removeprefix("$ ") for line in README.splitlines()]
+    quoted = [shlex.split(line, comments=True) for line in lines if line.startswith("evedrop ")]
     assert len(quoted) >= 20
     for words in quoted:
         assert cli.parser_of(words[1]).parse_args(words[1:]).command is not None
