@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Codes
+from evedrop.model.receiver import Codes, Flags
 from evedrop.view.palette import DECODED, DROPPED, MISLED
 from evedrop.view.scene import PeerSlots, Scene
 
@@ -50,9 +50,14 @@ def knowledge(scene: Scene, x: Floats, peer: PeerSlots) -> Codes:
     with np.errstate(all="ignore"):
         squared = np.sum((x - peer.x_hat) ** 2, axis=1)
         trace = np.trace(peer.P, axis1=1, axis2=2)
-        fooled = ~(squared <= FACTOR * np.maximum(trace, scene.noise))  # also if it is not a number
         drifting = np.maximum(squared, trace) > FACTOR * scene.noise
-    return np.where(fooled, np.uint8(2), np.where(drifting, np.uint8(1), np.uint8(0)))
+    return np.where(is_fooled(squared, trace, scene.noise), np.uint8(2), np.where(drifting, np.uint8(1), np.uint8(0)))
+
+
+def is_fooled(squared: Floats, trace: Floats, noise: float) -> Flags:
+    """Whether squared errors are far above the traces that a receiver believes; also if one is not a number. noise: tr Q."""
+    found: Flags = ~(squared <= FACTOR * np.maximum(trace, noise))
+    return found
 
 
 @final

@@ -14,9 +14,9 @@ from evedrop.loading import load
 from evedrop.model.process import Floats
 from evedrop.names import LEGITIMATE
 from evedrop.results.reading import Results
+from evedrop.view.knowledge import is_fooled
 
 _BEFORE, _AFTER = 105, 25  # slots that the panels show on either side, so that the picture is filled
-_FOOLED = 9.0  # times the trace that it believes: an error of three standard deviations
 
 
 def telling_slot(results: Results) -> int | None:
@@ -46,7 +46,7 @@ def most_telling(errors: Mapping[str, Floats], traces: Mapping[str, Floats], noi
     legitimate = errors[LEGITIMATE]
     others = [name for name in errors if name != LEGITIMATE]
     if others:
-        fooled = {name: errors[name] > _FOOLED * (traces[name] + noise) for name in others}
+        fooled = {name: is_fooled(errors[name], traces[name], noise) for name in others}
         some = any(flags[_candidates(len(flags))].any() for flags in fooled.values())
         separation = sum(
             np.log10((errors[name] + noise) / (legitimate + noise)) * (fooled[name] if some else 1.0) for name in others

@@ -30,7 +30,7 @@ class SquaredError(ViewPanel):
         if self.scene.moving:
             yield PlacedView(receivers_view(title, self._paths, whole_run(self.scene)), "right")
         else:
-            title += ", dim: ± 1.96 standard errors" if self._with_bands else ""
+            title += ", dim: 95 % bands" if self._with_bands else ""
             yield PlacedView(receivers_view(title, self._paths, recent_slots(self.scene)), "middle")
 
     @property

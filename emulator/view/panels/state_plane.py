@@ -1,4 +1,7 @@
-"""The panel of the first two states, and its geometry: truth, estimates with their recent paths, covariance ellipses believed."""
+"""The panel of the first two states, and its geometry: truth, estimates with their recent paths, covariance ellipses believed.
+
+It follows the truth and the legitimate estimator. An eavesdropper that is farther away is an arrow at the border.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,7 @@ from numpy.typing import NDArray
 
 from evedrop.model.process import Floats
 from evedrop.view.column import TIMELINE, Column
+from evedrop.view.knowledge import Distance
 from evedrop.view.palette import GROUND, Colour, colour, dim
 from evedrop.view.palette import TRUTH as WHITE
 from evedrop.view.panels.panel import PlacedView, ViewPanel
@@ -32,6 +36,7 @@ class StatePlane(ViewPanel):
     def __init__(self, scene: Scene) -> None:
         super().__init__(scene)
         self._frame, every = Frame(), stride(scene)
+        self._distance = Distance(scene)
         self._trails = {name: Trail(every) for name in (TRUTH, *(shown.name for shown in scene.receivers))}
 
     @classmethod
@@ -73,6 +78,13 @@ class StatePlane(ViewPanel):
         found = _point_styles(TRUTH, WHITE, radius=3.5, order=40.0)
         for i, shown in enumerate(self.scene.receivers):
             found |= _point_styles(shown.name, colour(i), radius=5.0, order=30.0 - i)
+            if i > 0:
+                found[_arrow(shown.name)] = rr.LineStrips2D.from_fields(
+                    colors=[colour(i)], radii=rr.Radius.ui_points(1.5)
+                )
+                found[_away(shown.name)] = rr.Points2D.from_fields(
+                    colors=[WHITE], radii=rr.Radius.ui_points(0.0), show_labels=True
+                )
         # Invisible: the view fits its range to it.
         found[_FRAME] = rr.LineStrips2D.from_fields(colors=[GROUND], radii=rr.Radius.ui_points(0.1))
         return found
@@ -82,22 +94,40 @@ class StatePlane(ViewPanel):
         k, at = slots.numbers, frames(self.scene, slots.first, slots.count)
         positions = {TRUTH: on_plane(slots.x)}
         positions |= {name: on_plane(peer.x_hat) for name, peer in slots.peers.items()}
-        for name, points in positions.items():
-            yield from self._moving(name, k, points, at)
-        everybody = np.stack([*positions.values()])
-        boxes = self._frame.boxes(everybody.min(axis=0), everybody.max(axis=0), at)
+        pieces = {name: self._trails[name].pieces(points, at) for name, points in positions.items()}
+        followed = np.stack([positions[TRUTH], positions[self.scene.receivers[0].name]])
+        boxes = self._frame.boxes(followed.min(axis=0), followed.max(axis=0), at)
         if not len(at):
             return
+        low, high = boxes[:, 0], boxes[:, 2]
+        truth = positions[TRUTH][at]
         yield Column(_FRAME, k[at], rr.LineStrips2D.columns(strips=boxes))
-        for name, peer in slots.peers.items():
-            outlines = ellipses(peer.x_hat[at], peer.P[at])
-            yield Column(_ellipse(name), k[at], rr.LineStrips2D.columns(strips=outlines))
+        for name, points in positions.items():
+            trail = within(pieces[name], low, high, truth)
+            yield Column(_trail(name), k[at], rr.LineStrips2D.columns(strips=trail))
+            yield Column(_point(name), k[at], rr.Points2D.columns(positions=borders(truth, points[at], low, high)))
+        for i, shown in enumerate(self.scene.receivers):
+            peer = slots.peers[shown.name]
+            outlines = np.clip(ellipses(peer.x_hat[at], peer.P[at]), low[:, None], high[:, None])
+            outlines = np.where(inside(positions[shown.name][at], low, high)[:, None, None], outlines, truth[:, None])
+            yield Column(_ellipse(shown.name), k[at], rr.LineStrips2D.columns(strips=outlines))
+            if i > 0:
+                distances = self._distance.of(slots.x[at], peer.x_hat[at])
+                yield from self._far(shown.name, k[at], (truth, positions[shown.name][at], low, high), distances)
 
-    def _moving(self, name: str, k: NDArray[np.int64], positions: Points, at: NDArray[np.intp]) -> Iterator[Column]:
-        pieces = self._trails[name].pieces(positions, at)
-        if len(at):
-            yield Column(_trail(name), k[at], rr.LineStrips2D.columns(strips=pieces))
-            yield Column(_point(name), k[at], rr.Points2D.columns(positions=positions[at]))
+    def _far(
+        self, name: str, k: NDArray[np.int64], seen: tuple[Points, Points, Points, Points], distances: Floats
+    ) -> Iterator[Column]:
+        """Arrows with distances where an estimate is outside the frame; seen: truth, estimates, lows and highs."""
+        truth, points, low, high = seen
+        far = ~inside(points, low, high)
+        drawn = arrows(truth[far], points[far], low[far], high[far])
+        texts = [f"{name}: {self._distance.text(one)}" for one in distances[far].tolist()]
+        lengths = far.astype(np.int64)
+        yield Column(_arrow(name), k, rr.LineStrips2D.columns(strips=drawn).partition(lengths))
+        centres = labels_of(truth[far], drawn[:, 1], low[far], high[far])
+        labels = rr.Points2D.columns(positions=centres, labels=texts)
+        yield Column(_away(name), k, labels.partition(lengths))
 
 
 def _point_styles(name: str, bright: Colour, *, radius: float, order: float) -> dict[str, rr.AsComponents]:
@@ -123,15 +153,27 @@ def _point(name: str) -> str:
     return f"{_PATH}/{name}/at"
 
 
+def _arrow(name: str) -> str:
+    return f"{_PATH}/{name}/arrow"
+
+
+def _away(name: str) -> str:
+    return f"{_PATH}/{name}/away"
+
+
 Points = NDArray[np.float32]
 
 _FRAMES_PER_SECOND = 30.0
 _MOST_FRAMES = 4_000
 _MOST_FRAMES_IN_REAL_TIME = 30_000  # five a second for more than an hour
 _LARGEST = 1e30  # Rerun's points are float32
-_FRAMED_SLOTS = 256
+_FRAMED_SLOTS = 130  # the length of the path of the truth
 _SIGMAS = 2.0
 _CORNERS = 40
+_EDGE = 0.1  # of a frame's sides: the room between the arrows' tips and its border
+_LABEL = 0.18  # the same for the labels: half the width of one
+_ARROW = 0.08  # length of an arrow, compared with the longer side
+_ROOM = 0.3  # around what the frame follows, compared with its longer side
 
 
 def stride(scene: Scene) -> int:
@@ -171,6 +213,48 @@ def ellipses(centres: Floats, P: Floats) -> Points:
     return _shown(lines * np.array([1.0, -1.0]))
 
 
+def inside(points: Points, low: Points, high: Points) -> NDArray[np.bool_]:
+    """Which points, (f, 2), are in the frames from low to high, (f, 2)."""
+    found: NDArray[np.bool_] = np.all((points >= low) & (points <= high), axis=1)
+    return found
+
+
+def within(pieces: Points, low: Points, high: Points, otherwise: Points) -> Points:
+    """The pieces of a path, (f, p, 2); one that leaves its frame becomes a dot at a point of `otherwise`, (f, 2)."""
+    stays = np.asarray(np.all((pieces >= low[:, None]) & (pieces <= high[:, None]), axis=(1, 2)))
+    found: Points = np.where(stays[:, None, None], pieces, otherwise[:, None])
+    return found
+
+
+def borders(truth: Points, points: Points, low: Points, high: Points) -> Points:
+    """The points, (f, 2); one outside its frame is moved along its line to the truth, to a border inside the frame's."""
+    edge = _EDGE * (high - low).astype(np.float64)
+    towards = points.astype(np.float64) - truth
+    with np.errstate(all="ignore"):
+        room = np.where(towards > 0.0, high - edge - truth, low + edge - truth) / towards
+    share = np.clip(np.nan_to_num(np.where(towards == 0.0, np.inf, room), nan=0.0).min(axis=1, initial=1.0), 0.0, 1.0)
+    moved = truth + share[:, None] * towards
+    return _shown(np.where(inside(points, low, high)[:, None], points, moved))
+
+
+def arrows(truth: Points, points: Points, low: Points, high: Points) -> Points:
+    """Arrows, (f, 5, 2), from within the frame to the border, towards points outside: a shaft, and both sides of its head."""
+    tips = borders(truth, points, low, high).astype(np.float64)
+    towards = points.astype(np.float64) - truth
+    direction = towards / np.maximum(np.hypot(towards[:, 0], towards[:, 1]), 1e-300)[:, None]
+    across = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
+    length = _ARROW * (high - low).astype(np.float64).max(axis=1, keepdims=True, initial=0.0)
+    heads = [tips - 0.4 * length * (direction + sign * 0.6 * across) for sign in (1.0, -1.0)]
+    return _shown(np.stack([tips - length * direction, tips, heads[0], tips, heads[1]], axis=1))
+
+
+def labels_of(truth: Points, tips: Points, low: Points, high: Points) -> Points:
+    """Where the labels of arrows with these tips, (f, 2), are drawn: off the truth, and with room for their letters."""
+    size = high - low
+    rising = np.where(tips[:, 1] <= truth[:, 1], -_LABEL, 0.0)[:, None] * size * [0.0, 1.0]
+    return _shown(np.clip(tips + rising, low + size * [_LABEL, 0.0], high - size * [_LABEL, 0.5 * _LABEL]))
+
+
 def _shown(values: NDArray[Any]) -> Points:
     points: Points = np.clip(np.nan_to_num(values, nan=_LARGEST), -_LARGEST, _LARGEST).astype(np.float32)
     return points
@@ -179,7 +263,7 @@ def _shown(values: NDArray[Any]) -> Points:
 @final
 @dataclass
 class Frame:
-    """The part of the plane to show: a box around all recent points, with some room.
+    """The part of the plane to show: a box around recent points, with some room.
 
     Its sides lie on a grid that is coarse compared with its size, so that the view does not jitter.
     """
@@ -197,6 +281,8 @@ class Frame:
             recent = slice(max(0, end - _FRAMED_SLOTS), end)
             low[i], high[i] = self._lows[recent].min(axis=0), self._highs[recent].max(axis=0)
         self._lows, self._highs = self._lows[-_FRAMED_SLOTS:], self._highs[-_FRAMED_SLOTS:]
+        room = _ROOM * (high - low).max(axis=1, keepdims=True, initial=0.0)
+        low, high = low - room, high + room
         step = np.exp2(np.floor(np.log2(np.maximum(high - low, 1e-30).max(axis=1, keepdims=True, initial=1e-30)))) / 8
         low, high = (np.floor(low / step) - 0.5) * step, (np.ceil(high / step) + 0.5) * step
         corners = [(low, low), (high, low), (high, high), (low, high), (low, low)]

@@ -1,0 +1,67 @@
+"""The state plane: what it follows, and what is far away."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evedrop.view.panels.state_plane import arrows, borders, inside, within
+from evedrop.view.recording import ViewRecording
+from tests.view.read_back import rows
+from tests.view.simulated_run import Simulated
+
+LOW, HIGH, TRUTH = (np.array([one], np.float32) for one in ([-10.0, -5.0], [10.0, 5.0], [2.0, 1.0]))
+
+
+@pytest.mark.parametrize("where", [(50.0, 1.0), (2.0, -40.0), (-30.0, 33.0), (1e30, 1e30), (11.0, 0.0)])
+def test_arrows_end_at_the_border_and_point_at_the_estimate(where: tuple[float, float]) -> None:
+    """Wherever it is, up to the largest number; their tip lies on the line from the truth."""
+    point = np.array([where], np.float32)
+    tip = borders(TRUTH, point, LOW, HIGH)[0].astype(float)
+    edge = np.array([2.0, 1.0])
+    assert (tip >= LOW[0] + edge - 1e-5).all()
+    assert (tip <= HIGH[0] - edge + 1e-5).all()
+    assert np.isclose(np.abs(tip), np.array([8.0, 4.0]), atol=1e-5).any()
+    towards, moved = point[0].astype(float) - TRUTH[0], tip - TRUTH[0]
+    assert np.isclose(towards @ moved, np.hypot(*towards) * np.hypot(*moved), rtol=1e-5)
+    shaft = arrows(TRUTH, point, LOW, HIGH)[0]
+    np.testing.assert_array_equal(shaft[1], shaft[3])
+    np.testing.assert_allclose(shaft[1], tip, rtol=1e-6)
+    assert (shaft[1] - shaft[0]) @ towards > 0.0
+
+
+def test_what_is_inside_stays() -> None:
+    """Points and pieces of paths inside the frame are as they were; a piece that leaves it is a dot."""
+    point = np.array([[9.9, -4.9]], np.float32)
+    np.testing.assert_array_equal(borders(TRUTH, point, LOW, HIGH), point)
+    assert inside(point, LOW, HIGH).all()
+    stays, leaves = np.array([[[0, 0], [9, 4]]], np.float32), np.array([[[0, 0], [11, 4]]], np.float32)
+    np.testing.assert_array_equal(within(stays, LOW, HIGH, TRUTH), stays)
+    np.testing.assert_array_equal(within(leaves, LOW, HIGH, TRUTH), [[TRUTH[0], TRUTH[0]]])
+
+
+def test_the_plane_follows_truth_and_legitimate(simulated: Callable[..., Simulated], tmp_path: Path) -> None:
+    """An eavesdropper far away changes no frame; it has an arrow with its distance there, and nowhere else."""
+    run = simulated(60)
+    naive = run.slots.peers["naive"]
+    x_hat = run.slots.x.copy()
+    x_hat[30:40] += [3000.0, 4000.0]
+    frames = {}
+    for name, peer in (("near", replace(naive, x_hat=run.slots.x)), ("far", replace(naive, x_hat=x_hat))):
+        slots = replace(run.slots, peers={**run.slots.peers, "naive": peer})
+        recording = ViewRecording(tmp_path / f"{name}.rrd", replace(run.scene, units=("m", "m")))
+        recording.add(slots)
+        assert recording.close()
+        frames[name] = rows(tmp_path / f"{name}.rrd", "plane/frame", "LineStrips2D:strips")
+    assert frames["near"] == frames["far"]
+    labels = rows(tmp_path / "far.rrd", "plane/naive/away", "Points2D:labels")
+    assert {k: text for k, text in labels.items() if text} == {k: ["naive: 5,000 m"] for k in range(30, 40)}
+    shown = np.array([rows(tmp_path / "far.rrd", "plane/naive/at", "Points2D:positions")[k][0] for k in range(60)])
+    for k in range(60):
+        corners = np.array(frames["far"][k][0])
+        assert (shown[k] >= corners.min(axis=0)).all()
+        assert (shown[k] <= corners.max(axis=0)).all()
