@@ -39,6 +39,7 @@ MODULES: Mapping[str, str] = {
     "step": "steer",
     "status": "steer",
     "view": "view",
+    "export": "export",
     "diff": "diff",
     "docs": "docs",
     "completion": "docs",
