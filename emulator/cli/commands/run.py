@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,8 +15,10 @@ from evedrop.command import Command
 from evedrop.errors import Interrupted, RunError, UsageError
 
 if TYPE_CHECKING:
+    from evedrop.cli.progress_line import ProgressLine
     from evedrop.live.launch.hosts_file import HostsPlan
     from evedrop.live.launch.process_set import Ended
+    from evedrop.news import Tell
     from evedrop.scenario import Scenario
     from evedrop.view.viewer import Viewer
 
@@ -45,14 +48,17 @@ def _run(options: argparse.Namespace) -> Ended:
     scenario = loaded(options)
     hosts = _hosts_of(options, scenario)
     with results_folder(options.out, options.scenario) as folder:
-        with ProgressLine(scenario.slots, "slots", options.json) as line:
+        with (
+            ProgressLine(scenario.slots, "slots", options.json) as line,
+            _metrics(options, scenario, folder, line) as tell,
+        ):
             try:
                 ended = launch(
                     scenario,
                     folder,
                     options.view,
                     options.listen,
-                    line.tell,
+                    tell,
                     options.relay,
                     paused=options.paused,
                     hosts=hosts,
@@ -63,6 +69,25 @@ def _run(options: argparse.Namespace) -> Ended:
                 raise
         print_so_far(ended.folder, options.json)
     return ended
+
+
+@contextlib.contextmanager
+def _metrics(options: argparse.Namespace, scenario: Scenario, folder: Path, line: ProgressLine) -> Iterator[Tell]:
+    """Serve the metrics of `--metrics` during the block; gives what takes the news."""
+    if options.metrics is None:
+        yield line.tell
+        return
+    from evedrop.live.launch.metrics import MetricsAddress, RunMetrics, metrics_served
+    from evedrop.output import warn
+
+    address = MetricsAddress.of(options.metrics)
+    metrics = RunMetrics(scenario, folder, line.tell)
+    with metrics_served(address, metrics) as page:
+        if not options.json:
+            line.console.print(f"metrics are served at {page}", soft_wrap=True)
+        if address.warning is not None:
+            warn(address.warning)
+        yield metrics.tell
 
 
 def _hosts_of(options: argparse.Namespace, scenario: Scenario) -> HostsPlan | None:
@@ -93,6 +118,11 @@ def _live(parser: argparse.ArgumentParser) -> None:
         "--listen", metavar="ENDPOINT", help="the router's endpoint: tcp/127.0.0.1:PORT or tls/127.0.0.1:PORT"
     )
     parser.add_argument("--relay", metavar="ENDPOINT", help="the second router's endpoint, if the scenario has two")
+    parser.add_argument(
+        "--metrics",
+        metavar="HOST:PORT",
+        help="serve metrics for Prometheus while the run goes on, such as 127.0.0.1:9464",
+    )
     parser.add_argument(
         "--paused", action="store_true", help="hold the run before slot 0, until `evedrop resume` or `evedrop step`"
     )

@@ -1,0 +1,140 @@
+import socket
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from urllib.request import urlopen
+
+import pytest
+
+from evedrop import run
+from evedrop.errors import UsageError
+from evedrop.live.launch.metrics import MetricsAddress, RunMetrics, metrics_served
+from evedrop.loading import load
+from evedrop.news import ConnectionOutage, News, RunProgress, Started, silent
+from evedrop.results.reading import load_results
+from tests.conftest import Evedrop
+
+pytest.importorskip("prometheus_client")
+ANY_PORT = MetricsAddress("127.0.0.1", 0)
+Samples = Mapping[tuple[str, ...], float]
+
+
+def scraped(page: str) -> Samples:
+    """The name of each sample, followed by the values of its labels in their alphabetical order → its value."""
+    from prometheus_client.parser import text_string_to_metric_families
+
+    with urlopen(page) as answer:  # noqa: S310 - our own page
+        families = [*text_string_to_metric_families(answer.read().decode())]
+    return {
+        (one.name, *(one.labels[label] for label in sorted(one.labels))): one.value
+        for family in families
+        for one in family.samples
+    }
+
+
+def test_a_scrape_has_the_figures_of_the_run(tmp_path: Path) -> None:
+    """During a real run the slots grow; at its end every metric is the figure of the summary."""
+    scenario = load("restart")
+    seen: list[Samples] = []
+
+    def tell(news: News) -> None:
+        metrics.tell(news)
+        if isinstance(news, RunProgress):
+            seen.append(scraped(page))
+
+    metrics = RunMetrics(scenario, tmp_path / "run", silent)
+    with metrics_served(ANY_PORT, metrics) as page:
+        run(scenario, out=tmp_path / "run", view="off", tell=tell)
+        last = scraped(page)
+    slots = [one["evedrop_slots_total",] for one in seen]
+    assert slots == sorted(slots)
+    assert 0 < slots[0] <= last["evedrop_slots_total",] == last["evedrop_slots_planned",] == scenario.slots
+    assert last["evedrop_running",] == 1
+    assert all(one["evedrop_slots_per_second",] > 0 for one in seen)
+    summary = load_results(tmp_path / "run").summary
+    for name, figures in summary["peers"].items():
+        for figure in ("mean_squared_error", "mean_trace_covariance", "received_fraction", "used_fraction"):
+            assert last[f"evedrop_{figure}", name] == figures[figure]
+        assert last["evedrop_recent_squared_error", name] >= 0
+    fates = {key[1:]: value for key, value in last.items() if key[0] == "evedrop_packets_total"}
+    wanted = {}
+    for name, link in summary["links"].items():
+        wanted["delivered", name] = link["delivered"]
+        wanted |= {(reason, name): count for reason, count in link["lost_by"].items()}
+        assert sum(count for key, count in fates.items() if key[1] == name) == link["offered"]
+    assert fates == wanted
+    with pytest.raises(OSError, match="refused"):
+        scraped(page)
+
+
+def test_a_lost_connection_is_counted(tmp_path: Path) -> None:
+    """By process; the news goes on to the terminal, and without figures on disk the rest is served."""
+    told: list[News] = []
+    metrics = RunMetrics(load("vehicle"), tmp_path, told.append)
+    news = [Started(), *[ConnectionOutage("smart", slot, slot + 1, 0.5) for slot in (3, 9)]]
+    with metrics_served(ANY_PORT, metrics) as page:
+        assert scraped(page)["evedrop_running",] == 0
+        for one in news:
+            metrics.tell(one)
+        found = scraped(page)
+    assert (found["evedrop_running",], found["evedrop_lost_connections_total", "smart"]) == (1, 2)
+    assert told == news
+
+
+def test_an_ipv6_address_has_brackets(tmp_path: Path) -> None:
+    """In the option and in the address of the page."""
+    address = MetricsAddress.of("[::1]:0")
+    try:
+        with metrics_served(address, RunMetrics(load("vehicle"), tmp_path, silent)) as page:
+            assert page.startswith("http://[::1]:")
+            assert scraped(page)["evedrop_slots_total",] == 0
+    except UsageError as error:
+        pytest.skip(str(error))
+
+
+def test_only_loopback_has_no_warning() -> None:
+    """Any other address can be reached by other machines."""
+    assert MetricsAddress.of("127.0.0.1:9464").warning is None
+    assert MetricsAddress.of("localhost:9464") == MetricsAddress("127.0.0.1", 9464)
+    assert MetricsAddress.of("[::1]:9464").warning is None
+    for text in ("0.0.0.0:9464", "[::]:9464", "10.0.0.1:1"):
+        assert text in str(MetricsAddress.of(text).warning)
+
+
+@pytest.mark.parametrize(
+    "text", ["9464", ":9464", "127.0.0.1", "127.0.0.1:", "127.0.0.1:65536", "::1:9464", "[127.0.0.1]:1", "a b:1"]
+)
+def test_what_is_not_an_address_is_refused(text: str) -> None:
+    """The error shows one that is."""
+    with pytest.raises(UsageError, match=r"127\.0\.0\.1:9464"):
+        MetricsAddress.of(text)
+
+
+def test_a_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the extra that brings it."""
+    monkeypatch.setitem(sys.modules, "prometheus_client", None)
+    with (
+        pytest.raises(UsageError, match=r"evedrop\[metrics\]"),
+        metrics_served(ANY_PORT, RunMetrics(load("vehicle"), tmp_path, silent)),
+    ):
+        pytest.fail("served")
+
+
+def test_a_taken_port_is_refused_before_anything_starts(evedrop: Evedrop) -> None:
+    """With status 2 and the address; no results folder is left."""
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        done = evedrop("run", "vehicle", "--view", "off", "--metrics", f"127.0.0.1:{port}")
+    assert done.status == 2
+    assert f"http://127.0.0.1:{port}/metrics cannot be served" in done.err
+    assert not (evedrop.folder / "runs").exists()
+
+
+def test_the_command_prints_the_address(evedrop: Evedrop) -> None:
+    """And the run ends as any other does."""
+    words = ("--slots", "50", "--view", "off", "--metrics", "127.0.0.1:0", "--out", "run")
+    done = evedrop("run", "vehicle", *words)
+    assert "metrics are served at http://127.0.0.1:" in done.err
+    assert load_results(evedrop.folder / "run").summary["ended"] == "complete"
