@@ -51,6 +51,11 @@ DROPPED_TEXT: Colour = (230, 78, 44)
 WIRE_TEXTS: tuple[Colour, ...] = (STATE, MISLED, DROPPED_TEXT, TRUTH_CURVE, TRUTH)
 """The links of a wire's graph by what they lost, those without messages, and the sides."""
 
+IN_TRACK_TEXT: Colour = (80, 255, 180)
+"""`DECODED` for letters on the background of the theme."""
+RUN_TEXTS: tuple[Colour, ...] = (TRUTH, TRUTH_CURVE, STATE, MISLED, DROPPED_TEXT, IN_TRACK_TEXT)
+"""The nodes of a run's graph: packets by what became of them, and receivers by what they know."""
+
 BLUE: Colour = (0, 114, 178)
 RED: Colour = (193, 39, 45)
 GREEN: Colour = (79, 191, 139)
@@ -74,6 +79,7 @@ PANELS: dict[str, tuple[Colour, ...]] = {
     "who knows what": KNOWLEDGE,
     "lanes of a wire": WIRE_LANES,
     "graph of a wire": WIRE_TEXTS,
+    "graph of a run": RUN_TEXTS,
     "figures": FIGURES,
     "verdicts": VERDICTS,
 }

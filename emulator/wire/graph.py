@@ -1,7 +1,5 @@
 """The graph of a wire's sides: a box for each side, and on the way from one to another a box for each link with its losses.
 
-Rerun draws no labels on edges, so a link is a node between its sides.
-
 Source: docs/wire.md, the view.
 """
 
@@ -14,6 +12,7 @@ from typing import final
 import rerun as rr
 import rerun.blueprint as rrb
 
+from evedrop.view.drawn_graph import LETTER, LINE, DrawnGraph
 from evedrop.view.palette import DROPPED_TEXT, TRUTH, TRUTH_CURVE
 from evedrop.wire.lane_states import LaneState, share_of
 from evedrop.wire.plan import WirePlan
@@ -21,7 +20,6 @@ from evedrop.wire.step_counts import DELIVERED, Counts
 
 GRAPH = "graph"
 """The graph's path in the recording."""
-_LETTER, _LINE = 7.0, 38.0  # width of a letter and distance of boxes in Rerun's drawing
 _LONGEST = ": 12.3 % lost"
 _TEXTS = {LaneState.QUIET: TRUTH_CURVE, LaneState.MOST: DROPPED_TEXT}  # for states whose lane is too dark for letters
 
@@ -33,26 +31,20 @@ class WireGraph:
     def __init__(self, plan: WirePlan) -> None:
         self._links = plan.links
         self._sides = tuple(plan.sides)
-        self._ids = [*(f"side {name}" for name in self._sides), *(f"link {link.name}" for link in plan.links)]
-        self._places = _places(plan)
+        ids = [*(f"side {name}" for name in self._sides), *(f"link {link.name}" for link in plan.links)]
+        edges: list[tuple[str, str]] = []
+        for link in self._links:
+            edges += [(f"side {link.source}", f"link {link.name}"), (f"link {link.name}", f"side {link.target}")]
+        self._drawn = DrawnGraph(GRAPH, dict(zip(ids, _places(plan), strict=True)), tuple(edges))
 
     def view(self, title: str) -> rrb.GraphView:
         """The view of the graph."""
-        margin = _LETTER * (4 + max(len(name) for name in self._sides)) / 2
-        across, down = (max(abs(place[axis]) for place in self._places) for axis in (0, 1))
-        bounds = rrb.VisualBounds2D(
-            x_range=(-across - margin, across + margin), y_range=(-down - _LINE / 2, down + _LINE / 2)
-        )
-        return rrb.GraphView(name=title, origin=GRAPH, visual_bounds=bounds)
+        margin = LETTER * (4 + max(len(name) for name in self._sides)) / 2
+        return self._drawn.view(title, (margin, LINE / 2))
 
     def style(self, to: rr.RecordingStream) -> None:
         """Record the edges, and which nodes are where."""
-        edges = []
-        for link in self._links:
-            edges += [(f"side {link.source}", f"link {link.name}"), (f"link {link.name}", f"side {link.target}")]
-        to.log(GRAPH, rr.GraphEdges(edges, graph_type="directed"), static=True, strict=True)
-        nodes = rr.GraphNodes(self._ids, positions=self._places, radii=[4.0] * len(self._ids))
-        to.log(GRAPH, nodes, static=True, strict=True)
+        to.log(GRAPH, self._drawn.style(), static=True, strict=True)
 
     def columns(self, recent: Sequence[Counts]) -> rr.ComponentColumnList:
         """Labels and colours of the nodes at c times.
@@ -65,8 +57,7 @@ class WireGraph:
             colours += [TRUTH] * len(self._sides)
             states = [share_of(counts[at]) for at in range(len(self._links))]
             colours += [_TEXTS.get(state, state.colour) for state in states]
-        lengths = [len(self._ids)] * len(recent)
-        return rr.GraphNodes.columns(labels=labels, colors=colours).partition(lengths)
+        return self._drawn.columns(labels, colours)
 
 
 def loss_of(counts: Counts) -> str:
@@ -86,15 +77,15 @@ def _places(plan: WirePlan) -> list[tuple[float, float]]:
     across, down = [-math.cos(turn) for turn in turns], [-math.sin(turn) for turn in turns]
     pairs = [frozenset((link.source, link.target)) for link in plan.links]
     label = max([len(link.name) for link in plan.links], default=0) + len(_LONGEST) + max(len(name) for name in sides)
-    width = _LETTER * label / 2 + 60.0
-    height = _LINE * max(1.6, *(0.6 * pairs.count(pair) for pair in pairs)) if pairs else _LINE
+    width = LETTER * label / 2 + 60.0
+    height = LINE * max(1.6, *(0.6 * pairs.count(pair) for pair in pairs)) if pairs else LINE
     xs, ys = _spread(across, width), _spread(down, height if len(sides) > 2 else 0.0)
     at = dict(zip(sides, zip(xs, ys, strict=True), strict=True))
     places = [*at.values()]
     for i, link in enumerate(plan.links):
         rank, of = pairs[:i].count(pairs[i]), pairs.count(pairs[i])
         (x0, y0), (x1, y1) = at[link.source], at[link.target]
-        places.append(((x0 + x1) / 2, (y0 + y1) / 2 + _LINE * (rank - (of - 1) / 2)))
+        places.append(((x0 + x1) / 2, (y0 + y1) / 2 + LINE * (rank - (of - 1) / 2)))
     return places
 
 

@@ -93,7 +93,7 @@ def test_every_panel_is_filled(n: int, growth: float, simulated: Callable[..., S
         if "no Vulkan driver" not in str(error):
             raise
         pytest.skip(str(error))
-    assert len(shares) == 8
+    assert len(shares) == 9
     assert min(shares.values()) > 0.004, shares
     assert complaints == []
 

@@ -6,6 +6,7 @@ from evedrop.model.registry import Registry
 from evedrop.view.panels.applications import ApplicationPanels
 from evedrop.view.panels.error import SquaredError
 from evedrop.view.panels.events import Events
+from evedrop.view.panels.fates import Fates
 from evedrop.view.panels.knowledge import WhoKnowsWhat
 from evedrop.view.panels.legend import Legend
 from evedrop.view.panels.levels import Levels
@@ -24,6 +25,7 @@ PANELS: Registry[ViewPanel] = Registry(
     {
         "title": Title,
         "knowledge": WhoKnowsWhat,
+        "fates": Fates,
         "plant": WhatMovesThePlant,
         "levels": Levels,
         "applications": ApplicationPanels,

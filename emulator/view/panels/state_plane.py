@@ -99,7 +99,8 @@ class StatePlane(ViewPanel):
         boxes = self._frame.boxes(followed.min(axis=0), followed.max(axis=0), at)
         if not len(at):
             return
-        low, high = boxes[:, 0], boxes[:, 2]
+        border = _BORDER * (boxes[:, 2] - boxes[:, 0])
+        low, high = boxes[:, 0] + border, boxes[:, 2] - border
         truth = positions[TRUTH][at]
         yield Column(_FRAME, k[at], rr.LineStrips2D.columns(strips=boxes))
         for name, points in positions.items():
@@ -170,6 +171,7 @@ _LARGEST = 1e30  # Rerun's points are float32
 _FRAMED_SLOTS = 130  # the length of the path of the truth
 _SIGMAS = 2.0
 _CORNERS = 40
+_BORDER = 0.04  # of the frame's sides, where a dot would be cut
 _EDGE = 0.1  # of a frame's sides: the room between the arrows' tips and its border
 _LABEL = 0.18  # the same for the labels: half the width of one
 _ARROW = 0.08  # length of an arrow, compared with the longer side
