@@ -89,7 +89,11 @@ class ScenarioItem(pytest.Item):
             tested = carry_out(str(self.path), manner)
         except Interrupted:
             raise KeyboardInterrupt from None
-        for name, value in (("evedrop_seed", tested.seed), ("evedrop_results", tested.folder)):
+        for name, value in (
+            ("evedrop_seed", tested.seed),
+            ("evedrop_results", tested.folder),
+            ("evedrop_report", tested.report),
+        ):
             if value is not None:
                 self.user_properties.append((name, str(value)))
         if tested.outcome is not Outcome.PASSED:

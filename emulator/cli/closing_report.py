@@ -28,6 +28,26 @@ def print_results(folder: Path, as_json: bool = False) -> None:
     print_summary(summary, str(folder), None if summary.mode == "live" else replay_command(folder))
 
 
+def report_page(folder: Path, as_json: bool = False) -> None:
+    """Write report.html into a results folder, and say where it is; a page that cannot be written gives a warning.
+
+    as_json: say nothing, because standard output is JSON.
+    """
+    from evedrop.report.writing import try_report
+
+    path = try_report(folder)
+    if path is not None and not as_json:
+        sys.stdout.write(f"report: {path}\n")
+
+
+def print_report_line(folder: Path) -> None:
+    """Say where the page of a results folder is, if it has one."""
+    from evedrop.report.writing import REPORT
+
+    if (folder / REPORT).exists():
+        sys.stdout.write(f"report: {folder / REPORT}\n")
+
+
 def print_ending(folder: Path, status: int, how: str) -> None:
     """Print the output of `evedrop run` at its end: the closing report, and the reason for a failure; never fails itself.
 
@@ -35,6 +55,7 @@ def print_ending(folder: Path, status: int, how: str) -> None:
     """
     try:
         print_results(folder)
+        report_page(folder)
         sys.stdout.flush()
     except UsageError:
         pass

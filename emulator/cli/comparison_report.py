@@ -2,166 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from itertools import groupby
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
-from rich.box import SIMPLE_HEAD
-from rich.table import Table
-
-from evedrop.cli.report import terminal
-from evedrop.figures.text import estimate, figure_text
-from evedrop.score.summary import RARE_SHARE
-from evedrop.score.verdict import MARKS, SecrecyKept
+from evedrop.cli.report import rich_table, terminal
+from evedrop.report.comparison import comparison_heading, comparison_lines, pairs_table, schemes_table
 
 if TYPE_CHECKING:
-    from evedrop.results.comparison import Cell, Comparison, SimulatedError
-
-WORDS = {
-    SecrecyKept.PERFECT: "perfect",
-    SecrecyKept.RELATIVE: "relative",
-    SecrecyKept.UNDECIDED: "too few",
-    SecrecyKept.BROKEN: "broken",
-}
-"""Each verdict in a word."""
+    from evedrop.results.comparison import Comparison
 
 
 def print_comparison(found: Comparison, folder: str) -> None:
     """Print a comparison on standard output."""
     console = terminal()
-    trials = f"{found.trials:,} trials" if found.trials > 1 else "1 trial"
-    console.print(f"{found.title} · {found.slots:,} slots · {trials}")
-    console.print(_schemes(found))
-    console.print(_pairs(found))
-    for line in (*_left_out(found), *_undefined(found), *_remarks(found)):
+    console.print(comparison_heading(found))
+    console.print(rich_table(schemes_table(found)))
+    pairs = pairs_table(found)
+    shown = rich_table(pairs)
+    for row, (_, following) in zip(shown.rows, pairwise(pairs.rows), strict=False):
+        row.end_section = bool(following[0])  # a scheme's name begins a section
+    console.print(shown)
+    for line in comparison_lines(found):
         console.print(line)
     console.print(f"results: {folder}/compare.json, compare.png, scenarios/")
-
-
-def _schemes(found: Comparison) -> Table:
-    table = _table("scheme", ("legitimate", "theory", "ACKs", "sent", "bits", "energy", "secret", "clear", "leak"))
-    for head in ("closest adversary", "verdict"):
-        table.add_column(head, no_wrap=True)
-    for name, one in found.schemes.items():
-        cell, needs = one.closest, one.needs
-        once = f" + {needs.initial_secret_bits}" if needs.initial_secret_bits else ""
-        table.add_row(
-            name,
-            simulated(one.legitimate),
-            theory(one.legitimate),
-            "yes" if needs.acknowledgements else "–",
-            f"{needs.sent_fraction:.3g}",
-            f"{needs.bits_per_slot:.4g}",
-            estimate(needs.energy_per_slot, needs.standard_errors["energy_per_slot"] or None, ".3g"),
-            f"{needs.secret_bits_per_slot}{once}" if needs.secret_bits_per_slot else "–",
-            *(
-                ("–", "–")
-                if one.leak is None
-                else (f"{one.leak.clear_fraction:.3g}", figure_text(one.leak.bits, ".3g"))
-            ),
-            *(("–", "–") if cell is None else (cell.match.adversary, verdict(cell))),
-        )
-    return table
-
-
-def _pairs(found: Comparison) -> Table:
-    table = _table("scheme", ())
-    table.add_column("adversary", no_wrap=True)
-    for head in ("its error", "theory", "z", "legitimate", "theory", "ratio"):
-        table.add_column(head, justify="right", no_wrap=True)
-    table.add_column("verdict", no_wrap=True)
-    for name, one in found.schemes.items():
-        table.add_section()
-        shown = name
-        for adversary, cell in one.cells.items():
-            if cell.eavesdropper is None or cell.legitimate is None:
-                continue
-            table.add_row(
-                shown,
-                adversary if cell.match.attack == "none" else f"{adversary} ({cell.match.strategy})",
-                simulated(cell.eavesdropper),
-                theory(cell.eavesdropper),
-                figure_text(cell.eavesdropper.z, "+.1f"),
-                simulated(cell.legitimate),
-                theory(cell.legitimate),
-                estimate(cell.ratio, cell.ratio_error, ".3g"),
-                verdict(cell),
-            )
-            shown = ""
-    return table
-
-
-def _table(first: str, numbers: tuple[str, ...]) -> Table:
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
-    table.add_column(first, no_wrap=True)
-    for head in numbers:
-        table.add_column(head, justify="right", no_wrap=True)
-    return table
-
-
-def simulated(of: SimulatedError) -> str:
-    """The mean over trials with its standard error, or the median if the variance is infinite."""
-    if of.infinite_variance:
-        return f"{of.typical:.3g} med"
-    return estimate(of.mean, of.standard_error, ".3g")
-
-
-def theory(of: SimulatedError) -> str:
-    """The mean that theory expects over the same slots; with ≥ if it is only a bound."""
-    return "–" if of.theory is None else f"{'≥ ' if of.theory.bound else ''}{of.theory.mean:.3g}"
-
-
-def verdict(cell: Cell) -> str:
-    """The mark and the word of a cell's verdict."""
-    return "–" if cell.verdict is None else f"{MARKS[cell.verdict]} {WORDS[cell.verdict]}"
-
-
-def _rare_share(of: SimulatedError | None) -> float:
-    return 0.0 if of is None or of.rare_events is None or of.infinite_variance else of.rare_events.share
-
-
-def _left_out(found: Comparison) -> Iterator[str]:
-    """A line for each scheme that cannot be used with the process."""
-    for scheme, why in found.left_out.items():
-        yield f"left out: {scheme}: {'; '.join(why)}"
-
-
-def _undefined(found: Comparison) -> Iterator[str]:
-    """A line for each adversary and reason that a pair is not defined, with its schemes."""
-    cells = [cell.match for one in found.schemes.values() for cell in one.cells.values()]
-    why = sorted((one.adversary, one.not_defined, one.scheme) for one in cells if one.not_defined is not None)
-    for (adversary, reason), some in groupby(why, lambda one: one[:2]):
-        yield f"not defined: {adversary} {reason} ({', '.join(scheme for _, _, scheme in some)})"
-
-
-def _remarks(found: Comparison) -> Iterator[str]:
-    yield (
-        "sent: the share of slots with a packet; bits, energy: what the sensor sends, headers included, and spends in a "
-        "slot on average; secret: the most bits that a slot uses, + bits that a trial uses once; "
-        "clear: the share of slots whose packet is the state itself; leak: the bits about the path of states that another packet "
-        "reveals without the secret"
-    )
-    measured = [cell.eavesdropper for one in found.schemes.values() for cell in one.cells.values()]
-    if any(one is not None and one.infinite_variance for one in measured):
-        yield (
-            "med: the variance over trials is infinite, so the mean says nothing; this is the median trial, which lies far "
-            "below the expectation of theory"
-        )
-    shares = {
-        name: max((_rare_share(cell.eavesdropper) for cell in one.cells.values()), default=0.0)
-        for name, one in found.schemes.items()
-    }
-    rare = [f"{name} up to {100 * share:.2g} %" for name, share in shares.items() if share > RARE_SHARE]
-    if rare:
-        yield (
-            f"events of which {found.trials:,} trials contain fewer than one on average carry a part of expected errors, whose "
-            f"means and standard errors are then probably too small: {', '.join(rare)}"
-        )
-    if any(one is not None and one.theory is not None and one.theory.bound for one in measured):
-        yield "≥: no closed form is known; a lower bound on the expected error of any receiver without the secret"
-    if found.dominant:
-        more = "each of them dominates" if len(found.dominant) > 1 else "dominates"
-        yield (
-            f"{', '.join(found.dominant)}: {more}: no other scheme costs the legitimate estimator less in the long run, "
-            "and with no other scheme is the closest adversary's error larger"
-        )

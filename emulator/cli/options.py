@@ -144,8 +144,10 @@ def loaded(options: argparse.Namespace, beyond_horizon: bool = False) -> Scenari
 
 
 def print_so_far(folder: Path, as_json: bool) -> None:
-    """Print the closing report of a run, if it has results."""
-    from evedrop.cli.closing_report import print_results
+    """Print the closing report of a run, if it has results, and write its page."""
+    from evedrop.cli.closing_report import print_results, report_page
 
     with contextlib.suppress(UsageError):
         print_results(folder, as_json)
+        sys.stdout.flush()  # the words first: the page takes a tenth of a second
+        report_page(folder, as_json)

@@ -6,12 +6,13 @@ Source: docs/results.md.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from evedrop.errors import UsageError
@@ -81,6 +82,25 @@ class Results:
         empty = [name for name in columns if name not in NULLABLE and table[name].null_count]
         if empty:
             raise UsageError(f"{path} has empty cells in {', '.join(empty)}; run the scenario again")
+        return table
+
+    def part(self, name: str, columns: Sequence[str], where: pc.Expression | None = None) -> pa.Table:
+        """Some columns of a table, of the rows for which `where` holds; reads no more than that of a finished run.
+
+        Raises UsageError if the table cannot be read, or lacks a column.
+        """
+        path = self.folder / f"{name}.parquet"
+        try:
+            if path.exists():
+                with opened(path):  # a pipe would be waited for
+                    pass
+                table = pq.read_table(path, columns=list(columns), filters=where)
+            else:
+                whole = pa.Table.from_batches(batches_of(self.folder, name), schema_of(self.folder, name))
+                table = (whole if where is None else whole.filter(where)).select(columns)
+            table.validate(full=True)
+        except Exception as error:  # pyarrow raises many kinds of errors for a damaged file
+            raise UsageError(f"{path} cannot be read ({_one_line(error)}); run the scenario again") from error
         return table
 
     @property

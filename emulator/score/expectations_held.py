@@ -28,10 +28,15 @@ _RUN = {Verdict.HELD.value: "the run shows it", Verdict.FAILED.value: "the run s
 
 def replay_of(folder: Path, scenario: Scenario, mode: str = "live") -> str:
     """The command that repeats the run in a results folder, to the same bits."""
+    return repeating(folder, scenario.trials, mode)
+
+
+def repeating(folder: Path, trials: int, mode: str) -> str:
+    """The same; trials: of the run, mode: as in the summary."""
     where = shlex.quote(str(folder.absolute()))
     if mode == "live":
         return f"evedrop run {where}"
-    return f"evedrop montecarlo {where} --trials {scenario.trials}{_MODES[mode]}"
+    return f"evedrop montecarlo {where} --trials {trials}{_MODES[mode]}"
 
 
 @dataclass(frozen=True)

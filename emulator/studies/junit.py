@@ -5,16 +5,14 @@ Source: docs/testing.md.
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
 from evedrop.errors import UsageError
+from evedrop.report.markup import printable
 from evedrop.studies.scenario_tests import Finding, Outcome
-
-_NO_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")  # not allowed in XML, escaped or not
 
 
 def write_junit(path: Path, tested: Sequence[Finding], started: float) -> None:
@@ -53,20 +51,16 @@ def _add(suite: ET.Element, tested: Finding) -> None:
     case = ET.SubElement(
         suite,
         "testcase",
-        {"classname": _text(where), "name": _text(path.stem), "time": f"{tested.seconds:.3f}"},
+        {"classname": printable(where), "name": printable(path.stem), "time": f"{tested.seconds:.3f}"},
     )
-    known = {"seed": tested.seed, "results": tested.folder}
+    known = {"seed": tested.seed, "results": tested.folder, "report": tested.report}
     if any(value is not None for value in known.values()):
         properties = ET.SubElement(case, "properties")
         for name, value in known.items():
             if value is not None:
-                ET.SubElement(properties, "property", {"name": name, "value": _text(str(value))})
+                ET.SubElement(properties, "property", {"name": name, "value": printable(str(value))})
     if tested.outcome is not Outcome.PASSED:
         kind = "failure" if tested.outcome is Outcome.FAILED else "error"
         message = tested.reasons[0] if tested.reasons else ""
-        said = ET.SubElement(case, kind, {"message": _text(message), "type": tested.outcome.name.lower()})
-        said.text = _text("\n".join(tested.reasons))
-
-
-def _text(text: str) -> str:
-    return _NO_XML.sub("\ufffd", text)
+        said = ET.SubElement(case, kind, {"message": printable(message), "type": tested.outcome.name.lower()})
+        said.text = printable("\n".join(tested.reasons))

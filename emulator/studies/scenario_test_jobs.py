@@ -75,10 +75,8 @@ class _Crew:
         if not said:
             return Finding(scenario, Outcome.BROKEN, 0.0, (f"its process ended with status {status}",))
         found = json.loads(said)
-        folder = None if found["folder"] is None else Path(found["folder"])
-        return Finding(
-            **{**found, "outcome": Outcome(found["outcome"]), "folder": folder, "reasons": (*found["reasons"],)}
-        )
+        places = {name: None if found[name] is None else Path(found[name]) for name in ("folder", "report")}
+        return Finding(**{**found, **places, "outcome": Outcome(found["outcome"]), "reasons": (*found["reasons"],)})
 
     def end(self, waiting: Sequence[Future[Finding]]) -> None:
         """Start no further processes, and end the running ones."""

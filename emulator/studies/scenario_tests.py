@@ -18,6 +18,7 @@ from evedrop.live.launch.launcher import launch
 from evedrop.loading import load, shipped
 from evedrop.memory.montecarlo import Plan, simulate
 from evedrop.news import silent
+from evedrop.report.writing import has_results, try_report
 from evedrop.results.folder import claimed, default_folder
 from evedrop.results.writer import load_results
 from evedrop.scenario import Scenario
@@ -66,12 +67,15 @@ class Finding:
     seed: int | None = None
     folder: Path | None = None
     """The results folder."""
+    report: Path | None = None
+    """Its report.html; None if there is none."""
 
     @property
     def lines(self) -> tuple[str, ...]:
         """The lines to print if it did not pass."""
         kept = () if self.folder is None or self.outcome is Outcome.PASSED else (f"results: {self.folder}",)
-        return (*self.reasons, *kept)
+        page = () if self.report is None or self.outcome is Outcome.PASSED else (f"report: {self.report}",)
+        return (*self.reasons, *kept, *page)
 
 
 def scenarios_of(places: Sequence[str]) -> list[str]:
@@ -114,9 +118,11 @@ def carry_out(scenario: str, manner: Manner) -> Finding:
     except UsageError as error:
         return ended(Outcome.MISTAKES, [str(error)], seed=made.seed)
     except RunError as error:
-        return ended(Outcome.BROKEN, str(error).splitlines(), seed=made.seed, folder=folder)
+        kept = {"seed": made.seed, "folder": folder, "report": try_report(folder) if has_results(folder) else None}
+        return ended(Outcome.BROKEN, str(error).splitlines(), **kept)
+    kept = {"seed": made.seed, "folder": folder, "report": try_report(folder)}
     reasons = list(_reasons(load_results(folder).typed_summary.expectations))
-    return ended(Outcome.FAILED if reasons else Outcome.PASSED, reasons, seed=made.seed, folder=folder)
+    return ended(Outcome.FAILED if reasons else Outcome.PASSED, reasons, **kept)
 
 
 def _run(scenario: Scenario, folder: Path, manner: Manner) -> Path:

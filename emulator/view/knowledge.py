@@ -1,10 +1,5 @@
 """What a receiver knows in a slot: it is in track, it drifts, or it is fooled. Does not use Rerun.
 
-A receiver whose covariance P is right has a squared error above 20 tr P in fewer than one of 100 000 slots, whatever the number
-of states: of all Gaussian errors with this trace, one along a single direction is above most often (Székely and Bakirov 2003),
-and there 20 is exceeded with probability 7.7e-6. Errors up to 20 times those of one step's noise, tr Q, are those of a receiver
-that follows the process step by step.
-
 Source: docs/view.md, who knows what.
 """
 
@@ -18,46 +13,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Codes, Flags
-from evedrop.view.palette import DECODED, DROPPED, MISLED
+from evedrop.model.receiver import Codes
+from evedrop.score.track import FACTOR, Track, track_of
+from evedrop.view import palette
 from evedrop.view.scene import PeerSlots, Scene
-
-FACTOR = 20.0
-"""How far above its expectation a squared error may be by chance."""
 
 
 class Knowledge(Enum):
     """What a receiver knows, as a word, and the colour of its lane."""
 
-    IN_TRACK = ("in track", DECODED)
-    DRIFTING = ("drifting", MISLED)
-    FOOLED = ("fooled", DROPPED)
+    IN_TRACK = Track.IN_TRACK
+    DRIFTING = Track.DRIFTING
+    FOOLED = Track.FOOLED
 
-    def __init__(self, word: str, colour: tuple[int, int, int]) -> None:
-        self.word = word
-        self.colour = colour
+    def __init__(self, track: Track) -> None:
+        self.word = track.word
+        self.colour = palette.KNOWLEDGE[track]
 
 
 KNOWLEDGE = tuple(Knowledge)
 
 
 def knowledge(scene: Scene, x: Floats, peer: PeerSlots) -> Codes:
-    """Indices into `KNOWLEDGE`, (c,), in the first recorded trial; x: true states, (c, n).
-
-    Fooled: the squared error is above 20 times the larger of tr P and tr Q. Drifting: otherwise, the squared error or tr P is
-    above 20 tr Q. In track: otherwise.
-    """
+    """Indices into `KNOWLEDGE`, (c,), in the first recorded trial, by the rule of `track_of`; x: true states, (c, n)."""
     with np.errstate(all="ignore"):
         squared = np.sum((x - peer.x_hat) ** 2, axis=1)
         trace = np.trace(peer.P, axis1=1, axis2=2)
-        drifting = np.maximum(squared, trace) > FACTOR * scene.noise
-    return np.where(is_fooled(squared, trace, scene.noise), np.uint8(2), np.where(drifting, np.uint8(1), np.uint8(0)))
-
-
-def is_fooled(squared: Floats, trace: Floats, noise: float) -> Flags:
-    """Whether squared errors are far above the traces that a receiver believes; also if one is not a number. noise: tr Q."""
-    found: Flags = ~(squared <= FACTOR * np.maximum(trace, noise))
-    return found
+    return track_of(squared, trace, scene.noise)
 
 
 @final

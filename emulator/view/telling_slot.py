@@ -14,7 +14,7 @@ from evedrop.loading import load
 from evedrop.model.process import Floats
 from evedrop.names import LEGITIMATE
 from evedrop.results.reading import Results
-from evedrop.view.knowledge import is_fooled
+from evedrop.score.track import is_fooled
 
 _BEFORE, _AFTER = 105, 25  # slots that the panels show on either side, so that the picture is filled
 

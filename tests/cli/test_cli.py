@@ -46,9 +46,11 @@ def test_a_run_prints_its_results_and_passes(evedrop: Evedrop) -> None:
     assert (done.status, done.err) == (0, "")
     for words in ("legitimate", "smart:", "naive:", "suspicious:", "expected legitimate.mean_squared_error", "here"):
         assert words in done.out
+    assert done.out.splitlines()[-1] == "report: here/report.html"
     files = {path.name for path in (evedrop.folder / "here").iterdir()}
     assert files == {
         "scenario.toml", "summary.json", "slots.parquet", "trials.parquet", "journal.parquet", "digests.parquet", "logs",
+        "report.html",
     }  # fmt: skip
 
 

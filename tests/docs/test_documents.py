@@ -45,6 +45,7 @@ OTHER_OPTIONS = {
     "emulator/applications/microgrid/day.py",  # a program of its own
     "emulator/live/launch/compose.py",  # those of docker compose
     "emulator/pytest_plugin.py",
+    "emulator/report/page.py",  # names in its style sheet
     "emulator/view/headless.py",  # the viewer's
     "emulator/view/viewer.py",
     "emulator/view/viewer_process.py",  # the sandbox's

@@ -51,8 +51,9 @@ def closing(done: Done) -> list[str]:
 
 def comparable(lines: list[str]) -> list[str]:
     """The lines of a closing report but for the folder's name and how fast the run was."""
-    assert lines[-1].startswith("results: ")
-    return [re.sub(r"[\d,]+ slots/s", "", line).rstrip() for line in lines[:-1]]
+    assert lines[-2].startswith("results: ")
+    assert lines[-1].startswith("report: ")
+    return [re.sub(r"[\d,]+ slots/s", "", line).rstrip() for line in lines[:-2]]
 
 
 TLS = ("--listen", "tls/0.0.0.0:{port}", "--connect", "tls/127.0.0.2:{port}")

@@ -151,6 +151,7 @@ def test_a_folder_may_be_renamed_while_a_run_goes_on(evedrop: Evedrop) -> None:
     assert results.trials.num_rows == results.journal.num_rows == 4 * 600
     assert {path.name for path in other.iterdir()} == {
         "scenario.toml", "summary.json", "slots.parquet", "trials.parquet", "journal.parquet", "digests.parquet", "logs",
+        "report.html",
     }  # fmt: skip
 
 
@@ -194,7 +195,9 @@ def test_a_full_disk_ends_the_run_and_what_fitted_can_be_read(evedrop: Evedrop, 
     if done.status in {1, 77} and "Traceback" not in done.err:
         pytest.skip("this machine lets nobody mount")
     assert done.status == 3
-    assert "the results cannot be written" in done.err.splitlines()[0]
+    page, failure = done.err.splitlines()[:2]
+    assert "report.html was not written ([Errno 28] No space left on device" in page
+    assert "the results cannot be written" in failure
     assert "Traceback" not in done.err
     live.nothing_left()
     results = live.results

@@ -17,9 +17,14 @@ from evedrop.memory.simulation import Mode
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.theory.closed_forms import encrypted_fraction
+from evedrop.report.comparison import verdict
+from evedrop.report.writing import write_report
 from evedrop.results.comparison import Comparison
+from evedrop.results.comparison_file import read_comparison
+from evedrop.results.summary_file import plain
 from evedrop.score.verdict import SecrecyKept
 from evedrop.studies.matchups import ATTACKERS, usual_adversaries
+from tests.pages import checked
 
 MARGINAL: dict[str, Any] = {"slots": 150, "trials": 60, "process__initial_covariance": [[1e-3, 0.0], [0.0, 1e-4]]}
 """Of the scenario `bayesian`: long enough for verdicts, and no first slot that rules the mean of the few trials that lose it."""
@@ -78,6 +83,25 @@ def test_every_pair_is_there_or_says_why_not(everything: Everything) -> None:
         for cell in scheme.cells.values():
             played = [cell.eavesdropper, cell.legitimate, cell.secrecy, cell.ratio]
             assert [one is None for one in played] == [cell.match.not_defined is not None] * 4
+
+
+def test_a_comparison_is_read_back_and_has_its_page(everything: Everything) -> None:
+    """What compare.json says is what was found, but for the sentences of verdicts; every pair has its cell on the page."""
+    found, folder = everything
+
+    def without_sentences(of: dict[str, Any]) -> dict[str, Any]:
+        for one in of["schemes"].values():
+            for cell in one["against"].values():
+                cell.get("secrecy", {}).pop("sentence", None)
+        return of
+
+    again = read_comparison(folder)
+    assert str(plain(without_sentences(again.as_dict()))) == str(plain(without_sentences(found.as_dict())))
+    write_report(folder)
+    page = checked(folder)
+    assert page.values("class").count("verdict") == len(found.schemes) * len(found.adversaries)
+    for one in found.schemes.values():
+        assert {verdict(cell) for cell in one.cells.values() if cell.verdict is not None} <= set(page.texts)
 
 
 @pytest.mark.parametrize(

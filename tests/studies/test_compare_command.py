@@ -150,7 +150,8 @@ def test_the_command_prints_a_table_and_writes_its_folder(evedrop: Evedrop) -> N
     for said in ("innovation", "acknowledged", "blocks-critical (reference)", "✕ broken", "not defined: smart"):
         assert said in done.out
     folder = evedrop.folder / "found"
-    assert sorted(path.name for path in folder.iterdir()) == ["compare.json", "compare.pdf", "compare.png", "scenarios"]
+    files = {"compare.json", "compare.pdf", "compare.png", "report.html", "scenarios"}
+    assert {path.name for path in folder.iterdir()} == files
     assert sorted(path.stem for path in (folder / "scenarios").iterdir()) == [
         "acknowledged",
         "acknowledged-blocks-critical",

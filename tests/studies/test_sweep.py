@@ -19,8 +19,10 @@ from evedrop.errors import UsageError
 from evedrop.figures import expectable_figures
 from evedrop.memory.montecarlo import Plan
 from evedrop.memory.simulation import Mode
+from evedrop.report.writing import write_report
 from evedrop.studies.sweep import grid_of, sweep_over
 from tests.conftest import Evedrop
+from tests.pages import checked
 
 decimals = st.decimals(-1000, 1000, places=3, allow_nan=False, allow_infinity=False)
 steps = st.decimals("0.001", 50, places=3)
@@ -158,7 +160,7 @@ def test_the_results_reference_has_every_column_of_a_sweep(swept: tuple[pa.Table
 
 
 def test_words_whole_numbers_and_other_modes_can_be_swept(tmp_path: Path) -> None:
-    """A strategy and slots, covariance-only: the actual trace stands in its own column, and the plot is drawn."""
+    """A strategy and slots, covariance-only: the actual trace stands in its own column; the plot is drawn, and the page made."""
     grid: dict[str, list[Any]] = {"eavesdroppers.smart.strategy": ["smart", "naive"], "slots": [10, 20]}
     plan = Plan(Mode.COVARIANCE_ONLY, workers=1)
     table = sweep_over("eavesdroppers", {"trials": 5}, grid, tmp_path / "run", lambda _: None, plan)
@@ -166,6 +168,12 @@ def test_words_whole_numbers_and_other_modes_can_be_swept(tmp_path: Path) -> Non
     assert table["mean_squared_error"].null_count == table.num_rows
     assert table["mean_actual_trace_covariance"].null_count == table["digest"].null_count - table.num_rows == 0
     assert (tmp_path / "run" / "sweep.png").is_file()
+    write_report(tmp_path / "run")
+    page = checked(tmp_path / "run")
+    assert (page.tags["svg"], page.tags["tr"]) == (2, 1 + 2 * 2 * 4)
+    command = "evedrop sweep eavesdroppers --over eavesdroppers.smart.strategy=smart,naive --over slots=10,20"
+    assert f"{command} --trials 5 --covariance-only" in page.texts
+    assert "All 4 points were done" in page.texts
 
 
 BASE = ("sweep", "eavesdroppers", "--slots", "20", "--out", "run")

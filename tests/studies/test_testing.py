@@ -21,6 +21,7 @@ from evedrop.studies import scenario_tests as testing
 from evedrop.studies.junit import junit_of
 from evedrop.studies.scenario_tests import Finding, Manner, Outcome
 from tests.conftest import Done, Evedrop, Live, wait_until
+from tests.pages import checked
 
 SCENARIO = (
     shipped()["eavesdroppers"]
@@ -59,10 +60,10 @@ def test_a_folder_of_scenarios_is_tested_in_memory(evedrop: Evedrop) -> None:
     failed = "expected smart.received_fraction over slots 10 to 59 above 2: FAILED, found 0."
     assert lines[1].startswith(f"    {failed}")
     assert lines[1].endswith(f"; see it again: evedrop montecarlo {evedrop.folder}/kept/fails --trials 3")
-    assert lines[2] == "    results: kept/fails"
-    assert re.fullmatch(r"passed    +\d+\.\d s  cases/holds.toml", lines[3])
-    assert re.fullmatch(r"MISTAKES  +\d+\.\d s  cases/wrong.toml", lines[4])
-    assert [line.split()[0] for line in lines[5:-1]] == ["slots:", "seed:", "sluts:"]
+    assert lines[2:4] == ["    results: kept/fails", "    report: kept/fails/report.html"]
+    assert re.fullmatch(r"passed    +\d+\.\d s  cases/holds.toml", lines[4])
+    assert re.fullmatch(r"MISTAKES  +\d+\.\d s  cases/wrong.toml", lines[5])
+    assert [line.split()[0] for line in lines[6:-1]] == ["slots:", "seed:", "sluts:"]
     assert re.fullmatch(r"1 passed, 1 FAILED, 1 MISTAKES, in \d+\.\d s", lines[-1])
     assert load_results(evedrop.folder / "kept" / "holds").summary["trials"] == 3
     assert sorted(path.name for path in (evedrop.folder / "kept").iterdir()) == ["fails", "holds"]
@@ -79,9 +80,11 @@ def test_a_folder_of_scenarios_is_tested_in_memory(evedrop: Evedrop) -> None:
     assert float(str(suite.get("time"))) == pytest.approx(sum(times), abs=0.01)
     assert [[part.tag for part in case] for case in suite] == [["properties", "failure"], ["properties"], ["error"]]
     known = {one.get("name"): one.get("value") for one in suite[0][0]}
-    assert known == {"seed": str(load_results(evedrop.folder / "kept/fails").summary["seed"]), "results": "kept/fails"}
+    seed = str(load_results(evedrop.folder / "kept/fails").summary["seed"])
+    assert known == {"seed": seed, "results": "kept/fails", "report": "kept/fails/report.html"}
+    assert "1 of 2 expectations FAILED" in checked(evedrop.folder / "kept/fails").texts
     assert str(suite[0][1].get("message")).startswith(failed)
-    assert str(suite[2][0].text).splitlines() == [line.strip() for line in lines[5:-1]]
+    assert str(suite[2][0].text).splitlines() == [line.strip() for line in lines[6:-1]]
 
 
 def test_a_live_test_that_fails_says_how_to_see_it_again(evedrop: Evedrop) -> None:
@@ -230,7 +233,8 @@ def test_pytest_collects_scenarios_as_tests(evedrop: Evedrop) -> None:
     assert "results: kept/fails" in done.out
     assert "sluts: is not an entry of this table; did you mean slots?" in done.out
     assert load_results(kept).summary["mode"] == "exact"
-    assert 'name="evedrop_results" value="kept/holds"' in (evedrop.folder / "r.xml").read_text()
+    for said in ('name="evedrop_results" value="kept/holds"', 'name="evedrop_report" value="kept/holds/report.html"'):
+        assert said in (evedrop.folder / "r.xml").read_text()
 
 
 def test_pytest_runs_a_named_scenario_live(evedrop: Evedrop) -> None:

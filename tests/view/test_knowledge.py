@@ -11,8 +11,9 @@ import pytest
 from scipy import stats
 
 from evedrop.model.process import Floats
+from evedrop.score.track import FACTOR
 from evedrop.view.glyphs import drawable
-from evedrop.view.knowledge import FACTOR, KNOWLEDGE, Distance, Knowledge, knowledge
+from evedrop.view.knowledge import KNOWLEDGE, Distance, Knowledge, knowledge
 from evedrop.view.panels.knowledge import WhoKnowsWhat
 from evedrop.view.panels.title import Title
 from evedrop.view.recording import ViewRecording

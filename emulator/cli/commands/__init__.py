@@ -40,6 +40,7 @@ MODULES: Mapping[str, str] = {
     "status": "steer",
     "view": "view",
     "export": "export",
+    "report": "report",
     "diff": "diff",
     "docs": "docs",
     "completion": "docs",

@@ -13,6 +13,7 @@ from evedrop.errors import UsageError
 def compare(options: argparse.Namespace) -> int:
     """Compare every scheme against every adversary."""
     from evedrop.api import compare as compare_all
+    from evedrop.cli.closing_report import report_page
     from evedrop.cli.comparison_report import print_comparison
     from evedrop.cli.progress_line import ProgressLine
     from evedrop.loading import value_of
@@ -46,6 +47,7 @@ def compare(options: argparse.Namespace) -> int:
         print(found.as_json(indent=None))
     else:
         print_comparison(found, str(folder))
+    report_page(folder, options.json)
     return 0
 
 

@@ -13,6 +13,7 @@ from evedrop.command import Command
 
 def sweep(options: argparse.Namespace) -> int:
     """Run Monte Carlo over a grid."""
+    from evedrop.cli.closing_report import report_page
     from evedrop.cli.progress_line import ProgressLine
     from evedrop.cli.report import print_sweep
     from evedrop.results.folder import results_folder
@@ -30,6 +31,7 @@ def sweep(options: argparse.Namespace) -> int:
         print(json.dumps(table.to_pylist(), ensure_ascii=False))
     else:
         print_sweep(table, tuple(grid), str(folder))
+    report_page(folder, options.json)
     return 0
 
 

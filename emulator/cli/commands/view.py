@@ -34,9 +34,10 @@ def view(options: argparse.Namespace) -> int:
         raise UsageError("--time is for wires; a run has slots, so give --slot")
     _check_names(options)
     if options.table:
-        from evedrop.cli.closing_report import print_results
+        from evedrop.cli.closing_report import print_report_line, print_results
 
         print_results(options.run)
+        print_report_line(options.run)
         return 0
     from evedrop.results.writer import load_results
     from evedrop.signals import raise_on_signals

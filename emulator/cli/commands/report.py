@@ -1,0 +1,35 @@
+"""`evedrop report`: the page of a results folder, made again."""
+
+from __future__ import annotations
+
+import argparse
+
+from evedrop.cli.options import argument
+from evedrop.command import Command
+from evedrop.errors import UsageError
+
+
+def report(options: argparse.Namespace) -> int:
+    """Write the page of a results folder."""
+    from evedrop.report.writing import write_report
+
+    try:
+        print(write_report(options.run))
+    except OSError as error:
+        raise UsageError(
+            f"{options.run}: report.html cannot be written ({error.strerror}); make the folder writable"
+        ) from error
+    return 0
+
+
+COMMANDS = (
+    Command(
+        "report",
+        report,
+        "write report.html: a run, sweep or comparison on one page",
+        (argument("run", "FOLDER"),),
+        section="inspect",
+        example="report runs/vehicle",
+        page="results",
+    ),
+)

@@ -1,0 +1,182 @@
+"""The sections of the report of a sweep. To add one, write a class and add it to `SWEEP_SECTIONS`."""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+import pyarrow.parquet as pq
+
+from evedrop.errors import UsageError
+from evedrop.figures import all_figures, error_column, shown_figure
+from evedrop.files import text_of
+from evedrop.model.process import Floats
+from evedrop.report.chart import Curve, LogChart
+from evedrop.report.markup import Node, element, paragraphs
+from evedrop.report.section import Section
+from evedrop.report.sweep import sweep_table
+from evedrop.report.tables import html_table
+from evedrop.view import palette
+
+SWEEP_TABLE = "sweep.parquet"
+_MOST_BYTES = 2**24
+_MOST_CHARTS = 12
+_MODES = {"covariance-only": ["--covariance-only"], "error-coordinates": ["--error-coordinates"]}
+
+
+@dataclass(frozen=True)
+class SweepSource:
+    """The folder of a sweep, read."""
+
+    folder: Path
+    rows: Sequence[Mapping[str, Any]]
+    scenario: str
+    changes: Mapping[str, Any]
+    grid: Mapping[str, Sequence[Any]]
+    """Entry → its values."""
+    mode: str
+
+    @classmethod
+    def read(cls, folder: Path) -> SweepSource:
+        """Read a folder. Raises UsageError if it is not that of a sweep."""
+        try:
+            found = json.loads(text_of(folder / "sweep.json", _MOST_BYTES))
+            rows = pq.read_table(folder / SWEEP_TABLE).to_pylist()
+            return cls(folder, rows, found["scenario"], found["changes"], found["over"], found["mode"])
+        except Exception as error:  # pyarrow raises many kinds of errors for a damaged file
+            raise UsageError(f"{folder} cannot be read as a sweep ({error}); run the sweep again") from error
+
+    @property
+    def points(self) -> int:
+        """How many points were done."""
+        return len({tuple(row[key] for key in self.grid) for row in self.rows})
+
+    @property
+    def amount(self) -> str:
+        """How much was run."""
+        row = self.rows[0]
+        return f"{self.points:,} points of {', '.join(self.grid)} · {row['slots']:,} slots · {row['trials']:,} trials"
+
+    @property
+    def outcome(self) -> str:
+        """How many points were done, as a sentence."""
+        planned = math.prod(len(values) for values in self.grid.values())
+        return (
+            f"All {planned:,} points were done" if self.points == planned else f"{self.points:,} of {planned:,} points"
+        )
+
+
+@final
+class SweepVerdicts(Section[SweepSource]):
+    """In how many points secrecy held."""
+
+    title = "Verdicts"
+
+    @classmethod
+    def nodes(cls, of: SweepSource) -> Iterator[Node]:
+        """A sentence for each eavesdropper."""
+        found, lines = dict[str, Counter[str]](), list[str]()
+        for row in of.rows:
+            if row["relative_secrecy"] is not None:
+                found.setdefault(row["peer"], Counter())[row["relative_secrecy"]] += 1
+        for name, counts in found.items():
+            said = ", ".join(f"{said} at {count:,} point{'' if count == 1 else 's'}" for said, count in counts.items())
+            lines.append(f"{name}: relative secrecy: {said}")
+        yield from paragraphs(lines)
+
+
+@final
+class SweepErrors(Section[SweepSource]):
+    """The error of every receiver against the first entry, in a chart for each combination of the others."""
+
+    title = "Errors"
+
+    @classmethod
+    def nodes(cls, of: SweepSource) -> Iterator[Node]:
+        """The charts: marks with 95 % intervals, and theory as lines."""
+        first, *others = of.grid
+        for values in list(dict.fromkeys(tuple(row[key] for key in others) for row in of.rows))[:_MOST_CHARTS]:
+            rows = [row for row in of.rows if tuple(row[key] for key in others) == values]
+            where = ", ".join(f"{key} = {value}" for key, value in zip(others, values, strict=True))
+            words = None
+            if not all(isinstance(row[first], (int, float)) for row in rows):
+                words = list(dict.fromkeys(str(row[first]) for row in rows))
+            curves = [
+                _curve(name, i, [row for row in rows if row["peer"] == name], first, words)
+                for i, name in enumerate(dict.fromkeys(row["peer"] for row in rows))
+            ]
+            label = f"Mean error of every receiver against {first}, with what theory expects. The table has the values. {where}"
+            shown = f"Mean error with its 95 % interval; dotted: theory{'; ' if where else ''}{where}"
+            node = LogChart(label, first, shown, curves, words).node
+            if node is not None:
+                yield node
+
+
+def _curve(name: str, i: int, rows: Sequence[Mapping[str, Any]], key: str, words: Sequence[str] | None) -> Curve:
+    """The curve of the i-th receiver; words: the names of the places of the axis, if it has names."""
+    marks, lines = (
+        [one for one, kind in all_figures().items() if kind.sweep_picture == way] for way in ("marks", "lines")
+    )
+    x = [float(row[key]) if words is None else float(words.index(str(row[key]))) for row in rows]
+    y, theory = (_values(rows, names) for names in (marks, lines))
+    scatter = 1.96 * np.nan_to_num(_values(rows, [error_column(one) for one in marks]))
+    return Curve(
+        name, palette.hexadecimal(palette.colour(i)), np.array(x), y, y - scatter, y + scatter, theory, bars=True
+    )
+
+
+def _values(rows: Sequence[Mapping[str, Any]], names: list[str]) -> Floats:
+    found = [shown_figure(row, names) for row in rows]
+    return np.array([math.nan if one is None else one for one in found], np.float64)
+
+
+@final
+class SweepFigures(Section[SweepSource]):
+    """The figures of all points, with their standard errors, theory, and z."""
+
+    title = "Figures"
+
+    @classmethod
+    def nodes(cls, of: SweepSource) -> Iterator[Node]:
+        """The table that the terminal shows."""
+        caption = "A row for each point and receiver: means ± standard errors; z: by how many of them the error is above theory"
+        yield html_table(sweep_table(of.rows, tuple(of.grid)), caption)
+
+
+@final
+class SweepRepeat(Section[SweepSource]):
+    """How to repeat the sweep."""
+
+    title = "Repeat it"
+
+    @classmethod
+    def nodes(cls, of: SweepSource) -> Iterator[Node]:
+        """The command."""
+        words = ["evedrop", "sweep", of.scenario]
+        for key, values in of.grid.items():
+            words += ["--over", f"{key}={','.join(_toml(value) for value in values)}"]
+        for key, value in of.changes.items():
+            words += [f"--{key}", _toml(value)] if key == "trials" else ["--set", f"{key}={_toml(value)}"]
+        words += _MODES.get(of.mode, [])
+        yield element("pre", element("code", shlex.join(words)))
+
+
+def _toml(value: Any) -> str:
+    """A value as the command line takes it."""
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+SWEEP_SECTIONS: tuple[type[Section[SweepSource]], ...] = (
+    SweepVerdicts,
+    SweepErrors,
+    SweepFigures,
+    SweepRepeat,
+)
+"""In the order of the page."""

@@ -1,0 +1,91 @@
+"""Whether a receiver follows the process, slot by slot, and the spans in which it does not.
+
+A receiver whose covariance P is right has a squared error above 20 tr P in fewer than one of 100 000 slots, whatever the number
+of states: of all Gaussian errors with this trace, one along a single direction is above most often (Székely and Bakirov 2003),
+and there 20 is exceeded with probability 7.7e-6. Errors up to 20 times those of one step's noise, tr Q, are those of a receiver
+that follows the process step by step.
+
+Source: docs/results.md, lost track.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Codes, Flags
+
+FACTOR = 20.0
+"""How far above its expectation a squared error may be by chance."""
+JOINED = 3
+"""Spans that are at most this many slots apart are one."""
+
+
+class Track(IntEnum):
+    """What a receiver knows of the process in a slot."""
+
+    IN_TRACK = 0
+    DRIFTING = 1
+    """Its error is large, or it believes so, and its own covariance expects such an error."""
+    FOOLED = 2
+    """Its error is far larger than its own covariance expects."""
+
+    @property
+    def word(self) -> str:
+        """The code as a word."""
+        return self.name.lower().replace("_", " ")
+
+
+def track_of(squared_error: Floats, trace: Floats, noise: float) -> Codes:
+    """The code of every slot (c,), from the squared error and the believed tr P, (c,) each, and the process noise tr Q.
+
+    Fooled: the squared error is above 20 times the larger of tr P and tr Q. Drifting: otherwise, the squared error or tr P is
+    above 20 tr Q. In track: otherwise.
+    """
+    fooled = is_fooled(squared_error, trace, noise)
+    with np.errstate(invalid="ignore"):
+        drifting = np.maximum(squared_error, trace) > FACTOR * noise
+    return np.where(
+        fooled, np.uint8(Track.FOOLED), np.where(drifting, np.uint8(Track.DRIFTING), np.uint8(Track.IN_TRACK))
+    )
+
+
+def is_fooled(squared_error: Floats, trace: Floats, noise: float) -> Flags:
+    """Whether squared errors are far above the traces that a receiver believes; also if one is not a number. noise: tr Q."""
+    with np.errstate(invalid="ignore"):
+        found: Flags = ~(squared_error <= FACTOR * np.maximum(trace, noise))
+    return found
+
+
+@dataclass(frozen=True)
+class LostSpan:
+    """Slots in which a receiver was off the track, the last one included."""
+
+    first: int
+    last: int
+    fooled: int
+    """In how many of them it was fooled."""
+
+    @property
+    def slots(self) -> int:
+        """Its length."""
+        return self.last - self.first + 1
+
+
+def lost_spans(codes: Codes, first: int = 0) -> list[LostSpan]:
+    """The spans off the track, in order; codes: of the slots from `first` on."""
+    off = np.flatnonzero(codes != Track.IN_TRACK)
+    if not off.size:
+        return []
+    breaks = np.flatnonzero(np.diff(off) > JOINED) + 1
+    return [
+        LostSpan(
+            first + int(part[0]),
+            first + int(part[-1]),
+            int(np.count_nonzero(codes[part[0] : part[-1] + 1] == Track.FOOLED)),
+        )
+        for part in np.split(off, breaks)
+    ]

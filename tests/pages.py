@@ -1,0 +1,69 @@
+"""What every page of a report must be, whatever it is about."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from html.parser import HTMLParser
+from pathlib import Path
+
+from evedrop.report.writing import REPORT
+
+VOID = {"meta", "img", "br", "link", "input", "hr"}
+
+
+class Checked(HTMLParser):
+    """A page whose tags are all closed in order; collects its texts, ids, attributes and headings."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: Counter[str] = Counter()
+        self.attributes: list[tuple[str, str, str]] = []
+        self.texts: list[str] = []
+        self.headings: list[str] = []
+        self.feed(page)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Remember an element that is open."""
+        self.tags[tag] += 1
+        self.attributes += [(tag, name, value or "") for name, value in attrs]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        """Check that it closes the element that was opened last."""
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        """Keep a text."""
+        if self.open and self.open[-1] != "style":
+            self.texts.append(data)
+        if self.open and self.open[-1] in {"h1", "h2"}:
+            self.headings.append(data)
+
+    def values(self, name: str) -> list[str]:
+        """The values of an attribute, in order."""
+        return [value for _, found, value in self.attributes if found == name]
+
+
+def checked(folder: Path) -> Checked:
+    """The page of a folder, with what every page must be: without scripts and requests, and readable without eyes or mouse."""
+    text = (folder / REPORT).read_text(encoding="utf-8")
+    page = Checked(text)
+    assert text.startswith("<!doctype html>")
+    assert page.tags["script"] == page.tags["link"] == page.tags["iframe"] == 0
+    assert not re.search(r"(https?:)?//[a-z]", text.replace("http-equiv", ""))
+    assert all(source.startswith("data:image/png;base64,") for source in page.values("src"))
+    assert "url(" not in text
+    assert "@import" not in text
+    ids = page.values("id")
+    assert len(ids) == len(set(ids))
+    assert {link.removeprefix("#") for link in page.values("href")} <= set(ids)
+    assert page.tags["img"] == sum(bool(words) for words in page.values("alt"))
+    assert page.tags["svg"] == len([one for one in page.attributes if one == ("svg", "aria-hidden", "true")])
+    assert page.values("role").count("region") == page.values("tabindex").count("0") == page.tags["table"]
+    assert page.headings[0]
+    return page

@@ -1,0 +1,190 @@
+"""The report on one page: whole, safe, without requests, with the words of the terminal; and it changes nothing else."""
+
+from __future__ import annotations
+
+import base64
+import stat
+import xml.etree.ElementTree as ET
+from collections import Counter
+from collections.abc import Iterator
+from io import BytesIO
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from evedrop import montecarlo
+from evedrop.memory.montecarlo import Plan
+from evedrop.memory.simulation import Mode
+from evedrop.report import closing
+from evedrop.report.chart import Curve, LogChart
+from evedrop.report.markup import element, written
+from evedrop.report.strip import strip
+from evedrop.report.writing import REPORT, try_report, write_report
+from evedrop.results.writer import load_results
+from evedrop.score.track import Track, lost_spans, track_of
+from tests.pages import Checked, checked
+
+HOSTILE = "<script>alert('&amp;')</script>\"></title>"
+"""A title by somebody who wants the page to do something else."""
+QUICK: dict[str, Any] = {"slots": 60, "plan": Plan(workers=1)}
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A study with a hostile title, of which one expectation fails."""
+    expect = [
+        {"figure": "legitimate.received_fraction", "above": 0.5},
+        {"figure": "smart.received_fraction", "above": 2},
+    ]
+    folder = tmp_path_factory.mktemp("report") / "study"
+    montecarlo("eavesdroppers", trials=20, out=folder, title=HOSTILE, expect=expect, **QUICK)
+    write_report(folder)
+    return folder
+
+
+def test_a_page_says_what_the_terminal_says_and_does_nothing_else(study: Path) -> None:
+    """Outcome and verdicts first, every cell of the table, links, spans, the command that repeats it; the title is only text."""
+    page, summary = checked(study), load_results(study).typed_summary
+    said = "".join(page.texts)
+    assert page.headings == [
+        HOSTILE,
+        "Verdicts", "Expectations", "Figures", "Errors", "Lost track", "Links", "Repeat it",
+    ]  # fmt: skip
+    assert "1 of 2 expectations FAILED" in page.texts
+    cells = [cell for row in closing.receivers_table(summary).rows for cell in row]
+    assert Counter(cells) <= Counter(page.texts)
+    for line in (*closing.verdicts(summary), *(one.sentence for one in summary.expectations)):
+        assert line in page.texts
+    for name, link in summary.links.items():
+        assert {name, f"{link.offered:,}", f"{link.rate:.4f}", f"{link.expected_rate:.4f}"} <= set(page.texts)
+    assert f"evedrop montecarlo {study} --trials 20" in said
+    assert {str(summary.seed), summary.peers["smart"].digest} <= set(page.texts)
+    assert page.tags["svg"] == 1
+    assert page.tags["img"] == 8
+    assert (study / REPORT).stat().st_size < 300_000
+    assert stat.S_IMODE((study / REPORT).stat().st_mode) == 0o600
+
+
+def test_a_report_that_cannot_be_written_leaves_everything_as_it_was(
+    study: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The older page and all results stay; the run is told in a warning, and nothing is left half written."""
+
+    def contents() -> dict[str, bytes]:
+        return {path.name: path.read_bytes() for path in study.iterdir()}
+
+    before = contents()
+
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("evedrop.report.writing.os.replace", full)
+    assert try_report(study) is None
+    assert "report.html was not written ([Errno 28] No space left on device)" in capsys.readouterr().err
+    assert contents() == before
+    monkeypatch.undo()
+    assert try_report(study) == study / REPORT
+    assert contents() == before
+
+
+def test_a_folder_of_another_version_has_the_parts_that_can_be_read(study: Path, tmp_path: Path) -> None:
+    """A table without a column is named in its part; a folder that is none is refused by the run's warning alone."""
+    for name in ("summary.json", "scenario.toml", "trials.parquet"):
+        (tmp_path / name).write_bytes((study / name).read_bytes())
+    pq.write_table(pq.read_table(study / "slots.parquet").drop_columns(["standard_error"]), tmp_path / "slots.parquet")
+    write_report(tmp_path)
+    page = checked(tmp_path)
+    assert any("slots.parquet cannot be read" in text and "standard_error" in text for text in page.texts)
+    assert {"Lost track", "Links", "Repeat it"} <= set(page.headings)
+
+
+@pytest.mark.parametrize("mode", [Mode.COVARIANCE_ONLY, Mode.ERROR_COORDINATES])
+def test_every_mode_has_its_page(tmp_path: Path, mode: Mode) -> None:
+    """Without recorded states there are no lanes, and all else is there."""
+    folder = tmp_path / "study"
+    montecarlo("vehicle", trials=3, out=folder, slots=30, plan=Plan(mode, workers=1))
+    write_report(folder)
+    assert {"Verdicts", "Figures", "Errors"} <= set(checked(folder).headings)
+
+
+def slot_by_slot(errors: list[float], traces: list[float], noise: float) -> Iterator[str]:
+    """The rule of docs/results.md, written out."""
+    for error, trace in zip(errors, traces, strict=True):
+        if error > 20 * trace and error > 20 * noise:
+            yield "fooled"
+        elif error > 20 * noise or trace > 20 * noise:
+            yield "drifting"
+        else:
+            yield "in track"
+
+
+numbers = st.lists(st.tuples(st.floats(0, 100), st.floats(0, 100)), max_size=60)
+
+
+@given(numbers, st.floats(0.0, 2.0), st.integers(0, 9))
+@settings(deadline=None, max_examples=200)
+def test_spans_cover_exactly_the_slots_off_the_track(
+    slots: list[tuple[float, float]], noise: float, first: int
+) -> None:
+    """Each slot by the rule; a span begins and ends off the track, and between two spans are more than three slots in track."""
+    errors, traces = [error for error, _ in slots], [trace for _, trace in slots]
+    codes = track_of(np.array(errors), np.array(traces), noise)
+    words = list(slot_by_slot(errors, traces, noise))
+    assert [Track(code).word for code in codes] == words
+    spans = lost_spans(codes, first)
+    covered = [k - first for span in spans for k in range(span.first, span.last + 1)]
+    assert {k for k, word in enumerate(words) if word != "in track"} <= set(covered)
+    for span in spans:
+        assert "in track" not in {words[span.first - first], words[span.last - first]}
+        assert span.fooled == words[span.first - first : span.last - first + 1].count("fooled")
+    for one, other in pairwise(spans):
+        assert other.first - one.last > 3
+
+
+def test_a_lane_has_a_pixel_for_every_slot_or_the_worst_of_several() -> None:
+    """The PNG says what the codes say; in a lane that is too long no lost slot disappears."""
+    colours = [(1, 2, 3), (200, 0, 9), (0, 0, 255)]
+
+    def pixels(codes: np.ndarray, worst: bool) -> list[list[int]]:
+        found = strip(codes, colours, "label", worst)
+        assert not isinstance(found, str)
+        data = base64.b64decode(str(found.get("src")).partition(",")[2])
+        return list(np.asarray(Image.open(BytesIO(data)).convert("RGB"))[0].reshape(-1, 3).tolist())
+
+    codes = np.array([0, 2, 1, 1, 0], np.uint8)
+    assert pixels(codes, worst=False) == [list(colours[code]) for code in codes]
+    long = np.zeros(100_000, np.uint8)
+    long[[17, 50_000]] = 1
+    assert pixels(long, worst=True).count(list(colours[1])) == 2
+    assert pixels(long, worst=False).count(list(colours[1])) == 0
+
+
+def test_a_chart_has_gaps_where_nothing_is_known_and_few_points() -> None:
+    """A curve of 10⁵ slots is drawn with 400 points; nothing to show is no chart; zeros and ∞ do not break the axis."""
+    x = np.arange(100_000.0)
+    node = LogChart("label", "slot", "error", [Curve("one", "#123456", x, 1.0 + x, theory=1.0 + x)]).node
+    assert isinstance(node, ET.Element)
+    (curve,) = [path for path in node.iter("path") if path.get("class") == "curve"]
+    assert str(curve.get("d")).count("L") == 399
+    broken = np.array([1.0, np.nan, 0.0, 10.0, np.inf, 5.0, 6.0])
+    node = LogChart("label", "slot", "error", [Curve("one", "#123456", x[:7], broken)]).node
+    assert isinstance(node, ET.Element)
+    (curve,) = [path for path in node.iter("path") if path.get("class") == "curve"]
+    assert str(curve.get("d")).count("M") == 3
+    assert LogChart("label", "slot", "error", [Curve("one", "#123456", x[:2], np.zeros(2))]).node is None
+
+
+def test_texts_are_escaped_wherever_they_stand() -> None:
+    """In text, in attributes, and after other elements; characters that HTML does not allow are replaced."""
+    texts = ("<b>\x00", "</p>", '"><x onload="y">')
+    page = Checked(written(element("p", texts[0], element("i", "&"), texts[1], title=texts[2])))
+    assert page.tags == {"p": 1, "i": 1}
+    assert page.texts == ["<b>\ufffd", "&", texts[1]]
+    assert page.attributes == [("p", "title", texts[2])]
