@@ -6,14 +6,15 @@ BIN := $(VENV)/bin
 unexport PYTHONDONTWRITEBYTECODE
 READY := $(VENV)/.ready
 DOCS_READY := $(VENV)/.docs-ready
+NOTEBOOKS_READY := $(VENV)/.notebooks-ready
 
-.PHONY: demo test bench coverage test-long test-hosts test-compose test-faults docs lint setup clean
+.PHONY: demo test notebooks bench coverage test-long test-hosts test-compose test-faults docs lint setup clean
 
 demo: $(READY)
 	$(BIN)/evedrop demo
 
 test: $(READY)
-	$(BIN)/python -m pytest -n 4 --dist loadfile -m "not long and not hosts and not containers"
+	$(BIN)/python -m pytest -n 4 --dist loadfile -m "not long and not hosts and not containers and not notebooks"
 
 COVERING := $(addprefix tests/,model live/protocol live/network/test_protocol.py live/network/test_wire.py)
 
@@ -29,6 +30,10 @@ bench: $(READY)
 
 test-long: $(READY)
 	$(BIN)/python -m pytest -m long
+
+# Every notebook of docs/notebooks from top to bottom, in a kernel.
+notebooks: $(NOTEBOOKS_READY)
+	$(BIN)/python -m pytest -n 2 -m notebooks tests/notebooks
 
 # As root: every process in a network namespace of its own. Where that cannot be, it says so and fails nothing. Most of the time
 # cables are out and others wait, so there are more tests at a time than processors.
@@ -78,6 +83,11 @@ $(READY): constraints.txt pyproject.toml hatch_build.py $(wildcard emulator/kern
 $(DOCS_READY): $(READY) constraints-docs.txt
 	$(BIN)/python -m pip install --quiet --require-hashes --requirement constraints-docs.txt
 	touch $(DOCS_READY)
+
+# Versions of the packages that run notebooks, each checked against its hash.
+$(NOTEBOOKS_READY): $(READY) constraints-notebooks.txt
+	$(BIN)/python -m pip install --quiet --require-hashes --requirement constraints-notebooks.txt
+	touch $(NOTEBOOKS_READY)
 
 clean:
 	rm -rf $(VENV) build/site emulator/kernels/_compiled.* .mypy_cache .ruff_cache .pytest_cache .hypothesis build/test-base-*.tar*

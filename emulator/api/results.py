@@ -81,7 +81,7 @@ class RunResults(Results):
     def _notes(self) -> Iterator[str]:
         if self.remark is not None:
             yield self.remark
-        yield from (f"{name}: {verdict.sentence}" for name, verdict in self.secrecy.items())
+        yield from (verdict.sentence for verdict in self.secrecy.values())
         yield from (one.sentence for one in self.expectations)
 
     def plot(self, *panels: Panels, slots: range | None = None, trial: int | None = None) -> ShownFigure:

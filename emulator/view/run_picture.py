@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 _WIDTH = 8.4
 _LAST = 300  # slots of lanes and plane unless told otherwise
+_DEEPEST = 1e3  # how far below a mean errors are shown
 _MARGIN = 0.25  # around the truth in the plane, as a share of its extent
 _HEIGHTS: Mapping[str, Callable[[int], float]] = {
     "errors": lambda _: 3.2,
@@ -84,10 +85,12 @@ def _errors(axes: Axes, rows: pa.Table, receivers: list[str], slots: range | Non
                 )  # symmetric on the logarithmic axis, and never below 0
             axes.fill_between(found["slot"], error / share, error * share, color=ink, alpha=0.25, linewidth=0)
     axes.set_yscale("log")
-    everything = np.concatenate(heights)
-    positive = everything[np.isfinite(everything) & (everything > 0.0)]
-    if positive.size:
-        axes.set_ylim(positive.min() / 1.6, positive.max() * 1.6)
+    finite = [one[np.isfinite(one) & (one > 0.0)] for one in heights]
+    shown = [one for one in finite if one.size]
+    if shown:  # the error of one trial falls to rounding with each state that arrives
+        axes.set_ylim(
+            max(min(map(np.min, shown)) / 1.6, min(map(np.mean, shown)) / _DEEPEST), max(map(np.max, shown)) * 1.6
+        )
     axes.set_xlabel("slot")
     axes.set_title("squared error" + (", mean ± 2 standard errors" if many else "") + "; dashed: theory")
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
