@@ -57,13 +57,12 @@ class Fates(ViewPanel):
         return not scene.moving
 
     def views(self) -> Iterator[PlacedView]:
-        """One view: right of the strip, or, with many receivers, below the plane."""
+        """One view, right of the strip; with many receivers, packets have this place, and the letters would be too small."""
+        if crowded(self.scene):
+            return
         longest = max(len(shown.name) for shown in self.scene.receivers) + len(": drifting, 0.32 m off")
         view: rrb.View = self._drawn.view("The last packet, and what each knows", (LETTER * longest / 2, LINE / 2))
-        if crowded(self.scene):
-            yield PlacedView(view, "right", 0.8)
-        else:
-            yield PlacedView(view, "top", 0.8, lanes_height(len(self.scene.receivers)))
+        yield PlacedView(view, "top", 0.8, lanes_height(len(self.scene.receivers)))
 
     def styles(self) -> dict[str, AsComponents]:
         """The edges, and where the nodes are."""

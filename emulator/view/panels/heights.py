@@ -5,6 +5,7 @@ from __future__ import annotations
 from evedrop.view.scene import Scene
 
 _PIXELS = 654.0  # between the viewer's own bars
+_MOST = 0.57
 _HEAD, _LANE = 48.0, 40.0  # title bar and ruler of a view of lanes; a lane with its name
 
 TITLE_HEIGHT = 0.06
@@ -14,8 +15,8 @@ FIXED_HEIGHT = TITLE_HEIGHT + LEGEND_HEIGHT
 
 
 def lanes_height(count: int) -> float:
-    """The share that a view of `count` lanes needs; at most half."""
-    return min(0.5, (_HEAD + _LANE * count) / _PIXELS)
+    """The share that a view of `count` lanes needs; eight lanes fit, and more can be reached by scrolling."""
+    return min(_MOST, (_HEAD + _LANE * count) / _PIXELS)
 
 
 def crowded(scene: Scene) -> bool:
