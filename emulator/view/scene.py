@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from evedrop.model.links.way import Way
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes, Flags
 from evedrop.scenario.application import Panel
@@ -54,6 +55,8 @@ class Scene:
     """Labels of a closed loop's disturbances, then inputs, such as "P_load (kW)"."""
     units: tuple[str, ...] = ()
     """Units of the states, such as "m"; none, or one for each."""
+    ways: Mapping[str, tuple[Way, Way]] = field(default_factory=dict)
+    """Receiver → the ways of sender and receiver on the ground, for links whose losses depend on them."""
     panels: tuple[Panel, ...] = ()
     """The panels of applications."""
 

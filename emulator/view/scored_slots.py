@@ -44,6 +44,7 @@ def open_recording(scenario: Scenario, run: str, path: Path, warn: Callable[[str
         )
         for name in scenario.receivers
     ]
+    ways = {name: scenario.link(name).model.ways for name in scenario.receivers}
     scene = Scene(
         title=drawable(scenario.title),
         run=run,
@@ -54,6 +55,7 @@ def open_recording(scenario: Scenario, run: str, path: Path, warn: Callable[[str
         receivers=tuple(receivers),
         noise=float(np.trace(scenario.process.process.Q)),
         units=tuple(map(drawable, scenario.process.units or ())),
+        ways={name: ways for name, ways in ways.items() if ways is not None},
         **driven_scene(scenario),
     )
     return ViewRecording(path, scene, warn)

@@ -68,7 +68,7 @@ class Distance(LossModel):
         shadowing_block: int = 1,
         fading_block: int = 1,
     ) -> None:
-        self._ways = (Way(sender), Way(receiver))
+        self.ways = self._ways = (Way(sender), Way(receiver))
         self._settled = max(slot for way in self._ways for slot in way.slots)
         self._margin = (threshold - reference_snr) * _NEPER
         self._exponent = float(exponent)

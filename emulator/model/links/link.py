@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from evedrop.model.links.way import Way
 from evedrop.model.parts_of_runs import parts_of
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes, Flags
@@ -76,6 +77,8 @@ class LossModel(ABC):
 
     parameters: ClassVar[Mapping[str, Any]] = MappingProxyType({})
     optional: ClassVar[frozenset[str]] = frozenset()
+    ways: tuple[Way, Way] | None = None
+    """Where sender and receiver are in every slot; None if losses do not depend on that."""
     uniforms_per_slot: int = 1
 
     @classmethod

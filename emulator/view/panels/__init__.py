@@ -7,6 +7,7 @@ from evedrop.view.panels.applications import ApplicationPanels
 from evedrop.view.panels.error import SquaredError
 from evedrop.view.panels.events import Events
 from evedrop.view.panels.fates import Fates
+from evedrop.view.panels.ground_map import GroundMap
 from evedrop.view.panels.knowledge import WhoKnowsWhat
 from evedrop.view.panels.legend import Legend
 from evedrop.view.panels.levels import Levels
@@ -34,6 +35,7 @@ PANELS: Registry[ViewPanel] = Registry(
         "packets": Packets,
         "plane": StatePlane,
         "state": StateOverTime,
+        "map": GroundMap,
         "events": Events,
         "legend": Legend,
     },

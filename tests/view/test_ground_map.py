@@ -1,0 +1,44 @@
+"""The map of sender and receivers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from operator import itemgetter
+from pathlib import Path
+
+import numpy as np
+
+from evedrop.loading import load
+from evedrop.view.panels.ground_map import GroundMap
+from evedrop.view.scored_slots import open_recording
+from tests.view.read_back import rows
+from tests.view.simulated_run import Simulated, orbit, simulate
+
+
+def test_only_links_by_distance_have_ways() -> None:
+    """The legitimate link of `driving-away` loses packets wherever the sender is, that of the eavesdropper does not."""
+    scenario = load("driving-away")
+    assert scenario.link("legitimate").model.ways is None
+    ways = scenario.link("parked").model.ways
+    assert ways is not None
+    assert [float(axis[0]) for axis in ways[0].at(np.array([750.0]))] == [212.5, 0.0]
+
+
+def test_the_map_shows_both_ends_and_their_distance(tmp_path: Path) -> None:
+    """In every frame of a run; the sender leaves at slot 300."""
+    scenario = load("driving-away")
+    run: Simulated = simulate(orbit(), 1500)
+    recording = open_recording(scenario, "r", tmp_path / "r.rrd")
+    peers = {"legitimate": run.slots.peers["legitimate"], "parked": run.slots.peers["smart"]}
+    for slots in run.chunks(400):
+        at = slice(slots.first, slots.first + slots.count)
+        some = {name: peer.mapped(itemgetter(at)) for name, peer in peers.items()}
+        recording.add(replace(slots, peers=some))
+    assert recording.close()
+    places = rows(tmp_path / "r.rrd", "map/parked/at", "Points2D:positions")
+    labels = rows(tmp_path / "r.rrd", "map/parked/at", "Points2D:labels")
+    for k, distance in ((0, 25.0), (300, 25.0), (750, 212.5), (1499, 400.0)):
+        np.testing.assert_allclose(places[k], [[distance, 0.0], [0.0, 0.0]], rtol=1e-6)
+        assert labels[k] == ["sensor", f"parked: {distance:,.0f} m away"]
+    assert not rows(tmp_path / "r.rrd", "map/legitimate/at", "Points2D:positions")
+    assert not GroundMap.applies(run.scene)
