@@ -90,4 +90,4 @@ $(NOTEBOOKS_READY): $(READY) constraints-notebooks.txt
 	touch $(NOTEBOOKS_READY)
 
 clean:
-	rm -rf $(VENV) build/site emulator/kernels/_compiled.* .mypy_cache .ruff_cache .pytest_cache .hypothesis build/test-base-*.tar*
+	rm -rf $(VENV) build/site build/gallery emulator/kernels/_compiled.* .mypy_cache .ruff_cache .pytest_cache .hypothesis build/test-base-*.tar*

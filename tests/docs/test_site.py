@@ -10,7 +10,7 @@ import pytest
 from tests.docs.test_documents import heading
 
 ROOT = Path(__file__).parents[2]
-MADE = {"index.md", "contributing.md", "security.md", "changelog.md"}
+MADE = {"index.md", "gallery.md", "contributing.md", "security.md", "changelog.md"}
 """Pages of the site that tools/site/pages.py makes, besides those in reference/."""
 
 

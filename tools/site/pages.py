@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from commands import commands_page
+from gallery import gallery_page, pictures
 from keys import keys_page
 from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
@@ -33,6 +34,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages that are not in docs/."""
     made = {there: (ROOT / name).read_text(encoding="utf-8") for name, there in _OF_THE_ROOT.items()}
     made |= {
+        "gallery.md": gallery_page(),
         "reference/scenario-keys.md": keys_page(),
         "reference/commands.md": commands_page(),
         "reference/evedrop.md": "# The module `evedrop`\n\n::: evedrop\n\n## wire\n\n::: evedrop.wire.running.wire\n",
@@ -41,6 +43,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     }
     for name, text in made.items():
         files.append(File.generated(config, name, content=text))
+    for name, picture in pictures().items():
+        files.append(File.generated(config, f"gallery/{name}.png", content=picture))
     return files
 
 
