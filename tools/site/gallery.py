@@ -22,9 +22,9 @@ _MOST_SLOTS = 5_000  # of the day in a house
 _LEAST_DESCRIPTION = 60
 _HEAD = """# Gallery
 
-Every built-in scenario, with errors, packets and estimates of a study in memory of at most 5000 slots. `evedrop show NAME` prints a
-scenario, with comments that say what to look for; `evedrop run NAME` runs it live. [Results](results.md) and [the view](view.md) explain
-the figures and colours.
+Every built-in scenario, with errors, packets and estimates of a study in memory of at most 5000 slots.
+`evedrop show NAME` prints a scenario, with comments that say what to look for; `evedrop run NAME` runs it live.
+[Results](results.md) and [the view](view.md) explain the figures and colours.
 """
 
 
