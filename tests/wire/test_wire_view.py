@@ -11,6 +11,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 from rerun.chunk import RrdReader
 
 from evedrop.cli.main import main
@@ -365,3 +366,28 @@ def test_a_word_that_is_not_a_view_is_refused(tmp_path: Path) -> None:
     with live_view(robot_plan(), tmp_path, "off", print) as view:
         assert view is None
     assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.long
+def test_a_video_of_a_wire(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """It shows the times that were asked for; a time that is not there is refused before anything is drawn."""
+    path = folder / "w.gif"
+    words = ["view", str(folder), "--video", str(path), "--size", "400x320", "--times"]
+    status = main([*words, "0:99999:50000"])
+    said = capfd.readouterr().err
+    if "Vulkan" in said:
+        pytest.skip(said)
+    assert status == 2
+    assert "50000 s is not a time of the wire" in said
+    assert main([*words, "2:10:4"]) == 0
+    with Image.open(path) as gif:
+        assert (gif.size, getattr(gif, "n_frames", 1)) == ((400, 320), 3)
+
+
+@pytest.mark.parametrize(("words", "advice"), [((), "--times FIRST:LAST"), (("--slots", "0:3"), "give --times")])
+def test_a_video_of_a_wire_needs_times(
+    words: tuple[str, ...], advice: str, folder: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A wire has no slots."""
+    assert main(["view", str(folder), "--video", str(folder / "w.gif"), *words]) == 2
+    assert advice in capfd.readouterr().err
