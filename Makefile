@@ -8,7 +8,7 @@ READY := $(VENV)/.ready
 DOCS_READY := $(VENV)/.docs-ready
 NOTEBOOKS_READY := $(VENV)/.notebooks-ready
 
-.PHONY: demo test notebooks bench coverage test-long test-hosts test-compose test-faults docs lint setup clean
+.PHONY: demo test notebooks bench coverage test-long test-hosts test-compose test-faults docs lint lint-types lint-rest setup clean
 
 demo: $(READY)
 	$(BIN)/evedrop demo
@@ -61,10 +61,15 @@ ifndef BUILD_ONLY
 endif
 	@echo "the site is in build/site; to read it: python3 -m http.server --bind 127.0.0.1 --directory build/site"
 
-lint: $(READY)
+# `make -j2 -O lint` checks types beside the rest.
+lint: lint-types lint-rest
+
+lint-types: $(READY)
+	$(BIN)/mypy
+
+lint-rest: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python tools/floor_plan.py --check
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import ast
 import re
 from collections import defaultdict
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted(path for folder in ("emulator", "peers") for path in (ROOT / folder).rglob("*.py"))
 
 
+@cache
 def trees() -> list[tuple[Path, ast.Module]]:
     """Every module of the package, parsed; links to folders are followed once."""
     found = [path for path in SOURCES if ROOT / "emulator" / "peers" not in path.parents]

@@ -165,7 +165,14 @@ def test_every_command_in_memory_names_class_slot_and_trials(
     assert "Traceback" not in done.err
 
 
-@pytest.mark.parametrize("case", [case for case in LATER if case != "fates"])
+OFTEN = ("packet", "uses", "block", "follow")
+"""Of each way into a class one: what else may break is told by the same code, in a live run only by `make test-long`."""
+
+
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(case, marks=[] if case in OFTEN else [pytest.mark.long]) for case in LATER if case != "fates"],
+)
 def test_what_breaks_in_a_later_slot_ends_a_live_run(case: str, evedrop: Evedrop) -> None:
     """Its process says the same as a study in memory; the slots of a block depend on how many packets had arrived."""
     changes = later(evedrop, case)

@@ -157,7 +157,7 @@ def test_a_run_on_loopback_takes_certificates_too(evedrop: Evedrop) -> None:
     assert digests_of(evedrop.folder / "a") == digests_of(evedrop.folder / "b")
 
 
-@pytest.mark.parametrize("scenario", ["acknowledged", "restart"])
+@pytest.mark.parametrize("scenario", [pytest.param("acknowledged", marks=pytest.mark.long), "restart"])
 def test_with_two_routers_a_run_is_the_same(scenario: str, evedrop: Evedrop) -> None:
     """Acknowledgements that cross, processes that are started again: the digests of one router, and of memory."""
     small = ("--trials", "1", "--record-trials", "1", "--pace", "0", "--set", "expect=[]")

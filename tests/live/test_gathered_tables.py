@@ -118,10 +118,30 @@ def same(found: pa.Table, wanted: pa.Table) -> None:
 ends = st.lists(st.integers(1, SLOTS - 1), max_size=6, unique=True).map(lambda some: [*sorted(some), SLOTS])
 
 
-@settings(max_examples=25)
-@given(cut=st.integers(1, TRIALS - 1), first=ends, second=ends, at_once=st.integers(1, 50), seed=st.integers(0, 9))
+in_parts = given(
+    cut=st.integers(1, TRIALS - 1), first=ends, second=ends, at_once=st.integers(1, 50), seed=st.integers(0, 9)
+)
+
+
+@settings(max_examples=8)
+@in_parts
 def test_two_shards_are_the_whole(cut: int, first: list[int], second: list[int], at_once: int, seed: int) -> None:
     """Wherever the trials are cut, in whatever parts their slots came, and however many slots fit into memory."""
+    check_two_shards(cut, first, second, at_once, seed)
+
+
+@pytest.mark.long
+@settings(max_examples=100)
+@in_parts
+def test_two_shards_are_the_whole_in_many_parts(
+    cut: int, first: list[int], second: list[int], at_once: int, seed: int
+) -> None:
+    """The same with more examples."""
+    check_two_shards(cut, first, second, at_once, seed)
+
+
+def check_two_shards(cut: int, first: list[int], second: list[int], at_once: int, seed: int) -> None:
+    """Check that the tables of two shards, put together, have the rows of the whole run."""
     whole = slots_of(seed)
     with TemporaryDirectory() as name:
         folder = Path(name)

@@ -103,7 +103,13 @@ RUNS: dict[str, dict[str, Any]] = {
     "in a loop over the truth": {"slots": 3000, "more": LOOP.format('period = 7\nacts_on = "truth"')},
     "paced, with events": {"slots": 2000, "more": CHANGING},
 }  # fmt: skip
-RARER = ("silent and acknowledged", "coded and acknowledged", "in a loop over the truth", "paced, with events")
+RARER = (
+    "as fast as it goes",
+    "silent and acknowledged",
+    "coded and acknowledged",
+    "in a loop over the truth",
+    "paced, with events",
+)
 
 
 def has_told(live: Live, event: str, times: int) -> bool:
@@ -255,7 +261,7 @@ def test_a_router_that_is_started_again_by_hand(evedrop: Evedrop, tmp_path: Path
     [
         ("sensor", "closed"),
         ("legitimate", "silent"),
-        ("observer", "closed"),
+        pytest.param("observer", "closed", marks=long),
         pytest.param("sensor", "silent", marks=long),
         pytest.param("legitimate", "closed", marks=long),
         pytest.param("observer", "silent", marks=long),

@@ -108,6 +108,7 @@ def test_the_folder_is_that_of_a_loop(ran: Ran) -> None:
         assert (folder / "logs" / f"shard-{number}" / "controller.log").is_file()
 
 
+@pytest.mark.long
 def test_a_loop_with_a_solver_is_made_one(tmp_path: Path) -> None:
     """Solvers stay in the processes that have them, and what they decided is what they decide in memory."""
     pytest.importorskip("osqp", reason="model predictive control needs the extra `microgrid`")
@@ -143,7 +144,7 @@ def test_a_loop_that_is_cut_short_is_made_one(evedrop: Evedrop, name: str) -> No
 
 def test_a_killed_router_of_a_shard_is_started_again(evedrop: Evedrop, tmp_path: Path) -> None:
     """The run ends with the digests of an undisturbed one, and says which shard was cut off, as it goes on and at the end."""
-    options = {"trials": 5, "slots": 3000, "pace": 0.001, "shards": 2, "expect": []}
+    options = {"trials": 5, "slots": 1500, "pace": 0.001, "shards": 2, "expect": []}
     words = [word for key, value in options.items() for word in ("--set", f"{key}={value}")]
     live = evedrop.live("eavesdroppers", *words)
     live.running(more_than=100)

@@ -79,14 +79,17 @@ def in_order(table: pa.Table) -> dict[str, list[Any]]:
     return columns
 
 
-@pytest.mark.parametrize("shards", [2, 3])
+two_or_three = pytest.mark.parametrize("shards", [2, pytest.param(3, marks=pytest.mark.long)])
+
+
+@two_or_three
 @pytest.mark.parametrize("name", ["trials", "journal", "digests"])
 def test_what_is_kept_by_trial_is_the_same_to_the_bit(ran: Ran, name: str, shards: int) -> None:
     """Recorded trials, every packet's fate with its bit mask, and digests do not depend on the number of shards."""
     assert in_order(getattr(ran(shards), name)) == in_order(getattr(ran(1), name))
 
 
-@pytest.mark.parametrize("shards", [2, 3])
+@two_or_three
 def test_the_statistics_of_every_slot_agree(ran: Ran, shards: int) -> None:
     """Counts are equal, and means and standard errors over all trials within rounding."""
     whole, gathered = in_order(ran(1).slots), in_order(ran(shards).slots)
@@ -99,7 +102,7 @@ def test_the_statistics_of_every_slot_agree(ran: Ran, shards: int) -> None:
             np.testing.assert_allclose(gathered[name], column, rtol=1e-13, err_msg=name)
 
 
-@pytest.mark.parametrize("shards", [2, 3])
+@two_or_three
 def test_the_summary_is_that_of_all_trials(ran: Ran, shards: int) -> None:
     """Figures, accounts, quantiles, events, verdicts and expectations are those of the whole run."""
     close(dict(ran(shards).summary), dict(ran(1).summary), "summary")
@@ -233,7 +236,7 @@ def whole(live: Live) -> int:
     return rows
 
 
-@pytest.mark.parametrize("name", ["smart", "sensor"])
+@pytest.mark.parametrize("name", [pytest.param("smart", marks=pytest.mark.long), "sensor"])
 def test_a_killed_process_of_a_shard_ends_all(evedrop: Evedrop, name: str) -> None:
     """The shard and the process are named, with the log where it is, and no slot that was scored is lost."""
     live = evedrop.live("eavesdroppers", *ENDLESS)

@@ -209,7 +209,12 @@ def test_a_singular_noise_runs_and_is_warned_of(evedrop: Evedrop) -> None:
     assert np.linalg.matrix_rank(Q, tol=1e-12) == 1
 
 
-@pytest.mark.parametrize("case", LIVE)
+OFTEN = ("twenty trials", "late and held", "filtered and betrayed")
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=[] if case in OFTEN else [pytest.mark.long]) for case in LIVE]
+)
 def test_a_live_loop_is_the_one_in_memory(case: str, tmp_path: Path) -> None:
     """Digests of all, the controller's too, and every recorded input: whatever the links and events are."""
     live = run(scenario_of(**LIVE[case]), out=tmp_path / "live")

@@ -56,6 +56,8 @@ RUNS: dict[str, dict[str, Any]] = {
 }
 NEEDS = ("acknowledged", "encrypted-schedule", "open-loop", "quantised-schedule", "scheduled")
 SILENT = ("scheduled", "withholding")
+BUILT_IN = ("noise", "twin-track")
+"""Schemes without acknowledgements in built-in scenarios, whose live runs `tests/scenarios` compares with memory."""
 
 
 def tables_of(scheme: str, **more: Any) -> dict[str, Any]:
@@ -95,7 +97,10 @@ def mistakes(scheme: str, **more: Any) -> list[str]:
     return str(caught.value).splitlines()
 
 
-@pytest.mark.parametrize("scheme", RUNS)
+@pytest.mark.parametrize(
+    "scheme",
+    [pytest.param(scheme, marks=[pytest.mark.long] if scheme in BUILT_IN else []) for scheme in RUNS],
+)
 def test_live_and_memory_are_the_same_bits(scheme: str, tmp_path: Path) -> None:
     """Equal digests and accounts of every receiver, the same alarms, and no packet unaccounted for."""
     scenario = scenario_of(scheme)

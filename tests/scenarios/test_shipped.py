@@ -21,6 +21,9 @@ SLOTS = 300
 BATCHES = {"a later trial": (1, 17), "forty trials": (40, 5)}
 """Trials, and the number of the first."""
 
+SHORTER: dict[str, dict[str, Any]] = {"learning": {"slots": 60, "expect": []}}
+"""Of a scenario whose slots take long, what its one trial changes; its forty trials run as they are."""
+
 Pair = tuple[Results, Results]
 
 
@@ -36,6 +39,8 @@ def twins(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Pair
         timed = scenario.event or any(expect.slots or expect.by for expect in scenario.expect)
         slots = scenario.slots if timed else min(SLOTS, scenario.slots)
         options: dict[str, Any] = {"slots": slots, "trials": trials, "first_trial": first, "pace": 0.0}
+        if trials == 1:
+            options |= SHORTER.get(name, {})
         return run(name, out=folder / "live", **options), montecarlo(name, out=folder / "memory", **options)
 
     return made

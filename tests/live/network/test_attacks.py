@@ -195,9 +195,13 @@ def test_a_process_that_is_alive_and_silent_is_named(evedrop: Evedrop, what: str
 
 
 def test_a_process_that_heeds_no_signal_is_killed_and_its_log_says_what_it_did(evedrop: Evedrop) -> None:
-    """Native code that holds Python's lock keeps all of Python waiting; the stacks are written all the same."""
+    """Native code that holds Python's lock keeps all of Python waiting; the stacks are written all the same.
+
+    It waits for a mutex that it has locked itself, through `PyDLL`, which does not let go of Python's lock.
+    """
     scenario, name, does = SILENT["a receiver in the middle"]
-    holds = "import collections, itertools\ndef hang(): collections.deque(itertools.repeat(0), maxlen=0)\n"
+    holds = "import ctypes\ndef hang():\n    mutex = ctypes.create_string_buffer(64)\n"
+    holds += "    for _ in range(2): ctypes.PyDLL(None).pthread_mutex_lock(mutex)\n"
     live = evedrop.live(
         scenario, "--pace", "0", "--set", "longest_outage=2", env=with_rogue(evedrop, name, holds + does)
     )
