@@ -19,7 +19,7 @@ from evedrop.view import palette
 from evedrop.view.scene import PeerSlots, Scene
 
 
-class Knowledge(Enum):
+class KnowledgeState(Enum):
     """What a receiver knows, as a word, and the colour of its lane."""
 
     IN_TRACK = Track.IN_TRACK
@@ -31,7 +31,7 @@ class Knowledge(Enum):
         self.colour = palette.KNOWLEDGE[track]
 
 
-KNOWLEDGE = tuple(Knowledge)
+KNOWLEDGE = tuple(KnowledgeState)
 
 
 def knowledge(scene: Scene, x: Floats, peer: PeerSlots) -> Codes:
@@ -43,7 +43,7 @@ def knowledge(scene: Scene, x: Floats, peer: PeerSlots) -> Codes:
 
 
 @final
-class Distance:
+class ErrorDistance:
     """How far an estimate is from the truth, as a number with its unit and in words.
 
     It counts the first states as far as they have the unit of the first, such as the two coordinates of a place in metres and
@@ -64,17 +64,17 @@ class Distance:
     def words(self) -> tuple[str, ...]:
         """All words of `codes`, such as "drifting, off by more than 10 m", by index."""
         near = self._text(self._near)
-        found = [f"{Knowledge.IN_TRACK.word}, within {near}"]
+        found = [f"{KnowledgeState.IN_TRACK.word}, within {near}"]
         for one in KNOWLEDGE[1:]:
             found.append(f"{one.word}, off by less than {near}")
             found += [f"{one.word}, off by more than {self._text(step)}" for step in self._steps]
         return tuple(found)
 
     @property
-    def meanings(self) -> tuple[Knowledge, ...]:
+    def meanings(self) -> tuple[KnowledgeState, ...]:
         """What each of the words says."""
         each = len(self._steps) + 1
-        return (Knowledge.IN_TRACK, *[Knowledge.DRIFTING] * each, *[Knowledge.FOOLED] * each)
+        return (KnowledgeState.IN_TRACK, *[KnowledgeState.DRIFTING] * each, *[KnowledgeState.FOOLED] * each)
 
     def of(self, x: Floats, x_hat: Floats) -> Floats:
         """The distances of estimates from true states, (c,)."""

@@ -11,7 +11,7 @@ import numpy as np
 from evedrop.view import lanes
 from evedrop.view.knowledge import KNOWLEDGE, knowledge
 from evedrop.view.palette import RUN_TEXTS
-from evedrop.view.panels.fates import FATES, KNOWN, Fates
+from evedrop.view.panels.fates import FATES, KNOWN, LastPacket
 from evedrop.view.recording import ViewRecording
 from tests.view.read_back import rows
 from tests.view.simulated_run import Simulated
@@ -51,5 +51,5 @@ def test_every_fate_and_state_has_a_colour_of_the_table() -> None:
 def test_a_closed_loop_has_no_graph(simulated: Callable[..., Simulated]) -> None:
     """Its view is full of panels of the plant."""
     scene = simulated(20).scene
-    assert Fates.applies(scene)
-    assert not Fates.applies(replace(scene, moving=("P (kW)",)))
+    assert LastPacket.applies(scene)
+    assert not LastPacket.applies(replace(scene, moving=("P (kW)",)))

@@ -13,7 +13,7 @@ from scipy import stats
 from evedrop.model.process import Floats
 from evedrop.score.track import FACTOR
 from evedrop.view.glyphs import drawable
-from evedrop.view.knowledge import KNOWLEDGE, Distance, Knowledge, knowledge
+from evedrop.view.knowledge import KNOWLEDGE, ErrorDistance, KnowledgeState, knowledge
 from evedrop.view.panels.knowledge import WhoKnowsWhat
 from evedrop.view.panels.title import Title
 from evedrop.view.recording import ViewRecording
@@ -24,7 +24,7 @@ from tests.view.simulated_run import Simulated
 SCENE = Scene("", "r", 10, 1, 2, 0.0, (Shown("smart", "eavesdropper", "smart", 1.0),), noise=0.05, units=("m", "m"))
 
 
-def known(error: float, trace: float, scene: Scene = SCENE) -> Knowledge:
+def known(error: float, trace: float, scene: Scene = SCENE) -> KnowledgeState:
     """What a receiver knows with this squared error and tr P."""
     none = np.zeros(1)
     P = np.diag([trace / 2, trace / 2])[None]
@@ -35,18 +35,18 @@ def known(error: float, trace: float, scene: Scene = SCENE) -> Knowledge:
 @pytest.mark.parametrize(
     ("error", "trace", "expected"),
     [
-        (0.0, 0.0, Knowledge.IN_TRACK),
-        (0.99, 0.0, Knowledge.IN_TRACK),  # 20 times the noise of a step is 1
-        (1.01, 0.0, Knowledge.FOOLED),
-        (1.01, 0.1, Knowledge.DRIFTING),
-        (0.0, 1.01, Knowledge.DRIFTING),  # near the truth by chance
-        (99.0, 5.0, Knowledge.DRIFTING),
-        (101.0, 5.0, Knowledge.FOOLED),
-        (np.nan, 5.0, Knowledge.FOOLED),
-        (np.inf, 5.0, Knowledge.FOOLED),
+        (0.0, 0.0, KnowledgeState.IN_TRACK),
+        (0.99, 0.0, KnowledgeState.IN_TRACK),  # 20 times the noise of a step is 1
+        (1.01, 0.0, KnowledgeState.FOOLED),
+        (1.01, 0.1, KnowledgeState.DRIFTING),
+        (0.0, 1.01, KnowledgeState.DRIFTING),  # near the truth by chance
+        (99.0, 5.0, KnowledgeState.DRIFTING),
+        (101.0, 5.0, KnowledgeState.FOOLED),
+        (np.nan, 5.0, KnowledgeState.FOOLED),
+        (np.inf, 5.0, KnowledgeState.FOOLED),
     ],
 )
-def test_a_word_for_error_and_covariance(error: float, trace: float, expected: Knowledge) -> None:
+def test_a_word_for_error_and_covariance(error: float, trace: float, expected: KnowledgeState) -> None:
     """The bounds of docs/view.md."""
     assert known(error, trace) is expected
 
@@ -58,7 +58,7 @@ def test_a_right_covariance_is_hardly_ever_called_fooled() -> None:
         assert stats.chi2.sf(FACTOR * n, n) < stats.chi2.sf(FACTOR, 1)
 
 
-def walk(errors: list[float], levels: list[int], distance: Distance) -> list[str]:
+def walk(errors: list[float], levels: list[int], distance: ErrorDistance) -> list[str]:
     """The words for distances along the first state."""
     x: Floats = np.array([[one, 0.0] for one in errors])
     codes = distance.codes(np.array(levels, np.uint8), distance.of(x, np.zeros_like(x)))
@@ -67,7 +67,7 @@ def walk(errors: list[float], levels: list[int], distance: Distance) -> list[str
 
 def test_words_say_the_largest_distance_of_a_stretch() -> None:
     """They name powers of ten, do not flicker, and continue over calls."""
-    distance = Distance(SCENE)
+    distance = ErrorDistance(SCENE)
     first = walk([0.2, 3.0, 30.0, 9.0], [0, 2, 2, 2], distance)
     more = "off by more than"
     assert first == ["in track, within 1 m", f"fooled, {more} 1 m", f"fooled, {more} 10 m", f"fooled, {more} 10 m"]
@@ -86,9 +86,9 @@ def test_distances_have_a_unit() -> None:
     """Only states with the unit of the first count; without units, all do."""
     moving = replace(SCENE, n=3, units=("m", "m", "m/s"))
     x: Floats = np.array([[3.0, 4.0, 12.0]])
-    assert Distance(moving).of(x, np.zeros((1, 3)))[0] == 5.0
-    assert Distance(replace(moving, units=())).of(x, np.zeros((1, 3)))[0] == 13.0
-    texts = [Distance(moving).text(one) for one in (0.0, 0.316, 12.34, 4567.0, 1e9, np.inf)]
+    assert ErrorDistance(moving).of(x, np.zeros((1, 3)))[0] == 5.0
+    assert ErrorDistance(replace(moving, units=())).of(x, np.zeros((1, 3)))[0] == 13.0
+    texts = [ErrorDistance(moving).text(one) for one in (0.0, 0.316, 12.34, 4567.0, 1e9, np.inf)]
     assert texts == ["0 m", "0.32 m", "12 m", "4,600 m", "1e+09 m", "everything"]
 
 

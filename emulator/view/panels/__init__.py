@@ -6,7 +6,7 @@ from evedrop.model.registry import Registry
 from evedrop.view.panels.applications import ApplicationPanels
 from evedrop.view.panels.error import SquaredError
 from evedrop.view.panels.events import Events
-from evedrop.view.panels.fates import Fates
+from evedrop.view.panels.fates import LastPacket
 from evedrop.view.panels.ground_map import GroundMap
 from evedrop.view.panels.knowledge import WhoKnowsWhat
 from evedrop.view.panels.legend import Legend
@@ -26,7 +26,7 @@ PANELS: Registry[ViewPanel] = Registry(
     {
         "title": Title,
         "knowledge": WhoKnowsWhat,
-        "fates": Fates,
+        "fates": LastPacket,
         "plant": WhatMovesThePlant,
         "levels": Levels,
         "applications": ApplicationPanels,

@@ -11,7 +11,7 @@ from rerun import AsComponents
 from evedrop.view import lanes
 from evedrop.view.column import Column
 from evedrop.view.drawn_graph import LETTER, LINE, DrawnGraph, Place
-from evedrop.view.knowledge import KNOWLEDGE, Distance, Knowledge, knowledge
+from evedrop.view.knowledge import KNOWLEDGE, ErrorDistance, KnowledgeState, knowledge
 from evedrop.view.palette import DROPPED_TEXT, IN_TRACK_TEXT, MISLED, STATE, TRUTH, TRUTH_CURVE, Colour
 from evedrop.view.panels.heights import crowded, lanes_height
 from evedrop.view.panels.panel import PlacedView, ViewPanel
@@ -30,17 +30,17 @@ FATES = {
     "silent": TRUTH_CURVE,
 }
 """The colour of each word of a lane."""
-KNOWN = {Knowledge.IN_TRACK: IN_TRACK_TEXT, Knowledge.DRIFTING: MISLED, Knowledge.FOOLED: DROPPED_TEXT}
+KNOWN = {KnowledgeState.IN_TRACK: IN_TRACK_TEXT, KnowledgeState.DRIFTING: MISLED, KnowledgeState.FOOLED: DROPPED_TEXT}
 """The colour of what a receiver knows."""
 
 
 @final
-class Fates(ViewPanel):
+class LastPacket(ViewPanel):
     """The nodes of a run, drawn at the view's frames. Not for a closed loop, whose view has other panels."""
 
     def __init__(self, scene: Scene) -> None:
         super().__init__(scene)
-        self._distance = Distance(scene)
+        self._distance = ErrorDistance(scene)
         rows = range(len(scene.receivers))
         middle = LINE * (len(rows) - 1) / 2
         nodes: dict[str, Place] = {_SENSOR: (0.0, middle - LINE / 2), _ROUTER: (0.0, middle + LINE / 2)}

@@ -10,7 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from evedrop.view.column import Column
-from evedrop.view.knowledge import Distance, knowledge
+from evedrop.view.knowledge import ErrorDistance, knowledge
 from evedrop.view.panels.curves import recent_slots
 from evedrop.view.panels.heights import lanes_height
 from evedrop.view.panels.panel import PlacedView, ViewPanel
@@ -27,8 +27,8 @@ class WhoKnowsWhat(ViewPanel):
         super().__init__(scene)
         digits = len(str(len(scene.receivers)))
         self._paths = [f"{_PATH}/{i + 1:0{digits}d}_{shown.name}" for i, shown in enumerate(scene.receivers)]
-        self._distances = [Distance(scene) for _ in self._paths]
-        self._words = Distance(scene).words
+        self._distances = [ErrorDistance(scene) for _ in self._paths]
+        self._words = ErrorDistance(scene).words
         self._last = [-1] * len(self._paths)
 
     def views(self) -> Iterator[PlacedView]:
@@ -38,7 +38,7 @@ class WhoKnowsWhat(ViewPanel):
 
     def styles(self) -> dict[str, rr.StateConfiguration]:
         """Words and colours."""
-        colours = [one.colour for one in Distance(self.scene).meanings]
+        colours = [one.colour for one in ErrorDistance(self.scene).meanings]
         return {path: rr.StateConfiguration(values=self._words, colors=colours) for path in self._paths}
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from evedrop.model.process import Floats
 from evedrop.view.column import TIMELINE, Column
-from evedrop.view.knowledge import Distance
+from evedrop.view.knowledge import ErrorDistance
 from evedrop.view.palette import GROUND, Colour, colour, dim
 from evedrop.view.palette import TRUTH as WHITE
 from evedrop.view.panels.panel import PlacedView, ViewPanel
@@ -36,7 +36,7 @@ class StatePlane(ViewPanel):
     def __init__(self, scene: Scene) -> None:
         super().__init__(scene)
         self._frame, every = Frame(), stride(scene)
-        self._distance = Distance(scene)
+        self._distance = ErrorDistance(scene)
         self._trails = {name: Trail(every) for name in (TRUTH, *(shown.name for shown in scene.receivers))}
 
     @classmethod
