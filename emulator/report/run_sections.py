@@ -18,7 +18,7 @@ from evedrop.report.strip import strip
 from evedrop.report.tables import html_table
 from evedrop.report.text_table import TextTable
 from evedrop.score.expectations_held import repeating
-from evedrop.score.track import FACTOR, LostSpan, Track, lost_spans
+from evedrop.score.track import FACTOR, LostSpan, Track
 from evedrop.view.lanes import EAVESDROPPER
 from evedrop.view.palette import hexadecimal
 
@@ -126,12 +126,11 @@ class LostTrackSection(Section[RunSource]):
         )
         table = TextTable.headed(["receiver"], ["in track", "drifting", "fooled", "spans lost", "longest"])
         for name, one in of.trial.items():
-            spans = lost_spans(one.track, int(one.slot[0]))
-            longest = max(spans, key=lambda span: span.slots, default=None)
+            longest = max(one.spans, key=lambda span: span.slots, default=None)
             table.add(
                 name,
                 *(f"{float(np.mean(one.track == code)):.1%}" for code in Track),
-                f"{len(spans):,}",
+                f"{len(one.spans):,}",
                 "–" if longest is None else f"slots {_where(longest)}",
             )
         yield html_table(table, "Shares of the slots, and spans in which the receiver lost track")
@@ -154,7 +153,7 @@ def _where(span: LostSpan) -> str:
 
 def _lanes(name: str, one: RecordedTrial) -> Iterator[Node]:
     """The two lanes of a receiver, and its longest spans."""
-    spans = sorted(lost_spans(one.track, int(one.slot[0])), key=lambda span: -span.slots)[:_MOST_SPANS]
+    spans = sorted(one.spans, key=lambda span: -span.slots)[:_MOST_SPANS]
     last = f"{int(one.slot[-1]):,}"
     yield element("h3", name)
     label = f"{name}: in track in {float(np.mean(one.track == Track.IN_TRACK)):.1%} of the slots 0 to {last}"

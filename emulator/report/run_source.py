@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from numpy.typing import NDArray
 
 from evedrop.errors import UsageError
 from evedrop.files import Unreadable, text_of
@@ -20,7 +21,7 @@ from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes
 from evedrop.results.reading import Results, load_results
 from evedrop.score.summary import Summary
-from evedrop.score.track import Track, track_of
+from evedrop.score.track import LostSpan, Track, lost_spans, track_of
 from evedrop.view import palette
 from evedrop.view.lanes import EAVESDROPPER
 
@@ -48,6 +49,8 @@ class RecordedTrial(NamedTuple):
     outcome: Codes
     """Of every packet, as indices into `OUTCOMES`."""
     track: Codes
+    spans: Sequence[LostSpan]
+    """In which it lost track."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +109,12 @@ class RunSource:
 
     def _by_receiver(self, table: pa.Table) -> dict[str, pa.Table]:
         found = {name: table.filter(pc.equal(table["peer"], name)) for name in self.summary.peers}
-        return {name: rows.sort_by("slot") for name, rows in found.items()}
+        return {name: rows if _in_order(rows) else rows.sort_by("slot") for name, rows in found.items()}
+
+
+def _in_order(rows: pa.Table) -> bool:
+    """Whether the rows are those of growing slots, as the writer leaves them."""
+    return bool((np.diff(rows["slot"].to_numpy()) > 0).all())
 
 
 def _means(rows: pa.Table) -> SlotMeans:
@@ -123,15 +131,25 @@ def _numbers(column: pa.ChunkedArray) -> Floats:
     return np.asarray(column.to_numpy(), np.float64)
 
 
+def _words(column: pa.ChunkedArray) -> tuple[NDArray[np.intp], list[str]]:
+    """A column of words as indices, (c,), into the words that follow."""
+    whole = pc.dictionary_encode(column.cast(pa.string())).combine_chunks()
+    if isinstance(whole, pa.ChunkedArray):  # without rows
+        whole = whole.chunk(0) if whole.num_chunks else pa.array([], pa.string()).dictionary_encode()
+    return whole.indices.to_numpy(zero_copy_only=False).astype(np.intp), whole.dictionary.to_pylist()
+
+
 def _trial(rows: pa.Table, noise: float) -> RecordedTrial:
-    words = np.array(rows["action"].cast(pa.string()).to_pylist())
-    words = np.where(np.array(rows["sent"].cast(pa.string()).to_pylist()) == "nothing", "silent", words)
-    unknown = sorted(set(words.tolist()) - set(OUTCOMES))
+    sent, actions = (_words(rows[name]) for name in ("sent", "action"))
+    unknown = sorted(set(actions[1]) - set(OUTCOMES))
     if unknown:
         raise UsageError(f"trials.parquet has the unknown action {unknown[0]}; run the scenario again")
-    outcome = np.select([words == word for word in OUTCOMES], range(len(OUTCOMES))).astype(np.uint8)
+    codes = np.array([OUTCOMES.index(word) for word in actions[1]], np.uint8)[actions[0]]
+    silent = np.array([word == "nothing" for word in sent[1]], np.bool_)[sent[0]]
+    outcome = np.where(silent, np.uint8(OUTCOMES.index("silent")), codes)
     errors, traces = _numbers(rows["squared_error"]), _numbers(rows["trace_covariance"])
-    return RecordedTrial(_numbers(rows["slot"]), outcome, track_of(errors, traces, noise))
+    slots, track = _numbers(rows["slot"]), track_of(errors, traces, noise)
+    return RecordedTrial(slots, outcome, track, lost_spans(track, int(slots[0])))
 
 
 TRACK_COLOURS = dict(zip(Track, palette.KNOWLEDGE, strict=True))

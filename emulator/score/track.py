@@ -80,12 +80,9 @@ def lost_spans(codes: Codes, first: int = 0) -> list[LostSpan]:
     off = np.flatnonzero(codes != Track.IN_TRACK)
     if not off.size:
         return []
-    breaks = np.flatnonzero(np.diff(off) > JOINED) + 1
-    return [
-        LostSpan(
-            first + int(part[0]),
-            first + int(part[-1]),
-            int(np.count_nonzero(codes[part[0] : part[-1] + 1] == Track.FOOLED)),
-        )
-        for part in np.split(off, breaks)
-    ]
+    breaks = np.flatnonzero(np.diff(off) > JOINED)
+    begins, ends = off[np.append(0, breaks + 1)], off[np.append(breaks, len(off) - 1)]
+    so_far = np.append(0, np.cumsum(codes == int(Track.FOOLED)))
+    fooled = so_far[ends + 1] - so_far[begins]
+    spans = zip((begins + first).tolist(), (ends + first).tolist(), fooled.tolist(), strict=True)
+    return [LostSpan(*span) for span in spans]

@@ -143,6 +143,8 @@ def test_spans_cover_exactly_the_slots_off_the_track(
     assert {k for k, word in enumerate(words) if word != "in track"} <= set(covered)
     for span in spans:
         assert "in track" not in {words[span.first - first], words[span.last - first]}
+        off = [k for k in range(span.first - first, span.last - first + 1) if words[k] != "in track"]
+        assert all(after - before <= 3 for before, after in pairwise(off))
         assert span.fooled == words[span.first - first : span.last - first + 1].count("fooled")
     for one, other in pairwise(spans):
         assert other.first - one.last > 3
