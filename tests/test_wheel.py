@@ -116,7 +116,7 @@ import emulator, peers, scenarios
 def test_names_are_theirs_and_little_is_loaded():
     assert [one.NAME for one in (emulator, peers, scenarios)] == ["their emulator", "their peers", "their scenarios"]
     loaded = {name for name in sys.modules if name.partition(".")[0] in {"evedrop", "numpy", "zenoh", "pydantic"}}
-    assert loaded <= {"evedrop", "evedrop.pytest_plugin", "evedrop.discovery", "evedrop.files"}, loaded
+    assert loaded <= {"evedrop", "evedrop.pytest_plugin", "evedrop.discovery", "evedrop.errors", "evedrop.files"}, loaded
 
 
 def test_a_wire(evedrop_wire, tmp_path):
