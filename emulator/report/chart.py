@@ -15,6 +15,7 @@ import numpy as np
 
 from evedrop.model.process import Floats
 from evedrop.report.markup import Node, element
+from evedrop.view.error_floor import floor_words
 
 _POINTS = 400  # of a curve, at most
 _WIDE, _HIGH = 2000, 1000  # of the drawing, in its own units
@@ -48,23 +49,26 @@ class LogChart:
     curves: Sequence[Curve] = field(default_factory=list)
     x_words: Sequence[str] | None = None
     """Names of the places 0, 1, … of the x axis, if x is not a number."""
+    floor: float = 0.0
+    """Lesser values lie on the lower edge, and the chart says so. 0: all are shown that are not too far below the highest."""
 
     @property
     def node(self) -> Node | None:
         """The chart; None if it has nothing to show."""
         curves = [one if one.bars else _thinned(one) for one in self.curves]
         heights = [part for one in curves for part in (one.y, one.theory) if part is not None]
-        positive = (
-            np.concatenate([part[np.isfinite(part) & (part > 0.0)] for part in heights]) if heights else np.empty(0)
-        )
+        known = np.concatenate([part[np.isfinite(part)] for part in heights]) if heights else np.empty(0)
+        below = bool((known < self.floor).any())
+        positive = np.maximum(known, self.floor)
+        positive = positive[positive > 0.0]
         if not positive.size:
             return None
         top = float(np.log10(positive.max()))
         bottom = max(float(np.log10(positive.min())), top - _MOST_DECADES)
+        top = max(top, bottom + 1.0) if below else top
         x = np.concatenate([one.x for one in self.curves])
-        axes = _Axes(
-            float(x.min()), float(x.max()), bottom - 0.05 * (top - bottom + 0.2), top + 0.05 * (top - bottom + 0.2)
-        )
+        room = 0.05 * (top - bottom + 0.2)
+        axes = _Axes(float(x.min()), float(x.max()), bottom - (0.0 if below else room), top + room)
         if any(one.bars for one in curves):  # room for the marks
             room = 0.04 * (axes.right - axes.left)
             axes = _Axes(axes.left - room, axes.right + room, axes.bottom, axes.top)
@@ -90,7 +94,7 @@ class LogChart:
         plot = element("div", drawing, *labels, class_="plot", role="img", aria_label=self.label)
         return element(
             "figure",
-            element("div", self.y_name, class_="axis"),
+            element("div", f"{self.y_name}; {floor_words(self.floor)}" if below else self.y_name, class_="axis"),
             plot,
             element("div", self.x_name, class_="axis below"),
             element("figcaption", *legend([(one.name, one.colour) for one in curves])),

@@ -19,6 +19,7 @@ from evedrop.report.tables import html_table
 from evedrop.report.text_table import TextTable
 from evedrop.score.expectations_held import repeating
 from evedrop.score.track import FACTOR, LostSpan, Track
+from evedrop.view.error_floor import error_floor
 from evedrop.view.lanes import EAVESDROPPER
 from evedrop.view.palette import hexadecimal
 
@@ -102,6 +103,7 @@ class ErrorsSection(Section[RunSource]):
             "slot",
             f"{said}; {bands}dotted: theory",
             curves,
+            floor=error_floor(of.noise, of.summary.trials),
         )
         if curves and (node := chart.node) is not None:
             yield node

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from evedrop.errors import UsageError
 from evedrop.files import Unreadable, text_of
-from evedrop.loading import load
+from evedrop.loading.process_noise import process_noise
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes
 from evedrop.results.reading import Results, load_results
@@ -97,15 +97,12 @@ class RunSource:
         """Receiver → its first recorded trial; empty without one. Raises UsageError if the table cannot be read."""
         columns = ["slot", "peer", "sent", "action", "squared_error", "trace_covariance"]
         table = self.results.part("trials", columns, pc.field("trial") == self.summary.first_trial)
-        return {name: _trial(rows, self._noise) for name, rows in self._by_receiver(table).items() if rows.num_rows}
+        return {name: _trial(rows, self.noise) for name, rows in self._by_receiver(table).items() if rows.num_rows}
 
     @cached_property
-    def _noise(self) -> float:
+    def noise(self) -> float:
         """The process noise tr Q; 0 if the scenario cannot be read."""
-        try:
-            return float(np.trace(load(self.folder, beyond_horizon=True).process.process.Q))
-        except UsageError:
-            return 0.0
+        return process_noise(self.folder)
 
     def _by_receiver(self, table: pa.Table) -> dict[str, pa.Table]:
         found = {name: table.filter(pc.equal(table["peer"], name)) for name in self.summary.peers}

@@ -15,7 +15,10 @@ from matplotlib.patches import Patch
 
 from evedrop.errors import UsageError
 from evedrop.loading import load
+from evedrop.loading.process_noise import process_noise
+from evedrop.model.process import Floats
 from evedrop.results.reading import Results
+from evedrop.view.error_floor import error_floor, floor_words
 from evedrop.view.figure_style import drawing
 from evedrop.view.lanes import EAVESDROPPER
 from evedrop.view.palette import TRUTH_CURVE, colour, hexadecimal
@@ -28,7 +31,7 @@ if TYPE_CHECKING:
 
 _WIDTH = 8.4
 _LAST = 300  # slots of lanes and plane unless told otherwise
-_DEEPEST = 1e3  # how far below a mean errors are shown
+_ROOM = 1.6  # the factor by which the axis of errors goes beyond them
 _MARGIN = 0.25  # around the truth in the plane, as a share of its extent
 _HEIGHTS: Mapping[str, Callable[[int], float]] = {
     "errors": lambda _: 3.2,
@@ -49,6 +52,7 @@ def run_figure(results: Results, wanted: Sequence[str], slots: range | None, tri
     if slots is not None and (not slots or slots.step != 1 or not 0 <= slots[0] <= slots[-1] <= last):
         raise UsageError(f"plot: {slots} are not slots of the run; expected some such as range(0, {last + 1})")
     receivers = rows["peer"].unique().to_pylist()
+    noise = process_noise(results.folder)
     one = None if names == ["errors"] else _RecordedTrial(results, receivers, trial, slots)
     heights = [_HEIGHTS[name](len(receivers)) for name in names]
     with drawing(_WIDTH, sum(heights)) as figure:
@@ -56,15 +60,18 @@ def run_figure(results: Results, wanted: Sequence[str], slots: range | None, tri
         places = figure.subplots(len(names), 1, height_ratios=heights, squeeze=False)[:, 0]
         for name, axes in zip(names, places, strict=True):
             if name == "errors":
-                _errors(axes, rows, receivers, slots)
+                _errors(axes, rows, receivers, slots, error_floor(noise, pc.max(rows["trials"]).as_py()))
             elif one is not None:
                 (one.lanes if name == "lanes" else one.plane)(axes)
     return figure
 
 
-def _errors(axes: Axes, rows: pa.Table, receivers: list[str], slots: range | None) -> None:
-    """The mean squared error of each slot, theory dashed, and a band of two standard errors of its logarithm."""
-    many, heights = False, []
+def _errors(axes: Axes, rows: pa.Table, receivers: list[str], slots: range | None, floor: float) -> None:
+    """The mean squared error of each slot, theory dashed, and a band of two standard errors of its logarithm.
+
+    floor: what is less is drawn there.
+    """
+    many, heights = False, list[Floats]()
     for i, name in enumerate(receivers):
         mine = rows.filter(pc.equal(rows["peer"], name))
         if slots is not None:
@@ -75,24 +82,27 @@ def _errors(axes: Axes, rows: pa.Table, receivers: list[str], slots: range | Non
         if np.isnan(error).all():
             error = found["mean_actual_trace_covariance"]
         heights += [error, theory]
-        axes.plot(found["slot"], error, color=ink, label=name, linewidth=1.3)
-        axes.plot(found["slot"], theory, "--", color=ink, linewidth=0.9)
+        axes.plot(found["slot"], np.maximum(error, floor), color=ink, label=name, linewidth=1.3)
+        axes.plot(found["slot"], np.maximum(theory, floor), "--", color=ink, linewidth=0.9)
         if (found["trials"] > 1).any():
             many = True
             with np.errstate(all="ignore"):
                 share = np.exp(
                     2.0 * found["standard_error"] / error
                 )  # symmetric on the logarithmic axis, and never below 0
-            axes.fill_between(found["slot"], error / share, error * share, color=ink, alpha=0.25, linewidth=0)
-    axes.set_yscale("log")
-    finite = [one[np.isfinite(one) & (one > 0.0)] for one in heights]
-    shown = [one for one in finite if one.size]
-    if shown:  # the error of one trial falls to rounding with each state that arrives
-        axes.set_ylim(
-            max(min(map(np.min, shown)) / 1.6, min(map(np.mean, shown)) / _DEEPEST), max(map(np.max, shown)) * 1.6
-        )
+            edges = (np.maximum(edge, floor) for edge in (error / share, error * share))
+            axes.fill_between(found["slot"], *edges, color=ink, alpha=0.25, linewidth=0)
+    known = np.concatenate(heights)
+    known = known[np.isfinite(known)]
+    below = bool((known < floor).any())
+    shown = np.maximum(known, floor)
+    shown = shown[shown > 0.0]
+    if shown.size:  # otherwise the axis has nothing to show, and no logarithms
+        axes.set_yscale("log")
+        axes.set_ylim(shown.min() / (1.0 if below else _ROOM), max(shown.max() * _ROOM, 10.0 * floor))
     axes.set_xlabel("slot")
-    axes.set_title("squared error" + (", mean ± 2 standard errors" if many else "") + "; dashed: theory")
+    title = "squared error" + (", mean ± 2 standard errors" if many else "") + "; dashed: theory"
+    axes.set_title(f"{title}; {floor_words(floor)}" if below else title)
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 

@@ -29,9 +29,31 @@ def test_errors_are_those_of_the_table_in_the_colours_of_the_view(results: RunRe
     curves = {str(line.get_label()): line for line in axes.get_lines()}
     for i, name in enumerate(results.peers):
         rows = [row for row in results.slots.to_pylist() if row["peer"] == name]
-        assert np.array_equal(np.asarray(curves[name].get_ydata()), [row["mean_squared_error"] for row in rows])
+        errors = np.maximum([row["mean_squared_error"] for row in rows], 1e-5)  # tr Q / trials is 0.0004
+        np.testing.assert_allclose(np.asarray(curves[name].get_ydata()), errors, rtol=1e-12)
         assert to_hex(curves[name].get_color()) == hexadecimal(colour(i))
     assert (len(axes.get_lines()), len(axes.collections), axes.get_yscale()) == (4, 2, "log")
+
+
+def test_errors_of_rounding_lie_on_the_lower_edge(results: RunResults) -> None:
+    """One trial ends far below tr Q where a state was received; a mean over several is shown further down."""
+    one = montecarlo(SCENARIO.replace(record_trials=1), trials=1)
+    (axes,) = one.plot("errors").axes
+    floor = 1e-4  # tr Q is 0.002
+    assert min(row["mean_squared_error"] for row in one.slots.to_pylist()) < 1e-20
+    assert axes.get_ylim()[0] == pytest.approx(floor)
+    assert "values below 0.0001 lie on the lower edge" in axes.get_title("left")
+    assert min(np.min(np.asarray(line.get_ydata())) for line in axes.get_lines()) == pytest.approx(floor)
+    (axes,) = results.plot("errors").axes
+    assert axes.get_ylim()[0] < floor
+
+
+def test_a_run_without_any_error_has_a_figure() -> None:
+    """Without a warning, which would be an error here: no value is positive."""
+    results = montecarlo("replay-attack-before", trials=1)
+    (axes,) = results.plot("errors").axes
+    assert {row["mean_squared_error"] for row in results.slots.to_pylist()} == {0.0}
+    assert axes.get_ylim()[1] == pytest.approx(10.0 * axes.get_ylim()[0])
 
 
 def test_lanes_have_the_outcome_of_every_packet(results: RunResults) -> None:

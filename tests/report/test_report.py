@@ -183,6 +183,21 @@ def test_a_chart_has_gaps_where_nothing_is_known_and_few_points() -> None:
     assert LogChart("label", "slot", "error", [Curve("one", "#123456", x[:2], np.zeros(2))]).node is None
 
 
+def test_values_below_the_floor_lie_on_the_lower_edge_and_the_chart_says_so() -> None:
+    """Rounding errors leave the axis to the errors that matter; a chart without them has no such words, and its own axis."""
+    errors = np.array([1e-30, 0.0, 5.0, 0.02])
+    for values, words in ((errors, "error; values below 0.01 lie on the lower edge"), (errors[2:], "error")):
+        curve = Curve("one", "#123456", np.arange(float(len(values))), values)
+        node = LogChart("label", "slot", "error", [curve], floor=0.01).node
+        assert isinstance(node, ET.Element)
+        assert node[0].text == words
+        ticks = [float(str(one.text)) for one in node.iter("span") if one.get("class") == "y"]
+        assert min(ticks) >= 0.01
+        (path,) = [one for one in node.iter("path") if one.get("class") == "curve"]
+        assert str(path.get("d")).count(" 1000") == (2 if len(values) == 4 else 0)
+    assert LogChart("", "", "", [Curve("", "", errors[:2], np.zeros(2))], floor=0.01).node is not None
+
+
 def test_texts_are_escaped_wherever_they_stand() -> None:
     """In text, in attributes, and after other elements; characters that HTML does not allow are replaced."""
     texts = ("<b>\x00", "</p>", '"><x onload="y">')

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from evedrop.model.process import Floats
 from evedrop.view.column import Column, scalars
+from evedrop.view.error_floor import error_floor
 from evedrop.view.palette import Colour
 from evedrop.view.scene import Scene
 
@@ -76,10 +77,9 @@ def thinned(scene: Scene, slots: NDArray[np.int64]) -> NDArray[np.intp]:
 def logarithms(scene: Scene, path: str, slots: NDArray[np.int64], values: Floats) -> Iterator[Column]:
     """log10 of squared errors or traces (c,), without NaNs.
 
-    Smaller values are raised to a floor: after a state was received, the error is 0. The floor is one decade below one step's
-    noise; two decades for a mean over several trials, since some trials may have no error.
+    Smaller values are raised to the floor of `error_floor`: after a state was received, the error is 0.
     """
     known = ~np.isnan(values)  # no theory covers some links
     if known.any():
-        floor = 10.0 ** (np.floor(np.log10(scene.noise)) - (1 if scene.trials == 1 else 2))
+        floor = error_floor(scene.noise, scene.trials)
         yield scalars(path, slots[known], np.log10(np.maximum(values[known], floor)))
