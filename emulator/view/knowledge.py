@@ -57,6 +57,7 @@ class ErrorDistance:
         self._unit = f" {unit}" if unit else ""
         self._level, self._step = -1, 0  # of the last slot
         self._near = math.sqrt(FACTOR * scene.noise)
+        self._nothing = math.sqrt(scene.noise) * _NOTHING
         first = math.floor(math.log10(self._near)) + 1
         self._steps = np.array([self._near, *(10.0**decade for decade in range(first, first + _DECADES))])
 
@@ -98,8 +99,8 @@ class ErrorDistance:
         return np.where(level == 0, 0, 1 + (level - 1) * (len(self._steps) + 1) + step)
 
     def text(self, distance: float) -> str:
-        """A distance with two digits and its unit, such as "0.32 m"."""
-        return self._text(distance)
+        """A distance with two digits and its unit, such as "0.32 m"; "0 m" if it is less than a thousandth of √(tr Q)."""
+        return self._text(0.0 if distance < self._nothing else distance)
 
     def _text(self, distance: float) -> str:
         if not math.isfinite(distance):
@@ -111,3 +112,4 @@ class ErrorDistance:
 
 
 _DECADES = 9
+_NOTHING = 1e-3  # the share of √(tr Q), the distance of one step, below which a distance is only that of rounding

@@ -92,6 +92,13 @@ def test_distances_have_a_unit() -> None:
     assert texts == ["0 m", "0.32 m", "12 m", "4,600 m", "1e+09 m", "everything"]
 
 
+def test_distances_of_rounding_are_none() -> None:
+    """√(tr Q) is 0.22 m here: less than a thousandth of it is 0, and the finest distance that is said has two digits."""
+    assert [ErrorDistance(SCENE).text(one) for one in (2e-15, 2.2e-4, 2.3e-4)] == ["0 m", "0 m", "0.00023 m"]
+    finer = ErrorDistance(replace(SCENE, noise=1e-20))
+    assert [finer.text(one) for one in (9e-14, 2e-13)] == ["0 m", "2e-13 m"]
+
+
 def test_the_strip_shows_who_knows_what(simulated: Callable[..., Simulated], tmp_path: Path) -> None:
     """However slots are handed over, a lane has the words of its receiver; a naive eavesdropper is fooled, a smart one is not."""
     run, lanes = simulated(300), {}
