@@ -40,7 +40,7 @@ SPECS: dict[str, dict[str, Any]] = {
     "trace, random start": {"model": "trace", "outcomes": "1101011110" * 10_000, "random_start": True},
     "distance, fading": {**RADIO, "receiver": [120.0, 0.0]},
     "distance, shadowed, moving": {**RADIO, "receiver": WALK, "shadowing": 6.0, "shadowing_block": 100},
-    "distance, all anew every slot": {**RADIO, "receiver": WALK, "shadowing": 6.0},
+    "distance, all drawn again in every slot": {**RADIO, "receiver": WALK, "shadowing": 6.0},
 }  # fmt: skip
 KEY = stream_key(root_of_seed(1), "link/eve")
 

@@ -154,7 +154,7 @@ def processor_seconds(
 
 
 def exponent(points: list[tuple[float, float]]) -> float:
-    """Of the power law that fits points best, by least squares of logarithms."""
+    """The exponent of the power law that fits points best, by least squares of logarithms."""
     x, y = np.log(np.array(points).T)
     return float(np.polyfit(x, y, 1)[0])
 

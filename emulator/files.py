@@ -136,9 +136,9 @@ def why_of(error: Exception) -> str:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """A temporary file beside a path, which takes its place when the block ends, and is removed if the block raises an error.
+    """A temporary file next to a path; it replaces the path when the block ends, and is removed if the block raises an error.
 
-    Raises UsageError if it cannot be written, also for an OSError of the block that names no other file.
+    Raises UsageError if it cannot be written, including for an OSError of the block that names no other file.
     """
     real = Path(os.path.realpath(path))
     if is_there(real) and not real.is_file():

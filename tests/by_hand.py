@@ -142,7 +142,7 @@ class ByHand:
 
     @property
     def summary(self) -> Mapping[str, Any]:
-        """Of the results."""
+        """The summary of the results."""
         return load_results(self.results).summary
 
 

@@ -1,4 +1,4 @@
-"""What every page of a report must be, whatever it is about."""
+"""Checks that every page of a report must pass."""
 
 from __future__ import annotations
 

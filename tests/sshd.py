@@ -1,4 +1,4 @@
-"""An sshd of our own on loopback, with keys and configuration of its own; nothing of the user's or the machine's is touched."""
+"""An sshd of our own on loopback, with keys and configuration of its own; it uses no file of the user or the machine."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Host *
 
 @dataclass(frozen=True)
 class Sshd:
-    """A server that runs, and what a client needs."""
+    """A running server, and what a client needs."""
 
     folder: Path
     process: subprocess.Popen[bytes]
@@ -54,7 +54,7 @@ class Sshd:
         return self.folder / "client"
 
     def sessions(self) -> list[int]:
-        """The processes that serve a connection each."""
+        """The processes that each serve a connection."""
         return descendants(self.process.pid)
 
 

@@ -9,7 +9,7 @@ from evedrop.files import whole_file
 
 
 def test_a_file_appears_when_it_is_complete(tmp_path: Path) -> None:
-    """Until then the old one is there; a link stays a link, and others may read the file as the umask says."""
+    """Until then the old file is there; a link stays a link, and the file's mode follows the umask."""
     path, link = tmp_path / "f.png", tmp_path / "link.png"
     path.write_text("old")
     link.symlink_to(path)
@@ -29,7 +29,7 @@ def test_a_file_appears_when_it_is_complete(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), ValueError("no")])
 def test_an_error_leaves_the_old_file_and_no_other(error: BaseException, tmp_path: Path) -> None:
-    """Also Ctrl-C."""
+    """So does Ctrl-C."""
     path = tmp_path / "f.png"
     path.write_text("old")
     with pytest.raises(type(error)), whole_file(path) as temporary:  # noqa: PT012 - the error is the block's
@@ -51,7 +51,7 @@ def test_a_full_disk_is_a_mistake_with_the_file_named(tmp_path: Path) -> None:
 
 
 def test_an_error_about_another_file_is_passed_on(tmp_path: Path) -> None:
-    """It has another remedy."""
+    """An error that names another file is not changed, because its remedy differs."""
     with pytest.raises(FileNotFoundError, match="elsewhere"), whole_file(tmp_path / "f.mp4"):
         raise FileNotFoundError(errno.ENOENT, "none", "/elsewhere")
 

@@ -1,4 +1,4 @@
-"""The functions that design: μ_d, one for each slot, when to send, when to encrypt.
+"""The functions that design a scheme: μ_d, a μ_d for each slot, when to send, and when to encrypt.
 
 Source: docs/design.md.
 """
@@ -39,7 +39,7 @@ def design(
     key.
 
     Raises ScenarioError with every mistake of the scenario, UsageError if the scheme does not send states and innovations, if
-    the losses of a link are not independent and alike in all slots, or if Ω is infinite or no μ_d keeps it.
+    the losses of a link are not independent and alike in all slots, or if Ω is infinite or no μ_d keeps the trace below it.
     """
     from evedrop.model.theory.design import design as design_of  # noqa: PLC0415 - a run does not need it
 
@@ -95,7 +95,7 @@ def design_schedule(
     """A μ_d for each slot of a short run, against each eavesdropper of a scenario.
 
     slots: N, from 2 to 100; max_trace: Ω, below which the legitimate trace stays in every slot; weight: of the legitimate
-    error in the sum, which has the eavesdropper's with the rest; block: how many slots share a μ_d; changes: entries by
+    error in the sum, from 0 to 1; the eavesdropper's error has the rest; block: how many slots share a μ_d; changes: entries by
     dotted key.
 
     Raises ScenarioError with every mistake of the scenario, UsageError as `design` does, and for numbers out of range.
@@ -138,7 +138,7 @@ def design_policy(
 ) -> PolicyDesign:
     """When a sensor with acknowledgements should send: the Pareto front against each eavesdropper of a scenario.
 
-    weights: of the user's error, from 0 to 1, the eavesdropper's has the rest; prices: of a transmission; states: how many
+    weights: of the user's error, from 0 to 1; the eavesdropper's error has the rest; prices: of a transmission; states: how many
     holding times are told apart; changes: entries by dotted key.
 
     Raises ScenarioError with every mistake of the scenario, UsageError if it is not one for policies, see

@@ -1,4 +1,4 @@
-"""What calls are given: a scenario, a folder for the results or none, workers, and who is told of progress."""
+"""The arguments that calls share: a scenario, a folder for the results, the number of workers, and changes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from evedrop.scenario import Scenario
 from evedrop.scenario.words import dotted
 
 _OF_RESULTS = ("summary.json", "unfinished", "shards", "sweep.json", "compare.json")
-"""Files and folders by which a results folder is known."""
+"""Files and folders that show that a folder is a results folder."""
 
 
 def scenario_of(scenario: str | Path | Scenario, changes: Mapping[str, Any], beyond_horizon: bool = False) -> Scenario:
@@ -94,7 +94,7 @@ def _clear(folder: Path, overwrite: bool) -> None:
     if not any((folder / name).exists() for name in _OF_RESULTS):
         raise UsageError(f"{folder} is not a results folder, and overwrite=True replaces only those; give another out")
     if goes_on(folder):
-        raise UsageError(f"{folder} belongs to a run that goes on; wait for its end, or give another out")
+        raise UsageError(f"{folder} belongs to a run in progress; wait for its end, or give another out")
     for inside in folder.iterdir():
         if inside.is_dir() and not inside.is_symlink():
             shutil.rmtree(inside)

@@ -1,4 +1,4 @@
-"""What is special in a notebook: a progress bar, and tables in HTML. Nothing here needs one."""
+"""What Evedrop shows in a notebook: a progress bar, and tables in HTML. Needs no notebook to be imported."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def in_notebook() -> bool:
 def progress(tell: Tell | None, total: int) -> Iterator[Tell]:
     """The function that takes the news of a call: `tell` if one is given, else a progress bar in a notebook.
 
-    total: progress at the end, unless the news say it. The bar vanishes at the end.
+    total: the progress at the end, unless the news gives it. The bar vanishes at the end.
     """
     if tell is not None or not in_notebook():
         yield tell or silent
@@ -54,7 +54,7 @@ def bar_text(done: int, total: int, beside: str) -> str:
 
 
 def table_text(title: str, heads: Sequence[str], rows: Sequence[Sequence[Any]], notes: Sequence[str] = ()) -> str:
-    """A table in HTML; the first column has names, the others have numbers. Any text may be in it."""
+    """A table in HTML; the first column has names, the others have numbers. Every text is escaped."""
     head = "".join(f"<th>{escape(one)}</th>" for one in heads)
     lines = "".join(
         "<tr>"

@@ -1,4 +1,4 @@
-"""The results of calls: read from their folder, typed, short when printed, and tables in a notebook."""
+"""The results of calls, read from their folder: typed entries, a short text when printed, and tables in a notebook."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ class SweepResults:
 
 
 def load_results(folder: str | Path) -> RunResults:
-    """Read a results folder, also one of a run that goes on or was killed: `ended` in its summary says so.
+    """Read a results folder, including that of a run in progress or killed: `ended` in its summary says so.
 
     Raises UsageError naming the missing or broken file if it is not a results folder.
     """

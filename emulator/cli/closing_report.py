@@ -31,7 +31,7 @@ def print_results(folder: Path, as_json: bool = False) -> None:
 def report_page(folder: Path, as_json: bool = False) -> None:
     """Write report.html into a results folder, and say where it is; a page that cannot be written gives a warning.
 
-    as_json: say nothing, because standard output is JSON.
+    as_json: print nothing, because standard output is JSON.
     """
     from evedrop.report.writing import try_report
 

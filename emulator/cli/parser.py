@@ -1,6 +1,6 @@
 """The parser of the command line: argparse, with a hint for a mistyped word, no abbreviations, and help in sections.
 
-Of argparse it uses one name that is not public, `_option_string_actions`, and does without hints for options if that is gone.
+It uses one private name of argparse, `_option_string_actions`; if a later Python lacks it, options have no hints.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def _columns() -> int:
 
 
 class _Help(argparse.RawDescriptionHelpFormatter):
-    """Keeps within the width, and breaks an example as a shell reads it."""
+    """Formats help within the width, and breaks an example so that a shell can still read it."""
 
     def __init__(self, prog: str, **more: Any) -> None:
         """more: what a later Python may add."""
@@ -39,7 +39,7 @@ class _Help(argparse.RawDescriptionHelpFormatter):
         groups: Iterable[Any],
         prefix: str | None = None,
     ) -> None:
-        """Without the options that may be left out, which are listed below it."""
+        """The usage without optional arguments, which are listed below it."""
         if prefix is None:
             options = argparse.Action([], "options", metavar="[options]")
             actions = [options, *(one for one in actions if one.required or not one.option_strings)]

@@ -1,4 +1,4 @@
-"""The results of runs and sweeps on the terminal: the tables and sentences of `evedrop.report`, in the room that there is."""
+"""The results of runs and sweeps on the terminal: the tables and sentences of `evedrop.report`, in its width."""
 
 from __future__ import annotations
 

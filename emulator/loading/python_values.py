@@ -69,7 +69,7 @@ class _Reader:
             found = {name: one for name, one in inner.items() if one is not None}
         elif isinstance(value, (list, tuple, range)):
             found = [self.plain(f"{path}.{i}", one) for i, one in enumerate(value)]
-        elif isinstance(value, (Path, str)):  # texts of numpy, and members of an enumeration
+        elif isinstance(value, (Path, str)):  # strings of numpy, and members of an enumeration
             found = str(value)
         elif isinstance(value, type):
             found = self._name(path, value)

@@ -109,7 +109,7 @@ class _Child:
 
     def __init__(self, folder: str | None, seconds: float) -> None:
         self._seconds = seconds
-        # Python's own modules first: pytest puts folders of tests before them, which may have files of the same names.
+        # Python's own modules first: pytest puts folders of tests before them, and these may have files with the same names.
         places = json.dumps([_PYTHON, *(str(Path(place).absolute()) for place in sys.path)])
         command = (
             "import json, sys; sys.path[:] = json.loads(sys.stdin.buffer.raw.readline()); "

@@ -1,1 +1,1 @@
-"""The report of a results folder: its words and tables, which the terminal prints, and the page that shows them with plots."""
+"""The report of a results folder: the sentences and tables that the terminal prints, and a page that adds charts."""

@@ -1,4 +1,4 @@
-"""Charts as HTML and SVG, drawn by hand: a hundredth of a second, and nothing to import.
+"""Charts as HTML and SVG, written without a plotting library, in a hundredth of a second.
 
 Only the curves are SVG, stretched to the width of the page; the words around them are HTML, so that they stay readable at any
 width.
@@ -87,7 +87,7 @@ class LogChart:
             labels.append(element("span", text, class_="x", style=f"left:{axes.h(np.array([at]))[0] / _WIDE:.2%}"))
         for one in curves:
             drawing.extend(_drawn(one, axes))
-        for one in curves:  # above the curves, with which theory should agree
+        for one in curves:  # drawn over the curves, so that it stays visible
             if one.theory is not None:
                 parts = _parts(axes.h(one.x), axes.v(one.theory), np.isfinite(one.theory))
                 drawing.append(element("path", d=_path(parts), class_="theory"))
@@ -115,7 +115,7 @@ class _Axes:
     left: float
     right: float
     bottom: float
-    """Of the decimal logarithm."""
+    """The decimal logarithm of the lowest value shown."""
     top: float
 
     def h(self, x: Floats) -> list[int]:
@@ -124,14 +124,14 @@ class _Axes:
         return [round(_WIDE * float(one - self.left) / span) for one in x]
 
     def v(self, y: Floats) -> list[int]:
-        """Places from the top; what is too small lies on the lower border."""
+        """Places from the top; values below the lowest one lie on the lower border."""
         with np.errstate(divide="ignore", invalid="ignore"):
             share = np.clip((np.log10(y) - self.bottom) / (self.top - self.bottom), 0.0, 1.0)
         return [round(_HIGH * (1.0 - float(one))) for one in np.nan_to_num(share)]
 
 
 def _drawn(one: Curve, axes: _Axes) -> list[ET.Element]:
-    """The elements of a curve: what is not finite interrupts it."""
+    """The elements of a curve; a value that is not finite interrupts it."""
     across, found = axes.h(one.x), list[ET.Element]()
     bounds = None if one.low is None or one.high is None else (axes.v(one.low), axes.v(one.high))
     known = np.isfinite(one.y)

@@ -117,7 +117,7 @@ def _split_lines(summary: Summary) -> Iterator[str]:
 
 
 def remarks(summary: Summary) -> Iterator[str]:
-    """What must be known to read the table: figures by splitting, figures that are left out, and links unlike their models."""
+    """Notes to the table: figures by splitting, figures that are left out, and links unlike their models."""
     yield from _split_lines(summary)
     for name, why in unloadable_figures().items():
         yield f"the figure {name} is left out{why}"
@@ -135,7 +135,7 @@ def verdicts(summary: Summary) -> Iterator[str]:
 
 
 def doubts(summary: Summary) -> Iterator[str]:
-    """A line for each receiver whose mean error says nothing, or too little."""
+    """A line for each receiver whose mean error is meaningless or too uncertain."""
     for name, peer in summary.peers.items():
         if peer.infinite_variance and peer.error_quantiles and summary.trials > 1:
             low, middle, high = (f"{value:.3g}" for value in peer.error_quantiles.values())
@@ -192,7 +192,7 @@ def _link_lines(links: Mapping[str, LinkSummary]) -> Iterator[str]:
 
 
 def _rare_lines(summary: Summary) -> Iterator[str]:
-    """A line for each receiver whose expected error is carried by events that so few trials need not meet."""
+    """A line for each receiver whose expected error is carried by events that may not occur in this many trials."""
     for name, peer in summary.peers.items():
         rare = peer.rare_events
         if rare is not None and rare.share > RARE_SHARE and summary.trials > 1:

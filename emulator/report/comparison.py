@@ -33,7 +33,7 @@ def comparison_heading(found: Comparison) -> str:
 
 
 def comparison_lines(found: Comparison) -> Iterator[str]:
-    """What the tables do not say: what was left out or is not defined, what their words mean, and which schemes dominate."""
+    """Notes to the tables: what was left out or is not defined, what their words mean, and which schemes dominate."""
     yield from _left_out(found)
     yield from _undefined(found)
     yield from _remarks(found)
@@ -153,5 +153,5 @@ def _remarks(found: Comparison) -> Iterator[str]:
         more = "each of them dominates" if len(found.dominant) > 1 else "dominates"
         yield (
             f"{', '.join(found.dominant)}: {more}: no other scheme costs the legitimate estimator less in the long run, "
-            "and with no other scheme is the closest adversary's error larger"
+            "and no other scheme gives the closest adversary a larger error"
         )

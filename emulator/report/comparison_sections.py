@@ -44,7 +44,7 @@ class ComparisonSource:
 
     @property
     def outcome(self) -> str:
-        """How many pairs kept what, as a sentence."""
+        """How many pairs have each verdict, as a sentence."""
         verdicts = [cell.verdict for one in self.found.schemes.values() for cell in one.cells.values()]
         counts = [(word, verdicts.count(word)) for word in SecrecyKept]
         said = ", ".join(f"{count:,} {word.value}" for word, count in counts if count)
@@ -91,7 +91,7 @@ class SchemesSection(Section[ComparisonSource]):
 
     @classmethod
     def nodes(cls, of: ComparisonSource) -> Iterator[Node]:
-        """The table that the terminal shows, and what must be known to read it."""
+        """The table that the terminal shows, and its notes."""
         yield html_table(schemes_table(of.found), "Cost and secrecy of each scheme; errors ± standard errors")
         yield from paragraphs(comparison_lines(of.found))
 

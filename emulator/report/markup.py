@@ -1,4 +1,4 @@
-"""HTML as a tree of elements: every text and attribute is escaped when the tree is written, wherever it comes from."""
+"""HTML as a tree of elements: every text and attribute is escaped when the tree is written."""
 
 from __future__ import annotations
 

@@ -47,10 +47,10 @@ class RecordedTrial(NamedTuple):
 
     slot: Floats
     outcome: Codes
-    """Of every packet, as indices into `OUTCOMES`."""
+    """What became of every packet, as indices into `OUTCOMES`."""
     track: Codes
     spans: Sequence[LostSpan]
-    """In which it lost track."""
+    """The spans in which it lost track."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class RunSource:
 
 
 def _in_order(rows: pa.Table) -> bool:
-    """Whether the rows are those of growing slots, as the writer leaves them."""
+    """Whether the slots of the rows increase, as in tables of the writer."""
     return bool((np.diff(rows["slot"].to_numpy()) > 0).all())
 
 

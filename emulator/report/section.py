@@ -1,4 +1,4 @@
-"""What a section of a report is: a class that makes its part of the page from the results."""
+"""The base class of sections of a report, each of which makes its part of the page from the results."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Section(ABC, Generic[SourceT]):
     @classmethod
     @abstractmethod
     def nodes(cls, of: SourceT) -> Iterator[Node]:
-        """Its contents; nothing if these results have nothing to show in it, which leaves it out."""
+        """Its contents; none if these results have nothing to show in it; it is then left out."""
 
     @classmethod
     def part(cls, of: SourceT) -> Part | None:

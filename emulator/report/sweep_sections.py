@@ -75,7 +75,7 @@ class SweepSource:
 
 @final
 class SweepVerdicts(Section[SweepSource]):
-    """In how many points secrecy held."""
+    """The number of points in which secrecy held."""
 
     title = "Verdicts"
 

@@ -1,4 +1,4 @@
-"""A table of texts, which the terminal and the page show each in its own way."""
+"""A table of texts, which the terminal and the page format differently."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ class TextColumn:
 
     heading: str
     number: bool = True
-    """Whether its cells are numbers, which stand on the right."""
+    """Whether its cells are numbers, which are aligned to the right."""
 
 
 @dataclass

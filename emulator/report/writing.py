@@ -54,7 +54,7 @@ def try_report(folder: Path) -> Path | None:
     """The same for a run that has just ended: a report that cannot be made gives a warning, and None."""
     try:
         return write_report(folder)
-    except Exception as error:  # the results need no page, whatever went wrong
+    except Exception as error:  # the results are complete without a page
         why = f"{type(error).__name__}: {error}" if not isinstance(error, OSError) else str(error)
         warn(f"{REPORT} was not written ({' '.join(why.split())}); to write it later: evedrop report {folder}")
         return None

@@ -24,7 +24,7 @@ _MOST_BYTES = 2**26
 
 
 def read_comparison(folder: Path) -> Comparison:
-    """The comparison in a results folder. Its verdicts lack `windows`, which only their sentences say. Raises UsageError."""
+    """The comparison in a results folder. Its verdicts lack `windows`, which only sentences have. Raises UsageError."""
     path = folder / COMPARISON
     try:
         return _comparison(json.loads(text_of(path, _MOST_BYTES)))

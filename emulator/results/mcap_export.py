@@ -27,7 +27,7 @@ from evedrop.results.reading import Results
 SUFFIX = ".mcap"
 _BATCH_ROWS = 4096
 _NANOSECONDS = 1_000_000_000
-_DEFAULT_PERIOD = 1.0  # seconds per slot of a run that says nothing about it
+_DEFAULT_PERIOD = 1.0  # seconds per slot, if the scenario gives none
 _LATEST = 2**63 - 1  # nanoseconds
 _INFO = 2  # of foxglove.Log
 _TIME = {"type": "object", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}}
@@ -78,7 +78,7 @@ def export_mcap(results: Results, path: Path, period: float | None = None) -> Ma
 
 
 def _add_trial(folder: Path, first: str, messages: _Messages) -> None:
-    """The first recorded trial: truth, estimates and inputs. first: a receiver, whose rows tell the truth."""
+    """The first recorded trial: truth, estimates and inputs. first: a receiver, whose rows also have the truth."""
     for row in _rows(folder, "trials", _first_trial(folder, "trials")):
         del row["trial"]
         sent, x = row.pop("sent"), row.pop("x")
@@ -172,14 +172,14 @@ def _rows(folder: Path, name: str, which: pc.Expression | None = None) -> Iterat
 
 
 def _batches(folder: Path, name: str, columns: list[str] | None = None) -> Iterator[pa.RecordBatch]:
-    """The rows of a table in batches, from its Parquet file, or from the stream of a run that goes on or was killed."""
+    """The rows of a table in batches, from its Parquet file, or from the stream of a run in progress or killed."""
     path = folder / f"{name}.parquet"
     if not path.exists():
         for batch in batches_of(folder, name):
             yield from _parts(batch if columns is None else batch.select(columns))
         return
     try:
-        with opened(path):  # a pipe would be waited for
+        with opened(path):  # reading a pipe would block
             pass
         for batch in pq.ParquetFile(path).iter_batches(_BATCH_ROWS, columns=columns):
             batch.validate(full=True)

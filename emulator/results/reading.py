@@ -64,7 +64,7 @@ class Results:
         schema = None if path.exists() else schema_of(self.folder, name)
         try:
             if schema is None:
-                with opened(path):  # a pipe would be waited for
+                with opened(path):  # reading a pipe would block
                     pass
                 # By its path: threads of Arrow that read a Python file may abort the interpreter at its end (Python 3.11).
                 table = pq.read_table(path)
@@ -85,14 +85,14 @@ class Results:
         return table
 
     def part(self, name: str, columns: Sequence[str], where: pc.Expression | None = None) -> pa.Table:
-        """Some columns of a table, of the rows for which `where` holds; reads no more than that of a finished run.
+        """Some columns of a table, of the rows for which `where` holds; of a finished run, reads only these.
 
         Raises UsageError if the table cannot be read, or lacks a column.
         """
         path = self.folder / f"{name}.parquet"
         try:
             if path.exists():
-                with opened(path):  # a pipe would be waited for
+                with opened(path):  # reading a pipe would block
                     pass
                 table = pq.read_table(path, columns=list(columns), filters=where)
             else:

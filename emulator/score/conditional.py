@@ -40,7 +40,7 @@ class ConditionalError:
         self._mark = np.zeros(trials)
         """The sum up to the last used state."""
         self._squares = np.zeros(trials)
-        """Of the sums from one used state to the next."""
+        """The squares of the sums from one used state to the next."""
         self.slots = 0
         """The number of slots so far; 0 in a mode without errors."""
 

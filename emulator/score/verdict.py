@@ -109,9 +109,9 @@ class SignTest:
     """The p-values of two one-sided tests on the mean, or the median, of a quantity."""
 
     above: float
-    """Of the hypothesis that it is 0 or less: small where it is above 0."""
+    """The p-value of the hypothesis that it is 0 or less: small where it is above 0."""
     below: float
-    """Of the hypothesis that it is 0 or more: small where it is below 0."""
+    """The p-value of the hypothesis that it is 0 or more: small where it is below 0."""
 
 
 SignTestOf = Callable[[Floats], SignTest]

@@ -32,7 +32,7 @@ class ParameterError:
     """Over trials."""
     mean: float
     standard_error: float | None
-    """Of the mean."""
+    """The standard error of the mean."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Rerun's viewer without a screen, which a recording is drawn with.
+"""Rerun's viewer without a screen, which draws recordings.
 
 Needs a Vulkan driver; a software driver is enough, such as Debian's mesa-vulkan-drivers.
 """
@@ -26,7 +26,7 @@ _ATTEMPTS = 3
 _START_SECONDS = 120.0
 _PATIENCE = 600.0  # seconds for one answer, for loading and for drawing; only a viewer that hangs needs them
 _PAUSE = 0.05
-_TINY = 16  # pixels: the smallest picture makes the viewer draw everything once, and is quickly sent
+_TINY = 16  # pixels: even the smallest picture makes the viewer draw everything once, and it is sent quickly
 
 T = TypeVar("T")
 
@@ -66,7 +66,7 @@ class HeadlessViewer:
             self._answer(lambda: self._client.set_time(TIMELINE, sequence=slot, play_state="paused"))
 
     def take(self, view_id: str | None = None) -> bytes:
-        """What is shown, or one of its views, as PNG. The first picture after `show` may be of the moment before."""
+        """What is shown, or one of its views, as PNG. The first picture after `show` may still show the previous moment."""
         return self._answer(lambda: self._client.take_screenshot(view_id))
 
     def frame(self, moment: float) -> bytes:

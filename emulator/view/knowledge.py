@@ -1,4 +1,4 @@
-"""What a receiver knows in a slot: it is in track, it drifts, or it is fooled. Does not use Rerun.
+"""Whether a receiver is in track, drifting or fooled in each slot, for the view. Does not use Rerun.
 
 Source: docs/view.md, who knows what.
 """
@@ -86,7 +86,7 @@ class ErrorDistance:
     def codes(self, known: Codes, distances: Floats) -> NDArray[np.int64]:
         """Indices into `words` of the next slots, (c,), for what is known and distances, (c,).
 
-        A word says what was the largest distance since this stretch of equal knowledge began, so that it does not flicker.
+        A word names the largest distance since this stretch of equal knowledge began, so that it does not flicker.
         """
         step = np.searchsorted(self._steps, np.nan_to_num(distances, nan=np.inf), side="left")
         level = known.astype(np.int64)

@@ -1,6 +1,6 @@
 """The colours of Evedrop, by what they stand for: view, figures and comparisons take theirs from here.
 
-Not here are those of text and grids, and those that a figure takes from the paper that it repeats.
+The colours of text and grids, and those that a figure takes from the paper that it repeats, are elsewhere.
 
 Two colours of one panel differ by at least 15 (CIEDE2000) for full colour vision, deuteranopia, protanopia and tritanopia;
 the colours of a lane differ in brightness, too. tests/view/test_palette.py checks both.

@@ -165,7 +165,7 @@ class _RecordedTrial:
     def plane(self, axes: Axes) -> None:
         """The truth and the estimates, those of eavesdroppers as dots: in the plane of the first two states, or against the slot.
 
-        The truth decides what is shown: an estimate far away leaves the picture.
+        The truth determines the limits: an estimate far from it lies outside the picture.
         """
         first = next(iter(self.rows.values()))
         truth = _path(first, "x")

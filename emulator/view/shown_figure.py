@@ -1,4 +1,4 @@
-"""A figure of matplotlib that a notebook shows by itself, without a display and without pyplot."""
+"""A matplotlib figure that a notebook shows by itself, without a display and without pyplot."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ def draw(path: Path, table: pa.Table, keys: Sequence[str]) -> None:
 
 
 def sweep_figure(table: pa.Table, keys: Sequence[str]) -> ShownFigure:
-    """The same as a figure."""
+    """The plot of a sweep as a figure."""
     rows = table.to_pylist()
     count = len(_others(rows, keys))
     with drawing(*_size(count)) as figure:

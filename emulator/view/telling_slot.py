@@ -1,6 +1,6 @@
 """Chooses the slot of a run that a picture shows.
 
-Source: docs/view.md, the slot of a picture.
+Source: docs/view.md, pictures.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _BEFORE, _AFTER = 105, 25  # slots that the panels show on either side, so that 
 
 
 def telling_slot(results: Results) -> int | None:
-    """The slot of a run whose picture tells most; None for the last one.
+    """The slot of a run whose picture is the most telling; None for the last one.
 
     Raises UsageError if the folder's tables cannot be read.
     """
@@ -58,6 +58,6 @@ def most_telling(errors: Mapping[str, Floats], traces: Mapping[str, Floats], noi
 
 
 def _candidates(slots: int) -> slice:
-    """The slots that may be chosen: not the first, in which receivers begin, and so that the panels are filled."""
+    """The slots that may be chosen: not the first, in which receivers begin, nor the last, so that the panels are filled."""
     first = min(_BEFORE, slots - 1)
     return slice(first, max(first + 1, slots - _AFTER))

@@ -1,4 +1,4 @@
-"""Makes a video of a finished recording without a screen: pictures of the viewer, one after the other, as MP4 or GIF.
+"""Makes an MP4 or a GIF of a finished recording without a screen: pictures of the viewer, one after another.
 
 At any time, only a few pictures are in memory.
 """
@@ -107,7 +107,7 @@ class Mp4File(VideoFile):
     def _failure(self) -> OSError:
         self._told.seek(0)
         text = self._told.read().decode(errors="replace")
-        if (full := os.strerror(errno.ENOSPC)) in text:  # other complaints follow from it
+        if (full := os.strerror(errno.ENOSPC)) in text:  # it causes the other complaints
             return OSError(errno.ENOSPC, full)
         lines = text.strip().splitlines()
         return OSError(lines[-1] if lines else f"ffmpeg ended with status {self._process.returncode}")

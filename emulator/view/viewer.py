@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 _ATTEMPTS = 3
 _WINDOW = ("--hide-welcome-screen",)
 _DARK = "theme=dark"
-"""Whatever the browser's theme, the page has the one that the colours of the panels are made for."""
+"""The page's theme, for which the colours of the panels are made, whatever the browser's theme is."""
 _NOTHING = f"rerun+http://{HOST}:9/proxy"
 """The page's default source: with it Rerun serves only the page, and opens no port for recordings."""
 

@@ -77,11 +77,11 @@ class WireJournal:
         self.amendment_listeners: list[AmendmentListener] = []
         self.event_listeners: list[EventListener] = []
         self.incomplete_since: float | None = None
-        """When the disk had no room for something for the first time; None: it always had room."""
+        """When the disk was full for the first time; None: it always had room."""
         self.recorded = 0
         """The number of all records, when it is closed."""
         self.missing = 0
-        """The number of records that are not on the disk, because it had no room for them; listeners got them."""
+        """The number of records that are not on the disk, because it had no room for them; listeners still got them."""
         self.links = [link.name for link in plan.links]
         """The names of the links, in the order of their codes."""
         self._tell = tell
@@ -293,7 +293,7 @@ class WireJournal:
             now = time.time()
             over = sorted(at for at, part in self._parts.items() if part.full and part.settled + _PATIENCE < now)
             for at in over:
-                if self._parts[at].path is None:  # memory has no room for many parts
+                if self._parts[at].path is None:  # many parts would need too much memory
                     self._convert(at)
             if now < self._convert_after:
                 continue

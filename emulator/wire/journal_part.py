@@ -152,7 +152,7 @@ def _mapped(path: Path, size: int) -> mmap.mmap:
 
 
 def _whole(stored: Records) -> Records:
-    """A copy of those of the stored records that are whole, with their fates."""
+    """A copy of the stored records that are complete, with their fates."""
     records: Records = stored[stored["fate"] != 0]
     records["fate"] -= STORED
     return records

@@ -35,7 +35,7 @@ _QUANTILES = (0.5, 0.9, 0.99)
 
 
 class SummarisedJournal(Protocol):
-    """What a summary needs of a journal: `WireJournal` has it, and so has `JournalOnDisk`."""
+    """What a summary needs from a journal; `WireJournal` and `JournalOnDisk` provide it."""
 
     listeners: list[Listener]
     amendment_listeners: list[AmendmentListener]

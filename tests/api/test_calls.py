@@ -1,4 +1,4 @@
-"""The functions of the Python API: where results are, what they say, and who is told of progress."""
+"""The functions of the Python API: where results are, what they contain, and how progress is reported."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def results() -> RunResults:
 
 
 def test_results_without_out_live_as_long_as_their_object(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a private temporary folder, not in the current one."""
+    """Without `out`, results are in a private temporary folder, not in the current one."""
     monkeypatch.chdir(tmp_path)
     found = montecarlo(SMALL, trials=2)
     folder = found.folder
@@ -63,7 +63,7 @@ def test_a_live_run_has_the_digests_of_memory_and_leaves_nothing_behind(tmp_path
 
 
 def test_out_that_is_in_use_is_only_replaced_when_asked(tmp_path: Path) -> None:
-    """Then nothing of the former results is left; the scenario is checked before."""
+    """`overwrite` leaves none of the earlier results; the scenario is checked first."""
     out = tmp_path / "out"
     first = montecarlo(SMALL, trials=2, out=out)
     (out / "extra.txt").write_text("mine")
@@ -78,7 +78,7 @@ def test_out_that_is_in_use_is_only_replaced_when_asked(tmp_path: Path) -> None:
 
 
 def test_overwrite_never_removes_what_is_not_results(tmp_path: Path) -> None:
-    """Nor results that a run still writes."""
+    """Nor are results overwritten that a run still writes."""
     (tmp_path / "thesis.tex").write_text("years of work")
     with pytest.raises(UsageError, match="is not a results folder, and overwrite=True replaces only those"):
         montecarlo(SMALL, out=tmp_path, overwrite=True)
@@ -87,13 +87,13 @@ def test_overwrite_never_removes_what_is_not_results(tmp_path: Path) -> None:
     (going / "unfinished").mkdir(parents=True)
     held = os.open(going / "unfinished", os.O_RDONLY)
     fcntl.flock(held, fcntl.LOCK_EX)
-    with pytest.raises(UsageError, match="belongs to a run that goes on"):
+    with pytest.raises(UsageError, match="belongs to a run in progress"):
         montecarlo(SMALL, out=going, overwrite=True)
     os.close(held)
 
 
 def failed(error: BaseException, *files: str) -> tuple[Path, list[str]]:
-    """A call that fails after it has written these files: its folder, and what is added to the error."""
+    """A call that fails after it has written these files: its folder, and the notes of the error."""
     place = place_for(None, overwrite=False)
     folder = place.__enter__().folder
     for name in files:
@@ -103,7 +103,7 @@ def failed(error: BaseException, *files: str) -> tuple[Path, list[str]]:
 
 
 def test_results_so_far_of_a_failed_call_stay_until_the_program_ends() -> None:
-    """The error says where; a folder with nothing in it is removed."""
+    """The error says where the results so far are; an empty folder is removed."""
     folder, said = failed(RunError("a process died"), "summary.json")
     assert (folder.exists(), said) == (
         True,
@@ -173,20 +173,20 @@ def test_a_sweep_takes_arrays_and_gives_a_table() -> None:
     ],
 )
 def test_a_sweep_over_no_values_is_refused(over: dict[str, Any], said: str) -> None:
-    """With the key and what is expected."""
+    """The message has the key and what is expected."""
     with pytest.raises(UsageError, match=said):
         sweep(SMALL, over)
 
 
 @pytest.mark.long
 def test_a_comparison_takes_a_scenario_of_python() -> None:
-    """And needs no folder."""
+    """A comparison needs no folder."""
     found = compare(SMALL, schemes=["innovation"], adversaries=["naive"], trials=2)
     assert found.cell("innovation", "naive").eavesdropper is not None
 
 
 def test_a_notebook_shows_progress_and_takes_it_away(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Only the kernel of a notebook does, and only if no function is told; the kernel is stood in for."""
+    """Only the kernel of a notebook shows a bar, and only if no function takes the news; the kernel is a stand-in."""
     shown: list[str] = []
     handle = SimpleNamespace(update=shown.append)
 

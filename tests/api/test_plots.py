@@ -70,7 +70,7 @@ def test_lanes_have_the_outcome_of_every_packet(results: RunResults) -> None:
 
 
 def test_the_plane_shows_the_truth_and_who_follows_it(results: RunResults) -> None:
-    """Far estimates leave the picture; a process of one state is drawn against the slot."""
+    """Estimates far from the truth lie outside the picture; a process of one state is drawn against the slot."""
     (axes,) = results.plot("plane").axes
     truth = np.array([row["x"] for row in results.trials.to_pylist() if row["trial"] == 0 and row["peer"] == "smart"])
     drawn = {str(line.get_label()): np.array(line.get_data()).T for line in axes.get_lines()}
@@ -86,7 +86,7 @@ def test_the_plane_shows_the_truth_and_who_follows_it(results: RunResults) -> No
 def test_a_figure_shows_itself_in_a_notebook_without_a_display(
     results: RunResults, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As a PNG, which pyplot and its windows have no part in."""
+    """A notebook shows the figure as a PNG, without pyplot and its windows."""
     monkeypatch.delenv("DISPLAY", raising=False)
     figure = results.plot()
     assert len(figure.axes) == 3
@@ -94,7 +94,7 @@ def test_a_figure_shows_itself_in_a_notebook_without_a_display(
 
 
 def test_what_cannot_be_drawn_is_refused(results: RunResults) -> None:
-    """With what can be; errors alone need no recorded trial."""
+    """The message lists what can be shown; errors alone need no recorded trial."""
     with pytest.raises(UsageError, match="there is no panel 'error'; expected errors, lanes, plane"):
         results.plot("error")  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="trial 7 is not recorded; recorded are 0, 1"):

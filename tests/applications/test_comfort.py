@@ -99,7 +99,7 @@ def test_the_view_is_given_every_curve_of_its_panels() -> None:
     ],
 )  # fmt: skip
 def test_mistakes_are_named(changes: dict[str, Any], said: str) -> None:
-    """Of the table itself, of names, and of expectations, all in a line that says what would be right."""
+    """Mistakes in the table, in names and in expectations each get a line that says what is expected."""
     with pytest.raises(ScenarioError) as caught:
         load("heated-room", changes)
     assert any(line.startswith(said) for line in caught.value.mistakes), caught.value.mistakes

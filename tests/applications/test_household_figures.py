@@ -69,7 +69,7 @@ def test_a_mistake_about_the_house_is_named(changes: dict[str, Any], said: str) 
 def test_without_the_solver_one_line_says_what_to_install(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Of the scenario that needs it; the list of scenarios, and those that do not, need no extra."""
+    """Only the scenario that uses the extra needs it; the list of scenarios and the other scenarios do not."""
     monkeypatch.setattr(mpc, "find_spec", lambda _: None)
     assert cli.main(["check", "microgrid-mpc"]) == 2
     told = capsys.readouterr().err

@@ -199,7 +199,7 @@ BASE = {"policy": "always", "threshold": 8.0, "watermark": [[0.3]]}
     ],
 )  # fmt: skip
 def test_mistakes_are_named(changes: dict[str, Any], said: str) -> None:
-    """Of the table itself, and of the table with plant, controller and events, each with what would be right."""
+    """Mistakes in the table, and in its use with plant, controller and events, say what is expected."""
     with pytest.raises(ScenarioError) as caught:
         load("replay-attack", {"expect": [], **changes})
     assert any(line.startswith(said) for line in caught.value.mistakes), caught.value.mistakes

@@ -61,7 +61,7 @@ def test_a_table_stays_a_table_as_long_as_it_fits() -> None:
 
 
 def test_a_report_fits_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What commands print their tables with shows them row by row."""
+    """On a narrow terminal, a table is printed row by row."""
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     monkeypatch.setenv("COLUMNS", "32")
     console = terminal()

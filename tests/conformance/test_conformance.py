@@ -168,7 +168,7 @@ class NoFirst(Innovation):
     """Sends innovations alone."""
 
     def shared(self, keys: Any, batch: Any) -> SharedSecret:
-        """Of which slot 0 has none."""
+        """The shared secret, without a state in slot 0."""
         return AllInnovations(self.process, self.state_probability, keys, batch)
 
 

@@ -166,7 +166,7 @@ def test_every_command_in_memory_names_class_slot_and_trials(
 
 
 OFTEN = ("packet", "uses", "block", "follow")
-"""Of each way into a class one: what else may break is told by the same code, in a live run only by `make test-long`."""
+"""One case for each way into a class; the other cases use the same code, and only `make test-long` runs them live."""
 
 
 @pytest.mark.parametrize(

@@ -100,11 +100,11 @@ WRONG = {
     "two.toml": f"two.toml has two routers, and {SERVICES}",
     "two-eavesdropers": "no scenario two-eavesdropers",
 }
-"""Scenario → what is said of it."""
+"""Scenario → the message that refuses it."""
 
 
 def test_of_a_scenario_that_does_not_fit_nothing_is_started(project: Make) -> None:
-    """It is said why, in one line; so it is of a user that is none."""
+    """One line says why; so does one for a user that does not exist."""
     one = project()
     shutil.copy("scenarios/cut.toml", one.folder / "one.toml")
     two = Path("scenarios/two-eavesdroppers.toml").read_text(encoding="utf-8")

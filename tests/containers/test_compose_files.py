@@ -1,4 +1,4 @@
-"""What the files of the image and of its services must say, whatever Docker there is."""
+"""Tests of the Dockerfile and of docker-compose.yml that need no Docker."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def services_of(folder: Path) -> dict[str, Any]:
 
 
 def test_every_process_has_a_service_a_brief_and_a_network(own: Path) -> None:
-    """Each reaches its router alone and has its own brief alone; all names are strings, and the scenario is the one given."""
+    """Each service reaches only its router and has only its own brief; names are strings, and the scenario is the one given."""
     found = services_of(own)
     services = found["services"]
     mounts = [one.split(":") for one in services["briefs"]["volumes"][2:]]
@@ -134,7 +134,7 @@ def test_docker_compose_accepts_the_files(own: Path) -> None:
     ],
 )
 def test_what_containers_cannot_run_is_refused(words: tuple[str, ...], said: str, evedrop: Evedrop) -> None:
-    """In one sentence, and no file is written."""
+    """The message is one sentence, and no file is written."""
     folder = evedrop.folder / "file"
     folder.mkdir()
     shutil.copy(ROOT / "scenarios" / "two-eavesdroppers.toml", folder / "two.toml")

@@ -1,7 +1,7 @@
-"""Carries out the command blocks of a page in order, and compares what they print with what the page shows.
+"""Runs the command blocks of a page in order, and compares their output with what the page shows.
 
-A fence of the language `console` is carried out: a line that begins with `$ ` is a command, the lines below it are its output,
-errors included. Output that is not shown is not compared, but the command must succeed. `…` stands for any text within a line,
+In a fence of the language `console`, a line that begins with `$ ` is a command, and the lines below it are its output, errors
+included. Output that is not shown is not compared, but the command must succeed. `…` stands for any text within a line,
 and on a line of its own for any lines. All commands of a page share a folder. A comment directly above a fence says more:
 
     <!-- file: mine.toml -->        the text is written to this file, as it is if its first line is `# mine.toml`
@@ -41,13 +41,13 @@ class Block:
 
     @property
     def file(self) -> str | None:
-        """The file that it is, by the comment above it or its own first line."""
+        """The name of the file that it contains, by the comment above it or its own first line."""
         found = re.match(r"# ([\w./-]+\.(?:py|toml))\n", self.text)
         return self._note("file") or (found[1] if found else None)
 
     @property
     def not_run(self) -> str | None:
-        """Why its commands are not carried out."""
+        """Why its commands are not run."""
         return self._note("not run")
 
     @property
@@ -57,12 +57,12 @@ class Block:
 
     @property
     def is_run(self) -> bool:
-        """Whether its commands are carried out."""
+        """Whether its commands are run."""
         return self.language == "console" and self.not_run is None
 
     @property
     def has_commands(self) -> bool:
-        """Whether it has a command for a shell, carried out or not."""
+        """Whether it has a command for a shell, run or not."""
         return self.language in {"", "sh", "text", "console"} and _COMMAND.search(self.text) is not None
 
     def commands(self) -> Iterator[tuple[str, str]]:
@@ -93,7 +93,7 @@ def matches(printed: str, shown: str) -> bool:
 
 @dataclass(frozen=True)
 class Carried:
-    """A command that was carried out: what the page shows, what it printed, and whether it ended as it should."""
+    """A command that was run: what the page shows, what it printed, and whether it ended as it should."""
 
     command: str
     shown: str

@@ -1,4 +1,4 @@
-"""The command blocks of the pages are carried out, and print what the pages show."""
+"""The command blocks of the pages print what the pages show."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ PAGES = {
     path.relative_to(ROOT).as_posix(): path for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 }
 QUICK = {"docs/links.md"}
-"""Pages whose commands take few seconds; those of the others are carried out by `make docs`."""
+"""Pages whose commands take few seconds; `make docs` runs those of the others."""
 RUN = [name for name, path in PAGES.items() if any(block.is_run for block in blocks(path))]
 NOT_RUN = {
     "README.md": 2,
@@ -32,7 +32,7 @@ NOT_RUN = {
     "docs/upstream.md": 2,
     "docs/wire.md": 5,
 }
-"""How many blocks of commands of each page are not carried out; those of other pages need a reason."""
+"""The number of command blocks of each page that are not run; those of other pages need a reason."""
 
 
 @pytest.mark.parametrize(
@@ -45,13 +45,13 @@ def test_the_commands_of_a_page_print_what_it_shows(name: str, tmp_path: Path) -
 
 
 def test_no_further_block_of_commands_is_left_out() -> None:
-    """Those that are not carried out are counted."""
+    """The blocks that are not run are counted."""
     left_out = {name: sum(one.has_commands and not one.is_run for one in blocks(path)) for name, path in PAGES.items()}
     assert {name: count for name, count in left_out.items() if count} == NOT_RUN
 
 
 def test_what_is_shown_only_says_why() -> None:
-    """A console that is not carried out names its reason."""
+    """A block that is not run names its reason."""
     consoles = [block for path in PAGES.values() for block in blocks(path) if block.language == "console"]
     assert consoles
     assert all(block.is_run or block.not_run for block in consoles)

@@ -1,4 +1,4 @@
-"""The Python of docs/python.md runs as it stands, and its mistakes are told as it says."""
+"""The Python of docs/python.md runs as it is, and raises the errors that it shows."""
 
 from __future__ import annotations
 

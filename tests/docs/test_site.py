@@ -1,4 +1,4 @@
-"""What the site needs of the pages, without building it: `make docs` checks the rest."""
+"""What the site needs from the pages, without building it; `make docs` checks the rest."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ class Run(Protocol):
 
     @property
     def variant(self) -> Variant:
-        """Of which it is a run."""
+        """The kind of run."""
 
     @property
     def folder(self) -> Path:

@@ -86,7 +86,7 @@ def _is_free(place: Path) -> bool:
 
 
 def nothing_left(folder: Path) -> None:
-    """No process is left on any host, and no file of one."""
+    """No process and no file of a process is left on any host."""
     for host in (*PLACES, "here"):
         place = folder / host / "temporary" if host in PLACES else folder / host
         wait_until(partial(_is_free, place), f"no process left of {host}", 60.0)

@@ -25,7 +25,7 @@ class Stage:
     put: SimpleQueue[tuple[str, bytes]] = field(default_factory=SimpleQueue)
     kept: dict[str, ReplayBuffer] = field(default_factory=dict)
     commands: SimpleQueue[bytes] = field(default_factory=SimpleQueue)
-    """Of the conductor, as its classes pack them."""
+    """The conductor's commands, as its classes pack them."""
 
     def session(self, brief: AnyBrief) -> FakeSession:
         """In the place of `Session`."""

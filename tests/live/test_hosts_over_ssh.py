@@ -72,7 +72,7 @@ def hosts(evedrop: Evedrop, server: Sshd, command: str = OURS, port: int | None 
 
 
 def nothing_left(evedrop: Evedrop) -> None:
-    """No process is left on any host, and no file of one."""
+    """No process and no file of a process is left on any host."""
     wait_until(lambda: not with_mark(str(evedrop.temporary)), "no process left on any host")
     assert sorted(path.name for path in evedrop.temporary.rglob("*")) == sorted(PLACES)
 
@@ -99,7 +99,7 @@ def test_over_ssh_it_is_the_same_run(evedrop: Evedrop, server: Sshd) -> None:
 
 
 def running(evedrop: Evedrop, server: Sshd) -> Live:
-    """A run that does not end by itself, under way."""
+    """A run in progress that does not end by itself."""
     words = ("--set", "event=[]", "--set", "expect=[]", "--hosts", str(hosts(evedrop, server)))
     live = evedrop.live("restart", *ENDLESS, *words)
     live.running()
@@ -284,7 +284,7 @@ def test_ctrl_c_while_a_host_does_not_answer_ends_at_once(evedrop: Evedrop, serv
 
 
 def test_a_host_ends_when_its_launcher_is_silent(evedrop: Evedrop) -> None:
-    """Although its standard input is still open."""
+    """It ends although its standard input is still open."""
     host = evedrop.start(["-m", "evedrop"], ("host",), {"stdin": subprocess.PIPE})
     assert host.stdin is not None
     assert host.stdout is not None

@@ -105,13 +105,13 @@ def test_only_loopback_has_no_warning() -> None:
     "text", ["9464", ":9464", "127.0.0.1", "127.0.0.1:", "127.0.0.1:65536", "::1:9464", "[127.0.0.1]:1", "a b:1"]
 )
 def test_what_is_not_an_address_is_refused(text: str) -> None:
-    """The error shows one that is."""
+    """The error shows a valid address."""
     with pytest.raises(UsageError, match=r"127\.0\.0\.1:9464"):
         MetricsAddress.of(text)
 
 
 def test_a_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the extra that brings it."""
+    """The message names the extra that installs it."""
     monkeypatch.setitem(sys.modules, "prometheus_client", None)
     with (
         pytest.raises(UsageError, match=r"evedrop\[metrics\]"),

@@ -24,7 +24,7 @@ from tests.conftest import Evedrop, wait_until
 from tests.live.test_shards import child, close, in_order
 
 TIMED = {"decisions", "mean_solve_seconds", "longest_solve_seconds"}
-"""Of the controller, what says how its own process did."""
+"""The controller's figures that depend on its own process."""
 TRIALS, SLOTS, RECORDED = 5, 300, 4
 HOUSE: dict[str, Any] = {
     "trials": TRIALS,

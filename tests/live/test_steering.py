@@ -384,8 +384,8 @@ def test_a_hold_that_is_told_once_more_is_one_hold() -> None:
     assert run.steering.at is None
 
 
-def test_a_router_that_is_started_anew_is_told_all_changes() -> None:
-    """Of the links that an operator has changed all that changes is listed, from the first slot on; of the others nothing."""
+def test_a_restarted_router_receives_all_changes() -> None:
+    """Links that an operator has changed are listed with all their changes, from the first slot on; others are not listed."""
     run = Run({"at": 5, "link": "legitimate", "set": {"quality": 0.5}}, {"at": 60, "cut": "smart"})
     assert run.steering.changes == {}
     run.holds(5)

@@ -108,7 +108,7 @@ def test_a_mistake_is_told_as_for_a_file(changes: dict[str, Any]) -> None:
 
 
 def test_all_mistakes_of_a_new_scenario_are_told_at_once() -> None:
-    """Missing entries and a misspelt one, with a hint."""
+    """Missing entries are named, and a misspelt one gets a hint."""
     with pytest.raises(ScenarioError) as caught:
         Scenario({"title": "x", "slotz": 3})
     said = caught.value.mistakes
@@ -149,14 +149,14 @@ def test_a_class_of_a_module_is_named_and_its_folder_known(own: Any, tmp_path: P
 
 
 def test_classes_of_two_folders_are_refused(own: Any, tmp_path: Path) -> None:
-    """Processes look for modules in one folder."""
+    """The processes of a run look for modules in one folder only."""
     (tmp_path / "other").mkdir()
     with pytest.raises(ScenarioError, match=r"of several folders, .*other and .*; put the modules into one folder"):
         vehicle(encoding={"scheme": own.Flipped}, modules=str(tmp_path / "other"))
 
 
 def test_a_class_that_no_process_can_import_is_refused_with_the_way_out(own: Any) -> None:
-    """That of a notebook's cell, of a function, and one whose module was loaded again."""
+    """Classes of a notebook's cell, of a function, and of a module that was loaded again are refused."""
 
     class Inside(Innovation):
         pass
@@ -189,7 +189,7 @@ def test_a_scenario_is_short_when_printed() -> None:
 
 
 def test_the_class_alone_says_where_scenarios_are_made(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without the room that checks whole scenarios none is made."""
+    """Without `evedrop.loading`, which checks whole scenarios, no scenario is made."""
     monkeypatch.setattr(Scenario, "builders", None)
     with pytest.raises(UsageError, match="from evedrop import Scenario"):
         vehicle()

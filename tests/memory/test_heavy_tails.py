@@ -41,7 +41,7 @@ def test_infinite_variance_is_flagged_where_theory_says(mu_d: float, tmp_path: P
 
 
 def test_a_marginally_stable_process_has_no_heavy_tails(tmp_path: Path) -> None:
-    """ρ = 1: nobody's variance is infinite, everybody is judged by means."""
+    """ρ = 1: no receiver's variance is infinite, so all verdicts use means."""
     summary = montecarlo("eavesdroppers", slots=40, trials=20, out=tmp_path / "run").summary
     assert not any(peer["infinite_variance"] for peer in summary["peers"].values())
     assert {verdict["judged_by"] for verdict in summary["secrecy"].values()} == {"mean"}

@@ -109,7 +109,7 @@ def test_workers_end_with_who_started_them(evedrop: Evedrop) -> None:
 
 
 def test_a_worker_is_given_no_tokens(evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of the environment of the command it gets what it needs to run, and nothing else."""
+    """It gets only those variables of the command's environment that it needs to run."""
     monkeypatch.setenv("ACCESS_TOKEN", "only the command has this")
     live, crew = started(evedrop, 2)
     given = [Path(f"/proc/{pid}/environ").read_bytes() for pid in crew]

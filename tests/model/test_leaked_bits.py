@@ -49,7 +49,7 @@ def test_the_bits_of_an_innovation(model: Model) -> None:
 
 
 def joint_covariance(process: Process, heard: list[int]) -> tuple[Matrix, Matrix, Matrix]:
-    """Of the path (x_0, w_0, …), of the innovation packets of these slots, and the covariance of path and packets."""
+    """The covariance of the path (x_0, w_0, …), that of the innovation packets of these slots, and that of path and packets."""
     n, last = process.n, max(heard)
     A, Q = exact(process.A), exact(process.Q)
     sigmas = rationals.state_covariances(A, Q, exact(process.initial_covariance))

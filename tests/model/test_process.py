@@ -190,7 +190,7 @@ def test_a_process_of_too_many_states_is_refused() -> None:
 
 @pytest.mark.parametrize("A", [np.array([[1.0, 0.1], [0.0, 1.0]]), np.eye(2)])
 def test_a_singular_Q_is_refused_with_the_entry_that_allows_it(A: Floats) -> None:
-    """Such as that of a double integrator; a Q with a negative eigenvalue is not allowed by any entry."""
+    """The Q of a double integrator gets a hint; no entry allows a Q with a negative eigenvalue."""
     Q = np.diag([0.0, 0.01])
     found = mistakes_of(A, Q, np.eye(2))
     assert found

@@ -1,4 +1,4 @@
-"""The notebooks of the documents run from top to bottom, in an empty folder, in a kernel without a display."""
+"""The notebooks of docs/ run from top to bottom, in an empty folder, in a kernel without a display."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ NOTEBOOKS = sorted(path.stem for path in FOLDER.glob("*.ipynb"))
 
 
 def test_there_are_four() -> None:
-    """So that the tests below test something."""
+    """There are notebooks for the tests below."""
     assert NOTEBOOKS == ["a-study-for-a-paper", "first-run", "your-own-scheme", "your-own-system"]
 
 
 @pytest.mark.parametrize("name", NOTEBOOKS)
 def test_notebooks_are_kept_without_outputs(name: str) -> None:
-    """Outputs would be pictures in every change, and would not be what this version computes."""
+    """Outputs would add pictures to every change, and might be those of an older version."""
     found = json.loads((FOLDER / f"{name}.ipynb").read_text(encoding="utf-8"))
     for cell in found["cells"]:
         assert (cell.get("outputs", []), cell.get("execution_count")) == ([], None)

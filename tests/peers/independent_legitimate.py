@@ -218,7 +218,7 @@ class Estimator:
         return ([a + (b - c) for a, b, c in zip(x, z, chi, strict=True)], C), 2
 
     def digest(self) -> str:
-        """Of the whole run."""
+        """The digest of the whole run."""
         whole = sha256()
         for r in range(self.R):
             for block in sorted(self.blocks):

@@ -332,7 +332,7 @@ class Impatient(TestClock):
 
 @pytest.mark.parametrize("slowest", ["a", "b", "observer"])
 def test_sensor_is_never_a_window_ahead_of_the_slowest(slowest: str, stage: Stage) -> None:
-    """It sends slot k exactly if k < window + the lowest progress; nobody's progress stands in for another's."""
+    """It sends slot k exactly if k < window + the lowest progress; no process's progress replaces another's."""
     followers = ("a", "b", "observer")
     session = stage.session(briefs()["sensor"])
     window = Window(session, followers, 10, ReplayBuffer(print), Impatient())

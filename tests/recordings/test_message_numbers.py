@@ -78,7 +78,7 @@ def test_a_long_silence_can_be_left_out() -> None:
 
 
 def test_too_many_outcomes_are_refused() -> None:
-    """Before memory is taken for them."""
+    """They are refused before memory is allocated for them."""
     arrivals = MessageArrivals(np.array([0, 1, 10**9]), np.array([0.0, 1.0, 1e9]))
     with pytest.raises(ValueError, match="more than 10000000 outcomes"):
         series_of(arrivals)

@@ -1,4 +1,4 @@
-"""The report on one page: whole, safe, without requests, with the words of the terminal; and it changes nothing else."""
+"""The report on one page: complete, safe, without requests, with the sentences of the terminal; the results stay unchanged."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ QUICK: dict[str, Any] = {"slots": 60, "plan": Plan(workers=1)}
 
 @pytest.fixture(scope="module")
 def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A study with a hostile title, of which one expectation fails."""
+    """A study with a hostile title, in which one expectation fails."""
     expect = [
         {"figure": "legitimate.received_fraction", "above": 0.5},
         {"figure": "smart.received_fraction", "above": 2},
@@ -75,7 +75,7 @@ def test_a_page_says_what_the_terminal_says_and_does_nothing_else(study: Path) -
 def test_a_report_that_cannot_be_written_leaves_everything_as_it_was(
     study: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The older page and all results stay; the run is told in a warning, and nothing is left half written."""
+    """The older page and all results stay; a warning says so, and no partial file is left."""
 
     def contents() -> dict[str, bytes]:
         return {path.name: path.read_bytes() for path in study.iterdir()}
@@ -95,7 +95,7 @@ def test_a_report_that_cannot_be_written_leaves_everything_as_it_was(
 
 
 def test_a_folder_of_another_version_has_the_parts_that_can_be_read(study: Path, tmp_path: Path) -> None:
-    """A table without a column is named in its part; a folder that is none is refused by the run's warning alone."""
+    """A table without a column is named in its part; a folder that is not a results folder gives only a warning."""
     for name in ("summary.json", "scenario.toml", "trials.parquet"):
         (tmp_path / name).write_bytes((study / name).read_bytes())
     pq.write_table(pq.read_table(study / "slots.parquet").drop_columns(["standard_error"]), tmp_path / "slots.parquet")
@@ -107,7 +107,7 @@ def test_a_folder_of_another_version_has_the_parts_that_can_be_read(study: Path,
 
 @pytest.mark.parametrize("mode", [Mode.COVARIANCE_ONLY, Mode.ERROR_COORDINATES])
 def test_every_mode_has_its_page(tmp_path: Path, mode: Mode) -> None:
-    """Without recorded states there are no lanes, and all else is there."""
+    """Without recorded states there are no lanes, but all other parts are there."""
     folder = tmp_path / "study"
     montecarlo("vehicle", trials=3, out=folder, slots=30, plan=Plan(mode, workers=1))
     write_report(folder)

@@ -247,7 +247,7 @@ NAMES = ("legitimate", "smart")
 
 
 def sums(count: int) -> SlotSums:
-    """Of so many slots of one trial."""
+    """Of this number of slots of one trial."""
     return SlotSums(*(np.ones(count) for _ in fields(SlotSums)))
 
 

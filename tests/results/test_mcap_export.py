@@ -101,7 +101,7 @@ def test_the_file_has_every_value_of_the_results(
 
 
 def test_events_are_shown_as_a_log(live: Results, tmp_path: Path) -> None:
-    """By Foxglove's own schema, so that its Log panel shows them."""
+    """Events use Foxglove's own schema, so that its Log panel shows them."""
     from mcap.reader import make_reader
 
     export_mcap(live, tmp_path / "r.mcap")
@@ -114,7 +114,7 @@ def test_events_are_shown_as_a_log(live: Results, tmp_path: Path) -> None:
 
 
 def test_mistakes_are_said(live: Results, tmp_path: Path, evedrop: Evedrop) -> None:
-    """With status 2, and no file is left."""
+    """The command ends with status 2 and leaves no file."""
     with pytest.raises(UsageError, match="give a --period"):
         export_mcap(live, tmp_path / "r.mcap", 1e9)
     assert ".mcap" in evedrop("export", str(live.folder), "r.csv").err
@@ -133,7 +133,7 @@ def test_mistakes_are_said(live: Results, tmp_path: Path, evedrop: Evedrop) -> N
 
 
 def test_a_missing_package_is_named(live: Results, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the extra that brings it."""
+    """The message names the extra that installs it."""
     monkeypatch.setitem(__import__("sys").modules, "mcap.writer", None)
     with pytest.raises(UsageError, match=r"evedrop\[mcap\]"):
         export_mcap(live, tmp_path / "r.mcap")

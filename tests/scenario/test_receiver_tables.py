@@ -107,7 +107,7 @@ CHAIN = {"model": "markov", "transitions": [[0.9, 0.1], [0.5, 0.5]], "loss": [0.
     ],
 )  # fmt: skip
 def test_a_mistake_of_a_link_is_named(link: dict[str, Any], said: str) -> None:
-    """Of the legitimate link and of an eavesdropper's: one line each, with the path."""
+    """A mistake in the legitimate link or in an eavesdropper's link gets one line, with the path of the entry."""
     for receiver in ("legitimate", "eavesdroppers.smart"):
         (line,) = mistakes({f"{receiver}.link": link})
         assert line.startswith(f"{receiver}.{said}")

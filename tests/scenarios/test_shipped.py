@@ -22,7 +22,7 @@ BATCHES = {"a later trial": (1, 17), "forty trials": (40, 5)}
 """Trials, and the number of the first."""
 
 SHORTER: dict[str, dict[str, Any]] = {"learning": {"slots": 60, "expect": []}}
-"""Of a scenario whose slots take long, what its one trial changes; its forty trials run as they are."""
+"""Changes of scenarios whose slots take long, for the test with one trial; the test with forty trials uses none."""
 
 Pair = tuple[Results, Results]
 

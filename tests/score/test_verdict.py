@@ -36,7 +36,7 @@ def around(level: float | Floats, spread: float = 0.1, trials: int = TRIALS) -> 
 
 
 def expectation(link: dict[str, Any], mu_d: float, uses: tuple[float, float] | None = None) -> Expectation:
-    """Of the legitimate estimator, or of an eavesdropper with P(b|0) and P(b|1), behind a link."""
+    """What theory expects of the legitimate estimator, or of an eavesdropper with P(b|0) and P(b|1), behind a link."""
 
     def outcomes_at(quality: float) -> Outcomes:
         return Outcomes.legitimate(quality, mu_d) if uses is None else Outcomes.eavesdropper(quality, mu_d, *uses)
@@ -210,7 +210,7 @@ def test_where_there_is_no_theory_the_run_alone_is_judged(links: tuple[dict[str,
 
 
 def test_an_error_without_a_known_bound_must_not_grow() -> None:
-    """If both errors grow, the legitimate one may be unbounded as well; with a known bound it may grow up to that."""
+    """If both errors grow, the legitimate error may be unbounded, too; with a known bound it may grow up to that."""
     user, other = tally(around(np.linspace(1e-5, 2e-5, WINDOWS))), tally(around(np.linspace(1.0, 9.0, WINDOWS)))
     unknown = expectation(ROTE, 0.5), expectation(good(0.5), 0.5, (1.0, 1.0))
     found = secrecy((user, unknown[0]), ("eve", other, unknown[1]))
@@ -220,7 +220,7 @@ def test_an_error_without_a_known_bound_must_not_grow() -> None:
 
 
 def test_a_bound_from_below_can_promise_and_cannot_deny() -> None:
-    """Of who has no closed form the genie is a bound: what holds against it holds; what does not is left open."""
+    """Without a closed form, the genie is a bound: secrecy that holds against the genie holds; otherwise it is left open."""
     user, other = tally(around(1e-5)), tally(around(np.linspace(1.0, 9.0, WINDOWS)))
 
     def found(process: Process, mu: float, mu_e: float) -> Secrecy:

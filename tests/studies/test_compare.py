@@ -27,7 +27,7 @@ from evedrop.studies.matchups import ATTACKERS, usual_adversaries
 from tests.pages import checked
 
 MARGINAL: dict[str, Any] = {"slots": 150, "trials": 60, "process__initial_covariance": [[1e-3, 0.0], [0.0, 1e-4]]}
-"""Of the scenario `bayesian`: long enough for verdicts, and no first slot that rules the mean of the few trials that lose it."""
+"""Changes of `bayesian`: long enough for verdicts, and trials that lose the first slot do not dominate the mean."""
 
 VERDICTS = {
     ("plain", "naive"): SecrecyKept.BROKEN,

@@ -49,7 +49,7 @@ def test_every_fate_and_state_has_a_colour_of_the_table() -> None:
 
 
 def test_a_closed_loop_has_no_graph(simulated: Callable[..., Simulated]) -> None:
-    """Its view is full of panels of the plant."""
+    """The view of a closed loop has panels of the plant instead."""
     scene = simulated(20).scene
     assert LastPacket.applies(scene)
     assert not LastPacket.applies(replace(scene, moving=("P (kW)",)))

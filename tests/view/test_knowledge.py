@@ -1,4 +1,4 @@
-"""What a receiver knows, and the lanes that say so."""
+"""Whether a receiver is in track, drifting or fooled, and the lanes that show it."""
 
 from __future__ import annotations
 

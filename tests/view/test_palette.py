@@ -48,7 +48,7 @@ def test_lanes_use_the_colours_of_the_table() -> None:
 
 @pytest.mark.parametrize("name", ["microgrid", "heated-room", "replay-attack"])
 def test_panels_of_applications_use_the_colours_of_the_table(name: str) -> None:
-    """Curves that are not of receivers have colours of the plant, each another one."""
+    """Curves that do not show receivers have colours of the plant, each a different one."""
     scenario = load(name)
     loop = controlled_plant(scenario)
     assert loop is not None

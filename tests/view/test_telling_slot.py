@@ -32,7 +32,7 @@ def test_where_the_legitimate_estimator_errs_as_well_there_is_nothing_to_see() -
 
 
 def test_without_a_fooled_eavesdropper_all_count() -> None:
-    """A drifting one is what there is to see."""
+    """If no eavesdropper is ever fooled, drifting ones count."""
     errors = errors_of(1000, drifting=(700, 900.0))
     assert most_telling(errors, believed(errors, drifting=900.0), 0.1) == 700
 

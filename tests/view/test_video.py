@@ -86,7 +86,7 @@ def test_an_mp4_has_all_frames_in_order(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["v.gif", "v.mp4"])
 def test_an_interrupt_leaves_no_file(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nor a temporary one, nor a process of ffmpeg."""
+    """Neither a temporary file nor a process of ffmpeg is left."""
     if name.endswith("mp4"):
         ffmpeg()
 
@@ -129,7 +129,7 @@ def test_impossible_videos_are_refused(name: str, size: tuple[int, int], rate: f
 
 
 def test_a_missing_ffmpeg_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    """So is the extra that brings it; a GIF needs none."""
+    """The message names the extra that installs ffmpeg; a GIF needs none."""
     monkeypatch.setitem(__import__("sys").modules, "imageio_ffmpeg", None)
     with pytest.raises(UsageError, match=r"evedrop\[video\]"):
         check_video(Path("v.mp4"), SIZE, 15.0)
@@ -149,7 +149,7 @@ def test_a_missing_ffmpeg_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_options_that_do_not_fit_are_refused(
     words: tuple[str, ...], advice: str, finished: Path, evedrop: Evedrop
 ) -> None:
-    """With status 2 and the option to give."""
+    """The command ends with status 2 and names the option to give."""
     done = evedrop("view", str(finished), *words)
     assert done.status == 2
     assert advice in done.err

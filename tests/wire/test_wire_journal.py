@@ -173,7 +173,7 @@ def test_numbers_go_on_after_a_kill_whatever_the_killed_wire_heard(tmp_path: Pat
 
 
 def test_parts_are_read_in_the_order_of_their_numbers(tmp_path: Path) -> None:
-    """Also when there are more than their names have digits for."""
+    """Their order is right even when there are more parts than their names have digits for."""
     with WireJournal(tmp_path, wire_plan()) as journal:
         put(journal, 0)
     made = tmp_path / "journal" / "001-0001.parquet"
@@ -352,7 +352,7 @@ print(*told, sep="\\n")
 
 @pytest.mark.parametrize("then", ["full", "room again"])
 def test_on_a_full_disk_the_wire_goes_on(then: str, tmp_path: Path) -> None:
-    """Listeners get every record; the journal keeps what there is room for, and says once from when on it is incomplete.
+    """Listeners get every record; the journal keeps what the disk has room for, and says once since when it is incomplete.
 
     With room again, the parts that were in memory are written as well.
     """

@@ -1,4 +1,4 @@
-"""What the view of a wire says of its messages: lines of the events, states of lanes, and shares of losses."""
+"""What the view of a wire says about its messages: lines of events, states of lanes, and shares of losses."""
 
 from __future__ import annotations
 

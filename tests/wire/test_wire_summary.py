@@ -267,7 +267,7 @@ def test_a_latency_is_that_of_its_quantile(tmp_path: Path) -> None:
 
 
 def test_the_exit_status_tells_of_an_incomplete_journal_and_of_unaccounted_messages(tmp_path: Path) -> None:
-    """1 and 3, each with a line."""
+    """The exit status is 1 or 3, each with a line."""
     with WireJournal(tmp_path, wire_plan()) as journal:
         summary = WireSummary(wire_plan(), journal)
     assert summary.finish(tmp_path) == 0

@@ -370,7 +370,7 @@ def test_a_word_that_is_not_a_view_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_a_video_of_a_wire(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    """It shows the times that were asked for; a time that is not there is refused before anything is drawn."""
+    """It shows the requested times; a time outside the wire is refused before anything is drawn."""
     path = folder / "w.gif"
     words = ["view", str(folder), "--video", str(path), "--size", "400x320", "--times"]
     status = main([*words, "0:99999:50000"])
@@ -388,6 +388,6 @@ def test_a_video_of_a_wire(folder: Path, capfd: pytest.CaptureFixture[str]) -> N
 def test_a_video_of_a_wire_needs_times(
     words: tuple[str, ...], advice: str, folder: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """A wire has no slots."""
+    """A wire has no slots, so `--slots` is refused."""
     assert main(["view", str(folder), "--video", str(folder / "w.gif"), *words]) == 2
     assert advice in capfd.readouterr().err

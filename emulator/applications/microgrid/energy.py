@@ -21,11 +21,11 @@ class EnergyDifference:
     """The difference of a run's grid power from another run's, as shares of the other's, per trial (…)."""
 
     net: Floats
-    """Of net energy: |Σ P − Σ P′| / |Σ P′|."""
+    """The difference of net energy: |Σ P − Σ P′| / |Σ P′|."""
     total: Floats
-    """Of the energy through the meter in both directions: |Σ |P| − Σ |P′|| / Σ |P′|."""
+    """The relative difference of the energy through the meter in both directions: |Σ |P| − Σ |P′|| / Σ |P′|."""
     summed: Floats
-    """Slot by slot: Σ |P − P′| / Σ |P′|. At least as large as the two others, as shares of the same Σ |P′|."""
+    """The sum of the differences of single slots: Σ |P − P′| / Σ |P′|. At least as large as both others, as shares of Σ |P′|."""
 
 
 @final

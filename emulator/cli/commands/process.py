@@ -190,11 +190,11 @@ def _observed(parser: argparse.ArgumentParser) -> None:
 def _briefs(parser: argparse.ArgumentParser) -> None:
     where = parser.add_mutually_exclusive_group(required=True)
     where.add_argument("--out", type=Path, metavar="DIR", help="folder for the briefs")
-    where.add_argument(
-        "--compose", type=Path, metavar="DIR", help="write the files with which Docker Compose starts the run, instead"
-    )
+    where.add_argument("--compose", type=Path, metavar="DIR", help="write the files for Docker Compose instead")
     parser.add_argument(
-        "--overwrite", action="store_true", help="with --compose: DIR may have files; replace those of the same names"
+        "--overwrite",
+        action="store_true",
+        help="with --compose: DIR may contain files; replace those with the same names",
     )
     parser.add_argument(
         "--results",

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from evedrop.view.viewer import Viewer
 
 _MOST_RATE = 60
-_BEFORE, _AFTER = 60, 20  # slots of a video around the slot that tells most
+_BEFORE, _AFTER = 60, 20  # slots of a video around the most telling one
 _LEAST, _MOST = 320, 3840  # pixels; the viewer takes more than its time limit for larger pictures
 
 
@@ -133,13 +133,13 @@ def _film(recording: Path, options: argparse.Namespace, moments: Sequence[float]
 
 
 def _chosen_slot(run: Path) -> int | None:
-    """The slot that tells most, which is printed; None for the last one."""
+    """Choose the most telling slot, and print it; None for the last slot."""
     from evedrop.results.writer import load_results
     from evedrop.view.telling_slot import telling_slot
 
     slot = telling_slot(load_results(run))
     if slot is not None:
-        print(f"slot {slot} tells most")
+        print(f"chose slot {slot}, the most telling one")
     return slot
 
 
@@ -227,13 +227,13 @@ def _shown(parser: argparse.ArgumentParser) -> None:
     )
     instead.add_argument("--table", action="store_true", help="print its table and sentences instead")
     moment = parser.add_mutually_exclusive_group()
-    moment.add_argument("--slot", type=int, metavar="K", help="the slot to draw; default one that tells much")
+    moment.add_argument("--slot", type=int, metavar="K", help="the slot to draw; default the most telling one")
     moment.add_argument("--time", type=float, metavar="SECONDS", help="for a wire: the time to draw; default the end")
     moment.add_argument(
         "--slots",
         type=_moments,
         metavar="A:B[:STEP]",
-        help="the slots of a video; default 80 around one that tells much",
+        help="the slots of a video; default 81 around the most telling one",
     )
     moment.add_argument(
         "--times", type=_moments, metavar="A:B[:STEP]", help="for a wire: the times of a video, in seconds"

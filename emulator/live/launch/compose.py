@@ -23,7 +23,7 @@ COMPOSE_FILE = "docker-compose.yml"
 MOST_NETWORKS = 30
 """How many networks fit into Docker's default address pools."""
 _OTHERS = frozenset({"briefs", "view", "finished"})
-"""The services that are not processes of the run."""
+"""The services other than the processes of the run."""
 # YAML 1.1, which docker-compose 1.29 reads, takes these words for truth values and for nothing.
 _YAML_WORDS = frozenset({"y", "n", "yes", "no", "on", "off", "true", "false", "null"})
 
@@ -98,7 +98,7 @@ services:
 _BUILD = """\
     build:
       context: .
-      args: [EVEDROP_BASE] # that of the Dockerfile where there is none
+      args: [EVEDROP_BASE] # without a value: the base that the Dockerfile names
 """
 
 _VIEW = """
@@ -150,7 +150,7 @@ class _Service:
 
     @property
     def network(self) -> str:
-        """The network on which only this process and its router are."""
+        """The network that only this process and its router share."""
         return f"to-{self.name}"
 
 
@@ -158,7 +158,7 @@ def write_compose(scenario: Scenario, source: str, changed: bool, folder: Path, 
     """Write the files into a folder; returns their paths.
 
     source: the scenario as the user named it, a built-in name or a file; changed: whether options change it; overwrite:
-    whether the folder may contain files, of which those with the same names are replaced. Raises UsageError if it may not,
+    whether the folder may contain files; those with the same names are then replaced. Raises UsageError if it may not,
     if the folder cannot be written, and for a scenario that containers cannot run.
     """
     _check(scenario)

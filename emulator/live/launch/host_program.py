@@ -35,7 +35,7 @@ def serve_launcher() -> None:
         raise UsageError("`evedrop host` is started by `evedrop run SCENARIO --hosts FILE`, over ssh; use that command")
     os.umask(0o077)
     answers = os.fdopen(os.dup(1), "wb", buffering=0)
-    os.dup2(2, 1)  # so that nothing else can write among the answers
+    os.dup2(2, 1)  # so that nothing else can write between the messages
     with raise_on_signals(), private_folder() as private, process_starter() as start:
         host, silence = HostProcesses(private, start, answers.write), _Silence()
         try:
@@ -57,7 +57,7 @@ class _Silence:
         self._seconds = 0.0
 
     def heard(self, seconds: float | None) -> None:
-        """Take note of an order; seconds: how long the launcher may be silent from now on, if the order says so."""
+        """Note that an order came; seconds: how long the launcher may be silent from now on, if the order says so."""
         self._seconds = self._seconds if seconds is None else float(seconds)
         if self._timer is not None:
             self._timer.cancel()

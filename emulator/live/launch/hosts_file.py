@@ -135,7 +135,7 @@ def processes_of(scenario: Scenario) -> tuple[str, ...]:
 
 
 def _of_processes(file: HostsFile, scenario: Scenario) -> list[str]:
-    """Mistakes in the lists of processes: unknown ones, those named twice, and classes that a host lacks."""
+    """Mistakes in the lists of processes: unknown names, names given twice, and missing folders of classes."""
     known, found, seen = processes_of(scenario), [], dict[str, str]()
     for name, host in file.hosts.items():
         for process in host.processes:

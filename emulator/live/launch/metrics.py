@@ -67,7 +67,7 @@ class MetricsAddress:
         address = ipaddress.ip_address(self.host)
         if address.is_loopback:
             return None
-        return f"anybody who can reach {self._at(self.port)} can read the metrics, which tell every receiver's error"
+        return f"anybody who can reach {self._at(self.port)} can read the metrics, which reveal every receiver's error"
 
     def page(self, port: int) -> str:
         """The address of the page, once it is served on this port."""
@@ -90,7 +90,7 @@ class RunMetrics:
         self._losses: Counter[str] = Counter()
 
     def tell(self, news: News) -> None:
-        """Take an item of news, and pass it on."""
+        """Note an item of news, and pass it on."""
         with self._lock:
             match news:
                 case Started():

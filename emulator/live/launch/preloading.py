@@ -253,7 +253,7 @@ class _Kept:
 
 
 _kept: list[_Kept] = []
-"""Of the `preloaded` blocks that this process is in."""
+"""What is kept for the `preloaded` blocks that this process is in."""
 
 
 @contextmanager

@@ -36,11 +36,13 @@ _LOOK_SECONDS = 0.05
 _MOST_SAID = 2**20
 _ALIVE_SECONDS = 3
 _BEAT_SECONDS = 30.0
-_SILENCE_SECONDS = 600.0  # after which a host takes the launcher for gone; a launcher may be suspended in its terminal
+_SILENCE_SECONDS = (
+    600.0  # after which a host considers the launcher gone; a user may suspend the launcher in its terminal
+)
 _OPTIONS = (
     "-T",
     *("-o", "BatchMode=yes"),  # never ask for a password or a key
-    *("-o", "ControlMaster=no"),  # a master would stay when the run is over
+    *("-o", "ControlMaster=no"),  # a shared connection would outlive the run
     *("-o", "ClearAllForwardings=yes"),
     *("-o", "ForwardAgent=no"),
     *("-o", "ForwardX11=no"),
@@ -70,7 +72,7 @@ class HostedProcess:
             os.write(self._log, text.encode())
 
     def ended(self, status: int) -> None:
-        """Take note of its end."""
+        """Note that it ended with this status."""
         self._status = status
         os.close(self._log)
         self._over.set()
@@ -120,7 +122,7 @@ class SshHost:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=self._said,
-                start_new_session=True,  # a Ctrl-C in the terminal is for the launcher
+                start_new_session=True,  # Ctrl-C in the terminal must reach only the launcher
             )
         except OSError as error:
             self._said.close()
@@ -197,7 +199,7 @@ class SshHost:
         self._said.close()
 
     def _follow(self) -> None:
-        """Read the answers until the connection ends; then all processes there have ended."""
+        """Read the host's messages until the connection ends; all processes there have ended then."""
         assert self._ssh.stdout is not None  # noqa: S101 - it was started with a pipe
         with self._ssh.stdout as answers, contextlib.suppress(ValueError, KeyError, TypeError, OSError):
             for line in itertools.islice(answers, MOST_NOISE):  # of the login shell
@@ -239,7 +241,7 @@ class SshHost:
         return f"host {self.name}"
 
     def _reason(self) -> str:
-        """What ssh said last, or its exit status."""
+        """The last line that ssh printed, or its exit status."""
         # Not by reading the file: ssh writes at the same position in it.
         said = os.pread(self._said.fileno(), _MOST_SAID, 0).decode("utf-8", "replace")
         lines = [line.strip() for line in said.splitlines() if line.strip()]
@@ -249,7 +251,7 @@ class SshHost:
         return "ssh is still connecting" if status is None else f"ssh ended with status {status}"
 
     def _remedy(self) -> str:
-        """What the user can try."""
+        """A command that the user can try."""
         words = [word for word in ssh_words(self._table) if word != "--"]
         return f"try `ssh {shlex.join(words)} {shlex.join([*self._table.command, '--version'])}`"
 
@@ -291,7 +293,7 @@ class SshStarter:
 
 @contextmanager
 def ssh_starter(plan: HostsPlan, here: Starter, stop: threading.Event, longest_outage: float) -> Iterator[Starter]:
-    """A starter for the processes of these hosts, with all of which it is connected; ends everything there with the block.
+    """A starter that is connected to all of these hosts; ends all processes on them at the end of the block.
 
     longest_outage: as for `SshHost`. Raises UsageError if a host cannot be used, Interrupted if stopped meanwhile.
     """

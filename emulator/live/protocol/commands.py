@@ -20,7 +20,7 @@ class Bounds:
     """The slots and receivers that a command may name."""
 
     slots: int
-    """Of the run."""
+    """The slots of the run."""
     receivers: Collection[str] | None = None
     """The names that it may have: of receivers, and to the sensor also the observer; None: any."""
 

@@ -158,7 +158,7 @@ def _carried(A: Floats, P: Factors) -> list[list[Entry]]:
 
 
 def _parts(joint: Factors) -> tuple[Factors, list[list[Floats]], Factors]:
-    """Of the factors of (2n, 2n) matrices: those of the first block, the block of U below it, and those of the remainder."""
+    """The factors of (2n, 2n) matrices in parts: those of the first block, the block of U below it, those of the remainder."""
     n = len(joint.diagonal) // 2
     starts = [i * (i - 1) // 2 for i in range(2 * n)]
     below = [list(joint.lower[start : start + n]) for start in starts[n:]]

@@ -11,7 +11,7 @@ _HEAD, _LANE = 48.0, 40.0  # title bar and ruler of a view of lanes; a lane with
 TITLE_HEIGHT = 0.06
 LEGEND_HEIGHT = 0.075
 FIXED_HEIGHT = TITLE_HEIGHT + LEGEND_HEIGHT
-"""Of the rows that every view has."""
+"""The height of the rows that every view has."""
 
 
 def lanes_height(count: int) -> float:
@@ -20,5 +20,5 @@ def lanes_height(count: int) -> float:
 
 
 def crowded(scene: Scene) -> bool:
-    """Whether two views of lanes do not fit above each other, so that both are in the row at the top."""
+    """Whether two views of lanes do not fit below each other, so that both are in the row at the top."""
     return 1.0 - FIXED_HEIGHT - lanes_height(len(scene.receivers)) - lanes_height(len(scene.receivers) + 1) < 0.1

@@ -251,7 +251,7 @@ def arrows(truth: Points, points: Points, low: Points, high: Points) -> Points:
 
 
 def labels_of(truth: Points, tips: Points, low: Points, high: Points) -> Points:
-    """Where the labels of arrows with these tips, (f, 2), are drawn: off the truth, and with room for their letters."""
+    """Where the labels of arrows with these tips, (f, 2), are drawn: away from the truth, with room for their letters."""
     size = high - low
     rising = np.where(tips[:, 1] <= truth[:, 1], -_LABEL, 0.0)[:, None] * size * [0.0, 1.0]
     return _shown(np.clip(tips + rising, low + size * [_LABEL, 0.0], high - size * [_LABEL, 0.5 * _LABEL]))

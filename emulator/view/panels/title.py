@@ -18,7 +18,7 @@ _PATH = "title"
 
 @final
 class Title(ViewPanel):
-    """A line over the whole width: the title, and of which trials the values are."""
+    """A line over the whole width: the title, and which trials the panels show."""
 
     def views(self) -> Iterator[PlacedView]:
         """One view without a title bar."""

@@ -60,7 +60,7 @@ def packets_of(heard: Reception) -> dict[str, Any]:
 
 
 SLOTS = 100_000
-"""Of the run that all golden messages could be of."""
+"""The slots of a run to which all golden messages could belong."""
 
 
 def extent_of(shape: dict[str, Any]) -> telemetry.Extent:

@@ -54,7 +54,7 @@ def flow(stage: Bench) -> None:
 
 
 def self_signed() -> Identity:
-    """A certificate of nobody's but its own making, which claims to be Eve's."""
+    """A self-signed certificate that claims to be Eve's."""
     other = Authority("nobody").identity(EVE)
     return replace(other, authority=other.certificate)
 
