@@ -13,15 +13,13 @@ import secrets
 import socket
 import threading
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import IO, Any, final
+from typing import IO, final
 
 from evedrop.errors import UsageError
+from evedrop.view.bounded_http import BoundedServer, QuietHandler
 
 _LOOK_SECONDS = 0.05  # between two checks of whether the file has grown
-_REQUEST_SECONDS = 10.0  # for a browser to send its request
-_MOST_READERS = 32  # at a time; further ones are turned away, so another user can use up all places
 _PIECE = 2**18
 
 
@@ -98,54 +96,28 @@ class Served:
                 f"{host}:{port} cannot be used ({error.strerror}) to show the run; give another"
             ) from error
         self.port = int(self._server.server_address[1])
-        threading.Thread(target=self._server.serve_forever, args=(_LOOK_SECONDS,), name="view", daemon=True).start()
+        self._server.start()
 
     def stop(self) -> None:
         """Accept no more readers. Those in progress continue by themselves."""
-        self._server.shutdown()
-        self._server.server_close()
+        self._server.stop()
 
 
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-    block_on_close = False
-
+class _Server(BoundedServer):
     def __init__(self, followed: Followed, path: str, host: str, port: int) -> None:
         self.followed = followed
         self.path = path.encode()
-        self._places = threading.BoundedSemaphore(_MOST_READERS)
         super().__init__((host, port), _Handler)
 
-    def process_request(self, request: Any, client_address: Any) -> None:
-        """Serve on a thread, if there is a free place."""
-        if self._places.acquire(blocking=False):
-            super().process_request(request, client_address)
-        else:
-            self.shutdown_request(request)
 
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Serve one reader."""
-        try:
-            super().process_request_thread(request, client_address)
-        finally:
-            self._places.release()
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """Ignore readers that leave or never send a request."""
-
-
-class _Handler(BaseHTTPRequestHandler):
-    protocol_version = "HTTP/1.1"
-    timeout = _REQUEST_SECONDS
+class _Handler(QuietHandler):
     server: _Server
 
     def do_GET(self) -> None:
         """Send the recording to a reader that knows its address."""
         self.close_connection = True
         if not hmac.compare_digest(self.path.encode(), self.server.path):
-            self.send_response(404)
-            self.send_header("Content-Length", "0")
-            self.end_headers()
+            self.refuse(404)
             return
         self.connection.settimeout(None)  # a browser whose user has paused it may wait indefinitely
         self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -158,10 +130,3 @@ class _Handler(BaseHTTPRequestHandler):
         for piece in self.server.followed.pieces():
             self.wfile.write(b"%x\r\n%b\r\n" % (len(piece), piece))
         self.wfile.write(b"0\r\n\r\n")
-
-    def log_message(self, *_: Any) -> None:
-        """Log nothing, because the address is a secret."""
-
-    def version_string(self) -> str:
-        """The program's name without its version."""
-        return "evedrop"

@@ -8,11 +8,13 @@ Source: docs/view.md, who sees it.
 
 from __future__ import annotations
 
+import contextlib
 import ipaddress
 import os
 import socket
 import subprocess
 import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, final
@@ -24,6 +26,7 @@ from evedrop.view.viewer_process import HOST, end, is_apart, spawn
 
 if TYPE_CHECKING:
     from evedrop.view.growing_recording import Followed, Served
+    from evedrop.view.web_page import WebPage
 
 _ATTEMPTS = 3
 _WINDOW = ("--hide-welcome-screen",)
@@ -101,25 +104,25 @@ class Viewer:
     """
 
     def __init__(
-        self, process: subprocess.Popen[bytes], followed: Followed, served: Served | None = None, page: str = ""
+        self,
+        process: subprocess.Popen[bytes],
+        followed: Followed,
+        servers: Sequence[Served | WebPage] = (),
+        address: str | None = None,
     ) -> None:
         self._process = process
         self._followed = followed
-        self._served = served
-        self.address: str | None = None
+        self._servers = [*servers]
+        self.address = address
         """The address to open in a browser; None for a window. Anybody who has it sees the truth."""
         self.warning: str | None = None
         """A warning to the user if others can reach the viewer."""
-        if served is None and not is_apart(process):
+        if address is None and not is_apart(process):
             self.warning = (
                 "other users of this machine can find the window's port, control the window and take pictures of what it "
                 "shows, for this system allows it no network of its own; --view web, whose address is a secret, or --view "
                 "off keep it from them (docs/view.md, who sees it)"
             )
-        if served is not None:
-            host = page.partition(":")[0]
-            data = quote(f"http://{host}:{served.port}{served.path}", safe="")
-            self.address = f"http://{page}/?url={data}&{_DARK}"
 
     @property
     def pid(self) -> int:
@@ -141,17 +144,9 @@ class Viewer:
         from evedrop.view.growing_recording import Followed  # noqa: PLC0415 - only with a view
 
         followed = Followed(recording, complete)
-        for attempt in range(_ATTEMPTS):
-            port = free_port()
-            try:
-                if mode == "web":
-                    return cls._page(followed, HOST, HOST, port, free_port(), logs)
-                return cls._window(followed, port, logs)
-            except UsageError:
-                # Another process may have taken the port after it was found free.
-                if attempt == _ATTEMPTS - 1:
-                    raise
-        return None
+        if mode == "web":
+            return _repeatedly(lambda: cls._page(followed, HOST, HOST, free_port(), free_port(), logs))
+        return _repeatedly(lambda: cls._window(followed, free_port(), logs))
 
     @classmethod
     def serve(cls, stand: WebAddress, logs: Path, recording: Path, complete: bool = False) -> Viewer:
@@ -163,19 +158,27 @@ class Viewer:
 
         stand.check_free()
         followed = Followed(recording, complete)
-        return cls._page(followed, stand.host, stand.seen, stand.port, stand.port + 1, logs)
+        return _repeatedly(lambda: cls._page(followed, stand.host, stand.seen, stand.port, stand.port + 1, logs))
 
     @classmethod
     def _page(cls, followed: Followed, host: str, seen: str, port: int, data_port: int, logs: Path) -> Viewer:
         from evedrop.view.growing_recording import Served  # noqa: PLC0415 - only with a view
+        from evedrop.view.web_page import WebPage  # noqa: PLC0415 - the same
 
         served = Served(followed, host, data_port)
         try:
-            process = spawn(port, ["--serve-web", "--web-viewer-port", str(port), _NOTHING], logs, host=host)
+            rerun = free_port()
+            process = spawn(rerun, ["--serve-web", "--web-viewer-port", str(rerun), _NOTHING], logs)
+            try:
+                page = WebPage((HOST, rerun), host, port, seen, data_port)
+            except BaseException:
+                end(process)
+                raise
         except BaseException:
             served.stop()
             raise
-        return cls(process, followed, served, f"{seen}:{port}")
+        data = quote(f"http://{seen}:{data_port}{served.path}", safe="")
+        return cls(process, followed, [served, page], f"http://{seen}:{port}/?url={data}&{_DARK}")
 
     @classmethod
     def _window(cls, followed: Followed, port: int, logs: Path) -> Viewer:
@@ -202,10 +205,17 @@ class Viewer:
     def stop(self) -> None:
         """End the viewer within seconds. Harmless if it has ended."""
         self._followed.complete()
-        if self._served is not None:
-            self._served.stop()
-            self._served = None
+        while self._servers:
+            self._servers.pop().stop()
         end(self._process)
+
+
+def _repeatedly(open_viewer: Callable[[], Viewer]) -> Viewer:
+    """Try several times, because another process may take a port after it was found free."""
+    for _ in range(_ATTEMPTS - 1):
+        with contextlib.suppress(UsageError):
+            return open_viewer()
+    return open_viewer()
 
 
 def _screen_is_remote() -> bool:

@@ -86,13 +86,12 @@ def spawn(
     arguments: Sequence[str],
     logs: Path,
     *,
-    host: str = HOST,
     stdin: int = subprocess.DEVNULL,
     apart: bool = False,
     environment: Mapping[str, str] | None = None,
     patience: float = _START_SECONDS,
 ) -> subprocess.Popen[bytes]:
-    """Start Rerun's command with these arguments, only on `host`; returns when it listens on `port`.
+    """Start Rerun's command with these arguments, only on loopback; returns when it listens on `port`.
 
     apart: with a network of its own, if the system allows it. patience: seconds to wait until it listens.
 
@@ -101,7 +100,7 @@ def spawn(
     with _log(logs) as log:
         start = log.tell()
         process = subprocess.Popen(
-            guarded([str(executable()), "--bind", host, *arguments], apart),
+            guarded([str(executable()), "--bind", HOST, *arguments], apart),
             bufsize=0,
             stdin=stdin,
             stdout=log,
@@ -110,7 +109,7 @@ def spawn(
             env={**viewer_environment(), "XDG_CONFIG_HOME": str(_CONFIG), **(environment or {})},
         )
         try:
-            if _listens(process, host, port, patience):
+            if _listens(process, port, patience):
                 return process
         except BaseException:
             end(process)
@@ -142,22 +141,22 @@ def executable() -> Path:
     return folder / ("rerun.exe" if sys.platform == "win32" else "rerun")
 
 
-def _listens(process: subprocess.Popen[bytes], host: str, port: int, patience: float) -> bool:
+def _listens(process: subprocess.Popen[bytes], port: int, patience: float) -> bool:
     deadline = time.monotonic() + patience
     while process.poll() is None and time.monotonic() < deadline:
-        if _is_there(process, host, port):
+        if _is_there(process, port):
             return True
         time.sleep(0.02)
     return False
 
 
-def _is_there(process: subprocess.Popen[bytes], host: str, port: int) -> bool:
+def _is_there(process: subprocess.Popen[bytes], port: int) -> bool:
     if is_apart(process):
         lines = [line.split() for line in Path(f"/proc/{process.pid}/net/tcp").read_text().splitlines()[1:]]
         return any(local.endswith(f":{port:04X}") and state == "0A" for _, local, _, state, *_ in lines)
     with socket.socket() as probe:
         probe.settimeout(1.0)
-        return probe.connect_ex((host, port)) == 0
+        return probe.connect_ex((HOST, port)) == 0
 
 
 def _log(logs: Path) -> IO[bytes]:

@@ -1,5 +1,8 @@
+import base64
 import errno
+import hashlib
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -21,6 +24,7 @@ from evedrop.ports import free_port
 from evedrop.view.growing_recording import Followed, feed
 from evedrop.view.recording import ViewRecording
 from evedrop.view.viewer import Viewer, WebAddress, choose, open_run
+from evedrop.view.web_page import WebPage, own_page
 from tests.conftest import LIMIT, wait_until
 from tests.view.simulated_run import Simulated
 
@@ -86,9 +90,60 @@ def test_off_starts_nothing(tmp_path: Path) -> None:
 def test_only_loopback_listens(viewer: Viewer) -> None:
     """Rerun serves its page on 127.0.0.1, and opens no other port: none that recordings could be fetched from."""
     assert listening(viewer.pid) == ["0100007F"]
+
+
+def test_the_page_can_ask_no_other_host(viewer: Viewer) -> None:
+    """It names no other host, and its policy allows none: only its own scripts, and the port of the recording."""
+    data = urlsplit(data_of(viewer)).netloc
     assert viewer.address is not None
-    with urllib.request.urlopen(viewer.address, timeout=LIMIT) as page:  # noqa: S310 - our own address
-        assert b"<html" in page.read()
+    port = urlsplit(viewer.address).port
+    asked = urllib.request.Request(viewer.address, headers={"Host": f"localhost:{port}"})  # noqa: S310 - our own address
+    with urllib.request.urlopen(asked, timeout=LIMIT) as reply:  # noqa: S310 - the same
+        page = reply.read().decode()
+        rules = dict(rule.split(" ", 1) for rule in reply.headers["Content-Security-Policy"].split("; "))
+        assert reply.headers["Referrer-Policy"] == "no-referrer"
+    assert "<canvas" in page
+    assert "wasm_bindgen.WebHandle" in page
+    assert "//" not in re.sub(r"(?<!:)//.*", "", page), "no address, with or without a scheme"
+    assert "fonts" not in page
+    assert rules["default-src"] == "'none'"
+    assert rules["connect-src"].split() == [
+        "'self'",
+        f"http://{data}",
+        f"http://localhost:{urlsplit(data_of(viewer)).port}",
+    ]
+    inline = re.findall(r"<script>(.*?)</script>", page, re.DOTALL)
+    digests = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in inline]
+    assert inline
+    assert rules["script-src"].split() == ["'self'", "'wasm-unsafe-eval'", *(f"'sha256-{one}'" for one in digests)]
+    for words in rules.values():
+        assert not {"*", "http:", "https:", "'unsafe-eval'"} & {*words.split()}
+    origin = f"http://127.0.0.1:{port}"
+    for name, begin in (("re_viewer.js", b"let wasm_bindgen"), ("re_viewer_bg.wasm", b"\0asm")):
+        with urllib.request.urlopen(f"{origin}/{name}", timeout=LIMIT) as reply:  # noqa: S310 - our own address
+            assert reply.read(len(begin)) == begin
+    with pytest.raises(urllib.error.HTTPError, match="404"):
+        urllib.request.urlopen(f"{origin}/sw.js", timeout=LIMIT)  # noqa: S310 - the same
+
+
+def test_links_to_other_hosts_are_dropped_from_any_page() -> None:
+    """Fonts are not loaded, and other addresses lead nowhere; what is the page's own stays."""
+    page = own_page(
+        '<link rel="icon" href="favicon.ico"/>\n<link\n href="https://fonts.example/css"\n rel="stylesheet"/>'
+        '<script>s.src = "https://statistics.example/a.js";</script><a href=https://issues.example/new>'
+    )
+    assert page == '<link rel="icon" href="favicon.ico"/>\n<script>s.src = "#";</script><a href=#>'
+
+
+def test_a_page_without_a_viewer_is_an_error(viewer: Viewer) -> None:
+    """A browser is told at once that the viewer has ended; a server that sends no page is not passed on."""
+    os.kill(viewer.pid, signal.SIGKILL)
+    viewer.wait()
+    assert viewer.address is not None
+    with pytest.raises(urllib.error.HTTPError, match="502"):
+        urllib.request.urlopen(f"http://{urlsplit(viewer.address).netloc}/re_viewer.js", timeout=LIMIT)
+    with pytest.raises(UsageError, match="sends no page"):
+        WebPage(("127.0.0.1", free_port()), "127.0.0.1", free_port(), "127.0.0.1", 9)
 
 
 def data_of(viewer: Viewer) -> str:
