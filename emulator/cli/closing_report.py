@@ -28,15 +28,15 @@ def print_results(folder: Path, as_json: bool = False) -> None:
     print_summary(summary, str(folder), None if summary.mode == "live" else replay_command(folder))
 
 
-def report_page(folder: Path, as_json: bool = False) -> None:
+def report_page(folder: Path, silent: bool = False) -> None:
     """Write report.html into a results folder, and say where it is; a page that cannot be written gives a warning.
 
-    as_json: print nothing, because standard output is JSON.
+    silent: do not say where, for example because standard output is JSON.
     """
     from evedrop.report.writing import try_report
 
     path = try_report(folder)
-    if path is not None and not as_json:
+    if path is not None and not silent:
         sys.stdout.write(f"report: {path}\n")
 
 

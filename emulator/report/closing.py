@@ -6,7 +6,7 @@ Source: docs/results.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 from evedrop.figures import columns, shown_figure, unloadable_figures
 from evedrop.figures.text import estimate, figure_text
@@ -36,18 +36,23 @@ def heading(summary: Summary) -> str:
 
 def outcome(summary: Summary) -> tuple[str, bool | None]:
     """The outcome of a run in a sentence, and whether it is good; None if there is nothing to judge."""
-    held = [one.held for one in summary.expectations]
+    said, good = expectations_outcome([one.held for one in summary.expectations], "scenario")
+    if summary.ended != "complete":
+        return f"{summary.ended.splitlines()[0]}; {said}", False
+    return said[0].upper() + said[1:], good
+
+
+def expectations_outcome(held: Sequence[bool | None], of: str) -> tuple[str, bool | None]:
+    """How many expectations held, and whether that is good; None without any. of: what they are of, such as "scenario"."""
     failed, unknown = held.count(False), held.count(None)
     said = f"all {len(held)} expectations held" if len(held) > 1 else "the expectation held"
     if not held:
-        said = "the scenario has no expectations"
+        said = f"the {of} has no expectations"
     elif failed:
         said = f"{failed} of {len(held)} expectations FAILED"
     elif unknown:
         said = f"{unknown} of {len(held)} expectations could not be evaluated"
-    if summary.ended != "complete":
-        return f"{summary.ended.splitlines()[0]}; {said}", False
-    return said[0].upper() + said[1:], None if not held else not failed and not unknown
+    return said, None if not held else not failed and not unknown
 
 
 def receivers_table(summary: Summary, wide: bool = True) -> TextTable:

@@ -13,7 +13,9 @@ from evedrop.report.run_sections import RUN_SECTIONS
 from evedrop.report.run_source import RunSource
 from evedrop.report.section import parts_of
 from evedrop.report.sweep_sections import SWEEP_SECTIONS, SWEEP_TABLE, SweepSource
+from evedrop.report.wire_sections import WIRE_SECTIONS, WireSource
 from evedrop.results.comparison_file import COMPARISON
+from evedrop.results.wire_folder import WIRE_FILE
 
 
 def run_page(folder: Path) -> Page:
@@ -38,7 +40,17 @@ def comparison_page(folder: Path) -> Page:
     )
 
 
-KINDS: Mapping[str, Callable[[Path], Page]] = {SWEEP_TABLE: sweep_page, COMPARISON: comparison_page}
+def wire_page(folder: Path) -> Page:
+    """The report of a wire."""
+    source = WireSource.read(folder)
+    return Page(source.title, source.about, *source.outcome, parts_of(WIRE_SECTIONS, source))
+
+
+KINDS: Mapping[str, Callable[[Path], Page]] = {
+    SWEEP_TABLE: sweep_page,
+    COMPARISON: comparison_page,
+    WIRE_FILE: wire_page,
+}
 """A file that only such a folder has → the function that makes its page. Any other folder is that of a run."""
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import final
 
 import numpy as np
@@ -18,6 +18,7 @@ from evedrop.report.strip import strip
 from evedrop.report.tables import html_table
 from evedrop.report.text_table import TextTable
 from evedrop.score.expectations_held import repeating
+from evedrop.score.summary import Judged
 from evedrop.score.track import FACTOR, LostSpan, Track
 from evedrop.view.error_floor import error_floor
 from evedrop.view.lanes import EAVESDROPPER
@@ -26,6 +27,17 @@ from evedrop.view.palette import hexadecimal
 _MOST_SPANS = 12
 _MOST_TEXT = 40_000
 _MARKS = {True: "✓", False: "✕", None: "?"}
+
+
+def marked_sentences(expectations: Sequence[Judged]) -> Iterator[Node]:
+    """A list of expectations with a mark each, and the command that repeats a failure; nothing without any."""
+    items = []
+    for one in expectations:
+        again = None if one.replay is None else element("pre", element("code", one.replay))
+        mark = element("span", _MARKS[one.held], aria_hidden="true", class_="mark")
+        items.append(element("li", mark, one.sentence, again))
+    if items:
+        yield element("ul", *items, class_="marked")
 
 
 @final
@@ -51,14 +63,7 @@ class ExpectationsSection(Section[RunSource]):
     @classmethod
     def nodes(cls, of: RunSource) -> Iterator[Node]:
         """A sentence for each, and the command that repeats a failure."""
-        if not of.summary.expectations:
-            return
-        items = []
-        for one in of.summary.expectations:
-            again = None if one.replay is None else element("pre", element("code", one.replay))
-            mark = element("span", _MARKS[one.held], aria_hidden="true", class_="mark")
-            items.append(element("li", mark, one.sentence, again))
-        yield element("ul", *items, class_="marked")
+        yield from marked_sentences(of.summary.expectations)
 
 
 @final

@@ -71,6 +71,11 @@ class WireHistory:
                 raise UsageError(f"{path}, line {at}, is not the history of a wire; give another --out") from error
         return history
 
+    @property
+    def events(self) -> list[tuple[float, str]]:
+        """The events since the latest start: seconds since it began, and a line for each."""
+        return [(round(at - self.began, 3), line) for at, line in self.said]
+
     def begin(self, plan: WirePlan, now: float) -> None:
         """Begin the next start. Raises UsageError if an earlier one had another seed, and OSError if the disk is full."""
         if self._seed not in {None, plan.seed}:

@@ -157,6 +157,12 @@ class WireJournal:
             except OSError as error:
                 self._miss(error)
 
+    @property
+    def events(self) -> list[tuple[float, str]]:
+        """The events of this start so far: seconds since it began, and a line for each."""
+        with self._state:
+            return self._history.events
+
     def note(self, line: str) -> None:
         """Note an event that happens now, and tell the listeners."""
         now = time.time()

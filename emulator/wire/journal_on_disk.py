@@ -47,6 +47,11 @@ class JournalOnDisk:
         """The number of the start, from 1."""
         return self._history.start
 
+    @property
+    def events(self) -> list[tuple[float, str]]:
+        """The events of the start: seconds since it began, and a line for each."""
+        return self._history.events
+
     def key_of(self, code: int) -> str:
         """The key of a code."""
         return self._keys[code]

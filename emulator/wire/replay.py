@@ -15,8 +15,8 @@ import rerun as rr
 
 from evedrop.errors import UsageError
 from evedrop.results.folder import private_file
+from evedrop.results.wire_folder import WIRE_FILE
 from evedrop.wire.file import load_wire
-from evedrop.wire.folder import WIRE_FILE
 from evedrop.wire.history import WireHistory
 from evedrop.wire.journal_part import records_of
 from evedrop.wire.journal_reader import JOURNAL_FOLDER, journal_tables

@@ -9,13 +9,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 from evedrop.output import warn
+from evedrop.report.wire import wire_failures
 from evedrop.results.folder import make_private, new_folder, write_private
+from evedrop.results.wire_folder import WIRE_FILE
 from evedrop.signals import stop_on_signals
-from evedrop.wire.closing import closing_lines, wire_failures
+from evedrop.wire.closing import closing_lines
 from evedrop.wire.conductor import WireConductor
 from evedrop.wire.control import WireControl
 from evedrop.wire.file import resolved_wire
-from evedrop.wire.folder import WIRE_FILE
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_reader import JOURNAL_FOLDER
 from evedrop.wire.live_view import live_view

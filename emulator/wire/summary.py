@@ -5,11 +5,13 @@ Source: docs/wire.md, the summary.
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import os
+import platform
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol, final
@@ -50,6 +52,10 @@ class SummarisedJournal(Protocol):
     @property
     def recovered(self) -> int:
         """The number of records that an earlier start had left behind."""
+
+    @property
+    def events(self) -> Sequence[tuple[float, str]]:
+        """The events of this start: seconds since it began, and a line for each."""
 
     def key_of(self, code: int) -> str:
         """The key of a code."""
@@ -168,6 +174,11 @@ class WireSummary:
             },
             "links": {name: asdict(link) for name, link in links.items()},
             "expectations": [judged.as_dict() for judged in self.judged(links)],
+            "events": [{"seconds": seconds, "event": event} for seconds, event in journal.events],
+            "made_with": {
+                "python": platform.python_version(),
+                **{name: importlib.metadata.version(name) for name in ("evedrop", "eclipse-zenoh")},
+            },
         }
 
     def judged(self, links: Mapping[str, WireLinkSummary]) -> list[Judged]:

@@ -23,6 +23,7 @@ from evedrop.wire.recorded_link import journal_recording
 from evedrop.wire.running import ExpectationFailed, RunningWire
 from evedrop.wire.summary import WireSummary
 from tests.conftest import wait_until
+from tests.pages import checked
 from tests.wire.wire_plans import wire_plan
 
 FAILING = """
@@ -67,6 +68,10 @@ def test_a_wire_is_opened_steered_read_and_judged(tmp_path: Path) -> None:
     summary = json.loads((tmp_path / "wire" / "summary.json").read_text())
     assert running.summary() == summary
     assert summary["links"]["scan"]["delivered"] == len(got)
+    page = checked(tmp_path / "wire")
+    assert {"1 of 1 expectations FAILED", "partition robot, base", *summary["made_with"].values()} <= set(page.texts)
+    assert [one["event"].split()[0] for one in summary["events"]] == ["link", "partition", "heal", "cut", "heal"]
+    assert {one["event"] for one in summary["events"]} <= set(page.texts)
     with pytest.raises(UsageError, match="no run is going on"):
         running.cut("scan")
 

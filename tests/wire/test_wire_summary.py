@@ -13,8 +13,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evedrop.errors import ScenarioError
-from evedrop.wire.closing import closing_lines, wire_failures, wire_sentences
+from evedrop.errors import ScenarioError, UsageError
+from evedrop.report.wire import wire_failures, wire_sentences, wire_table
+from evedrop.report.writing import write_report
+from evedrop.results.wire_folder import WIRE_FILE
+from evedrop.wire.closing import closing_lines
 from evedrop.wire.crossing import AGAIN, RECORD, UNLINKED, Crossing, Kind
 from evedrop.wire.expect import WireExpectTable
 from evedrop.wire.fates import KeyFates
@@ -23,6 +26,7 @@ from evedrop.wire.journal import WireJournal
 from evedrop.wire.plan import Side, WirePlan
 from evedrop.wire.summary import WireSummary
 from evedrop.wire.tallies import LinkTally, StreamTally
+from tests.pages import checked
 from tests.wire.wire_links import LOSSES
 from tests.wire.wire_plans import wire_plan
 
@@ -203,6 +207,21 @@ link = "scan"
     said = list(wire_sentences(found))
     assert "expected 0.9 quantile of scan.latency below 0.025: held, found 0.02" in said
     assert any(line.startswith("expected scan.gap_messages below 3: FAILED") for line in wire_failures(found))
+    (tmp_path / WIRE_FILE).write_text(resolved_wire(plan))
+    write_report(tmp_path)
+    page = checked(tmp_path)
+    assert page.headings == ["Wire of robot and base", "Expectations", "Links", "Losses by reason", "Repeat it"]
+    assert "2 of 5 expectations FAILED" in page.texts
+    assert {cell for row in wire_table(found).rows for cell in row} <= set(page.texts)
+    assert {"{:.4f} to {:.4f}".format(*found["links"]["scan"]["bounds"]), "lost: loss"} <= set(page.texts)
+    assert {*said[1:], *wire_failures(found)} <= set(page.texts)
+    assert "bernoulli: quality = 0.6" in page.texts
+    (tmp_path / "summary.json").write_text("{}")
+    with pytest.raises(UsageError, match="not the summary of a wire of this version"):
+        write_report(tmp_path)
+    (tmp_path / "summary.json").unlink()
+    with pytest.raises(UsageError, match="--table sums up its journal"):
+        write_report(tmp_path)
     nothing, status = run(tmp_path / "silent", plan, messages=0)
     assert status == 0
     assert {one["held"] for one in nothing["expectations"]} == {None}

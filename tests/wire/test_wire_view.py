@@ -16,11 +16,11 @@ from rerun.chunk import RrdReader
 
 from evedrop.cli.main import main
 from evedrop.errors import UsageError
+from evedrop.results.wire_folder import WIRE_FILE
 from evedrop.view import recording
 from evedrop.view.column import ELAPSED
 from evedrop.wire.crossing import UNLINKED, Crossing, Kind
 from evedrop.wire.file import resolved_wire
-from evedrop.wire.folder import WIRE_FILE
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.lane_states import LaneState
 from evedrop.wire.live_view import live_view

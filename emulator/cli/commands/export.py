@@ -15,9 +15,9 @@ _LONGEST = 3600.0  # seconds per slot, as for pace
 def export(options: argparse.Namespace) -> int:
     """Write the results of a run as an MCAP file."""
     from evedrop.results.mcap_export import export_mcap
+    from evedrop.results.wire_folder import is_wire
     from evedrop.results.writer import load_results
     from evedrop.signals import raise_on_signals
-    from evedrop.wire.folder import is_wire
 
     if is_wire(options.run):
         raise UsageError(f"{options.run} is the folder of a wire; give the results folder of a run")

@@ -26,7 +26,7 @@ _LEAST, _MOST = 320, 3840  # pixels; the viewer takes more than its time limit f
 
 def view(options: argparse.Namespace) -> int:
     """Open a finished run or wire, draw it, or print its closing report again."""
-    from evedrop.wire.folder import is_wire
+    from evedrop.results.wire_folder import is_wire
 
     if is_wire(options.run):
         return _view_wire(options)
@@ -145,10 +145,11 @@ def _chosen_slot(run: Path) -> int | None:
 
 def _view_wire(options: argparse.Namespace) -> int:
     """Show or draw a wire, from its journal, or print its table."""
+    from evedrop.report.wire import wire_failures
     from evedrop.signals import raise_on_signals
     from evedrop.view.picture import picture_apart
     from evedrop.view.viewer import WebAddress, open_run
-    from evedrop.wire.closing import closing_lines, wire_failures
+    from evedrop.wire.closing import closing_lines
     from evedrop.wire.replay import PICTURE_SIZE, replay_wire, summary_of_wire
 
     _check_names(options)

@@ -40,12 +40,15 @@ def wire(options: argparse.Namespace) -> int:
         print(f"evedrop: warning: {warning}", file=sys.stderr)
     if options.check:
         return 0
+    from evedrop.cli.closing_report import report_page
     from evedrop.results.folder import results_folder
     from evedrop.wire.run import run_wire
 
     with results_folder(options.out, f"wire-{options.file.stem}") as folder:
         said = {"say": _hush, "complain": complain} if options.quiet else {"say": _say}
-        return run_wire(plan, folder, seconds=seconds, view=options.view, **said)
+        status = run_wire(plan, folder, seconds=seconds, view=options.view, **said)
+        report_page(folder, options.quiet)
+        return status
 
 
 def _say(line: str) -> None:
