@@ -40,9 +40,8 @@ def test_the_tutorial_has_short_classes_and_a_scenario() -> None:
 
 def test_the_tutorial_works_as_it_is_typed(tutorial: Evedrop) -> None:
     """Its classes are checked, and run live, in memory and again from the results, with the same digests."""
-    commands = [
-        line.split()[1:] for line in PAGE.read_text(encoding="utf-8").splitlines() if line.startswith("evedrop ")
-    ]
+    lines = PAGE.read_text(encoding="utf-8").splitlines()
+    commands = [line.split()[2:] for line in lines if line.startswith("$ evedrop ")]
     assert {words[0] for words in commands} == {"check", "run", "montecarlo", "diff"}
     for words in [*commands, ["check", "--scheme", "flipped:Flipped"]]:
         done = tutorial(*words)
