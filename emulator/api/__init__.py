@@ -4,10 +4,11 @@ Source: docs/python.md.
 """
 
 from evedrop.api.designs import design, design_budget, design_policy, design_schedule
-from evedrop.api.results import RunResults, SweepResults, load_results
+from evedrop.api.results import ComparisonResults, RunResults, SweepResults, load_results
 from evedrop.api.running import compare, montecarlo, run, sweep
 
 __all__ = [
+    "ComparisonResults",
     "RunResults",
     "SweepResults",
     "compare",

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Protocol, Self
 
 import pyarrow as pa
 
 from evedrop.api.notebook import table_text
 from evedrop.figures import columns, error_column, shown_figure
 from evedrop.figures.text import estimate, figure_text
+from evedrop.results.comparison import Comparison
 from evedrop.results.reading import Results
 from evedrop.results.reading import load_results as read_results
 from evedrop.score.summary import Judged, LinkSummary, PeerSummary, SecrecySummary, Summary
@@ -24,8 +25,26 @@ Panels = Literal["errors", "lanes", "plane"]
 _MOST_ROWS = 40  # of a table in a notebook
 
 
+class _InFolder(Protocol):
+    @property
+    def folder(self) -> Path: ...
+
+
+class ReportedResults:
+    """Results in a folder, which can be shown on one page."""
+
+    def report(self: _InFolder) -> Path:
+        """Write report.html into the folder, and return its path. Source: docs/results.md, report.html.
+
+        Raises UsageError if the results cannot be read, and OSError if the page cannot be written.
+        """
+        from evedrop.report.writing import write_report  # noqa: PLC0415 - no other method needs it
+
+        return write_report(self.folder)
+
+
 @dataclass(frozen=True, repr=False)
-class RunResults(Results):
+class RunResults(Results, ReportedResults):
     """The results of a run or of trials in memory: typed figures, and tables as Arrow.
 
     Results in a temporary folder are removed with this object, or when the program ends.
@@ -111,7 +130,7 @@ class RunResults(Results):
 
 
 @dataclass(frozen=True, repr=False)
-class SweepResults:
+class SweepResults(ReportedResults):
     """The results of a sweep: `table` has a row for each point and receiver, with every figure and its standard error."""
 
     folder: Path
@@ -150,6 +169,24 @@ class SweepResults:
         for column, names in columns("sweep_column").items():
             errors = [error_column(name) for name in names]
             yield estimate(shown_figure(row, names), shown_figure(row, errors), column.format)
+
+
+@dataclass(frozen=True)
+class ComparisonResults(Comparison, ReportedResults):
+    """The results of a comparison, and their folder."""
+
+    folder: Path = field(kw_only=True)
+
+    @classmethod
+    def of(cls, found: Comparison, folder: Path) -> Self:
+        """A comparison whose files are in a folder."""
+        return cls(**{one.name: getattr(found, one.name) for one in fields(found)}, folder=folder)
+
+    def plot(self) -> ShownFigure:
+        """A figure of matplotlib: the matrix of schemes and adversaries, with a mark, a colour and a ratio in every cell."""
+        from evedrop.view.comparison_picture import comparison_figure  # noqa: PLC0415 - matplotlib takes half a second
+
+        return comparison_figure(self)
 
 
 def load_results(folder: str | Path) -> RunResults:

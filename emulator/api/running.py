@@ -9,13 +9,12 @@ from typing import Any
 
 from evedrop.api.given import place_for, plan_of, scenario_of
 from evedrop.api.notebook import progress
-from evedrop.api.results import RunResults, SweepResults
+from evedrop.api.results import ComparisonResults, RunResults, SweepResults
 from evedrop.errors import UsageError
 from evedrop.loading.python_values import plain_tables
 from evedrop.memory.montecarlo import Plan
 from evedrop.memory.simulation import Mode
 from evedrop.news import Tell
-from evedrop.results.comparison import Comparison
 from evedrop.scenario import Scenario
 from evedrop.scenario.words import dotted
 
@@ -124,8 +123,8 @@ def sweep(
 def compare(
     scenario: str | Path | Scenario,
     *,
-    schemes: Sequence[str] | None = None,
-    adversaries: Sequence[str] | None = None,
+    schemes: Sequence[str | type] | None = None,
+    adversaries: Sequence[str | type] | None = None,
     parameters: Mapping[str, Any] | None = None,
     trials: int = 200,
     out: str | Path | None = None,
@@ -134,10 +133,10 @@ def compare(
     plan: Plan | None = None,
     tell: Tell | None = None,
     **changes: Any,
-) -> Comparison:
+) -> ComparisonResults:
     """Compare every scheme against every adversary, on a scenario's process and links.
 
-    schemes, adversaries: names, by default all; parameters: of schemes other than the scenario's own, such as
+    schemes, adversaries: names or classes, by default all; parameters: of schemes other than the scenario's own, such as
     `{"innovation.state_probability": 0.7}`; all else as for `montecarlo`. Source: docs/compare.md.
 
     Raises UsageError with every unknown name, ScenarioError with every mistake of the scenario, RunError if a worker
@@ -150,9 +149,15 @@ def compare(
     from evedrop.studies.compare import compare_all  # noqa: PLC0415 - no other call needs it
     from evedrop.studies.matchups import matchups_of  # noqa: PLC0415 - the same
 
-    made = scenario_of(scenario, {**changes, "trials": trials})
-    matchups = matchups_of(made, schemes, adversaries, parameters)
+    given = {**dotted(changes), "trials": trials}
+    modules = scenario.modules if isinstance(scenario, Scenario) else given.get("modules")
+    chosen = plain_tables({"schemes": schemes, "adversaries": adversaries}, "compare", modules)
+    if "modules" in chosen:
+        given["modules"] = chosen["modules"]
+    made = scenario_of(scenario, given)
+    matchups = matchups_of(made, chosen.get("schemes"), chosen.get("adversaries"), parameters)
     with place_for(out, overwrite) as place, progress(tell, 0) as told:
         found = compare_all(matchups, place.folder, told, plan_of(plan, workers))
-        place.keep_for(found)
-        return found
+        results = ComparisonResults.of(found, place.folder)
+        place.keep_for(results)
+        return results

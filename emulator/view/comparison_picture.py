@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 from evedrop.score.verdict import MARKS, SecrecyKept
 from evedrop.view import palette
-from evedrop.view.figure_style import panels
+from evedrop.view.figure_style import drawing, panels
 from evedrop.view.palette import hexadecimal
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from evedrop.results.comparison import Cell, Comparison, SchemeResult
+    from evedrop.view.shown_figure import ShownFigure
 
 # Blue for secrecy kept, darker where perfect; orange for broken: distinct with any colour blindness, and in greyscale.
 _GROUND = {
@@ -39,31 +40,51 @@ _SAID = {
 _NOTABLE = 1.1  # the factor by which an attack must raise the user's error to be noted
 _FACTS = ("legitimate\nerror", "ACKs", "bits\na slot", "energy\na slot", "secret bits\na slot (+ once)")
 _FACT_WIDTH = 1.25
+_LEFT = _FACT_WIDTH * len(_FACTS)
 _LEAST_WIDTH = 9.0
 
 
 def draw(path: Path, found: Comparison) -> None:
     """Draw a comparison as `path`.png and `path`.pdf."""
-    schemes, adversaries = list(found.schemes.values()), found.adversaries
-    left = _FACT_WIDTH * len(_FACTS)
-    right = max(float(len(adversaries)) + 1.1, _LEAST_WIDTH)  # room for the legend
-    with panels(path, 1, 0.92 * (left + right + 2.0), 2.3 + 0.56 * len(schemes)) as (axes,):
-        axes.set_axis_off()
-        axes.set_xlim(-left - 2.0, right)
-        axes.set_ylim(len(schemes) + 1.6, -2.6)
-        for row, one in enumerate(schemes):
-            weight = "bold" if one.name in found.dominant else "normal"
-            axes.text(-left - 0.1, row, one.name, ha="right", va="center", fontsize=10.5, fontweight=weight)
-            for i, fact in enumerate(_facts(one)):
-                place = -left + _FACT_WIDTH * (i + 0.5)
-                axes.text(place, row, fact, ha="center", va="center", fontsize=9, color="#33383d")
-            for column, adversary in enumerate(adversaries):
-                _cell(axes, column, row, one, one.cells[adversary])
-        for i, head in enumerate(_FACTS):
-            axes.text(-left + _FACT_WIDTH * (i + 0.5), -0.62, head, ha="center", va="bottom", fontsize=9)
+    with panels(path, 1, *_size(found)) as (axes,):
+        _draw_on(axes, found)
+
+
+def comparison_figure(found: Comparison) -> ShownFigure:
+    """The picture of a comparison as a figure."""
+    with drawing(*_size(found)) as figure:
+        _draw_on(figure.subplots(), found)
+    return figure
+
+
+def _right(found: Comparison) -> float:
+    """The right end of the picture: room for the adversaries, and for the legend."""
+    return max(float(len(found.adversaries)) + 1.1, _LEAST_WIDTH)
+
+
+def _size(found: Comparison) -> tuple[float, float]:
+    """Width and height in inches."""
+    return 0.92 * (_LEFT + _right(found) + 2.0), 2.3 + 0.56 * len(found.schemes)
+
+
+def _draw_on(axes: Axes, found: Comparison) -> None:
+    schemes, adversaries, left = list(found.schemes.values()), found.adversaries, _LEFT
+    axes.set_axis_off()
+    axes.set_xlim(-left - 2.0, _right(found))
+    axes.set_ylim(len(schemes) + 1.6, -2.6)
+    for row, one in enumerate(schemes):
+        weight = "bold" if one.name in found.dominant else "normal"
+        axes.text(-left - 0.1, row, one.name, ha="right", va="center", fontsize=10.5, fontweight=weight)
+        for i, fact in enumerate(_facts(one)):
+            place = -left + _FACT_WIDTH * (i + 0.5)
+            axes.text(place, row, fact, ha="center", va="center", fontsize=9, color="#33383d")
         for column, adversary in enumerate(adversaries):
-            axes.text(column + 0.42, -0.62, adversary, ha="left", va="bottom", fontsize=9.5, rotation=38)
-        _legend(axes, found, left)
+            _cell(axes, column, row, one, one.cells[adversary])
+    for i, head in enumerate(_FACTS):
+        axes.text(-left + _FACT_WIDTH * (i + 0.5), -0.62, head, ha="center", va="bottom", fontsize=9)
+    for column, adversary in enumerate(adversaries):
+        axes.text(column + 0.42, -0.62, adversary, ha="left", va="bottom", fontsize=9.5, rotation=38)
+    _legend(axes, found, left)
 
 
 def _facts(one: SchemeResult) -> Iterator[str]:

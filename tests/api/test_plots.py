@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import importlib
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
 from evedrop import Scenario, montecarlo
-from evedrop.api import RunResults, SweepResults, sweep
+from evedrop.api import ComparisonResults, RunResults, SweepResults, compare, sweep
 from evedrop.errors import UsageError
 from evedrop.memory.montecarlo import Plan
 from evedrop.memory.simulation import Mode
+from evedrop.model.eavesdroppers.naive import Naive
+from evedrop.report.writing import REPORT
 from evedrop.view.palette import DROPPED, colour, hexadecimal
+from tests.conformance.own_classes import BLOCK, PAGE
+from tests.pages import checked
 from tests.scenario.good import GOOD
 
 SCENARIO = Scenario(GOOD).replace(slots=30, trials=2, record_trials=2)
@@ -114,3 +124,30 @@ def test_a_sweep_is_drawn_as_its_file_is() -> None:
     axes = found.plot().axes
     assert [one.get_title("left") for one in axes] == ["slots = 4", "slots = 6"]
     assert axes[0].get_xlabel() == "encoding.state_probability"
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The module `flipped` of the tutorial, imported from a folder as a user does."""
+    (tmp_path / "flipped.py").write_text(dict(BLOCK.findall(PAGE.read_text(encoding="utf-8")))["flipped.py"])
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield importlib.import_module("flipped")
+    del sys.modules["flipped"]
+
+
+def test_a_comparison_takes_a_class_and_has_a_figure_and_a_page(own: Any) -> None:
+    """The figure has a row for each scheme; the page lies in the folder of the results."""
+    found = compare(SCENARIO, schemes=[own.Flipped, "plain"], adversaries=[Naive], trials=2, plan=Plan(workers=1))
+    assert isinstance(found, ComparisonResults)
+    assert list(found.schemes) == ["flipped:Flipped", "plain"]
+    assert found.adversaries == ("naive",)
+    texts = {one.get_text() for one in found.plot().axes[0].texts}
+    assert {*found.schemes, *found.adversaries} <= texts
+    assert found.report() == found.folder / REPORT
+    assert any("flipped:Flipped" in text for text in checked(found.folder).texts)
+
+
+def test_results_write_their_page(results: RunResults) -> None:
+    """Into their folder."""
+    assert results.report() == results.folder / REPORT
+    assert SCENARIO.title in checked(results.folder).headings

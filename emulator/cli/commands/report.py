@@ -26,7 +26,7 @@ COMMANDS = (
     Command(
         "report",
         report,
-        "write report.html: a run, sweep or comparison on one page",
+        "write report.html: a run, sweep, comparison or wire on one page",
         (argument("run", "FOLDER"),),
         section="inspect",
         example="report runs/vehicle",
