@@ -7,13 +7,12 @@ import os
 import platform
 from pathlib import Path
 
-import tomli_w
-
 from evedrop.plugins import sources_of
 from evedrop.recordings.disturbance_file import table_text
 from evedrop.results.folder import write_private
 from evedrop.results.taken_states import STATES
 from evedrop.scenario import Scenario
+from evedrop.scenario.toml_text import toml_text
 
 DISTURBANCES = "disturbances.csv"
 """The file in a results folder if its scenario has disturbances."""
@@ -59,5 +58,4 @@ def resolved(scenario: Scenario, taken: bool = False) -> str:
         **{name: importlib.metadata.version(name) for name in ("evedrop", "numpy", "cryptography", "eclipse-zenoh")},
         **sources_of(tables),
     }
-    text: str = tomli_w.dumps(tables)
-    return text
+    return toml_text(tables)

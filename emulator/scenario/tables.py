@@ -298,10 +298,10 @@ class Scenario(Table):
 
     def to_toml(self) -> str:
         """The scenario as the text of a file; loading the file gives an equal scenario, which gives equal digests."""
-        import tomli_w  # noqa: PLC0415 - a live run does not wait for it
+        from evedrop.scenario.toml_text import toml_text  # noqa: PLC0415 - a live run does not wait for it
 
         made_with = {"made_with": self.made_with} if self.made_with else {}
-        return tomli_w.dumps({**self.as_tables(), **made_with})
+        return toml_text({**self.as_tables(), **made_with})
 
     def as_tables(self) -> dict[str, Any]:
         """The tables of its file, with the entries that were given."""

@@ -11,7 +11,6 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import tomli_w
 from pydantic import ValidationError
 
 from evedrop.errors import ScenarioError, UsageError
@@ -20,6 +19,7 @@ from evedrop.loading import set_entry, tables_in
 from evedrop.loading.line_numbers import with_line_numbers
 from evedrop.scenario.input_files import read_recordings, recordings_located
 from evedrop.scenario.sentences import sentences
+from evedrop.scenario.toml_text import toml_text
 from evedrop.scenario.values import unusable
 from evedrop.wire.across import link_names, mistakes_across
 from evedrop.wire.plan import Side, SideTls, WireEvent, WireLink, WirePlan
@@ -74,7 +74,7 @@ def wire_of(
 
 def resolved_wire(plan: WirePlan) -> str:
     """The complete wire file of a plan, as TOML: loading it gives the same plan."""
-    text: str = tomli_w.dumps(
+    return toml_text(
         {
             "seed": plan.seed,
             "lossless": list(plan.lossless),
@@ -88,7 +88,6 @@ def resolved_wire(plan: WirePlan) -> str:
             "expect": [dict(one) for one in plan.expectations],
         }
     )
-    return text
 
 
 def _located(tables: dict[str, Any], folder: Path) -> None:
