@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import getpass
 import os
 import shutil
@@ -76,17 +77,36 @@ def program() -> str:
 
 
 @contextmanager
+def _separated() -> Iterator[None]:
+    """The folder into which sshd moves its children as root; a folder that was made is removed when no other test uses it."""
+    if os.getuid() != 0:
+        yield
+        return
+    made = False
+    with suppress(FileExistsError):
+        _SEPARATION.mkdir(0o755)
+        made = True
+    folder = os.open(_SEPARATION, os.O_RDONLY)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_SH)
+        yield
+    finally:
+        if made:
+            with suppress(OSError):
+                fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                _SEPARATION.rmdir()
+        os.close(folder)
+
+
+@contextmanager
 def sshd(folder: Path, address: str = "127.0.0.1", enter: tuple[str, ...] = (), port: int = 0) -> Iterator[Sshd]:
     """A server that lets this user in, until the block ends.
 
     enter: the words that start a command on its host. Raises CannotRun if there is no sshd, or it does not start.
     """
-    command, made = program(), False
-    if os.getuid() == 0 and not _SEPARATION.exists():
-        _SEPARATION.mkdir(0o755)
-        made = True
+    command = program()
     port = port or free_port()
-    try:
+    with _separated():
         for name in ("host", "user"):
             run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", getpass.getuser(), "-f", str(folder / name))
         key = " ".join((folder / "host.pub").read_text().split()[:2])
@@ -114,7 +134,3 @@ def sshd(folder: Path, address: str = "127.0.0.1", enter: tuple[str, ...] = (), 
                 with suppress(ProcessLookupError):
                     os.kill(pid, 9)
             process.wait()
-    finally:
-        if made:
-            with suppress(OSError):
-                _SEPARATION.rmdir()
