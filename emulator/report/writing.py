@@ -5,15 +5,13 @@ Source: docs/results.md, report.html.
 
 from __future__ import annotations
 
-import contextlib
-import os
 from pathlib import Path
 
 from evedrop.errors import UsageError
 from evedrop.output import warn
 from evedrop.report.kinds import page_of
 from evedrop.report.page import Page
-from evedrop.results.folder import write_private
+from evedrop.results.folder import replace_private
 from evedrop.results.reading import load_results
 
 REPORT = "report.html"
@@ -30,15 +28,8 @@ def write_report(folder: Path) -> Path:
 
 def write_page(folder: Path, page: Page) -> Path:
     """Write a page as the report of a folder; it is there completely or not at all. Raises OSError."""
-    path, unfinished = folder / REPORT, folder / f"{REPORT}.new"
-    try:
-        write_private(unfinished, page.html)
-        os.replace(unfinished, path)
-    except OSError:
-        with contextlib.suppress(OSError):
-            unfinished.unlink()
-        raise
-    return path
+    replace_private(folder / REPORT, page.html)
+    return folder / REPORT
 
 
 def has_results(folder: Path) -> bool:

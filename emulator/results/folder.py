@@ -136,6 +136,18 @@ def write_private(path: Path, text: str) -> None:
     private_file(path).write_text(text, encoding="utf-8")
 
 
+def replace_private(path: Path, text: str) -> None:
+    """Write a text to a file that only this user can read; at any moment the file is the old or the new one. Raises OSError."""
+    unfinished = path.with_name(f"{path.name}.new")
+    try:
+        write_private(unfinished, text)
+        os.replace(unfinished, path)
+    except OSError:
+        with suppress(OSError):
+            unfinished.unlink()
+        raise
+
+
 _F_GETPATH = 50  # of macOS; Python has no name for it before 3.9, and none on Linux
 
 

@@ -25,7 +25,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from evedrop.results.folder import make_private, private_opener, write_private
+from evedrop.results.folder import make_private, private_opener, replace_private
 from evedrop.results.tables import NULLABLE
 
 UNFINISHED = "unfinished"
@@ -214,9 +214,7 @@ def last_round(folder: Path) -> TableRound:
 
 def write_figures(folder: Path, text: str) -> None:
     """Write the summary of the run so far; the file is complete at any moment."""
-    place = folder / UNFINISHED
-    write_private(place / f"{_SUMMARY}.new", text)
-    os.replace(place / f"{_SUMMARY}.new", place / _SUMMARY)
+    replace_private(folder / UNFINISHED / _SUMMARY, text)
 
 
 def figures_path(folder: Path) -> Path:

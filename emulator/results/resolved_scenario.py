@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import importlib.metadata
-import os
 import platform
 from pathlib import Path
 
 from evedrop.plugins import sources_of
 from evedrop.recordings.disturbance_file import table_text
-from evedrop.results.folder import write_private
+from evedrop.results.folder import replace_private
 from evedrop.results.taken_states import STATES
 from evedrop.scenario import Scenario
 from evedrop.scenario.toml_text import toml_text
@@ -24,9 +23,7 @@ def write_resolved(folder: Path, scenario: Scenario, taken: bool = False) -> Non
     taken: whether all states of a program have been written, so that the run can be repeated from them.
     """
     for name, text in {**input_texts(scenario), "scenario.toml": resolved(scenario, taken)}.items():
-        unfinished = folder / f"{name}.new"
-        write_private(unfinished, text)
-        os.replace(unfinished, folder / name)
+        replace_private(folder / name, text)
 
 
 def input_texts(scenario: Scenario) -> dict[str, str]:

@@ -5,30 +5,21 @@ Source: docs/results.md, summary.json.
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from evedrop.results.folder import write_private
+from evedrop.results.folder import replace_private
 from evedrop.results.growing_tables import forget
 from evedrop.score.summary import Summary
 
 
 def write_summary(folder: Path, summary: Summary) -> None:
     """Write summary.json, which completes a results folder; infinite and undefined numbers as strings, which JSON lacks."""
-    unfinished = folder / "summary.json.new"
-    try:
-        write_private(unfinished, summary_text(summary))
-        os.replace(unfinished, folder / "summary.json")
-    except OSError:
-        with contextlib.suppress(OSError):
-            unfinished.unlink()
-        raise
+    replace_private(folder / "summary.json", summary_text(summary))
     forget(folder)
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
-import os
 import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,7 +31,7 @@ from evedrop.model.schemes import scheme_of
 from evedrop.names import LEGITIMATE
 from evedrop.news import Tell
 from evedrop.results.comparison import Cell, Comparison, Needs, PacketLeak, SchemeResult, SimulatedError, Theory
-from evedrop.results.folder import make_private, new_folder, private_pictures, write_private
+from evedrop.results.folder import make_private, new_folder, private_pictures, replace_private, write_private
 from evedrop.results.resolved_scenario import input_texts, resolved
 from evedrop.scenario import Scenario
 from evedrop.score.histogram import LEVELS
@@ -222,6 +221,4 @@ def _write(folder: Path, found: Comparison, played: Sequence[tuple[Group, Merger
 def _write_found(folder: Path, found: Comparison) -> None:
     """Write compare.json with the schemes so far, if there are any; replaces the file atomically."""
     if found.schemes:
-        unfinished = folder / "compare.json.new"
-        write_private(unfinished, found.as_json() + "\n")
-        os.replace(unfinished, folder / "compare.json")
+        replace_private(folder / "compare.json", found.as_json() + "\n")

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
-import os
 import platform
 import threading
 import time
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 
 from evedrop.model.slot.link import Change
 from evedrop.output import warn
-from evedrop.results.folder import write_private
+from evedrop.results.folder import replace_private
 from evedrop.results.summary_file import plain
 from evedrop.score.summary import Judged
 from evedrop.wire.crossing import UNLINKED, Crossing, Kind
@@ -193,10 +192,8 @@ class WireSummary:
         """
         self._seconds = time.monotonic() - self._began
         found = self.as_dict()
-        unfinished = out / "summary.json.new"
         try:
-            write_private(unfinished, json.dumps(plain(found), indent=1, ensure_ascii=False) + "\n")
-            os.replace(unfinished, out / "summary.json")
+            replace_private(out / "summary.json", json.dumps(plain(found), indent=1, ensure_ascii=False) + "\n")
         except OSError as error:
             warn(f"the summary of the wire cannot be written ({error})")
             return 1

@@ -85,7 +85,7 @@ def test_a_report_that_cannot_be_written_leaves_everything_as_it_was(
     def full(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("evedrop.report.writing.os.replace", full)
+    monkeypatch.setattr("evedrop.results.folder.os.replace", full)
     assert try_report(study) is None
     assert "report.html was not written ([Errno 28] No space left on device)" in capsys.readouterr().err
     assert contents() == before

@@ -21,7 +21,7 @@ from queue import SimpleQueue
 from typing import IO, Protocol, final
 
 from evedrop.environment import SINGLE_THREADED, own_environment
-from evedrop.live.launch.starter import StartedProcess, Starter, start_process
+from evedrop.live.launch.starter import ReportedProcess, StartedProcess, Starter, start_process
 from evedrop.names import OBSERVER
 from evedrop.signals import held_back
 
@@ -43,50 +43,24 @@ OF_SUMMARIES = ("scipy.special",)
 
 
 @final
-class Fork:
-    """A process that a fork server has started, and whose end it reports; used like a `subprocess.Popen`."""
-
-    stdin: IO[bytes] | None = None
-    stdout: IO[bytes] | None = None
+class Fork(ReportedProcess):
+    """A process that a fork server has started, and whose end it reports."""
 
     def __init__(self, pid: int, handle: int) -> None:
         """handle: a file descriptor that refers to the process; once it has ended, its id may be another process's."""
-        self.pid = pid
+        super().__init__(pid)
         self._handle: int | None = handle
-        self._status: int | None = None
-        self._lock, self._over = threading.Lock(), threading.Event()
 
-    def ended(self, status: int) -> None:
-        """Take note of its end."""
-        with self._lock:
-            if self._handle is not None:
-                os.close(self._handle)
-            self._handle, self._status = None, status
-        self._over.set()
-
-    def poll(self) -> int | None:
-        """Its status; None while it runs."""
-        return self._status
-
-    def wait(self, timeout: float | None = None) -> int:
-        """Wait for its end. Raises subprocess.TimeoutExpired."""
-        if not self._over.wait(timeout) or self._status is None:
-            raise subprocess.TimeoutExpired("evedrop", timeout or 0.0)
-        return self._status
+    def _close(self) -> None:
+        if self._handle is not None:
+            os.close(self._handle)
+        self._handle = None
 
     def send_signal(self, sig: int) -> None:
         """Send a signal to it, if it still runs."""
         with self._lock, suppress(ProcessLookupError):
             if self._handle is not None:
                 signal.pidfd_send_signal(self._handle, sig)
-
-    def terminate(self) -> None:
-        """Ask it to end."""
-        self.send_signal(signal.SIGTERM)
-
-    def kill(self) -> None:
-        """End it."""
-        self.send_signal(signal.SIGKILL)
 
 
 class ServerProcess(Protocol):

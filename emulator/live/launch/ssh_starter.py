@@ -13,7 +13,6 @@ import itertools
 import json
 import os
 import shlex
-import signal
 import subprocess
 import tempfile
 import threading
@@ -27,7 +26,7 @@ from evedrop.environment import own_environment
 from evedrop.errors import Interrupted, UsageError
 from evedrop.live.launch.host_messages import MOST_NOISE, line_of, message_in, own_version
 from evedrop.live.launch.hosts_file import HostsPlan, HostTable
-from evedrop.live.launch.starter import CONNECTION_LOST, StartedProcess, Starter
+from evedrop.live.launch.starter import CONNECTION_LOST, ReportedProcess, StartedProcess, Starter
 
 ANSWER_SECONDS = 60.0
 """How long a host may take to connect and to start Python."""
@@ -36,9 +35,7 @@ _LOOK_SECONDS = 0.05
 _MOST_SAID = 2**20
 _ALIVE_SECONDS = 3
 _BEAT_SECONDS = 30.0
-_SILENCE_SECONDS = (
-    600.0  # after which a host considers the launcher gone; a user may suspend the launcher in its terminal
-)
+_SILENCE_SECONDS = 600.0  # after which a host considers a silent launcher gone; a user may suspend it for a while
 _OPTIONS = (
     "-T",
     *("-o", "BatchMode=yes"),  # never ask for a password or a key
@@ -53,52 +50,26 @@ _OPTIONS = (
 
 
 @final
-class HostedProcess:
-    """A process on another host; used like a `subprocess.Popen`."""
-
-    stdin: IO[bytes] | None = None
-    stdout: IO[bytes] | None = None
+class HostedProcess(ReportedProcess):
+    """A process on another host."""
 
     def __init__(self, number: int, host: SshHost, log: int) -> None:
         """number: distinguishes it from all other processes of the run; log: the file descriptor of its log, which it owns."""
-        self.pid = number
+        super().__init__(number)
         self._host, self._log = host, log
-        self._status: int | None = None
-        self._over = threading.Event()
 
     def write(self, text: str) -> None:
         """Write to its log."""
         with contextlib.suppress(OSError):  # the disk is full
             os.write(self._log, text.encode())
 
-    def ended(self, status: int) -> None:
-        """Note that it ended with this status."""
-        self._status = status
+    def _close(self) -> None:
         os.close(self._log)
-        self._over.set()
-
-    def poll(self) -> int | None:
-        """Its status; None while it runs."""
-        return self._status
-
-    def wait(self, timeout: float | None = None) -> int:
-        """Wait for its end. Raises subprocess.TimeoutExpired."""
-        if not self._over.wait(timeout) or self._status is None:
-            raise subprocess.TimeoutExpired("evedrop", timeout or 0.0)
-        return self._status
 
     def send_signal(self, sig: int) -> None:
         """Send a signal to it, if it still runs."""
         if self._status is None:
             self._host.send({"signal": self.pid, "number": int(sig)})
-
-    def terminate(self) -> None:
-        """Ask it to end."""
-        self.send_signal(signal.SIGTERM)
-
-    def kill(self) -> None:
-        """End it."""
-        self.send_signal(signal.SIGKILL)
 
 
 @final

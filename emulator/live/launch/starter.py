@@ -6,7 +6,9 @@ import contextlib
 import signal
 import subprocess
 import sys
+import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import IO, Protocol
@@ -49,6 +51,51 @@ class StartedProcess(Protocol):
 
     def kill(self) -> None:
         """End it."""
+
+
+class ReportedProcess(ABC):
+    """A process whose end another process reports; used like a `subprocess.Popen`."""
+
+    stdin: IO[bytes] | None = None
+    stdout: IO[bytes] | None = None
+
+    def __init__(self, pid: int) -> None:
+        self.pid = pid
+        self._status: int | None = None
+        self._lock, self._over = threading.Lock(), threading.Event()
+
+    @abstractmethod
+    def _close(self) -> None:
+        """Close what refers to the process, which has ended."""
+
+    @abstractmethod
+    def send_signal(self, sig: int) -> None:
+        """Send a signal to it, if it still runs."""
+
+    def ended(self, status: int) -> None:
+        """Note that it ended with this status."""
+        with self._lock:
+            self._close()
+            self._status = status
+        self._over.set()
+
+    def poll(self) -> int | None:
+        """Its status; None while it runs."""
+        return self._status
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait for its end. Raises subprocess.TimeoutExpired."""
+        if not self._over.wait(timeout) or self._status is None:
+            raise subprocess.TimeoutExpired("evedrop", timeout or 0.0)
+        return self._status
+
+    def terminate(self) -> None:
+        """Ask it to end."""
+        self.send_signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        """End it."""
+        self.send_signal(signal.SIGKILL)
 
 
 class Starter(Protocol):
