@@ -8,18 +8,19 @@ from __future__ import annotations
 
 import hashlib
 import re
-from functools import cache
 from pathlib import Path
+
+from kept import PICTURES, program_digest
+from view_pictures import view_pictures, view_section
 
 from evedrop import Scenario, montecarlo
 from evedrop.loading.file import built_in_text, shipped
 
-ROOT = Path(__file__).parents[2]
-PICTURES = ROOT / "build" / "gallery"
 _TRIAL_SLOTS = 200_000
 _MOST_TRIALS = 200
 _MOST_SLOTS = 5_000  # of the day in a house
 _LEAST_DESCRIPTION = 60
+_THIS = Path(__file__).read_bytes()
 _HEAD = """# Gallery
 
 Every built-in scenario, with errors, packets and estimates of a study in memory of at most 5000 slots.
@@ -35,7 +36,7 @@ def gallery_page() -> str:
         title = Scenario.load(name).title
         parts += [f"## {name}\n", f"**{title}.** {description(name)}\n", f"```text\nevedrop run {name}\n```\n"]
         parts += [f"![Errors, packets and estimates of {name}](gallery/{name}.png)\n"]
-    return "\n".join(parts)
+    return "\n".join([*parts, view_section()])
 
 
 def description(name: str) -> str:
@@ -51,13 +52,13 @@ def description(name: str) -> str:
 
 
 def pictures() -> dict[str, bytes]:
-    """The picture of each scenario, as PNG."""
+    """The picture of each scenario, and those of the view, as PNG."""
     PICTURES.mkdir(parents=True, exist_ok=True)
-    return {name: _picture(name) for name in sorted(shipped())}
+    return {name: _picture(name) for name in sorted(shipped())} | view_pictures()
 
 
 def _picture(name: str) -> bytes:
-    kept = PICTURES / f"{hashlib.sha256(_program() + built_in_text(name).encode()).hexdigest()[:16]}.png"
+    kept = PICTURES / f"{hashlib.sha256(program_digest() + _THIS + built_in_text(name).encode()).hexdigest()[:16]}.png"
     if not kept.exists():
         slots = min(Scenario.load(name).slots, _MOST_SLOTS)
         results = montecarlo(name, trials=min(_MOST_TRIALS, _TRIAL_SLOTS // slots), slots=slots)
@@ -65,12 +66,3 @@ def _picture(name: str) -> bytes:
         results.plot().savefig(new, format="png", dpi=80)
         new.replace(kept)
     return kept.read_bytes()
-
-
-@cache
-def _program() -> bytes:
-    """A digest of the program's source."""
-    found = hashlib.sha256(Path(__file__).read_bytes())
-    for path in sorted((ROOT / "emulator").rglob("*.py")):
-        found.update(path.read_bytes())
-    return found.digest()

@@ -1,0 +1,19 @@
+"""Pictures of the site that are kept from one build to the next, until the program changes."""
+
+from __future__ import annotations
+
+import hashlib
+from functools import cache
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+PICTURES = ROOT / "build" / "gallery"
+
+
+@cache
+def program_digest() -> bytes:
+    """A digest of the program's source."""
+    found = hashlib.sha256()
+    for path in sorted((ROOT / "emulator").rglob("*.py")):
+        found.update(path.read_bytes())
+    return found.digest()
