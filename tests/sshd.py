@@ -78,7 +78,7 @@ def program() -> str:
 
 @contextmanager
 def _separated() -> Iterator[None]:
-    """The folder into which sshd moves its children as root; a folder that was made is removed when no other test uses it."""
+    """Make the folder in which sshd confines its children as root; remove it later, unless it was there or a test uses it."""
     if os.getuid() != 0:
         yield
         return

@@ -43,7 +43,7 @@ def outcome(summary: Summary) -> tuple[str, bool | None]:
 
 
 def expectations_outcome(held: Sequence[bool | None], of: str) -> tuple[str, bool | None]:
-    """How many expectations held, and whether that is good; None without any. of: what they are of, such as "scenario"."""
+    """How many expectations held, and whether that is good; None without any. of: what gives them, such as "scenario"."""
     failed, unknown = held.count(False), held.count(None)
     said = f"all {len(held)} expectations held" if len(held) > 1 else "the expectation held"
     if not held:

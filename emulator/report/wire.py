@@ -62,7 +62,7 @@ def wire_outcome(summary: Mapping[str, Any]) -> tuple[str, bool | None]:
 
 
 def wire_sentences(summary: Mapping[str, Any]) -> Iterator[str]:
-    """What the table does not say: why messages did not arrive, and which expectations were met."""
+    """Notes to the table: why messages did not arrive, and which expectations were met."""
     for name, link in summary["links"].items():
         lost = _counted(link["lost_by"])
         dropped = _counted(link["dropped_by"])

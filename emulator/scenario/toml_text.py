@@ -11,7 +11,7 @@ import tomli_w
 
 _ITEM = r'(?:"(?:[^"\\\n]|\\.)*"|[-+.\w]+)'
 _LIST = re.compile(rf"^(?P<before>.*)\[\n(?P<items>(?: *{_ITEM},\n)+)(?P<indent> *)\]", re.MULTILINE)
-"""A list of numbers or texts as tomli-w writes it: an item a line. Texts have no line breaks there, so no text looks like it."""
+"""A list of numbers or texts as tomli-w writes it: one item per line. Texts have no line breaks there, so none looks like it."""
 _WIDTH = 120
 _STEP = "    "
 

@@ -148,6 +148,6 @@ def test_a_comparison_takes_a_class_and_has_a_figure_and_a_page(own: Any) -> Non
 
 
 def test_results_write_their_page(results: RunResults) -> None:
-    """Into their folder."""
+    """The page is written into their folder."""
     assert results.report() == results.folder / REPORT
     assert SCENARIO.title in checked(results.folder).headings

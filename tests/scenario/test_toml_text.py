@@ -47,5 +47,5 @@ def test_a_row_has_a_line() -> None:
 @example({"x": ["a" * 100, " b,  c" * 9, 'd"\\', "\n["] * 9})
 @example({"x": [{"a": [1, 2]}, 3, ["]", "["]]})
 def test_reading_gives_the_same_tables(tables: dict[str, Any]) -> None:
-    """Whatever the texts are, and however lists and tables contain each other."""
+    """It does so for any text, and for any nesting of lists and tables."""
     assert tomllib.loads(toml_text(tables)) == tables
