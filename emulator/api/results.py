@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
@@ -171,7 +172,7 @@ class SweepResults(ReportedResults):
             yield estimate(shown_figure(row, names), shown_figure(row, errors), column.format)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ComparisonResults(Comparison, ReportedResults):
     """The results of a comparison, and their folder."""
 
@@ -187,6 +188,24 @@ class ComparisonResults(Comparison, ReportedResults):
         from evedrop.view.comparison_picture import comparison_figure  # noqa: PLC0415 - matplotlib takes half a second
 
         return comparison_figure(self)
+
+    @property
+    def _facts(self) -> str:
+        schemes = "1 scheme" if len(self.schemes) == 1 else f"{len(self.schemes)} schemes"
+        adversaries = "1 adversary" if len(self.adversaries) == 1 else f"{len(self.adversaries)} adversaries"
+        return f"{self.slots:,} slots, {self.trials:,} trials, {schemes}, {adversaries}"
+
+    def __repr__(self) -> str:
+        return f"<ComparisonResults of {self.title!r}: {self._facts}>"
+
+    def _repr_html_(self) -> str:
+        heads = ["scheme", "largest legitimate error", "error of the closest adversary", "beaten by another scheme"]
+        rows = []
+        for one in self.schemes.values():
+            price, kept = (None if math.isnan(error) else error for error in (one.price, one.kept))
+            beaten = "–" if kept is None else "no" if one.name in self.dominant else "yes"
+            rows.append([one.name, figure_text(price, ".3g"), figure_text(kept, ".3g"), beaten])
+        return table_text(f"{self.title} · {self._facts}", heads, rows)
 
 
 def load_results(folder: str | Path) -> RunResults:

@@ -82,7 +82,8 @@ def _errors(axes: Axes, rows: pa.Table, receivers: list[str], slots: range | Non
         if np.isnan(error).all():
             error = found["mean_actual_trace_covariance"]
         heights += [error, theory]
-        axes.plot(found["slot"], np.maximum(error, floor), color=ink, label=name, linewidth=1.3)
+        dot = "o" if len(error) == 1 else ""  # a line through one slot cannot be seen
+        axes.plot(found["slot"], np.maximum(error, floor), color=ink, label=name, linewidth=1.3, marker=dot)
         axes.plot(found["slot"], np.maximum(theory, floor), "--", color=ink, linewidth=0.9)
         if (found["trials"] > 1).any():
             many = True

@@ -45,6 +45,12 @@ def test_errors_are_those_of_the_table_in_the_colours_of_the_view(results: RunRe
     assert (len(axes.get_lines()), len(axes.collections), axes.get_yscale()) == (4, 2, "log")
 
 
+def test_the_error_of_the_only_slot_is_a_dot() -> None:
+    """A line through one slot would not be seen."""
+    (axes,) = montecarlo(SCENARIO.replace(slots=1, trials=1, record_trials=1), trials=1).plot("errors").axes
+    assert [line.get_marker() for line in axes.get_lines()] == ["o", "None", "o", "None"]
+
+
 def test_errors_of_rounding_lie_on_the_lower_edge(results: RunResults) -> None:
     """One trial ends far below tr Q where a state was received; a mean over several is shown further down."""
     one = montecarlo(SCENARIO.replace(record_trials=1), trials=1)
@@ -145,6 +151,10 @@ def test_a_comparison_takes_a_class_and_has_a_figure_and_a_page(own: Any) -> Non
     assert {*found.schemes, *found.adversaries} <= texts
     assert found.report() == found.folder / REPORT
     assert any("flipped:Flipped" in text for text in checked(found.folder).texts)
+    assert repr(found) == f"<ComparisonResults of {SCENARIO.title!r}: 30 slots, 2 trials, 2 schemes, 1 adversary>"
+    shown = found._repr_html_()
+    assert "<th>flipped:Flipped</th>" in shown
+    assert f"<th>plain</th><td>{found.schemes['plain'].price:.3g}</td>" in shown
 
 
 def test_results_write_their_page(results: RunResults) -> None:
