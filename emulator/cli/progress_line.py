@@ -24,6 +24,7 @@ from evedrop.kernels.choice import fallback_warning
 from evedrop.news import ConnectionOutage, FolderMoved, Held, News, RunEnded, RunProgress, Started, ViewOpened
 
 _BAR_WIDTH = 120  # the least width of a terminal, in columns, that has room for a bar
+_WHOLE_WIDTH = 70  # the least width that has room for more than what is done and the time left
 
 
 class _Unfailing:
@@ -59,15 +60,16 @@ class ProgressLine:
         self._total = total
         self.moved: Path | None = None
         """The results folder, if it was renamed."""
+        whole = self.console.width >= _WHOLE_WIDTH
         self._progress = Progress(
             SpinnerColumn(),
-            TextColumn("{task.description}"),
+            *([TextColumn("{task.description}")] if whole else []),
             *([BarColumn(bar_width=24)] if self.console.width >= _BAR_WIDTH else []),
             MofNCompleteColumn(),
-            TextColumn(f"{unit} · {{task.fields[rate]}}"),
+            TextColumn(f"{unit} · {{task.fields[rate]}}" if whole else unit),
             TimeRemainingColumn(compact=True),
             TextColumn("left"),
-            TextColumn("{task.fields[errors]}"),
+            *([TextColumn("{task.fields[errors]}")] if whole else []),
             console=self.console,
             transient=True,
             disable=quiet or not self.console.is_terminal,

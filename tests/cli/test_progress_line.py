@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from evedrop.cli.progress_line import ProgressLine
-from evedrop.news import Held
+from evedrop.news import Held, RunProgress, Started
 
 
 class Terminal(io.StringIO):
@@ -28,3 +28,19 @@ def test_a_held_run_shows_how_far_it_is(monkeypatch: pytest.MonkeyPatch) -> None
         line.tell(Held(20))
     assert "held before slot 20" in terminal.getvalue()
     assert "20/50" in terminal.getvalue()
+
+
+def test_a_narrow_terminal_shows_what_is_done_and_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At 40 columns the speed and the errors are left out, and nothing is cut off."""
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "40")
+    with ProgressLine(2_000_000, "trial-slots") as line:
+        line.tell(Started())
+        line.tell(RunProgress(500_000, 123_456.0, "trial-slots/s", {"legitimate": 0.5, "smart": 2.0}))
+    last = terminal.getvalue().split("500000/2000000")[-1]
+    assert "trial-slots" in last
+    assert "left" in last
+    assert "123,456" not in terminal.getvalue()
+    assert "…" not in terminal.getvalue()
