@@ -71,6 +71,7 @@ def source_mistakes(table: Mapping[str, Any], n: int) -> Iterator[Found]:
     The table is unchecked: any entry may be missing or malformed.
     """
     source, names = table.get("source"), table.get("states")
+    given = source in ("file", "zenoh")  # the source may be a list, which a set does not take
     held = {"state_file": table.get("state_file"), "state_values": table.get("state_values")}
     if source is None:
         entries = {**held, "zenoh": table.get("zenoh")}
@@ -80,9 +81,9 @@ def source_mistakes(table: Mapping[str, Any], n: int) -> Iterator[Found]:
         yield "state_file", 'is missing; expected state_file = "pose.csv", or state_values'
     if source == "zenoh" and table.get("zenoh") is None:
         yield "zenoh", f"is missing; expected {_EXAMPLE}"
-    if source in {"file", "zenoh"} and names is None:
+    if given and names is None:
         yield "states", 'is missing; expected the names of the states in file or message, such as states = ["x", "y"]'
-    for entry in ("states", "units") if source in {"file", "zenoh"} else ():
+    for entry in ("states", "units") if given else ():
         found = table.get(entry)
         words = found if isinstance(found, list) and all(isinstance(one, str) for one in found) else []
         wrong = next((one for one in words if not _WORD.fullmatch(one)), None)
@@ -90,7 +91,7 @@ def source_mistakes(table: Mapping[str, Any], n: int) -> Iterator[Found]:
             yield entry, f'has {as_toml(wrong)}; expected words for the first line of a CSV file, without [ ] , " and #'
         elif entry == "states" and len({*words}) < len(words):
             yield entry, "has a name twice; expected different names"
-    if source not in {"file", "zenoh"} and table.get("theory") is not None:
+    if not given and table.get("theory") is not None:
         yield "theory", "is given, but the states are simulated, and theory describes them; remove the line"
     program = table.get("zenoh")
     offsets = program.get("offsets") if isinstance(program, Mapping) else None
