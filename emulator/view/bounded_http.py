@@ -50,7 +50,7 @@ class BoundedServer(ThreadingHTTPServer):
 
 
 class QuietHandler(BaseHTTPRequestHandler):
-    """A request, of which nothing is logged, because the address of a recording is a secret."""
+    """A request. Nothing about it is logged, because the address of a recording is a secret."""
 
     protocol_version = "HTTP/1.1"
     timeout = _REQUEST_SECONDS

@@ -156,7 +156,7 @@ def test_options_that_do_not_fit_are_refused(
 
 
 def test_the_video_of_a_run_shows_its_slots(finished: Path, evedrop: Evedrop, tmp_path: Path) -> None:
-    """The whole way, from the command to the file: two slots, of which the second is not the first."""
+    """The whole way, from the command to the file: two slots give two frames that differ."""
     path = tmp_path / "run.gif"
     done = evedrop("view", str(finished), "--video", str(path), "--slots", "20:40:20", "--size", "400x320")
     if "Vulkan" in done.err:

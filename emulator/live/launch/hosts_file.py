@@ -74,8 +74,8 @@ class HostTable(Table):
     port: Annotated[int | None, Field(strict=True, ge=1, le=65535, examples=[22])] = None
     processes: Annotated[tuple[Word, ...], Field(min_length=1, examples=[["router", "sensor"]])]
     command: Annotated[tuple[Line, ...], Field(min_length=1, examples=[["/opt/evedrop/bin/evedrop"]])] = ("evedrop",)
-    folder: Annotated[Line | None, Field(examples=["/home/lab/work"])] = None
-    modules: Annotated[Line | None, Field(examples=["/home/lab/classes"])] = None
+    folder: Annotated[Line | None, Field(examples=["/srv/evedrop/work"])] = None
+    modules: Annotated[Line | None, Field(examples=["/srv/evedrop/classes"])] = None
 
 
 class HostsFile(Table):
