@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -26,6 +27,7 @@ from evedrop.live.launch.ssh_starter import ssh_command
 from evedrop.loading import load
 from evedrop.ports import free_port
 from evedrop.scenario.stream_keys import StreamKeys
+from evedrop.scenario.tables import NetworkTable
 from tests.builders import digests_of
 from tests.conftest import LIMIT, Evedrop, Live, wait_until, with_mark
 from tests.privileged import CannotRun, skip
@@ -252,6 +254,59 @@ def test_mistakes_in_the_file_are_all_listed(text: str, mistakes: list[str], tmp
     with pytest.raises(ScenarioError) as error:
         load_hosts(tmp_path / "hosts.toml", load("restart"))
     assert error.value.mistakes == mistakes
+
+
+NO_CLASSES = """
+[router]
+listen = "tls/alpha.lan:7447"
+[hosts.alpha]
+address = "alpha.lan"
+processes = ["router"]
+[hosts.beta]
+address = "beta.lan"
+processes = ["smart"]
+modules = "/srv/classes"
+"""
+
+
+@pytest.mark.parametrize(
+    ("changes", "mistakes"),
+    [
+        (
+            {"network": NetworkTable(routers=2)},
+            ['relay: is missing; expected [relay] with listen = "tls/HOST:PORT": the scenario has two routers'],
+        ),
+        (
+            {"modules": "/home/here"},
+            [
+                "hosts.alpha.modules: is missing; expected the folder there of the modules that the scenario names (line 4)"
+            ],
+        ),
+    ],
+)
+def test_what_the_scenario_needs_is_missed(changes: dict[str, Any], mistakes: list[str], tmp_path: Path) -> None:
+    """A second router, and a folder of classes on every host."""
+    (tmp_path / "hosts.toml").write_text(NO_CLASSES)
+    with pytest.raises(ScenarioError) as error:
+        load_hosts(tmp_path / "hosts.toml", load("restart").model_copy(update=changes))
+    assert error.value.mistakes == mistakes
+
+
+def test_a_configuration_of_ssh_is_beside_the_file(tmp_path: Path) -> None:
+    """Wherever the command is called."""
+    (tmp_path / "hosts.toml").write_text(f'ssh_config = "ssh/config"\n{NO_CLASSES}')
+    assert load_hosts(tmp_path / "hosts.toml", load("restart")).ssh_config == tmp_path / "ssh" / "config"
+    (tmp_path / "hosts.toml").write_text(NO_CLASSES)
+    assert load_hosts(tmp_path / "hosts.toml", load("restart")).ssh_config is None
+
+
+def test_a_host_has_a_plain_name(tmp_path: Path) -> None:
+    """It is part of sentences and of paths in mistakes."""
+    (tmp_path / "hosts.toml").write_text(NO_CLASSES.replace("hosts.beta", 'hosts."Beta 1"'))
+    with pytest.raises(ScenarioError) as error:
+        load_hosts(tmp_path / "hosts.toml", load("restart"))
+    (mistake,) = error.value.mistakes
+    assert "expected a name of a lower-case letter" in mistake
 
 
 def test_what_ssh_is_given_never_asks_and_has_no_secret(tmp_path: Path) -> None:

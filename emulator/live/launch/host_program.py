@@ -109,11 +109,12 @@ class HostProcesses:
             environment["TMPDIR"] = str(self._private)
         read, write = os.pipe()
         try:
-            path = self._private / f"{process}.json"
-            with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
-                json.dump(brief, file)
-            with os.fdopen(write, "wb") as log, held_back():
-                self._processes[number] = self._start(role, path, log, environment)
+            with os.fdopen(write, "wb") as log:
+                path = self._private / f"{process}.json"
+                with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
+                    json.dump(brief, file)
+                with held_back():
+                    self._processes[number] = self._start(role, path, log, environment)
         except OSError as error:
             os.close(read)
             self.answer({"log": number, "text": f"evedrop: {process} cannot be started ({error})\n"})

@@ -1,0 +1,108 @@
+"""The launcher's side of a connection with a host; a script stands for ssh."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from evedrop.environment import own_environment
+from evedrop.errors import UsageError
+from evedrop.live.launch import ssh_starter
+from evedrop.live.launch.host_messages import MOST_NOISE, own_version
+from evedrop.live.launch.hosts_file import HostTable
+from evedrop.live.launch.ssh_starter import SshHost
+from evedrop.live.launch.starter import CONNECTION_LOST
+from tests.conftest import LIMIT, wait_until
+
+GREETING = json.dumps({"evedrop": own_version()})
+Connect = Callable[..., SshHost]
+
+
+@pytest.fixture
+def connect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Connect:
+    """Begin a connection; the script says these lines, keeps all that it is told, and ends with its standard input."""
+    monkeypatch.setenv("PATH", str(tmp_path / "bin"), prepend=":")
+
+    def begin(*said: str, **table: Any) -> SshHost:
+        (tmp_path / "bin").mkdir()
+        (tmp_path / "told").touch()
+        (tmp_path / "said").write_text("".join(f"{line}\n" for line in said))
+        script = tmp_path / "bin" / "ssh"
+        script.write_text(f"#!/bin/sh\ncat '{tmp_path}/said'\ncat >'{tmp_path}/told'\n")
+        script.chmod(0o700)
+        return SshHost("beta", HostTable(address="beta.lan", processes=("smart",), **table), None, 30.0)
+
+    return begin
+
+
+def ready(host: SshHost) -> None:
+    """Wait until the host has answered."""
+    host.wait_until_ready(time.monotonic() + LIMIT, threading.Event())
+
+
+def told(folder: Path) -> list[dict[str, Any]]:
+    """What the host has been told."""
+    return [json.loads(line) for line in (folder / "told").read_text().splitlines()]
+
+
+def test_a_host_gets_the_brief_and_what_differs_from_its_own_environment(connect: Connect, tmp_path: Path) -> None:
+    """No brief stays on disk here, and classes are in the folder there; with the connection its processes are lost."""
+    host = connect(GREETING, modules="/srv/classes")
+    ready(host)
+    brief, log = tmp_path / "smart.json", tmp_path / "smart.log"
+    brief.write_text(json.dumps({"process": "smart", "part": {"modules": "/home/here"}}))
+    with log.open("wb") as file:
+        process = host.start(7, "eavesdropper", brief, file, {**own_environment(), "OMP_NUM_THREADS": "one"})
+    assert not brief.exists()
+    assert process.poll() is None
+    host.close(time.monotonic() + LIMIT)
+    (order,) = told(tmp_path)
+    made = {"process": "smart", "part": {"modules": "/srv/classes"}}
+    assert order == {"start": 7, "role": "eavesdropper", "brief": made, "environment": {"OMP_NUM_THREADS": "one"}}
+    assert process.wait(LIMIT) == CONNECTION_LOST
+    assert log.read_text() == "evedrop: the connection with host beta ended: ssh ended with status 0\n"
+
+
+def test_a_brief_without_classes_gets_no_folder_of_classes(connect: Connect, tmp_path: Path) -> None:
+    """It has no use for it."""
+    host = connect(GREETING, modules="/srv/classes")
+    ready(host)
+    brief = tmp_path / "smart.json"
+    brief.write_text(json.dumps({"process": "smart", "part": {"modules": None}}))
+    with (tmp_path / "smart.log").open("wb") as file:
+        host.start(7, "eavesdropper", brief, file, {})
+    host.close(time.monotonic() + LIMIT)
+    assert told(tmp_path)[0]["brief"]["part"] == {"modules": None}
+
+
+def test_what_a_login_shell_prints_is_passed_over(connect: Connect) -> None:
+    """Up to a number of lines, even if they are JSON."""
+    host = connect("Welcome", "7", "[1]", "{}", *["more"] * (MOST_NOISE - 5), GREETING)
+    ready(host)
+    host.close(time.monotonic() + LIMIT)
+
+
+def test_a_host_that_only_talks_is_given_up(connect: Connect) -> None:
+    """After that many lines."""
+    host = connect(*["more"] * MOST_NOISE, GREETING)
+    with pytest.raises(UsageError, match=r"^host beta: "):
+        ready(host)
+    host.close(time.monotonic() + LIMIT)
+
+
+def test_a_host_is_told_that_the_launcher_lives(
+    connect: Connect, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From time to time; the order says how long it may wait for the next."""
+    monkeypatch.setattr(ssh_starter, "_BEAT_SECONDS", 0.01)
+    host = connect(GREETING)
+    ready(host)
+    wait_until(lambda: len((tmp_path / "told").read_bytes().splitlines()) > 2, "three heartbeats")
+    host.close(time.monotonic() + LIMIT)
+    assert told(tmp_path)[:3] == [{"silence": 600.0}] * 3
