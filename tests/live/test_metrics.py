@@ -6,11 +6,11 @@ from urllib.request import urlopen
 
 import pytest
 
-from evedrop import run
+from evedrop import montecarlo, run
 from evedrop.errors import UsageError
 from evedrop.live.launch.metrics import MetricsAddress, RunMetrics, metrics_served
 from evedrop.loading import load
-from evedrop.news import ConnectionOutage, News, RunProgress, Started, silent
+from evedrop.news import ConnectionOutage, FolderMoved, Held, News, RunProgress, Started, silent
 from evedrop.results.reading import load_results
 from tests.conftest import Evedrop
 
@@ -79,6 +79,32 @@ def test_a_lost_connection_is_counted(tmp_path: Path) -> None:
         found = scraped(page)
     assert (found["evedrop_running",], found["evedrop_lost_connections_total", "smart"]) == (1, 2)
     assert told == news
+
+
+def test_a_run_that_is_paused_is_held(tmp_path: Path) -> None:
+    """Until slots are reported again."""
+    metrics = RunMetrics(load("vehicle"), tmp_path, silent)
+    held = []
+    with metrics_served(ANY_PORT, metrics) as page:
+        for news in (Started(), Held(20), RunProgress(21, 5.0, "slots/s", {"smart": 0.5})):
+            metrics.tell(news)
+            held.append(scraped(page)["evedrop_held",])
+        assert scraped(page)["evedrop_recent_squared_error", "smart"] == 0.5
+    assert held == [0, 1, 0]
+
+
+def test_figures_are_those_of_the_folder_and_alarms_of_the_watermark(tmp_path: Path) -> None:
+    """A folder that has been renamed is found again."""
+    montecarlo("replay-attack", trials=10, out=tmp_path / "after")
+    metrics = RunMetrics(load("replay-attack"), tmp_path / "before", silent)
+    with metrics_served(ANY_PORT, metrics) as page:
+        assert ("evedrop_mean_squared_error", "legitimate") not in scraped(page)
+        metrics.tell(FolderMoved(str(tmp_path / "after")))
+        found = scraped(page)
+    summary = load_results(tmp_path / "after").summary
+    assert found["evedrop_mean_squared_error", "legitimate"] == summary["peers"]["legitimate"]["mean_squared_error"]
+    for figure in ("false_alarm_fraction", "detected_fraction"):
+        assert found[f"evedrop_{figure}",] == summary["integrity"][figure]
 
 
 def test_an_ipv6_address_has_brackets(tmp_path: Path) -> None:
