@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -18,17 +19,18 @@ from evedrop.view.panels.knowledge import WhoKnowsWhat
 from evedrop.view.panels.title import Title
 from evedrop.view.recording import ViewRecording
 from evedrop.view.scene import PeerSlots, Scene, Shown
-from tests.view.read_back import lane
+from tests.view.read_back import lane, rows
 from tests.view.simulated_run import Simulated
 
 SCENE = Scene("", "r", 10, 1, 2, 0.0, (Shown("smart", "eavesdropper", "smart", 1.0),), noise=0.05, units=("m", "m"))
 
 
 def known(error: float, trace: float, scene: Scene = SCENE) -> KnowledgeState:
-    """What a receiver knows with this squared error and tr P."""
+    """What a receiver knows with this squared error and tr P, shared by two states."""
     none = np.zeros(1)
-    P = np.diag([trace / 2, trace / 2])[None]
-    peer = PeerSlots(np.array([[np.sqrt(error), 0.0]]), P, none.astype(np.uint8), none, none, none, none)
+    P = np.diag([trace / 4, 3 * trace / 4])[None]
+    off = np.sqrt(error / 4), -np.sqrt(3 * error / 4)
+    peer = PeerSlots(np.array([off]), P, none.astype(np.uint8), none, none, none, none)
     return KNOWLEDGE[int(knowledge(scene, np.zeros((1, 2)), peer)[0])]
 
 
@@ -107,10 +109,12 @@ def test_the_strip_shows_who_knows_what(simulated: Callable[..., Simulated], tmp
         for slots in run.chunks(length):
             recording.add(slots)
         assert recording.close()
-        for i, shown in enumerate(run.scene.receivers):
-            lanes[shown.name, length] = lane(tmp_path / f"{length}.rrd", f"knows/{i + 1}_{shown.name}", 300)
-    for shown in run.scene.receivers:
+        for i, shown in enumerate(run.scene.receivers, 1):
+            lanes[shown.name, length] = lane(tmp_path / f"{length}.rrd", f"knows/{i}_{shown.name}", 300)
+    for i, shown in enumerate(run.scene.receivers, 1):
         assert lanes[shown.name, 7] == lanes[shown.name, 300]
+        changes = rows(tmp_path / "7.rrd", f"knows/{i}_{shown.name}", "StateChange:state")
+        assert [word for _, (word,) in sorted(changes.items())] == [word for word, _ in groupby(lanes[shown.name, 7])]
         expected = knowledge(run.scene, run.slots.x, run.slots.peers[shown.name])
         assert [word.split(",")[0] for word in lanes[shown.name, 7]] == [KNOWLEDGE[code].word for code in expected]
     words = {name: " ".join(found) for (name, _), found in lanes.items()}
@@ -126,7 +130,20 @@ def test_the_strip_shows_who_knows_what(simulated: Callable[..., Simulated], tmp
 def test_titles_in_any_letters_are_drawn() -> None:
     """Letters that the viewer's font lacks become question marks, and Markdown stays as it was typed."""
     assert drawable("Größe σ² ≥ 1 Ж x\u0302") == "Größe σ² ≥ 1 Ж x\u0302"
-    assert drawable("東 🚗") == "? ?"
-    text = Title(replace(SCENE, title="a *b* # c")).styles()["title"].text
+    assert drawable("東 🚗 \u0387\u038b\u038d\u03a2") == "? ? ????"
+    assert title_of(replace(SCENE, title="a *b* # c")) == r"**a \*b\* \# c**"
+
+
+def title_of(scene: Scene) -> str:
+    """The text in the first line of a view, in Markdown."""
+    text = Title(scene).styles()["title"].text
     assert text is not None
-    assert text.as_arrow_array().to_pylist() == [r"**a \*b\* \# c**"]
+    (found,) = text.as_arrow_array().to_pylist()
+    return str(found)
+
+
+def test_the_title_says_which_trials_are_shown() -> None:
+    """If there are several."""
+    assert title_of(replace(SCENE, title="a", trials=1)) == "**a**"
+    many = "**a** · curves: means of 2,000 trials, everything else: the first of them"
+    assert title_of(replace(SCENE, title="a", trials=2000)) == many
