@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evedrop.view.panels.state_plane import arrows, borders, inside, within
+from evedrop.view.panels.state_plane import apart, arrows, borders, inside, labels_of, within
 from evedrop.view.recording import ViewRecording
 from tests.view.read_back import rows
 from tests.view.simulated_run import Simulated
@@ -42,6 +42,62 @@ def test_what_is_inside_stays() -> None:
     stays, leaves = np.array([[[0, 0], [9, 4]]], np.float32), np.array([[[0, 0], [11, 4]]], np.float32)
     np.testing.assert_array_equal(within(stays, LOW, HIGH, TRUTH), stays)
     np.testing.assert_array_equal(within(leaves, LOW, HIGH, TRUTH), [[TRUTH[0], TRUTH[0]]])
+
+
+@pytest.mark.parametrize(
+    ("tip", "centre"),
+    [
+        ((2.0, 0.0), (2.0, -1.8)),  # above the truth: the letters are above the tip
+        ((2.0, 3.0), (2.0, 3.0)),  # below it: they are drawn below the centre anyway
+        ((9.0, 1.0), (6.4, -0.8)),  # at a border: moved into the frame
+        ((-9.0, -4.5), (-6.4, -5.0)),
+        ((2.0, 4.5), (2.0, 4.1)),
+    ],
+)
+def test_a_label_is_beyond_the_tip_and_in_the_frame(tip: tuple[float, float], centre: tuple[float, float]) -> None:
+    """The letters do not cover the arrow, which points away from the truth; Rerun's y axis points down."""
+    found = labels_of(TRUTH, np.array([tip], np.float32), LOW, HIGH)
+    np.testing.assert_allclose(found, [centre], rtol=1e-6)
+
+
+@pytest.mark.parametrize("tip", [(9.0, -4.0), (9.0, 4.0), (2.0, -4.5), (-8.0, 1.0)])
+def test_labels_of_estimates_at_one_place_are_below_each_other(tip: tuple[float, float]) -> None:
+    """Each is moved by as few lines as needed, and stays in the frame; one that is alone stays where it is."""
+    first = labels_of(TRUTH, np.array([tip], np.float32), LOW, HIGH)
+    placed = [apart(first, [], LOW, HIGH)]
+    np.testing.assert_array_equal(placed[0], first)
+    for _ in range(3):
+        placed.append(apart(first, placed, LOW, HIGH))
+    heights = np.sort([one[0, 1] for one in placed])
+    np.testing.assert_allclose(np.diff(heights), 0.11 * 10.0, rtol=1e-5)
+    assert {float(one[0, 0]) for one in placed} == {float(first[0, 0])}
+    assert all(inside(one, LOW, HIGH)[0] for one in placed)
+    beside = first + np.array([[8.0, 0.0]], np.float32)
+    np.testing.assert_array_equal(apart(beside, placed, LOW, HIGH), beside)
+    nowhere = np.full((1, 2), np.nan, np.float32)
+    np.testing.assert_array_equal(apart(first, [nowhere], LOW, HIGH), first)
+
+
+def test_two_that_are_far_have_labels_apart(simulated: Callable[..., Simulated], tmp_path: Path) -> None:
+    """Where one of them is near, the other's label is where it would be without it."""
+    run = simulated(60)
+    far = run.slots.x.copy()
+    far[30:40] += [3000.0, 4000.0]
+    labels = {}
+    for name, first in (("both", slice(30, 40)), ("one", slice(35, 40))):
+        near = run.slots.x.copy()
+        near[first] = far[first]
+        found = {"naive": near, "suspicious": far, "smart": run.slots.x}
+        peers = {who: replace(run.slots.peers[who], x_hat=x_hat) for who, x_hat in found.items()}
+        recording = ViewRecording(tmp_path / f"{name}.rrd", run.scene)
+        recording.add(replace(run.slots, peers={**run.slots.peers, **peers}))
+        assert recording.close()
+        for who in ("naive", "suspicious"):
+            labels[name, who] = rows(tmp_path / f"{name}.rrd", f"plane/{who}/away", "Points2D:positions")
+    for k in range(30, 40):
+        assert labels["both", "suspicious"][k] != labels["both", "naive"][k]
+        alone = labels["one", "suspicious"][k] == labels["both", "naive"][k]
+        assert alone == (k < 35)
 
 
 def test_the_plane_follows_truth_and_legitimate(simulated: Callable[..., Simulated], tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ It follows the truth and the legitimate estimator. An eavesdropper that is farth
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, final
 
@@ -102,6 +102,7 @@ class StatePlane(ViewPanel):
         border = _BORDER * (boxes[:, 2] - boxes[:, 0])
         low, high = boxes[:, 0] + border, boxes[:, 2] - border
         truth = positions[TRUTH][at]
+        labels: list[Points] = []
         yield Column(_FRAME, k[at], rr.LineStrips2D.columns(strips=boxes))
         for name, points in positions.items():
             trail = within(pieces[name], low, high, truth)
@@ -114,21 +115,33 @@ class StatePlane(ViewPanel):
             yield Column(_ellipse(shown.name), k[at], rr.LineStrips2D.columns(strips=outlines))
             if i > 0:
                 distances = self._distance.of(slots.x[at], peer.x_hat[at])
-                yield from self._far(shown.name, k[at], (truth, positions[shown.name][at], low, high), distances)
+                seen = truth, positions[shown.name][at], low, high
+                yield from self._far(shown.name, k[at], seen, distances, labels)
 
     def _far(
-        self, name: str, k: NDArray[np.int64], seen: tuple[Points, Points, Points, Points], distances: Floats
+        self,
+        name: str,
+        k: NDArray[np.int64],
+        seen: tuple[Points, Points, Points, Points],
+        distances: Floats,
+        labels: list[Points],
     ) -> Iterator[Column]:
-        """Arrows with distances where an estimate is outside the frame; seen: truth, estimates, lows and highs."""
+        """Arrows with distances where an estimate is outside the frame.
+
+        seen: truth, estimates, lows and highs; labels: those of other receivers, as in `apart`, to which its own are added.
+        """
         truth, points, low, high = seen
         far = ~inside(points, low, high)
         drawn = arrows(truth[far], points[far], low[far], high[far])
         texts = [f"{name}: {self._distance.text(one)}" for one in distances[far].tolist()]
         lengths = far.astype(np.int64)
         yield Column(_arrow(name), k, rr.LineStrips2D.columns(strips=drawn).partition(lengths))
-        centres = labels_of(truth[far], drawn[:, 1], low[far], high[far])
-        labels = rr.Points2D.columns(positions=centres, labels=texts)
-        yield Column(_away(name), k, labels.partition(lengths))
+        centres = np.full((len(k), 2), np.nan, np.float32)
+        centres[far] = labels_of(truth[far], drawn[:, 1], low[far], high[far])
+        centres = apart(centres, labels, low, high)
+        labels.append(centres)
+        columns = rr.Points2D.columns(positions=centres[far], labels=texts)
+        yield Column(_away(name), k, columns.partition(lengths))
 
 
 def _point_styles(name: str, bright: Colour, *, radius: float, order: float) -> dict[str, rr.AsComponents]:
@@ -174,6 +187,7 @@ _CORNERS = 40
 _BORDER = 0.04  # of the frame's sides, where a dot would be cut
 _EDGE = 0.1  # of a frame's sides: the room between the arrows' tips and its border
 _LABEL = 0.18  # the same for the labels: half the width of one
+_LINE = 0.11  # of a frame's height: what a label needs
 _ARROW = 0.08  # length of an arrow, compared with the longer side
 _ROOM = 0.3  # around what the frame follows, compared with its longer side
 
@@ -255,6 +269,20 @@ def labels_of(truth: Points, tips: Points, low: Points, high: Points) -> Points:
     size = high - low
     rising = np.where(tips[:, 1] <= truth[:, 1], -_LABEL, 0.0)[:, None] * size * [0.0, 1.0]
     return _shown(np.clip(tips + rising, low + size * [_LABEL, 0.0], high - size * [_LABEL, 0.5 * _LABEL]))
+
+
+def apart(centres: Points, others: Sequence[Points], low: Points, high: Points) -> Points:
+    """The centres of labels, (f, 2), moved towards the middle of their frames by lines until none covers one of `others`.
+
+    NaN where there is no label.
+    """
+    found, size = centres.astype(np.float64), (high - low).astype(np.float64)
+    line = np.where(found[:, 1] > (low + high)[:, 1] / 2, -_LINE, _LINE) * size[:, 1]
+    for _ in range(2 * len(others)):  # each of them covers two lines at most
+        distances = [np.abs(found - other) for other in others]
+        covered = np.any([np.all(one < size * [2 * _LABEL, 0.99 * _LINE], axis=1) for one in distances], axis=0)
+        found[:, 1] += np.where(covered, line, 0.0)
+    return found.astype(np.float32)
 
 
 def _shown(values: NDArray[Any]) -> Points:
