@@ -6,7 +6,7 @@ import itertools
 import subprocess
 import sys
 import tempfile
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import IO
@@ -52,7 +52,7 @@ def picture_apart(rrd: Path, png: Path, moment: float | None = None, size: tuple
 
 
 def frames_apart(
-    rrd: Path, moments: Sequence[float] | None, size: tuple[int, int], complaints: list[str]
+    rrd: Path, moments: Iterable[float] | None, size: tuple[int, int], complaints: list[str]
 ) -> Generator[bytes, None, None]:
     """Pictures of some moments, or of the last one, as PNG; the panels' complaints about the last are added to `complaints`.
 

@@ -13,6 +13,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from io import BytesIO
+from itertools import chain
 from pathlib import Path
 from typing import IO, final
 
@@ -190,7 +191,7 @@ def video_apart(
     check_video(path, size, rate)
     complaints: list[str] = []
     # The last moment first: if it is not in the recording, nothing is drawn in vain.
-    pictures = frames_apart(rrd, [moments[-1], *moments], size, complaints)
+    pictures = frames_apart(rrd, chain([moments[-1]], moments), size, complaints)
     with whole_file(path) as temporary, closing(pictures), _opened(temporary, path.suffix.lower(), rate) as file:
         next(pictures)
         for done, picture in enumerate(pictures, 1):

@@ -1,5 +1,5 @@
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from io import BytesIO
 from pathlib import Path
 from types import ModuleType
@@ -110,6 +110,19 @@ def test_a_full_disk_is_said_and_leaves_no_file(name: str, tmp_path: Path, monke
     monkeypatch.setattr(video, "_KINDS", kinds)
     with pytest.raises(UsageError, match=r"cannot be written \(.*No space left on device"):
         video_apart(tmp_path / "r.rrd", tmp_path / name, range(9), SIZE, 15.0, lambda _: None)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_slots_that_the_run_does_not_have_are_refused_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many they are: the last one is drawn first, and the moments are never made into a list."""
+
+    def frames(_rrd: Path, moments: Iterable[float], *_: object) -> object:
+        raise UsageError(f"slot {next(iter(moments))} is not in the run")
+        yield
+
+    monkeypatch.setattr(video, "frames_apart", frames)
+    with pytest.raises(UsageError, match="slot 999999999999 is not in the run"):
+        video_apart(tmp_path / "r.rrd", tmp_path / "v.gif", range(10**12), SIZE, 15.0, lambda _: None)
     assert list(tmp_path.iterdir()) == []
 
 
