@@ -21,7 +21,7 @@ from evedrop.results.reading import Results
 from evedrop.view.error_floor import error_floor, floor_words
 from evedrop.view.figure_style import drawing
 from evedrop.view.lanes import EAVESDROPPER
-from evedrop.view.palette import TRUTH_CURVE, colour, hexadecimal
+from evedrop.view.palette import RECEIVERS, TRUTH_CURVE, colour, hexadecimal
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,6 +33,8 @@ _WIDTH = 8.4
 _LAST = 300  # slots of lanes and plane unless told otherwise
 _ROOM = 1.6  # the factor by which the axis of errors goes beyond them
 _MARGIN = 0.25  # around the truth in the plane, as a share of its extent
+_LINES, _DOTS = ("-", "-.", ":"), (".", "x", "+")
+"""Of the first receivers with different colours, of the next ones, whose colours are the same, and so on."""
 _HEIGHTS: Mapping[str, Callable[[int], float]] = {
     "errors": lambda _: 3.2,
     "lanes": lambda receivers: 0.9 + 0.3 * receivers,
@@ -83,7 +85,8 @@ def _errors(axes: Axes, rows: pa.Table, receivers: list[str], slots: range | Non
             error = found["mean_actual_trace_covariance"]
         heights += [error, theory]
         dot = "o" if len(error) == 1 else ""  # a line through one slot cannot be seen
-        axes.plot(found["slot"], np.maximum(error, floor), color=ink, label=name, linewidth=1.3, marker=dot)
+        line = _LINES[i // len(RECEIVERS) % len(_LINES)]
+        axes.plot(found["slot"], np.maximum(error, floor), line, color=ink, label=name, linewidth=1.3, marker=dot)
         axes.plot(found["slot"], np.maximum(theory, floor), "--", color=ink, linewidth=0.9)
         if (found["trials"] > 1).any():
             many = True
@@ -172,8 +175,9 @@ class _RecordedTrial:
         truth = _path(first, "x")
         axes.plot(*truth, color=hexadecimal(TRUTH_CURVE), linewidth=2.6, alpha=0.8, label="truth")
         for i, (name, rows) in enumerate(self.rows.items()):
+            dot = _DOTS[i // len(RECEIVERS) % len(_DOTS)]
             manner: dict[str, Any] = (
-                {"linewidth": 1.2} if i == 0 else {"marker": ".", "markersize": 4.0, "linewidth": 0.0}
+                {"linewidth": 1.2} if i == 0 else {"marker": dot, "markersize": 4.0, "linewidth": 0.0}
             )
             axes.plot(*_path(rows, "x_hat"), color=hexadecimal(colour(i)), label=name, **manner)
         for limits, values in ((axes.set_xlim, truth[0]), (axes.set_ylim, truth[1])):

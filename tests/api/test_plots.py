@@ -99,6 +99,20 @@ def test_the_plane_shows_the_truth_and_who_follows_it(results: RunResults) -> No
     assert axes.get_xlabel() == "slot"
 
 
+def test_nine_receivers_look_different() -> None:
+    """Colours repeat after seven; then the lines and dots are others, in the legend, too."""
+    eavesdroppers = {f"antenna{i}": {"strategy": "naive", "link": {"quality": 0.5}} for i in range(8)}
+    results = montecarlo(SCENARIO, trials=2, eavesdroppers=eavesdroppers)
+    errors, _, plane = results.plot().axes
+    manners = []
+    for axes, kind in ((errors, "get_linestyle"), (plane, "get_marker")):
+        lines = [one for one in axes.get_lines() if str(one.get_label()) in results.peers]
+        assert [one.get_label() for one in lines] == list(results.peers)
+        manners += [{(to_hex(one.get_color()), getattr(one, kind)()) for one in lines}]
+        assert len({to_hex(one.get_color()) for one in lines}) == 7
+    assert [len(one) for one in manners] == [9, 9]
+
+
 def test_a_figure_shows_itself_in_a_notebook_without_a_display(
     results: RunResults, monkeypatch: pytest.MonkeyPatch
 ) -> None:
