@@ -10,11 +10,27 @@ import numpy as np
 
 from evedrop.view import lanes
 from evedrop.view.knowledge import KNOWLEDGE, knowledge
-from evedrop.view.palette import RUN_TEXTS
+from evedrop.view.palette import DROPPED_TEXT, IN_TRACK_TEXT, MISLED, RUN_TEXTS, STATE, TRUTH, TRUTH_CURVE, Colour
 from evedrop.view.panels.fates import FATES, KNOWN, LastPacket
+from evedrop.view.panels.packets import Packets
 from evedrop.view.recording import ViewRecording
 from tests.view.read_back import rows
 from tests.view.simulated_run import Simulated
+
+COLOURS = {
+    **dict.fromkeys(("state", "innovation"), STATE),
+    **dict.fromkeys(("misled", "drifting"), MISLED),
+    **dict.fromkeys(("dropped", "fooled"), DROPPED_TEXT),
+    **dict.fromkeys(("discarded", "silent"), TRUTH_CURVE),
+    "in track": IN_TRACK_TEXT,
+}
+"""Word → its colour: blue for what was used, amber for what misleads, red for what is lost, green for what is known."""
+
+
+def coloured(found: int) -> Colour:
+    """A colour as it is in a recording, in bytes of red, green, blue and opacity."""
+    red, green, blue, _ = found.to_bytes(4)
+    return red, green, blue
 
 
 def test_the_graph_tells_fates_and_errors(simulated: Callable[..., Simulated], tmp_path: Path) -> None:
@@ -25,10 +41,12 @@ def test_the_graph_tells_fates_and_errors(simulated: Callable[..., Simulated], t
         recording.add(slots)
     assert recording.close()
     labels = rows(tmp_path / "r.rrd", "graph", "GraphNodes:labels")
+    colours = rows(tmp_path / "r.rrd", "graph", "GraphNodes:colors")
     assert sorted(labels) == list(range(60))
     receivers, nothing = run.scene.receivers, 1e-3 * np.sqrt(run.scene.noise)
     for k, shown in labels.items():
         assert shown[:2] == [f"sensor: {'innovation' if run.slots.nu[k] else 'state'}", "router"]
+        assert [coloured(one) for one in colours[k][:2]] == [TRUTH, TRUTH]
         for i, one in enumerate(receivers):
             peer = run.slots.peers[one.name]
             word = lanes.lane_of(one).words[int(lanes.received(one, run.slots)[k])]
@@ -37,6 +55,8 @@ def test_the_graph_tells_fates_and_errors(simulated: Callable[..., Simulated], t
             name, _, rest = shown[2 + len(receivers) + i].partition(": ")
             what, _, off = rest.partition(", ")
             assert (name, what) == (one.name, known.word)
+            inks = [coloured(colours[k][at + i]) for at in (2, 2 + len(receivers))]
+            assert inks == [COLOURS[word], COLOURS[what]]
             distance = float(off.removesuffix(" off").replace(",", ""))
             assert np.isclose(distance, np.linalg.norm(run.slots.x[k] - peer.x_hat[k]), rtol=0.05, atol=nothing)
 
@@ -53,3 +73,13 @@ def test_a_closed_loop_has_no_graph(simulated: Callable[..., Simulated]) -> None
     scene = simulated(20).scene
     assert LastPacket.applies(scene)
     assert not LastPacket.applies(replace(scene, moving=("P (kW)",)))
+
+
+def test_with_many_receivers_the_lanes_of_packets_have_its_place(simulated: Callable[..., Simulated]) -> None:
+    """Docs/view.md: with more than four receivers; the letters of the graph would be too small."""
+    scene = simulated(20, copies=2).scene
+    for count in (1, 4, 5, 7):
+        some = replace(scene, receivers=scene.receivers[:count])
+        (packets,) = Packets(some).views()
+        drawn = [*LastPacket(some).views()]
+        assert (len(drawn), packets.side) == ((1, "left") if count <= 4 else (0, "top"))

@@ -7,9 +7,12 @@ from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
+import rerun as rr
 
 from evedrop.loading import load
+from evedrop.model.links.way import Way
 from evedrop.view.panels.ground_map import GroundMap
+from evedrop.view.recording import ViewRecording
 from evedrop.view.scored_slots import open_recording
 from tests.view.read_back import rows
 from tests.view.simulated_run import Simulated, orbit, simulate
@@ -42,3 +45,25 @@ def test_the_map_shows_both_ends_and_their_distance(tmp_path: Path) -> None:
         assert labels[k] == ["sensor", f"parked: {distance:,.0f} m away"]
     assert not rows(tmp_path / "r.rrd", "map/legitimate/at", "Points2D:positions")
     assert not GroundMap.applies(run.scene)
+
+
+def test_both_ends_may_move(tmp_path: Path) -> None:
+    """North is up, where Rerun's y axis points down; the lines of the ways bend at every waypoint of the run, and end with it."""
+    run: Simulated = simulate(orbit(), 60)
+    sender, receiver = Way([[0, 0.0, 10.0], [20, 0.0, 30.0], [90, 70.0, 30.0]]), Way([30.0, -10.0])
+    scene = replace(run.scene, ways={"smart": (sender, receiver)})
+    recording = ViewRecording(tmp_path / "r.rrd", scene)
+    recording.add(run.slots)
+    assert recording.close()
+    places = rows(tmp_path / "r.rrd", "map/smart/at", "Points2D:positions")
+    np.testing.assert_allclose(places[0], [[0.0, -10.0], [30.0, 10.0]])
+    np.testing.assert_allclose(places[59], [[39.0, -30.0], [30.0, 10.0]])
+    labels = rows(tmp_path / "r.rrd", "map/smart/at", "Points2D:labels")
+    assert [labels[k][1] for k in (0, 20)] == ["smart: 36 m away", "smart: 50 m away"]
+    ways = GroundMap(scene).styles()["map/smart/ways"]
+    assert isinstance(ways, rr.LineStrips2D)
+    assert ways.strips is not None
+    lines = ways.strips.as_arrow_array().to_pylist()
+    assert lines == [[[0.0, -10.0], [0.0, -30.0], [39.0, -30.0]], [[30.0, 10.0], [30.0, 10.0]]]
+    assert GroundMap.applies(scene)
+    assert not GroundMap.applies(replace(scene, moving=("P (kW)",)))
