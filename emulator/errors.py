@@ -17,7 +17,7 @@ EvedropError                    exit status
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 MOST_MISTAKES = 100
 """The most mistakes of a scenario in one message: more would not be read."""
@@ -151,6 +151,17 @@ class Interrupted(EvedropError):
 
 class NoAnswer(Exception):
     """A class raised an error, gave an invalid answer, or did not answer when asked; the text says which."""
+
+
+class UnknownName(KeyError):
+    """A name that results do not have; the message says which they have."""
+
+    def __init__(self, what: str, name: object, known: Iterable[str]) -> None:
+        """what: the kind of thing, such as "receiver"."""
+        super().__init__(f"there is no {what} {name!r}; expected one of {', '.join(known)}")
+
+    def __str__(self) -> str:
+        return str(self.args[0])  # KeyError would show its repr
 
 
 class NotRegistered(KeyError):

@@ -5,12 +5,13 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from html import escape
+from collections.abc import Iterable, Iterator
 from importlib import import_module
-from typing import Any
 
 from evedrop.news import News, RunProgress, Tell, silent
+from evedrop.report.markup import element, fragment, paragraphs, printable
+from evedrop.report.tables import html_table
+from evedrop.report.text_table import TextTable
 
 _TELL_SECONDS = 0.2
 
@@ -50,21 +51,11 @@ def progress(tell: Tell | None, total: int) -> Iterator[Tell]:
 def bar_text(done: int, total: int, beside: str) -> str:
     """A progress bar in HTML."""
     share = min(1.0, done / total) if total else 0.0
-    return f'<progress max="1" value="{share:.4f}"></progress> {share:.0%} · {escape(beside)}'
+    bar = element("progress", max="1", value=f"{share:.4f}")
+    bar.tail = printable(f" {share:.0%} · {beside}")
+    return fragment(bar)
 
 
-def table_text(title: str, heads: Sequence[str], rows: Sequence[Sequence[Any]], notes: Sequence[str] = ()) -> str:
-    """A table in HTML; the first column has names, the others have numbers. Every text is escaped."""
-    head = "".join(f"<th>{escape(one)}</th>" for one in heads)
-    lines = "".join(
-        "<tr>"
-        + "".join(f"<{kind}>{escape(str(one))}</{kind}>" for kind, one in zip(_kinds(row), row, strict=True))
-        + "</tr>"
-        for row in rows
-    )
-    said = "".join(f"<div>{escape(note)}</div>" for note in notes)
-    return f"<div><strong>{escape(title)}</strong></div><table><thead><tr>{head}</tr></thead><tbody>{lines}</tbody></table>{said}"
-
-
-def _kinds(row: Sequence[Any]) -> Iterator[str]:
-    return ("td" if i else "th" for i in range(len(row)))
+def table_text(title: str, table: TextTable, notes: Iterable[str] = ()) -> str:
+    """A table in HTML, as the page of a report has it, with notes below it."""
+    return fragment(element("div", html_table(table, title), *paragraphs(notes)))

@@ -7,13 +7,17 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol, Self
+from typing import TYPE_CHECKING, Literal, Protocol, Self, TypeVar, final
 
 import pyarrow as pa
 
 from evedrop.api.notebook import table_text
-from evedrop.figures import columns, error_column, shown_figure
-from evedrop.figures.text import estimate, figure_text
+from evedrop.errors import UnknownName
+from evedrop.figures import shown_figure
+from evedrop.figures.text import figure_text
+from evedrop.report import closing
+from evedrop.report.sweep import sweep_table
+from evedrop.report.text_table import TextTable
 from evedrop.results.comparison import Comparison
 from evedrop.results.reading import Results
 from evedrop.results.reading import load_results as read_results
@@ -22,8 +26,22 @@ from evedrop.score.summary import Judged, LinkSummary, PeerSummary, SecrecySumma
 if TYPE_CHECKING:
     from evedrop.view.shown_figure import ShownFigure
 
+T = TypeVar("T")
 Panels = Literal["errors", "lanes", "plane"]
 _MOST_ROWS = 40  # of a table in a notebook
+
+
+@final
+class ByName(dict[str, T]):
+    """Entries of results by name. An unknown name raises UnknownName, a KeyError that lists the known ones."""
+
+    def __init__(self, what: str, entries: Mapping[str, T]) -> None:
+        """what: the kind of entry, such as "receiver"."""
+        super().__init__(entries)
+        self._what = what
+
+    def __missing__(self, name: object) -> T:
+        raise UnknownName(self._what, name, self)
 
 
 class _InFolder(Protocol):
@@ -61,20 +79,20 @@ class RunResults(Results, ReportedResults):
     def _typed(self) -> Summary:
         return self.typed_summary
 
-    @property
+    @cached_property
     def peers(self) -> Mapping[str, PeerSummary]:
         """Receiver → its figures, the legitimate estimator first."""
-        return self._typed.peers
+        return ByName("receiver", self._typed.peers)
 
-    @property
+    @cached_property
     def links(self) -> Mapping[str, LinkSummary]:
         """Receiver → the account of its link."""
-        return self._typed.links
+        return ByName("link", self._typed.links)
 
-    @property
+    @cached_property
     def secrecy(self) -> Mapping[str, SecrecySummary]:
         """Eavesdropper → the verdict."""
-        return self._typed.secrecy
+        return ByName("verdict on", self._typed.secrecy)
 
     @property
     def expectations(self) -> list[Judged]:
@@ -87,21 +105,11 @@ class RunResults(Results, ReportedResults):
         trials = "1 trial" if one.trials == 1 else f"{one.trials:,} trials"
         return f"{one.slots:,} slots, {trials}, {'live' if one.mode == 'live' else f'in memory ({one.mode})'}"
 
-    def _rows(self) -> Iterator[list[str]]:
-        for name, peer in self.peers.items():
-            figures = (
-                estimate(
-                    shown_figure(peer.all_figures, names), shown_figure(peer.standard_errors, names), column.format
-                )
-                for column, names in columns("column", self._typed.mode).items()
-            )
-            z = next((z for z in peer.z.values() if z is not None), None)
-            yield [name, *figures, figure_text(z, "+.1f")]
-
     def _notes(self) -> Iterator[str]:
         if self.remark is not None:
             yield self.remark
-        yield from (verdict.sentence for verdict in self.secrecy.values())
+        for lines in (closing.remarks, closing.verdicts, closing.doubts, closing.application_lines):
+            yield from lines(self._typed)
         yield from (one.sentence for one in self.expectations)
 
     def plot(self, *panels: Panels, slots: range | None = None, trial: int | None = None) -> ShownFigure:
@@ -126,8 +134,8 @@ class RunResults(Results, ReportedResults):
         return f"<RunResults of {self._typed.scenario!r}: {self._facts}; mean error: {', '.join(errors)}{remark}>"
 
     def _repr_html_(self) -> str:
-        heads = ["receiver", *(column.heading for column in columns("column", self._typed.mode)), "z"]
-        return table_text(f"{self._typed.scenario} · {self._facts}", heads, [*self._rows()], [*self._notes()])
+        title = f"{self._typed.scenario} · {self._facts}"
+        return table_text(title, closing.receivers_table(self._typed), self._notes())
 
 
 @dataclass(frozen=True, repr=False)
@@ -151,25 +159,17 @@ class SweepResults(ReportedResults):
         return sweep_figure(self.table, self.keys)
 
     def __repr__(self) -> str:
-        return (
-            f"<SweepResults over {', '.join(self.keys)}: {self.points} points, a table of {self.table.num_rows} rows>"
-        )
+        return f"<SweepResults over {self._facts}, a table of {self.table.num_rows} rows>"
+
+    @property
+    def _facts(self) -> str:
+        return f"{', '.join(self.keys)}: {self.points} points"
 
     def _repr_html_(self) -> str:
-        shown = columns("sweep_column")
-        rows = [
-            [*(row[key] for key in self.keys), row["peer"], *self._figures(row)]
-            for row in self.table.slice(0, _MOST_ROWS).to_pylist()
-        ]
         more = self.table.num_rows - _MOST_ROWS
         notes = [f"and {more} rows more: .table has all of them"] if more > 0 else []
-        return table_text("", [*self.keys, "receiver", *(column.heading for column in shown)], rows, notes)
-
-    @staticmethod
-    def _figures(row: Mapping[str, Any]) -> Iterator[str]:
-        for column, names in columns("sweep_column").items():
-            errors = [error_column(name) for name in names]
-            yield estimate(shown_figure(row, names), shown_figure(row, errors), column.format)
+        rows = self.table.slice(0, _MOST_ROWS).to_pylist()
+        return table_text(f"Sweep over {self._facts}", sweep_table(rows, self.keys), notes)
 
 
 @dataclass(frozen=True, repr=False)
@@ -199,13 +199,13 @@ class ComparisonResults(Comparison, ReportedResults):
         return f"<ComparisonResults of {self.title!r}: {self._facts}>"
 
     def _repr_html_(self) -> str:
-        heads = ["scheme", "largest legitimate error", "error of the closest adversary", "beaten by another scheme"]
-        rows = []
+        numbers = ["largest legitimate error", "error of the closest adversary"]
+        table = TextTable.headed(["scheme"], numbers, ["beaten by another scheme"])
         for one in self.schemes.values():
             price, kept = (None if math.isnan(error) else error for error in (one.price, one.kept))
             beaten = "–" if kept is None else "no" if one.name in self.dominant else "yes"
-            rows.append([one.name, figure_text(price, ".3g"), figure_text(kept, ".3g"), beaten])
-        return table_text(f"{self.title} · {self._facts}", heads, rows)
+            table.add(one.name, figure_text(price, ".3g"), figure_text(kept, ".3g"), beaten)
+        return table_text(f"{self.title} · {self._facts}", table)
 
 
 def load_results(folder: str | Path) -> RunResults:

@@ -11,6 +11,7 @@ import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from evedrop.cli.names import name_lines
 from evedrop.hints import near
 
 if TYPE_CHECKING:
@@ -88,10 +89,7 @@ class Parser(argparse.ArgumentParser):
         parts = [f"usage: {self.prog} [options] COMMAND ...", "", *about, ""]
         for title, commands in self.sections.items():
             parts.append(f"{title}:")
-            for name, does in commands.items():
-                lines = textwrap.wrap(does, max(20, _columns() - width - 2)) or [""]
-                parts.append(f"  {name:<{width}}{lines[0]}")
-                parts += [" " * (width + 2) + line for line in lines[1:]]
+            parts += (f"  {line}" for line in name_lines(commands, width, _columns() - 2))
             parts.append("")
         parts += textwrap.wrap(str(self.epilog), _columns())
         return "\n".join(parts) + "\n"

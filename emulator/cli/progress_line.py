@@ -15,10 +15,12 @@ from rich.progress import (
     MofNCompleteColumn,
     Progress,
     SpinnerColumn,
+    Task,
     TaskID,
     TextColumn,
     TimeRemainingColumn,
 )
+from rich.text import Text
 
 from evedrop.kernels.choice import fallback_warning
 from evedrop.news import ConnectionOutage, FolderMoved, Held, News, RunEnded, RunProgress, Started, ViewOpened
@@ -51,10 +53,22 @@ def _unfailing(stream: TextIO | None) -> TextIO:
 
 
 @final
-class ProgressLine:
-    """Shows the news of a run on standard error; a context manager. total: progress at the end, counted in `unit`s."""
+class _TimeLeft(TimeRemainingColumn):
+    """The time left; nothing before it is known how much is to be done."""
 
-    def __init__(self, total: int, unit: str, quiet: bool = False) -> None:
+    def render(self, task: Task) -> Text:
+        time = super().render(task)
+        return time if task.total is None else time + " left"
+
+
+@final
+class ProgressLine:
+    """Shows the news of a run on standard error; a context manager.
+
+    total: progress at the end, counted in `unit`s; None if the news will tell it.
+    """
+
+    def __init__(self, total: int | None, unit: str, quiet: bool = False) -> None:
         self.console = Console(file=_unfailing(sys.stderr), highlight=False, markup=False)
         self._quiet = quiet
         self._total = total
@@ -67,8 +81,7 @@ class ProgressLine:
             *([BarColumn(bar_width=24)] if self.console.width >= _BAR_WIDTH else []),
             MofNCompleteColumn(),
             TextColumn(f"{unit} · {{task.fields[rate]}}" if whole else unit),
-            TimeRemainingColumn(compact=True),
-            TextColumn("left"),
+            _TimeLeft(compact=True),
             *([TextColumn("{task.fields[errors]}")] if whole else []),
             console=self.console,
             transient=True,

@@ -3,24 +3,13 @@
 Source: docs/scenario.md.
 """
 
-from evedrop.loading.file import (
-    built_in_text,
-    checked,
-    load,
-    parse,
-    read,
-    set_entry,
-    shipped,
-    tables_in,
-    value_of,
-    write_new,
-)
+from evedrop.loading.file import checked, load, parse, read, set_entry, tables_in, value_of
 from evedrop.loading.python_scenario import prepared, register
 from evedrop.scenario.tables import Scenario
+from evedrop.scenarios import shipped
 
 __all__ = [
     "Scenario",
-    "built_in_text",
     "checked",
     "load",
     "parse",
@@ -30,7 +19,6 @@ __all__ = [
     "shipped",
     "tables_in",
     "value_of",
-    "write_new",
 ]
 
 register()

@@ -8,7 +8,6 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Mapping
-from importlib import resources
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -37,6 +36,7 @@ from evedrop.scenario.tables import Scenario
 from evedrop.scenario.valid import ValidTables
 from evedrop.scenario.values import unusable
 from evedrop.scenario.words import listed
+from evedrop.scenarios import shipped
 
 MOST_BYTES = 2**28
 """The largest scenario file: room for the outcomes of millions of packets."""
@@ -46,37 +46,6 @@ _MOST_DOTS = 32
 # Python's TOML reader takes time that grows with the square of the number of a key's parts.
 _PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+"""
 _DOTTED = re.compile(rf"""(?<![A-Za-z0-9_"'.-])(?:{_PART}){{{_MOST_DOTS}}}""")
-
-
-def shipped() -> dict[str, Path]:
-    """The scenarios inside the package: name → file."""
-    folder = Path(str(resources.files("evedrop.scenarios")))
-    return {path.stem: path for path in sorted(folder.glob("[a-z]*.toml"), key=lambda path: path.stem)}
-
-
-def built_in_text(name: str) -> str:
-    """The file of a built-in scenario. Raises UsageError if there is no scenario of this name."""
-    if name not in shipped():
-        raise UsageError(
-            f"there is no built-in scenario {name}{near(name, shipped()) or '; evedrop list prints the names'}"
-        )
-    return shipped()[name].read_text(encoding="utf-8")
-
-
-def write_new(path: Path, origin: str | None = None) -> None:
-    """Write a scenario to start from: the commented one, or a copy of the built-in scenario `origin`.
-
-    Raises UsageError if the file exists or cannot be written, or there is no such scenario.
-    """
-    commented = Path(str(resources.files("evedrop.scenarios"))).joinpath("_new.toml")
-    text = commented.read_text(encoding="utf-8") if origin is None else built_in_text(origin)
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
-    except FileExistsError as error:
-        raise UsageError(f"{path} exists already; give another name") from error
-    except OSError as error:
-        raise UsageError(f"{path} cannot be written ({error.strerror}); give another place") from error
 
 
 def load(source: str | Path, changes: Mapping[str, Any] | None = None, *, beyond_horizon: bool = False) -> Scenario:

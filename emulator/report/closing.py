@@ -203,11 +203,15 @@ def _rare_lines(summary: Summary) -> Iterator[str]:
         if rare is not None and rare.share > RARE_SHARE and summary.trials > 1:
             enough = f"{_count(rare.trials)} trials" if math.isfinite(rare.trials) else "no number of trials"
             yield (
-                f"{name}: {100 * rare.share:.2g} % of its expected error is carried by events of which {summary.trials:,} trials "
-                f"contain fewer than one on average, so its mean and standard error are probably too small; {enough} would "
-                f"leave {100 * RARE_SHARE:.2g} %"
+                f"{name}: {100 * rare.share:.2g} % of its expected error is carried by {rare_events_words(summary.trials)}, so "
+                f"its mean and standard error are probably too small; {enough} would leave {100 * RARE_SHARE:.2g} %"
                 + ("; montecarlo --rare estimates it by splitting" if peer.rare_estimate is None else "")
             )
+
+
+def rare_events_words(trials: int) -> str:
+    """Events that are too rare for so few trials."""
+    return f"events of which {trials:,} trials contain fewer than one on average"
 
 
 def _count(number: float) -> str:

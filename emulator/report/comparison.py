@@ -10,6 +10,7 @@ from itertools import groupby
 from typing import TYPE_CHECKING
 
 from evedrop.figures.text import estimate, figure_text
+from evedrop.report.closing import rare_events_words
 from evedrop.report.text_table import TextTable
 from evedrop.score.summary import RARE_SHARE
 from evedrop.score.verdict import MARKS, SecrecyKept
@@ -144,8 +145,8 @@ def _remarks(found: Comparison) -> Iterator[str]:
     rare = [f"{name} up to {100 * share:.2g} %" for name, share in shares.items() if share > RARE_SHARE]
     if rare:
         yield (
-            f"events of which {found.trials:,} trials contain fewer than one on average carry a part of expected errors, whose "
-            f"means and standard errors are then probably too small: {', '.join(rare)}"
+            f"{rare_events_words(found.trials)} carry a part of expected errors, whose means and standard errors are then "
+            f"probably too small: {', '.join(rare)}"
         )
     if any(one is not None and one.theory is not None and one.theory.bound for one in measured):
         yield "≥: no closed form is known; a lower bound on the expected error of any receiver without the secret"

@@ -13,7 +13,7 @@ from evedrop.figures.text import estimate
 from evedrop.report.comparison import comparison_lines, pairs_table, schemes_table, verdict
 from evedrop.report.markup import Node, element, paragraphs
 from evedrop.report.section import Section
-from evedrop.report.tables import html_table
+from evedrop.report.tables import captioned, html_table
 from evedrop.results.comparison import Cell, Comparison
 from evedrop.results.comparison_file import read_comparison
 from evedrop.score.verdict import SecrecyKept
@@ -68,10 +68,7 @@ class MatrixSection(Section[ComparisonSource]):
             row = element("tr", element("th", name, scope="row"))
             row.extend(_cell(one.cells[adversary]) for adversary in found.adversaries)
             body.append(row)
-        table = element("table", element("thead", element("tr", *heads)), body, aria_label=caption)
-        region = element("div", table, class_="scroll", tabindex="0", role="region", aria_label=caption)
-        yield element("p", caption, class_="caption")
-        yield region
+        yield captioned(element("tr", *heads), body, caption)
 
 
 def _cell(cell: Cell) -> ET.Element:

@@ -49,6 +49,11 @@ def paragraphs(lines: Iterable[str]) -> list[Node]:
     return [element("ul", *items)] if items else []
 
 
+def fragment(root: ET.Element) -> str:
+    """The tree as a part of an HTML document."""
+    return ET.tostring(root, encoding="unicode", method="html")
+
+
 def written(root: ET.Element) -> str:
     """The tree as an HTML document."""
-    return "<!doctype html>\n" + ET.tostring(root, encoding="unicode", method="html") + "\n"
+    return f"<!doctype html>\n{fragment(root)}\n"

@@ -15,7 +15,7 @@ from evedrop.report.markup import Node, element, paragraphs
 from evedrop.report.run_source import OUTCOMES, TRACK_COLOURS, RecordedTrial, RunSource
 from evedrop.report.section import Section
 from evedrop.report.strip import strip
-from evedrop.report.tables import html_table
+from evedrop.report.tables import facts_table, html_table
 from evedrop.report.text_table import TextTable
 from evedrop.score.expectations_held import repeating
 from evedrop.score.summary import Judged
@@ -243,16 +243,15 @@ class RepeatSection(Section[RunSource]):
         commands = [repeating(of.folder, summary.trials, summary.mode), f"evedrop view {where}"]
         yield element("pre", element("code", "\n".join(commands)))
         made = of.tables.get("made_with", {})
-        facts = TextTable.headed(["what"], [], ["value"])
-        facts.add("seed", str(summary.seed))
-        facts.add("trials", f"{summary.first_trial:,} to {summary.first_trial + summary.trials - 1:,}")
-        facts.add("mode", summary.mode)
-        facts.add("time", f"{summary.wall_seconds:,.1f} s")
-        for name, value in made.items() if isinstance(made, dict) else ():
-            facts.add(str(name), str(value))
-        for name, peer in summary.peers.items():
-            facts.add(f"digest of {name}", peer.digest or "–")
-        yield html_table(facts, "Seed, versions and digests")
+        facts = {
+            "seed": summary.seed,
+            "trials": f"{summary.first_trial:,} to {summary.first_trial + summary.trials - 1:,}",
+            "mode": summary.mode,
+            "time": f"{summary.wall_seconds:,.1f} s",
+            **(made if isinstance(made, dict) else {}),
+            **{f"digest of {name}": peer.digest or "–" for name, peer in summary.peers.items()},
+        }
+        yield facts_table(facts, "Seed, versions and digests")
         if of.scenario_text and len(of.scenario_text) <= _MOST_TEXT:
             text = element("pre", element("code", of.scenario_text))
             yield element("details", element("summary", "The scenario with all its entries"), text)

@@ -17,6 +17,8 @@ import pyarrow.parquet as pq
 from evedrop.errors import UsageError
 from evedrop.figures import all_figures, error_column, shown_figure
 from evedrop.files import text_of
+from evedrop.loading import value_of
+from evedrop.model.checks import toml_of
 from evedrop.model.process import Floats
 from evedrop.report.chart import Curve, LogChart
 from evedrop.report.markup import Node, element, paragraphs
@@ -42,35 +44,30 @@ class SweepSource:
     grid: Mapping[str, Sequence[Any]]
     """Entry → its values."""
     mode: str
+    amount: str
+    """How much was run."""
+    outcome: str
+    """How many points were done, as a sentence."""
 
     @classmethod
     def read(cls, folder: Path) -> SweepSource:
         """Read a folder. Raises UsageError if it is not that of a sweep."""
         try:
             found = json.loads(text_of(folder / "sweep.json", _MOST_BYTES))
-            rows = pq.read_table(folder / SWEEP_TABLE).to_pylist()
-            return cls(folder, rows, found["scenario"], found["changes"], found["over"], found["mode"])
+            rows, grid = pq.read_table(folder / SWEEP_TABLE).to_pylist(), found["over"]
+            done, planned = len({tuple(row[key] for key in grid) for row in rows}), math.prod(map(len, grid.values()))
+            sizes = (_size([row[name] for row in rows], name) for name in ("slots", "trials"))
+            amount = " · ".join((f"{done:,} points of {', '.join(grid)}", *sizes))
+            outcome = f"All {planned:,} points were done" if done == planned else f"{done:,} of {planned:,} points"
+            return cls(folder, rows, found["scenario"], found["changes"], grid, found["mode"], amount, outcome)
         except Exception as error:  # pyarrow raises many kinds of errors for a damaged file
             raise UsageError(f"{folder} cannot be read as a sweep ({error}); run the sweep again") from error
 
-    @property
-    def points(self) -> int:
-        """How many points were done."""
-        return len({tuple(row[key] for key in self.grid) for row in self.rows})
 
-    @property
-    def amount(self) -> str:
-        """How much was run."""
-        row = self.rows[0]
-        return f"{self.points:,} points of {', '.join(self.grid)} · {row['slots']:,} slots · {row['trials']:,} trials"
-
-    @property
-    def outcome(self) -> str:
-        """How many points were done, as a sentence."""
-        planned = math.prod(len(values) for values in self.grid.values())
-        return (
-            f"All {planned:,} points were done" if self.points == planned else f"{self.points:,} of {planned:,} points"
-        )
+def _size(counts: Sequence[int], of: str) -> str:
+    """The counts of all points in words, such as "1,000 slots"; their range if the points differ."""
+    least, most = min(counts), max(counts)
+    return f"{least:,} {of}" if least == most else f"{least:,} to {most:,} {of}"
 
 
 @final
@@ -159,7 +156,8 @@ class SweepRepeat(Section[SweepSource]):
     @classmethod
     def nodes(cls, of: SweepSource) -> Iterator[Node]:
         """The command."""
-        words = ["evedrop", "sweep", of.scenario]
+        given = of.folder / "scenario.toml"  # of a scenario that was made in Python, whose name is only its title
+        words = ["evedrop", "sweep", str(given.absolute()) if given.exists() else of.scenario]
         for key, values in of.grid.items():
             words += ["--over", f"{key}={','.join(_toml(value) for value in values)}"]
         for key, value in of.changes.items():
@@ -169,8 +167,9 @@ class SweepRepeat(Section[SweepSource]):
 
 
 def _toml(value: Any) -> str:
-    """A value as the command line takes it."""
-    return value if isinstance(value, str) else json.dumps(value)
+    """A value as the command line takes it; a word without quotes unless it would be read as something else."""
+    plain = isinstance(value, str) and value_of(value) == value and not {",", ":"} & set(value)
+    return str(value) if plain else toml_of(value)
 
 
 SWEEP_SECTIONS: tuple[type[Section[SweepSource]], ...] = (

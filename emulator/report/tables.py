@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from xml.etree import ElementTree as ET
+
 from evedrop.report.markup import Node, element
 from evedrop.report.text_table import TextTable
 
@@ -16,9 +19,22 @@ def html_table(table: TextTable, caption: str) -> Node:
             for i, (cell, column) in enumerate(zip(row, table.columns, strict=True))
         ]
         body.append(element("tr", *cells))
-    shown = element("table", element("thead", element("tr", *heads)), body, aria_label=caption)
+    return captioned(element("tr", *heads), body, caption)
+
+
+def captioned(heads: ET.Element, body: ET.Element, caption: str) -> Node:
+    """A table of elements with its caption."""
+    shown = element("table", element("thead", heads), body, aria_label=caption)
     region = element("div", shown, class_="scroll", tabindex="0", role="region", aria_label=caption)
     return element("div", element("p", caption, class_="caption"), region)  # a caption would be as wide as its table
+
+
+def facts_table(facts: Mapping[str, object], caption: str) -> Node:
+    """A table of what is known about a run: name → value."""
+    table = TextTable.headed(["what"], [], ["value"])
+    for name, value in facts.items():
+        table.add(name, str(value))
+    return html_table(table, caption)
 
 
 def _class(number: bool) -> str | None:

@@ -15,7 +15,7 @@ from evedrop.files import Unreadable, text_of
 from evedrop.report.markup import Node, element, paragraphs
 from evedrop.report.run_sections import marked_sentences
 from evedrop.report.section import Section
-from evedrop.report.tables import html_table
+from evedrop.report.tables import facts_table, html_table
 from evedrop.report.text_table import TextTable
 from evedrop.report.wire import reasons_table, unlinked_sentence, wire_faults, wire_outcome, wire_table, wire_title
 from evedrop.results.wire_folder import WIRE_FILE
@@ -157,13 +157,13 @@ class WireRepeat(Section[WireSource]):
         yield element("p", "A wire whose messages have the same fates, and a look at this one:")
         commands = [["evedrop", "wire", str(where / WIRE_FILE)], ["evedrop", "view", str(where)]]
         yield element("pre", element("code", "\n".join(map(shlex.join, commands))))
-        facts = TextTable.headed(["what"], [], ["value"])
-        facts.add("seed", str(of.summary["seed"]))
-        facts.add("start", f"{of.summary['start']:,} in this folder")
-        facts.add("time", f"{of.summary['seconds']:,.1f} s")
-        for name, value in of.summary["made_with"].items():
-            facts.add(str(name), str(value))
-        yield html_table(facts, "Seed and versions")
+        facts = {
+            "seed": of.summary["seed"],
+            "start": f"{of.summary['start']:,} in this folder",
+            "time": f"{of.summary['seconds']:,.1f} s",
+            **of.summary["made_with"],
+        }
+        yield facts_table(facts, "Seed and versions")
 
 
 WIRE_SECTIONS: tuple[type[Section[WireSource]], ...] = (

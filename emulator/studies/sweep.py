@@ -110,6 +110,8 @@ def sweep_over(
         with disk_errors(folder):
             text = json.dumps(description, indent=1, ensure_ascii=False, default=str)
             write_private(folder / "sweep.json", text + "\n")
+            if isinstance(source, Scenario):  # there is no other file from which the sweep could be repeated
+                write_private(folder / "scenario.toml", source.to_toml())
             with contextlib.closing(results_of(everything, workers, client, told, stop.is_set)) as results:
                 written = time.monotonic()
                 try:

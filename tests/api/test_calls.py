@@ -6,24 +6,36 @@ import fcntl
 import gc
 import json
 import os
+import shlex
+import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from evedrop import Scenario, compare, load_results, montecarlo, run, sweep
 from evedrop.api import RunResults
 from evedrop.api.given import place_for
+from evedrop.cli.main import parser_of
+from evedrop.cli.options import changes_of
 from evedrop.errors import RunError, ScenarioError, UsageError
 from evedrop.figures import all_figures
+from evedrop.loading import load
+from evedrop.memory.montecarlo import Plan
+from evedrop.memory.simulation import Mode
 from evedrop.news import News, RunProgress
+from evedrop.report import closing
 from evedrop.score.built_in_figures import BuiltInFigures
 from evedrop.score.summary import PeerSummary
+from evedrop.studies.sweep import grid_of
 from tests.builders import digests_of
+from tests.pages import checked
 from tests.scenario.good import GOOD
 
 SMALL = Scenario(GOOD).replace(slots=12)
@@ -92,6 +104,14 @@ def test_overwrite_never_removes_what_is_not_results(tmp_path: Path) -> None:
     os.close(held)
 
 
+@pytest.fixture
+def at_exit(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """What is to be done when this program ends; it is not done."""
+    calls: list[Any] = []
+    monkeypatch.setattr("evedrop.api.given.atexit.register", lambda *given, **_: calls.append(given))
+    return calls
+
+
 def failed(error: BaseException, *files: str) -> tuple[Path, list[str]]:
     """A call that fails after it has written these files: its folder, and the notes of the error."""
     place = place_for(None, overwrite=False)
@@ -102,13 +122,15 @@ def failed(error: BaseException, *files: str) -> tuple[Path, list[str]]:
     return folder, getattr(error, "__notes__", [])
 
 
-def test_results_so_far_of_a_failed_call_stay_until_the_program_ends() -> None:
+def test_results_so_far_of_a_failed_call_stay_until_the_program_ends(at_exit: list[Any]) -> None:
     """The error says where the results so far are; an empty folder is removed."""
     folder, said = failed(RunError("a process died"), "summary.json")
     assert (folder.exists(), said) == (
         True,
         [f"Until this program ends, load_results('{folder}') reads the results so far."],
     )
+    assert at_exit == [(shutil.rmtree, folder)]
+    shutil.rmtree(folder)
     for error in (RunError("at once"), KeyboardInterrupt()):
         folder, said = failed(error)
         assert (folder.exists(), said) == (False, [])
@@ -140,7 +162,31 @@ def test_results_are_short_when_printed_and_a_table_in_a_notebook(results: RunRe
     assert "&lt;Small&gt; &amp; quick" in html
     assert "<Small>" not in html
     assert html.count("<tr>") == 3
-    assert results.secrecy["smart"].sentence.split(";")[0] in html
+    for sentence in closing.verdicts(results.typed_summary):
+        assert sentence.split(";")[0] in html
+
+
+def test_a_table_in_a_notebook_has_the_cautions_of_the_terminal(results: RunResults) -> None:
+    """An incomplete run says so first; a mean that rare events carry is doubted."""
+    rare = {"share": 0.5, "trials": 1e6}
+    changed = json.loads(json.dumps(results.summary))
+    changed["ended"] = "a process died"
+    changed["peers"]["smart"]["rare_events"] = rare
+    html = RunResults(results.folder, changed)._repr_html_()
+    assert f"{results.folder}: a process died" in html
+    assert "smart: 50 % of its expected error is carried by events of which 4 trials contain fewer than one" in html
+
+
+def test_an_unknown_name_is_named_with_the_known_ones(results: RunResults) -> None:
+    """The error is a KeyError, and its text is a sentence without quotes around it."""
+    with pytest.raises(KeyError) as caught:
+        results.peers["antena"]
+    assert str(caught.value) == "there is no receiver 'antena'; expected one of legitimate, smart"
+    with pytest.raises(KeyError, match=r"there is no verdict on 'legitimate'; expected one of smart"):
+        results.secrecy["legitimate"]
+    with pytest.raises(KeyError, match="there is no link 'smrt'"):
+        results.links["smrt"]
+    assert results.peers.get("antena") is None
 
 
 def test_workers_change_no_digest() -> None:
@@ -151,16 +197,33 @@ def test_workers_change_no_digest() -> None:
         montecarlo(tiny, workers=0)
 
 
+def test_errors_alone_can_be_followed_for_any_number_of_slots() -> None:
+    """States grow beyond double precision; the mode that does not follow them takes the scenario."""
+    fast = SMALL.replace(process={"A": [[2.0]], "Q": [[0.1]], "initial_covariance": [[1.0]]}, slots=200)
+    with pytest.raises(ScenarioError, match="slots"):
+        montecarlo(fast, trials=1)
+    assert montecarlo(fast, trials=1, plan=Plan(Mode.ERROR_COORDINATES)).typed_summary.slots == 200
+
+
 def test_a_sweep_takes_arrays_and_gives_a_table() -> None:
-    """A row for each point and receiver; the point's own study gives the same numbers."""
-    found = sweep(SMALL, {"encoding.state_probability": np.array([0.2, 0.6]), "slots": range(5, 8, 2)}, trials=3)
-    assert (found.points, found.table.num_rows, found.keys) == (4, 8, ("encoding.state_probability", "slots"))
+    """A row for each point and receiver, with the numbers of the point's own study; the page has the command that repeats it."""
+    over = {"encoding.state_probability": np.array([0.2, 0.6]), "slots": range(5, 8, 2), "title": ["1:2"]}
+    link = {"quality": 0.7}
+    found = sweep(SMALL, over, trials=3, legitimate={"link": link})
+    assert (found.points, found.table.num_rows, found.keys) == (4, 8, tuple(over))
     row = found.table.to_pylist()[-1]
-    same = montecarlo(SMALL, trials=3, slots=7, encoding__state_probability=0.6)
+    same = montecarlo(SMALL, trials=3, slots=7, encoding__state_probability=0.6, legitimate__link=link)
     assert (row["peer"], row["mean_squared_error"]) == ("smart", same.peers["smart"].mean_squared_error)
     assert "4 points" in repr(found)
-    assert found._repr_html_().count("<tr>") == 9
-    assert (found.folder / "sweep.parquet").exists()
+    html = found._repr_html_()
+    assert ("4 points" in html, html.count("<tr>"), "more:" in html) == (True, 9, False)
+    wide = replace(found, table=pa.concat_tables([found.table] * 6))
+    assert "and 8 rows more: .table has all of them" in wide._repr_html_()
+    found.report()
+    (command,) = (text for text in checked(found.folder).texts if text.startswith("evedrop sweep"))
+    options = parser_of("sweep").parse_whole(shlex.split(command)[1:])
+    assert grid_of(options.over) == {"encoding.state_probability": [0.2, 0.6], "slots": [5, 7], "title": ["1:2"]}
+    assert load(options.scenario, changes_of(options)) == SMALL.replace(trials=3, legitimate__link=link)
 
 
 @pytest.mark.parametrize(

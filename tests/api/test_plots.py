@@ -21,7 +21,7 @@ from evedrop.model.eavesdroppers.naive import Naive
 from evedrop.report.writing import REPORT
 from evedrop.view.palette import DROPPED, colour, hexadecimal
 from tests.conformance.own_classes import BLOCK, PAGE
-from tests.pages import checked
+from tests.pages import Checked, checked
 from tests.scenario.good import GOOD
 
 SCENARIO = Scenario(GOOD).replace(slots=30, trials=2, record_trials=2)
@@ -167,8 +167,10 @@ def test_a_comparison_takes_a_class_and_has_a_figure_and_a_page(own: Any) -> Non
     assert any("flipped:Flipped" in text for text in checked(found.folder).texts)
     assert repr(found) == f"<ComparisonResults of {SCENARIO.title!r}: 30 slots, 2 trials, 2 schemes, 1 adversary>"
     shown = found._repr_html_()
-    assert "<th>flipped:Flipped</th>" in shown
-    assert f"<th>plain</th><td>{found.schemes['plain'].price:.3g}</td>" in shown
+    cells = Checked(shown).texts[5:]  # after the caption and the heads
+    assert cells[::4] == ["flipped:Flipped", "plain"]
+    assert cells[5] == f"{found.schemes['plain'].price:.3g}"
+    assert cells[3::4] == ["no" if name in found.dominant else "yes" for name in found.schemes]
 
 
 def test_results_write_their_page(results: RunResults) -> None:

@@ -9,6 +9,8 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
+from evedrop.cli.main import main
+from evedrop.cli.names import name_lines
 from evedrop.cli.narrow import fitted
 from evedrop.cli.report import terminal
 
@@ -68,6 +70,38 @@ def test_a_report_fits_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> Non
     with console.capture() as caught:
         console.print(table())
     assert "scheme innovation" in caught.get()
+
+
+def test_names_and_descriptions_fit_a_narrow_terminal() -> None:
+    """A description is wrapped beside its name, or below it where there is no room; none of its words is lost."""
+    described = {"one": "a description of several words", "two": "short"}
+    assert list(name_lines(described, 5, 30)) == [
+        "one  a description of several",
+        "     words",
+        "two  short",
+    ]
+    assert list(name_lines(described, 5, 24)) == [
+        "one",
+        "    a description of",
+        "    several words",
+        "two",
+        "    short",
+    ]
+
+
+@pytest.mark.parametrize("command", [["list"], ["docs"], ["paper"]])
+def test_lists_fit_a_narrow_terminal(
+    command: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On a terminal, no line is wider than it; elsewhere each entry has one line."""
+    assert main(command) == 0
+    lines = capsys.readouterr().out.splitlines()
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "40")
+    assert main(command) == 0
+    narrow = capsys.readouterr().out
+    assert max(map(len, lines)) > 40 >= max(map(len, narrow.splitlines()))
+    assert "".join(narrow.split()) == "".join("".join(lines).split())
 
 
 def test_a_head_may_be_wrapped() -> None:

@@ -30,6 +30,21 @@ def test_a_held_run_shows_how_far_it_is(monkeypatch: pytest.MonkeyPatch) -> None
     assert "20/50" in terminal.getvalue()
 
 
+def test_a_study_shows_no_total_before_it_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A sweep counts its points while the line is already there."""
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    with ProgressLine(None, "trial-slots") as line:
+        line.tell(Started())
+        before = terminal.getvalue()
+        line.tell(RunProgress(5, 1.0, "trial-slots/s", {}, 20))
+    assert "0/0" not in terminal.getvalue()
+    assert ("0/?" in before, "left" in before) == (True, False)
+    assert "5/20" in terminal.getvalue().removeprefix(before)
+    assert "left" in terminal.getvalue().removeprefix(before)
+
+
 def test_a_narrow_terminal_shows_what_is_done_and_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
     """At 40 columns the speed and the errors are left out, and nothing is cut off."""
     terminal = Terminal()

@@ -174,6 +174,8 @@ def test_words_whole_numbers_and_other_modes_can_be_swept(tmp_path: Path) -> Non
     command = "evedrop sweep eavesdroppers --over eavesdroppers.smart.strategy=smart,naive --over slots=10,20"
     assert f"{command} --trials 5 --covariance-only" in page.texts
     assert "All 4 points were done" in page.texts
+    assert "4 points of eavesdroppers.smart.strategy, slots · 10 to 20 slots · 5 trials" in page.texts
+    assert ("path", "class", "bar") in page.attributes
 
 
 BASE = ("sweep", "eavesdroppers", "--slots", "20", "--out", "run")

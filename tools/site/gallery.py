@@ -14,7 +14,7 @@ from kept import PICTURES, program_digest
 from view_pictures import view_pictures, view_section
 
 from evedrop import Scenario, montecarlo
-from evedrop.loading.file import built_in_text, shipped
+from evedrop.scenarios import built_in_text, shipped
 
 _TRIAL_SLOTS = 200_000
 _MOST_TRIALS = 200

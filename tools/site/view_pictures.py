@@ -14,7 +14,7 @@ from pathlib import Path
 
 from kept import PICTURES, program_digest
 
-from evedrop.loading.file import built_in_text
+from evedrop.scenarios import built_in_text
 
 SCENARIO = "vehicle"
 SLOT = 1612

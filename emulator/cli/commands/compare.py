@@ -31,7 +31,7 @@ def compare(options: argparse.Namespace) -> int:
         parameters[key] = value_of(value)
     with (
         results_folder(options.out, f"compare-{Path(options.scenario).name}") as folder,
-        ProgressLine(0, "trial-slots", options.json) as line,
+        ProgressLine(None, "trial-slots", options.json) as line,
     ):
         found = compare_all(
             options.scenario,

@@ -6,6 +6,7 @@ import argparse
 from importlib import resources
 from pathlib import Path
 
+from evedrop.cli.names import print_names
 from evedrop.command import Command
 from evedrop.errors import UsageError
 from evedrop.hints import near
@@ -17,9 +18,7 @@ def docs(options: argparse.Namespace) -> int:
     """Print a page of the documentation; list the pages if none is named."""
     pages = _pages()
     if options.page is None:
-        width = max(map(len, pages)) + 2
-        for name, path in pages.items():
-            print(f"{name:<{width}}{_title(path)}")
+        print_names({name: _title(path) for name, path in pages.items()})
         return 0
     name = str(options.page).removesuffix(".md")
     if name not in pages:

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from evedrop.cli.names import print_names
 from evedrop.cli.options import as_json
 from evedrop.command import Command
 from evedrop.errors import UsageError
@@ -49,9 +50,7 @@ def _list(as_json: bool) -> None:
         }
         print(json.dumps(papers, ensure_ascii=False))
         return
-    width = max(map(len, PAPERS)) + 2
-    for name, one in PAPERS.items():
-        print(f"{name:<{width}}{one.authors}: {one.title}. {one.published}")
+    print_names({name: f"{one.authors}: {one.title}. {one.published}" for name, one in PAPERS.items()})
 
 
 def _made(folder: Path) -> None:

@@ -9,21 +9,19 @@ from evedrop.command import Command
 
 
 def list_scenarios(_: argparse.Namespace) -> int:
-    """Print a line for each built-in scenario, even if it needs an extra that is not installed."""
+    """Print the name and title of each built-in scenario, even if it needs an extra that is not installed."""
     import tomllib
 
-    from evedrop.loading import shipped
+    from evedrop.cli.names import print_names
+    from evedrop.scenarios import shipped
 
-    scenarios = shipped()
-    width = max(map(len, scenarios)) + 2
-    for name, path in scenarios.items():
-        print(f"{name:<{width}}{tomllib.loads(path.read_text(encoding='utf-8'))['title']}")
+    print_names({name: tomllib.loads(path.read_text(encoding="utf-8"))["title"] for name, path in shipped().items()})
     return 0
 
 
 def new(options: argparse.Namespace) -> int:
     """Write a scenario to start from."""
-    from evedrop.loading import write_new
+    from evedrop.scenarios import write_new
 
     write_new(options.file, options.origin)
     print(f"{options.file} written; change it, then: evedrop run {options.file}")
@@ -32,7 +30,7 @@ def new(options: argparse.Namespace) -> int:
 
 def show(options: argparse.Namespace) -> int:
     """Print the file of a built-in scenario."""
-    from evedrop.loading import built_in_text
+    from evedrop.scenarios import built_in_text
 
     print(built_in_text(options.name), end="")
     return 0

@@ -24,7 +24,7 @@ def sweep(options: argparse.Namespace) -> int:
     plan = plan_of(options)
     with (
         results_folder(options.out, f"{Path(options.scenario).stem}-sweep") as folder,
-        ProgressLine(0, "trial-slots", options.json) as line,
+        ProgressLine(None, "trial-slots", options.json) as line,
     ):
         table = sweep_over(options.scenario, changes_of(options), grid, folder, line.tell, plan)
     if options.json:
