@@ -19,6 +19,7 @@ from evedrop.model.process import Floats, Process
 from evedrop.model.reference_code import ReferenceCode
 from evedrop.model.reference_floor import reference_floor
 from evedrop.model.schemes import SCHEMES, scheme_of
+from evedrop.model.schemes.scheme import ClosedFormName
 from evedrop.model.slot.link_law import law_of
 from evedrop.model.theory import covariances as theory
 from evedrop.model.theory.closed_form import ClosedForm
@@ -132,7 +133,7 @@ def closed_of(scenario: Scenario, receiver: str) -> ClosedForm | None:
     return _of_scheme(scenario, receiver) if found is None else found
 
 
-def _kind_of(scenario: Scenario, receiver: str) -> str | None:
+def _kind_of(scenario: Scenario, receiver: str) -> ClosedFormName | None:
     reader = LEGITIMATE if receiver == LEGITIMATE else scenario.eavesdroppers[receiver].strategy
     return SCHEMES[scenario.encoding.scheme].closed_forms.get(reader)
 

@@ -26,7 +26,7 @@ from evedrop.conformance.checked import (
 from evedrop.conformance.problems import Problem
 from evedrop.conformance.rules import Broken, expect_array, expect_finite
 from evedrop.model.delays import DELAY_MODELS
-from evedrop.model.links import LOSS_MODELS
+from evedrop.model.links import LOSS_MODELS, single_specs
 from evedrop.model.links.link import Fate
 from evedrop.model.receiver import Receiver
 from evedrop.model.schemes import SCHEMES
@@ -118,9 +118,9 @@ def _models_of(schedule: LinkSchedule) -> Iterator[str]:
 
 
 def _names_in(settings: Mapping[str, Any]) -> Iterator[str]:
-    loss, delay = settings.get("loss") or {}, settings.get("delay") or {}
-    for spec in loss.get("links", []) if loss.get("model") == "pooled" else [loss]:
-        if spec and LOSS_MODELS.foreign(spec["model"]):
+    loss, delay = settings.get("loss"), settings.get("delay")
+    for spec in single_specs(loss) if loss else ():
+        if LOSS_MODELS.foreign(spec["model"]):
             yield spec["model"]
     if delay and DELAY_MODELS.foreign(delay["model"]):
         yield delay["model"]

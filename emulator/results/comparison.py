@@ -37,6 +37,8 @@ class Match:
     """Its strategy; None if the match is not defined."""
     attack: str = "none"
     not_defined: str | None = None
+    betrayed: bool = False
+    """Whether the adversary learns a true state, against which no scheme can protect."""
 
     @property
     def receiver(self) -> str:
@@ -92,11 +94,6 @@ class Cell:
     secrecy: Secrecy | None = None
 
     @property
-    def betrayed(self) -> bool:
-        """Whether the adversary learns a true state, against which no scheme can protect."""
-        return self.match.strategy == "replay-informed"
-
-    @property
     def ratio(self) -> float | None:
         """Eavesdropper's over legitimate error; of medians if either variance is infinite. None if the pair is not defined."""
         if self.legitimate is None or self.eavesdropper is None:
@@ -135,6 +132,7 @@ class Cell:
         return {
             "reads_as": self.match.strategy,
             "attack": self.match.attack,
+            "betrayed": self.match.betrayed,
             "eavesdropper": asdict(self.eavesdropper),
             "legitimate": asdict(self.legitimate),
             "ratio": self.ratio,
@@ -204,7 +202,7 @@ class SchemeResult:
     @property
     def closest(self) -> Cell | None:
         """The adversary with the least error, except those that learn a true state; None if there is none."""
-        played = [cell for cell in self.cells.values() if cell.eavesdropper is not None and not cell.betrayed]
+        played = [cell for cell in self.cells.values() if cell.eavesdropper is not None and not cell.match.betrayed]
         return min(played, key=lambda cell: _error(cell.eavesdropper), default=None)
 
     @property

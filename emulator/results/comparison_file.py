@@ -61,7 +61,7 @@ def _scheme(name: str, found: Mapping[str, Any], trials: int) -> SchemeResult:
 def _cell(scheme: str, adversary: str, found: Mapping[str, Any], trials: int) -> Cell:
     if "verdict" not in found:
         return Cell(Match(scheme, adversary, not_defined=found["not_defined"]))
-    match = Match(scheme, adversary, found["reads_as"], found["attack"])
+    match = Match(scheme, adversary, found["reads_as"], found["attack"], betrayed=bool(found["betrayed"]))
     said = TypeAdapter(SecrecySummary).validate_python(found["secrecy"])
     secrecy = Secrecy(
         match.receiver,

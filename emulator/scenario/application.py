@@ -193,6 +193,8 @@ class Application(ABC):
     """Its figures in the summary that expectations and sweeps can use."""
     receiver_figures: ClassVar[tuple[str, ...]] = ()
     """Its figures for each receiver, likewise."""
+    metrics: ClassVar[tuple[str, ...]] = ()
+    """Those of `figures` that `evedrop run --metrics` serves."""
     has_monitor: ClassVar[bool] = False
     """Whether it can have a monitor."""
 

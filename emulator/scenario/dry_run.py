@@ -17,7 +17,7 @@ from evedrop.conformance.schemes import SchemeChecks
 from evedrop.errors import NoAnswer
 from evedrop.model.delays import DELAY_MODELS, delay_of
 from evedrop.model.eavesdroppers import ANSWERS, STRATEGIES
-from evedrop.model.links import LOSS_MODELS, loss_of
+from evedrop.model.links import LOSS_MODELS, POOLED, loss_of, single_specs
 from evedrop.model.process import Process
 from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.scheme import Scheme
@@ -36,7 +36,7 @@ _TRIALS = 3
 
 def foreign(tables: Any) -> bool:
     """Whether tables name any class that is not built in."""
-    built_in = {"pooled"}.union(SCHEMES, STRATEGIES, LOSS_MODELS, DELAY_MODELS)
+    built_in = {POOLED}.union(SCHEMES, STRATEGIES, LOSS_MODELS, DELAY_MODELS)
     return any(name not in built_in for name in names_in(tables))
 
 
@@ -130,7 +130,7 @@ def _model_mistakes(settings: Mapping[str, Any]) -> bool:
 
 def _settings_mistakes(path: str, settings: Mapping[str, Any], problem: Problem) -> Iterator[str]:
     losses = settings.get("loss")
-    for spec in losses["links"] if losses and losses["model"] == "pooled" else [losses] if losses else []:
+    for spec in single_specs(losses) if losses else ():
         if LOSS_MODELS.foreign(spec["model"]):
             check = LossChecks(lambda spec=spec: loss_of(spec), LOSS_MODELS[spec["model"]]).shapes  # type: ignore[misc]
             broken = how_broken(check, problem)

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from evedrop.hints import near
 from evedrop.model.delays import DELAY_MODELS
-from evedrop.model.links import LOSS_MODELS, loss_of
+from evedrop.model.links import LOSS_MODELS, loss_of, pooled_spec
 from evedrop.model.links.link import LossModel
 from evedrop.scenario.table import Found, Probability, Table, model_mistakes
 from evedrop.scenario.words import as_toml, listed
@@ -65,7 +65,7 @@ class LinkTable(Table):
     @classmethod
     def pooled(cls, links: list[LinkTable]) -> LinkTable:
         """Several links that end at one receiver, as one link: the receiver gets every packet that any of them delivers."""
-        return cls.model_construct(loss={"model": "pooled", "links": [link.loss_spec for link in links]})
+        return cls.model_construct(loss=pooled_spec([link.loss_spec for link in links]))
 
     @property
     def loss_spec(self) -> dict[str, Any]:

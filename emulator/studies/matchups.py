@@ -208,7 +208,8 @@ def _match(scenario: Scenario, scheme: str, adversary: str) -> Match:
     lacking = lacking_streams(STRATEGIES[strategy].streams(parameters), SCHEMES[scheme])
     if lacking:
         return Match(scheme, adversary, not_defined=f"knows the {listed(lacking)}, and there is none")
-    return Match(scheme, adversary, strategy, attack)
+    betrayed = STRATEGIES[strategy].betrayed(parameters) is not None
+    return Match(scheme, adversary, strategy, attack, betrayed=betrayed)
 
 
 def _encoding(scenario: Scenario, scheme: str, parameters: Mapping[str, Any]) -> Tables:

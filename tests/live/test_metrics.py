@@ -105,6 +105,7 @@ def test_figures_are_those_of_the_folder_and_alarms_of_the_watermark(tmp_path: P
     assert found["evedrop_mean_squared_error", "legitimate"] == summary["peers"]["legitimate"]["mean_squared_error"]
     for figure in ("false_alarm_fraction", "detected_fraction"):
         assert found[f"evedrop_{figure}",] == summary["integrity"][figure]
+    assert ("evedrop_watermark_fraction",) not in found  # only those that the application names
 
 
 def test_an_ipv6_address_has_brackets(tmp_path: Path) -> None:

@@ -16,7 +16,8 @@ from tests.conftest import Evedrop
 
 def test_the_scenario_says_what_it_says_and_the_rest_is_documented() -> None:
     """A strategy's first eavesdropper is taken as it is; others listen behind the link of the scenario's first."""
-    groups = {group.name: group.scenario for group in matchups_of(load("numerical")).groups}
+    matchups = matchups_of(load("numerical"))
+    groups = {group.name: group.scenario for group in matchups.groups}
     innovation = groups["innovation"]
     assert innovation.encoding.parameters == groups["withholding"].encoding.parameters == {"state_probability": 0.56}
     assert {name: innovation.quality[name] for name in ("legitimate", "smart", "naive", "genie")} == {
@@ -30,6 +31,8 @@ def test_the_scenario_says_what_it_says_and_the_rest_is_documented() -> None:
     assert innovation.eavesdroppers["colluding"].reads_as == "bayesian"
     assert innovation.quality["colluding"] == pytest.approx(1.0 - 0.15**2)
     assert innovation.eavesdroppers["replay-informed"].learns_at == 40
+    told = {match.adversary for group in matchups.groups for match in group.matches if match.betrayed}
+    assert told == {"replay-informed"}
     assert groups["acknowledged"].acknowledgements is not None
     assert groups["acknowledged"].acknowledgements.link.quality == 1.0
     attacked = groups["acknowledged-blocks-critical"].acknowledgements
@@ -186,7 +189,7 @@ def test_json_is_strict_and_has_what_is_documented(evedrop: Evedrop) -> None:
     }
     cell = scheme["against"]["forges"]
     ratio = {"ratio", "ratio_standard_error"}
-    assert set(cell) == {"reads_as", "attack", "eavesdropper", "legitimate", "verdict", "secrecy"} | ratio
+    assert set(cell) == {"reads_as", "attack", "betrayed", "eavesdropper", "legitimate", "verdict", "secrecy"} | ratio
     measured = {"mean", "standard_error", "quantiles", "infinite_variance", "theory", "z", "rare_events"}
     assert set(cell["eavesdropper"]) == set(cell["legitimate"]) == measured
     assert set(cell["legitimate"]["theory"]) == {"mean", "last", "limit", "bound"}

@@ -80,6 +80,7 @@ class Integrity(Application):
         "expected_watermark_cost",
         "watermark_cost_z",
     )
+    metrics = ("false_alarm_fraction", "detected_fraction")
     has_monitor = True
 
     @classmethod

@@ -19,21 +19,13 @@ from pathlib import Path
 from typing import Any, final
 
 from evedrop.errors import UsageError
+from evedrop.figures import estimated_figures
 from evedrop.news import ConnectionOutage, FolderMoved, Held, News, RunProgress, Started, Tell
 from evedrop.results.reading import load_results
 from evedrop.scenario import Scenario
+from evedrop.scenario.application import APPLICATIONS
 
 _FORM = re.compile(r"(?:\[([0-9a-fA-F:.%]+)\]|([^\[\]:]+)):([0-9]{1,5})")
-_GAUGES = {
-    "mean_squared_error": "of |x - x_hat|^2, mean over slots and trials so far",
-    "mean_trace_covariance": "of the trace of the covariance that the receiver believes, mean over slots and trials so far",
-    "received_fraction": "of the packets, received so far",
-    "used_fraction": "of the packets, received and used so far",
-}
-_ALARMS = {
-    "false_alarm_fraction": "of the trials, with an alarm before the attack",
-    "detected_fraction": "of the trials without a false alarm, with an alarm since the attack began",
-}
 
 
 @dataclass(frozen=True)
@@ -146,16 +138,18 @@ class RunMetrics:
             for reason, count in link["lost_by"].items():
                 packets.add_metric([name, reason], count)
         yield packets
-        for figure, text in _GAUGES.items():
-            family = gauge(f"evedrop_{figure}", f"{text[0].upper()}{text[1:]}.", labels=["receiver"])
+        for figure, kind in estimated_figures().items():
+            if kind.only_in_mode is not None:
+                continue
+            family = gauge(f"evedrop_{figure}", f"{figure} so far: {kind.meaning}.", labels=["receiver"])
             for name, figures in summary.get("peers", {}).items():
                 if isinstance(value := figures.get(figure), (int, float)):
                     family.add_metric([name], value)
             yield family
-        found = summary.get("integrity") or {}
-        for figure, text in _ALARMS.items():
-            if isinstance(value := found.get(figure), (int, float)):
-                yield gauge(f"evedrop_{figure}", f"{text[0].upper()}{text[1:]}.", value)
+        for name in self._scenario.applications:
+            for figure in APPLICATIONS[name].metrics if summary.get(name) else ():
+                if (value := APPLICATIONS[name].figure(summary[name], (figure,))) is not None:
+                    yield gauge(f"evedrop_{figure}", f"{figure} of {name} so far.", value)
 
 
 def _summary(folder: Path) -> Mapping[str, Any]:

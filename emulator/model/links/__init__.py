@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from evedrop.model.links.bernoulli import Bernoulli
@@ -15,6 +15,8 @@ from evedrop.model.links.pooled import Pooled
 from evedrop.model.links.trace import RecordedLoss
 from evedrop.model.registry import Registry
 
+POOLED = "pooled"
+"""The `model` of what `pooled_spec` gives; a scenario cannot name it."""
 _BUILT_IN: Mapping[str, type[LossModel]] = {
     "bernoulli": Bernoulli,
     "distance": Distance,
@@ -27,8 +29,18 @@ LOSS_MODELS: Registry[LossModel] = Registry("loss model", LossModel, "evedrop.li
 
 
 def loss_of(spec: Mapping[str, Any]) -> LossModel:
-    """The loss model that a scenario describes: `{"model": …, …parameters}`, or `{"model": "pooled", "links": […]}`."""
-    if spec["model"] == "pooled":
+    """The loss model that a scenario describes: `{"model": …, …parameters}`, or what `pooled_spec` gives."""
+    if spec["model"] == POOLED:
         return Pooled([loss_of(one) for one in spec["links"]])
     parameters = {name: value for name, value in spec.items() if name != "model"}
     return LOSS_MODELS[spec["model"]](**parameters)
+
+
+def pooled_spec(specs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The description of several links that end at one receiver; specs: the description of each one's loss model."""
+    return {"model": POOLED, "links": list(specs)}
+
+
+def single_specs(spec: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
+    """The descriptions of the loss models that have a name: of every link where several are pooled, otherwise the one given."""
+    return spec["links"] if spec["model"] == POOLED else [spec]

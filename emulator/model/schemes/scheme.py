@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple, final
+from typing import Any, ClassVar, Literal, NamedTuple, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,9 @@ from evedrop.model.theory.leaked_bits import RevealedBits
 from evedrop.model.theory.lost_reference import LostReference
 from evedrop.model.theory.quantisation import QuantisationError
 from evedrop.streams import Batch
+
+ClosedFormName = Literal["always sent", "noise", "open-loop", "reference", "scheduled", "selective"]
+"""A closed form in `evedrop.expected.closed_forms`."""
 
 _WORD_BITS = 64
 _THEORY = ("error_floor", "revealed_bits", "bound_outcomes", "reader_outcomes", "closed_form", "lost_reference")
@@ -177,8 +180,8 @@ class Scheme(ABC):
     """The strategy that, without the secret, reads its packets best. `evedrop compare` has attackers read with it."""
     sends_states_and_innovations: ClassVar[bool] = False
     """Whether every packet is a state or an innovation, so that no eavesdropper without the secret does better than the genie."""
-    closed_forms: ClassVar[Mapping[str, str]] = MappingProxyType({})
-    """Receiver (a strategy, or `legitimate`) → the closed form in `evedrop.expected.closed_forms` for slots that differ."""
+    closed_forms: ClassVar[Mapping[str, ClosedFormName]] = MappingProxyType({})
+    """Receiver (a strategy, or `legitimate`) → the closed form for slots that differ."""
     mu_d: StateProbability = 1.0
     """μ_d, or μ_d(k) of each slot."""
 

@@ -1,4 +1,4 @@
-"""`spoof`: the sensor's measurements are attacked, as `[integrity]` describes."""
+"""`spoof`: the sensor's measurements are attacked, as the table of an application describes."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Annotated, Self
 
 from pydantic import Field
 
+from evedrop.scenario.application import APPLICATIONS, applications_in
 from evedrop.scenario.events.effects import Spoofing
 from evedrop.scenario.events.event import Act, EventKind, Surroundings, begun_too_early
 from evedrop.scenario.table import Found
@@ -35,7 +36,8 @@ class Spoof(EventKind):
         if self.spoof != _SPOOFED:
             yield "spoof", f"is {as_toml(self.spoof)}; expected {as_toml(_SPOOFED)}"
         elif not surroundings.monitored:
-            yield "spoof", "no attack is described; expected a table [integrity] with an attack as well"
+            able = [f"[{name}]" for name, one in applications_in(APPLICATIONS.names).items() if one.has_monitor]
+            yield "spoof", f"no attack is described; expected a table {' or '.join(able)} with an attack as well"
 
     @classmethod
     def in_turn(cls, events: Sequence[tuple[int, Self]]) -> Iterator[str]:
