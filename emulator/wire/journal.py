@@ -193,6 +193,8 @@ class WireJournal:
                     amended = [self._amended.popleft() for _ in range(len(self._amended))]
                     part = self._parts.get(self._next)
                     block = np.empty(0, RECORD) if part is None else part.take()
+                    if part is not None and part.path is None:
+                        self.missing += len(block)
                     if part is not None and part.full:
                         self._next += 1
                 for fate in {fate for _, fate in amended}:
@@ -200,8 +202,6 @@ class WireJournal:
                     self._hear(self.amendment_listeners, records, fate)
                 if part is None or not len(block):
                     return
-                if part.path is None:
-                    self.missing += len(block)
                 self._count(block)
                 self._hear(self.listeners, block)
 
@@ -297,7 +297,8 @@ class WireJournal:
                 if part is not None and 2 * part.handed > self._rows and self._next + 1 not in self._buffers:
                     self._add_part(self._next + 1)
             now = time.time()
-            over = sorted(at for at, part in self._parts.items() if part.full and part.settled + _PATIENCE < now)
+            with self._state:  # a thread that records may make a part
+                over = sorted(at for at, part in self._parts.items() if part.full and part.settled + _PATIENCE < now)
             for at in over:
                 if self._parts[at].path is None:  # many parts would need too much memory
                     self._convert(at)

@@ -240,7 +240,7 @@ class QueryRelay:
         if state is None:
             self._journal.record(now, -1, sequence, 0.0, code, sender, size, UNLINKED, kind, Crossing.UNLINKED)
             return
-        n, fate, delay, again = self._decided(state, kind.stream, key, expression, size)
+        n, fate, delay, again = self._decided(state, kind.stream, key, expression, now, size)
         mark = int(kind) | AGAIN if again else int(kind)
         row = self._journal.record(now, n, sequence, delay, code, sender, size, state.link.number, mark, fate)
         if fate:
@@ -275,7 +275,7 @@ class QueryRelay:
         found = self._plan.link_of(source, target, key, query=True)
         return None if found is None else self._links[found.name]
 
-    def _decided(self, state: LinkState, kind: str, key: str, expression: zenoh.KeyExpr, size: int) -> Decision:
+    def _decided(self, state: LinkState, kind: str, key: str, expression: zenoh.KeyExpr, now: float, size: int) -> Decision:
         with self._lock:
             name = (state.link.name, kind, key)
             if name not in self._lanes:
@@ -284,7 +284,7 @@ class QueryRelay:
                     forget[1].forget(*oldest[1:])
                     del self._lanes[oldest]
                 self._lanes[name] = (state.lane(kind, key, self._plan.is_lossless(expression)), state)
-            return self._lanes[name][0](time.time(), size)
+            return self._lanes[name][0](now, size)
 
     def _querier(self, target: str, query: zenoh.Query, key: str, complete: bool) -> zenoh.Querier:
         accepts = query.accepts_replies()

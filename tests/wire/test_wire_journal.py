@@ -94,6 +94,30 @@ def test_every_record_of_many_threads_is_in_parquet_exactly_once(tmp_path: Path)
     ]  # fmt: skip
 
 
+def test_the_journal_goes_on_when_a_part_is_made_while_it_looks_at_all_parts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A thread that records makes a part if the journal's own thread has not made one in time."""
+
+    class Patience:
+        """No patience; but while a full part is looked at, another thread fills parts, unless it must wait for its turn."""
+
+        def __radd__(self, settled: float) -> float:
+            monkeypatch.setattr(journal_module, "_PATIENCE", 0.0)
+            recording.start()
+            recording.join(0.2)
+            return settled
+
+    monkeypatch.setattr(journal_module, "_PATIENCE", Patience())
+    with WireJournal(tmp_path, wire_plan(), part_rows=2) as journal:
+        recording = threading.Thread(target=lambda: [put(journal, n) for n in range(2, 12)])
+        for n in range(2):
+            put(journal, n)
+        wait_until((tmp_path / "journal" / "001-0006.parquet").exists, "the Parquet file of the last full part")
+        recording.join()
+    assert [row["n"] for row in rows_of(tmp_path)] == list(range(12))
+
+
 def test_a_row_says_all_that_was_recorded(tmp_path: Path) -> None:
     """Names in place of codes, null where there is nothing, and sizes that do not fit as the largest."""
     with WireJournal(tmp_path, wire_plan()) as journal:
