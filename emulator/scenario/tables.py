@@ -1,19 +1,17 @@
-"""The scenario as a table, and the smaller tables in it: their entries, checks and meaning.
+"""The scenario as a table: its entries, checks and meaning.
 
 Source: docs/scenario.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self, TypedDict, Unpack
+from typing import Annotated, Any, ClassVar, Self, Unpack
 
 from pydantic import (
-    AfterValidator,
-    ConfigDict,
     Field,
     ModelWrapValidatorHandler,
     PrivateAttr,
@@ -26,18 +24,17 @@ from pydantic import (
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from evedrop.errors import UsageError
-from evedrop.model.acknowledgements import ATTACKS, OVERHEARING
 from evedrop.model.controllers import Assignment
 from evedrop.model.eavesdroppers import ANSWERS, STRATEGIES
 from evedrop.model.energy import EnergyModel
 from evedrop.model.plant import Plant
-from evedrop.model.registry import asked, is_own
-from evedrop.model.schedule import StateProbability, mean_of
-from evedrop.model.schemes import SCHEMES
 from evedrop.model.slot.link import LinkSchedule
 from evedrop.names import CONTROLLER, LEGITIMATE
 from evedrop.plugins import elsewhere, look_in, trusted_in
+from evedrop.scenario.acknowledgements import AcknowledgementsTable
 from evedrop.scenario.application import APPLICATIONS, applications_in, unloadable_in
+from evedrop.scenario.encoding import EncodingTable
+from evedrop.scenario.entries import ScenarioEntries
 from evedrop.scenario.events.table import AnyEvent, event_table
 from evedrop.scenario.expect import ExpectTable
 from evedrop.scenario.link_table import LinkTable, changed_link
@@ -45,113 +42,12 @@ from evedrop.scenario.nemesis import NemesisTable
 from evedrop.scenario.plant import ControllerTable, PlantTable, assignment_of, plant_of
 from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.receivers import EavesdropperTable, LegitimateTable
-from evedrop.scenario.table import Found, Probability, ProcessName, Table, again, one_of, registered
+from evedrop.scenario.table import Found, ProcessName, Table, again
 from evedrop.scenario.timeline import Timeline
 from evedrop.scenario.values import MOST_EAVESDROPPERS
 from evedrop.scenario.wire_table import WireTable
-from evedrop.scenario.words import as_toml, dotted, listed
+from evedrop.scenario.words import as_toml, dotted
 from evedrop.streams import MOST_SLOTS
-
-Entries = Mapping[str, Any]
-"""A table, as a dict."""
-
-
-class EncodingTable(Table):
-    """`[encoding]`: the scheme and its parameters."""
-
-    model_config = ConfigDict(extra="allow")
-
-    scheme: Annotated[str, Field(strict=True, examples=["innovation"]), AfterValidator(registered(SCHEMES))]
-
-    @classmethod
-    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Missing, unknown and wrong parameters of the scheme."""
-        scheme = SCHEMES.get(str(table.get("scheme")))
-        given = {name: value for name, value in table.items() if name != "scheme"}
-        if scheme is None and is_own(table.get("scheme")):
-            return []
-        if scheme is None:
-            anywhere = {name for one in SCHEMES.values() for name in one.parameters}
-            return [
-                (name, "is not a parameter of any scheme; remove the line") for name in given if name not in anywhere
-            ]
-        found = [
-            (name, f"is missing; the scheme {table['scheme']} needs it, such as {name} = {as_toml(example)}")
-            for name, example in scheme.parameters.items()
-            if name not in given
-        ]
-        known = f"expected {listed(sorted(scheme.parameters))}" if scheme.parameters else "remove the line"
-        what = f"is set, but the scheme {table['scheme']} has no such parameter; {known}"
-        found += [(name, what) for name in given if name not in scheme.parameters]
-        return found + asked(scheme, {name: value for name, value in given.items() if name in scheme.parameters})
-
-    @property
-    def parameters(self) -> dict[str, Any]:
-        """The scheme's parameters."""
-        return dict(self.model_extra or {})
-
-    @property
-    def spec(self) -> dict[str, Any]:
-        """The scheme's description for sensor and legitimate estimator."""
-        return {"scheme": self.scheme, **self.parameters}
-
-    @property
-    def mu_d(self) -> float:
-        """μ_d, or its mean over slots k ≥ 1; 1 for a scheme without `state_probability`."""
-        return mean_of(self._mu_d)
-
-    @property
-    def state_probabilities(self) -> tuple[float, ...] | None:
-        """μ_d(k) for every slot; None if it is the same in all slots."""
-        return self._mu_d if isinstance(self._mu_d, tuple) else None
-
-    @property
-    def _mu_d(self) -> StateProbability:
-        given = self.parameters.get("state_probability", 1.0)
-        return tuple(map(float, given)) if isinstance(given, list) else float(given)
-
-
-class WayBackTable(Table):
-    """`link = {…}` of the acknowledgements: each is lost independently or arrives at once."""
-
-    quality: Annotated[Probability, Field(examples=[0.9])]
-
-
-class AcknowledgementsTable(Table):
-    """`[acknowledgements]`: their way back to the sensor, for schemes that need them, and an attack on it."""
-
-    link: Annotated[WayBackTable, Field(examples=[{"quality": 0.9}])]
-    attack: Annotated[str, Field(strict=True, examples=["critical"]), AfterValidator(one_of(ATTACKS))] = "none"
-    jammer: Annotated[str | None, Field(strict=True, examples=["smart"])] = None
-    flip: Annotated[Probability | None, Field(examples=[0.1])] = None
-    false_alarms: Annotated[float, Field(strict=True, ge=10.0, le=1e9, examples=[1e4])] = 1e4
-
-    @classmethod
-    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Mistakes in the entries of attacks: two need a jammer with a link of its own, `flip` a probability."""
-        attack, jammer, flip = table.get("attack", "none"), table.get("jammer"), table.get("flip")
-        if attack == "flip" and flip is None:
-            return [
-                (
-                    "flip",
-                    "is missing; the attack flip needs the probability of flipping an acknowledgement, such as flip = 0.1",
-                )
-            ]
-        if attack != "flip" and flip is not None:
-            return [("flip", f"is set, but the attack {as_toml(attack)} flips nothing; remove the line")]
-        if attack in [*OVERHEARING] and jammer is None:
-            return [
-                ("jammer", f"is missing; the attack {attack} needs the eavesdropper that it serves, by what that hears")
-            ]
-        if attack not in [*OVERHEARING] and jammer is not None:
-            return [
-                (
-                    "jammer",
-                    f"is set, but the attack {as_toml(attack)} does not depend on what it hears; remove the line",
-                )
-            ]
-        return []
-
 
 _Energy = Annotated[float, Field(strict=True, ge=0.0, le=1e12)]
 
@@ -168,36 +64,6 @@ class NetworkTable(Table):
     """`[network]`: how the processes of a live run are connected; it does not change the trials."""
 
     routers: Annotated[int, Field(ge=1, le=2, strict=True, examples=[2])] = 1
-
-
-class ScenarioEntries(TypedDict, total=False):
-    """The entries of a scenario as Python values, for editors and type checkers; docs/scenario.md describes each."""
-
-    title: str
-    slots: int
-    seed: int
-    trials: int
-    first_trial: int
-    record_trials: int
-    shards: int
-    pace: float
-    longest_outage: float
-    slot_seconds: float | None
-    secret_file: str | Path | None
-    modules: str | Path | None
-    process: Entries
-    encoding: Entries
-    legitimate: Entries
-    eavesdroppers: Mapping[str, Entries]
-    plant: Entries | None
-    controller: Entries | None
-    acknowledgements: Entries | None
-    energy: Entries | None
-    wire: Entries | None
-    network: Entries | None
-    event: Sequence[Entries]
-    nemesis: Entries | None
-    expect: Sequence[Entries]
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,9 @@ from pydantic import TypeAdapter, ValidationError
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.names import LEGITIMATE
+from evedrop.scenario.acknowledgements import AcknowledgementsTable
 from evedrop.scenario.application import Application, applications_in
+from evedrop.scenario.encoding import EncodingTable
 from evedrop.scenario.events.event import EventKind
 from evedrop.scenario.events.table import event_of
 from evedrop.scenario.expect import ExpectTable
@@ -27,8 +29,6 @@ from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.receivers import EavesdropperTable, LegitimateTable
 from evedrop.scenario.table import Table
 from evedrop.scenario.tables import (
-    AcknowledgementsTable,
-    EncodingTable,
     Scenario,
 )
 from evedrop.scenario.wire_table import WireTable

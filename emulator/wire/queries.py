@@ -275,7 +275,9 @@ class QueryRelay:
         found = self._plan.link_of(source, target, key, query=True)
         return None if found is None else self._links[found.name]
 
-    def _decided(self, state: LinkState, kind: str, key: str, expression: zenoh.KeyExpr, now: float, size: int) -> Decision:
+    def _decided(
+        self, state: LinkState, kind: str, key: str, expression: zenoh.KeyExpr, now: float, size: int
+    ) -> Decision:
         with self._lock:
             name = (state.link.name, kind, key)
             if name not in self._lanes:

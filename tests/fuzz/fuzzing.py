@@ -25,7 +25,8 @@ from pathlib import Path
 
 from evedrop.errors import EvedropError
 from tests.fuzz.mutation import Mutator
-from tests.fuzz.readers import READERS, Reader
+from tests.fuzz.reader import Reader
+from tests.fuzz.readers import READERS
 
 CORPUS = Path(__file__).parents[1] / "corpus"
 LONGEST_SECONDS = 20.0

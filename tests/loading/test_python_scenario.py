@@ -19,7 +19,7 @@ from evedrop.loading import load, shipped
 from evedrop.memory.montecarlo import Plan
 from evedrop.model.eavesdroppers.naive import Naive
 from evedrop.model.schemes.innovation import Innovation
-from evedrop.scenario.tables import ScenarioEntries
+from evedrop.scenario.entries import ScenarioEntries
 from tests.builders import digests_of
 from tests.conformance.own_classes import BLOCK, PAGE
 from tests.scenario.good import GOOD, mistakes
