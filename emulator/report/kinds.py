@@ -40,16 +40,15 @@ def comparison_page(folder: Path) -> Page:
     )
 
 
-def wire_page(folder: Path) -> Page:
+def wire_page(source: WireSource) -> Page:
     """The report of a wire."""
-    source = WireSource.read(folder)
     return Page(source.title, source.about, *source.outcome, parts_of(WIRE_SECTIONS, source))
 
 
 KINDS: Mapping[str, Callable[[Path], Page]] = {
     SWEEP_TABLE: sweep_page,
     COMPARISON: comparison_page,
-    WIRE_FILE: wire_page,
+    WIRE_FILE: lambda folder: wire_page(WireSource.read(folder)),
 }
 """A file that only such a folder has → the function that makes its page. Any other folder is that of a run."""
 

@@ -58,6 +58,8 @@ def wire_outcome(summary: Mapping[str, Any]) -> tuple[str, bool | None]:
         return f"unaccounted for: {_messages(summary['unaccounted'])}; {said}", False
     if summary["journal"]["incomplete_since"] is not None:
         return f"the journal is incomplete; {said}", False
+    if _unfinished(summary):
+        return f"{_unfinished(summary)}; {said}", False if good is False else None
     return said[0].upper() + said[1:], good
 
 
@@ -87,7 +89,9 @@ def wire_failures(summary: Mapping[str, Any]) -> Iterator[str]:
 
 
 def wire_faults(summary: Mapping[str, Any]) -> Iterator[str]:
-    """Links outside their bounds, messages that are unaccounted for, and an incomplete journal."""
+    """A wire that has not ended, links outside their bounds, messages that are unaccounted for, and an incomplete journal."""
+    if _unfinished(summary):
+        yield f"{_unfinished(summary)}: these are the figures that its journal gives so far"
     for name, link in summary["links"].items():
         if link["within_bounds"] is False:
             low, high = link["bounds"]
@@ -101,6 +105,11 @@ def wire_faults(summary: Mapping[str, Any]) -> Iterator[str]:
         yield f"the journal lacks {_messages(summary['journal']['missing'])}, because the disk was full"
     elif summary["journal"]["incomplete_since"] is not None:
         yield "the disk was full for some time: the journal has all messages, but perhaps not all changes and events"
+
+
+def _unfinished(summary: Mapping[str, Any]) -> str:
+    """That the wire has not ended, if its summary was made from its journal."""
+    return {"running": "the wire still runs", "killed": "the wire was killed"}.get(str(summary.get("state")), "")
 
 
 def _counted(reasons: Mapping[str, int]) -> str:

@@ -21,6 +21,7 @@ from evedrop.report.wire import reasons_table, unlinked_sentence, wire_faults, w
 from evedrop.results.wire_folder import WIRE_FILE
 from evedrop.score.summary import Judged
 
+_SUMMARY = "summary.json"
 _MOST_BYTES = 2**24
 _MOST_EVENTS = 500
 _MOST_WORDS = 120  # characters about a loss model
@@ -28,11 +29,11 @@ _MOST_WORDS = 120  # characters about a loss model
 
 @dataclass(frozen=True)
 class WireSource:
-    """The folder of a wire that ended, read."""
+    """The folder of a wire, read."""
 
     folder: Path
     summary: Mapping[str, Any]
-    """The entries of summary.json."""
+    """The entries of summary.json, or of what would be in it."""
     title: str
     about: str
     """What the wire did, in a line."""
@@ -46,13 +47,20 @@ class WireSource:
     @classmethod
     def read(cls, folder: Path) -> WireSource:
         """Read a folder. Raises UsageError if it is not that of a wire that ended."""
-        path = folder / "summary.json"
+        path = folder / _SUMMARY
         if not path.exists():
             raise UsageError(
-                f"{folder} has no summary.json: the wire goes on or was killed; evedrop view {folder} --table sums up its journal"
+                f"{folder} has no {_SUMMARY}: the wire runs or was killed; to make its report: evedrop report {folder}"
             )
         try:
-            summary = json.loads(text_of(path, _MOST_BYTES))
+            return cls.of(folder, json.loads(text_of(path, _MOST_BYTES)))
+        except (OSError, Unreadable, ValueError, RecursionError) as error:
+            raise UsageError(f"{path} is not the summary of a wire of this version ({error!r})") from error
+
+    @classmethod
+    def of(cls, folder: Path, summary: Mapping[str, Any]) -> WireSource:
+        """A folder whose summary is known. Raises UsageError if it is not a summary."""
+        try:
             # These raise an error unless it is a summary.
             wire_table(summary), reasons_table(summary), list(wire_faults(summary))
             *sides, last = dict.fromkeys(one[end] for one in summary["links"].values() for end in ("source", "target"))
@@ -60,8 +68,8 @@ class WireSource:
             events = [(f"{one['seconds']:,.1f} s", str(one["event"])) for one in summary["events"]]
             dict(summary["made_with"])
             found = title, wire_title(summary), wire_outcome(summary)
-        except (OSError, Unreadable, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise UsageError(f"{path} is not the summary of a wire of this version ({error!r})") from error
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise UsageError(f"{folder / _SUMMARY} is not the summary of a wire of this version ({error!r})") from error
         try:
             tables = tomllib.loads(text_of(folder / WIRE_FILE, _MOST_BYTES))
             models = {one["name"]: _model(one["loss"]) for one in tables["link"]}

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 import os
 import shutil
 import struct
@@ -38,7 +39,7 @@ from evedrop.wire.journal_part import (
     table_of,
     write_parquet,
 )
-from evedrop.wire.journal_reader import JOURNAL_FOLDER, UNFINISHED, parquet_path
+from evedrop.wire.journal_reader import JOURNAL_FOLDER, UNFINISHED, JournalState, parquet_path
 from evedrop.wire.journal_recovery import locked, recover
 from evedrop.wire.journal_words import JournalWords
 from evedrop.wire.plan import WirePlan
@@ -97,6 +98,7 @@ class WireJournal:
         self._next = 0  # the part whose rows are handed over now
         self._amended: deque[tuple[Records, Crossing]] = deque()
         self._number = itertools.count()
+        self._began, self._stopped = time.monotonic(), math.inf
         self._amended_late: deque[tuple[int, Crossing]] = deque()
         self._convert_after = 0.0
         try:
@@ -132,6 +134,16 @@ class WireJournal:
     def start(self) -> int:
         """The number of this start of the wire in its folder, from 1."""
         return self._history.start
+
+    @property
+    def seconds(self) -> float:
+        """How long this start has lasted."""
+        return min(time.monotonic(), self._stopped) - self._began
+
+    @property
+    def state(self) -> JournalState:
+        """Whether this start still runs."""
+        return "ended" if self._ended.is_set() else "running"
 
     def key_code(self, key: str) -> int:
         """The code of a key in records."""
@@ -211,6 +223,7 @@ class WireJournal:
             return
         self._ended.set()
         self._thread.join()
+        self._stopped = time.monotonic()
         self.recorded = next(self._number)
         self.flush()
         try:

@@ -1,22 +1,45 @@
-"""The journal of a wire that runs in another process, read from the disk: for its figures so far.
+"""The journal of a wire that runs in another process, or was killed, read from the disk: for its figures so far.
 
 Source: docs/wire.md, from Python.
 """
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
-from typing import final
+from typing import Any, final
 
 import pyarrow as pa
 
+from evedrop.errors import UsageError
 from evedrop.model.slot.link import Change
+from evedrop.results.summary_file import plain
+from evedrop.results.wire_folder import WIRE_FILE
+from evedrop.wire.file import load_wire
 from evedrop.wire.history import WireHistory
 from evedrop.wire.journal import AmendmentListener, Listener
 from evedrop.wire.journal_part import records_of
-from evedrop.wire.journal_reader import JOURNAL_FOLDER, journal_tables
+from evedrop.wire.journal_reader import JOURNAL_FOLDER, UNFINISHED, JournalState, journal_tables, last_beat
+from evedrop.wire.journal_recovery import is_in_use
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.summary import WireSummary
+
+
+def summary_of_wire(folder: Path) -> dict[str, Any]:
+    """The entries of a wire's summary.json. A wire that runs or was killed has none: then those that its journal gives.
+
+    Raises UsageError if neither can be read.
+    """
+    path = folder / "summary.json"
+    if not path.exists():
+        found: dict[str, Any] = plain(summary_on_disk(folder, load_wire(folder / WIRE_FILE)).as_dict())
+        return found
+    try:
+        found = json.loads(path.read_bytes())
+    except (OSError, ValueError) as error:
+        why = (error.strerror if isinstance(error, OSError) else None) or error
+        raise UsageError(f"{path} is not the summary of a wire ({why})") from error
+    return found
 
 
 def summary_on_disk(folder: Path, plan: WirePlan) -> WireSummary:
@@ -39,6 +62,11 @@ class JournalOnDisk:
         self._folder = folder
         self._links = {link.name: link.number for link in plan.links}
         self._history = WireHistory.read(folder / JOURNAL_FOLDER)
+        self.seconds = 0.0
+        """Until the wire was last alive, or heard its last message, as far as these were read."""
+        self.state: JournalState = "ended"
+        if not self._history.ended:
+            self.state = "running" if is_in_use(folder / JOURNAL_FOLDER) else "killed"
         self._keys: list[str] = []
         self._codes: dict[str, int] = {}
 
@@ -62,14 +90,23 @@ class JournalOnDisk:
 
     def read(self) -> None:
         """Hand all records to the listeners. Raises UsageError if there is no journal."""
-        for table in journal_tables(self._folder, self.start):
+        alive = last_beat(self._folder / JOURNAL_FOLDER / UNFINISHED)
+        self._is_alive_at(alive)
+        for table in journal_tables(self._folder, self.start, alive if self.state == "killed" else None):
             for key in {*_words(table["key"])} - {*self._codes}:
                 self._codes[key] = len(self._keys)
                 self._keys.append(key)
             records = records_of(table, self._links, self._codes)
             self.recorded += len(records)
-            for listener in self.listeners if len(records) else ():
-                listener(records)
+            if len(records):
+                self._is_alive_at(float(records["time"].max()))
+                for listener in self.listeners:
+                    listener(records)
+        # Again, because a change may have come in between; it is written before the first record that it concerns.
+        self._history = WireHistory.read(self._folder / JOURNAL_FOLDER)
+
+    def _is_alive_at(self, time: float) -> None:
+        self.seconds = max(self.seconds, time - self._history.began)
 
 
 def _words(column: pa.ChunkedArray) -> list[str]:

@@ -10,6 +10,7 @@ import re
 import struct
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pyarrow as pa
@@ -24,17 +25,19 @@ from evedrop.wire.journal_words import words_in
 
 JOURNAL_FOLDER = "journal"
 """The folder inside a wire's folder that contains its journal."""
+JournalState = Literal["running", "ended", "killed"]
+"""What became of the start of a wire to which a journal belongs."""
 _LATEST = 1e15  # seconds
 UNFINISHED = "unfinished"
 """The folder inside it for records that are not yet in a Parquet file."""
 
 
-def journal_tables(folder: Path | str, start: int | None = None) -> Iterator[pa.Table]:
+def journal_tables(folder: Path | str, start: int | None = None, alive: float | None = None) -> Iterator[pa.Table]:
     """The journal of a wire's folder in the order of its rows, a table for each part.
 
     The wire may still run, or may have been killed. A journal without messages is one empty table.
 
-    start: only the rows of this start of the wire, from 1; None: the rows of all starts.
+    start: only the rows of this start of the wire, from 1; None: the rows of all starts. alive: as for `unfinished_table`.
 
     Raises UsageError if there is no journal, or a part cannot be read.
     """
@@ -49,16 +52,16 @@ def journal_tables(folder: Path | str, start: int | None = None) -> Iterator[pa.
         yield PARQUET.empty_table()
     for name in names:
         try:
-            yield _table(journal, name, links)
+            yield _table(journal, name, links, alive)
         except (OSError, pa.ArrowException) as error:
             raise damaged(journal, name, error) from error
 
 
-def _table(journal: Path, name: str, links: dict[int, list[str]]) -> pa.Table:
+def _table(journal: Path, name: str, links: dict[int, list[str]], alive: float | None) -> pa.Table:
     path = journal / UNFINISHED / f"{name}.rows"
     with contextlib.suppress(FileNotFoundError):  # a wire that goes on may just have made the Parquet file
         if not parquet_path(journal, name).exists():
-            return unfinished_table(path, links)
+            return unfinished_table(path, links, alive)
     return pq.read_table(parquet_path(journal, name), schema=PARQUET)
 
 

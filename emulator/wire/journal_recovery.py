@@ -33,6 +33,15 @@ def locked(folder: Path) -> int:
     return descriptor
 
 
+def is_in_use(folder: Path) -> bool:
+    """Whether another process uses a folder, as `locked` says."""
+    try:
+        os.close(locked(folder))
+    except UsageError:
+        return True
+    return False
+
+
 def recover(journal: Path, history: WireHistory) -> int:
     """Make Parquet files from all that an earlier start left behind, and end that start; returns the number of such records.
 

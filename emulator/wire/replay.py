@@ -5,10 +5,8 @@ Source: docs/wire.md, the view.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pyarrow.compute as pc
 import rerun as rr
@@ -60,18 +58,6 @@ def replay_wire(folder: Path, path: Path) -> Path:
     finally:
         file.disconnect()
     return path
-
-
-def summary_of_wire(folder: Path) -> dict[str, Any]:
-    """The entries of a wire's summary.json. Raises UsageError if there is none."""
-    try:
-        found: dict[str, Any] = json.loads((folder / "summary.json").read_bytes())
-    except (OSError, ValueError) as error:
-        why = (error.strerror if isinstance(error, OSError) else None) or error
-        raise UsageError(
-            f"{folder} has no summary.json of a wire ({why}); a wire writes it when it ends, and not if it is killed"
-        ) from error
-    return found
 
 
 def _notices(plan: WirePlan, history: WireHistory) -> Iterator[Notice]:

@@ -57,7 +57,7 @@ def run_wire(
                 journal.note(line.partition(": ")[2])
                 say(line)
 
-            _write_plan(out, plan)
+            _begin_results(out, plan)
             if journal.recovered:
                 say(
                     f"{journal.recovered:,} messages were recovered from an earlier start, which was killed; their numbers go on"
@@ -79,9 +79,10 @@ def run_wire(
     return status
 
 
-def _write_plan(out: Path, plan: WirePlan) -> None:
-    """Write wire.toml, the complete file of the wire."""
+def _begin_results(out: Path, plan: WirePlan) -> None:
+    """Write wire.toml, the complete file of the wire, and remove the summary of an earlier start."""
     try:
+        (out / "summary.json").unlink(missing_ok=True)
         write_private(out / WIRE_FILE, resolved_wire(plan))
     except OSError as error:
         warn(f"wire.toml cannot be written ({error}); the wire goes on")

@@ -9,7 +9,6 @@ import importlib.metadata
 import json
 import platform
 import threading
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -28,6 +27,7 @@ from evedrop.wire.crossing import UNLINKED, Crossing, Kind
 from evedrop.wire.expect import WireExpectTable
 from evedrop.wire.journal import AmendmentListener, Listener
 from evedrop.wire.journal_part import REASONS, Records
+from evedrop.wire.journal_reader import JournalState
 from evedrop.wire.law import bounds, expected
 from evedrop.wire.plan import WireLink, WirePlan
 from evedrop.wire.tallies import LinkTally, StreamTally
@@ -47,6 +47,14 @@ class SummarisedJournal(Protocol):
     @property
     def start(self) -> int:
         """The number of the start of the wire in its folder, from 1."""
+
+    @property
+    def seconds(self) -> float:
+        """How long this start has lasted."""
+
+    @property
+    def state(self) -> JournalState:
+        """What became of this start."""
 
     @property
     def recovered(self) -> int:
@@ -103,7 +111,6 @@ class WireSummary:
         self._unlinked = LinkTally()
         self._lossless: dict[int, bool] = {}
         self._lock = threading.Lock()
-        self._began, self._seconds = time.monotonic(), 0.0
         journal.listeners.append(self.add)
         journal.amendment_listeners.append(self.amend)
 
@@ -162,7 +169,8 @@ class WireSummary:
         return {
             "seed": self._plan.seed,
             "start": journal.start,
-            "seconds": self._seconds,
+            "state": journal.state,
+            "seconds": journal.seconds,
             "heard": journal.recorded,
             "unlinked": self._unlinked.heard,
             "unaccounted": self.unaccounted,
@@ -190,7 +198,6 @@ class WireSummary:
 
         1 if an expectation failed or the journal is incomplete, 3 if a message is unaccounted for.
         """
-        self._seconds = time.monotonic() - self._began
         found = self.as_dict()
         try:
             replace_private(out / "summary.json", json.dumps(plain(found), indent=1, ensure_ascii=False) + "\n")

@@ -20,8 +20,9 @@ from evedrop.errors import UsageError
 from evedrop.expected.estimates import warnings_of
 from evedrop.loading import parse, shipped
 from tests.fuzz.fuzzing import CORPUS, broken_by, campaign
+from tests.fuzz.message_readers import MESSAGES
 from tests.fuzz.mutation import REALS
-from tests.fuzz.readers import FILES, MESSAGES, READERS
+from tests.fuzz.readers import FILES, READERS
 
 CHEAP = {"change", "disturbances", "disturbances-gz", "trace", "trace-parquet", "brief", "control"}
 CHEAP |= {"states", "state-message", "state-bytes"}

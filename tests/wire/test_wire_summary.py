@@ -220,7 +220,7 @@ link = "scan"
     with pytest.raises(UsageError, match="not the summary of a wire of this version"):
         write_report(tmp_path)
     (tmp_path / "summary.json").unlink()
-    with pytest.raises(UsageError, match="--table sums up its journal"):
+    with pytest.raises(UsageError, match="to make its report: evedrop report"):
         write_report(tmp_path)
     nothing, status = run(tmp_path / "silent", plan, messages=0)
     assert status == 0

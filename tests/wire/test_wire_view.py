@@ -322,13 +322,11 @@ def test_a_picture_of_a_wire(folder: Path, capfd: pytest.CaptureFixture[str]) ->
         assert any(all(abs(a - 0.8 * b) < 14 for a, b in zip(one, state.colour, strict=True)) for one in colours), state
 
 
-def test_a_killed_wire_has_no_table(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    """It wrote no summary; the message says when a wire does."""
+def test_a_summary_that_is_damaged_is_refused(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """With its path."""
+    (folder / "summary.json").write_text("{")
     assert main(["view", str(folder), "--table"]) == UsageError.exit_status
-    assert (
-        f"evedrop: {folder} has no summary.json of a wire (No such file or directory); a wire writes it when it ends, and not "
-        "if it is killed\n"
-    ) == capfd.readouterr().err
+    assert f"evedrop: {folder / 'summary.json'} is not the summary of a wire (" in capfd.readouterr().err
 
 
 def test_a_wire_that_nothing_crossed_is_refused(tmp_path: Path) -> None:

@@ -12,9 +12,13 @@ from evedrop.errors import UsageError
 def report(options: argparse.Namespace) -> int:
     """Write the page of a results folder."""
     from evedrop.report.writing import write_report
+    from evedrop.results.wire_folder import is_wire
 
+    write = write_report
+    if is_wire(options.run):  # its summary may have to be made from its journal
+        from evedrop.wire.page import write_wire_report as write
     try:
-        print(write_report(options.run))
+        print(write(options.run))
     except OSError as error:
         raise UsageError(
             f"{options.run}: report.html cannot be written ({error.strerror}); make the folder writable"

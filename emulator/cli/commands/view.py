@@ -150,7 +150,8 @@ def _view_wire(options: argparse.Namespace) -> int:
     from evedrop.view.picture import picture_apart
     from evedrop.view.viewer import WebAddress, open_run
     from evedrop.wire.closing import closing_lines
-    from evedrop.wire.replay import PICTURE_SIZE, replay_wire, summary_of_wire
+    from evedrop.wire.journal_on_disk import summary_of_wire
+    from evedrop.wire.replay import PICTURE_SIZE, replay_wire
 
     _check_names(options)
     if options.slot is not None:

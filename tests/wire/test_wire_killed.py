@@ -1,0 +1,102 @@
+"""A wire that has no summary, because it runs or was killed, has a table and a page all the same: from its journal."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from evedrop.cli.main import main
+from evedrop.errors import UsageError
+from evedrop.results.wire_folder import WIRE_FILE
+from evedrop.wire.crossing import Crossing, Kind
+from evedrop.wire.file import resolved_wire
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal_on_disk import summary_of_wire
+from evedrop.wire.run import run_wire
+from tests.pages import checked
+from tests.wire.wire_at_work import LOSSY, both_ways
+
+DELIVERED, LOST, DELAYED = 6, 3, 1
+
+
+@pytest.fixture
+def folders(tmp_path: Path) -> Iterator[dict[str, Path]]:
+    """The folders of a wire while it runs, and of one that was killed in its second start."""
+    plan, out = both_ways(LOSSY), tmp_path / "running"
+    found = {"running": out, "killed": tmp_path / "killed"}
+    with WireJournal(out, plan) as journal:
+        journal.record(time.time(), 0, -1, 0.0, journal.key_code("scan"), 0, 8, 0, Kind.PUT, Crossing.LOST)
+    with WireJournal(out, plan) as journal:
+        (out / WIRE_FILE).write_text(resolved_wire(plan))
+        fates = [Crossing.DELIVERED] * (DELIVERED + DELAYED) + [Crossing.LOST] * LOST
+        for n, fate in enumerate(fates):
+            delay = 1000.0 if n < DELAYED else 0.0
+            journal.record(time.time(), 1 + n, -1, delay, journal.key_code("scan"), 0, 8, 0, Kind.PUT, fate)
+        shutil.copytree(out, found["killed"])
+        yield found
+
+
+@pytest.mark.parametrize(
+    ("state", "says", "delivered", "dropped"),
+    [
+        ("running", "the wire still runs", DELIVERED + DELAYED, {}),
+        ("killed", "the wire was killed", DELIVERED, {"underway": DELAYED}),
+    ],
+)
+def test_a_wire_without_a_summary_is_summed_up_from_its_journal(
+    state: str, says: str, delivered: int, dropped: dict[str, int],
+    folders: dict[str, Path], capfd: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """Its latest start: a message that was still delayed when the wire was killed did not arrive."""
+    folder = folders[state]
+    found = summary_of_wire(folder)
+    link = found["links"]["robot-base"]
+    assert (found["state"], found["start"], found["heard"]) == (state, 2, DELIVERED + LOST + DELAYED)
+    assert (link["delivered"], link["lost_by"], link["dropped_by"]) == (delivered, {"loss": LOST}, dropped)
+    assert 0.0 < found["seconds"] < 100.0
+    assert main(["view", str(folder), "--table"]) == 0
+    sentence = f"{says}: these are the figures that its journal gives so far"
+    printed = capfd.readouterr().out
+    assert sentence in printed
+    assert "robot-base lost 3 by loss" in printed
+    assert main(["report", str(folder)]) == 0
+    assert capfd.readouterr().out == f"{folder / 'report.html'}\n"
+    texts = checked(folder).texts
+    assert sentence in texts
+    assert any(text.startswith(f"{says}; ") for text in texts)
+    assert not (folder / "summary.json").exists()
+
+
+def test_a_wire_without_a_journal_says_so(folders: dict[str, Path], capfd: pytest.CaptureFixture[str]) -> None:
+    """Nothing is written."""
+    shutil.rmtree(folders["killed"] / "journal")
+    assert main(["report", str(folders["killed"])]) == UsageError.exit_status
+    assert "is not the folder of a wire: it has no folder journal" in capfd.readouterr().err
+    assert not (folders["killed"] / "report.html").exists()
+
+
+def test_the_summary_of_an_earlier_start_does_not_outlive_it(tmp_path: Path) -> None:
+    """While the wire runs again, and if it is then killed, its folder has no summary that is not of this start."""
+    plan, out = both_ways(LOSSY), tmp_path / "out"
+    assert run_wire(plan, out, seconds=0.01, say=lambda _: None) == 0
+    assert json.loads((out / "summary.json").read_text())["state"] == "ended"
+    there: list[bool] = []
+    assert run_wire(plan, out, seconds=0.01, say=lambda _: there.append((out / "summary.json").exists())) == 0
+    assert there[0] is False
+    assert there[-1] is True
+    assert json.loads((out / "summary.json").read_text())["start"] == 2
+
+
+def test_a_wire_that_heard_nothing_has_lasted_until_it_was_last_alive(tmp_path: Path) -> None:
+    """It notes that it is alive from its start on, so this is not 0."""
+    plan = both_ways(LOSSY)
+    with WireJournal(tmp_path, plan):
+        (tmp_path / WIRE_FILE).write_text(resolved_wire(plan))
+        found = summary_of_wire(tmp_path)
+    assert (found["heard"], found["state"]) == (0, "running")
+    assert 0.0 < found["seconds"] < 100.0
