@@ -7,13 +7,15 @@ import struct
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from typing import final
 
 _PIECE = 1 << 16
 _RESET = struct.pack("ii", 1, 0)
 
 
+@final
 class Cable:
-    """Passes on what comes to its own port. Final.
+    """Passes on what comes to its own port.
 
     whole: set while it passes everything on; closed connections stay closed, and none is accepted meanwhile.
     """

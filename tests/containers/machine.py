@@ -15,7 +15,7 @@ import signal
 import subprocess
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 from tests.conftest import wait_until
 from tests.containers.base import ROOT
@@ -53,8 +53,9 @@ def checkout(folder: Path) -> Path:
     return copy
 
 
+@final
 class Docker:
-    """A daemon that runs until `end`. Final."""
+    """A daemon that runs until `end`."""
 
     def __init__(self, folder: Path) -> None:
         """Start it. Raises CannotRun with its last words if it does not start."""

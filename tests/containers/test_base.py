@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import final
 
 import pytest
 
@@ -38,8 +39,9 @@ bootstrap(folder, "http://mirror.invalid", "bookworm", folder / "base.tar")
 IN_A_NAMESPACE = ("unshare", "--mount", "--propagation", "private")
 
 
+@final
 class Making:
-    """What is known of a stand-in of debootstrap that was started. Final."""
+    """What is known of a stand-in of debootstrap that was started."""
 
     def __init__(self, folder: Path) -> None:
         self._pipe = folder / "alive"

@@ -20,6 +20,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import final
 
 from evedrop.results.writer import load_results
 from tests.faults import ours
@@ -55,9 +56,10 @@ class Verdict:
         return f"{self.case.seed:6d}  {self.outcome:18} {self.seconds:5.1f} s  {self.case}{some}"
 
 
+@final
 @dataclass
 class Campaign:
-    """Cases in a folder. Final."""
+    """Cases in a folder."""
 
     folder: Path
     small_disks: bool

@@ -5,56 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from evedrop.loading import load
 from evedrop.scenario import Scenario
+from tests.disturbed import ACKNOWLEDGED, LOOP, SCHEDULED, disturbed
 
-_RICH = """
-title = "Disturbed by the campaign"
-slots = {slots}
-seed = 20
-trials = {trials}
-record_trials = {recorded}
-pace = {pace}
-[process]
-A = [[1.0, 0.1], [0.0, 0.98]]
-Q = [[0.01, 0.0], [0.0, 0.01]]
-initial_covariance = [[1.0, 0.0], [0.0, 1.0]]
-[encoding]
-{encoding}
-[legitimate]
-window = 3
-{more_of_legitimate}
-link = {{ quality = 0.8, delay = {{ model = "normal", mean = 1.0, deviation = 1.0 }}, duplicate = 0.1, corrupt = 0.02 }}
-[eavesdroppers.smart]
-strategy = "{strategy}"
-link = {{ loss = {{ model = "gilbert-elliott", p = 0.05, r = 0.3 }} }}
+_NAIVE = """
 [eavesdroppers.naive]
 strategy = "naive"
-link = {{ quality = 0.9 }}
-{more}
+link = { quality = 0.9 }
 """
-_INNOVATION = 'scheme = "innovation"\nstate_probability = 0.5'
-_SCHEDULED = 'scheme = "scheduled"\nthreshold = 3'
-_ACKNOWLEDGEMENTS = """
-[acknowledgements]
-link = { quality = 0.8 }
-attack = "critical"
-jammer = "smart"
-"""
-_LOOP = """
-[plant]
-inputs = ["heater"]
-input_matrix = [[0.1], [0.0]]
-input_lower = [-2.0]
-input_upper = [2.0]
-noise = [[1e-4, 0.0], [0.0, 1e-4]]
-[controller]
-strategy = "lqr"
-period = 3
-state_weights = [1.0, 1.0]
-input_weights = [0.1]
-"""
+_LOOP = LOOP.format("period = 3")
 _EVENTS = """
 [[event]]
 at = 100
@@ -76,18 +38,8 @@ cut = "legitimate"
 """
 
 
-def _rich(**given: str | int | float) -> str:
-    entries: dict[str, str | int | float] = {
-        "slots": 400,
-        "trials": 3,
-        "recorded": 2,
-        "pace": 0.004,
-        "encoding": _INNOVATION,
-        "strategy": "smart",
-        "more_of_legitimate": "",
-        "more": "",
-    }
-    return _RICH.format(**{**entries, **given})
+def _rich(more: str, **given: Any) -> str:
+    return disturbed(400, pace=0.004, entries="record_trials = 2", more=_NAIVE + more, **given)
 
 
 @dataclass(frozen=True)
@@ -142,11 +94,11 @@ VARIANTS: Mapping[str, Variant] = {
         Variant("fast", "eavesdroppers", {"slots": 6000}, _EVES),
         Variant("batch", "eavesdroppers", {**_SHORT, "trials": 60, "record_trials": 3}, _EVES),
         Variant("viewed", "eavesdroppers", _SHORT, _EVES, view="web"),
-        Variant("events", _rich(more=_EVENTS), {}, _TWO),
-        Variant("acknowledged", _rich(encoding=_SCHEDULED, strategy="naive", more=_ACKNOWLEDGEMENTS), {}, _TWO),
-        Variant("loop", _rich(more=_LOOP, more_of_legitimate="knows_input = true"), {}, _TWO, ("controller",)),
+        Variant("events", _rich(_EVENTS), {}, _TWO),
+        Variant("acknowledged", _rich(ACKNOWLEDGED, encoding=SCHEDULED, strategy="naive"), {}, _TWO),
+        Variant("loop", _rich(_LOOP, more_of_legitimate="knows_input = true"), {}, _TWO, ("controller",)),
         Variant(
-            "relayed", _rich(more=_LOOP + "[network]\nrouters = 2\n"), {}, _TWO, ("controller", "relay")
+            "relayed", _rich(_LOOP + "[network]\nrouters = 2\n"), {}, _TWO, ("controller", "relay")
         ),
         Variant("shards", "eavesdroppers", {**_SHORT, "trials": 20, "record_trials": 12, "shards": 2}, _EVES, shards=2),
     )

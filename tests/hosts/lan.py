@@ -13,6 +13,7 @@ import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import final
 
 from tests.privileged import CannotRun
 
@@ -54,8 +55,9 @@ def prove() -> None:
         raise CannotRun(f"a network of our own cannot be made: {error}") from error
 
 
+@final
 class Lan:
-    """Final. Hosts 10.77.0.1, 10.77.0.2, …; each on its own cable to the switch."""
+    """Hosts 10.77.0.1, 10.77.0.2, …; each on its own cable to the switch."""
 
     def __init__(self, hosts: tuple[str, ...]) -> None:
         self._begin = f"{_PREFIX}-{os.getpid()}-{next(_numbers)}"

@@ -10,6 +10,7 @@ import re
 import signal
 import socket
 from pathlib import Path
+from typing import final
 
 import pytest
 
@@ -208,8 +209,9 @@ def test_a_brief_of_another_run_is_told_apart(protocol: str, evedrop: Evedrop) -
     assert list((evedrop.folder / "results").iterdir()) == []
 
 
+@final
 class Router:
-    """A router that listens. Final; ended when the block ends."""
+    """A router that listens; ended when the block ends."""
 
     def __init__(self, evedrop: Evedrop, brief: str, endpoint: str) -> None:
         host, _, port = endpoint.partition("/")[2].rpartition(":")

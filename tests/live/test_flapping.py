@@ -24,8 +24,8 @@ from evedrop.ports import free_port
 from evedrop.scenario import Scenario
 from tests.by_hand import as_if_undisturbed, by_hand
 from tests.conftest import Evedrop, wait_until
+from tests.disturbed import ACKNOWLEDGED, INNOVATION, LOOP
 from tests.live.network.bench import is_matched
-from tests.live.test_recovery import ACKNOWLEDGED, INNOVATION, LOOP
 from tests.proxy import cable
 from tests.resets import reset_connections
 from tests.steps import stepping

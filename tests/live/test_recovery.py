@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -16,51 +17,10 @@ from evedrop.ports import free_port
 from evedrop.scenario import Scenario
 from tests.by_hand import as_if_undisturbed, by_hand
 from tests.conftest import Evedrop, Live, wait_until
+from tests.disturbed import ACKNOWLEDGED, LOOP, SCHEDULED, disturbed
 from tests.proxy import Cable, cable
 from tests.steps import stepping
 
-SCENARIO = """
-title = "Disturbed"
-slots = {slots}
-seed = 20
-trials = {trials}
-pace = {pace}
-longest_outage = {longest_outage}
-[process]
-A = [[1.0, 0.1], [0.0, 0.98]]
-Q = [[0.01, 0.0], [0.0, 0.01]]
-initial_covariance = [[1.0, 0.0], [0.0, 1.0]]
-[encoding]
-{encoding}
-[legitimate]
-window = 3
-{more_of_legitimate}
-link = {{ quality = 0.8, delay = {{ model = "normal", mean = 1.0, deviation = 1.0 }}, duplicate = 0.1, corrupt = 0.02 }}
-[eavesdroppers.smart]
-strategy = "{strategy}"
-link = {{ loss = {{ model = "gilbert-elliott", p = 0.05, r = 0.3 }} }}
-{more}
-"""
-INNOVATION = 'scheme = "innovation"\nstate_probability = 0.5'
-ACKNOWLEDGED = """
-[acknowledgements]
-link = { quality = 0.8 }
-attack = "critical"
-jammer = "smart"
-"""
-LOOP = """
-[plant]
-inputs = ["heater"]
-input_matrix = [[0.1], [0.0]]
-input_lower = [-2.0]
-input_upper = [2.0]
-noise = [[1e-4, 0.0], [0.0, 1e-4]]
-[controller]
-strategy = "lqr"
-state_weights = [1.0, 1.0]
-input_weights = [0.1]
-{}
-"""
 CHANGING = """
 [[event]]
 at = 300
@@ -74,14 +34,10 @@ state = "last"
 """
 
 
-def scenario_in(folder: Path, **given: Any) -> tuple[Path, Scenario]:
+def scenario_in(folder: Path, slots: int = 700, longest_outage: float = 30.0, **given: Any) -> tuple[Path, Scenario]:
     """A scenario with losses in bursts, delays and second copies, and its file."""
-    entries = {
-        "slots": 700, "trials": 3, "pace": 0.002, "longest_outage": 30.0, "encoding": INNOVATION, "strategy": "smart", "more": "",
-        "more_of_legitimate": "", **given,
-    }  # fmt: skip
     path = folder / "disturbed.toml"
-    path.write_text(SCENARIO.format(**entries))
+    path.write_text(disturbed(slots, entries=f"longest_outage = {longest_outage}", **given))
     return path, load(path)
 
 
@@ -90,7 +46,7 @@ long = pytest.mark.long
 RUNS: dict[str, dict[str, Any]] = {
     "as fast as it goes": {"slots": 1500, "trials": 10, "pace": 0.0},
     "silent and acknowledged": {
-        "slots": 1500, "trials": 20, "pace": 0.003, "encoding": 'scheme = "scheduled"\nthreshold = 3', "strategy": "naive",
+        "slots": 1500, "trials": 20, "pace": 0.003, "encoding": SCHEDULED, "strategy": "naive",
         "more": ACKNOWLEDGED,
     },
     "coded and acknowledged": {
@@ -256,6 +212,27 @@ def test_a_router_that_is_started_again_by_hand(evedrop: Evedrop, tmp_path: Path
         assert outage["seconds"] > 3.0
 
 
+def is_taken_up(
+    name: str, cut_off: Callable[[Cable], None], scenario: Scenario, evedrop: Evedrop, folder: Path
+) -> None:
+    """Assert that a run goes on as in memory once a process that was cut off is back, and that it lists the outage."""
+    port = free_port()
+    with ExitStack() as stack:
+        wire: Cable = stack.enter_context(cable(port))
+        run = stack.enter_context(by_hand(scenario, folder, f"tcp/127.0.0.1:{port}", paused=True))
+        run.write(**{name: wire.endpoint})
+        run.start()
+        with stepping(evedrop, run.results, 600):
+            run.running(more_than=100)
+            assert wire.connections
+            cut_off(wire)
+            wire.heal()
+        assert evedrop("resume", str(run.results)).status == 0
+        assert set(run.statuses().values()) == {0}
+        as_if_undisturbed(run.summary, scenario, folder / "memory")
+        assert [one["process"] for one in run.summary["outages"]] == [name]
+
+
 @pytest.mark.parametrize(
     ("name", "how"),
     [
@@ -269,49 +246,29 @@ def test_a_router_that_is_started_again_by_hand(evedrop: Evedrop, tmp_path: Path
 )
 def test_a_cut_connection_costs_nothing_but_time(name: str, how: str, evedrop: Evedrop, tmp_path: Path) -> None:
     """Closed for two seconds, or without a word for longer than its lease: who was cut off is listed, and all is as ever."""
-    given = {"encoding": 'scheme = "scheduled"\nthreshold = 3', "strategy": "naive", "more": ACKNOWLEDGED}
-    _, scenario = scenario_in(tmp_path, **given)
-    port = free_port()
-    with ExitStack() as stack:
-        wire: Cable = stack.enter_context(cable(port))
-        run = stack.enter_context(by_hand(scenario, tmp_path, f"tcp/127.0.0.1:{port}", paused=True))
-        run.write(**{name: wire.endpoint})
-        run.start()
-        with stepping(evedrop, run.results, 600):
-            run.running(more_than=100)
-            assert wire.connections
-            if how == "closed":
-                wire.cut()
-                time.sleep(2.0)  # how long it is cut off is what is tested
-            else:
-                wire.silence()
-                time.sleep(7.0)  # the same
-            wire.heal()
-        assert evedrop("resume", str(run.results)).status == 0
-        assert set(run.statuses().values()) == {0}
-        as_if_undisturbed(run.summary, scenario, tmp_path / "memory")
-        assert [one["process"] for one in run.summary["outages"]] == [name]
+    _, scenario = scenario_in(tmp_path, encoding=SCHEDULED, strategy="naive", more=ACKNOWLEDGED)
+
+    def cut_off(wire: Cable) -> None:
+        if how == "closed":
+            wire.cut()
+            time.sleep(2.0)  # how long it is cut off is what is tested
+        else:
+            wire.silence()
+            time.sleep(7.0)  # the same
+
+    is_taken_up(name, cut_off, scenario, evedrop, tmp_path)
 
 
 @pytest.mark.parametrize("name", [pytest.param("controller", marks=long), "legitimate"])
 def test_a_loop_is_taken_up_where_it_was_cut(name: str, evedrop: Evedrop, tmp_path: Path) -> None:
     """Estimates and inputs that were lost on the way are sent again: no process waits for ever, and no input changes."""
     _, scenario = scenario_in(tmp_path, more=LOOP.format("period = 5"), more_of_legitimate="knows_input = true")
-    port = free_port()
-    with ExitStack() as stack:
-        wire: Cable = stack.enter_context(cable(port))
-        run = stack.enter_context(by_hand(scenario, tmp_path, f"tcp/127.0.0.1:{port}", paused=True))
-        run.write(**{name: wire.endpoint})
-        run.start()
-        with stepping(evedrop, run.results, 600):
-            run.running(more_than=100)
-            wire.cut()
-            time.sleep(1.0)  # how long it is cut off is what is tested
-            wire.heal()
-        assert evedrop("resume", str(run.results)).status == 0
-        assert set(run.statuses().values()) == {0}
-        as_if_undisturbed(run.summary, scenario, tmp_path / "memory")
-        assert [one["process"] for one in run.summary["outages"]] == [name]
+
+    def cut_off(wire: Cable) -> None:
+        wire.cut()
+        time.sleep(1.0)  # how long it is cut off is what is tested
+
+    is_taken_up(name, cut_off, scenario, evedrop, tmp_path)
 
 
 def test_a_process_that_stays_cut_off_ends_the_run(tmp_path: Path) -> None:

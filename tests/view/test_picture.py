@@ -1,4 +1,3 @@
-import io
 import os
 import subprocess
 import sys
@@ -14,10 +13,11 @@ import pytest
 
 from evedrop.errors import UsageError
 from evedrop.view.headless import HeadlessViewer
-from evedrop.view.picture import check_picture_name, opened, picture_apart
+from evedrop.view.picture import check_picture_name, picture_apart
 from evedrop.view.recording import ViewRecording
 from evedrop.view.viewer_process import guarded
 from tests.conftest import wait_until
+from tests.view.drawn import panels_are_filled, skipped_without_driver
 from tests.view.simulated_run import Simulated
 
 
@@ -62,19 +62,11 @@ def test_nobody_can_connect_to_who_draws(simulated: Callable[..., Simulated], tm
     pid = wait_until(lambda: drawing(rrd) or bool(found), "a viewer that draws")
     network = None if found else os.readlink(f"/proc/{pid}/ns/net")
     thread.join()
-    if isinstance(found[0], UsageError):
-        if "no Vulkan driver" not in str(found[0]):
+    with skipped_without_driver():
+        if isinstance(found[0], UsageError):
             raise found[0]
-        pytest.skip(str(found[0]))
     assert (network != os.readlink("/proc/self/ns/net")) == apart
     assert np.asarray(matplotlib.image.imread(tmp_path / "r.png")).shape[:2] == (950, 1600)
-
-
-def filled(png: bytes) -> float:
-    """Share of the pixels inside a panel that are not its most frequent colour."""
-    pixels = np.asarray(matplotlib.image.imread(io.BytesIO(png)))[:, :, :3]
-    inside = (pixels[40:, :, :] * 255).astype(np.int64) @ np.array([65536, 256, 1])
-    return float(np.mean(inside != np.bincount(inside.ravel()).argmax()))
 
 
 @pytest.mark.parametrize(
@@ -84,29 +76,14 @@ def filled(png: bytes) -> float:
 def test_every_panel_is_filled(n: int, growth: float, simulated: Callable[..., Simulated], tmp_path: Path) -> None:
     """Whatever the process, each panel draws something, in more than one colour, and complains of nothing."""
     rrd = recorded(simulated(120, n=n, growth=growth), tmp_path / "r.rrd")
-    try:
-        with opened(rrd, (1600, 950)) as viewer:
-            views = viewer.state().views
-            shares = {str(view.name): filled(viewer.take(view.view_id)) for view in views}
-            complaints = [view.reports for view in views if view.reports]
-    except UsageError as error:
-        if "no Vulkan driver" not in str(error):
-            raise
-        pytest.skip(str(error))
-    assert len(shares) == 9
-    assert min(shares.values()) > 0.004, shares
-    assert complaints == []
+    panels_are_filled(rrd, 9)
 
 
 def test_picture_is_a_png_of_that_size(simulated: Callable[..., Simulated], tmp_path: Path) -> None:
     """A picture is written in the size asked for, without complaints."""
     rrd = recorded(simulated(60), tmp_path / "r.rrd")
-    try:
+    with skipped_without_driver():
         assert picture_apart(rrd, tmp_path / "r.png", size=(1200, 800)) == []
-    except UsageError as error:
-        if "no Vulkan driver" not in str(error):
-            raise
-        pytest.skip(str(error))
     assert np.asarray(matplotlib.image.imread(tmp_path / "r.png")).shape[:2] == (800, 1200)
 
 
