@@ -382,7 +382,14 @@ def test_a_video_of_a_wire(folder: Path, capfd: pytest.CaptureFixture[str]) -> N
         assert (gif.size, getattr(gif, "n_frames", 1)) == ((400, 320), 3)
 
 
-@pytest.mark.parametrize(("words", "advice"), [((), "--times FIRST:LAST"), (("--slots", "0:3"), "give --times")])
+@pytest.mark.parametrize(
+    ("words", "advice"),
+    [
+        ((), "--times FIRST:LAST"),
+        (("--slots", "0:3"), "give --times"),
+        (("--times", "0:1e12"), "more than 1,000,000 frames"),
+    ],
+)
 def test_a_video_of_a_wire_needs_times(
     words: tuple[str, ...], advice: str, folder: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

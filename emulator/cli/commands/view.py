@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 _MOST_RATE = 60
 _BEFORE, _AFTER = 60, 20  # slots of a video around the most telling one
+_MOST_TIMES = 1_000_000  # frames of a video of a wire: eighteen hours at 15 a second
 _LEAST, _MOST = 320, 3840  # pixels; the viewer takes more than its time limit for larger pictures
 
 
@@ -111,6 +112,10 @@ def _times_of(options: argparse.Namespace) -> Sequence[float]:
         raise UsageError("a video of a wire needs --times FIRST:LAST, in seconds, such as --times 0:10")
     first, last, step = options.times
     step = 1.0 / (options.fps or FRAME_RATE) if step is None else step
+    if (last - first) / step > _MOST_TIMES:
+        raise UsageError(
+            f"--times gives more than {_MOST_TIMES:,} frames; give a shorter time, or a larger step as in 0:60:0.1"
+        )
     return [first + number * step for number in range(int((last - first) / step + 1e-9) + 1)]
 
 
@@ -128,7 +133,8 @@ def _film(recording: Path, options: argparse.Namespace, moments: Sequence[float]
 
         size, rate = options.size or VIDEO_SIZE, options.fps or FRAME_RATE
         complaints = video_apart(recording, options.video, moments, size, rate, tell)
-    print("\n".join([*complaints, f"{len(moments)} frames are in {options.video}"]))
+    frames = f"{len(moments)} frames are" if len(moments) > 1 else "1 frame is"
+    print("\n".join([*complaints, f"{frames} in {options.video}"]))
     return 0
 
 
