@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
+from evedrop.errors import UsageError
 from evedrop.live.launch.compose import write_compose
 from evedrop.loading import load
 from tests.conftest import Evedrop
@@ -143,6 +144,26 @@ def test_what_containers_cannot_run_is_refused(words: tuple[str, ...], said: str
     assert done.status == 2
     assert done.err.startswith(f"evedrop: {said}"), done.err
     assert [path.name for path in folder.iterdir()] == ["two.toml"]
+
+
+SHIPPED = load("two-eavesdroppers")
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"modules": "/home/here"}, r"^modules = /home/here: .*evedrop brief SCENARIO --out DIR"),
+        (
+            {"process": SHIPPED.process.model_copy(update={"source": "zenoh"})},
+            r"^process\.zenoh: no container can reach",
+        ),
+    ],
+)
+def test_what_the_image_lacks_is_refused(changes: dict[str, Any], said: str, tmp_path: Path) -> None:
+    """Classes of the user, and a program that gives the states; no folder is made."""
+    with pytest.raises(UsageError, match=said):
+        write_compose(SHIPPED.model_copy(update=changes), "two-eavesdroppers", False, tmp_path / "made", False)
+    assert not (tmp_path / "made").exists()
 
 
 def test_a_scenario_beside_its_files_is_used_as_it_is(evedrop: Evedrop) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import signal
+import threading
 from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any
@@ -12,6 +14,7 @@ import pytest
 
 from evedrop.live.launch.host_program import HostProcesses
 from evedrop.live.launch.starter import StartedProcess
+from tests.conftest import LIMIT, wait_until
 
 ORDER: Mapping[str, Any] = {
     "start": 7,
@@ -24,6 +27,65 @@ ORDER: Mapping[str, Any] = {
 def unable(role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:
     """A starter on a system that has no process to spare."""
     raise OSError(11, "Resource temporarily unavailable")
+
+
+class Process:
+    """A process that runs until it is told to end."""
+
+    pid, stdin, stdout = 1, None, None
+
+    def __init__(self) -> None:
+        self.over = threading.Event()
+
+    def poll(self) -> int | None:
+        """Its status."""
+        return -signal.SIGTERM if self.over.is_set() else None
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait for its end."""
+        assert self.over.wait(LIMIT if timeout is None else timeout)
+        return -signal.SIGTERM
+
+    def send_signal(self, sig: int) -> None:
+        """Only the signal that ends it has an effect."""
+        if sig == signal.SIGTERM:
+            self.over.set()
+
+    def terminate(self) -> None:
+        """End it."""
+        self.send_signal(signal.SIGTERM)
+
+    kill = terminate
+
+
+def test_a_process_has_its_files_in_the_private_folder(tmp_path: Path) -> None:
+    """Its brief, its state and its temporary files; its log and its end are sent, and `end` ends it."""
+    started: list[tuple[dict[str, Any], Mapping[str, str], int]] = []
+    sent: list[bytes] = []
+
+    def start(role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:
+        assert (role, brief) == ("eavesdropper", tmp_path / "smart.json")
+        started.append((json.loads(brief.read_text()), environment, brief.stat().st_mode & 0o777))
+        log.write(b"a line\n")
+        return Process()
+
+    def send(text: memoryview) -> int:
+        sent.append(bytes(text[:10]))  # a pipe may take less than it is given
+        return len(sent[-1])
+
+    host = HostProcesses(tmp_path, start, send)
+    part = {"state_file": "/launcher/smart.state"}
+    host.obey({**ORDER, "brief": {"process": "smart", "part": part}, "environment": {"TMPDIR": "/launcher", "A": "1"}})
+    ((brief, environment, mode),) = started
+    assert brief["part"] == {"state_file": str(tmp_path / "smart.state")}
+    assert (environment["TMPDIR"], environment["A"], mode) == (str(tmp_path), "1", 0o600)
+    wait_until(lambda: b"".join(sent).endswith(b"\n"), "the log")
+    host.end()
+    wait_until(lambda: b"".join(sent).count(b"\n") == 2, "the end")
+    assert [json.loads(line) for line in b"".join(sent).splitlines()] == [
+        {"log": 7, "text": "a line\n"},
+        {"ended": 7, "status": -15},
+    ]
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="reads /proc")

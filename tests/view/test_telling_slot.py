@@ -1,7 +1,12 @@
+from pathlib import Path
+
 import numpy as np
 
+from evedrop import montecarlo
+from evedrop.loading import load
 from evedrop.model.process import Floats
-from evedrop.view.telling_slot import most_telling
+from evedrop.results.reading import load_results
+from evedrop.view.telling_slot import most_telling, telling_slot
 
 
 def errors_of(slots: int, **far: tuple[int, float]) -> dict[str, Floats]:
@@ -51,3 +56,28 @@ def test_the_slots_around_it_fill_the_panels() -> None:
     for slots in (1, 60, 105):
         errors = errors_of(slots, naive=(0, 5.0))
         assert most_telling(errors, believed(errors), 0.1) == slots - 1
+
+
+def test_the_first_recorded_trial_decides(tmp_path: Path) -> None:
+    """It is the one that the view shows; the covariances are those that receivers believe."""
+    found = []
+    for trials in (1, 3):
+        montecarlo("vehicle", slots=400, record_trials=trials, trials=trials, out=tmp_path / str(trials))
+        found.append(telling_slot(load_results(tmp_path / str(trials))))
+    assert found[0] == found[1]
+    results = load_results(tmp_path / "3")
+    rows = [row for row in results.trials.to_pylist() if row["trial"] == 0]
+    errors: dict[str, list[float]] = {}
+    traces: dict[str, list[float]] = {}
+    for row in sorted(rows, key=lambda one: one["slot"]):
+        errors.setdefault(row["peer"], []).append(row["squared_error"])
+        traces.setdefault(row["peer"], []).append(np.trace(np.array(row["P"]).reshape(len(row["x"]), -1)))
+    noise = float(np.trace(load("vehicle").process.process.Q))
+    seen, claimed = ({name: np.array(one) for name, one in by.items()} for by in (errors, traces))
+    assert found[1] == most_telling(seen, claimed, noise)
+
+
+def test_a_closed_loop_is_shown_to_its_end(tmp_path: Path) -> None:
+    """Its panels show the whole run, up to the slot; so there is no slot to choose."""
+    montecarlo("heated-room", trials=1, out=tmp_path / "run")
+    assert telling_slot(load_results(tmp_path / "run")) is None
