@@ -58,6 +58,7 @@ def checked(folder: Path) -> Checked:
     assert not re.search(r"(https?:)?//[a-z]", text.replace("http-equiv", ""))
     assert all(source.startswith("data:image/png;base64,") for source in page.values("src"))
     assert "url(" not in text
+    assert "default-src 'none'; style-src 'unsafe-inline'; img-src data:" in page.values("content")
     assert "@import" not in text
     ids = page.values("id")
     assert len(ids) == len(set(ids))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import stat
 import xml.etree.ElementTree as ET
 from collections import Counter
@@ -10,9 +11,12 @@ from collections.abc import Iterator
 from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
@@ -25,10 +29,12 @@ from evedrop.memory.simulation import Mode
 from evedrop.report import closing
 from evedrop.report.chart import Curve, LogChart
 from evedrop.report.markup import element, written
+from evedrop.report.run_sections import LostTrackSection
+from evedrop.report.run_source import OUTCOMES, RecordedTrial, RunSource
 from evedrop.report.strip import strip
 from evedrop.report.writing import REPORT, try_report, write_report
 from evedrop.results.writer import load_results
-from evedrop.score.track import Track, lost_spans, track_of
+from evedrop.score.track import LostSpan, Track, lost_spans, track_of
 from tests.pages import Checked, checked
 
 HOSTILE = "<script>alert('&amp;')</script>\"></title>"
@@ -105,6 +111,56 @@ def test_a_folder_of_another_version_has_the_parts_that_can_be_read(study: Path,
     assert {"Lost track", "Links", "Repeat it"} <= set(page.headings)
 
 
+def test_a_page_has_cautions_events_and_outages_and_does_not_depend_on_the_order_of_rows(
+    study: Path, tmp_path: Path
+) -> None:
+    """A mean that rare events carry is doubted; an event and an outage have a row each; a failure has its command."""
+    summary = json.loads((study / "summary.json").read_text())
+    summary["peers"]["smart"]["rare_events"] = {"share": 0.5, "trials": 1e6}
+    summary["events"] = [{"slot": 1234, "event": "the link of smart is cut", "by": "scenario"}]
+    summary["outages"] = [{"process": "smart", "slot": 7, "until": None, "seconds": 1.0, "shard": None}]
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    (tmp_path / "scenario.toml").write_bytes((study / "scenario.toml").read_bytes())
+    for name in ("slots.parquet", "trials.parquet"):
+        table = pq.read_table(study / name)
+        pq.write_table(table.take(np.random.default_rng(0).permutation(table.num_rows)), tmp_path / name)
+    write_report(tmp_path)
+    page, before = checked(tmp_path), checked(study)
+    doubts = list(closing.doubts(load_results(tmp_path).typed_summary))
+    assert any("smart: 50 % of its expected error" in line for line in doubts)
+    assert set(doubts) <= set(page.texts)
+    assert {"1,234", "the link of smart is cut", "smart cut off from the network, the run did not continue"} <= set(
+        page.texts
+    )
+    (failed,) = (one for one in load_results(study).typed_summary.expectations if not one.held)
+    assert before.texts[before.texts.index(failed.sentence) + 1] == failed.replay
+    for name in ("d", "src"):  # the curves and the lanes
+        assert page.values(name) == before.values(name)
+
+
+def test_a_slot_without_a_packet_is_silent_in_its_lane(study: Path, tmp_path: Path) -> None:
+    """Whatever the receiver's action is: nothing was sent."""
+    for name in ("summary.json", "scenario.toml"):
+        (tmp_path / name).write_bytes((study / name).read_bytes())
+    table = pq.read_table(study / "trials.parquet")
+    column = pc.if_else(pc.less(table["slot"], 3), "nothing", table["sent"].cast(pa.string()))
+    pq.write_table(table.set_column(table.column_names.index("sent"), "sent", column), tmp_path / "trials.parquet")
+    outcome = RunSource.read(tmp_path).trial["smart"].outcome
+    assert [OUTCOMES[code] == "silent" for code in outcome[:6]] == [True] * 3 + [False] * 3
+
+
+def test_the_longest_spans_are_listed_in_the_order_of_time() -> None:
+    """Of many spans without track those that say most."""
+    spans = [LostSpan(100 * i, 100 * i + length, 0) for i, length in enumerate([5, 1, *range(10, 21)])]
+    slots = np.arange(1400.0)
+    trial = RecordedTrial(slots, np.zeros(1400, np.uint8), np.zeros(1400, np.uint8), spans)
+    source: Any = SimpleNamespace(summary=SimpleNamespace(first_trial=0), trial={"smart": trial})
+    nodes = [node for node in LostTrackSection.nodes(source) if not isinstance(node, str) and node.tag == "details"]
+    (listed,) = nodes
+    said = [str(item.text).partition(":")[0] for item in listed.iter("li")]
+    assert said == [f"slots {one.first:,} to {one.last:,}" for one in spans if one.slots > 2]
+
+
 @pytest.mark.parametrize("mode", [Mode.COVARIANCE_ONLY, Mode.ERROR_COORDINATES])
 def test_every_mode_has_its_page(tmp_path: Path, mode: Mode) -> None:
     """Without recorded states there are no lanes, but all other parts are there."""
@@ -171,8 +227,10 @@ def test_a_lane_has_a_pixel_for_every_slot_or_the_worst_of_several() -> None:
 def test_a_chart_has_gaps_where_nothing_is_known_and_few_points() -> None:
     """A curve of 10⁵ slots is drawn with 400 points; nothing to show is no chart; zeros and ∞ do not break the axis."""
     x = np.arange(100_000.0)
-    node = LogChart("label", "slot", "error", [Curve("one", "#123456", x, 1.0 + x, theory=1.0 + x)]).node
+    node = LogChart("label", "slot", "error", [Curve("one", "#123456", x, 1.0 + x, x, 2.0 + x, theory=1.0 + x)]).node
     assert isinstance(node, ET.Element)
+    (band,) = [path for path in node.iter("path") if path.get("class") == "band"]
+    assert str(band.get("d")).count("L") == 799
     (curve,) = [path for path in node.iter("path") if path.get("class") == "curve"]
     assert str(curve.get("d")).count("L") == 399
     broken = np.array([1.0, np.nan, 0.0, 10.0, np.inf, 5.0, 6.0])
@@ -193,6 +251,8 @@ def test_values_below_the_floor_lie_on_the_lower_edge_and_the_chart_says_so() ->
         assert node[0].text == words
         ticks = [float(str(one.text)) for one in node.iter("span") if one.get("class") == "y"]
         assert min(ticks) >= 0.01
+        edge = [one.get("style") for one in node.iter("span") if one.text == "0.01"]
+        assert edge == (["top:100.00%"] if len(values) == 4 else [])
         (path,) = [one for one in node.iter("path") if one.get("class") == "curve"]
         assert str(path.get("d")).count(" 1000") == (2 if len(values) == 4 else 0)
     assert LogChart("", "", "", [Curve("", "", errors[:2], np.zeros(2))], floor=0.01).node is not None
