@@ -47,11 +47,11 @@ def design(
     if not SCHEMES[made.encoding.scheme].sends_states_and_innovations:
         raise UsageError(_not_for(made.encoding.scheme))
     if max_trace == math.inf:
-        raise UsageError("--max-trace inf is kept by every admissible μ_d; give a finite trace")
+        raise UsageError("an infinite largest trace is kept by every admissible μ_d; give a finite one")
     if made.encoding.state_probabilities is not None:
         raise UsageError(
             "the design of μ_d is for one μ_d in all slots, whose limits it compares, and encoding.state_probability is a list; "
-            "give --set encoding.state_probability=0.6 for the design, or --schedule N for another list"
+            "change it, as by encoding.state_probability=0.6, or design a schedule, which is another list"
         )
     mu, adversaries, left_out = _adversaries(made)
     found = design_of(made.process.process, mu, made.encoding.mu_d, adversaries, made.slots, max_trace)
@@ -107,15 +107,17 @@ def design_schedule(
         raise UsageError(_not_for(made.encoding.scheme))
     if not 2 <= slots <= _LONGEST_SCHEDULE:
         raise UsageError(
-            f"--schedule {slots}: expected a whole number from 2 to {_LONGEST_SCHEDULE}, the slots of the run"
+            f"a schedule of {slots} slots: expected a whole number from 2 to {_LONGEST_SCHEDULE}, the slots of the run"
         )
     if not 1 <= block < slots:
-        raise UsageError(f"--block {block}: expected a whole number from 1 to {slots - 1}, the slots that share a μ_d")
+        raise UsageError(
+            f"blocks of {block} slots: expected a whole number from 1 to {slots - 1}, the slots that share a μ_d"
+        )
     if not 0.0 <= weight <= 1.0:
-        raise UsageError(f"--weight {weight:g}: expected a number from 0 to 1, the weight of the legitimate error")
+        raise UsageError(f"a weight of {weight:g}: expected a number from 0 to 1, the weight of the legitimate error")
     if (max_trace is None or max_trace == math.inf) and weight == 0.0:
         raise UsageError(
-            "a schedule needs a bound on the legitimate trace or a weight for it: give --max-trace, or --weight"
+            "a schedule needs a bound on the legitimate trace or a weight for it: give a largest trace, or a weight"
         )
     mu, adversaries, left_out = _adversaries(made)
     bound, process = math.inf if max_trace is None else max_trace, made.process.process

@@ -30,11 +30,8 @@ def scenario_of(scenario: str | Path | Scenario, changes: Mapping[str, Any], bey
 
 def plan_of(plan: Plan | None, workers: int | None) -> Plan:
     """The plan of a call. Raises UsageError if workers is not positive."""
-    if workers is None:
-        return plan or Plan()
-    if workers < 1:
-        raise UsageError(f"workers={workers}: expected 1 or more")
-    return replace(plan or Plan(), workers=workers)
+    found = plan or Plan()
+    return found if workers is None else replace(found, workers=workers)
 
 
 @final

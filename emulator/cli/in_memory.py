@@ -1,14 +1,18 @@
-"""The options of commands that simulate in memory."""
+"""Shared by commands that simulate in memory: their options, and studies of one scenario."""
 
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, TypeVar
 
-from evedrop.cli.options import entries, output, workers
+from evedrop.cli.options import entries, loaded, output, workers
 
 if TYPE_CHECKING:
     from evedrop.memory.montecarlo import Plan
+    from evedrop.scenario import Scenario
+
+T = TypeVar("T")
 
 
 def memory(parser: argparse.ArgumentParser) -> None:
@@ -31,6 +35,18 @@ def memory(parser: argparse.ArgumentParser) -> None:
         help="simulate the errors themselves: any number of slots, no digest",
     )
     parser.set_defaults(mode="exact")
+
+
+def studied(options: argparse.Namespace, study: Callable[[Scenario, Callable[[int], None]], T]) -> tuple[Scenario, T]:
+    """The scenario of a command, of 100 trials unless told otherwise, and what the study finds of it, with a progress line."""
+    from evedrop.cli.progress_line import ProgressLine
+    from evedrop.memory.montecarlo import teller
+
+    options.trials = 100 if options.trials is None else options.trials
+    scenario = loaded(options)
+    total = scenario.trials * scenario.slots
+    with ProgressLine(total, "trial-slots", options.json) as line:
+        return scenario, study(scenario, teller(line.tell, total))
 
 
 MEMORY = (entries, output, memory)

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import math
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +29,21 @@ def argument(name: str, shown: str) -> Option:
         parser.add_argument(name, type=Path, metavar=shown)
 
     return add
+
+
+def number_type(least: float, most: float, words: str) -> Callable[[str], float]:
+    """The type of an option that is a number from `least` to `most`; words: what it must be, for the message."""
+
+    def number(text: str) -> float:
+        try:
+            found = float(text)
+        except ValueError:
+            found = math.nan
+        if not least <= found <= most:
+            raise argparse.ArgumentTypeError(f"{text} is not {words}")
+        return found
+
+    return number
 
 
 def scenario(parser: argparse.ArgumentParser) -> None:

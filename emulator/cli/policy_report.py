@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from evedrop.cli.report import terminal
+from evedrop.cli.report import left_out_line, terminal
 from evedrop.figures.text import finite_text
 
 if TYPE_CHECKING:
@@ -40,8 +40,7 @@ def print_policies(design: PolicyDesign) -> None:
         if front.dominated:
             console.print(f"left out: {front.dominated} policies, each of which another one dominates")
     if design.left_out:
-        who = ", ".join(f"{name} ({strategy})" for name, strategy in design.left_out.items())
-        console.print(f"left out: {who}: no closed form of its error is known under this scheme")
+        console.print(left_out_line(design.left_out, "no closed form of its error is known under this scheme"))
 
 
 def _thresholds(front: Front) -> Table:

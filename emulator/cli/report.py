@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from rich.box import SIMPLE_HEAD
@@ -75,6 +76,12 @@ def print_sweep(table: pa.Table, keys: tuple[str, ...], folder: str) -> None:
     console = terminal()
     console.print(rich_table(sweep_table(table.to_pylist(), keys), tight=False))
     console.print(f"results: {folder}/sweep.parquet, sweep.png")
+
+
+def left_out_line(left_out: Mapping[str, str], why: str) -> str:
+    """The eavesdroppers that a design leaves out; left_out: name → strategy."""
+    who = ", ".join(f"{name} ({strategy})" for name, strategy in left_out.items())
+    return f"left out: {who}: {why}"
 
 
 class _Console(Console):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from evedrop.cli.report import terminal
+from evedrop.cli.report import left_out_line, terminal
 from evedrop.model.checks import toml_of
 
 if TYPE_CHECKING:
@@ -36,8 +36,7 @@ def print_schedules(design: ScheduleDesign) -> None:
         console.print(f"to run it, with slots = {len(numbers)}, write in [encoding]:")
         console.print(f"state_probability = {toml_of(numbers)}\n", soft_wrap=True, highlight=False, markup=False)
     if design.left_out:
-        who = ", ".join(f"{name} ({strategy})" for name, strategy in design.left_out.items())
-        console.print(f"left out: {who}: no closed form of its error is known")
+        console.print(left_out_line(design.left_out, "no closed form of its error is known"))
 
 
 def _slots(schedule: MeanSchedule) -> Table:

@@ -80,7 +80,7 @@ def budget_of(scenario: Scenario, budget: float) -> BudgetDesign:
     and for a budget that no threshold meets.
     """
     if not 0.0 <= budget < math.inf:
-        raise UsageError(f"--budget {budget:g}: expected a finite number of at least 0, an energy in a slot")
+        raise UsageError(f"a budget of {budget:g}: expected a finite number of at least 0, an energy in a slot")
     name = scenario.encoding.scheme
     if SCHEMES[name].closed_forms.get(LEGITIMATE) != _CLOSED_FORM:
         able = [one for one in SCHEMES if SCHEMES[one].closed_forms.get(LEGITIMATE) == _CLOSED_FORM]
@@ -108,7 +108,7 @@ def budget_of(scenario: Scenario, budget: float) -> BudgetDesign:
         raise UsageError(
             f"no threshold up to {most} meets the budget {budget:g}: packets in clear cost {in_clear:g} in a slot and encrypted "
             f"ones {encrypted:g}, and {100.0 * encrypted_fraction(most, arrives):.2g} % are encrypted then; give more, such as "
-            f"--budget {in_clear + 0.5 * (encrypted - in_clear):g}"
+            f"{in_clear + 0.5 * (encrypted - in_clear):g}"
             + ("" if arrives else f"; no acknowledgement arrives, so nothing less than {encrypted:g} is enough")
         )
 

@@ -101,14 +101,16 @@ def policies_of(scenario: Scenario, weights: Sequence[float], prices: Sequence[f
 def _check_numbers(scenario: Scenario, weights: Sequence[float], prices: Sequence[float], states: int) -> None:
     for weight in weights:
         if not 0.0 <= weight <= 1.0:
-            raise UsageError(f"--weight {weight:g}: expected a number from 0 to 1, the weight of the user's error")
+            raise UsageError(f"a weight of {weight:g}: expected a number from 0 to 1, the weight of the user's error")
     for price in prices:
         if not 0.0 <= price < math.inf:
-            raise UsageError(f"--price {price:g}: expected a finite number of at least 0, the cost of a transmission")
+            raise UsageError(
+                f"a price of {price:g}: expected a finite number of at least 0, the cost of a transmission"
+            )
     most = math.isqrt(_LARGEST_CHAIN // scenario.process.process.n**2)
     if not 2 <= states <= max(2, most):
         raise UsageError(
-            f"--states {states}: expected a whole number from 2 to {max(2, most)}, how many holding times are told apart"
+            f"{states} states: expected a whole number from 2 to {max(2, most)}, how many holding times are told apart"
         )
 
 
@@ -123,7 +125,7 @@ def _not_for(scheme: str) -> str:
 
 def _never(scenario: Scenario, name: str, links: ScheduledLinks, weight: float, price: float, states: int) -> str:
     least = least_weight(scenario.process.process, links.mu, links.mu_e, price, states)
-    never = f"the best policy against {name} never sends at --weight {weight:g} --price {price:g}"
+    never = f"the best policy against {name} never sends at weight {weight:g} and price {price:g}"
     if least is None:
         return f"{never}, nor at any other weight: give a lower price"
-    return f"{never}: it sends from --weight {least:.4f} on; give a larger weight to the user's error, up to 1"
+    return f"{never}: it sends from weight {least:.4f} on; give a larger weight to the user's error, up to 1"

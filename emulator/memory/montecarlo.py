@@ -60,10 +60,13 @@ class Plan:
     rare: bool = False
     """Whether to estimate means that rare events carry by splitting, too."""
 
-    def workers_for(self, scenario: Scenario) -> int:
-        """The number of workers. Raises UsageError if it is not positive."""
+    def __post_init__(self) -> None:
+        """Raise UsageError if the number of workers is not positive."""
         if self.workers is not None and self.workers < 1:
-            raise UsageError(f"--workers {self.workers}: expected 1 or more")
+            raise UsageError(f"workers={self.workers}: expected 1 or more")
+
+    def workers_for(self, scenario: Scenario) -> int:
+        """The number of workers."""
         if self.workers is not None:
             return self.workers
         work = scenario.trials * scenario.slots * len(scenario.receivers)
@@ -130,7 +133,7 @@ def disk_errors(folder: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise RunError(
-            f"{folder} cannot be written ({error.strerror or error}); free some space, or give another --out"
+            f"{folder} cannot be written ({error.strerror or error}); free some space, or give another folder"
         ) from error
 
 

@@ -85,7 +85,7 @@ class _Worker:
             )
         except OSError as error:
             self.pipe.close()
-            raise RunError(f"no worker process can be started ({error}); try fewer --workers") from error
+            raise RunError(f"no worker process can be started ({error}); try fewer workers") from error
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             theirs.close()
@@ -141,7 +141,7 @@ def _received(worker: _Worker) -> int | str | BatchResult:
             worker.process.wait(_LAST_SECONDS)
         code = worker.process.returncode
         how = f"was ended by signal {-code}" if code is not None and code < 0 else f"ended with status {code}"
-        raise RunError(f"a worker process {how}; was it killed, or out of memory? try fewer --workers") from error
+        raise RunError(f"a worker process {how}; was it killed, or out of memory? try fewer workers") from error
     return news
 
 

@@ -60,7 +60,7 @@ def results_folder(out: str | Path | None, scenario: str | Path) -> Iterator[Pat
 
 
 def _unusable(folder: Path, why: str) -> UsageError:
-    return UsageError(f"{shown(folder)} cannot be written ({why}); give another --out")
+    return UsageError(f"{shown(folder)} cannot be written ({why}); give another folder")
 
 
 _FOLDER_MODE, _FILE_MODE = 0o700, 0o600
@@ -72,18 +72,18 @@ def new_folder(folder: Path) -> Path:
     Raises UsageError if it is not empty, belongs to another user, or cannot be written.
     """
     if shown(folder) != str(folder):
-        raise UsageError(f"--out {shown(folder)} is not a name in UTF-8, which results and messages are; give another")
+        raise UsageError(f"{shown(folder)} is not a name in UTF-8, which results and messages are; give another folder")
     try:
         make_private(folder)
         _narrow(folder)
         if any(folder.iterdir()):
-            raise UsageError(f"{folder} is not empty; give another --out, or empty it")
+            raise UsageError(f"{folder} is not empty; give another folder, or empty it")
     except NotADirectoryError as error:
-        raise UsageError(f"{folder}: a part of it is a file; give another --out") from error
+        raise UsageError(f"{folder}: a part of it is a file; give another folder") from error
     except FileExistsError as error:
-        raise UsageError(f"{folder} is a file; give another --out") from error
+        raise UsageError(f"{folder} is a file; give another folder") from error
     except OSError as error:
-        raise UsageError(f"{folder} cannot be written ({error.strerror}); give another --out") from error
+        raise UsageError(f"{folder} cannot be written ({error.strerror}); give another folder") from error
     return folder
 
 
@@ -102,7 +102,7 @@ def _narrow(folder: Path) -> None:
         if found.st_uid != os.geteuid():
             raise UsageError(
                 f"{folder} belongs to the user with the id {found.st_uid}, who could read the seed and the truth in it; "
-                "give another --out, or a folder of your own"
+                "give another folder, or a folder of your own"
             )
         if found.st_mode & 0o077:
             os.fchmod(opened, _FOLDER_MODE)

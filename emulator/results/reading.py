@@ -177,7 +177,7 @@ def _read_summary(path: Path) -> dict[str, Any]:
         summary = json.loads(text_of(path, _MOST_BYTES))
     except Unreadable as error:
         raise UsageError(
-            f"{path.parent} is not a results folder ({path.name}: {error}); give the --out of a run"
+            f"{path.parent} is not a results folder ({path.name}: {error}); give the results folder of a run"
         ) from error
     except (ValueError, RecursionError) as error:
         raise UsageError(f"{path} is not JSON ({error}); run the scenario again") from error

@@ -98,7 +98,7 @@ class RecordingThread(ABC, Generic[Chunk, Note]):
 
     def _give_up(self, why: str) -> None:
         if self.failure is None:
-            self.failure = f"the recording is incomplete: {why}; free some space, or choose another --out"
+            self.failure = f"the recording is incomplete: {why}; free some space, or choose another folder"
 
     def _write(self) -> None:
         while True:

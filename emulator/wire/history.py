@@ -63,12 +63,12 @@ class WireHistory:
         except FileNotFoundError:
             return history
         except OSError as error:
-            raise UsageError(f"{path} cannot be read ({error.strerror}); give another --out") from error
+            raise UsageError(f"{path} cannot be read ({error.strerror}); give another folder") from error
         for at, line in enumerate(lines, start=1):
             try:
                 history._take(json.loads(line))
             except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
-                raise UsageError(f"{path}, line {at}, is not the history of a wire; give another --out") from error
+                raise UsageError(f"{path}, line {at}, is not the history of a wire; give another folder") from error
         return history
 
     @property
@@ -81,7 +81,7 @@ class WireHistory:
         if self._seed not in {None, plan.seed}:
             raise UsageError(
                 f"the wire of {self.folder.parent} had the seed {self._seed}, and this one has {plan.seed}: its fates would not "
-                "go on; give the same seed, or another --out"
+                "go on; give the same seed, or another folder"
             )
         links = {link.name: dict(link.settings) for link in plan.links}
         self._write({"start": self.start + 1, "time": now, "seed": plan.seed, "links": links})

@@ -111,7 +111,7 @@ class WireJournal:
                 raise
         except OSError as error:
             raise UsageError(
-                f"{folder} cannot be written ({error.strerror}); make room, or give another --out"
+                f"{folder} cannot be written ({error.strerror}); make room, or give another folder"
             ) from error
         self.record = self._recorder()
         self._ended = threading.Event()

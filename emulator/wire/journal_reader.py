@@ -44,7 +44,7 @@ def journal_tables(folder: Path | str, start: int | None = None, alive: float | 
     journal = Path(folder) / JOURNAL_FOLDER
     if not journal.is_dir():
         raise UsageError(
-            f"{folder} is not the folder of a wire: it has no folder {JOURNAL_FOLDER}; give the --out of a wire"
+            f"{folder} is not the folder of a wire: it has no folder {JOURNAL_FOLDER}; give the results folder of a wire"
         )
     links = WireHistory.read(journal).links
     names = [name for name in part_names(journal) if start in {None, _start_of(name)}]
@@ -73,7 +73,7 @@ def _start_of(name: str) -> int:
 def damaged(journal: Path, name: str, why: object) -> UsageError:
     """The error about a part that cannot be read."""
     return UsageError(
-        f"part {name} of the journal in {journal} cannot be read ({why}); remove its file, or give another --out"
+        f"part {name} of the journal in {journal} cannot be read ({why}); remove its file, or give another folder"
     )
 
 

@@ -27,7 +27,7 @@ def locked(folder: Path) -> int:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
         os.close(descriptor)
-        raise UsageError(f"another wire writes to {folder.parent}; end it, or give another --out") from error
+        raise UsageError(f"another wire writes to {folder.parent}; end it, or give another folder") from error
     except OSError:  # a file system without locks
         pass
     return descriptor

@@ -133,9 +133,9 @@ def test_a_results_folder_must_be_new_or_empty(evedrop: Evedrop) -> None:
     (evedrop.folder / "full" / "file").touch()
     (evedrop.folder / "empty").mkdir()
     montecarlo = ("montecarlo", "eavesdroppers", "--slots", "9", "--trials", "1", "--out")
-    refused(evedrop(*montecarlo, "full"), "full is not empty; give another --out, or empty it")
-    refused(evedrop(*montecarlo, "full/file"), "full/file is a file; give another --out")
-    refused(evedrop(*montecarlo, "full/file/x"), "a part of it is a file; give another --out")
+    refused(evedrop(*montecarlo, "full"), "full is not empty; give another folder, or empty it")
+    refused(evedrop(*montecarlo, "full/file"), "full/file is a file; give another folder")
+    refused(evedrop(*montecarlo, "full/file/x"), "a part of it is a file; give another folder")
     assert evedrop(*montecarlo, "empty").status == 0
     assert [path.name for path in (evedrop.folder / "full").iterdir()] == ["file"]
 
@@ -299,7 +299,7 @@ def test_an_observer_that_cannot_write_says_so(evedrop: Evedrop) -> None:
     """Started by hand, with a file where its results should go: one line with the place, exit 2."""
     assert evedrop("brief", "numerical", "--out", "briefs", "--results", "results").status == 0
     (evedrop.folder / "results").touch()
-    refused(evedrop.process("observer", "briefs/observer.json"), "results is a file; give another --out")
+    refused(evedrop.process("observer", "briefs/observer.json"), "results is a file; give another folder")
 
 
 def test_a_reader_that_leaves_does_no_harm(evedrop: Evedrop) -> None:

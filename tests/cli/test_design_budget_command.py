@@ -85,7 +85,7 @@ def test_what_has_no_limit_is_unbounded(evedrop: Evedrop, scenario: Path) -> Non
 @pytest.mark.parametrize(
     ("budget", "changes", "why"),
     [
-        (1.0, {}, r"no threshold up to \d+ meets the budget 1: packets in clear cost 1 .* such as --budget 1.5"),
+        (1.0, {}, r"no threshold up to \d+ meets the budget 1: packets in clear cost 1 .* such as 1.5"),
         (0.2, {}, "no threshold"),
         (1.5, {"acknowledgements.link.quality": 0.0}, "no acknowledgement arrives, so nothing less than 2 is enough"),
         (float("nan"), {}, "expected a finite number"),

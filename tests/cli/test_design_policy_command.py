@@ -97,13 +97,13 @@ def test_in_python(scenario: str) -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("--weight", "1.5"), "--weight 1.5: expected a number from 0 to 1"),
-        (("--weight", "nan"), "--weight nan: expected"),
-        (("--price", "-1"), "--price -1: expected a finite number of at least 0"),
-        (("--price", "inf"), "--price inf: expected"),
-        (("--states", "1"), "--states 1: expected a whole number from 2 to 22"),
+        (("--weight", "1.5"), "a weight of 1.5: expected a number from 0 to 1"),
+        (("--weight", "nan"), "a weight of nan: expected"),
+        (("--price", "-1"), "a price of -1: expected a finite number of at least 0"),
+        (("--price", "inf"), "a price of inf: expected"),
+        (("--states", "1"), "1 states: expected a whole number from 2 to 22"),
         (("--states", "23"), "expected a whole number from 2 to 22"),
-        (("--weight", "0.2"), "against near never sends at --weight 0.2 --price 0: it sends from --weight 0."),
+        (("--weight", "0.2"), "against near never sends at weight 0.2 and price 0: it sends from weight 0."),
         (("--price", "1e9"), "nor at any other weight: give a lower price"),
         (("--set", "legitimate.link.quality=0.48"), "μ = 0.48 must exceed max(0, 1 − ρ⁻²) = 0.480785"),
         (("--set", "legitimate.link.quality=0.0"), "must exceed"),
@@ -148,5 +148,5 @@ def test_the_least_weight_of_a_refusal_works(evedrop: Evedrop, scenario: str) ->
     """The weight that a refusal names gives a policy that sends."""
     changes = ("--set", 'eavesdroppers={near={strategy="naive",link={quality=0.95}}}')
     done = evedrop("design", scenario, "--policy", "--weight", "0.2", *changes)
-    weight = done.err.split("it sends from --weight ")[1].split()[0]
+    weight = done.err.split("it sends from weight ")[1].split()[0]
     assert fronts(evedrop, scenario, "--weight", weight, *changes)["eavesdroppers"]["near"]["policies"]

@@ -101,6 +101,16 @@ def test_a_mistyped_word_gets_a_hint(given: list[str], said: str, capsys: pytest
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("rate", ["0.9", "61", "nan", "fast"])
+def test_a_number_out_of_range_is_refused_with_its_range(rate: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """By the parser, before anything is loaded."""
+    with pytest.raises(SystemExit):
+        main(["view", "run", "--video", "run.mp4", "--fps", rate])
+    said = f"argument --fps: {rate} is not a number of frames per second from 1 to 60"
+    assert said in capsys.readouterr().err
+    assert parser_of("view").parse_whole(["view", "run", "--fps", "60"]).fps == 60.0
+
+
 def test_a_word_that_resembles_no_other_gets_no_hint(capsys: pytest.CaptureFixture[str]) -> None:
     """A hint that is wrong would mislead."""
     with pytest.raises(SystemExit):

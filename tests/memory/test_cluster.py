@@ -121,7 +121,7 @@ def test_a_folder_that_is_not_empty_is_refused_there_too(evedrop: Evedrop, sched
     done = evedrop.process(
         "montecarlo", "eavesdroppers", "--slots", "9", "--trials", "5", "--scheduler", scheduler, "--out", "full"
     )
-    assert (done.status, done.err) == (2, "evedrop: full is not empty; give another --out, or empty it\n")
+    assert (done.status, done.err) == (2, "evedrop: full is not empty; give another folder, or empty it\n")
 
 
 @pytest.mark.parametrize("command", ["montecarlo", "sweep"])

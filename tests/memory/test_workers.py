@@ -96,7 +96,7 @@ def test_a_killed_worker_is_said(evedrop: Evedrop) -> None:
     no_process_left(live)
     ended_by_fault(live, done)
     assert "a worker process was ended by signal 9" in done.err
-    assert "try fewer --workers" in done.err
+    assert "try fewer workers" in done.err
     assert not live.folder.exists()
 
 

@@ -119,7 +119,7 @@ def test_a_run_may_be_killed_at_any_moment(evedrop: Evedrop, what: str) -> None:
     kill_all(live)
     if not last_round(live.folder).at and not (live.folder / "summary.json").exists():
         assert what in {"a folder", "streams"}
-        with pytest.raises(UsageError, match=r"run the scenario again|give the --out of a run"):
+        with pytest.raises(UsageError, match=r"run the scenario again|give the results folder of a run"):
             load_results(live.folder)
         return
     results = live.results

@@ -155,7 +155,7 @@ def test_a_file_that_is_there_is_narrowed(tmp_path: Path) -> None:
 def test_a_folder_of_somebody_else_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An empty folder whose owner is another user is refused, for its owner could look into it again at any time."""
     monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
-    with pytest.raises(UsageError, match=r"belongs to the user with the id \d+, .* give another --out"):
+    with pytest.raises(UsageError, match=r"belongs to the user with the id \d+, .* give another folder"):
         new_folder(tmp_path)
 
 

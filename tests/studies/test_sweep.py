@@ -192,7 +192,7 @@ BASE = ("sweep", "eavesdroppers", "--slots", "20", "--out", "run")
         (("--over", "seed=1,2", "--trials", "0"), "trials: is 0; expected a number at least 1"),
         (("--over", "seed=1,2", "--trials", "-4"), "trials: is -4; expected a number at least 1"),
         (("--over", "seed=5:1:1", "--trials", "5"), "--over seed=5:1:1: the range is empty"),
-        (("--over", "seed=1,2", "--trials", "5", "--workers", "0"), "--workers 0: expected 1 or more"),
+        (("--over", "seed=1,2", "--trials", "5", "--workers", "0"), "workers=0: expected 1 or more"),
     ],
 )
 def test_what_cannot_be_swept_is_refused(evedrop: Evedrop, more: tuple[str, ...], said: str) -> None:

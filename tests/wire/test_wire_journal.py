@@ -139,7 +139,7 @@ def test_another_wire_on_the_same_folder_is_refused(tmp_path: Path) -> None:
     """While the first one runs; afterwards it may have the folder, but not with another seed."""
     with WireJournal(tmp_path, wire_plan()) as journal:
         put(journal, 0)
-        with pytest.raises(UsageError, match=r"another wire writes to .*; end it, or give another --out"):
+        with pytest.raises(UsageError, match=r"another wire writes to .*; end it, or give another folder"):
             WireJournal(tmp_path, wire_plan())
     with pytest.raises(UsageError, match="had the seed 7, and this one has 8"):
         WireJournal(tmp_path, wire_plan(seed=8))
@@ -262,7 +262,7 @@ def test_the_settings_that_each_message_had_are_known_after_a_restart(tmp_path: 
         assert [one.at for one in second.changes_of("scan", "scan/2", "put")] == [0]
     assert [json.loads(line).get("start") for line in history.read_text().splitlines()] == [1, None, None, 2, None]
     history.write_text("nonsense\n")
-    with pytest.raises(UsageError, match=r"history.jsonl, line 1, is not the history of a wire; give another --out"):
+    with pytest.raises(UsageError, match=r"history.jsonl, line 1, is not the history of a wire; give another folder"):
         WireJournal(tmp_path, wire_plan())
 
 

@@ -7,7 +7,8 @@ import json
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
-from evedrop.cli.options import as_json, entries, loaded, scenario
+from evedrop.cli.in_memory import studied
+from evedrop.cli.options import as_json, entries, scenario
 from evedrop.command import Command
 
 if TYPE_CHECKING:
@@ -16,15 +17,9 @@ if TYPE_CHECKING:
 
 def cost(options: argparse.Namespace) -> int:
     """Compare a house's scheme with `plain`, day by day."""
-    from evedrop.cli.progress_line import ProgressLine
-    from evedrop.memory.montecarlo import teller
     from evedrop.studies.secrecy_cost import secrecy_cost
 
-    options.trials = 100 if options.trials is None else options.trials
-    scenario = loaded(options)
-    total = scenario.trials * scenario.slots
-    with ProgressLine(total, "trial-slots", options.json) as line:
-        found = secrecy_cost(scenario, teller(line.tell, total))
+    _, found = studied(options, secrecy_cost)
     if options.json:
         print(json.dumps(asdict(found)))
     else:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 
-from evedrop.cli.options import argument
+from evedrop.cli.options import argument, number_type
 from evedrop.command import Command
 from evedrop.errors import UsageError
 
@@ -30,22 +31,11 @@ def export(options: argparse.Namespace) -> int:
     return 0
 
 
-def _period(text: str) -> float:
-    """Seconds per slot. Raises ArgumentTypeError."""
-    try:
-        period = float(text)
-    except ValueError:
-        period = 0.0
-    if not 0 < period <= _LONGEST:
-        raise argparse.ArgumentTypeError(f"{text} is not a number of seconds above 0 and up to {_LONGEST:.0f}")
-    return period
-
-
 def _written(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", type=Path, metavar="FILE.mcap")
     parser.add_argument(
         "--period",
-        type=_period,
+        type=number_type(math.ulp(0.0), _LONGEST, f"a number of seconds above 0 and up to {_LONGEST:.0f}"),
         metavar="SECONDS",
         help="seconds per slot; default those of the scenario, or 1",
     )

@@ -7,7 +7,8 @@ import json
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
-from evedrop.cli.options import as_json, entries, loaded, scenario
+from evedrop.cli.in_memory import studied
+from evedrop.cli.options import as_json, entries, scenario
 from evedrop.command import Command
 
 if TYPE_CHECKING:
@@ -18,15 +19,9 @@ _ROUNDING = 1e-12  # a standard error that is smaller, over the mean, is roundin
 
 def learned(options: argparse.Namespace) -> int:
     """Print what has been learned after 8, 16, 32, … slots."""
-    from evedrop.cli.progress_line import ProgressLine
-    from evedrop.memory.montecarlo import teller
     from evedrop.studies.learning_curve import learning_curve
 
-    options.trials = 100 if options.trials is None else options.trials
-    scenario = loaded(options)
-    total = scenario.trials * scenario.slots
-    with ProgressLine(total, "trial-slots", options.json) as line:
-        rows = learning_curve(scenario, teller(line.tell, total))
+    scenario, rows = studied(options, learning_curve)
     if options.json:
         print(json.dumps([asdict(row) for row in rows]))
     else:

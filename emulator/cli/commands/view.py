@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from evedrop.cli.holding import hold
-from evedrop.cli.options import argument, served
+from evedrop.cli.options import argument, number_type, served
 from evedrop.command import Command
 from evedrop.errors import UsageError
 
@@ -213,17 +213,6 @@ def _moments(text: str) -> tuple[float, float, float | None]:
     return first, last, step[0] if step else None
 
 
-def _rate(text: str) -> float:
-    """Frames per second. Raises ArgumentTypeError."""
-    try:
-        rate = float(text)
-    except ValueError:
-        rate = 0.0
-    if not 1 <= rate <= _MOST_RATE:
-        raise argparse.ArgumentTypeError(f"{text} is not a number of frames per second from 1 to {_MOST_RATE}")
-    return rate
-
-
 def _shown(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--view", choices=("auto", "native", "web"), default="auto", help="default auto")
     instead = parser.add_mutually_exclusive_group()
@@ -246,7 +235,8 @@ def _shown(parser: argparse.ArgumentParser) -> None:
     moment.add_argument(
         "--times", type=_moments, metavar="A:B[:STEP]", help="for a wire: the times of a video, in seconds"
     )
-    parser.add_argument("--fps", type=_rate, metavar="F", help="frames per second of a video; default 15")
+    rate = number_type(1, _MOST_RATE, f"a number of frames per second from 1 to {_MOST_RATE}")
+    parser.add_argument("--fps", type=rate, metavar="F", help="frames per second of a video; default 15")
     parser.add_argument(
         "--size", type=_size, metavar="WxH", help="in pixels; default 1600x950 for a picture, 1200x720 for a video"
     )
