@@ -16,7 +16,9 @@ from pathlib import Path
 from typing import Any, final
 
 from evedrop.errors import UsageError
+from evedrop.model.links import LOSS_MODELS
 from evedrop.model.slot.link import NEVER, Change
+from evedrop.scenario.table import model_mistakes
 from evedrop.wire.plan import WirePlan
 
 Numbered = tuple[str, str, str]
@@ -138,11 +140,19 @@ class WireHistory:
 
     def _add(self, link: str, settings: Mapping[str, Any], since: Mapping[tuple[str, str], int]) -> None:
         """Settings come into force; those of a start, at the present counts of all streams."""
-        str(settings["loss"]["model"])  # raises an error unless they are settings
+        _check(settings)
         known = self._settings.setdefault(link, [])
         counted = {(key, kind): n for (name, key, kind), n in self.counts.items() if name == link}
         if not known or known[-1].settings != settings:
             known.append(_Settings(settings, {**counted, **since}))
+
+
+def _check(settings: Mapping[str, Any]) -> None:
+    """Raise an error unless the law of the losses can be computed from these settings."""
+    str(settings["loss"]["model"])
+    mistakes = model_mistakes("loss", settings["loss"], LOSS_MODELS)
+    if mistakes or not 0.0 <= float(settings.get("corrupt", 0.0)) <= 1.0:
+        raise ValueError(mistakes)
 
 
 def _number(found: Any) -> int:

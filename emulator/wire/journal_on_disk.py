@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Any, final
 
 import pyarrow as pa
+import zenoh
 
 from evedrop.errors import UsageError
+from evedrop.model.checks import as_toml
 from evedrop.model.slot.link import Change
 from evedrop.results.summary_file import plain
 from evedrop.results.wire_folder import WIRE_FILE
@@ -89,11 +91,17 @@ class JournalOnDisk:
         return self._history.changes_of(link, key, kind)
 
     def read(self) -> None:
-        """Hand all records to the listeners. Raises UsageError if there is no journal."""
+        """Hand all records to the listeners. Raises UsageError if there is no journal, or it is damaged."""
         alive = last_beat(self._folder / JOURNAL_FOLDER / UNFINISHED)
         self._is_alive_at(alive)
         for table in journal_tables(self._folder, self.start, alive if self.state == "killed" else None):
             for key in {*_words(table["key"])} - {*self._codes}:
+                try:
+                    zenoh.KeyExpr(key)
+                except zenoh.ZError as error:
+                    raise UsageError(
+                        f"the journal in {self._folder} is damaged: {as_toml(key)} is not a key; remove it, or give another --out"
+                    ) from error
                 self._codes[key] = len(self._keys)
                 self._keys.append(key)
             records = records_of(table, self._links, self._codes)

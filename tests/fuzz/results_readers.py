@@ -21,6 +21,7 @@ from evedrop.loading import load
 from evedrop.memory.montecarlo import simulate
 from evedrop.news import silent
 from evedrop.plugins import named_in
+from evedrop.report.wire import wire_failures
 from evedrop.results.diff import difference
 from evedrop.results.reading import load_results
 from evedrop.results.resolved_scenario import write_resolved
@@ -28,6 +29,7 @@ from evedrop.results.writer import ResultsWriter
 from evedrop.score.sums import SlotSums
 from evedrop.view.replay import replay
 from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal_on_disk import summary_on_disk
 from evedrop.wire.journal_reader import journal_tables
 from tests.fuzz.reader import Reader, as_json, as_parquet, lines, raw, tried
 from tests.wire.wire_plans import wire_plan
@@ -157,7 +159,7 @@ def _killed_wire() -> dict[str, bytes]:
 
 
 def _in_wire(file: str) -> Callable[[bytes, Path], None]:
-    """Read the journal with other bytes in one of its files, and start the wire again."""
+    """Read the journal with other bytes in one of its files, sum it up, and start the wire again."""
 
     def look(data: bytes, folder: Path) -> None:
         for path, content in (*_killed_wire().items(), (file, data)):
@@ -166,6 +168,8 @@ def _in_wire(file: str) -> Callable[[bytes, Path], None]:
         with contextlib.suppress(EvedropError):
             for table in journal_tables(folder):
                 table.to_pylist()
+        with contextlib.suppress(EvedropError):
+            [*wire_failures(summary_on_disk(folder, wire_plan()).as_dict())]
         with WireJournal(folder, wire_plan()) as journal:
             journal.changes_of("scan", "scan/0", "put")
 
