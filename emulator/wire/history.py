@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, final
 
 from evedrop.errors import UsageError
+from evedrop.model.checks import as_toml
 from evedrop.model.links import LOSS_MODELS
 from evedrop.model.slot.link import NEVER, Change
 from evedrop.scenario.table import model_mistakes
@@ -110,6 +111,17 @@ class WireHistory:
             found[one.since.get((key, kind), 0)] = one.settings
         return tuple(Change(at, settings) for at, settings in sorted(found.items()))
 
+    def expect_laws(self) -> None:
+        """Raise UsageError unless each link had settings from which the law of its losses can be computed."""
+        for link, known in self._settings.items():
+            for one in known:
+                mistakes = model_mistakes("loss", one.settings["loss"], LOSS_MODELS)
+                corrupt = one.settings.get("corrupt", 0.0)
+                if not isinstance(corrupt, float | int) or not 0.0 <= corrupt <= 1.0:
+                    mistakes.append(("corrupt", f"is {as_toml(corrupt)}; expected a probability"))
+                for name, what in mistakes:
+                    raise UsageError(f"{self.folder / _FILE} has settings of the link {link} in which {name} {what}")
+
     def _write(self, entry: Mapping[str, Any]) -> None:
         line = json.dumps(entry).encode() + b"\n"
         path = self.folder / _FILE
@@ -140,19 +152,11 @@ class WireHistory:
 
     def _add(self, link: str, settings: Mapping[str, Any], since: Mapping[tuple[str, str], int]) -> None:
         """Settings come into force; those of a start, at the present counts of all streams."""
-        _check(settings)
+        str(settings["loss"]["model"])  # raises an error unless they are settings
         known = self._settings.setdefault(link, [])
         counted = {(key, kind): n for (name, key, kind), n in self.counts.items() if name == link}
         if not known or known[-1].settings != settings:
             known.append(_Settings(settings, {**counted, **since}))
-
-
-def _check(settings: Mapping[str, Any]) -> None:
-    """Raise an error unless the law of the losses can be computed from these settings."""
-    str(settings["loss"]["model"])
-    mistakes = model_mistakes("loss", settings["loss"], LOSS_MODELS)
-    if mistakes or not 0.0 <= float(settings.get("corrupt", 0.0)) <= 1.0:
-        raise ValueError(mistakes)
 
 
 def _number(found: Any) -> int:
