@@ -103,7 +103,7 @@ def test_two_that_are_far_have_labels_apart(simulated: Callable[..., Simulated],
 def test_the_plane_follows_truth_and_legitimate(simulated: Callable[..., Simulated], tmp_path: Path) -> None:
     """An eavesdropper far away changes no frame; it has an arrow with its distance there, and nowhere else."""
     run = simulated(60)
-    naive = run.slots.peers["naive"]
+    naive = replace(run.slots.peers["naive"], P=np.broadcast_to(np.eye(2), (60, 2, 2)))
     x_hat = run.slots.x.copy()
     x_hat[30:40] += [3000.0, 4000.0]
     frames = {}
@@ -116,8 +116,38 @@ def test_the_plane_follows_truth_and_legitimate(simulated: Callable[..., Simulat
     assert frames["near"] == frames["far"]
     labels = rows(tmp_path / "far.rrd", "plane/naive/away", "Points2D:labels")
     assert {k: text for k, text in labels.items() if text} == {k: ["naive: 5,000 m"] for k in range(30, 40)}
-    shown = np.array([rows(tmp_path / "far.rrd", "plane/naive/at", "Points2D:positions")[k][0] for k in range(60)])
+    shown = {
+        what: rows(tmp_path / "far.rrd", f"plane/naive/{what}", component)
+        for what, component in (
+            ("at", "Points2D:positions"),
+            ("trail", "LineStrips2D:strips"),
+            ("cov", "LineStrips2D:strips"),
+        )
+    }
     for k in range(60):
         corners = np.array(frames["far"][k][0])
-        assert (shown[k] >= corners.min(axis=0)).all()
-        assert (shown[k] <= corners.max(axis=0)).all()
+        for what, found in shown.items():
+            points = np.array(found[k]).reshape(-1, 2)
+            assert (points >= corners.min(axis=0)).all()
+            assert (points <= corners.max(axis=0)).all()
+            if what == "cov" and 30 <= k < 40:  # no ellipse is where it is far away
+                np.testing.assert_allclose(points, np.broadcast_to(run.slots.x[k] * [1, -1], points.shape), rtol=1e-5)
+
+
+def test_the_plane_shows_a_legitimate_estimate_wherever_it_is(
+    simulated: Callable[..., Simulated], tmp_path: Path
+) -> None:
+    """The frame is around both."""
+    run = simulated(60)
+    x_hat = run.slots.x.copy()
+    x_hat[30:40] += [300.0, 400.0]
+    peers = {**run.slots.peers, "legitimate": replace(run.slots.peers["legitimate"], x_hat=x_hat)}
+    recording = ViewRecording(tmp_path / "r.rrd", run.scene)
+    recording.add(replace(run.slots, peers=peers))
+    assert recording.close()
+    found = rows(tmp_path / "r.rrd", "plane/frame", "LineStrips2D:strips")
+    for k in range(30, 40):
+        corners = np.array(found[k][0])
+        for state in (run.slots.x[k], x_hat[k]):
+            assert (corners.min(axis=0) < state * [1, -1]).all()
+            assert (corners.max(axis=0) > state * [1, -1]).all()
