@@ -9,6 +9,7 @@ from evedrop.figures import FIGURES
 from evedrop.model.controllers import CONTROLLERS
 from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.integrity import POLICIES, SENSOR_ATTACKS
 from evedrop.model.links import LOSS_MODELS
 from evedrop.model.schemes import SCHEMES
 from evedrop.scenario import Scenario
@@ -37,6 +38,8 @@ _REGISTRIES = (
     ("loss models", "model", LOSS_MODELS),
     ("delay models", "model", DELAY_MODELS),
     ("controllers", "strategy", CONTROLLERS),
+    ("attacks on measurements", "model", SENSOR_ATTACKS),
+    ("watermark policies", "policy", POLICIES),
     ("events", "event", EVENTS),
     ("figures", "figure", FIGURES),
 )

@@ -21,7 +21,7 @@ THRESHOLD = "threshold"
 
 @final
 class AlwaysMarked(WatermarkPolicy):
-    """threshold: h, in nats."""
+    """A watermark in every slot, and a CUSUM test; threshold: h, in nats."""
 
     parameters: ClassVar[Mapping[str, Any]] = MappingProxyType({THRESHOLD: 8.0})
 

@@ -23,7 +23,10 @@ _STEEPEST = 700.0  # a log-likelihood ratio whose exponential is still a number
 
 @final
 class Parsimonious(WatermarkPolicy):
-    """watch_from: θ₁; alarm_from: θ₂; attack_rate: the prior probability that an attack begins in a slot, if none has begun."""
+    """A watermark while an attack is suspected.
+
+    watch_from: θ₁; alarm_from: θ₂; attack_rate: the prior probability that an attack begins in a slot, if none has begun.
+    """
 
     parameters: ClassVar[Mapping[str, Any]] = MappingProxyType({LOWER: 0.05, UPPER: 0.999, RATE: 1e-3})
     rests = True

@@ -24,7 +24,10 @@ MATRIX, NOISE = "matrix", "noise"
 @final
 @dataclass(frozen=True)
 class Replacement(SensorAttack):
-    """z is stationary from slot 0 on, so that an attack may begin in any slot."""
+    """A stationary process of the attacker: z⁺ = A_a z + w_a.
+
+    z is stationary from slot 0 on, so that an attack may begin in any slot.
+    """
 
     A: Floats
     """A_a, (p, p)."""
