@@ -28,8 +28,9 @@ QUICK ?=
 bench: $(READY)
 	$(BIN)/python benchmarks/bench.py $(QUICK)
 
+# Also the tests with random examples, with more examples than in `make test`.
 test-long: $(READY)
-	$(BIN)/python -m pytest -m long
+	$(BIN)/python -m pytest --hypothesis-profile=full -m "long or hypothesis"
 
 # Every notebook of docs/notebooks from top to bottom, in a kernel.
 notebooks: $(NOTEBOOKS_READY)

@@ -21,7 +21,6 @@ from typing import Any
 from unittest.mock import patch
 
 import pytest
-from hypothesis import HealthCheck, settings
 
 from evedrop import preloaded
 from evedrop.cli import main as cli
@@ -29,6 +28,7 @@ from evedrop.kernels import choice
 from evedrop.names import KERNELS_VARIABLE
 from evedrop.results.writer import Results, load_results
 from tests.commands import NEWS, TELLING, CommandProcess, ForkedCommand
+from tests.examples import register_profiles
 from tests.privileged import say_what_was_skipped
 
 FORKABLE = frozenset({"env", "cwd", "stdout"})
@@ -36,10 +36,7 @@ FORKABLE = frozenset({"env", "cwd", "stdout"})
 LIMIT = 120.0
 """Seconds after which a condition that a test waits for counts as never met: far above what a busy machine needs."""
 
-# Neither how long an example takes nor how long it takes to think of one says anything on a machine that others use.
-settings.register_profile("unhurried", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.load_profile("unhurried")
-
+register_profiles()
 
 # Where no C compiler worked, every run begins with a warning, which most tests do not expect: ask for numpy, as users can.
 if choice.KERNELS == choice.FALLBACK:

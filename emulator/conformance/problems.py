@@ -61,7 +61,7 @@ def small(slots: int = 0) -> list[Problem]:
 
     The last one crosses the ends of blocks in which streams are read ahead, and its trials have large numbers.
     """
-    shapes = ((1, 0.8, 9, 4, 0), (2, 1.0, 12, 5, 3), (3, 1.1, 10, 3, 1000), (1, 0.95, 300, 2, 2**40))
+    shapes = ((1, 0.8, 9, 4, 0), (2, 1.0, 12, 5, 3), (3, 1.1, 10, 3, 1000), (1, 0.95, 260, 2, 2**40))
     return [
         Problem(_process(number, n, radius), Batch(max(least, slots), trials, first))
         for number, (n, radius, least, trials, first) in enumerate(shapes)

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from evedrop.kernels import reference
 from evedrop.kernels.choice import EXTENSION, KERNELS
+from tests.examples import examples
 
 library = pytest.importorskip(EXTENSION, reason="the C kernels are not built: no compiler worked").lib
 
@@ -88,7 +89,7 @@ def twins(name: str, *arguments: Any) -> None:
         same(one, other)
 
 
-QUICK = settings(max_examples=60, deadline=None)
+QUICK = settings(max_examples=examples(60), deadline=None)
 
 
 @QUICK
@@ -285,7 +286,7 @@ def posterior_arguments(
     return [A, G, leaks, rounding, before, gamma, z]
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=examples(150), deadline=None)
 @given(RANDOM, SIZES, st.integers(1, 13), st.sampled_from([0.0, 0.1, 0.7, 1.0]), st.booleans(), st.booleans())
 def test_posteriors_are_the_same(
     random: np.random.Generator, sizes: tuple[int, int, int], capacity: int, mu_d: float, initial: bool, odd: bool

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator
+from functools import cache
 
 import numpy as np
 
@@ -13,14 +15,7 @@ from evedrop.model.process import Process
 from evedrop.model.schemes.acknowledged import Acknowledged
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.streams import Batch
-from tests.model.rationals import (
-    exact,
-    identity,
-    inverted,
-    state_covariances,
-    times,
-    transposed,
-)
+from tests.model.rationals import Matrix, exact, identity, inverted, state_covariances, times, transposed
 from tests.model.slot_loop import Played, play
 
 MIXED = Process(
@@ -53,14 +48,22 @@ def all_events(slots: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def carried(process: Process, t: int, k: int, scheme: type[Scheme] = Acknowledged) -> np.ndarray:
     """The matrix by which the reference of slot t is carried to slot k, from its definition in exact rationals."""
-    A, Q = exact(process.A), exact(process.Q)
+    A = exact(process.A)
     power = identity(process.n)
     for _ in range(k - t):
         power = times(A, power)
     if scheme is Acknowledged and process is not SINGULAR:
-        sigmas = list(itertools.islice(state_covariances(A, Q, exact(process.initial_covariance), 200), k + 1))
+        sigmas = _first_sigmas(*(M.tobytes() for M in (process.A, process.Q, process.initial_covariance)), k + 1)
         power = times(sigmas[k], transposed(inverted(power)), inverted(sigmas[t]))
     return np.array([[float(value) for value in row] for row in power])
+
+
+@cache
+def _first_sigmas(A: bytes, Q: bytes, initial: bytes, slots: int) -> list[Matrix]:
+    """The state's covariances in the first slots; the matrices are given as their doubles."""
+    n = math.isqrt(len(A) // 8)
+    of_process = [exact(np.frombuffer(one).reshape(n, n)) for one in (A, Q, initial)]
+    return list(itertools.islice(state_covariances(of_process[0], of_process[1], of_process[2], 200), slots))
 
 
 def exact_sigmas(process: Process) -> Iterator[np.ndarray]:

@@ -19,6 +19,7 @@ from evedrop.model.schemes.acknowledged import Acknowledged
 from evedrop.model.theory.closed_forms import reference_covariances
 from evedrop.streams import Batch, stream_key
 from tests.builders import UNSTABLE
+from tests.examples import examples
 from tests.model.slot_loop import ROOT, coins, play
 
 KEY = stream_key(ROOT, "link/acknowledgements")
@@ -125,7 +126,7 @@ def test_blocking_all_is_a_run_of_misses(misses: int) -> None:
     assert chart.run_length(0.0) == misses
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=examples(60))
 @given(
     normal=st.floats(0.05, 0.95),
     attacked=st.floats(0.0, 1.0),

@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 from evedrop.kernels import reference
 from evedrop.model.receiver import Action, asymmetry, trace_of
 from tests.builders import mirrored
+from tests.examples import examples
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(
     st.integers(0, 2**32),
     st.sampled_from([1, 2, 3, 8, 30]),

@@ -17,6 +17,7 @@ from evedrop.model.receiver import Action, Receiver, Reception
 from evedrop.model.theory.covariances import Outcomes, expected_traces
 from evedrop.streams import Batch
 from tests.builders import MARGINAL, MICROGRID
+from tests.examples import examples
 from tests.model.listening import EXAMPLE, followed, keys, slots
 
 SURE = 4.5  # standard errors: a normal mean is beyond with a probability below 7e-6
@@ -81,7 +82,7 @@ def enumerated(process: Process, mu_d: float, z: Floats, gamma: list[bool]) -> t
     st.integers(1, 3), st.floats(0.5, 1.5), st.floats(0.05, 0.95), st.lists(st.booleans(), min_size=1, max_size=7),
     st.integers(0, 2**32),
 )  # fmt: skip
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=examples(60))
 def test_it_is_the_posterior_over_all_type_words(
     n: int, radius: float, mu_d: float, gamma: list[bool], seed: int
 ) -> None:

@@ -21,6 +21,7 @@ from evedrop.model.theory.design import (
     relative_secrecy,
 )
 from tests.builders import MICROGRID, UNSTABLE
+from tests.examples import examples
 
 LOW = 0.534206
 
@@ -103,7 +104,7 @@ def test_relative_secrecy_is_the_sign_of_the_difference(
 
 
 @given(st.floats(1.0, 1.3), qualities, qualities)
-@settings(deadline=None, max_examples=30)
+@settings(deadline=None, max_examples=examples(30))
 def test_perfect_secrecy_is_where_one_is_bounded_and_the_other_not(growth: float, mu: float, mu_e: float) -> None:
     """Just inside the interval J is finite and J_e infinite; beyond its upper end J_e is finite."""
     process = Process(np.diag([growth, 0.7]), np.eye(2), np.eye(2))
@@ -150,7 +151,7 @@ def test_secrecy_in_every_slot_can_fail_early() -> None:
 
 
 @given(st.floats(1.0, 1.3), st.floats(0.5, 0.99), st.floats(1.001, 1e6))
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=examples(40))
 def test_least_state_probability_keeps_the_trace(growth: float, mu: float, factor: float) -> None:
     """At μ_d_min the trace is Ω."""
     process = Process(np.diag([growth, 0.7]), np.eye(2), np.eye(2))

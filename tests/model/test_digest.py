@@ -15,6 +15,7 @@ from xxhash import xxh3_128, xxh3_128_digest
 from evedrop.model.digest import BLOCK_SLOTS, BlockDigests, Blocks, DigestLog, InputLog, PartialDigests, RunDigest
 from evedrop.model.receiver import Belief, Beliefs
 from tests.builders import one_slot
+from tests.examples import examples
 
 
 def random_beliefs(slots: int, n: int, trials: int, seed: int) -> list[Belief]:
@@ -58,7 +59,7 @@ def logged(beliefs: list[Belief], trials: int) -> dict[int, np.ndarray]:
     return found
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 @given(st.sampled_from([1, 5, 255, 256, 257, 512, 600]), st.integers(1, 3), st.integers(1, 5), st.integers(0, 2**31))
 def test_digests_are_as_defined(slots: int, n: int, trials: int, seed: int) -> None:
     """Every block of every trial, and the receiver's digest ordered by trial, then block."""
@@ -128,7 +129,7 @@ def test_the_hash_is_the_published_one() -> None:
 
 
 @given(cuts=st.lists(st.integers(1, 39), max_size=9), trials=st.sampled_from([3, 700, 3000]), seed=st.integers(0, 99))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=examples(30), deadline=None)
 def test_a_block_may_be_digested_in_parts(cuts: list[int], trials: int, seed: int) -> None:
     """Whatever slots the parts have, and whether they are held or hashed at once, its digests are those of the whole block."""
     beliefs = random_beliefs(40, 2, trials, seed)

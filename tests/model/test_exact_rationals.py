@@ -37,6 +37,7 @@ from evedrop.model.theory.covariances import (
     radius,
 )
 from evedrop.model.theory.leak import RemainingCovariances, remaining_limit
+from tests.examples import examples
 from tests.model import rationals
 from tests.model.rationals import Matrix, exact, trace
 
@@ -105,7 +106,7 @@ def test_the_process_that_a_recursion_of_inverses_got_wrong() -> None:
     assert np.all(expected_traces(process, Outcomes.legitimate(0.9, 0.9), 60)[1:] < found[1:])
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=examples(40))
 @given(models(), receivers)
 def test_expectations(model: Model, outcomes: Outcomes) -> None:
     """Of each receiver, in each slot, and of what it believes."""
@@ -115,7 +116,7 @@ def test_expectations(model: Model, outcomes: Outcomes) -> None:
         assert all(close(value, trace(E)) for value, E in zip(found, expected, strict=True))
 
 
-@settings(deadline=None, max_examples=20)
+@settings(deadline=None, max_examples=examples(20))
 @given(models())
 def test_covariances_of_packets(model: Model) -> None:
     """The encoding noise, and the error of a receiver that takes an innovation for a state: each entry, relative to the trace."""
@@ -131,7 +132,7 @@ def test_covariances_of_packets(model: Model) -> None:
                 assert abs(Fraction(float(misled[k, i, j])) - 2 * value) <= 2 * scale
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=examples(40))
 @given(models())
 def test_what_a_leak_leaves(model: Model) -> None:
     """M_k in each slot; the trace is what theory uses of it."""
@@ -159,7 +160,7 @@ def test_what_a_leak_leaves_beyond_the_largest_double() -> None:
     assert np.allclose(M, remaining_limit(process), rtol=1e-12, atol=0.0)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(deadline=None, max_examples=examples(30))
 @given(models(highest=0.97))
 def test_the_limit_of_what_a_leak_leaves(model: Model) -> None:
     """Q − QΣ⁻¹Q with the stationary Σ, which is rational."""
@@ -168,7 +169,7 @@ def test_the_limit_of_what_a_leak_leaves(model: Model) -> None:
     assert close(float(np.trace(remaining_limit(model.process))), expected, Fraction(1, 10**8))
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=examples(40))
 @given(models(highest=1.3), receivers)
 def test_limits(model: Model, outcomes: Outcomes) -> None:
     """S = p A S Aᵀ + source; near the bound of stability rounding of A itself is amplified as S is."""
@@ -189,7 +190,7 @@ def test_limits(model: Model, outcomes: Outcomes) -> None:
     assert close(limit_trace(model.process, outcomes), expected, CLOSE * amplified)
 
 
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=examples(25))
 @given(
     models(most_states=2), st.floats(0.01, 1.0), st.floats(0.01, 1.0), probabilities, probabilities, st.integers(0, 2)
 )
@@ -216,7 +217,7 @@ def test_bursts(model: Model, p: float, r: float, good: float, bad: float, kind:
     assert all(close(one, value) for one, value in zip(found, expected, strict=True))
 
 
-@settings(deadline=None, max_examples=20)
+@settings(deadline=None, max_examples=examples(20))
 @given(models(most_states=2, highest=0.95), st.floats(0.01, 1.0), st.floats(0.01, 1.0), st.floats(0.1, 1.0))
 def test_limits_behind_bursts(model: Model, p: float, r: float, good: float) -> None:
     """The linear equations of all states of the link at once; the second state loses everything."""
@@ -243,7 +244,7 @@ def test_limits_behind_bursts(model: Model, p: float, r: float, good: float) -> 
     assert close(found, expected, CLOSE * amplified)
 
 
-@settings(deadline=None, max_examples=20)
+@settings(deadline=None, max_examples=examples(20))
 @given(models())
 def test_the_bound_of_twin_tracks(model: Model) -> None:
     """Half the trace of A^k Σ0 A^kᵀ."""
@@ -253,7 +254,7 @@ def test_the_bound_of_twin_tracks(model: Model) -> None:
         grown = rationals.rounded(rationals.congruent(model.A, grown))
 
 
-@settings(deadline=None, max_examples=20)
+@settings(deadline=None, max_examples=examples(20))
 @given(models(), probabilities, probabilities, probabilities)
 def test_readers_of_references(model: Model, received: float, heard: float, unheard: float) -> None:
     """P is a reference's or a predicted error, and the reference is the error at the last acknowledgement."""
@@ -269,7 +270,7 @@ def test_readers_of_references(model: Model, received: float, heard: float, unhe
         assert close(float(np.trace(found[k])), trace(P))
 
 
-@settings(deadline=None, max_examples=20)
+@settings(deadline=None, max_examples=examples(20))
 @given(models(most_states=2, highest=0.9), st.integers(1, 3), st.floats(0.05, 1.0), probabilities, st.booleans())
 def test_schedules_by_holding_time(
     model: Model, threshold: int, received: float, share: float, encrypted: bool

@@ -244,7 +244,7 @@ def traces_of(
 @pytest.mark.parametrize(("mu_e", "policy", "user", "eve"), [PUBLISHED[1], PUBLISHED[4]])
 def test_the_published_figures(mu_e: float, policy: dict[str, float], user: float, eve: float, tmp_path: Path) -> None:
     """40,000 slots, within 4.5 standard errors, and 1 % for the standard error of the published figures."""
-    found, error = traces_of(mu_e, policy, 1050, 40, tmp_path)
+    found, error = traces_of(mu_e, policy, 550, 80, tmp_path)
     assert (error < 0.03 * found).all()
     assert (np.abs(found - [user, eve]) < 4.5 * error + 0.01 * found).all()
 

@@ -29,6 +29,7 @@ from evedrop.model.theory.covariances import (
 from evedrop.model.theory.leak import Leaks, RemainingCovariances, remaining_limit
 from evedrop.streams import Batch
 from tests.builders import MARGINAL
+from tests.examples import examples
 from tests.model.listening import EXAMPLE, followed, keys, slots
 
 SURE = 4.5  # standard errors: a normal mean is beyond with a probability below 7e-6
@@ -76,7 +77,7 @@ def test_a_slot_of_the_genie() -> None:
             assert np.allclose(np.moveaxis(belief.P, 2, 0), P, rtol=1e-9, atol=1e-15)
 
 
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, max_examples=examples(50))
 @given(systems())
 def test_the_leak_by_triangularisation_is_the_leak(process: Process) -> None:
     """Gain, what remains, Σ_k's determinant and the whitened packet, to 1e-8 of the formulas with inverses, 12 slots."""
@@ -123,7 +124,7 @@ def test_the_leak_where_the_state_covariance_cannot_be_inverted() -> None:
         assert np.linalg.eigvalsh(EXAMPLE.Q - M)[0] > -1e-16
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=examples(60))
 @given(systems(), st.floats(0.0, 1.0), st.floats(0.0, 1.0))
 def test_the_expectation_is_the_recursion(process: Process, mu_e: float, mu_d: float) -> None:
     """P_k = q(A P Aᵀ + Q) − μ_e(1−μ_d) QΣ_k⁻¹Q from P_0 = (1−μ_e)Σ0, to 1e-8, twelve slots."""
@@ -145,7 +146,7 @@ def test_known_values() -> None:
     assert np.array_equal(whole[:300], expected_traces(MARGINAL, Outcomes.genie(0.9, 0.3), 300))
 
 
-@settings(deadline=None, max_examples=150)
+@settings(deadline=None, max_examples=examples(150))
 @given(systems(0.9), st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.floats(0.0, 0.999))
 def test_nobody_without_the_secret_does_better(process: Process, mu: float, share: float, mu_d: float) -> None:
     """For μ_e ≤ μ and μ_d < 1 the genie is at no k better than the legitimate estimator, as matrices.
@@ -180,7 +181,7 @@ def test_the_limit_is_where_it_goes(process: Process) -> None:
     assert np.allclose(found, limit(process, outcomes), rtol=1e-9, atol=1e-9 * np.abs(found).max())
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=examples(40))
 @given(systems(0.3, 0.9), st.floats(0.01, 1.0), st.floats(0.0, 1.0))
 def test_the_limit_of_stable_processes(process: Process, mu_e: float, mu_d: float) -> None:
     """There Σ_k converges, and what remains of the noise is Q − QΣ⁻¹Q with Σ its limit."""

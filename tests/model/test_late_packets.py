@@ -23,6 +23,7 @@ from evedrop.model.slot.receiver import Absence, ReceiverCore
 from evedrop.model.slot.transit import Arrival, Arrivals, Late, Transit
 from evedrop.streams import Batch
 from tests.builders import stream_keys
+from tests.examples import examples
 
 PROCESS = Process(np.array([[1.0, 0.1], [0.0, 0.9]]), np.diag([0.1, 0.2]), np.eye(2))
 BATCH = Batch(40, 9)
@@ -158,7 +159,7 @@ def test_the_prior_of_a_slot_is_the_state_covariance() -> None:
         sigma = PROCESS.A @ sigma @ PROCESS.A.T + PROCESS.Q
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=examples(40))
 @given(st.lists(st.lists(st.booleans(), min_size=3, max_size=3), min_size=1, max_size=60), st.integers(1, 20))
 def test_bursts_are_runs_of_losses(lost: list[list[bool]], piece: int) -> None:
     """Counted once they end, whatever the pieces; as itertools groups them."""

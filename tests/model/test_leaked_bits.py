@@ -19,6 +19,7 @@ from evedrop.model.theory.covariances import Outcomes, limit_trace, stability_bo
 from evedrop.model.theory.leak import remaining_limit
 from evedrop.model.theory.leaked_bits import LeakedBits
 from tests.builders import MARGINAL, MICROGRID, UNSTABLE
+from tests.examples import examples
 from tests.model import rationals
 from tests.model.rationals import Matrix, exact
 from tests.model.test_exact_rationals import Model, models
@@ -31,7 +32,7 @@ def bits_of(ratio: Fraction) -> float:
     return math.log1p(float(ratio - 1)) / (2.0 * math.log(2.0))
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=examples(40))
 @given(models(lowest=0.5))
 def test_the_bits_of_an_innovation(model: Model) -> None:
     """½ log₂ det Σ_k / det A Σ_{k−1} Aᵀ, for noise of any condition: nothing cancels, in large leaks and in small ones."""
@@ -143,7 +144,7 @@ def test_the_rates_of_a_link() -> None:
         assert np.array_equal([float(law.rates(range(k, k + 1))[0]) for k in range(6)], law.rates(range(6)))
 
 
-@settings(deadline=None, max_examples=30)
+@settings(deadline=None, max_examples=examples(30))
 @given(st.floats(1.05, 1.6), st.floats(0.3, 1.0), st.floats(0.1, 1.0), st.floats(0.0, 1.0))
 def test_a_bounded_user_error_reveals_information(rho: float, mu: float, mu_e: float, mu_d: float) -> None:
     """With a filter of covariance P̄ at the sensor: the bits of the states heard, each by the slots since the last, exceed it.

@@ -14,6 +14,7 @@ from evedrop.model.delays import DELAY_MODELS, delay_of
 from evedrop.model.links.link import Fate
 from evedrop.model.slot.link import NEVER, Change, Fates, Link, LinkSchedule, ReceiverOutage, streams_of
 from evedrop.streams import Batch, Stream, normals, root_of_seed, stream_key, uniforms
+from tests.examples import examples
 
 ROOT = root_of_seed(77)
 PLAIN = {"loss": {"model": "bernoulli", "quality": 0.8}}
@@ -138,7 +139,7 @@ def test_fates_are_those_of_the_reference(schedule: LinkSchedule) -> None:
         assert np.array_equal(fates.delays[delivered], delays[delivered])
 
 
-@settings(deadline=None, max_examples=30)
+@settings(deadline=None, max_examples=examples(30))
 @given(at=st.integers(1, 59), kind=st.sampled_from(["cut", "loss", "all"]), name=st.sampled_from(sorted(SCHEDULES)))
 def test_a_change_known_late_is_one_known_early(at: int, kind: str, name: str) -> None:
     """Amended in the middle of what was planned, a link goes on as one that knew of the change from the start."""

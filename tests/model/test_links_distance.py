@@ -18,6 +18,7 @@ from evedrop.model.links.fading import delivery_probability
 from evedrop.model.links.link import Fate
 from evedrop.model.links.way import Way
 from evedrop.streams import Stream, root_of_seed, stream_key, uniforms
+from tests.examples import examples
 
 KEY = stream_key(root_of_seed(31), "link/eve")
 STANDS: dict[str, Any] = {
@@ -62,7 +63,7 @@ def snr(spec: dict[str, Any], u: np.ndarray[Any, Any], k: int, first: int) -> fl
     return decibels + 10.0 * math.log10(power) if power > 0.0 else -math.inf
 
 
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, max_examples=examples(50))
 @given(
     spec=st.sampled_from([STANDS, WALKS, PASSES]),
     shadowing=st.sampled_from([0.0, 0.5, 7.0, 30.0]),

@@ -85,8 +85,10 @@ def test_it_is_the_kalman_filter_slot_by_slot() -> None:
 
 @pytest.mark.parametrize(
     ("C", "noise"),
-    [(np.array([[0.0, 1.0]]), W), (np.array([[1.0, 0.0]]), np.zeros((2, 2)))],
-    ids=["a state that is not seen", "no noise"],
+    [
+        pytest.param(np.array([[0.0, 1.0]]), W, id="a state that is not seen"),
+        pytest.param(np.array([[1.0, 0.0]]), np.zeros((2, 2)), id="no noise", marks=pytest.mark.long),
+    ],
 )
 def test_a_filter_without_an_end_is_refused(C: np.ndarray, noise: np.ndarray) -> None:
     """Its covariance grows for ever, or it trusts no measurement any more."""

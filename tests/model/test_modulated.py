@@ -26,6 +26,7 @@ from evedrop.model.theory.covariances import (
 )
 from evedrop.model.theory.covariances import limit_trace as independent_limit
 from tests.builders import MARGINAL, UNSTABLE
+from tests.examples import examples
 
 STABLE = Process(np.array([[0.9, 0.1], [0.0, 0.7]]), np.eye(2) * 1e-2, np.eye(2))
 MU_D = 0.6
@@ -77,7 +78,7 @@ def test_a_link_whose_states_are_alike_is_the_papers(
         assert tail == pytest.approx(tail_index(process, outcomes_at(0.7)), rel=1e-9)
 
 
-@settings(deadline=None, max_examples=20)
+@settings(deadline=None, max_examples=examples(20))
 @given(st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.floats(0.01, 1.0), st.integers(1, 40))
 def test_slots_may_be_asked_for_in_any_pieces(good: float, bad: float, p: float, first: int) -> None:
     """The same numbers, whatever the pieces."""

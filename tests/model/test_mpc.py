@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from types import MappingProxyType
 from typing import Any
 
@@ -37,12 +38,24 @@ def assigned(horizon: int = 8, **changed: Any) -> Assignment:
     return replace(made, **changed)
 
 
+@cache
+def carried(A: bytes) -> tuple[np.ndarray, np.ndarray]:
+    """A^PERIOD, and the sum of all lower powers of A, multiplied one after the other."""
+    power, total = np.eye(2), np.zeros((2, 2))
+    for _ in range(PERIOD):
+        total, power = total + power, power @ np.frombuffer(A).reshape(2, 2)
+    return power, total
+
+
 def cost(inputs: np.ndarray, given: Assignment, x: np.ndarray, d: np.ndarray) -> float:
-    """What the inputs of the horizon cost, from the definition, slot by slot; inputs before are 0."""
+    """What the inputs of the horizon cost, from the definition; inputs before are 0.
+
+    x ← A x + B u + B_d d, PERIOD times with the same u and d, is A^PERIOD x + (I + A + ... + A^(PERIOD − 1)) (B u + B_d d).
+    """
+    over, pushed = carried(given.process.A.tobytes())
     total, before = 0.0, np.zeros(2)
     for u in inputs.reshape(-1, 2):
-        for _ in range(PERIOD):
-            x = given.process.A @ x + given.plant.input_matrix @ u + given.plant.disturbance_matrix @ d
+        x = over @ x + pushed @ (given.plant.input_matrix @ u + given.plant.disturbance_matrix @ d)
         beyond = np.maximum(x - given.plant.state_upper, 0.0) + np.maximum(given.plant.state_lower - x, 0.0)
         total += given.state_weights @ x**2 + given.input_weights @ u**2
         total += given.rate_weights @ (u - before) ** 2 + given.parameters["soft"] * float(beyond @ beyond)

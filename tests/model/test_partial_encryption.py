@@ -23,6 +23,7 @@ from evedrop.model.theory.clear_states import ClearStatesForm
 from evedrop.model.theory.covariances import Outcomes, expected_traces, state_covariances
 from evedrop.streams import Batch
 from tests.builders import DRIFTING, MARGINAL, MICROGRID, UNSTABLE, stream_keys
+from tests.examples import examples
 from tests.model import rationals
 from tests.model.rationals import trace
 from tests.model.test_exact_rationals import Model, models
@@ -196,7 +197,7 @@ def form(
     return ClearStatesForm(process, np.isin(np.arange(process.n), hidden), mu_d, received, slots)
 
 
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=examples(25))
 @given(models(lowest=0.5), st.sampled_from([0.0, 1.0]), st.integers(0, 7))
 def test_what_theory_knows_in_exact_fractions(model: Model, mu_d: float, bits: int) -> None:
     """Schur complements of the states in clear, for noise of any condition."""

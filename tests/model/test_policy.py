@@ -20,6 +20,7 @@ from evedrop.model.theory.policy_front import (
     scheduled_figures,
 )
 from tests.builders import DRIFTING, MICROGRID, UNSTABLE
+from tests.examples import examples
 from tests.model.slot_loop import STABLE, coins
 from tests.model.test_holding_times import played_over
 
@@ -32,7 +33,7 @@ def links_of(mu: float, mu_e: float) -> ScheduledLinks:
     return ScheduledLinks(mu, mu_e, (mu, 0.0), (mu * mu_e, mu * (1.0 - mu_e)))
 
 
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=examples(25))
 @given(
     mu=st.sampled_from([0.5, 0.8, 0.95, 1.0]),
     mu_e=st.sampled_from([0.0, 0.3, 0.6, 0.9, 1.0]),

@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from fractions import Fraction
 from itertools import product as words_of
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -71,25 +71,36 @@ def packets(process: Process, random: np.random.Generator, slots: int = SLOTS) -
     return Packets(next(flat), nu, next(flat))
 
 
-def conditioned(process: Process, word: Sequence[bool], z: Matrix, heard: Sequence[bool]) -> Posterior:
-    """The last state given the packets heard, if `word` are their types, by exact conditioning of the joint distribution."""
-    n, A, Q, sigma = process.n, exact(process.A), exact(process.Q), sigmas(process, len(word))
-    powers = [exact(np.eye(n))]
-    for _ in word:
-        powers.append(times(powers[-1], A))
+class Covariances:
+    """Of the states and packets of the first slots, exactly; each is worked out once for all words of types."""
 
-    def covariance(j: int, k: int) -> Matrix:
-        """Cov(z_j, z_k) for j ≥ k; number len(word) is the last state."""
+    def __init__(self, process: Process, slots: int) -> None:
+        self.n, self._slots = process.n, slots
+        self._sigmas, self._Q = sigmas(process, slots), exact(process.Q)
+        self._powers = [exact(np.eye(process.n))]
+        for _ in range(slots):
+            self._powers.append(times(self._powers[-1], exact(process.A)))
+        self._with_state: dict[tuple[int, int], Matrix] = {}
+        self._with_innovation: dict[int, Matrix] = {}
+
+    def of(self, word: Sequence[bool], j: int, k: int) -> Matrix:
+        """Cov(z_j, z_k) for j ≥ k, if `word` are the types; number len(word) is the last state."""
         first, second = (one < len(word) and word[one] for one in (j, k))
         at, before = min(j, len(word) - 1), min(k, len(word) - 1)
         if first:
-            return sigma[at] if j == k else exact(np.zeros((n, n)))
-        if second:
-            return times(powers[at - before], Q)
-        return times(powers[at - before], sigma[before])
+            return self._sigmas[at] if j == k else exact(np.zeros((self.n, self.n)))
+        known: dict[Any, Matrix] = self._with_innovation if second else self._with_state
+        key = at - before if second else (at, before)
+        if key not in known:
+            known[key] = times(self._powers[at - before], self._Q if second else self._sigmas[before])
+        return known[key]
 
+
+def conditioned(of: Covariances, word: Sequence[bool], z: Matrix, heard: Sequence[bool]) -> Posterior:
+    """The last state given the packets heard, if `word` are their types, by exact conditioning of the joint distribution."""
+    n = of.n
     numbers = [k for k in range(len(word)) if heard[k]] + [len(word)]
-    blocks = {(j, k): covariance(j, k) for j in numbers for k in numbers if j >= k}
+    blocks = {(j, k): of.of(word, j, k) for j in numbers for k in numbers if j >= k}
     blocks |= {(k, j): transposed(block) for (j, k), block in blocks.items()}
     joint = [[value for k in numbers for value in blocks[j, k][i]] for j in numbers for i in range(n)]
     mean, known, log_density = [Fraction(0)] * len(joint), 0, 0.0
@@ -112,12 +123,12 @@ def conditioned(process: Process, word: Sequence[bool], z: Matrix, heard: Sequen
 def enumerated(process: Process, z: Matrix, heard: Sequence[bool]) -> tuple[Floats, Floats]:
     """Mean and covariance of the last state over all words of types: those that explain the most numbers exactly, weighed."""
     some = [k for k in range(1, len(z)) if heard[k]]
-    found = []
+    covariances, found = Covariances(process, len(z)), []
     for types in words_of([False, True], repeat=len(some)):
         word = [False] * len(z)
         for k, innovation in zip(some, types, strict=True):
             word[k] = innovation
-        one = conditioned(process, word, z, heard)
+        one = conditioned(covariances, word, z, heard)
         if one.log_density > -math.inf:
             prior = sum(math.log(1.0 - MU_D if innovation else MU_D) for innovation in types)
             found.append((one, one.log_density + prior))
@@ -213,7 +224,7 @@ def test_the_genie_is_the_exact_posterior_of_known_types(case: str) -> None:
             z[k] = [row[0] for row in x]
     assert 0 < sum(word) < slots - 1
     for k, belief in enumerate(followed(genie, z, heard)):
-        one = conditioned(process, word[: k + 1], z, heard)
+        one = conditioned(Covariances(process, k + 1), word[: k + 1], z, heard)
         assert np.allclose(belief.x_hat[:, 0], np.array(one.mean, np.float64), rtol=0, atol=CLOSE)
         assert np.allclose(belief.P[:, :, 0], np.array(one.covariance, np.float64), rtol=0, atol=CLOSE)
 

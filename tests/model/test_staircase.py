@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from evedrop.model.process import Process
 from evedrop.model.staircase import Staircase, checked_slots
 from evedrop.model.theory.leak import Leaks
+from tests.examples import examples
 from tests.model.singular_processes import PROCESSES, process_of
 
 UNROUND = process_of([[1.0, 0.1, 0.0], [0.03, 0.9, 0.07], [0.0, 0.2, 1.1]], [[0.3], [0.1], [0.7]])
@@ -39,7 +40,7 @@ def test_directions_without_noise_are_zeros_to_the_bit(case: str) -> None:
     assert np.array_equal(stairs.outward_covariance(many), rows)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(st.integers(2, 5), st.integers(1, 3), st.integers(0, 2**32 - 1))
 def test_units_of_the_states_do_not_matter(n: int, rank: int, seed: int) -> None:
     """What noise reaches, and the probability of a type, are the same in metres and in millimetres."""

@@ -27,6 +27,7 @@ from evedrop.model.theory.covariances import (
     tail_index,
 )
 from tests.builders import MICROGRID, UNSTABLE
+from tests.examples import examples
 
 probabilities = st.one_of(st.floats(0.0, 1.0), st.sampled_from([0.0, 1.0]))
 
@@ -96,7 +97,7 @@ def close(found: Floats, expected: Floats) -> bool:
 
 
 @given(processes(), probabilities, probabilities, st.integers(1, 80))
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=examples(60))
 def test_legitimate_expectation_is_the_recursion(process: Process, mu: float, mu_d: float, slots: int) -> None:
     """E P_k of the legitimate estimator equals the slot-by-slot recursion over its events."""
     found = expected_covariances(process, Outcomes.legitimate(mu, mu_d), slots)
@@ -104,7 +105,7 @@ def test_legitimate_expectation_is_the_recursion(process: Process, mu: float, mu
 
 
 @given(processes(), probabilities, probabilities, probabilities, probabilities, st.integers(1, 80))
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=examples(60))
 def test_eavesdropper_expectation_is_the_recursion(
     process: Process, mu_e: float, mu_d: float, b0: float, b1: float, slots: int
 ) -> None:
@@ -114,7 +115,7 @@ def test_eavesdropper_expectation_is_the_recursion(
 
 
 @given(processes(), probabilities, probabilities, probabilities, probabilities)
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=examples(40))
 def test_outcomes_are_a_distribution(process: Process, mu_e: float, mu_d: float, b0: float, b1: float) -> None:
     """The outcomes of a slot sum to one, for the truth and for the belief."""
     for outcomes in (Outcomes.eavesdropper(mu_e, mu_d, b0, b1), Outcomes.legitimate(mu_e, mu_d)):
@@ -135,7 +136,7 @@ def test_long_runs_cross_blocks() -> None:
 
 
 @given(processes(), probabilities, probabilities, st.lists(st.integers(0, 1500), min_size=1, max_size=5))
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=examples(25))
 def test_chunks_are_the_whole(process: Process, mu: float, mu_d: float, chunks: list[int]) -> None:
     """Asked for in chunks of any size, the expectation is the same to the last bit."""
     outcomes = Outcomes.eavesdropper(mu, mu_d, 0.9, 0.2)
@@ -225,7 +226,7 @@ def test_bounded_expectation_of_unstable_process_stays_at_its_limit() -> None:
 
 
 @given(processes(), st.floats(0.05, 1.0), st.floats(0.05, 1.0), st.sampled_from([(1.0, 0.0), (0.7, 0.0)]))
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=examples(60))
 def test_limits_are_where_long_runs_end(process: Process, mu: float, mu_d: float, use: tuple[float, float]) -> None:
     """Where (kept ρ²) < 0.98 the run ends at the limit; where it exceeds 1, limit and bound say unbounded."""
     for outcomes, quality in (
@@ -242,7 +243,7 @@ def test_limits_are_where_long_runs_end(process: Process, mu: float, mu_d: float
 
 
 @given(processes(), st.floats(0.0, 1.0), st.floats(0.0, 0.999))
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=examples(40))
 def test_a_misled_receiver_is_unbounded(process: Process, mu_d: float, loss: float) -> None:
     """Corollaries V.3 and V.4: with any chance of using an innovation the error diverges."""
     outcomes = Outcomes.eavesdropper(1.0 - loss, min(mu_d, 0.999), 1.0, 0.5)
@@ -250,7 +251,7 @@ def test_a_misled_receiver_is_unbounded(process: Process, mu_d: float, loss: flo
 
 
 @given(processes(), st.floats(0.05, 0.95), st.floats(0.1, 0.95), st.floats(0.01, 0.5))
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=examples(40))
 def test_traces_fall_as_the_state_is_sent_more_often(process: Process, mu: float, mu_d: float, more: float) -> None:
     """Lemma VI.1: J and J_e fall as μ_d rises."""
     higher = min(1.0, mu_d + more)

@@ -35,6 +35,7 @@ from evedrop.report.strip import strip
 from evedrop.report.writing import REPORT, try_report, write_report
 from evedrop.results.writer import load_results
 from evedrop.score.track import LostSpan, Track, lost_spans, track_of
+from tests.examples import examples
 from tests.pages import Checked, checked
 
 HOSTILE = "<script>alert('&amp;')</script>\"></title>"
@@ -185,7 +186,7 @@ numbers = st.lists(st.tuples(st.floats(0, 100), st.floats(0, 100)), max_size=60)
 
 
 @given(numbers, st.floats(0.0, 2.0), st.integers(0, 9))
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=examples(200))
 def test_spans_cover_exactly_the_slots_off_the_track(
     slots: list[tuple[float, float]], noise: float, first: int
 ) -> None:

@@ -26,6 +26,7 @@ from evedrop.results.writer import Results, ResultsWriter, load_results
 from evedrop.score.sums import SlotSums
 from evedrop.view.replay import replay
 from tests.conftest import Evedrop, Live, wait_until
+from tests.examples import examples
 from tests.rogue import with_rogue
 from tests.steps import stepping
 
@@ -251,7 +252,7 @@ def sums(count: int) -> SlotSums:
     return SlotSums(*(np.ones(count) for _ in fields(SlotSums)))
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(rounds=st.lists(st.integers(1, 40), min_size=1, max_size=6), data=st.data())
 def test_a_writer_may_stop_at_any_byte(rounds: list[int], data: st.DataObject) -> None:
     """Of a round that was being written when the writer ended nothing is read, and everything of those before."""

@@ -35,14 +35,14 @@ def test_the_error_in_a_direction_is_that_of_its_sum(found: Results) -> None:
     scenario = load("partial-encryption", SOME)
     process: Process = scenario.process.process
     weights = scenario.process.directions_as_arrays
+    rows = found.trials.to_pylist()
     for receiver, entries in found.summary["directions"].items():
+        errors: dict[int, list[np.ndarray]] = {}
+        for row in rows:
+            if row["peer"] == receiver:
+                errors.setdefault(row["trial"], []).append(np.subtract(row["x"], row["x_hat"]))
         for name, entry in entries.items():
-            errors: dict[int, list[float]] = {}
-            for row in found.trials.to_pylist():
-                if row["peer"] == receiver:
-                    error = weights[name] @ (np.array(row["x"]) - np.array(row["x_hat"]))
-                    errors.setdefault(row["trial"], []).append(error**2)
-            means = np.mean(list(errors.values()), axis=1)
+            means = ((np.array(list(errors.values())) @ weights[name]) ** 2).mean(axis=1)
             assert entry["mean_squared_error"] == pytest.approx(means.mean(), rel=1e-9)
             assert entry["standard_error"] == pytest.approx(means.std(ddof=1) / np.sqrt(40), rel=1e-6)
     mu = scenario.quality["legitimate"]

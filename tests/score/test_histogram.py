@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from evedrop.model.process import Floats
 from evedrop.score.histogram import LEVELS, SlotHistograms
+from tests.examples import examples
 
 SCALE = 2e-3
 QUARTER_OCTAVE = 1.25
@@ -36,7 +37,7 @@ def order_statistics(samples: Floats, level: float) -> set[float]:
 
 
 @given(st.lists(values, min_size=1, max_size=300))
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=examples(200))
 def test_a_quantile_is_within_a_quarter_octave_of_the_exact_one(samples: list[float]) -> None:
     """For any sample and each level, the order statistic and what is reported are less than 25 % apart."""
     exact = np.array(samples)
@@ -72,7 +73,7 @@ def test_slots_without_values_have_no_quantiles() -> None:
 
 
 @given(st.integers(4097, 30_000), st.lists(st.integers(1, 700), min_size=1, max_size=80))
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=examples(25))
 def test_a_long_run_is_looked_at_in_even_steps(slots: int, lengths: list[int]) -> None:
     """Every stride-th slot has its own quantiles whatever the chunks it came in, at most 4096 of them."""
     made = SlotHistograms(slots, SCALE)
@@ -92,7 +93,7 @@ def test_a_long_run_is_looked_at_in_even_steps(slots: int, lengths: list[int]) -
 
 
 @given(st.lists(st.lists(values, min_size=1, max_size=20), min_size=2, max_size=6), st.randoms())
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, max_examples=examples(50))
 def test_merging_is_the_same_in_any_order(parts: list[list[float]], random: Random) -> None:
     """Parts merged in any order and grouping are the histogram of all samples at once."""
     whole = histograms(np.concatenate([np.array(part) for part in parts])[None, :]).quantiles()

@@ -22,6 +22,7 @@ from evedrop.memory.simulation import Mode
 from evedrop.report.writing import write_report
 from evedrop.studies.sweep import grid_of, sweep_over
 from tests.conftest import Evedrop
+from tests.examples import examples
 from tests.pages import checked
 
 decimals = st.decimals(-1000, 1000, places=3, allow_nan=False, allow_infinity=False)
@@ -29,7 +30,7 @@ steps = st.decimals("0.001", 50, places=3)
 
 
 @given(decimals, steps, st.integers(0, 400), st.booleans())
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=examples(200))
 def test_a_range_has_both_ends_and_decimal_values(first: Decimal, step: Decimal, count: int, down: bool) -> None:
     """first:last:step gives first + i·step as a decimal fraction reads, no value more and none less."""
     step = -step if down else step
@@ -39,7 +40,7 @@ def test_a_range_has_both_ends_and_decimal_values(first: Decimal, step: Decimal,
 
 
 @given(st.integers(-50, 50), st.integers(1, 9), st.integers(0, 30))
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, max_examples=examples(50))
 def test_a_range_of_whole_numbers_is_whole(first: int, step: int, count: int) -> None:
     """Slots and trials can be swept; an end between two steps is left out."""
     (values,) = grid_of([f"key={first}:{first + count * step + step - 1}:{step}"]).values()
@@ -108,6 +109,13 @@ def test_every_combination_has_a_row_for_every_peer(swept: tuple[pa.Table, Path]
     expected = [(*point, peer) for point in itertools.product(*GRID.values()) for peer in peers]
     assert [(*(row[key] for key in GRID), row["peer"]) for row in rows] == expected
     assert {row["trials"] for row in rows} == {620}
+
+
+def test_a_sweep_without_a_house_has_none_of_its_figures(swept: tuple[pa.Table, Path]) -> None:
+    """Neither columns nor a plot."""
+    table, folder = swept
+    assert "sold_energy" not in table.column_names
+    assert not (folder / "household.png").exists()
 
 
 def test_a_point_is_a_study_of_its_own(swept: tuple[pa.Table, Path], tmp_path: Path) -> None:
