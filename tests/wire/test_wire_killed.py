@@ -100,3 +100,14 @@ def test_a_wire_that_heard_nothing_has_lasted_until_it_was_last_alive(tmp_path: 
         found = summary_of_wire(tmp_path)
     assert (found["heard"], found["state"]) == (0, "running")
     assert 0.0 < found["seconds"] < 100.0
+
+
+@pytest.mark.parametrize("corrupt", [5, -0.1, "0.1"])
+def test_a_history_with_settings_that_no_link_has_is_refused(corrupt: object, folders: dict[str, Path]) -> None:
+    """With its file, the link and the entry: otherwise the bounds would be those of no model."""
+    history = folders["killed"] / "journal" / "history.jsonl"
+    settings = {"loss": {"model": "bernoulli", "quality": 0.5}, "corrupt": corrupt}
+    with history.open("a") as file:
+        file.write(json.dumps({"change": "robot-base", "time": time.time(), "settings": settings, "since": []}) + "\n")
+    with pytest.raises(UsageError, match=r"history\.jsonl has settings of the link robot-base in which corrupt is"):
+        summary_of_wire(folders["killed"])

@@ -99,3 +99,13 @@ def test_threads_share_the_messages_of_a_key(tmp_path: Path) -> None:
             sys.setswitchinterval(before)
     assert changes > 1
     assert sorted(one for into in found for one in into) == [(n, 0, n / 8, False) for n in range(30_000)]
+
+
+def test_settings_that_stay_the_same_are_not_written_again(lossy: LinkState, tmp_path: Path) -> None:
+    """Every event gives every link its settings, and most links have them already."""
+    history = tmp_path / "journal" / "history.jsonl"
+    before = history.read_bytes()
+    lossy.change(dict(lossy.link.settings))
+    assert history.read_bytes() == before
+    lossy.change(DEAD)
+    assert history.read_bytes() != before
