@@ -9,11 +9,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from evedrop.errors import UsageError
 from evedrop.expected.closed_forms import acknowledged_form
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.theory.covariances import LARGEST_OPERATOR, stability_bound
-from evedrop.model.theory.policy import least_weight
+from evedrop.model.theory.policy import held_traces, least_weight
 from evedrop.model.theory.policy_front import Front, ScheduledLinks, front
 from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
@@ -21,6 +23,7 @@ from evedrop.scenario.words import listed
 
 _CLOSED_FORM = "scheduled"
 _LARGEST_CHAIN = 4 * LARGEST_OPERATOR  # rows of the linear equation of a policy's chain, which then takes a second
+_LARGEST_ERROR = 1e200  # the sums of value iteration are then far from overflow
 
 
 @dataclass(frozen=True)
@@ -52,7 +55,8 @@ def policies_of(scenario: Scenario, weights: Sequence[float], prices: Sequence[f
 
     Raises UsageError if the scheme does not go by acknowledgements when to send, if the losses of a link are not independent
     and alike in all slots, if the user's error is unbounded under every policy, for weights at which the best policy
-    never sends, and for numbers out of range.
+    never sends, for numbers out of range,
+    and for holding times in which the error grows too large.
     """
     _check_numbers(scenario, weights, prices, states)
     forms = SCHEMES[scenario.encoding.scheme].closed_forms
@@ -81,6 +85,13 @@ def policies_of(scenario: Scenario, weights: Sequence[float], prices: Sequence[f
     user = closed[LEGITIMATE]
     assert user is not None  # noqa: S101 - refused above
     process, mu = scenario.process.process, user.received
+    with np.errstate(over="ignore", invalid="ignore"):
+        largest = float(held_traces(process, states)[-1])
+    if not largest <= _LARGEST_ERROR:
+        raise UsageError(
+            f"{states} states: {states} slots after a packet the error exceeds {_LARGEST_ERROR:g}, and policies cannot be "
+            "compared; give fewer holding times"
+        )
     if mu == 0.0 or (process.spectral_radius >= 1.0 and stability_bound(process, mu) >= 1.0):
         bound = max(0.0, 1.0 - process.spectral_radius**-2)
         raise UsageError(

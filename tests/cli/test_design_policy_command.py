@@ -103,6 +103,10 @@ def test_in_python(scenario: str) -> None:
         (("--price", "inf"), "a price of inf: expected"),
         (("--states", "1"), "1 states: expected a whole number from 2 to 22"),
         (("--states", "23"), "expected a whole number from 2 to 22"),
+        (
+            ("--states", "22", "--set", "process.A=[[1e8,0.0],[0.0,0.5]]", "--set", "legitimate.link.quality=1.0"),
+            "the error exceeds 1e+200, and policies cannot be compared; give fewer holding times",
+        ),
         (("--weight", "0.2"), "against near never sends at weight 0.2 and price 0: it sends from weight 0."),
         (("--price", "1e9"), "nor at any other weight: give a lower price"),
         (("--set", "legitimate.link.quality=0.48"), "μ = 0.48 must exceed max(0, 1 − ρ⁻²) = 0.480785"),

@@ -182,6 +182,18 @@ def test_the_parsimonious_policy_saves_watermark_and_still_detects() -> None:
         assert not marked[int(alarms[r]) :, r].any()
 
 
+@pytest.mark.parametrize("name", POLICIES)
+def test_the_statistic_stays_as_it_is_after_an_alarm(name: str) -> None:
+    """Whatever evidence follows, and there is no further watermark; below the threshold it goes on."""
+    policy = POLICIES[name].of(POLICIES[name].parameters)
+    alarm = policy.threshold
+    statistic = np.array([alarm, alarm, 0.5 * alarm])
+    after = policy.step(statistic, np.array([-5.0, 0.1, -0.1]))
+    assert after[:2].tolist() == [alarm, alarm]
+    assert 0.0 < after[2] != statistic[2]
+    assert policy.marks(statistic).tolist() == [False, False, True]
+
+
 def test_a_trial_is_the_same_alone() -> None:
     """Statistic and watermark of the first trials do not depend on how many others there are."""
     few, many = (simulated(SIGMA, 30, trials, assignment=PLANAR) for trials in (2, 50))

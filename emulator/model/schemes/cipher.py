@@ -9,7 +9,7 @@ import numpy as np
 from evedrop.model import update
 from evedrop.model.numeric.masking import Mask
 from evedrop.model.process import MARGINAL, Floats, Process
-from evedrop.model.receiver import Belief, Codes, Flags, Receiver, Reception
+from evedrop.model.receiver import Belief, Codes, Flags, Receiver, Reception, select
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, PacketBlock, Scheme, Shared
 from evedrop.model.theory.covariances import Outcomes, state_covariances
 from evedrop.model.theory.leaked_bits import RevealedBits
@@ -27,8 +27,13 @@ class CipherEncoder(Encoder):
         return Packet(self._mask.hide(k, x), np.zeros(x.shape[1], np.bool_))
 
 
+def encrypted_packets(heard: Reception) -> Flags:
+    """Whether a packet was received that is encrypted, (R,): 1 in its header, or no header, says so."""
+    return heard.gamma if heard.header is None else heard.gamma & (heard.header[0] == 1)
+
+
 class CipherEstimator(Receiver):
-    """Unmasks every packet it receives, and so has the state."""
+    """Unmasks the packets that are masked, and has the state from every packet."""
 
     def __init__(self, process: Process, trials: int, mask: Mask) -> None:
         super().__init__(process, trials)
@@ -41,8 +46,10 @@ class CipherEstimator(Receiver):
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """(A x̂, A P Aᵀ + Q) if lost, otherwise (the state, 0)."""
         action = self.act(k, heard.gamma)
-        state = self._mask.reveal(k, np.where(heard.gamma, heard.z, 0.0))
-        return update.belief(self.process, k, belief, action, state)
+        encrypted = encrypted_packets(heard)
+        masked = np.where(encrypted, heard.z, 0.0)
+        z = select(encrypted, lambda: self._mask.reveal(k, masked), lambda: heard.z)
+        return update.belief(self.process, k, belief, action, z)
 
 
 class Cipher(Scheme):

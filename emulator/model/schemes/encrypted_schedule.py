@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from evedrop.model import update
 from evedrop.model.checks import count_mistakes
 from evedrop.model.holding_time import HoldingTime
 from evedrop.model.numeric.masking import Mask
 from evedrop.model.process import Floats, Process
-from evedrop.model.receiver import Belief, Codes, Flags, Receiver, Reception, select
+from evedrop.model.receiver import Flags, select
+from evedrop.model.schemes.cipher import CipherEstimator
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, PacketBlock, Scheme, Shared
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.streams import Batch
@@ -43,26 +43,6 @@ class EncryptedScheduleEncoder(Encoder):
     def acknowledged(self, k: int, acknowledged: Flags) -> None:
         """Send in clear again where slot k is acknowledged."""
         self._held.acknowledged(k, acknowledged)
-
-
-class EncryptedScheduleEstimator(Receiver):
-    """Unmasks the packets that are masked, and has the state from every packet."""
-
-    def __init__(self, process: Process, trials: int, mask: Mask) -> None:
-        super().__init__(process, trials)
-        self._mask = mask
-
-    def act(self, k: int, gamma: Flags) -> Codes:  # noqa: ARG002 - every slot alike
-        """The state where a packet arrives: the codes 0 and 1 of `Action` are γ itself."""
-        return gamma.astype(np.uint8)
-
-    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
-        """(A x̂, A P Aᵀ + Q) if lost, otherwise (the state, 0)."""
-        action = self.act(k, heard.gamma)
-        encrypted = heard.gamma if heard.header is None else heard.gamma & (heard.header[0] == 1)
-        masked = np.where(encrypted, heard.z, 0.0)
-        z = select(encrypted, lambda: self._mask.reveal(k, masked), lambda: heard.z)
-        return update.belief(self.process, k, belief, action, z)
 
 
 class EncryptedSchedule(Scheme):
@@ -99,7 +79,7 @@ class EncryptedSchedule(Scheme):
             self.process,
             batch.trials,
             lambda: EncryptedScheduleEncoder(self.threshold, batch.trials, mask),
-            lambda: EncryptedScheduleEstimator(self.process, batch.trials, mask),
+            lambda: CipherEstimator(self.process, batch.trials, mask),
         )
 
     def encrypted(self, packets: PacketBlock) -> Flags:

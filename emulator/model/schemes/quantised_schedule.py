@@ -15,6 +15,7 @@ from evedrop.model.holding_time import HoldingTime
 from evedrop.model.numeric.quantiser import MOST_BITS, DitheredQuantiser, LevelPad
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Belief, Codes, Flags, Receiver, Reception
+from evedrop.model.schemes.cipher import encrypted_packets
 from evedrop.model.schemes.encrypted_schedule import encrypted_by_header
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, PacketBlock, Scheme, Shared
 from evedrop.model.theory.quantisation import QuantisationError
@@ -68,7 +69,7 @@ class QuantisedScheduleEstimator(Receiver):
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """(A x̂, A P Aᵀ + Q) if lost, otherwise (what is read, R_k)."""
         action = self.act(k, heard.gamma)
-        encrypted = heard.gamma if heard.header is None else heard.gamma & (heard.header[0] == 1)
+        encrypted = encrypted_packets(heard)
         masked = self._quantiser.levels_of(k, np.where(encrypted, heard.z, 0.0))
         z = np.where(encrypted, self._quantiser.read(k, self._pad.reveal(k, masked)), heard.z)
         after = update.belief(self.process, k, belief, action, z)
