@@ -30,6 +30,8 @@ _UNTIL_THE_END = ExitStack()
 atexit.register(_UNTIL_THE_END.close)
 NEWS = "EVEDROP_TEST_NEWS"
 """The environment variable that names the file for a command's news."""
+LARGEST_FILE = "EVEDROP_TEST_LARGEST_FILE"
+"""The environment variable that limits the size of the files of a command that writes its news, in bytes; 0: no limit."""
 TELLING = Path(__file__).with_name("telling.py")
 """Runs a command that writes its news."""
 
@@ -66,11 +68,17 @@ class ForkedCommand:
     """A command that was forked, and what it writes."""
 
     def __init__(
-        self, words: Sequence[str], environment: Mapping[str, str], folder: Path, stdout: IO[Any] | None = None
+        self,
+        words: Sequence[str],
+        environment: Mapping[str, str],
+        folder: Path,
+        stdout: IO[Any] | None = None,
+        umask: int | None = None,
     ) -> None:
-        """stdout: where its output goes, if it is not to be kept."""
-        umask = os.umask(0)
-        os.umask(umask)
+        """stdout: where its output goes, if it is not to be kept; umask: by default that of this process."""
+        if umask is None:
+            umask = os.umask(0)
+            os.umask(umask)
         with ExitStack() as stack:
             nothing = stack.enter_context(open(os.devnull))
             pipes = [os.pipe() for _ in range(2)]

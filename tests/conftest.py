@@ -27,12 +27,12 @@ from evedrop.cli import main as cli
 from evedrop.kernels import choice
 from evedrop.names import KERNELS_VARIABLE
 from evedrop.results.writer import Results, load_results
-from tests.commands import NEWS, TELLING, CommandProcess, ForkedCommand
+from tests.commands import LARGEST_FILE, NEWS, TELLING, CommandProcess, ForkedCommand
 from tests.examples import register_profiles
 from tests.privileged import say_what_was_skipped
 
-FORKABLE = frozenset({"env", "cwd", "stdout"})
-"""The options of Popen that a forked command can have, too."""
+FORKABLE = frozenset({"env", "cwd", "start_new_session", "stdout", "umask"})
+"""The options of Popen that a forked command can have, too; it has a session of its own in any case."""
 LIMIT = 120.0
 """Seconds after which a condition that a test waits for counts as never met: far above what a busy machine needs."""
 
@@ -257,7 +257,9 @@ class Evedrop:
         self, arguments: tuple[str, ...], environment: dict[str, str], options: Mapping[str, Any]
     ) -> ForkedCommand:
         folder = options.get("cwd", self.folder)
-        return ForkedCommand(arguments, options.get("env", environment), folder, options.get("stdout"))
+        return ForkedCommand(
+            arguments, options.get("env", environment), folder, options.get("stdout"), options.get("umask")
+        )
 
     def begun(self, *arguments: str, **options: Any) -> Live:
         """The same in a new interpreter, without waiting for its end."""
@@ -268,15 +270,14 @@ class Evedrop:
     ) -> Live:
         """Start a command in a process of its own, to be followed and disturbed.
 
-        The process is forked from one that has made the imports, unless `interpreter`, the size of its files or other options
-        of Popen than those in FORKABLE ask for an interpreter of its own.
+        largest_file: in bytes; 0: no limit. The process is forked from one that has made the imports, unless `interpreter` or
+        other options of Popen than those in FORKABLE ask for an interpreter of its own.
         """
         news = self.folder / f"{out.replace('/', '-')}.news"
         words = (*arguments, "--out", out)
-        options["env"] = {**options.get("env", self.environment), NEWS: str(news)}
-        if interpreter or largest_file or options.keys() - FORKABLE:
-            telling = ["-P", str(TELLING), str(largest_file)]
-            process: CommandProcess = self.start(telling, words, options)
+        options["env"] = {**options.get("env", self.environment), NEWS: str(news), LARGEST_FILE: str(largest_file)}
+        if interpreter or options.keys() - FORKABLE:
+            process: CommandProcess = self.start(["-P", str(TELLING)], words, options)
         else:
             process = self._forked(words, self.environment, options)
         return Live(process, self.temporary, self.folder / out, news)

@@ -1,8 +1,7 @@
 """The command as it is, which also writes what its progress line shows: run as a script, or imported by a fork server.
 
-The environment variable EVEDROP_TEST_NEWS names the file for the news, if it is set. As a script: telling.py LARGEST WORDS...,
-where LARGEST limits the size of the command's files (0: no limit). A fork finds the modules of its own PYTHONPATH, as a new
-interpreter would.
+The environment variable EVEDROP_TEST_NEWS names the file for the news, if it is set, and EVEDROP_TEST_LARGEST_FILE limits the
+size of the command's files in bytes (0: no limit). A fork finds the modules of its own PYTHONPATH, as a new interpreter would.
 """
 
 from __future__ import annotations
@@ -80,6 +79,14 @@ def _become_servers(channels: Sequence[socket.socket]) -> NoReturn:
     serve(theirs[0], (), [(channel, ()) for channel in theirs[1:]])
 
 
+def limited_program() -> NoReturn:
+    """`program`, whose files are no larger than the environment says."""
+    largest = int(os.environ.get("EVEDROP_TEST_LARGEST_FILE", "0"))
+    if largest:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (largest, largest))
+    program()
+
+
 def program_with_path() -> NoReturn:
     """In the place of `program`, in a fork: with the modules of PYTHONPATH, and a `sitecustomize` among them."""
     folders = [one for one in os.environ.get("PYTHONPATH", "").split(os.pathsep) if one and one not in sys.path]
@@ -88,18 +95,14 @@ def program_with_path() -> NoReturn:
         importlib.invalidate_caches()
         with suppress(ModuleNotFoundError):
             importlib.import_module("sitecustomize")
-    program()
+    limited_program()
 
 
 ProgressLine.tell = tell  # type: ignore[method-assign]
 program = command.program
 
 if __name__ == "__main__":
-    largest = int(sys.argv[1])
-    if largest:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (largest, largest))
-    sys.argv[1:] = sys.argv[2:]
-    program()
+    limited_program()
 else:
     preloading.start_servers = forked_servers
     command.program = program_with_path

@@ -32,7 +32,7 @@ import importlib, json, sys
 bare, found = set(sys.modules), {{}}
 for name in {modules!r}:
     importlib.import_module(name)
-    found[name] = [one for one in sys.modules if one not in bare]
+    found.setdefault(name, [one for one in sys.modules if one not in bare])
 print(json.dumps(found))
 """
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -55,17 +55,36 @@ def ours(names: set[str]) -> set[str]:
     return {".".join(name.split(".")[:2]) for name in names if name.startswith("evedrop.")}
 
 
-def test_peers_and_network_stay_light() -> None:
+@pytest.fixture(scope="module")
+def loaded() -> dict[str, set[str]]:
+    """Module → what is loaded once it and those before it are: first the lightest, at last all that a live run may load.
+
+    What comes before a module can only make a check of it stricter.
+    """
+    peers = (*modules_of("peers"), *modules_of("live.network"), *modules_of("live.protocol"))
+    rooms = ("live", "memory", "scenario", "score", "results", "expected")
+    rest = (module for room in rooms for module in modules_of(room))
+    return loaded_by("evedrop.model.controllers", *model(), *peers, "evedrop.live.observer.observer", *rest)
+
+
+@pytest.fixture(scope="module")
+def loaded_without_network() -> dict[str, set[str]]:
+    """The same for what loads no Zenoh."""
+    return loaded_by("evedrop.live.launch.launcher", "evedrop.memory.montecarlo", "evedrop.api")
+
+
+def test_peers_and_network_stay_light(loaded: dict[str, set[str]]) -> None:
     """Peers, network and protocol load five packages and their own, and neither view nor results nor scenarios."""
     modules = (*modules_of("peers"), *modules_of("live.network"), *modules_of("live.protocol"))
-    for module, names in loaded_by(*modules).items():
+    for module in modules:
+        names = loaded[module]
         assert packages(names) <= {"zenoh", "msgpack", "numpy", "cryptography", "xxhash", "_cffi_backend"}, module
         assert not ours(names) & {"evedrop.view", "evedrop.results", "evedrop.score", "evedrop.scenario", "evedrop.api"}
 
 
-def test_a_solver_is_loaded_only_when_a_controller_is_made() -> None:
+def test_a_solver_is_loaded_only_when_a_controller_is_made(loaded: dict[str, set[str]]) -> None:
     """The strategy that needs a solver is registered with the others, and loads it with its first controller."""
-    names = loaded_by("evedrop.model.controllers")["evedrop.model.controllers"]
+    names = loaded["evedrop.model.controllers"]
     assert "evedrop.model.controllers.mpc" in names
     assert not packages(names) & {"osqp", "scipy"}
 
@@ -74,11 +93,16 @@ MATHEMATICS = {f"evedrop.{room}" for room in ("model", "streams", "kernels", "na
 """What the model may import."""
 
 
-def test_model_is_mathematics() -> None:
+def model() -> list[str]:
+    """The modules of the model that do without scipy."""
+    return [name for name in modules_of("model") if not name.startswith(SCIPY)]
+
+
+def test_model_is_mathematics(loaded: dict[str, set[str]]) -> None:
     """The model loads numpy, cryptography for streams, xxhash for digests: no network, no view, no scipy outside theory."""
-    model = [name for name in modules_of("model") if not name.startswith(SCIPY)]
-    assert len(model) > 15
-    for module, names in loaded_by(*model).items():
+    assert len(model()) > 15
+    for module in model():
+        names = loaded[module]
         assert packages(names) <= {"numpy", "cryptography", "xxhash", "_cffi_backend"}, module
         assert ours(names) <= MATHEMATICS, module
 
@@ -91,9 +115,11 @@ def test_theory_may_use_scipy_and_no_more() -> None:
 
 
 @pytest.mark.parametrize("module", ["evedrop.live.launch.launcher", "evedrop.memory.montecarlo", "evedrop.api"])
-def test_launcher_and_memory_load_neither_zenoh_nor_rerun(module: str) -> None:
+def test_launcher_and_memory_load_neither_zenoh_nor_rerun(
+    module: str, loaded_without_network: dict[str, set[str]]
+) -> None:
     """The launcher stays clear of what could hang, so that it can end it; Monte Carlo and the Python calls need neither."""
-    assert not packages(loaded_by(module)[module]) & {"zenoh", "rerun", "matplotlib"}
+    assert not packages(loaded_without_network[module]) & {"zenoh", "rerun", "matplotlib"}
 
 
 STARTS = {
@@ -116,9 +142,11 @@ SLOW = {"http.server", "rich", "multiprocessing", "asyncio", "unittest", "concur
 
 
 @pytest.mark.parametrize("module", STARTS)
-def test_a_run_starts_without_what_only_its_end_or_its_view_needs(module: str) -> None:
+def test_a_run_starts_without_what_only_its_end_or_its_view_needs(
+    module: str, loaded: dict[str, set[str]], loaded_without_network: dict[str, set[str]]
+) -> None:
     """Neither scipy, nor the terminal's tables, nor a web server is loaded before the first slot."""
-    names = loaded_by(module)[module]
+    names = loaded_without_network.get(module) or loaded[module]
     assert packages(names) - THEIRS <= STARTS[module] | {"_distutils_hack"}
     assert not names & SLOW
 
@@ -136,8 +164,7 @@ def test_the_pytest_plugin_loads_nothing_but_pytest() -> None:
     assert ours(more) == {"evedrop.pytest_plugin"}
 
 
-def test_only_view_and_paper_load_rerun_and_matplotlib() -> None:
-    """No module of the other rooms loads Rerun or matplotlib when it is imported; all in one process, in this order."""
-    rooms = ("model", "live", "memory", "scenario", "score", "results", "expected", "peers")
-    for module, names in loaded_by(*(module for room in rooms for module in modules_of(room))).items():
+def test_only_view_and_paper_load_rerun_and_matplotlib(loaded: dict[str, set[str]]) -> None:
+    """No module of the other rooms loads Rerun or matplotlib when it is imported; theory is looked at above."""
+    for module, names in loaded.items():
         assert not packages(names) & {"rerun", "matplotlib"}, module

@@ -104,11 +104,11 @@ def interrupted(live: Live, done: Done) -> None:
 )
 def test_a_signal_ends_a_command_in_order(evedrop: Evedrop, command: str, moment: str, number: signal.Signals) -> None:
     """All three the same, from the first moment on that Python lets us decide, to the last file."""
-    if moment == "done":  # only then it must tell how far it is
-        live = evedrop.started(*COMMANDS[command])
-    else:
+    if moment in {"first", "import"}:  # a fork has made the imports, and need not wait for them
         live = evedrop.begun(*COMMANDS[command], "--out", "run")
         live.folder = evedrop.folder / "run"
+    else:
+        live = evedrop.started(*COMMANDS[command])
     wait_until(lambda: MOMENTS[moment](live) or live.process.poll() is not None, moment)
     if live.process.poll() is None:
         live.process.send_signal(number)

@@ -21,7 +21,7 @@ from typing import Any, final
 from evedrop.environment import own_environment
 from evedrop.errors import UsageError
 from evedrop.live.launch.host_messages import line_of, message_in, own_version
-from evedrop.live.launch.preloading import process_starter
+from evedrop.live.launch.preloading import preloaded_without_observer
 from evedrop.live.launch.private_folder import private_folder
 from evedrop.live.launch.starter import StartedProcess, Starter, end_all
 from evedrop.signals import held_back, raise_on_signals
@@ -36,7 +36,7 @@ def serve_launcher() -> None:
     os.umask(0o077)
     answers = os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)  # so that nothing else can write between the messages
-    with raise_on_signals(), private_folder() as private, process_starter() as start:
+    with raise_on_signals(), private_folder() as private, preloaded_without_observer() as start:
         host, silence = HostProcesses(private, start, answers.write), _Silence()
         try:
             host.answer({"evedrop": own_version()})

@@ -201,10 +201,10 @@ def fork_servers(*modules: Sequence[str]) -> Iterator[tuple[ForkServer, ...]]:
 
 @final
 class PreloadedStarter:
-    """Starts an observer from one fork server, and all others, which need fewer modules, from another one."""
+    """Starts an observer from the last of some fork servers, and all others, which need fewer modules, from the first."""
 
-    def __init__(self, observers: ForkServer, others: ForkServer) -> None:
-        self._observers, self._others = observers, others
+    def __init__(self, servers: Sequence[ForkServer]) -> None:
+        self._observers, self._others = servers[-1], servers[0]
 
     def __call__(self, role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:
         """Start `evedrop ROLE BRIEF`. Raises OSError."""
@@ -261,16 +261,23 @@ def preloaded_for_one_run() -> Iterator[Starter]:
 
 
 @contextmanager
-def _kept_servers(of_others: Sequence[str], of_observers: Sequence[str]) -> Iterator[Starter]:
+def preloaded_without_observer() -> Iterator[Starter]:
+    """The same on a host that carries only other processes of a run: the imports of an observer are not made."""
+    with _kept_servers(OF_OTHERS) as starter:
+        yield starter
+
+
+@contextmanager
+def _kept_servers(*modules: Sequence[str]) -> Iterator[Starter]:
     """Fork servers that import these modules, for all runs in the block. Raises OSError."""
     try:
         os.close(os.pidfd_open(os.getpid()))
     except (AttributeError, OSError):  # not Linux, or a sandbox that forbids it
         yield start_process
         return
-    with fork_servers(of_others, of_observers) as (others, observers):
-        starter = PreloadedStarter(observers, others)
-        kept = _Kept((others, observers), starter, _inherited())
+    with fork_servers(*modules) as servers:
+        starter = PreloadedStarter(servers)
+        kept = _Kept(servers, starter, _inherited())
         _kept.append(kept)
         try:
             yield starter
