@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from evedrop.model.links import LOSS_MODELS
+from evedrop.model.links import LOSS_MODELS, pooled_spec, single_specs
 from evedrop.model.links.link import Fate
 from evedrop.model.slot.account import Accountant
 from evedrop.model.slot.link import Fates, link_of
@@ -97,3 +97,10 @@ def test_losses_account_for_every_packet(slots: int, trials: int, seed: int) -> 
     assert set(counted) == {fate.name.lower() for fate in Fate} - {"delivered", "unsent"}
     assert np.array_equal((fates == Fate.DELIVERED).sum(axis=1) + sum(counted.values()), np.full(slots, trials))
     assert all(counts.dtype == np.uint32 for counts in counted.values())
+
+
+def test_a_pooled_description_names_the_models_of_its_links() -> None:
+    """In their order; any other description names one."""
+    specs = [SPECS["bernoulli"], SPECS["distance"]]
+    assert single_specs(pooled_spec(specs)) == specs
+    assert single_specs(specs[0]) == specs[:1]
