@@ -21,7 +21,7 @@ class Command:
     """In a few words, for `--help`."""
     options: tuple[Option, ...] = ()
     group: str | None = None
-    """The word before its name, such as `links` in `links fit`; None if there is none."""
+    """The word before its name, such as `links` in `links fit`; None if it has no such word."""
     section: str = "other commands"
     """The title under which `--help` lists it."""
     example: str = ""

@@ -1,4 +1,4 @@
-"""Names of the processes of a run, and of what is done to them."""
+"""Names of the processes of a run, and of the actions on them."""
 
 from __future__ import annotations
 

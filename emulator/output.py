@@ -77,7 +77,7 @@ def silence() -> None:
 
 
 def _flush(stream: TextIO | None) -> None:
-    """Flush a stream; discards what nobody can read any more."""
+    """Flush a stream; discards the text if its reader is gone."""
     try:
         if stream is not None:
             stream.flush()

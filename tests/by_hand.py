@@ -126,7 +126,7 @@ class ByHand:
         return max(self._done, default=0)
 
     def running(self, more_than: int = 0) -> None:
-        """Wait until more than so many slots are joined."""
+        """Wait until more than this number of slots is joined."""
         observer = self.processes["observer"]
         wait_until(lambda: self.done() > more_than or observer.poll() is not None, "a run under way", LONG)
         assert observer.poll() is None, self.log("observer").read_text()

@@ -1,4 +1,4 @@
-"""A clock that nobody waits for."""
+"""A clock for tests, in which no real time passes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class TestClock:
         self.now += seconds
 
     def next(self, queue: SimpleQueue[T], timeout: float | None) -> T:
-        """The next item; if there is none, the time limit passes at once."""
+        """The next item; if the queue is empty, the time limit passes at once."""
         if queue.empty():
             self.now += 0.0 if timeout is None else timeout
             raise Empty

@@ -71,7 +71,7 @@ class Cable:
         return len(self._swallowed)
 
     def silence(self) -> None:
-        """Pass nothing on any more; nobody is told."""
+        """Stop passing anything on, without telling either end."""
         self._flows.clear()
 
     def heal(self) -> None:

@@ -13,7 +13,7 @@ from tests.conftest import Evedrop, wait_until
 
 @contextmanager
 def stepping(evedrop: Evedrop, folder: Path, slots: int) -> Iterator[None]:
-    """The block begins while a paused run, with its results in this folder, goes on for so many slots; it ends paused.
+    """The block begins while a paused run, with its results in this folder, goes on for this number of slots; it ends paused.
 
     In the block the run may reach the last of these slots, and then it waits there.
     """

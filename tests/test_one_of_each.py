@@ -87,7 +87,7 @@ def test_a_package_with_one_of_each_runs(evedrop: Evedrop, environment: dict[str
 
 
 def test_studies_and_checks_take_them_too(evedrop: Evedrop, environment: dict[str, str]) -> None:
-    """`check --scheme` and the like, `compare` and `sweep`, by their short names."""
+    """`check` with its options for classes, `compare` and `sweep`, by their short names."""
     for kind, name in (("scheme", "flipped"), ("link", "shifts"), ("delay", "steady")):
         done = evedrop.process("check", f"--{kind}", name, env=environment)
         assert done.status == 0, done.out

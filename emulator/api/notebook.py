@@ -48,11 +48,11 @@ def progress(tell: Tell | None, total: int) -> Iterator[Tell]:
         handle.update(shown.HTML(""))
 
 
-def bar_text(done: int, total: int, beside: str) -> str:
+def bar_text(done: int, total: int, label: str) -> str:
     """A progress bar in HTML."""
     share = min(1.0, done / total) if total else 0.0
     bar = element("progress", max="1", value=f"{share:.4f}")
-    bar.tail = printable(f" {share:.0%} · {beside}")
+    bar.tail = printable(f" {share:.0%} · {label}")
     return fragment(bar)
 
 

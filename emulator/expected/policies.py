@@ -32,7 +32,7 @@ class PolicyDesign:
 
     mu: float
     states: int
-    """Holding times are told apart up to this one."""
+    """Holding times are distinguished up to this one."""
     fronts: dict[str, Front]
     left_out: dict[str, str]
     """Eavesdropper → strategy, for those whose error has no closed form under this scheme."""
@@ -51,7 +51,7 @@ def policies_of(scenario: Scenario, weights: Sequence[float], prices: Sequence[f
     """The front of each eavesdropper of a scenario.
 
     weights: of the user's error, from 0 to 1, the eavesdropper's has the rest; prices: of a transmission; states: how many
-    holding times are told apart.
+    holding times are distinguished.
 
     Raises UsageError if the scheme does not go by acknowledgements when to send, if the losses of a link are not independent
     and alike in all slots, if the user's error is unbounded under every policy, for weights at which the best policy
@@ -121,7 +121,7 @@ def _check_numbers(scenario: Scenario, weights: Sequence[float], prices: Sequenc
     most = math.isqrt(_LARGEST_CHAIN // scenario.process.process.n**2)
     if not 2 <= states <= max(2, most):
         raise UsageError(
-            f"{states} states: expected a whole number from 2 to {max(2, most)}, how many holding times are told apart"
+            f"{states} states: expected a whole number from 2 to {max(2, most)}, how many holding times are distinguished"
         )
 
 

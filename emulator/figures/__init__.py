@@ -38,7 +38,7 @@ _TAKEN = ("error_quantiles", "standard_errors", "z", "infinite_variance", "rare_
 
 
 def figure(name: str) -> type[Figure]:
-    """A figure by its name. Raises NotRegistered if there is none, its name cannot be used, or it cannot be loaded."""
+    """A figure by its name. Raises NotRegistered if no figure has this name, its name cannot be used, or it cannot be loaded."""
     if name in _TAKEN or not name.isidentifier():
         wanted = "; expected a name of letters, digits and _ that no other entry of a receiver in the summary has"
         raise NotRegistered(name, wanted)

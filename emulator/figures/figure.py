@@ -83,7 +83,7 @@ class FigureTally(ABC):
     @property
     @abstractmethod
     def value(self) -> float | None:
-        """The figure over the slots so far; None if there is none."""
+        """The figure over the slots so far; None if it has no value."""
 
     @property
     def of_trials(self) -> Floats | None:

@@ -26,7 +26,7 @@ PAPERS: Mapping[str, type[Paper]] = {
 
 
 def paper(name: str) -> type[Paper]:
-    """A paper by its name. Raises UsageError if there is none."""
+    """A paper by its name. Raises UsageError if no paper has this name."""
     if name not in PAPERS:
         hint = near(name, PAPERS) or f"; expected one of {', '.join(PAPERS)}"
         raise UsageError(f"paper {name}: no such paper{hint}")

@@ -49,7 +49,7 @@ def with_line_numbers(text: str, changed: Iterable[str] = ()) -> Iterator[None]:
 
 
 def line_of(path: str, lines: Mapping[str, int]) -> int | None:
-    """The line of an entry, or of the innermost table or value that holds it; None if there is none."""
+    """The line of an entry, or of the innermost table or value that holds it; None if the file has neither."""
     while path:
         if path in lines:
             return lines[path]

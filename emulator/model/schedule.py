@@ -36,7 +36,7 @@ def mean_of(mu_d: StateProbability) -> float:
 
 
 def equal_slots(mu_d: StateProbability, slots: range) -> list[range]:
-    """Consecutive slots in parts, in order, in each of which μ_d is the same."""
+    """Consecutive slots in parts, in order; within a part, μ_d is constant."""
     if not isinstance(mu_d, tuple):
         return [slots]
     inner = [k for k in slots[1:] if in_slot(mu_d, k) != in_slot(mu_d, k - 1)]

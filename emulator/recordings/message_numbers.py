@@ -21,7 +21,7 @@ WRAP = 2**32
 _LATE = 64  # numbers by which a message may come late where nothing tells when it was sent
 _AHEAD = 8  # messages that are looked at to tell a late message from a sender that was started again
 _JUMP = 64  # numbers that a counter must leap before its time is looked at
-_HASTE = 0.1  # of the time that so many messages take: a leap in less is no loss
+_HASTE = 0.1  # of the time that this number of messages takes: a leap in less is not a loss
 
 
 @dataclass(frozen=True)

@@ -94,7 +94,7 @@ class ErrorsSection(Section[RunSource]):
 
     @classmethod
     def nodes(cls, of: RunSource) -> Iterator[Node]:
-        """A chart with bands, and theory beside it."""
+        """A chart with bands and theory."""
         curves = [
             Curve(name, of.colour(name), one.slot, one.error, one.low, one.high, one.theory)
             for name, one in of.means.items()

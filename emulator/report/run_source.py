@@ -150,4 +150,4 @@ def _trial(rows: pa.Table, noise: float) -> RecordedTrial:
 
 
 TRACK_COLOURS = dict(zip(Track, palette.KNOWLEDGE, strict=True))
-"""The colours of what a receiver knows."""
+"""The colours of the lanes that say what a receiver knows."""

@@ -1,4 +1,4 @@
-"""The base class of sections of a report, each of which makes its part of the page from the results."""
+"""The base class of a report's sections: each makes its part of the page from the results."""
 
 from __future__ import annotations
 

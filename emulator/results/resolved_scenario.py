@@ -27,7 +27,7 @@ def write_resolved(folder: Path, scenario: Scenario, taken: bool = False) -> Non
 
 
 def input_texts(scenario: Scenario) -> dict[str, str]:
-    """The files beside a complete scenario: name → text."""
+    """The files that a complete scenario needs next to it: name → text."""
     plant, process = scenario.plant, scenario.process
     found = {}
     if plant is not None and plant.disturbance_values:

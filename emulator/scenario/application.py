@@ -206,7 +206,7 @@ class Application(ABC):
 
     @classmethod
     def monitor(cls, loop: ControlledPlant, table: Table) -> MonitorPlan | None:
-        """The watermark, the detector beside the sensor's filter and the attack that it wants; by default none."""
+        """The watermark, the detector for the sensor's filter and the attack that it wants; by default none."""
         del loop, table
         return None
 

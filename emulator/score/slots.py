@@ -71,7 +71,7 @@ class InputSlots:
     failed: Flags
     """Whether the decision failed, so that the previous inputs are held, (c, R)."""
     monitored: MonitoredSlots | None = None
-    """The watermark, and what the detector beside the sensor's filter says; None without one."""
+    """The watermark, and what the detector for the sensor's filter says; None without one."""
 
     def part(self, trials: slice) -> InputSlots:
         """The same for some of the trials."""

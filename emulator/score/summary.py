@@ -38,7 +38,7 @@ class RareEvents:
     """The events that carry a receiver's expected error, but that too few trials meet."""
 
     share: float
-    """The share of the expected error that is carried by events of which fewer than one is expected in all trials."""
+    """The share of the expected error that comes from events that are expected less than once in all trials."""
     trials: float
     """The number of trials for which this share would be RARE_SHARE."""
 

@@ -49,7 +49,7 @@ class GuardedTally(FigureTally):
 
     @property
     def value(self) -> float | None:
-        """The figure over the slots so far; None if there is none, or if it is not a number."""
+        """The figure over the slots so far; None if it has no value, or if it is not a number."""
         found = self._asked(lambda: _number(self._begun.value))
         return None if found is None or math.isnan(found) else found
 

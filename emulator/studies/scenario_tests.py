@@ -68,7 +68,7 @@ class Finding:
     folder: Path | None = None
     """The results folder."""
     report: Path | None = None
-    """Its report.html; None if there is none."""
+    """Its report.html; None if it has no report."""
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -79,7 +79,7 @@ class Finding:
 
 
 def scenarios_of(places: Sequence[str]) -> list[str]:
-    """The scenarios in files, folders and built-in names, each once. Raises UsageError if there is none."""
+    """The scenarios in files, folders and built-in names, each once. Raises UsageError if none is found."""
     found: dict[Path, str] = {}
     for place in places:
         paths: Sequence[Path] = [Path(place)]

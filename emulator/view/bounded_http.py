@@ -6,7 +6,7 @@ import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
-_LOOK_SECONDS = 0.05  # between two checks of whether the server shall stop
+_LOOK_SECONDS = 0.05  # between two checks of whether the server is to stop
 _REQUEST_SECONDS = 10.0  # for a browser to send its request
 _MOST_READERS = 32  # at a time; further ones are turned away, so another user can use up all places
 

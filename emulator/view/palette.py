@@ -1,4 +1,4 @@
-"""The colours of Evedrop, by what they stand for: view, figures and comparisons take theirs from here.
+"""The colours of Evedrop, by meaning: view, figures and comparisons take theirs from here.
 
 The colours of text and grids, and those that a figure takes from the paper that it repeats, are elsewhere.
 
@@ -49,12 +49,12 @@ WIRE_LANES: tuple[Colour, ...] = (STATE, DECODED, DISCARDED, MISLED, DROPPED, SI
 DROPPED_TEXT: Colour = (230, 78, 44)
 """`DROPPED` for letters on the background of the theme, which need to be brighter than a lane."""
 WIRE_TEXTS: tuple[Colour, ...] = (STATE, MISLED, DROPPED_TEXT, TRUTH_CURVE, TRUTH)
-"""The links of a wire's graph by what they lost, those without messages, and the sides."""
+"""The links of a wire's graph by the share that they lost, those without messages, and the sides."""
 
 IN_TRACK_TEXT: Colour = (80, 255, 180)
 """`DECODED` for letters on the background of the theme."""
 RUN_TEXTS: tuple[Colour, ...] = (TRUTH, TRUTH_CURVE, STATE, MISLED, DROPPED_TEXT, IN_TRACK_TEXT)
-"""The nodes of a run's graph: packets by what became of them, and receivers by what they know."""
+"""The nodes of a run's graph: packets by their fate, and receivers by what they know."""
 
 BLUE: Colour = (0, 114, 178)
 RED: Colour = (193, 39, 45)

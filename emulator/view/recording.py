@@ -65,7 +65,7 @@ class RecordingThread(ABC, Generic[Chunk, Note]):
 
     @abstractmethod
     def _style(self, to: rr.RecordingStream) -> None:
-        """Record names, colours and the like, once."""
+        """Record names, colours and other styles, once."""
 
     @abstractmethod
     def _send(self, chunks: list[Chunk], notes: list[Note], to: rr.RecordingStream) -> bool:

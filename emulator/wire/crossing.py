@@ -78,4 +78,4 @@ RECORD = np.dtype(
         ("fate", "u1"),  # `Crossing`
     ]
 )
-"""A row of the journal while the wire runs, 48 bytes; codes of keys and sources are kept beside it."""
+"""A row of the journal while the wire runs, 48 bytes; codes of keys and sources are in another file."""

@@ -83,7 +83,7 @@ class JournalPart:
     """Records in a file, or in memory alone if the disk is full."""
 
     def __init__(self, path: Path | None, rows: int) -> None:
-        """path: of a new file for so many rows. Raises OSError if there is no room on the disk for all of them."""
+        """path: of a new file for this number of rows. Raises OSError if the disk has no room for all of them."""
         self.path = path
         size = rows * RECORD.itemsize
         if path is None:

@@ -120,7 +120,7 @@ class WirePlan:
     expectations: tuple[Mapping[str, Any], ...] = ()
 
     def link_of(self, source: str, target: str, key: zenoh.KeyExpr, *, query: bool = False) -> WireLink | None:
-        """The first link that takes the messages of a key from one side to another; None if there is none.
+        """The first link that takes the messages of a key from one side to another; None if no link does.
 
         query: whether they are queries or replies, which no tap carries.
         """
@@ -128,7 +128,7 @@ class WirePlan:
         return next((link for link in links if link.takes(key) and not (query and link.tap)), None)
 
     def named(self, name: str) -> WireLink:
-        """The link with this name. Raises KeyError if there is none."""
+        """The link with this name. Raises KeyError if no link has it."""
         return {link.name: link for link in self.links}[name]
 
     def is_lossless(self, key: zenoh.KeyExpr) -> bool:

@@ -1,4 +1,4 @@
-"""The names behind the gids of a wire's journal: every entity of ROS 2 that the wire has seen, in a file beside it.
+"""The names behind the gids of a wire's journal: every entity of ROS 2 that the wire has seen, in a file of the same folder.
 
 Source: docs/ros2.md, the journal.
 """

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 _PATIENCE = 60.0  # seconds, for the process to begin, to answer, and to end
 _POLL_SECONDS = 0.02
 LONGEST_SECONDS = 3600.0
-"""After so many seconds a wire ends by itself: the program that opened it may have been killed."""
+"""The seconds after which a wire ends by itself: the program that opened it may have been killed."""
 
 
 class ExpectationFailed(EvedropError, AssertionError):

@@ -151,7 +151,7 @@ def test_an_application_of_another_package_needs_nothing_here(evedrop: Evedrop) 
 
 
 def test_an_application_that_cannot_be_loaded_is_a_mistake_of_who_uses_it(evedrop: Evedrop) -> None:
-    """With the reason, beside the scenario's other mistakes; scenarios without its table do not notice."""
+    """It is refused with the reason, among the scenario's other mistakes; scenarios without its table still run."""
     install(evedrop.folder, {"platooning.py": "import nothing_of_this_name\n"}, PLATOON)
     (evedrop.folder / "two.toml").write_text(SCENARIO.replace("slots = 200", "slots = -1"))
     environment = {**evedrop.environment, "PYTHONPATH": str(evedrop.folder)}

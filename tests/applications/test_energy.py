@@ -58,7 +58,7 @@ def test_what_differs_slot_by_slot_bounds_the_rest(run: np.ndarray, reference: n
 
 
 def test_a_meter_may_be_read_in_parts() -> None:
-    """Slots after slots, and trials beside trials, come to what all come to at once, to the bit."""
+    """Sums over parts of the slots and of the trials equal the sum over all at once, to the bit."""
     rng = np.random.default_rng(4)
     run, other = rng.standard_normal((2, 50, 4))
     whole = Meter.over(run, other)

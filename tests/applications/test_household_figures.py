@@ -146,7 +146,7 @@ def test_the_figures_are_those_of_the_tables(tmp_path: Path) -> None:
 
 
 def test_active_windows_are_the_days(tmp_path: Path) -> None:
-    """Their number is that of the load; who has nothing to go by is near a coin, the legitimate estimator far above."""
+    """A receiver without information has an area near ½, the legitimate one nearly 1; the windows are those of the load."""
     scenario = part_of_day("microgrid", 25_200, 4800, eavesdroppers__bayesian__strategy="smart")
     house = montecarlo(scenario, trials=2, out=tmp_path / "x", plan=Plan(workers=1)).summary["household"]
     load_power = np.array(scenario.plant.disturbance_values)[: 79 * 60, 1]

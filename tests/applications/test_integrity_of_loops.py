@@ -191,7 +191,7 @@ BASE = {"policy": "always", "threshold": 8.0, "watermark": [[0.3]]}
         ({"integrity.attack": {"model": "replace", "matrix": [[1.2]]}}, "integrity.attack.matrix: has the spectral radius 1.2"),
         ({"integrity": BASE}, "integrity.attack: is missing, but an event begins it; expected attack = {"),
         ({"controller.period": 2}, "controller.period: is 2, but the laws of integrity assume a decision in every slot"),
-        ({"controller.acts_on": "truth"}, 'controller.acts_on: is "truth", so that false measurements deceive nobody'),
+        ({"controller.acts_on": "truth"}, 'controller.acts_on: is "truth", so false measurements would mislead no controller'),
         ({"controller.rate_weights": [0.1]}, "controller.rate_weights: are given, but the laws of integrity assume none"),
         ({"controller": {"strategy": "mpc", "state_weights": [1.0], "input_weights": [0.1]}}, "controller.strategy: has no"),
         ({"event": [{"at": 160, "spoof": "sensor"}]}, 'event.0.spoof: is "sensor"; expected "measurements"'),

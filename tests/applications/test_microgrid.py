@@ -62,7 +62,7 @@ def test_what_is_summed_slot_by_slot_depends_on_the_weights(tmp_path: Path) -> N
 
 
 def test_covariances_are_those_of_the_table(tmp_path: Path) -> None:
-    """4000 slots and 200 trials: within 2 % of what theory says of these slots."""
+    """4000 slots and 200 trials: within 2 % of the theory for these slots."""
     results = montecarlo("microgrid", trials=200, slots=4000, out=tmp_path / "x", plan=COVARIANCES, **NO_PACKETS)
     for name in ("legitimate", "smart"):
         peer = results.summary["peers"][name]

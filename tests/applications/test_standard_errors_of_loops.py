@@ -71,7 +71,7 @@ def test_applications_have_the_standard_errors_of_single_trials(
 
 
 def test_a_delay_has_the_standard_error_of_its_alarms() -> None:
-    """It is computed over the trials that raised an alarm in time; with a single alarm there is none."""
+    """It is computed over the trials that raised an alarm in time; a single alarm gives no standard error."""
     scenario = load("acknowledged", {"trials": 4})
     detection = Detection(4)
     detection.first[:] = 10, 14, -1, 18

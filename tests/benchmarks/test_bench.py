@@ -75,7 +75,7 @@ def test_without_a_failure_the_exit_status_is_0(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_every_figure_is_measured() -> None:
-    """With small sizes, all programs run to their end and print each figure beside its yardstick and its targets."""
+    """With small sizes, all programs run to their end and print each figure with its yardstick and its targets."""
     command = [sys.executable, str(BENCHMARKS / "bench.py"), "--quick"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=900)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -141,7 +141,7 @@ def test_a_results_folder_must_be_new_or_empty(evedrop: Evedrop) -> None:
 
 
 def unwritable(folder: Path) -> str:
-    """A folder that nobody may write to: one without permission, or for root one of the kernel's."""
+    """A folder in which no file can be created: one without permission, or for root one of the kernel's."""
     if os.geteuid() == 0:
         return "/proc"
     (folder / "locked").mkdir(mode=0o500)
@@ -216,7 +216,7 @@ def test_a_scenario_names_a_secret_in_its_own_folder(evedrop: Evedrop) -> None:
 
 
 def test_diff_says_where_and_tells_by_its_status(evedrop: Evedrop) -> None:
-    """0 for equal runs, 1 for a difference, 2 for what is no run."""
+    """0 for equal runs, 1 for a difference, 2 for a folder that is not a run."""
     base = ("montecarlo", "eavesdroppers", "--slots", "30", "--trials", "1", "--out")
     for name, more in (("a", ()), ("b", ()), ("c", ("--seed", "3"))):
         assert evedrop(*base, name, *more).status == 0
@@ -336,7 +336,7 @@ def test_other_errors_of_the_system_are_not_blamed_on_the_output(
 
 @pytest.mark.parametrize("reader", ["/dev/full", "gone"])
 def test_an_interrupt_stays_one_for_every_reader(evedrop: Evedrop, reader: str) -> None:
-    """Ctrl-C also ends who stands behind the pipe; that our closing table cannot be written changes nothing."""
+    """Ctrl-C also ends the reader of the pipe; that our closing table cannot be written changes nothing."""
     ends = os.pipe()
     os.close(ends[0])
     with Path("/dev/full").open("w") if reader == "/dev/full" else os.fdopen(ends[1], "w") as output:

@@ -125,7 +125,7 @@ def test_a_trace_that_cannot_be_kept_is_refused(evedrop: Evedrop, wanted: str) -
 
 
 def test_the_least_choice_is_in_the_json_if_asked_for(evedrop: Evedrop) -> None:
-    """`minimum` beside bound and trace; at that μ_d the trace is Ω."""
+    """`minimum` is given with bound and trace; at that μ_d the trace is Ω."""
     least = designed(evedrop, "numerical", "--max-trace", "0.01")["legitimate"]["minimum"]
     assert least == pytest.approx(0.540427, abs=1e-6)
     again = designed(evedrop, "numerical", *changes(encoding__state_probability=least))
@@ -133,7 +133,7 @@ def test_the_least_choice_is_in_the_json_if_asked_for(evedrop: Evedrop) -> None:
 
 
 def test_a_run_of_any_length_can_be_designed(evedrop: Evedrop) -> None:
-    """More slots than float64 can follow are no obstacle to theory."""
+    """Theory is not limited by the number of slots that float64 can follow."""
     assert designed(evedrop, "numerical", *changes(slots=20000))["rho"] == pytest.approx(1.387799, abs=1e-6)
 
 

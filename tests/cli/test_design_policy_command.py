@@ -80,7 +80,7 @@ def test_for_people(evedrop: Evedrop, scenario: str) -> None:
         "best θ",
         "∞",
         "the best policy never sends: with λ = 0 the weights 0, 0.05",
-        "which another one dominates",
+        "policies that another one dominates",
         "left out: deaf (constant)",
     ):
         assert words in done.out, words

@@ -1,4 +1,4 @@
-"""Classes that break rules: how they are made, and what is said of them."""
+"""Classes that break rules: how they are made, and how they are reported."""
 
 from __future__ import annotations
 

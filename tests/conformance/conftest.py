@@ -15,7 +15,7 @@ from tests.conftest import Evedrop
 
 @pytest.fixture
 def imports_forgotten(tmp_path: Path) -> Iterator[None]:
-    """What a test imports from its folder is no other test's."""
+    """Modules that a test imports from its folder are not visible to other tests."""
     before = list(sys.path)
     ANSWERS.forget()
     yield

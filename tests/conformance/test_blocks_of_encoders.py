@@ -90,7 +90,7 @@ BLOCKS: dict[str, tuple[Callable[[PacketBlock], Any], tuple[str, ...]]] = {
     ),
     "Reuses": (into_room, ("Packet.z is ", " by Reuses.encode_block() of slots ")),
 }
-"""The name of a class, what it makes of the packets of several slots, and what is said of it."""
+"""The name of a class, how it changes the packets of several slots, and the expected report."""
 
 
 @pytest.mark.parametrize("name", BLOCKS)

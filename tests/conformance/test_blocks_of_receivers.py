@@ -80,7 +80,7 @@ FOLLOWS: dict[str, tuple[Callable[[tuple[Beliefs, Belief]], Any], tuple[str, ...
         ),
     ),
 }
-"""The name of a class, what it makes of beliefs and last belief of several slots, and what is said of it."""
+"""The name of a class, how it changes the beliefs and the last belief of several slots, and the expected report."""
 
 
 @pytest.mark.parametrize("name", FOLLOWS)
@@ -257,7 +257,7 @@ def test_a_taker_may_use_every_packet_of_some_slots(kind: type[PacketTaker]) -> 
 
 
 class Told(Naive):
-    """Learns a state, and takes blocks of which that slot is none."""
+    """Learns a state in one slot, and takes blocks that do not contain this slot."""
 
     @classmethod
     def betrayed(cls, parameters: Any) -> int | None:

@@ -51,7 +51,7 @@ class Counted(Sent):
 
 
 class Negative(Sent):
-    """Is not what the estimator reads."""
+    """Sends packets that the estimator cannot read."""
 
     def of(self, k: int, x: Floats) -> Floats:  # noqa: ARG002 - every slot alike
         """The negative."""
@@ -71,7 +71,7 @@ class Remembers(PlainEstimator):
 
 
 class Peeks(PlainEstimator):
-    """Uses a little of what was never received."""
+    """Uses a small part of a packet that was never received."""
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """As plain, and more."""
@@ -80,7 +80,7 @@ class Peeks(PlainEstimator):
 
 
 class Discards(PlainEstimator):
-    """Says that it uses what it leaves."""
+    """Says that it uses packets that it ignores."""
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """Other than `act`."""

@@ -137,7 +137,7 @@ def test_an_eavesdropper_that_breaks_a_rule_is_told_which(kind: Any, rule: str, 
     ],
 )
 def test_what_cannot_be_checked_is_refused(names: dict[str, str], parameters: dict[str, Any], said: str) -> None:
-    """Names that are none, parameters that are none or wrong, keys that the scheme beside it does not have."""
+    """Unknown names, unknown or wrong parameters, and keys that the scheme of the same command does not have."""
     with pytest.raises(UsageError) as caught:
         list(examined(names, parameters))
     assert said in str(caught.value)
@@ -161,7 +161,7 @@ class Anywhen(Naive):
 
 
 class Silent(Naive):
-    """Has nothing to say of its parameters, and no list to say it with."""
+    """Returns None in place of a list of its parameters' mistakes."""
 
     @classmethod
     def mistakes(cls, given: Any) -> Any:

@@ -115,7 +115,7 @@ LATER = {
               "        return super().fates(first, uniforms) if first < 32 else 1 / 0",
               "legitimate's link (later_fates:Mine) failed in slots 32 to 63, trials {trials}: ZeroDivisionError: "),
 }  # fmt: skip
-"""What of a class goes wrong in a later slot than the dry run sees → the entry, the class, what is said."""
+"""A failure of a class in a slot after those of the dry run → the entry, the class, the expected message."""
 
 
 def later(evedrop: Evedrop, case: str) -> tuple[str, ...]:

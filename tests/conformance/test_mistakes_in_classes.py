@@ -108,7 +108,7 @@ def test_a_name_that_names_nothing_is_refused(name: str, evedrop: Evedrop) -> No
 
 
 def test_one_name_is_one_module(evedrop: Evedrop) -> None:
-    """Two folders with a module of one name cannot be used in one session: nobody could tell which class it was."""
+    """Two folders with modules of the same name cannot be used in one session: the class would be ambiguous."""
     for folder in ("here", "there"):
         (evedrop.folder / folder).mkdir()
         (evedrop.folder / folder / "twice.py").write_text(f"{HEAD}\n\nclass Mine(Plain):\n    pass\n")

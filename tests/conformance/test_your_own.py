@@ -75,7 +75,7 @@ def test_a_module_that_has_changed_since_is_warned_of(tutorial: Evedrop) -> None
 
 
 def test_the_folder_of_modules_can_be_another(tutorial: Evedrop) -> None:
-    """`modules` is beside the scenario, wherever the command is typed; every process is told what it needs, and no more."""
+    """`modules` is relative to the scenario, wherever the command is typed; every process is told what it needs, and no more."""
     lib, home = tutorial.folder / "home" / "lib", tutorial.folder / "home"
     lib.mkdir(parents=True)
     for module in tutorial.folder.glob("*.py"):

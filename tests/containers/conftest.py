@@ -1,4 +1,4 @@
-"""Docker, the image, and a project to bring up; skipped, which is said loudly, where there can be none."""
+"""Docker, the image, and a project to bring up; where Docker cannot run, the tests are skipped with a loud message."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ systemd-resolved runs: that is when Docker 20.10 lets a container's questions ou
 
 
 def checkout(folder: Path) -> Path:
-    """A copy of this checkout, as somebody has it who clones it."""
+    """A copy of this checkout, as a clone of it would be."""
     copy = folder / "evedrop"
     copy.mkdir()
     names = run("git", "ls-files", "-z", "--cached", "--others", "--exclude-standard", cwd=ROOT).stdout

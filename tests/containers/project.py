@@ -90,7 +90,7 @@ class Project:
         return max((json.loads(line)["done"] for line in lines), default=0)
 
     def running(self, more_than: int = 0) -> None:
-        """Wait until more than so many slots are done."""
+        """Wait until more than this number of slots is done."""
         wait_until(lambda: self.progress() > more_than, "a run under way")
         assert self.state("observer")["Running"], "the run must not end before it is disturbed"
 

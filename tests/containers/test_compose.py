@@ -67,7 +67,7 @@ def test_the_recipe_for_a_script_gives_table_and_status(project: Make) -> None:
 
 
 def test_a_scenario_of_ones_own(project: Make) -> None:
-    """A file beside docker-compose.yml."""
+    """A file in the folder of docker-compose.yml."""
     own = project(EVEDROP_OPTIONS=SHORT, EVEDROP_SCENARIO="mine/two.toml")
     (own.folder / "mine").mkdir()
     shutil.copy("scenarios/two-eavesdroppers.toml", own.folder / "mine" / "two.toml")

@@ -75,7 +75,7 @@ def is_healthy(project: Project, service: str) -> bool:
 
 
 def test_who_can_reach_what(going: Project) -> None:
-    """Every role reaches the router and no other, has its own brief alone, and no rights; all come to be healthy."""
+    """Every role reaches only the router, has only its own brief, and has no rights; all become healthy."""
     everybody = {service: addresses(going, service) for service in ROLES}
     others = [f"{host}:{port}" for found in everybody.values() for host in found.values() for port in (7447, 17450)]
 
@@ -113,7 +113,7 @@ while True:
     question = names.recv(512)[12:]
     print(question[1 : 1 + question[0]].decode(), flush=True)
 """
-"""Two services of the host: one that listens at every address, and the one that names are asked of, which says who asks."""
+"""Two services of the host: one listens at every address, the other resolves names and says who asks."""
 
 REACHES = """
 import socket, sys
@@ -130,11 +130,11 @@ except OSError:
     pass
 print(*reached)
 """
-"""Connects to a port of hosts, and says which let it; asks for a name that nobody has."""
+"""Connects to a port of several hosts, and says which accept; resolves a name that does not exist."""
 
 
 def test_no_way_leads_out(going: Project) -> None:
-    """No process of the run reaches the host at any address, or has it ask for a name; only what forwards the view reaches it."""
+    """No process of the run reaches the host at any address, or resolves a name through it; only the view's forwarder does."""
     docker, project = going.docker, going.environment["COMPOSE_PROJECT_NAME"]
     networks = docker("network", "ls", "-q", "--filter", f"label=com.docker.compose.project={project}").split()
     gateways = {docker.inspected("network", one)["IPAM"]["Config"][0]["Gateway"] for one in networks}
@@ -173,7 +173,7 @@ except RuntimeError:
 over.set()
 held = b"x" * int(sys.argv[1])
 """
-"""Starts threads until it may not, says how many it could, and then takes memory."""
+"""Starts threads up to the limit, says how many it could start, and then takes memory."""
 
 
 def test_a_container_cannot_take_the_whole_machine(going: Project) -> None:

@@ -45,7 +45,7 @@ class Case:
 
     @property
     def options(self) -> list[str]:
-        """Of `evedrop run`, beside those of the variant."""
+        """Arguments of `evedrop run`, in addition to those of the variant."""
         return ["--set", f"longest_outage={self.longest_outage}"]
 
     @property

@@ -166,7 +166,7 @@ def _held(fault: Fault, run: Disturbed, how: str) -> bool:
 
 
 def _fill(fault: Fault, run: Disturbed) -> bool:
-    """Fill the disk; without one of our own, no file of those who write results may grow any more."""
+    """Fill the disk; without a disk of our own, forbid the processes that write results to let any file grow."""
     del fault
     if run.fill():
         return True

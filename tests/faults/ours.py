@@ -78,7 +78,7 @@ def descendants() -> Iterator[Process]:
 
 
 def none_left(before: frozenset[int], seconds: float) -> list[Process]:
-    """Wait until no descendant is left but those before; those that still are after so many seconds."""
+    """Wait until no descendants are left except the earlier ones; returns those that remain after this number of seconds."""
     deadline = time.monotonic() + seconds
     while True:
         found = [one for one in descendants() if one.pid not in before]

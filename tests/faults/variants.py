@@ -44,7 +44,7 @@ def _rich(more: str, **given: Any) -> str:
 
 @dataclass(frozen=True)
 class Variant:
-    """A scenario, and who takes part in its live run."""
+    """A scenario, and the processes of its live run."""
 
     name: str
     source: str

@@ -173,7 +173,7 @@ def test_intervals_are_wilsons(hits: int, count: int) -> None:
 
 @pytest.mark.parametrize("spec", [BERNOULLI, GILBERT, SOFT])
 def test_the_law_of_runs(spec: dict[str, Any]) -> None:
-    """Bursts and gaps of half a million outcomes: the law's mean at 1e-6 confidence, and its p-value is no small one."""
+    """Bursts and gaps of half a million outcomes have the law's mean at 1e-6 confidence, and its p-value is not small."""
     outcomes = recorded(spec, 500_000, 7)
     for lost in (True, False):
         lengths, law = lengths_of(outcomes == (0 if lost else 1)), RunLaw.of(spec, lost)
@@ -189,7 +189,7 @@ def test_the_law_of_runs(spec: dict[str, Any]) -> None:
 
 
 def test_runs_at_the_ends_do_not_count() -> None:
-    """How long they were nobody knows."""
+    """Their lengths are unknown."""
     word = np.array([int(c) for c in "0011101000110"], np.uint8)
     assert lengths_of(word == 0).tolist() == [1, 3]
     assert lengths_of(word == 1).tolist() == [3, 1, 2]

@@ -50,7 +50,7 @@ class TooLong(Exception):
 
 @contextlib.contextmanager
 def _limited(seconds: float) -> Iterator[None]:
-    """Raise TooLong in the block once it has used so many seconds of processor."""
+    """Raise TooLong in the block when it has used this number of seconds of processor time."""
 
     def ring(*_: object) -> None:
         raise TooLong(f"it took more than {seconds:g} s")
@@ -85,7 +85,7 @@ def broken_by(reader: Reader, data: bytes, folder: Path) -> Failure | None:
 
 
 def campaign(name: str, seed: int, count: int, first: int = 0) -> list[Failure]:
-    """The failures of a reader among so many changed examples, from the one with the number `first` on."""
+    """The failures of a reader among this number of changed examples, from the one with the number `first` on."""
     reader = READERS[name]
     found: list[Failure] = []
     with tempfile.TemporaryDirectory(prefix="fuzz-") as place:

@@ -1,4 +1,4 @@
-"""Changes at random, seeded: of bytes, and of what tables, lists and numbers are made of."""
+"""Random changes, seeded: of bytes, and of the parts of tables, lists and numbers."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ class Reader:
     """From the bytes, and a folder of its own, to anything."""
     changes: tuple[Change, ...]
     status: int = 2
-    """The exit status of what it raises."""
+    """The exit status of the error that it raises."""
     words: Callable[[], tuple[str, ...]] = tuple
 
     def changed(self, mutator: Mutator, number: int) -> bytes:

@@ -8,6 +8,6 @@ from tests.fuzz.results_readers import OF_RESULTS
 from tests.fuzz.scenario_readers import OF_SCENARIOS
 
 FILES: dict[str, Reader] = {**OF_SCENARIOS, **OF_RESULTS}
-"""Files that are read by what a user types."""
+"""Files that commands of a user read."""
 
 READERS: dict[str, Reader] = {**FILES, **MESSAGES}

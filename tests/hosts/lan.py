@@ -30,7 +30,7 @@ def _ip(*words: str) -> str:
 
 
 def _take_away(name: str) -> None:
-    """End who is in a namespace, and the namespace."""
+    """End the processes in a namespace, and the namespace."""
     for pid in _ip("netns", "pids", name).split():
         subprocess.run(["kill", "-9", pid], check=False, capture_output=True)
     _ip("netns", "del", name)

@@ -148,7 +148,7 @@ def test_in_clear_everything_can_be_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("host", ["eve", "router"])
 def test_a_pulled_cable_is_an_outage(host: str, tmp_path: Path) -> None:
-    """Out for longer than a connection's lease, and in again: the run goes on to the bits of an undisturbed one, and says so."""
+    """Unplugged for longer than a connection's lease, and plugged in again: the run reaches the bits of an undisturbed one."""
     scenario = scenario_of()
     with apart(tmp_path, scenario) as (network, run):
         run.start()

@@ -70,7 +70,7 @@ def test_processes_of_a_run_use_the_same_kernels(monkeypatch: pytest.MonkeyPatch
 def test_a_run_begins_with_a_warning_if_there_are_no_kernels(
     kernels: str, warned: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Only if nobody asked for numpy."""
+    """Only if numpy was not asked for."""
     monkeypatch.setattr(choice, "KERNELS", kernels)
     with ProgressLine(10, "slots"):
         pass

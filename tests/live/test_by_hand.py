@@ -121,7 +121,7 @@ def test_by_hand_the_observer_prints_and_ends_as_run_does(below: float, evedrop:
 
 @pytest.mark.long
 def test_a_reader_that_leaves_early_changes_no_exit_status(evedrop: Evedrop) -> None:
-    """Of an observer whose output nobody reads any more, the status is still that of the run."""
+    """An observer whose output is no longer read still exits with the status of the run."""
     expect = "expect=[{figure='smart.mean_squared_error', below=0}]"
     briefs = written(evedrop, "--listen", f"tcp/127.0.0.1:{free_port()}", "--set", expect)
     observer_brief = briefs.pop("observer")
@@ -301,7 +301,7 @@ def test_who_ends_the_observer_ends_the_run(evedrop: Evedrop) -> None:
 
 
 def test_without_a_router_everybody_says_so(evedrop: Evedrop) -> None:
-    """A router that nobody starts: each names where it should be, exit 3; the observer leaves no results."""
+    """If the router is never started, each process names where it should be, exit 3; the observer leaves no results."""
     endpoint = f"tls/127.0.0.1:{free_port()}"
     briefs = written(evedrop, "--listen", endpoint, "--wait", "1")
     for name in ("sensor", "observer"):

@@ -85,7 +85,7 @@ class Steered:
         return found
 
     def end(self) -> Done:
-        """Its end, after which nobody can get at it."""
+        """The file is removed at the end of the run."""
         done = self.live.end()
         assert not self.control.exists()
         return done
@@ -146,7 +146,7 @@ def test_a_steered_run_is_the_same_again(steered: Start, evedrop: Evedrop) -> No
 
 
 def test_a_paused_run_stands_still(steered: Start, evedrop: Evedrop) -> None:
-    """No slot passes until it goes on; status and summary tell what was done, and by whom."""
+    """No slot passes until it goes on; status and summary say what was done, and who did it."""
     run = steered(pace=0.002)
     with stepping(evedrop, run.live.folder, 300):
         at = slot_of(run("pause"))
@@ -174,7 +174,7 @@ def test_a_paused_run_stands_still(steered: Start, evedrop: Evedrop) -> None:
 
 
 def test_mistakes_are_told_and_change_nothing(steered: Start) -> None:
-    """Every one at once, with exit status 2; what is not a command is refused before the run hears of it."""
+    """All mistakes at once, with exit status 2; an unknown command is refused before the run hears of it."""
     run = steered()
     before = (run.live.folder / "scenario.toml").read_text()
     done = run.try_to("link", "legitimate", "quality=1.2", "sluts=3")
@@ -266,7 +266,7 @@ def test_no_run_is_said(evedrop: Evedrop, tmp_path: Path) -> None:
 
 
 def test_the_control_file_is_nobody_elses(tmp_path: Path) -> None:
-    """It can be read by its owner alone, reads back as it was written, and what is no such file is refused."""
+    """Only its owner can read it, it reads back as it was written, and other files are refused."""
     control = Control("r0", "tcp/127.0.0.1:9", "operator", "secret")
     control.write(tmp_path)
     path = tmp_path / "control.json"

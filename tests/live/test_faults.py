@@ -23,7 +23,7 @@ SECONDS = 30.0
 
 
 def ended_by_fault(live: Live) -> str:
-    """Check a run that a fault ended, just now; what was said of it."""
+    """Check a run that a fault has just ended; returns its message."""
     begun = time.monotonic()
     done = live.end()
     assert time.monotonic() - begun < SECONDS
@@ -70,7 +70,7 @@ ROGUES = {
     "journal without a link": ("router", "Journal.pack = lambda self: pack({'k': 0, 'c': 1, 'links': {}})", "a map"),
     "wrong progress": ("suspicious", "reporting.progress = lambda k: b''", "not msgpack"),
 }
-"""What is wrong → the process that does it, how, and what is said of it: for each pair of a sender and who notices."""
+"""What is wrong → the process at fault, how, and the expected message: for each pair of a sender and a process that notices."""
 
 
 @pytest.mark.parametrize("what", ROGUES)
@@ -108,7 +108,7 @@ def test_a_process_that_fails_is_named(evedrop: Evedrop, does: str, said: str) -
 
 
 def test_a_router_that_lies_is_found_out(evedrop: Evedrop) -> None:
-    """Packets that the journal calls delivered and nobody received end the run; slot and both who disagree are named."""
+    """Packets that are delivered by the journal, but were not received, end the run; the message names slot and processes."""
     lie = (
         "import evedrop.live.network.router as router\nhonest = router.delivery\n"
         "router.delivery = lambda k, mask, z, *rest: honest(k, bytes(len(mask)), b'') if k == 7 else honest(k, mask, z, *rest)"

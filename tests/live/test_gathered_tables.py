@@ -41,7 +41,7 @@ def slots_of(seed: int) -> Slots:
 
 
 def part_of(whole: Slots, rows: slice, trials: slice, recorded: int) -> Slots:
-    """Some slots of some trials of it, of which the first `recorded` in full."""
+    """Some slots of some of its trials, the first `recorded` trials in full."""
     receivers = {}
     for name, one in whole.receivers.items():
         trace = np.einsum("kiir->kr", one.P)[rows, trials]
@@ -78,7 +78,7 @@ def write(folder: Path, whole: Slots, trials: slice, recorded: int, ends: Sequen
 def gathered(
     folder: Path, shards: Sequence[Path], sizes: Sequence[int], at_once: int
 ) -> Iterator[tuple[str, pa.Table]]:
-    """The tables of the run, put together so many slots at a time."""
+    """The tables of the run, put together this number of slots at a time."""
     folder.mkdir()
     with ResultsWriter(folder, NAMES, N):
         pass

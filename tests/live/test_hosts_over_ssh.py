@@ -128,7 +128,7 @@ def test_a_killed_launcher_leaves_nothing_on_any_host(evedrop: Evedrop, server: 
 
 
 def test_a_host_that_dies_in_the_middle_is_named(evedrop: Evedrop, server: Sshd) -> None:
-    """Kill -9 of what serves its connection: the run ends, the sentence names process and host, and the results are kept."""
+    """After kill -9 of its connection's server, the run ends, the message names process and host, and the results are kept."""
     live = running(evedrop, server)
     ours = [pid for pid, command in with_mark(str(temporary(evedrop, "beta"))).items() if command.split()[-1] == "host"]
     above = [ours[0]]

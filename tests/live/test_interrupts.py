@@ -181,7 +181,7 @@ os.execv(sys.executable, [sys.executable, "-m", "evedrop", *sys.argv[1:]])
 
 
 def test_a_terminal_that_closes_ends_the_run(evedrop: Evedrop) -> None:
-    """The system hangs up on who runs in it, whose output goes nowhere any more: still 130, and whole results."""
+    """The terminal hangs up, and the output goes nowhere: the status is still 130, and the results are whole."""
     ours, theirs = pty.openpty()
     process = subprocess.Popen(
         [sys.executable, "-c", IN_TERMINAL, "run", "eavesdroppers", *ENDLESS, "--view", "off", "--out", "run"],

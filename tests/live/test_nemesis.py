@@ -1,4 +1,4 @@
-"""`[nemesis]`: what is wrong with one, all at once; what a right one comes to; and that nobody draws for anybody else."""
+"""`[nemesis]`: all mistakes at once; what a correct one does; and that each receiver has random draws of its own."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ BUSY = "import time\nwhile True:\n    pass\n"
 
 @pytest.mark.long
 def test_a_run_on_a_starved_machine_comes_to_its_end(evedrop: Evedrop) -> None:
-    """One processor for all its processes, at the lowest priority, beside six that never rest."""
+    """One processor for all its processes, at the lowest priority, shared with six processes that never rest."""
     loops = [subprocess.Popen(["taskset", "-c", "0", sys.executable, "-c", BUSY]) for _ in range(6)]
     try:
         command = ["taskset", "-c", "0", "nice", "-n", "10", sys.executable, "-m", "evedrop"]

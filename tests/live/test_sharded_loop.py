@@ -44,7 +44,7 @@ Ran = Callable[[int], Results]
 
 @pytest.fixture(scope="module")
 def ran(tmp_path_factory: pytest.TempPathFactory) -> Ran:
-    """The run in so many shards; in memory for 0."""
+    """The run in this number of shards; in memory for 0."""
     folder = tmp_path_factory.mktemp("loops")
     noon = part_of_day("microgrid", 43_200, SLOTS, **HOUSE)
     expect = [{"figure": "household.summed_difference", "above": 0.0}]

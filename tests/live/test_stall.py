@@ -106,7 +106,7 @@ RUNS = {
         ["sensor"],
     ),
 }
-"""What happens → places by report, what is answered, and who is silent."""
+"""What happens → the slots by report, the answers, and which processes are silent."""
 
 
 @pytest.mark.parametrize("what", RUNS)
@@ -164,7 +164,7 @@ def test_a_silent_process_is_named_after_the_patience_and_not_before() -> None:
 
 @pytest.mark.parametrize("how", ["held", "missing", "asleep", "joined"])
 def test_time_in_which_nobody_is_expected_to_do_anything_does_not_count(how: str) -> None:
-    """While the run is held or paused, somebody is cut off, this machine sleeps, or slots are joined, nobody is silent."""
+    """Nothing counts as silent while a run is held or paused, a process is cut off, the machine sleeps, or slots are joined."""
     run = Run(20.0)
     run.answers = {"eve": at(55)}
     run.wait(15.0)

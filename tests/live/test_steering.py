@@ -39,7 +39,7 @@ class Asked:
 
 @dataclass
 class Told:
-    """A conductor that keeps what it would send, and who is there."""
+    """A conductor that keeps the messages that it would send, and the processes that are present."""
 
     absent: set[str] = field(default_factory=set)
     away: set[str] = field(default_factory=set)
@@ -76,7 +76,7 @@ class Run:
         )
 
     def asks(self, do: str, reported: int = 0, **fields: Any) -> Asked:
-        """An operator asks for something while so many slots are reported."""
+        """An operator asks for something after this number of slots was reported."""
         asked = Asked()
         self.steering.take(Order(Request(do, **fields), asked), reported)  # type: ignore[arg-type]
         return asked
@@ -278,7 +278,7 @@ def test_a_step_within_a_step_is_refused() -> None:
 
 
 def test_a_pause_ends_a_step() -> None:
-    """The operator who stepped is told how far the run came; a hold where the step would have ended is passed over."""
+    """The operator of the step is told how far the run came; a hold where the step would have ended is skipped."""
     run = Run()
     stepped = run.asks("step", slots=10)
     run.holds(20)

@@ -28,7 +28,7 @@ CUTS = (300, 310)
 
 
 def beliefs(slots: int = SLOTS, trials: int = TRIALS) -> list[Belief]:
-    """Any beliefs, large and small ones beside each other."""
+    """Any beliefs, with large and small ones next to each other."""
     rng = np.random.default_rng(5)
     P = rng.standard_normal((slots, N, N, trials)) * np.exp(4.0 * rng.standard_normal((slots, 1, 1, trials)))
     x_hat, action = rng.standard_normal((slots, N, trials)), rng.integers(0, 4, (slots, trials), np.uint8)
@@ -78,7 +78,7 @@ def test_an_honest_receiver_passes(batch: int, recorded: int) -> None:
 
 
 def changed(place: int, **how: Callable[[Any], Any]) -> list[Report]:
-    """Reports of which one has other columns."""
+    """Reports, one of them with other columns."""
     made = reports(100)
     made[place] = replace(made[place], **{name: change(getattr(made[place], name)) for name, change in how.items()})
     return made
@@ -109,7 +109,7 @@ LIES = {
         "its sums of tr P",
     ),
 }
-"""What is not as it was → the reports, and what is said of them."""
+"""What was changed → the reports, and the expected message."""
 
 
 @pytest.mark.parametrize("what", LIES)
@@ -188,7 +188,7 @@ CLAIMS: dict[str, tuple[dict[str, Any], str]] = {
     "sent": ({"sent": np.ones((2, TRIALS), bool) & (np.arange(TRIALS) > 0)}, "sensor contradicts router: in slot 8 it says that "
              "1 trials sent nothing, but the journal says 0"),
 }  # fmt: skip
-"""What somebody claims against the journal → the columns, and what is said of it."""
+"""What a process claims against the journal → the columns, and the expected message."""
 
 
 def test_slots_in_which_all_say_the_same_pass() -> None:
@@ -218,7 +218,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "another shape": ({"x_hat": np.zeros((100, N, 3))}, "x_hat of 4800 bytes; expected 6400 bytes"),
     "more slots than a batch": ({"x_hat": np.zeros((301, N, 4))}, "c = 301; expected an integer c from 1 to 300"),
 }
-"""What is wrong with a report → its columns, and what is said of it."""
+"""What is wrong with a report → its columns, and the expected message."""
 
 
 @pytest.mark.parametrize("what", WRONG)
@@ -256,7 +256,7 @@ JOURNALS: dict[str, tuple[dict[str, Any], str]] = {
     "more bursts than packets": ({"bursts": np.full(COUNTED_BURSTS, 5, np.uint32)}, "bursts of 5; expected numbers from 0 to 4"),
     "more delays than packets": ({"delays": np.full(2, 3, np.uint32)}, "more delays than packets of eve; expected at most 4"),
 }  # fmt: skip
-"""What is wrong with a journal → the columns of its link, and what is said of it."""
+"""What is wrong with a journal → the columns of its link, and the expected message."""
 
 
 @pytest.mark.parametrize("what", JOURNALS)

@@ -1,4 +1,4 @@
-"""A scenario that is refused, and what is said of it."""
+"""A scenario that is refused, and the message."""
 
 from __future__ import annotations
 

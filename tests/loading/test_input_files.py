@@ -91,7 +91,7 @@ def test_a_path_with_a_zero_byte_is_refused() -> None:
 
 
 def bomb(path: Path, size: int, block: bytes) -> Path:
-    """A gz file that stands for so many bytes of a block again and again."""
+    """A gz file that expands to this number of bytes, a block repeated."""
     with gzip.open(path, "wb", compresslevel=1) as file:
         for part in chain([b"P_load [kW]\n"], repeat(block, size // len(block))):
             file.write(part)
@@ -173,7 +173,7 @@ def test_a_parquet_recording_of_one_long_text_is_refused(tmp_path: Path) -> None
 
 
 def test_lines_end_with_the_limit(tmp_path: Path) -> None:
-    """A file of just so many lines is read, and one more line is too many."""
+    """A file with exactly the largest number of lines is read, and one more line is too many."""
     path = tmp_path / "table.csv"
     path.write_text("a\n" * 10)
     assert list(lines_of(path, Limit(10, 20))) == ["a\n"] * 10

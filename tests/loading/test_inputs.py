@@ -232,7 +232,7 @@ def test_a_command_that_fails_leaves_no_empty_folder(evedrop: Evedrop) -> None:
 
 
 def test_every_refusal_is_of_the_tree() -> None:
-    """What cannot be read is no error of ours by itself: who asks for a file says what it is."""
+    """An unreadable file raises none of our errors by itself: the caller says what the file is."""
     assert not issubclass(Unreadable, EvedropError)
     checks: list[Callable[[], object]] = [lambda: load("\x00"), lambda: load("a" * 5000), lambda: load("/dev/null/x")]
     for check in checks:

@@ -73,7 +73,7 @@ def test_a_long_value_takes_time_that_grows_with_its_length() -> None:
 
 
 def test_what_is_inside_a_value_has_the_line_of_the_value() -> None:
-    """And what is nowhere has none."""
+    """An entry that is not in the file has no line."""
     lines = lines_of_entries(TEXT)
     assert line_of("event.1.y", lines) == 3
     assert line_of("link.1.loss.model", lines) == 11

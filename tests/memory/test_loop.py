@@ -335,7 +335,7 @@ def test_inputs_are_held_between_decisions(tmp_path: Path) -> None:
 
 
 def test_late_packets_are_followed_with_the_inputs(tmp_path: Path) -> None:
-    """A window that goes back over slots with inputs: without noise and disturbances, who knows these soon knows all."""
+    """A window that goes back over slots with inputs: without noise and disturbances, a receiver with them soon knows all."""
     link = {"quality": 0.9, "delay": {"model": "normal", "mean": 1.0, "deviation": 1.0}}
     late = {}
     for knows in (False, True):

@@ -35,7 +35,7 @@ UNSTABLE = [[1.0, 0.3], [0.5, 1.001]]
 
 
 def scenario(A: list[list[float]], slots: int, mu_d: float = 0.6, **eavesdroppers: dict[str, Any]) -> Scenario:
-    """A process with these receivers beside a legitimate link of quality 0.9, allowed beyond the horizon."""
+    """A process with these receivers and a legitimate link of quality 0.9, allowed beyond the horizon."""
     n = len(A)
     identity = [[1e-3 * (i == j) for j in range(n)] for i in range(n)]
     tables = {
@@ -340,7 +340,7 @@ def test_misled_receivers_believe_less_than_there_is(covariances: Results) -> No
 
 
 def test_error_coordinates_have_no_digest(tmp_path: Path) -> None:
-    """Squared errors beside theory, beyond the horizon of the ordinary mode; the horizon is not asked for."""
+    """Squared errors agree with theory beyond the horizon of the ordinary mode; the horizon is not checked."""
     changes: dict[str, Any] = {"encoding__state_probability": 0.9, "slots": 300}
     results = montecarlo("numerical", trials=20, plan=ERRORS, out=tmp_path / "run", **changes)
     assert results.summary["mode"] == "error-coordinates"

@@ -1,4 +1,4 @@
-"""Every scheme in a run: the same bits live and in memory, every packet accounted for, nobody told more than its part."""
+"""Every scheme in a run: the same bits live and in memory, every packet accounted for, no process told more than its part."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_live_and_memory_are_the_same_bits(scheme: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("scheme", RUNS)
 def test_who_is_given_what(scheme: str) -> None:
-    """Only the sensor holds what it alone needs; the router alone the way back; nobody but the sensor the leaks' states."""
+    """Only the sensor's brief has what only it needs, and the leaks' states; only the router's has the acknowledgements' link."""
     briefs = briefs_of(scenario_of(scheme), "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False))
     scenario = scenario_of(scheme)
     kind = scheme_of(scenario.process.process, scenario.encoding.spec)

@@ -71,7 +71,7 @@ def test_interrupting_keeps_what_is_done(evedrop: Evedrop, workers: int, number:
 
 
 def test_a_ctrl_c_in_the_terminal_reaches_the_workers_too(evedrop: Evedrop) -> None:
-    """The whole group gets the signal, workers that have just been born among them; nobody prints a traceback."""
+    """The whole group gets the signal, including workers that have just started; no process prints a traceback."""
     live = evedrop.started("montecarlo", "eavesdroppers", *ENDLESS, "--workers", "2", start_new_session=True)
     wait_until(lambda: crew_of(live), "a worker")
     os.killpg(live.process.pid, signal.SIGINT)
@@ -101,7 +101,7 @@ def test_a_killed_worker_is_said(evedrop: Evedrop) -> None:
 
 
 def test_workers_end_with_who_started_them(evedrop: Evedrop) -> None:
-    """Kill -9 of the command itself: the workers notice that nobody listens."""
+    """After kill -9 of the command itself, the workers notice that it is gone, and end."""
     live, _ = started(evedrop, 2)
     live.process.kill()
     live.process.communicate()

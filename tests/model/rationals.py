@@ -86,7 +86,7 @@ def congruent(A: Matrix, P: Matrix) -> Matrix:
 
 
 def rounded(M: Matrix, bits: int = _BITS) -> Matrix:
-    """Each entry to so many bits."""
+    """Each entry, rounded to this number of bits."""
     return [[_short(value, bits) for value in row] for row in M]
 
 
@@ -104,7 +104,7 @@ def remaining(Q: Matrix, sigma: Matrix) -> Matrix:
 
 
 def state_covariances(A: Matrix, Q: Matrix, initial: Matrix, bits: int = _BITS) -> Iterator[Matrix]:
-    """Σ_0, Σ_1 and so on, to so many bits."""
+    """Σ_0, Σ_1 and so on, rounded to this number of bits."""
     sigma = initial
     while True:
         yield sigma

@@ -93,7 +93,7 @@ def test_attacks_on_state_secrecy_codes_cost_what_theory_says(attack: str) -> No
 
 
 def simulated(chart: Chart, rate: float, trials: int, packets: int) -> np.ndarray:
-    """Packets until the alarm in each trial, by stepping the chart; `packets` where there is none."""
+    """Packets until the alarm in each trial, by stepping the chart; `packets` if no alarm is raised."""
     S, length = chart.start(trials), np.full(trials, packets)
     rng = np.random.default_rng(9)
     for k in range(packets):

@@ -202,7 +202,7 @@ def test_certain_types(mu_d: float) -> None:
 
 @pytest.mark.thorough
 def test_it_may_come_late_and_stays_itself() -> None:
-    """Slots 28 600 to 30 000 of the microgrid, by one who heard nothing before: it finds the state.
+    """Slots 28 600 to 30 000 of the microgrid, for a receiver that heard nothing before: it finds the state.
 
     Weights and P are in order, and the error is what it must be, 4.67e-5 within a fifth.
     """

@@ -164,7 +164,7 @@ class PickyNaive(Picky, Naive):
 
 
 class Quick(Naive):
-    """Takes blocks of its own, by what is known of the class: every packet is used."""
+    """Takes blocks by a method of its own that relies on a property of the class: every packet is used."""
 
     def follow(self, slots: range, belief: Belief, gamma: Flags, z: Floats) -> tuple[Beliefs, Belief]:
         """The state from every packet."""

@@ -1,4 +1,4 @@
-"""The stream cipher: the user reads everything, nobody else anything."""
+"""The stream cipher: the user reads everything, other receivers nothing."""
 
 from __future__ import annotations
 

@@ -205,7 +205,7 @@ def test_a_subclass_that_changes_a_packet_changes_blocks_too() -> None:
 
 
 def test_acknowledgements_reach_scheme_and_watch() -> None:
-    """Without a chart, nobody watches; with one, missing acknowledgements raise an alarm."""
+    """Without a chart, missing acknowledgements go unnoticed; with one, they raise an alarm."""
     everyone, nobody = np.ones(BATCH.trials, np.bool_), np.zeros(BATCH.trials, np.bool_)
     plain = sensor("plain")
     assert not plain.watches

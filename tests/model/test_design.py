@@ -195,7 +195,7 @@ def test_deaf_eavesdropper() -> None:
 
 
 def test_marginally_stable_process() -> None:
-    """For ρ = 1 every μ_d > 0 is admissible, nobody smart is ever kept out perfectly, and the ends are closed form."""
+    """For ρ = 1 every μ_d > 0 is admissible, secrecy from smart is never perfect, and the ends have closed forms."""
     found = design(MICROGRID, 0.6, 0.5, [smart(0.6)], slots=80)
     assert found.admissible == (0.0, 1.0)
     assert found.eavesdroppers["smart"].perfect is None

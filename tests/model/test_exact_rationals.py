@@ -109,7 +109,7 @@ def test_the_process_that_a_recursion_of_inverses_got_wrong() -> None:
 @settings(deadline=None, max_examples=examples(40))
 @given(models(), receivers)
 def test_expectations(model: Model, outcomes: Outcomes) -> None:
-    """Of each receiver, in each slot, and of what it believes."""
+    """The covariances of each receiver's error and belief, in each slot."""
     for one in (outcomes, outcomes.believed):
         expected = rationals.expectations(model.A, model.Q, model.initial, odds_of(one), SLOTS)
         found = expected_traces(model.process, one, SLOTS)

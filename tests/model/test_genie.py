@@ -97,7 +97,7 @@ def test_the_leak_by_triangularisation_is_the_leak(process: Process) -> None:
 
 @given(st.data())
 def test_leaks_in_order_are_computed_once(data: st.DataObject) -> None:
-    """Whatever number of slots is read at a time: a long live run reads them in blocks that nobody can foresee."""
+    """For any number of slots at a time: a long live run reads them in blocks of unpredictable lengths."""
     leaks, computed = Leaks(MIXED), list[int]()
     whole, original = Leaks(MIXED).block(range(1, 400)), StateFactors.block
 

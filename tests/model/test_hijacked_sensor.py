@@ -1,4 +1,4 @@
-"""A hijacked sensor: nobody can tell it from the honest one, and the eavesdropper that it serves gains."""
+"""A hijacked sensor: it looks like the honest one, and the eavesdropper that it serves gains."""
 
 from __future__ import annotations
 

@@ -172,7 +172,7 @@ def test_the_parsimonious_policy_is_the_posterior_of_an_attack() -> None:
 
 
 def test_the_parsimonious_policy_saves_watermark_and_still_detects() -> None:
-    """It marks few slots when nobody attacks, most from the attack to the alarm, and none afterwards."""
+    """It marks few slots without an attack, most from the attack to the alarm, and none afterwards."""
     run = simulated(0.3 * ONE, 400, 300, REPLACED, [(150, 400)], PARSIMONIOUS)
     marked, alarms = run.watermark[:, 0] != 0.0, run.first_alarms(0.999)
     assert marked[:150].mean() < 0.2
@@ -202,7 +202,7 @@ def test_a_trial_is_the_same_alone() -> None:
 
 
 def test_a_clipped_watermark_counts_as_far_as_it_enters() -> None:
-    """The detector is told of what the plant's limits leave of it."""
+    """The detector gets the part of it that the plant's limits leave."""
     inf, none = np.array([np.inf]), np.zeros((1, 0))
     plant = Plant(ONE, none, ONE, np.zeros(1), np.array([-1.0]), np.array([1.0]), -inf, inf)
     entered = plant.entering(np.array([[0.5, 0.9, 2.0]]), np.array([[0.25, 0.4, -0.5]]))

@@ -205,7 +205,7 @@ def test_when_it_climbs() -> None:
     ],
 )
 def test_mistakes_in_its_parameters(given: dict[str, Any], entry: str, message: str) -> None:
-    """Names that nothing has, and numbers of slots that are none."""
+    """Unknown names, and invalid numbers of slots."""
     (found,) = LearningEm.mistakes(given)
     assert found[0] == entry
     assert found[1].startswith(message)

@@ -196,7 +196,7 @@ def test_a_delegate_tells_what_its_reader_has_learned() -> None:
     ],
 )
 def test_mistakes_in_its_parameters(given: dict[str, Any], entry: str, message: str) -> None:
-    """Names that nothing has, and numbers of particles that are none."""
+    """Unknown names, and invalid numbers of particles."""
     (found,) = LearningParticle.mistakes(given)
     assert found[0] == entry
     assert found[1].startswith(message)

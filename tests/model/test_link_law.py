@@ -83,7 +83,7 @@ def test_links_that_change() -> None:
 
 
 def test_a_quality_that_differs_from_slot_to_slot() -> None:
-    """A link whose ends move apart, by what the model says of every slot."""
+    """A link whose ends move apart, by the model's probability for every slot."""
     moving = {
         "model": "distance",
         "sender": [0.0, 0.0],

@@ -90,7 +90,7 @@ def test_fates_are_those_of_the_textbook(
 
 
 def test_uniforms_that_are_zero_are_fates_too() -> None:
-    """The least of all numbers: no power at all, which is lost, beside the least shadowing."""
+    """The smallest random number gives no power at all, which is a loss, and the least shadowing."""
     assert loss_of({**STANDS, **SHADOWED}).fates(0, np.zeros((1, 2, 1))).tolist() == [[Fate.LOST]]
 
 
@@ -158,7 +158,7 @@ def test_blocks_that_do_not_nest_have_a_bound() -> None:
 
 
 def test_the_mean_quality_is_that_of_the_walk() -> None:
-    """Of one who stands it is that of every slot; of one who walks that of the slots up to the last waypoint."""
+    """Of a receiver at rest it is that of every slot; of a moving one, that of the slots up to the last waypoint."""
     for spec, slots in ((STANDS, 1), (WALKS, 91)):
         loss = loss_of({**spec, **SHADOWED})
         assert loss.quality == pytest.approx(float(loss.quality_at(range(slots)).mean()), rel=1e-12)

@@ -1,4 +1,4 @@
-"""Partial encryption: its packets, its user, the exact reader of what is in clear, and what theory knows of that reader."""
+"""Partial encryption: its packets, its user, the exact reader of the packets in clear, and the theory of that reader."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def scheme(process: Process, encrypted: list[int], mu_d: float) -> PartialEncryp
 
 
 def reader_of(process: Process, batch: Batch) -> Receiver:
-    """The reader of what is in clear."""
+    """The reader of the packets in clear."""
     return READERS[READER](Knowledge(process, 1.0, {}, {}), batch)
 
 

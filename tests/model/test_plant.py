@@ -1,4 +1,4 @@
-"""The plant and who steers it, held against plain linear algebra."""
+"""The plant and its controllers, compared with plain linear algebra."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def assignment(A: np.ndarray, of: Plant, period: int = 1, rate: float = 0.0, lim
 @pytest.mark.parametrize("rate", [0.0, 0.5])
 @pytest.mark.parametrize("seed", range(3))
 def test_the_gain_is_that_of_the_riccati_equation(seed: int, rate: float, period: int) -> None:
-    """Against scipy, over the state with the inputs before beside it, for random systems and held inputs."""
+    """Against scipy, on the state augmented by the previous inputs, for random systems and held inputs."""
     random = np.random.default_rng(seed)
     n, m = 3, 2
     A = random.normal(size=(n, n)) if period == 1 else np.eye(n) + 0.1 * random.normal(size=(n, n))
@@ -165,7 +165,7 @@ def test_a_semidefinite_matrix_is_factored() -> None:
 
 
 def test_a_plant_survives_its_brief() -> None:
-    """Numbers, and limits that are none, come back from what is written into a brief."""
+    """Numbers, and absent limits, come back from the text of a brief."""
     of = plant(input_lower=np.array([-1.0, -np.inf]), disturbance_matrix=np.ones((2, 3)))
     again = PlantEntry.of(of).plant
     assert all(np.array_equal(getattr(of, name), getattr(again, name)) for name in Plant.__dataclass_fields__)

@@ -79,7 +79,7 @@ def test_what_double_precision_cannot_decide_is_refused() -> None:
 
 
 def test_a_range_within_rounding_of_all_states_is_seen() -> None:
-    """With a growing mode beside one that noise never reaches, the reach of rounding becomes that of the states."""
+    """With a growing mode and one that noise never reaches, the reach of rounding becomes that of the states."""
     process = process_of([[2.0, 0.0], [0.0, 0.5]], [[1.0], [0.0]])
     near = process_of([[2.0, 0.0], [1.5, 0.5]], [[1.0], [1.0]])
     for one, blurred in ((process, False), (near, True)):
@@ -93,7 +93,7 @@ def test_a_range_within_rounding_of_all_states_is_seen() -> None:
 
 
 def test_the_part_of_a_noise_outside_the_range_is_measured() -> None:
-    """0 for the range of Q itself, and the share of what leaves it."""
+    """0 for the range of Q itself, and the share of a matrix that is outside this range."""
     stairs = Staircase(PROCESSES["sampled force"])
     G = PROCESSES["sampled force"].noise_factor[:, :1]
     assert stairs.outside(G).max() < 1e-15

@@ -18,7 +18,7 @@ MARGINAL = Process(np.array([[1.0, 0.1], [0.0, 1.0]]), Q, Q)  # a large Σ0 surv
 
 
 def agrees(samples: Floats, expected: Floats) -> bool:
-    """Whether means over trials (the last axis) are within five standard errors of what is expected."""
+    """Whether means over trials (the last axis) are within five standard errors of the expected values."""
     error = samples.std(axis=-1, ddof=1) / np.sqrt(samples.shape[-1])
     return bool(np.all(np.abs(samples.mean(axis=-1) - expected) <= 5.0 * error + 1e-15))
 

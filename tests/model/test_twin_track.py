@@ -158,7 +158,7 @@ def test_an_estimator_that_begins_later_knows_the_start() -> None:
 
 
 def test_the_floor_grows_where_the_powers_of_the_process_do() -> None:
-    """Half of what is not known of x_0; of an unstable or drifting process it has no bound."""
+    """Half of the uncertainty of x_0; for an unstable or drifting process it has no bound."""
     for process, grows in ((UNSTABLE, True), (STABLE, False), (Process(np.eye(2), np.eye(2), np.eye(2)), False)):
         floor, without_bound = TwinTrack(process).error_floor(5)
         assert np.allclose(floor, [0.5 * np.trace(spread(process, k)) for k in range(5)], rtol=1e-12)

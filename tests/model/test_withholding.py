@@ -1,4 +1,4 @@
-"""Withholding: what is not sent nobody has."""
+"""Withholding: no receiver has the packets that are not sent."""
 
 from __future__ import annotations
 

@@ -70,7 +70,7 @@ def heard(
 
 
 def trimmed(outcomes: Outcomes) -> list[int]:
-    """From the first to the last delivered: nobody can see what was lost before or after."""
+    """From the first to the last delivered message: losses before and after cannot be seen."""
     places = np.flatnonzero(outcomes)
     found: list[int] = outcomes[places[0] : places[-1] + 1].tolist()
     return found

@@ -114,7 +114,7 @@ def test_a_recorder_that_counts_by_itself_shows_no_loss(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("offset", [0, 1000])
 def test_two_publishers_in_one_channel_are_refused(tmp_path: Path, offset: int) -> None:
-    """rosbag2 keeps one channel for a topic, so the numbers of its publishers are mixed: they cannot be told apart."""
+    """rosbag2 keeps one channel for a topic, so the numbers of its publishers are mixed and cannot be separated."""
     one = heard(lossy(BURSTS, 500))
     other = [(number + offset, sent + 0.03, logged + 0.03) for number, sent, logged in heard(lossy(BURSTS, 500, 2))]
     both = sorted([*one, *other], key=lambda message: message[2])
@@ -130,7 +130,7 @@ def test_two_publishers_in_one_channel_are_refused(tmp_path: Path, offset: int) 
 
 
 def test_what_was_kept_for_late_subscribers_is_left_out(tmp_path: Path) -> None:
-    """A message of transient-local durability from long before the recording is no sign of losses."""
+    """A message of transient-local durability from long before the recording is not taken for losses."""
     messages = [(1, -3600.0, 0.0), *heard(lossy(BURSTS, 500), first=36_001)]
     found = mcap_recording(write(tmp_path / "bag.mcap", [Recorded("/map", messages)]))
     assert len(found.series.outcomes) <= 500

@@ -1,4 +1,4 @@
-"""The numbers of messages that arrived: which were lost, came late or twice, and what is not a loss."""
+"""The numbers of messages that arrived: which were lost, came late or twice, and which gaps are not losses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Disturbances from a file: what is read, and what is said of a file that cannot be."""
+"""Disturbances from a file: what is read, and the messages about a file that cannot be read."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_a_day_is_read(tmp_path: Path, text: str, name: str) -> None:
 
 
 def test_slots_may_last_longer(tmp_path: Path) -> None:
-    """Times advance by what a slot lasts, which need not be a binary fraction."""
+    """Times advance by the length of a slot, which need not be a binary fraction."""
     rows = "".join(f"{0.1 * k:.1f},1,2\n" for k in range(1000))
     path = write(tmp_path, f"time [s],P_solar [kW],P_load [kW]\n{rows}")
     assert len(read_disturbances(path, NAMES, UNITS, 1000, 0.1)) == 1000
@@ -114,7 +114,7 @@ def test_what_is_no_file_is_said(tmp_path: Path, name: str, content: bytes | Non
 
 
 def test_without_units_in_the_scenario_none_are_asked_for(tmp_path: Path) -> None:
-    """Numbers are taken as they are, with or without a unit beside the name; lines that begin with # are passed over."""
+    """Numbers are taken as they are, with or without a unit after the name; lines that begin with # are skipped."""
     path = write(tmp_path, "# measured\nP_load [W], P_solar\n7, 8\n# a pause\n9, 10\n")
     assert read_disturbances(path, NAMES) == [[8.0, 7.0], [10.0, 9.0]]
 

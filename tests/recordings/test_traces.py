@@ -166,7 +166,7 @@ def test_a_mistake_of_a_scenarios_trace_is_named(tmp_path: Path, loss: dict[str,
 
 
 def test_mistakes_of_recordings_hide_no_others(tmp_path: Path) -> None:
-    """Two recordings that are none and an entry that is wrong: three lines."""
+    """Two files that are not recordings and a wrong entry: three lines."""
     eve = {"strategy": "smart", "link": {"loss": {"model": "trace", "file": "other.csv", "once": True}}}
     found = mistakes(tmp_path, {"model": "trace", "file": "walk.csv"}, eavesdroppers={"eve": eve}, slots=0)
     assert sorted(line.partition(":")[0] for line in found) == [
@@ -175,7 +175,7 @@ def test_mistakes_of_recordings_hide_no_others(tmp_path: Path) -> None:
 
 
 def test_a_run_needs_its_recording_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Read beside the scenario, kept in the results; repeated from there without the file, to the same digests."""
+    """It is read from the scenario's folder and kept in the results; a run from there needs no file and has the same digests."""
     write(tmp_path, "walk.csv", "t,ok\n0,1\n1,0\n2,1\n")
     loss = {"model": "trace", "file": "walk.csv", "column": "ok", "random_start": True}
     write(tmp_path, "mine.toml", tomli_w.dumps({**GOOD, "legitimate": {"link": {"loss": loss}}}))
@@ -190,7 +190,7 @@ def test_a_run_needs_its_recording_once(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_a_change_names_a_recording_of_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The scenario's own recording is beside it, one that a change names is where the user is."""
+    """The scenario's own recording is in its folder; one that a change names is relative to the user's current folder."""
     (tmp_path / "here").mkdir()
     write(tmp_path, "walk.csv", "1\n")
     write(tmp_path / "here", "walk.csv", "0\n1\n")

@@ -39,7 +39,7 @@ from tests.examples import examples
 from tests.pages import Checked, checked
 
 HOSTILE = "<script>alert('&amp;')</script>\"></title>"
-"""A title by somebody who wants the page to do something else."""
+"""A title that tries to inject code into the page."""
 QUICK: dict[str, Any] = {"slots": 60, "plan": Plan(workers=1)}
 
 

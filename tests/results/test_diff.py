@@ -160,7 +160,7 @@ OTHER = {
         "has empty cells in slot",
     ),
 }
-"""What was done to a table → which table, how, and what is said of it."""
+"""What was done to a table → which table, how, and the expected message."""
 
 
 @pytest.mark.parametrize("what", OTHER)

@@ -137,7 +137,7 @@ def test_briefs_are_private(evedrop: Evedrop) -> None:
 
 
 def test_an_empty_folder_is_narrowed(tmp_path: Path) -> None:
-    """An empty folder that everybody may look into is taken, and then nobody else may."""
+    """An empty folder that all users can read is accepted, and from then on only its owner can."""
     tmp_path.chmod(0o777)
     new_folder(tmp_path)
     assert open_to_others(tmp_path) == {}

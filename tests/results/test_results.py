@@ -125,6 +125,6 @@ def test_rows_that_come_at_once_are_parted(monkeypatch: pytest.MonkeyPatch, tmp_
 
 
 def test_a_summary_is_replaced_as_a_whole(results: Results) -> None:
-    """No half-written summary can be read, and none is left beside it."""
+    """A half-written summary can never be read, and no temporary file is left."""
     assert [path.name for path in results.folder.glob("summary*")] == ["summary.json"]
     assert load_results(str(results.folder)).summary == results.summary

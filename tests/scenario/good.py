@@ -1,4 +1,4 @@
-"""A scenario without a mistake, and what is said of it with one."""
+"""A scenario without mistakes, and the messages if it has one."""
 
 from __future__ import annotations
 

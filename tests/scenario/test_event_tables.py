@@ -117,7 +117,7 @@ def test_a_wrong_event_is_named(name: str) -> None:
 
 
 def test_all_wrong_events_are_named_at_once() -> None:
-    """A line for each, beside mistakes of other tables."""
+    """A line for each, among mistakes of other tables."""
     found = mistakes(
         {"at": 100, "cut": "eve"},
         {"at": 1, "kill": "nobody"},
@@ -274,7 +274,7 @@ def test_an_expectation_that_events_leave_without_theory_is_refused(
     ],
 )
 def test_who_is_told_a_state_must_be_there(event: dict[str, Any], away: str | None) -> None:
-    """A slot in which it is down or paused is a mistake; a link that is cut is none, for it is not told over that."""
+    """A slot in which it is down or paused is a mistake; a cut link is not, because the state does not arrive over it."""
     spy = {"strategy": "replay-informed", "reads_as": "naive", "learns_at": 15, "link": {"quality": 0.8}}
     if away is None:
         assert right(event, eavesdroppers={"spy": spy}).leaks == {"spy": 15}

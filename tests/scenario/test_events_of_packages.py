@@ -106,7 +106,7 @@ FAILING = {
         "event.0.dim: cannot be checked: Dim raised ValueError: no, dimming.py line 15",
     ),
 }
-"""What fails → the line of the module, what stands there instead, and what is said."""
+"""What fails → the line of the module, its replacement, and the expected message."""
 
 
 @pytest.mark.parametrize("case", FAILING)
@@ -133,7 +133,7 @@ def test_an_event_that_names_nobody_is_a_mistake(evedrop: Evedrop) -> None:
 
 
 def test_an_event_that_cannot_be_loaded_is_a_mistake_of_who_uses_it(evedrop: Evedrop) -> None:
-    """With the reason, beside the scenario's other mistakes; scenarios without it do not notice."""
+    """It is refused with the reason, among the scenario's other mistakes; scenarios without it still run."""
     environment = with_package(evedrop, "import nothing_of_this_name\n")
     (evedrop.folder / "dim.toml").write_text(SCENARIO.replace("slots = 60", "slots = -1"))
     (evedrop.folder / "bright.toml").write_text(SCENARIO.replace('{ at = 20, dim = "smart" }, ', ""))

@@ -90,7 +90,7 @@ def test_a_mistake_of_an_expectation_is_named(expectation: dict[str, Any], said:
 
 
 def test_all_mistakes_of_expectations_are_named_at_once() -> None:
-    """Those of several tables, and of one table whose entries are wrong by themselves, together, and beside the rest."""
+    """Mistakes of several tables, and of one table with wrong entries and wrong combinations, are reported together."""
     found = mistakes(
         {"figure": "smart.mean_eror", "near": 1, "slots": [3, 99], "quantile": 2.0},
         {"secrecy": "relative", "against": "nobody", "by": 3},

@@ -163,7 +163,7 @@ def test_a_recording_is_enough_for_other_schemes_and_for_covariances(tmp_path: P
 
 
 def test_the_scenarios_of_a_comparison_can_be_run(tmp_path: Path) -> None:
-    """They name the file of states beside them."""
+    """They name the file of states in their folder."""
     scenario = checked(tables({"source": "file", "state_values": ROWS}), "file")
     found = compare(scenario, schemes=["plain"], adversaries=["naive"], trials=2, out=tmp_path, plan=Plan(workers=1))
     cell = found.cell("plain", "naive").eavesdropper

@@ -82,7 +82,7 @@ def test_an_eavesdropper_knows_the_law_of_the_noise_and_no_more() -> None:
 
 
 def test_theory_covers_those_that_take_noise_behind_independent_losses() -> None:
-    """It has a limit; behind bursts there is none, and those that tell types apart are bounded by smart."""
+    """It has a limit; with bursts it has none, and receivers that can tell the types of packets are bounded by smart."""
     link = {"quality": 0.8}
     bursts = {"loss": {"model": "gilbert-elliott", "p": 0.1, "r": 0.4}}
     eavesdroppers = {

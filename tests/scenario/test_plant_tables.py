@@ -268,7 +268,7 @@ CSV = "# a day\nP_load [kW],other,P_solar [kW]\n0.4,x,0\n0.4,x,0.5\n0.1,x,0.25\n
 
 
 def scenario_file(folder: Path, text: str = CSV) -> Path:
-    """A scenario file whose disturbances are beside it."""
+    """A scenario file with its disturbances in the same folder."""
     import tomli_w
 
     tables = changed(plant__disturbance_values=None, plant__disturbance_file="day.csv")
@@ -314,14 +314,14 @@ def test_a_file_that_will_not_do_is_told(text: str, what: str, tmp_path: Path) -
 
 
 def test_what_may_never_end_is_not_read(tmp_path: Path) -> None:
-    """A pipe that nobody writes to is refused at once."""
+    """A pipe without a writer is refused at once."""
     os.mkfifo(tmp_path / "pipe.csv")
     (mistake,) = mistakes(plant__disturbance_values=None, plant__disturbance_file=str(tmp_path / "pipe.csv"))
     assert "pipe.csv cannot be read (it is a pipe or a device, not a file); expected a CSV file" in mistake
 
 
 def test_a_file_that_is_not_there_is_told() -> None:
-    """And so is one beside the numbers themselves."""
+    """A file is refused, too, if the numbers themselves are also given."""
     missing = mistakes(plant__disturbance_values=None, plant__disturbance_file="none.csv")
     assert len(missing) == 1
     assert missing[0].startswith(

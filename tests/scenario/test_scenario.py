@@ -98,7 +98,7 @@ def test_a_missing_entry_is_named(entry: str) -> None:
 
 
 def test_an_uncontrollable_pair_is_named() -> None:
-    """Noise that never reaches a direction of the state is no process of this project."""
+    """A process with noise that never reaches a direction of the state is refused."""
     found = mistakes({"process.A": [[1.0, 0.0], [0.0, 1.0]], "process.Q": [[1.0, 0.0], [0.0, 0.0]]})
     assert any("not controllable: the noise reaches 1 of 2 directions" in line for line in found)
 
@@ -138,7 +138,7 @@ def test_all_mistakes_are_named_at_once() -> None:
 
 
 def test_an_expectation_on_what_theory_does_not_know_is_refused() -> None:
-    """Behind a queue nobody knows the expected trace, so nothing can be asked of it; of its other figures something can."""
+    """Behind a queue the expected trace is unknown, so expectations of it are refused; those of other figures are not."""
     queue = {"eavesdroppers.smart.link": {"quality": 0.9, "rate": 0.5}}
     expect = [
         {"figure": f"smart.{figure}", "below": 1.0} for figure in ("received_fraction", "expected_trace_covariance")
@@ -224,7 +224,7 @@ def test_values_on_the_command_line_are_toml_or_text(value: Any) -> None:
 
 @pytest.mark.parametrize("name", sorted(shipped()))
 def test_the_resolved_scenario_is_the_same_scenario(name: str, tmp_path: Path) -> None:
-    """What a results folder keeps reads back as what was run, with the versions beside it."""
+    """The scenario in a results folder reads back as the one that was run, with the versions next to it."""
     scenario = load(name, {"slots": 7200} if name.startswith("microgrid") else None)
     write_resolved(tmp_path, scenario)
     text = (tmp_path / "scenario.toml").read_text(encoding="utf-8")

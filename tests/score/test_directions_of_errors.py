@@ -31,7 +31,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> Results:
 
 
 def test_the_error_in_a_direction_is_that_of_its_sum(found: Results) -> None:
-    """From the recorded rows, with the textbook's standard error, and theory beside it."""
+    """Computed from the recorded rows, with the textbook's standard error, and compared with theory."""
     scenario = load("partial-encryption", SOME)
     process: Process = scenario.process.process
     weights = scenario.process.directions_as_arrays

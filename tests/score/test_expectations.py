@@ -71,7 +71,7 @@ def of_trials(results: Results, receiver: str) -> dict[str, Any]:
 
 
 def test_live_and_memory_agree_on_every_expectation(made: Runs) -> None:
-    """To the last bit, but for sums over all slots, and the believed trace, of which a live run has the sum over trials."""
+    """To the last bit, except for sums over all slots, and for the believed trace, which a live run sums over trials."""
     live, memory = (made(where).summary["expectations"] for where in ("live", "memory"))
     assert len(live) == len(OPTIONS["expect"])
     for one, other in zip(live, memory, strict=True):

@@ -146,7 +146,7 @@ FAILING = {
     "no trials": (TRIALS, "def of_each_trial(self)", "of_trials gave None; expected an array of 4 numbers"),
     "no tally": (TALLY, "return None", "tally() gave None; expected a FigureTally"),
 }
-"""What fails → the line of the module, what stands there instead, and what is said."""
+"""What fails → the line of the module, its replacement, and the expected message."""
 
 
 @pytest.mark.parametrize("case", FAILING)

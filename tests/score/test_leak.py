@@ -1,4 +1,4 @@
-"""The leak in bits of a run: what is counted, beside theory, and where it is not known."""
+"""The leak in bits of a run: what is counted, compared with theory, and where it is not known."""
 
 from __future__ import annotations
 

@@ -131,7 +131,7 @@ def test_infinite_variance_leaves_only_counts_a_standard_error() -> None:
 
 
 def test_a_covariance_only_study_has_the_z_of_its_own_figure() -> None:
-    """The mean actual trace stands beside theory; there is no squared error."""
+    """The mean actual trace is compared with theory; there is no squared error."""
     scenario = load("eavesdroppers", {"slots": 50, "trials": 20, "expect": []})
     peer = summary_of_study(scenario, mode=Mode.COVARIANCE_ONLY).peers["smart"]
     error, z = peer.standard_errors["mean_actual_trace_covariance"], peer.z["mean_actual_trace_covariance"]

@@ -176,7 +176,7 @@ def test_perfect_secrecy_is_not_claimed_where_theory_denies_it() -> None:
 
 
 def test_theory_of_relative_secrecy_needs_a_worse_eavesdropper() -> None:
-    """An eavesdropper with a perfect link beside a poor one is better off, and theory says so."""
+    """An eavesdropper with a perfect link is better off than a user with a poor one, and theory says so."""
     user, other = tally(around(0.001)), tally(around(0.002))
     expected = expectation(good(0.3), 0.9), expectation(good(1.0), 0.9, (1.0, 0.0))
     assert not secrecy((user, expected[0]), ("eve", other, expected[1])).relative_by_theory

@@ -1,4 +1,4 @@
-"""Comparisons: who meets whom, on which losses, what is said of it, and the numbers of the literature."""
+"""Comparisons: which schemes meet which adversaries, with which losses and verdicts, and the numbers of the literature."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ Everything = tuple[Comparison, Path]
 
 @pytest.fixture(scope="module")
 def everything(tmp_path_factory: pytest.TempPathFactory) -> Everything:
-    """All schemes against all adversaries beside a marginally stable process, by two workers, and the folder."""
+    """All schemes against all adversaries with a marginally stable process, by two workers, and the folder."""
     folder = tmp_path_factory.mktemp("compare") / "run"
     return compare("bayesian", out=folder, plan=Plan(workers=2), **MARGINAL), folder
 

@@ -82,7 +82,7 @@ def test_what_a_measuring_sensor_cannot_use_is_left_out() -> None:
 
 
 def test_all_wrong_names_are_told_at_once(evedrop: Evedrop) -> None:
-    """Exit 2, every name that is none, and what there is."""
+    """Exit 2, every unknown name, and the names that exist."""
     options = ("--schemes", "cypher,plain", "--adversaries", "smrt", "--with", "innovation.mu_d=0.7")
     done = evedrop("compare", "numerical", *options)
     assert (done.status, done.out) == (2, "")

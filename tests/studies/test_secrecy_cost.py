@@ -22,7 +22,7 @@ OTHERS: dict[str, Any] = {"eavesdroppers": {}, "expect": []}
 
 
 def grid_powers(folder: Path, **changes: Any) -> Floats:
-    """The grid power of every slot and trial of a study of its own, (slots, trials), by what the plant does."""
+    """The grid power of every slot and trial of a separate study, (slots, trials), recomputed from the plant."""
     options = {"slots": SLOTS, "trials": TRIALS, "record_trials": TRIALS, "first_trial": 2, **OTHERS, **changes}
     results = montecarlo("microgrid", out=folder, plan=Plan(workers=1), **options)
     assert results.inputs is not None

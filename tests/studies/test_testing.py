@@ -1,4 +1,4 @@
-"""Scenarios as tests: by `evedrop test` and by pytest, what passes, what is said of the rest, and what CI reads."""
+"""Scenarios as tests: by `evedrop test` and by pytest, what passes, the messages about the rest, and what CI reads."""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ def test_formulas_are_shown_as_printed_and_corrected(report: Path) -> None:
 
 
 def test_captions_state_the_size(report: Path) -> None:
-    """What was simulated, how often, and how sure it is stands beside the figure."""
+    """The figure says what was simulated, how often, and how precise the result is."""
     text = report.read_text(encoding="utf-8")
     assert "mean over 1000 slots of one second and 20 trials" in text
     assert "400 trials of the real model" in text

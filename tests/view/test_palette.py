@@ -1,4 +1,4 @@
-"""The colours of a panel can be told apart, also by the colour-blind. Vision and distance are the library coloraide's."""
+"""The colours of a panel can be distinguished, also by the colour-blind. Vision and distance are the library coloraide's."""
 
 from __future__ import annotations
 

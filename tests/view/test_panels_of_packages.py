@@ -127,7 +127,7 @@ BROKEN = {
         ": ValueError: assignment destination is read-only, broken_writes.py",
     ),
 }  # fmt: skip
-"""What a panel of a package does wrong → its class, and what is said."""
+"""What a panel of a package does wrong → its class, and the expected message."""
 
 
 def install_broken(site: Path) -> None:

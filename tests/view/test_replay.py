@@ -41,7 +41,7 @@ def test_recording_of_a_study_holds_its_curves(study: Path) -> None:
 @pytest.mark.parametrize("live", [False, True], ids=["memory", "live"])
 @pytest.mark.parametrize("scheme", ["scheduled", "withholding"])
 def test_silence_is_shown_as_silence(scheme: str, live: bool, tmp_path: Path) -> None:
-    """In the lane of what was sent and in every receiver's, and nowhere else: as the tables have it."""
+    """In the sensor's lane and in every receiver's, and nowhere else: as the tables have it."""
     changes: dict[str, Any] = {"encoding": {"scheme": scheme, "threshold": 3}, "eavesdroppers": EVE, "slots": SLOTS}
     if scheme == "withholding":
         changes["encoding"] = {"scheme": scheme, "state_probability": 0.5}
@@ -87,7 +87,7 @@ OTHER: dict[str, tuple[str, Callable[[pa.Table], pa.Table], str]] = {
 
 @pytest.mark.parametrize("what", OTHER)
 def test_tables_that_do_not_fit_are_refused(what: str, study: Path, tmp_path: Path) -> None:
-    """A table of another version, one cut short, and words that nobody knows: one line, and no recording is left."""
+    """A table of another version, one cut short, and unknown words: one line, and no recording is left."""
     name, change, said = OTHER[what]
     folder = tmp_path / "run"
     shutil.copytree(study, folder, ignore=shutil.ignore_patterns("*.rrd"))
@@ -99,7 +99,7 @@ def test_tables_that_do_not_fit_are_refused(what: str, study: Path, tmp_path: Pa
 
 
 def test_another_process_is_refused(study: Path, tmp_path: Path) -> None:
-    """The tables of two states beside a scenario of one: a line at once, where a recording would never be finished."""
+    """Tables of two states with a scenario of one: the message comes at once; a recording would never be finished."""
     one: dict[str, Any] = {"process__A": [[1.0]], "process__Q": [[1e-3]], "process__initial_covariance": [[1.0]]}
     folder = montecarlo("eavesdroppers", trials=2, slots=SLOTS, out=tmp_path / "run", **one).folder
     shutil.copy(study / "trials.parquet", folder)

@@ -255,7 +255,7 @@ def port_of(pid: int) -> int:
 
 
 def test_a_pipe_gets_the_recording_as_it_grows(tmp_path: Path) -> None:
-    """From its beginning to its end, whenever the file is made; who stops reading holds up nobody."""
+    """From its beginning to its end, whenever the file is made; a reader that stops holds up no other."""
     followed = Followed(tmp_path / "r.rrd")
     reading, writing = os.pipe()
     feed(followed, os.fdopen(writing, "wb", buffering=0))
@@ -335,7 +335,7 @@ def test_viewer_that_cannot_start_says_why(tmp_path: Path) -> None:
 def test_faulty_viewer_changes_nothing(
     fault: str, simulated: Callable[..., Simulated], viewer: Viewer, tmp_path: Path
 ) -> None:
-    """A viewer that hangs, dies or reads nothing of what it asked for holds up no slot, and the file is complete."""
+    """A viewer that hangs, dies or does not read what it asked for holds up no slot, and the file is complete."""
     run = simulated(SLOTS)
     run = replace(run, scene=replace(run.scene, run=fault))
     recording = ViewRecording(tmp_path / "r.rrd", run.scene)

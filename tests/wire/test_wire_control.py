@@ -73,7 +73,7 @@ def test_a_wire_is_steered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
 
 
 def test_what_cannot_be_done_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Every mistake has a line, exit status 2, and nothing is changed; nobody without the password is answered."""
+    """Every mistake has a line, exit status 2, and nothing is changed; commands without the password get no answer."""
 
     def refused(*words: str) -> str:
         assert main([words[0], str(tmp_path), *words[1:]]) == 2

@@ -60,7 +60,7 @@ def test_the_example() -> None:
 
 
 def test_everything_that_a_file_can_have(tmp_path: Path) -> None:
-    """Each entry arrives in the plan, and in the resolved file; files are found beside the wire file."""
+    """Each entry arrives in the plan, and in the resolved file; files are found relative to the wire file."""
     (tmp_path / "walk.csv").write_text("1\n0\n1\n1\n")
     text = """
     seed = 11

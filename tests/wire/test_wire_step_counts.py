@@ -73,7 +73,7 @@ def test_every_message_is_counted_once(found: list[list[tuple[float, int, int]]]
 
 
 def test_a_silence_takes_little() -> None:
-    """After ten days without a message, a few steps are given, of which the last is the one before the next message."""
+    """After ten days without a message, a few steps are given, the last of them just before the next message."""
     rows = np.zeros(2, RECORD)
     rows["time"] = START, START + 864_000.0
     steps = counted([rows])

@@ -64,7 +64,7 @@ class IntegrityFeed(PanelFeed):
 
 @final
 class Integrity(Application):
-    """A watermark, an attack on the measurements, and the detector beside the sensor's filter."""
+    """A watermark, an attack on the measurements, and the detector that tests the sensor's filter."""
 
     table = IntegrityTable
     names = {}  # noqa: RUF012 - declared so by the base class
@@ -156,7 +156,7 @@ class Integrity(Application):
 
 
 def _theory(law: WatermarkedLoop, table: IntegrityTable, covariance: Floats) -> WatermarkTheory:
-    """The closed forms against the attack; against a replay if there is none."""
+    """The closed forms against the attack; against a replay if the table has no attack."""
     described = table.described_attack
     if described is None:
         return WatermarkTheory.of(law, Replay(1), covariance)
@@ -183,7 +183,7 @@ def _objections(loop: ControlledPlant, table: IntegrityTable) -> Iterator[str]:
         yield 'controller.strategy: has no fixed gain, which the laws of integrity need; expected strategy = "lqr"'
         return
     if loop.on_truth:
-        yield 'controller.acts_on: is "truth", so that false measurements deceive nobody; expected acts_on = "estimate"'
+        yield 'controller.acts_on: is "truth", so false measurements would mislead no controller; expected acts_on = "estimate"'
     if loop.period != 1:
         yield f"controller.period: is {loop.period}, but the laws of integrity assume a decision in every slot; expected 1"
     if assignment.rate_weights.any():

@@ -26,7 +26,7 @@ def means(values: Floats, window: int) -> Floats:
 
 
 def active(load: Floats, window: int, threshold: float) -> Flags:
-    """Whether the house is active in each window, (windows,); load: (slots,) in kW, as is the threshold."""
+    """Whether the house is active in each window, (windows,); load: (slots,), in kW like the threshold."""
     return np.greater_equal(means(load, window), threshold)
 
 

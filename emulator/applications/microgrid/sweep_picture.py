@@ -57,7 +57,7 @@ def draw(path: Path, table: pa.Table, key: str) -> None:
 
 
 def _bars(rows: list[dict[str, Any]], column: str) -> list[float]:
-    """The standard errors of a column; NaN, which draws nothing, where there is none."""
+    """The standard errors of a column; NaN, which draws nothing, where a row has none."""
     errors = (row[error_column(column)] for row in rows)
     return [float("nan") if one is None else one for one in errors]
 

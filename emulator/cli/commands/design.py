@@ -98,7 +98,7 @@ def _designs(parser: argparse.ArgumentParser) -> None:
         "--weight", type=float, nargs="+", metavar="β", help="weights of the user's error, 0 to 1 (default 0, 0.05 … 1)"
     )
     parser.add_argument("--price", type=float, nargs="+", metavar="λ", help="costs of a transmission (default 0)")
-    parser.add_argument("--states", type=int, metavar="N", help="holding times that are told apart (default 10)")
+    parser.add_argument("--states", type=int, metavar="N", help="holding times that are distinguished (default 10)")
     parser.add_argument("--block", type=int, metavar="L", help="slots of --schedule that share a μ_d (default 1)")
 
 

@@ -103,7 +103,7 @@ class ForkServer:
         self._forks: dict[int, Fork] = {}
         self._asking = threading.Lock()
         self._begun: SimpleQueue[Fork | OSError] = SimpleQueue()
-        """The process that was asked for, or why there is none."""
+        """The process that was asked for, or why it could not be started."""
         self._follower = threading.Thread(target=self._follow, name="fork server", daemon=True)
         self._follower.start()
 

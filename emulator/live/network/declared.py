@@ -1,4 +1,4 @@
-"""Publishers, subscribers and the like that a process declares on its session, and again on each later session.
+"""Publishers, subscribers and other entities that a process declares on its session, and again on each later session.
 
 The process keeps one object: it reads an inbox without a break while another subscriber replaces the inbox's own.
 """

@@ -34,7 +34,7 @@ class TruthReporter:
     """The sensor's reports: states and schedule; sent flags, alarms and inputs, if the scenario has them.
 
     inputs: how many a controller decides; measures: whether the sensor filters its measurements; monitors: whether it has a
-    detector beside its filter.
+    detector for its filter.
     """
 
     def __init__(

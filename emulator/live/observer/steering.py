@@ -165,7 +165,7 @@ class Steering:
             )
 
     def _may(self, act: Act) -> bool:
-        """Whether an act may begin: a receiver is ended or stopped only once it has left: it may not have seen the hold yet."""
+        """Whether an act may begin: a receiver is ended or stopped only after it has left, in case it missed the hold."""
         return not isinstance(act.effect, Leave) or all(self._left.get(name) == act.at for name in act.names)
 
     def _do(self, k: int, act: Act) -> None:

@@ -108,7 +108,7 @@ class SensorPlantEntry(PlantEntry):
 
 @dataclass(frozen=True)
 class MonitorEntry:
-    """The watermark, the detector beside the sensor's filter and the attack on its measurements, as plain numbers."""
+    """The watermark, the detector for the sensor's filter and the attack on its measurements, as plain numbers."""
 
     watermark: Matrix = field(metadata=entry(MATRIX))
     """Σ_e."""

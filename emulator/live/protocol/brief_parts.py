@@ -198,7 +198,7 @@ class SensorPart:
     modules: str | None = field(default=None, metadata=entry(maybe(text), left_out=True))
     """As the router's."""
     monitor: MonitorEntry | None = field(default=None, metadata=inner(MonitorEntry, left_out=True))
-    """None without a detector beside its filter."""
+    """None without a detector for its filter."""
     states: str | None = field(default=None, metadata=entry(text, left_out=True))
     """Given states of all slots, as deviations, as `brief_closed_loop.encoded`; None if they are not known before the run."""
     program: ProgramEntry | None = field(default=None, metadata=inner(ProgramEntry, left_out=True))

@@ -1,4 +1,4 @@
-"""The detector beside the sensor's filter, slot by slot: it draws the watermark, and tests the filter's innovations.
+"""The detector for the sensor's filter, slot by slot: it draws the watermark, and tests the filter's innovations.
 
 Source: docs/mathematics.md, integrity.
 """

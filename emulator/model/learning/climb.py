@@ -1,6 +1,6 @@
 """Expectation-maximisation over all slots that an eavesdropper has kept, from several starts at once.
 
-The starts are further columns beside the trials: a trial has one for each start, and in the end keeps the most likely one.
+The starts are columns next to those of the trials: a trial has one for each start, and in the end keeps the most likely one.
 
 Source: docs/mathematics.md, eavesdroppers that learn.
 """

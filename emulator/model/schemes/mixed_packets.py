@@ -17,7 +17,7 @@ from evedrop.model.schemes.acknowledged import AcknowledgedEncoder
 from evedrop.model.schemes.scheme import Packet
 
 MIXED_HEADER = (
-    "slot t of the reference; −1: there is none",
+    "slot t of the reference; −1: no reference",
     "0: z is the state; 1: z is the state minus L_{t,k} x_t",
 )
 """The header of these schemes. A packet with the state names the reference too, so that receivers follow it."""

@@ -41,7 +41,7 @@ class OpenLoop(Scheme):
     closed_forms = MappingProxyType({"legitimate": "open-loop", "reference": "open-loop"})
     needs_acknowledgements = True
     reads_packets = True
-    header = ("slot t of the reference; −1: there is none", "0: z is the state; 2: z is the state minus A^{k−t} x_t")
+    header = ("slot t of the reference; −1: no reference", "0: z is the state; 2: z is the state minus A^{k−t} x_t")
 
     def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
         """The references; nothing is secret."""

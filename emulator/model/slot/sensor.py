@@ -28,7 +28,7 @@ class Sent(NamedTuple):
     """The states that packets are made from, (c, n, R): the true ones, or the estimates of the sensor's filter."""
     packets: PacketBlock
     monitored: MonitoredSlots | None = None
-    """The detector beside the filter; None without one."""
+    """The detector for the filter; None without one."""
 
     @classmethod
     def joined(cls, parts: Sequence[Sent]) -> Sent:
@@ -77,7 +77,7 @@ class SensorCore:
 
     @property
     def monitors(self) -> bool:
-        """Whether there is a detector beside the sensor's filter."""
+        """Whether the sensor's filter has a detector."""
         return self._monitor is not None
 
     def send(self, slots: range) -> Sent:

@@ -56,7 +56,7 @@ class ViewPanel(ABC):
         """Its views; none if it is recorded but not shown."""
 
     def styles(self) -> Mapping[str, rr.AsComponents]:
-        """Path → name, colour and the like, recorded once; by default none, so that Rerun chooses."""
+        """Path → name, colour and other styles, recorded once; by default none, so that Rerun chooses."""
         return {}
 
     @abstractmethod

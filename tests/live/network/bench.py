@@ -42,7 +42,7 @@ def until(condition: Callable[[], Any], what: str, seconds: float = LIMIT_SECOND
 
 
 def is_matched(end: zenoh.Publisher | zenoh.Querier) -> bool:
-    """Whether there is somebody who reads its key, or answers."""
+    """Whether any process reads its key, or answers."""
     return bool(end.matching_status.matching)  # type: ignore[attr-defined]  # the stub says bool
 
 

@@ -210,7 +210,7 @@ def decode_whereabouts(_shape: dict[str, Any], _value: dict[str, Any], raw: byte
 
 
 def decode_refusal(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
-    """As the observer reads it from the sensor, who refuses what an eavesdropper wrote."""
+    """As the observer reads it from the sensor; the observer refuses messages that an eavesdropper wrote."""
     message = wire.Reader(KEY, raw)
     assert wire.is_refusal(message)
     refusal = wire.read_refusal(message, "sensor")

@@ -40,7 +40,7 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 
 
 def flow(stage: Bench) -> None:
-    """Let one slot pass: everybody who should gets exactly what they should, and nothing else was in the way."""
+    """Let one slot pass: each process gets exactly the messages that it should, and no others came first."""
     k, stage.due = stage.due, stage.due + 1
     stage.put("sensor", stage.keys.uplink, packets.uplink(k, stage.packet(k)))
     for name, ear in stage.downlinks.items():
@@ -55,7 +55,7 @@ def flow(stage: Bench) -> None:
 
 
 def all_keys(stage: Bench) -> dict[str, str]:
-    """Every key of the run, by what it is."""
+    """Every key of the run, by its kind."""
     keys = stage.keys
     found = {"uplink": keys.uplink, "journal": keys.journal}
     for name in (*PROCESSES, "router", "observer"):
@@ -215,7 +215,7 @@ def test_eavesdropper_sees_nobody_alive(stage: Bench) -> None:
 
 @pytest.mark.parametrize("mode", MODES)
 def test_eavesdropper_can_write_only_its_telemetry_and_progress(mode: str, stage: Bench) -> None:
-    """What it puts on any other key, and any deletion, reaches nobody; the run goes on as if nothing had been."""
+    """Its messages on any other key, and all its deletions, reach no process; the run goes on undisturbed."""
     keys = all_keys(stage)
     own = {keys[f"telemetry/{EVE}"], keys[f"progress/{EVE}"]}
     payloads = (packets.uplink(stage.due, np.zeros(SHAPE)), End().pack(), wire.progress(10**9), b"\xc1")
@@ -234,7 +234,7 @@ def test_eavesdropper_can_write_only_its_telemetry_and_progress(mode: str, stage
 
 
 def test_eavesdropper_cannot_feign_another_process(stage: Bench) -> None:
-    """Nobody sees a token that it declares for another process, and nobody one that it withdraws."""
+    """No process sees a token that it declares for another process, or the withdrawal of such a token."""
     with connect(stage.briefs[EVE]) as attacker:
         tokens = [
             attacker.liveliness().declare_token(stage.keys.alive(name)) for name in (*PROCESSES, "router", "observer")
@@ -248,7 +248,7 @@ def test_eavesdropper_cannot_feign_another_process(stage: Bench) -> None:
 
 
 def test_eavesdropper_answers_no_question(stage: Bench) -> None:
-    """A queryable that it offers, for every key, is asked by nobody, the observer included."""
+    """No process, not even the observer, asks a queryable that it offers for every key."""
     asked: list[str] = []
     with connect(stage.briefs[EVE]) as attacker:
         for key in [*all_keys(stage).values(), "**", "evedrop/**"]:

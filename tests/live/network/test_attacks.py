@@ -81,7 +81,7 @@ LIES = {
         "smart contradicts",
     ),
 }
-"""What a receiver claims → how, and what is said of it."""
+"""What a receiver claims → how it claims that, and the expected message."""
 FEW = ("x_hat = 7, P = 0, no digests", "the last packet")
 
 
@@ -183,7 +183,7 @@ SILENT = {
     "what", [one if one == "a receiver in the middle" else pytest.param(one, marks=pytest.mark.long) for one in SILENT]
 )
 def test_a_process_that_is_alive_and_silent_is_named(evedrop: Evedrop, what: str) -> None:
-    """It keeps its connection and its token, and its loop stands still: the run ends, and says who it was that all waited for."""
+    """Its connection and its token stay, and its loop stands still: the run ends, and names the process that all waited for."""
     scenario, name, does = SILENT[what]
     rogue = with_rogue(evedrop, name, HANG + does)
     live = evedrop.live(scenario, "--pace", "0", "--set", "longest_outage=2", env=rogue)
@@ -230,7 +230,7 @@ PROGRESS = {
     "no message": ("b''", "not msgpack"),
     "beyond what was sent": ("pack({'k': 10**9})", r"k = 1000000000; expected an integer k from 0 to \d+"),
 }
-"""What a receiver says of its progress → how, and what is said of it."""
+"""What a receiver says about its progress → how it says that, and the expected message."""
 
 
 @pytest.mark.parametrize("what", ["beyond what was sent", pytest.param("no message", marks=pytest.mark.long)])
@@ -292,7 +292,7 @@ BeliefReporter.add = add
 
 
 def test_messages_of_megabytes_harm_nobody(evedrop: Evedrop) -> None:
-    """What is larger than any message of the run the router drops; the run goes on to its end, and nobody grows by it."""
+    """The router drops messages larger than any of the run; the run goes on to its end, and no process takes more memory."""
     live = evedrop.live("eavesdroppers", "--slots", "1200", "--json", env=with_rogue(evedrop, "naive", BOMB))
     largest = dict.fromkeys(("observer", "sensor", "router"), 0.0)
     while live.process.poll() is None:

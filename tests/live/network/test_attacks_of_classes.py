@@ -134,7 +134,7 @@ def spied(folder: Path) -> list[dict[str, Any]]:
 
 
 def written(folder: Path) -> None:
-    """A scenario with the class, and beside it modules that are called like some of ours and of a library."""
+    """A scenario with the class, and in its folder modules with the names of some of ours and of a library's."""
     (folder / "spy.py").write_text(SPY)
     (folder / "spy.toml").write_text(SCENARIO)
     for name in ("zenoh", "rerun", "pyarrow", "evedrop", "tomli_w"):
@@ -182,7 +182,7 @@ def test_no_process_finds_it_where_it_only_asks(evedrop: Evedrop) -> None:
 
 
 def test_what_a_class_says_of_itself_is_checked(evedrop: Evedrop) -> None:
-    """Answers that are no answer are mistakes of the scenario, with the entry or what was asked; so is an end without one."""
+    """Invalid answers, and processes that end without an answer, are mistakes of the scenario, with the entry or the question."""
     (evedrop.folder / "spy.toml").write_text(SCENARIO)
     wrong = {
         "os._exit(7)": "the process that was to answer for it ended (status",

@@ -60,7 +60,7 @@ def self_signed() -> Identity:
 
 
 def expired() -> Identity:
-    """A certificate of a year ago, of an authority that nobody knows."""
+    """A year-old certificate of an unknown authority."""
     return Authority("old", datetime.datetime.now(datetime.UTC) - datetime.timedelta(days=365)).identity(EVE)
 
 
@@ -98,7 +98,7 @@ def test_a_certificate_that_is_not_of_this_run_opens_nothing(who: str, stage: Be
 
 @pytest.mark.parametrize("protocol", ["tls", "tcp"])
 def test_without_a_certificate_there_is_no_session(protocol: str, stage: Bench) -> None:
-    """Nobody is let in who shows none, nor who speaks no TLS."""
+    """Clients without a certificate, and clients without TLS, are refused."""
     brief = stage.briefs[EVE]
     config = client_config(brief)
     endpoint = f"{protocol}/{brief.router.partition('/')[2]}"
@@ -158,7 +158,7 @@ def test_with_the_own_certificate_an_eavesdropper_hears_its_own_alone(stage: Ben
 
 
 def test_an_eavesdropper_cannot_pose_as_the_router(stage: Bench) -> None:
-    """A router with a process's certificate is believed by nobody, and a process says that it is none."""
+    """No process trusts a router that has a process's certificate, and each says that this is not a router."""
     sensor, eve = stage.briefs["sensor"], stage.briefs[EVE]
     port = free_port()
     config = client_config(eve)
@@ -194,7 +194,7 @@ def test_another_runs_router_is_told_apart(stage: Bench) -> None:
 
 
 def test_the_operator_has_a_certificate_too(stage: Bench, tmp_path: Path) -> None:
-    """What the observer writes into its folder opens a session; without the certificate in it none is opened."""
+    """The file that the observer writes into its folder opens a session; without the certificate in it, none opens."""
     part = stage.briefs["observer"].part
     assert isinstance(part, ObserverPart)
     control = Control(stage.keys.run, stage.briefs[EVE].router, "operator", part.operator, part.operator_identity)
@@ -318,7 +318,7 @@ def test_a_router_that_is_not_there_is_waited_for() -> None:
 
 
 def test_briefs_that_fit_no_endpoint_are_refused() -> None:
-    """Certificates for a router in clear, none for one that takes them, and what is no endpoint."""
+    """Certificates for a router without TLS, none for a router that requires them, and malformed endpoints."""
     for door, said in (
         (RouterAddress("tls/127.0.0.1:7447", "r01", {}), "there is no identity"),
         (RouterAddress("tcp/127.0.0.1:7447", "r01", {}, EVES), "takes no identity"),

@@ -31,7 +31,7 @@ def test_who_is_ready_is_there_and_who_left_is_not(bench: Callable[..., Bench]) 
 
 
 def test_the_router_is_asked_for_itself(bench: Callable[..., Bench]) -> None:
-    """It is ready once it has found the others; nobody else has its credentials."""
+    """It is ready once it has found the others; no other process has its credentials."""
     assert is_there(bench().briefs["router"])
 
 

@@ -314,7 +314,7 @@ def test_a_process_is_told_neither_seed_nor_others_passwords(name: str, evidence
 
 @pytest.mark.parametrize("name", EVERYBODY)
 def test_a_process_is_given_nothing_else_of_the_launchers_environment(name: str, evidence: Evidence) -> None:
-    """A token that the launcher has in its environment reaches nobody; where programs and libraries are does."""
+    """A token in the launcher's environment reaches no process; the paths of programs and libraries reach all."""
     traces = evidence.left_behind[name]
     assert TOKEN.encode() not in b"\n".join(traces.values())
     given = {entry.partition(b"=")[0] for entry in traces["environment"].split(b"\0") if entry}

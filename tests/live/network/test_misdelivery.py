@@ -82,7 +82,7 @@ def stage(tmp_path: Path) -> Iterator[Stage]:
 
 
 def test_a_message_names_its_key() -> None:
-    """The key is read from the front of a message; of anything else there is none."""
+    """The key is read from the front of a message; anything else has no key."""
     assert named_in(enclosed("evedrop/r/uplink", GOOD)) == "evedrop/r/uplink"
     for message in (b"", b"\xc1", GOOD, b"\xd9\xff", b"\xa5uplin"[:3]):
         assert named_in(message) is None

@@ -140,7 +140,7 @@ def test_nobody_else_may_answer(stage: Bench) -> None:
 
 
 def ask_nothing(session: zenoh.Session, stage: Bench) -> list[bytes]:
-    """Ask where nobody answers."""
+    """Ask on a key on which no process answers."""
     return [reply.ok.payload.to_bytes() for reply in session.get(stage.keys.journal, timeout=PATIENCE) if reply.ok]
 
 

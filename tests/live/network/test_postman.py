@@ -1,4 +1,4 @@
-"""Parts of a slot, waited for in real time: never too early, in order, and nobody else held up."""
+"""Parts of a slot that are sent later, in real time: never too early, in order, and without holding up other messages."""
 
 from __future__ import annotations
 

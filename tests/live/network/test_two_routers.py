@@ -92,7 +92,7 @@ def test_an_eavesdropper_at_the_relay_hears_its_own_alone(stage: Bench) -> None:
 
 
 def test_an_eavesdropper_at_the_relay_cannot_write_for_others(stage: Bench) -> None:
-    """What it puts on the keys that cross the link reaches nobody; its own telemetry, put after all that, does."""
+    """Its messages on the keys that cross the link reach no process; its own telemetry, sent after them, arrives."""
     keys = stage.keys
     with connect(stage.briefs[EVE]) as attacker:
         for key in (
@@ -123,7 +123,7 @@ def test_each_router_is_asked_for_itself(stage: Bench) -> None:
 
 @pytest.mark.parametrize("who", ["eve", "legitimate", "observer"])
 def test_who_belongs_to_the_relay_is_not_let_in_at_the_router(who: str, stage: Bench) -> None:
-    """At the router there are the sensor and the relay, and nobody else has a password there."""
+    """The router's only clients are the sensor and the relay, and no other process has a password there."""
     near = stage.briefs["sensor"].router
     with pytest.raises(zenoh.ZError):
         connect(replace(stage.briefs[who], router=near), connect={"endpoints": [near], **ONCE}).close()

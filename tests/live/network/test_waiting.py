@@ -37,7 +37,7 @@ def test_a_process_says_that_it_waits_for_its_router(tmp_path: Path, capfd: pyte
 
 @contextlib.contextmanager
 def listener(lasting: float | None) -> Iterator[RouterAddress]:
-    """A listener that ends every connection after so many seconds, or the one who connects ends it."""
+    """A listener that ends every connection after this number of seconds, unless the client ends it first."""
     with socket.create_server(("127.0.0.1", 0)) as server, contextlib.ExitStack() as links:
 
         def accept() -> None:

@@ -25,7 +25,7 @@ PLAIN: dict[str, Any] = json.loads(BRIEF.text)
 
 
 def test_reads_back_what_was_written(tmp_path: Path) -> None:
-    """A brief survives its file, which nobody else may read, whatever the umask."""
+    """A brief is the same after it was written and read; only its owner may read the file, whatever the umask."""
     before = os.umask(0)
     try:
         path = BRIEF.write(tmp_path)
@@ -104,7 +104,7 @@ def test_refuses_what_is_no_brief(found: object, tmp_path: Path) -> None:
 
 
 def test_refuses_what_is_not_there(tmp_path: Path) -> None:
-    """A missing file and one that is not JSON are told apart."""
+    """A missing file and one that is not JSON have different messages."""
     with pytest.raises(BriefError, match="No such file or directory"):
         read_brief(tmp_path / "none.json")
     path = tmp_path / "broken.json"
@@ -218,7 +218,7 @@ def test_no_secret_is_in_what_python_shows_of_a_brief() -> None:
     ],
 )
 def test_a_malformed_outage_is_refused(role: str, outage: list[Any], said: str, tmp_path: Path) -> None:
-    """Before the receiver takes part in the run."""
+    """It is refused before the receiver joins the run."""
     found = json.loads(made(scenario_of())[role].text)
     found["part"]["outages"] = [outage]
     assert said in str(refusal(found, tmp_path))
@@ -330,7 +330,7 @@ def test_a_process_without_its_key_ends_with_status_2(evedrop: Evedrop) -> None:
 
 @pytest.mark.parametrize("kind", ["pipe", "folder", "device"])
 def test_a_brief_that_is_no_file_is_refused(kind: str, tmp_path: Path) -> None:
-    """At once, and without waiting for somebody who writes to it."""
+    """It is refused at once, without waiting for a writer."""
     path = tmp_path / "sensor.json"
     if kind == "pipe":
         os.mkfifo(path, 0o600)

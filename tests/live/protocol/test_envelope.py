@@ -20,7 +20,7 @@ def test_a_message_is_read_on_the_key_that_it_names_and_on_no_other() -> None:
 
 @pytest.mark.parametrize("message", [b"", b"\xc1", msgpack.packb(7), head_of(KEY)[:-1], msgpack.packb("x" * 1000)])
 def test_bytes_that_name_no_key(message: bytes) -> None:
-    """Nothing, what is not msgpack, a number, and a key that is cut off."""
+    """An empty message, one that is not msgpack, a number, and a key that is cut off."""
     assert named_in(message) is None
 
 

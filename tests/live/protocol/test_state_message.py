@@ -108,7 +108,7 @@ def test_a_brief_has_what_its_sensor_needs(source: str, tmp_path: Path) -> None:
     ],
 )
 def test_a_brief_with_other_states_is_refused(change: dict[str, Any], said: str) -> None:
-    """Before the process takes part in the run."""
+    """It is refused before the process joins the run."""
     brief = sensor_of("file")
     with pytest.raises(BriefError, match=said):
         expect_usable(replace(brief, part=replace(part_of(brief, SensorPart), **change)))
