@@ -148,6 +148,15 @@ def test_a_replay_is_seen_only_with_a_watermark() -> None:
     assert heard == [0, 1, 2, 3, 4, 2, 3, 4, 2, 3, 4, 2, 12, 13]
 
 
+@pytest.mark.parametrize("k", [0, 1])
+def test_replaced_measurements_are_stationary_from_slot_0_on(k: int) -> None:
+    """Z of 4000 trials has its stationary variance, 0.1 / (1 − 0.8²), to 6 standard errors; its noise alone has 0.1."""
+    feed = SENSOR_ATTACKS["replace"].read({"matrix": [[0.8]], "noise": [[0.1]]}).feed(b"k" * 32, Batch(20, 4000))
+    z = [feed.take(slot, np.zeros((1, 4000)), True) for slot in range(k + 1)][k]
+    expected = 0.1 / (1.0 - 0.8**2)
+    assert float(np.mean(z**2)) == pytest.approx(expected, abs=6.0 * expected * np.sqrt(2.0 / 4000))
+
+
 def test_the_parsimonious_policy_is_the_posterior_of_an_attack() -> None:
     """Bayes' rule slot by slot; marks only between the thresholds; it stays as it is after the alarm."""
     policy = POLICIES["parsimonious"].of(PARSIMONIOUS[1])

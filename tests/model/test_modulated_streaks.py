@@ -106,8 +106,8 @@ def test_independent_losses_have_the_streaks_of_the_closed_form(outcomes: Outcom
 
 
 def test_a_link_that_changes_during_the_run() -> None:
-    """From the slot of the change on the chain begins in its stationary law; all of the error is carried."""
-    better = Chain(BURSTS.transitions, BURSTS.law, np.array([1.0, 0.6]))
+    """In the slot of a change the new chain begins in its stationary law; all of the error is carried."""
+    better = Chain(np.array([[0.9, 0.1], [0.1, 0.9]]), np.array([0.5, 0.5]), np.array([1.0, 0.6]))
     law = LinkLaw(
         (*LinkLaw.steady(BURSTS).segments, Segment(20, better, 0.9, np.ones(1)), Segment(99, BURSTS, 1.0, np.ones(1)))
     )

@@ -206,6 +206,12 @@ def test_knowing_the_eavesdropper_helps() -> None:
     assert max(gains) > 1e-4
 
 
+@pytest.mark.parametrize("process", [STABLE, DRIFTING, UNSTABLE], ids=["stable", "drifting", "unstable"])
+def test_where_silence_is_as_good_as_a_packet_it_is_silent(process: Process) -> None:
+    """An eavesdropper that hears nothing, and a user whose error does not count: both choices cost the same, but for rounding."""
+    assert not best_policy(process, 0.3, 0.0, 0.0, 9).send.any()
+
+
 @pytest.mark.parametrize("price", [0.0, 5e-3])
 def test_the_least_weight_separates_silence_from_sending(price: float) -> None:
     """Below it the best policy never sends, from it on it does."""

@@ -111,6 +111,14 @@ def test_share_is_of_streaks_that_too_few_trials_meet() -> None:
         assert found.share(trials) <= level < found.share(trials - 1)
 
 
+def test_a_small_share_is_not_rounded_away() -> None:
+    """A share above 1e-9 is told as it is; less than that is what `streaks` leaves out, and counts as nothing."""
+    number = np.array([[1.0, 1e-6], [0.0, 0.0], [0.0, 0.0]])
+    for rare, share in ((5e-4, 5e-4), (2e-9, 2e-9), (5e-10, 0.0)):
+        carried = np.array([[1.0 - rare, rare], [0.0, 0.0], [0.0, 0.0]])
+        assert Streaks(number, carried, 1.0).share(10) == pytest.approx(share, rel=1e-6)
+
+
 def test_share_of_an_initial_covariance_that_no_trial_misses_packets_of() -> None:
     """A first packet that one trial in a thousand loses carries nearly all of the error if nothing else does."""
     process = Process(np.array([[0.5]]), np.array([[1e-9]]), np.array([[1.0]]))
