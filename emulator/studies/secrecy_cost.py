@@ -1,8 +1,8 @@
 """The energy that secrecy costs a house: its scheme against `plain`, over the same link, on the same days.
 
 A trial is run with the scenario's scheme and with `plain`, with the same noise of the plant and the same losses, and each
-time as a controller that sees the truth. Every figure is made from differences within a trial, so its standard error is
-that of the mean of the trials' differences.
+time also with a controller that sees the truth. Every figure is made from differences within a trial, so its standard error
+is that of the mean of the trials' differences.
 
 Source: docs/microgrid.md, what does secrecy cost in energy.
 """
