@@ -98,7 +98,7 @@ class Scenario(Table):
     builders: ClassVar[Builders | None] = None
     """Set by `evedrop.loading` when it is imported."""
 
-    title: Annotated[str, Field(min_length=1, max_length=200, examples=["Two eavesdroppers beside a planar vehicle"])]
+    title: Annotated[str, Field(min_length=1, max_length=200, examples=["Two eavesdroppers near a planar vehicle"])]
     slots: Annotated[int, Field(ge=1, le=MOST_SLOTS, strict=True, examples=[2000])]
     seed: Annotated[int, Field(ge=0, lt=2**256, strict=True, examples=[7])] = 0
     trials: Annotated[int, Field(ge=1, le=1_000_000, strict=True, examples=[1])] = 1

@@ -116,7 +116,7 @@ def _unusable(name: str, link: WireLink, links: Mapping[str, WireLink], happens:
         yield f"{link.name}, the link of {name}, {why}"
     tie = None if link.correlation is None else link.correlation[0]
     if tie is not None and tie not in {one.name for other, one in links.items() if other != name}:
-        yield f"{link.name}, the link of {name}, is tied to {tie}, which is no other receiver's link"
+        yield f"{link.name}, the link of {name}, is tied to {tie}, which is not the link of another receiver"
 
 
 def _tie(link: WireLink, links: Mapping[str, WireLink]) -> dict[str, Any] | None:

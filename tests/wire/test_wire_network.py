@@ -207,7 +207,7 @@ def test_what_a_run_cannot_have_is_refused() -> None:
     apart = [{"at": "1 s", "partition": ["robot", "base"]}]
     assert "the scenario has no slot_seconds" in refusal(wire(event=apart), scenario_of(slot_seconds=None))
     both = refusal(tied_to_a_third(), scenario_of())
-    assert "tap, the link of eve, is tied to third, which is no other receiver's link" in both
+    assert "tap, the link of eve, is tied to third, which is not the link of another receiver" in both
     several = {"eve": {"strategy": "colluding", "reads_as": "smart", "links": [{"quality": 0.5}, {"quality": 0.5}]}}
     assert "eve has several links" in refusal(wire(), scenario_of(eavesdroppers=several))
 
