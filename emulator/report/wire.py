@@ -6,110 +6,109 @@ Source: docs/wire.md, the summary.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any
 
 from evedrop.report.closing import expectations_outcome
 from evedrop.report.text_table import TextTable
-from evedrop.score.summary import Judged
+from evedrop.results.wire_summary import WireSummary
 
 _MARKS = {True: "yes", False: "NO", None: "–"}
 
 
-def wire_title(summary: Mapping[str, Any]) -> str:
-    """How much a wire did, in a line. summary: here and below the entries of summary.json."""
-    return f"wire · seed {summary['seed']} · {summary['heard']:,} messages · {summary['seconds']:,.1f} s"
+def wire_title(summary: WireSummary) -> str:
+    """How much a wire did, in a line."""
+    return f"wire · seed {summary.seed} · {summary.heard:,} messages · {summary.seconds:,.1f} s"
 
 
-def wire_table(summary: Mapping[str, Any]) -> TextTable:
+def wire_table(summary: WireSummary) -> TextTable:
     """The table of the links."""
     heads = ["heard", "delivered", "lost", "dropped", "rate", "model", "within", "delay", "gap"]
     table = TextTable.headed(["link"], heads, title=wire_title(summary))
-    for name, link in summary["links"].items():
-        median = link["delays"].get("0.5")
+    for name, link in summary.links.items():
+        median = link.delays.get("0.5")
         table.add(
             name,
-            f"{link['heard']:,}",
-            f"{link['delivered']:,}",
-            f"{sum(link['lost_by'].values()):,}",
-            f"{sum(link['dropped_by'].values()):,}",
-            "–" if link["rate"] is None else f"{link['rate']:.4f}",
-            "–" if link["expected_rate"] is None else f"{link['expected_rate']:.4f}",
-            _MARKS[link["within_bounds"]],
+            f"{link.heard:,}",
+            f"{link.delivered:,}",
+            f"{sum(link.lost_by.values()):,}",
+            f"{sum(link.dropped_by.values()):,}",
+            "–" if link.rate is None else f"{link.rate:.4f}",
+            "–" if link.expected_rate is None else f"{link.expected_rate:.4f}",
+            _MARKS[link.within_bounds],
             "–" if median is None else f"{1000 * median:.3g} ms",
-            f"{link['gap_messages']:,}",
+            f"{link.gap_messages:,}",
         )
     return table
 
 
-def reasons_table(summary: Mapping[str, Any]) -> TextTable:
+def reasons_table(summary: WireSummary) -> TextTable:
     """Why messages did not arrive: a row for each link and reason."""
     table = TextTable.headed(["link"], ["messages"], ["reason"])
-    for name, link in summary["links"].items():
-        for kind, said in (("lost_by", "lost"), ("dropped_by", "dropped by the wire itself, or Zenoh")):
-            for reason, count in link[kind].items():
+    for name, link in summary.links.items():
+        for by, said in ((link.lost_by, "lost"), (link.dropped_by, "dropped by the wire itself, or Zenoh")):
+            for reason, count in by.items():
                 table.add(name, f"{count:,}", f"{said}: {reason.replace('_', ' ')}")
     return table
 
 
-def wire_outcome(summary: Mapping[str, Any]) -> tuple[str, bool | None]:
+def wire_outcome(summary: WireSummary) -> tuple[str, bool | None]:
     """The outcome of a wire in a sentence, and whether it is good; None if there is nothing to judge."""
-    said, good = expectations_outcome([one["held"] for one in summary["expectations"]], "wire")
-    if summary["unaccounted"]:
-        return f"unaccounted for: {_messages(summary['unaccounted'])}; {said}", False
-    if summary["journal"]["incomplete_since"] is not None:
+    said, good = expectations_outcome([one.held for one in summary.expectations], "wire")
+    if summary.unaccounted:
+        return f"unaccounted for: {_messages(summary.unaccounted)}; {said}", False
+    if summary.journal.incomplete_since is not None:
         return f"the journal is incomplete; {said}", False
     if _unfinished(summary):
         return f"{_unfinished(summary)}; {said}", False if good is False else None
     return said[0].upper() + said[1:], good
 
 
-def wire_sentences(summary: Mapping[str, Any]) -> Iterator[str]:
+def wire_sentences(summary: WireSummary) -> Iterator[str]:
     """Notes to the table: why messages did not arrive, and which expectations were met."""
-    for name, link in summary["links"].items():
-        lost = _counted(link["lost_by"])
-        dropped = _counted(link["dropped_by"])
+    for name, link in summary.links.items():
+        lost = _counted(link.lost_by)
+        dropped = _counted(link.dropped_by)
         if lost:
             yield f"{name} lost {lost}"
         if dropped:
             yield f"{name}: the wire itself, or Zenoh, dropped {dropped}"
     yield from unlinked_sentence(summary)
-    yield from (Judged(**one).sentence for one in summary["expectations"] if one["held"] is not False)
+    yield from (one.sentence for one in summary.expectations if one.held is not False)
 
 
-def unlinked_sentence(summary: Mapping[str, Any]) -> Iterator[str]:
+def unlinked_sentence(summary: WireSummary) -> Iterator[str]:
     """How many messages no link took, if there were some."""
-    if summary["unlinked"]:
-        yield f"no link of the file takes {_messages(summary['unlinked'])}; add a link, or let programs not publish them"
+    if summary.unlinked:
+        yield f"no link of the file takes {_messages(summary.unlinked)}; add a link, or let programs not publish them"
 
 
-def wire_failures(summary: Mapping[str, Any]) -> Iterator[str]:
+def wire_failures(summary: WireSummary) -> Iterator[str]:
     """What went wrong: faults of the wire, as below, and expectations that failed."""
     yield from wire_faults(summary)
-    yield from (Judged(**one).sentence for one in summary["expectations"] if one["held"] is False)
+    yield from (one.sentence for one in summary.expectations if one.held is False)
 
 
-def wire_faults(summary: Mapping[str, Any]) -> Iterator[str]:
+def wire_faults(summary: WireSummary) -> Iterator[str]:
     """A wire that has not ended, links outside their bounds, messages that are unaccounted for, and an incomplete journal."""
     if _unfinished(summary):
         yield f"{_unfinished(summary)}: these are the figures that its journal gives so far"
-    for name, link in summary["links"].items():
-        if link["within_bounds"] is False:
-            low, high = link["bounds"]
+    for name, link in summary.links.items():
+        if link.within_bounds is False and link.bounds is not None:
+            low, high = link.bounds
             yield (
-                f"{name} is outside the 99 % bounds of its model: it let {link['rate']:.4f} of the messages through, where "
+                f"{name} is outside the 99 % bounds of its model: it let {link.rate:.4f} of the messages through, where "
                 f"{low:.4f} to {high:.4f} were expected"
             )
-    if summary["unaccounted"]:
-        yield f"unaccounted for: {_messages(summary['unaccounted'])}; this is a fault of Evedrop"
-    if summary["journal"]["missing"]:
-        yield f"the journal lacks {_messages(summary['journal']['missing'])}, because the disk was full"
-    elif summary["journal"]["incomplete_since"] is not None:
+    if summary.unaccounted:
+        yield f"unaccounted for: {_messages(summary.unaccounted)}; this is a fault of Evedrop"
+    if summary.journal.missing:
+        yield f"the journal lacks {_messages(summary.journal.missing)}, because the disk was full"
+    elif summary.journal.incomplete_since is not None:
         yield "the disk was full for some time: the journal has all messages, but perhaps not all changes and events"
 
 
-def _unfinished(summary: Mapping[str, Any]) -> str:
+def _unfinished(summary: WireSummary) -> str:
     """That the wire has not ended, if its summary was made from its journal."""
-    return {"running": "the wire still runs", "killed": "the wire was killed"}.get(str(summary.get("state")), "")
+    return {"running": "the wire still runs", "killed": "the wire was killed"}.get(summary.state, "")
 
 
 def _counted(reasons: Mapping[str, int]) -> str:

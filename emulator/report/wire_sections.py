@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,9 +18,8 @@ from evedrop.report.tables import facts_table, html_table
 from evedrop.report.text_table import TextTable
 from evedrop.report.wire import reasons_table, unlinked_sentence, wire_faults, wire_outcome, wire_table, wire_title
 from evedrop.results.wire_folder import WIRE_FILE
-from evedrop.score.summary import Judged
+from evedrop.results.wire_summary import WIRE_SUMMARY_FILE, WireSummary
 
-_SUMMARY = "summary.json"
 _MOST_BYTES = 2**24
 _MOST_EVENTS = 500
 _MOST_WORDS = 120  # characters about a loss model
@@ -32,8 +30,8 @@ class WireSource:
     """The folder of a wire, read."""
 
     folder: Path
-    summary: Mapping[str, Any]
-    """The entries of summary.json, or of what would be in it."""
+    summary: WireSummary
+    """That of summary.json, or what would be in it."""
     title: str
     about: str
     """What the wire did, in a line."""
@@ -47,35 +45,25 @@ class WireSource:
     @classmethod
     def read(cls, folder: Path) -> WireSource:
         """Read a folder. Raises UsageError if it is not that of a wire that ended."""
-        path = folder / _SUMMARY
+        path = folder / WIRE_SUMMARY_FILE
         if not path.exists():
             raise UsageError(
-                f"{folder} has no {_SUMMARY}: the wire runs or was killed; to make its report: evedrop report {folder}"
+                f"{folder} has no {path.name}: the wire runs or was killed; to make its report: evedrop report {folder}"
             )
-        try:
-            return cls.of(folder, json.loads(text_of(path, _MOST_BYTES)))
-        except (OSError, Unreadable, ValueError, RecursionError) as error:
-            raise UsageError(f"{path} is not the summary of a wire of this version ({error!r})") from error
+        return cls.of(folder, WireSummary.read(path))
 
     @classmethod
-    def of(cls, folder: Path, summary: Mapping[str, Any]) -> WireSource:
-        """A folder whose summary is known. Raises UsageError if it is not a summary."""
-        try:
-            # These raise an error unless it is a summary.
-            wire_table(summary), reasons_table(summary), list(wire_faults(summary))
-            *sides, last = dict.fromkeys(one[end] for one in summary["links"].values() for end in ("source", "target"))
-            title = f"Wire of {', '.join(sides)} and {last}"
-            events = [(f"{one['seconds']:,.1f} s", str(one["event"])) for one in summary["events"]]
-            dict(summary["made_with"])
-            found = title, wire_title(summary), wire_outcome(summary)
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise UsageError(f"{folder / _SUMMARY} is not the summary of a wire of this version ({error!r})") from error
+    def of(cls, folder: Path, summary: WireSummary) -> WireSource:
+        """A folder whose summary is known."""
+        sides = [*dict.fromkeys(side for link in summary.links.values() for side in (link.source, link.target))]
+        title = f"Wire of {', '.join(sides[:-1])} and {sides[-1]}" if sides else "Wire without links"
+        events = [(f"{one.seconds:,.1f} s", one.event) for one in summary.events]
         try:
             tables = tomllib.loads(text_of(folder / WIRE_FILE, _MOST_BYTES))
             models = {one["name"]: _model(one["loss"]) for one in tables["link"]}
         except (OSError, Unreadable, ValueError, KeyError, TypeError, AttributeError, RecursionError):
             models = {}
-        return cls(folder, summary, *found, models, events)
+        return cls(folder, summary, title, wire_title(summary), wire_outcome(summary), models, events)
 
 
 def _model(loss: Mapping[str, Any]) -> str:
@@ -94,7 +82,7 @@ class WireExpectations(Section[WireSource]):
     @classmethod
     def nodes(cls, of: WireSource) -> Iterator[Node]:
         """A sentence for each."""
-        yield from marked_sentences([Judged(**one) for one in of.summary["expectations"]])
+        yield from marked_sentences(of.summary.expectations)
 
 
 @final
@@ -113,9 +101,9 @@ class WireLinks(Section[WireSource]):
             "the median delay; the most messages in a row that did not arrive",
         )
         table = TextTable.headed(["link", "from", "to", "keys"], ["99 % bounds"], ["loss model"])
-        for name, link in of.summary["links"].items():
-            bounds = "–" if link["bounds"] is None else "{:.4f} to {:.4f}".format(*link["bounds"])
-            table.add(name, link["source"], link["target"], link["keys"], bounds, of.models.get(name, "–"))
+        for name, link in of.summary.links.items():
+            bounds = "–" if link.bounds is None else "{:.4f} to {:.4f}".format(*link.bounds)
+            table.add(name, link.source, link.target, link.keys, bounds, of.models.get(name, "–"))
         yield html_table(
             table, "The links as the file gives them, and the bounds of 99 % for the messages that they took"
         )
@@ -166,10 +154,10 @@ class WireRepeat(Section[WireSource]):
         commands = [["evedrop", "wire", str(where / WIRE_FILE)], ["evedrop", "view", str(where)]]
         yield element("pre", element("code", "\n".join(map(shlex.join, commands))))
         facts = {
-            "seed": of.summary["seed"],
-            "start": f"{of.summary['start']:,} in this folder",
-            "time": f"{of.summary['seconds']:,.1f} s",
-            **of.summary["made_with"],
+            "seed": of.summary.seed,
+            "start": f"{of.summary.start:,} in this folder",
+            "time": f"{of.summary.seconds:,.1f} s",
+            **of.summary.made_with,
         }
         yield facts_table(facts, "Seed and versions")
 

@@ -7,18 +7,17 @@ from __future__ import annotations
 
 import io
 import shutil
-from collections.abc import Mapping
-from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
 from evedrop.report.wire import wire_sentences, wire_table
+from evedrop.results.wire_summary import WireSummary
 
 
-def closing_lines(summary: Mapping[str, Any]) -> list[str]:
-    """The table of the links, and the sentences. summary: the entries of summary.json."""
+def closing_lines(summary: WireSummary) -> list[str]:
+    """The table of the links, and the sentences."""
     text, found = io.StringIO(), wire_table(summary)
     table = Table(title=found.title, title_justify="left", box=SIMPLE_HEAD)
     for column in found.columns:

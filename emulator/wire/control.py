@@ -31,7 +31,7 @@ from evedrop.ports import free_port
 from evedrop.wire.conductor import WireConductor
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.relay import WireRelay
-from evedrop.wire.summary import WireSummary
+from evedrop.wire.scorekeeper import WireScorekeeper
 
 _ATTEMPTS = 5  # another program may take a port between its choice and its use
 _LARGEST = 2**20
@@ -46,13 +46,13 @@ class WireControl:
         folder: Path,
         relay: WireRelay,
         conductor: WireConductor,
-        summary: WireSummary,
+        scorekeeper: WireScorekeeper,
         journal: WireJournal,
         events: Sequence[str],
     ) -> None:
         """folder: the wire's; events: the events so far, a line each, to which lines may be added."""
         self._folder, self._relay, self._conductor = folder, relay, conductor
-        self._summary, self._journal, self._events = summary, journal, events
+        self._scorekeeper, self._journal, self._events = scorekeeper, journal, events
         self._run = f"wire-{secrets.token_hex(8)}"
         self._key = RunKeys(self._run).control(OBSERVER)
         self._stack = contextlib.ExitStack()
@@ -125,7 +125,7 @@ class WireControl:
         states = self._relay.links
         links = {
             name: WireLinkStatus(heard, delivered, states[name].cut)
-            for name, (heard, delivered) in self._summary.counts().items()
+            for name, (heard, delivered) in self._scorekeeper.counts().items()
         }
         sides = {name: list(endpoints) for name, endpoints in self._relay.endpoints.items()}
         complete = "complete" if self._journal.incomplete_since is None else "incomplete, because the disk was full"

@@ -28,6 +28,7 @@ from evedrop.errors import UsageError
 from evedrop.model.slot.link import Change
 from evedrop.output import warn
 from evedrop.results.folder import make_private
+from evedrop.results.wire_summary import JournalState
 from evedrop.wire.crossing import RECORD, UNLINKED, Crossing, Kind
 from evedrop.wire.history import Numbered, WireHistory, highest
 from evedrop.wire.journal_part import (
@@ -39,7 +40,7 @@ from evedrop.wire.journal_part import (
     table_of,
     write_parquet,
 )
-from evedrop.wire.journal_reader import JOURNAL_FOLDER, UNFINISHED, JournalState, parquet_path
+from evedrop.wire.journal_reader import JOURNAL_FOLDER, UNFINISHED, parquet_path
 from evedrop.wire.journal_recovery import locked, recover
 from evedrop.wire.journal_words import JournalWords
 from evedrop.wire.plan import WirePlan

@@ -5,9 +5,8 @@ Source: docs/wire.md, from Python.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any, final
+from typing import final
 
 import pyarrow as pa
 import zenoh
@@ -15,41 +14,35 @@ import zenoh
 from evedrop.errors import UsageError
 from evedrop.model.checks import as_toml
 from evedrop.model.slot.link import Change
-from evedrop.results.summary_file import plain
 from evedrop.results.wire_folder import WIRE_FILE
+from evedrop.results.wire_summary import WIRE_SUMMARY_FILE, JournalState, WireSummary
 from evedrop.wire.file import load_wire
 from evedrop.wire.history import WireHistory
 from evedrop.wire.journal import AmendmentListener, Listener
 from evedrop.wire.journal_part import records_of
-from evedrop.wire.journal_reader import JOURNAL_FOLDER, UNFINISHED, JournalState, journal_tables, last_beat
+from evedrop.wire.journal_reader import JOURNAL_FOLDER, UNFINISHED, journal_tables, last_beat
 from evedrop.wire.journal_recovery import is_in_use
 from evedrop.wire.plan import WirePlan
-from evedrop.wire.summary import WireSummary
+from evedrop.wire.scorekeeper import WireScorekeeper
 
 
-def summary_of_wire(folder: Path) -> dict[str, Any]:
-    """The entries of a wire's summary.json. A wire that runs or was killed has none: then those that its journal gives.
+def summary_of_wire(folder: Path) -> WireSummary:
+    """The summary of a wire; of a wire that runs or was killed, which has none yet, the one that its journal gives.
 
     Raises UsageError if neither can be read.
     """
-    path = folder / "summary.json"
-    if not path.exists():
-        found: dict[str, Any] = plain(summary_on_disk(folder, load_wire(folder / WIRE_FILE)).as_dict())
-        return found
-    try:
-        found = json.loads(path.read_bytes())
-    except (OSError, ValueError) as error:
-        why = (error.strerror if isinstance(error, OSError) else None) or error
-        raise UsageError(f"{path} is not the summary of a wire ({why})") from error
-    return found
+    path = folder / WIRE_SUMMARY_FILE
+    if path.exists():
+        return WireSummary.read(path)
+    return scorekeeper_on_disk(folder, load_wire(folder / WIRE_FILE)).summary()
 
 
-def summary_on_disk(folder: Path, plan: WirePlan) -> WireSummary:
-    """The summary of a wire so far, from its results folder. Raises UsageError if there is no journal."""
+def scorekeeper_on_disk(folder: Path, plan: WirePlan) -> WireScorekeeper:
+    """The figures of a wire so far, from its results folder. Raises UsageError if there is no journal."""
     journal = JournalOnDisk(folder, plan)
-    summary = WireSummary(plan, journal)
+    scorekeeper = WireScorekeeper(plan, journal)
     journal.read()
-    return summary
+    return scorekeeper
 
 
 @final

@@ -10,7 +10,6 @@ import re
 import struct
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pyarrow as pa
@@ -25,8 +24,6 @@ from evedrop.wire.journal_words import words_in
 
 JOURNAL_FOLDER = "journal"
 """The folder inside a wire's folder that contains its journal."""
-JournalState = Literal["running", "ended", "killed"]
-"""What became of the start of a wire to which a journal belongs."""
 _LATEST = 1e15  # seconds
 UNFINISHED = "unfinished"
 """The folder inside it for records that are not yet in a Parquet file."""

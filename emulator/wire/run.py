@@ -12,6 +12,7 @@ from evedrop.output import warn
 from evedrop.report.wire import wire_failures
 from evedrop.results.folder import make_private, new_folder, write_private
 from evedrop.results.wire_folder import WIRE_FILE
+from evedrop.results.wire_summary import WIRE_SUMMARY_FILE
 from evedrop.signals import stop_on_signals
 from evedrop.wire.closing import closing_lines
 from evedrop.wire.conductor import WireConductor
@@ -22,7 +23,7 @@ from evedrop.wire.journal_reader import JOURNAL_FOLDER
 from evedrop.wire.live_view import live_view
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.relay import WireRelay
-from evedrop.wire.summary import WireSummary
+from evedrop.wire.scorekeeper import WireScorekeeper
 
 
 def run_wire(
@@ -48,7 +49,7 @@ def run_wire(
 
     with stop_on_signals() as stop:
         with live_view(plan, out, view, say) as shown, WireJournal(out, plan) as journal:
-            summary = WireSummary(plan, journal)
+            scorekeeper = WireScorekeeper(plan, journal)
             if shown is not None:
                 shown.follow(journal)
 
@@ -67,13 +68,14 @@ def run_wire(
                     say(f"{name} {' '.join(endpoints)}")
                 with (
                     WireConductor(plan, relay, happened) as conductor,
-                    WireControl(out, relay, conductor, summary, journal, events),
+                    WireControl(out, relay, conductor, scorekeeper, journal, events),
                 ):
                     stop.wait(seconds)
-        status = summary.finish(out)
-    for line in closing_lines(summary.as_dict()):
+        status = scorekeeper.finish(out)
+    summary = scorekeeper.summary()
+    for line in closing_lines(summary):
         say(line)
-    for line in wire_failures(summary.as_dict()):
+    for line in wire_failures(summary):
         (say if complain is None else complain)(line)
     say(f"results: {out}")
     return status
@@ -82,7 +84,7 @@ def run_wire(
 def _begin_results(out: Path, plan: WirePlan) -> None:
     """Write wire.toml, the complete file of the wire, and remove the summary of an earlier start."""
     try:
-        (out / "summary.json").unlink(missing_ok=True)
+        (out / WIRE_SUMMARY_FILE).unlink(missing_ok=True)
         write_private(out / WIRE_FILE, resolved_wire(plan))
     except OSError as error:
         warn(f"wire.toml cannot be written ({error}); the wire goes on")

@@ -26,10 +26,10 @@ from evedrop.live.network.control_file import no_run, read_control
 from evedrop.live.network.operator import Answer, Request, ask
 from evedrop.live.protocol.wire_status import WireStatus
 from evedrop.results.folder import claimed, default_folder, write_private
+from evedrop.results.wire_summary import WIRE_SUMMARY_FILE, WireSummary
 from evedrop.scenario.words import listed
-from evedrop.score.summary import Judged
 from evedrop.wire.file import load_wire, resolved_wire, wire_of
-from evedrop.wire.journal_on_disk import summary_on_disk
+from evedrop.wire.journal_on_disk import scorekeeper_on_disk
 from evedrop.wire.journal_reader import journal_tables
 from evedrop.wire.plan import WirePlan
 
@@ -125,8 +125,7 @@ class RunningWire:
         if error is not None or status == 0:
             return
         with suppress(UsageError):
-            judged = [Judged(**one) for one in self.summary()["expectations"]]
-            if failed := [one.sentence for one in judged if one.held is False]:
+            if failed := [one.sentence for one in self.typed_summary().expectations if one.held is False]:
                 raise ExpectationFailed("\n".join(failed))
         raise self._failure(status)
 
@@ -179,11 +178,14 @@ class RunningWire:
 
     def summary(self) -> Mapping[str, Any]:
         """What became of the messages so far: the entries of summary.json (docs/wire.md, the summary)."""
-        path = self.folder / "summary.json"
+        return self.typed_summary().as_dict()
+
+    def typed_summary(self) -> WireSummary:
+        """What became of the messages so far, with types. Raises UsageError if it cannot be read."""
+        path = self.folder / WIRE_SUMMARY_FILE
         if not self.is_running and path.is_file():
-            found: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-            return found
-        return summary_on_disk(self.folder, self.plan).as_dict()
+            return WireSummary.read(path)
+        return scorekeeper_on_disk(self.folder, self.plan).summary()
 
     def expect(self, figure: str | None = None, **bounds: Any) -> None:
         """Raise ExpectationFailed if an expectation does not hold so far.
@@ -192,7 +194,7 @@ class RunningWire:
         """
         table = {"figure": figure, **bounds} if figure is not None else bounds
         plan = wire_of({**tomllib.loads(resolved_wire(self.plan)), "expect": [table]})
-        found = summary_on_disk(self.folder, plan)
+        found = scorekeeper_on_disk(self.folder, plan)
         for judged in found.judged(found.links()):
             if not judged.held:
                 raise ExpectationFailed(judged.sentence)

@@ -29,7 +29,7 @@ from evedrop.results.writer import ResultsWriter
 from evedrop.score.sums import SlotSums
 from evedrop.view.replay import replay
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.journal_on_disk import summary_on_disk
+from evedrop.wire.journal_on_disk import scorekeeper_on_disk
 from evedrop.wire.journal_reader import journal_tables
 from tests.fuzz.reader import Reader, as_json, as_parquet, lines, raw, tried
 from tests.wire.wire_plans import wire_plan
@@ -169,7 +169,7 @@ def _in_wire(file: str) -> Callable[[bytes, Path], None]:
             for table in journal_tables(folder):
                 table.to_pylist()
         with contextlib.suppress(EvedropError):
-            [*wire_failures(summary_on_disk(folder, wire_plan()).as_dict())]
+            [*wire_failures(scorekeeper_on_disk(folder, wire_plan()).summary())]
         with WireJournal(folder, wire_plan()) as journal:
             journal.changes_of("scan", "scan/0", "put")
 

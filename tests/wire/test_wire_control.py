@@ -18,7 +18,7 @@ from evedrop.live.protocol.keys import RunKeys
 from evedrop.names import OBSERVER
 from evedrop.wire.conductor import WireConductor
 from evedrop.wire.control import WireControl
-from evedrop.wire.summary import WireSummary
+from evedrop.wire.scorekeeper import WireScorekeeper
 from tests.conftest import wait_until
 from tests.wire.wire_at_work import LOSSY, WireAtWork, at_work, both_ways, program
 
@@ -29,10 +29,10 @@ def steered(folder: Path) -> Iterator[WireAtWork]:
     plan = both_ways(LOSSY)
     events: list[str] = []
     with at_work(plan, folder) as wire:
-        summary = WireSummary(plan, wire.journal)
+        keeper = WireScorekeeper(plan, wire.journal)
         with (
             WireConductor(plan, wire.relay, events.append) as conductor,
-            WireControl(folder, wire.relay, conductor, summary, wire.journal, events),
+            WireControl(folder, wire.relay, conductor, keeper, wire.journal, events),
         ):
             yield wire
 

@@ -18,10 +18,10 @@ from evedrop import wire
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.wire.crossing import AGAIN, Crossing, Kind
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.journal_on_disk import summary_on_disk
+from evedrop.wire.journal_on_disk import scorekeeper_on_disk
 from evedrop.wire.recorded_link import journal_recording
 from evedrop.wire.running import ExpectationFailed, RunningWire
-from evedrop.wire.summary import WireSummary
+from evedrop.wire.scorekeeper import WireScorekeeper
 from tests.conftest import wait_until
 from tests.pages import checked
 from tests.wire.wire_plans import wire_plan
@@ -67,6 +67,7 @@ def test_a_wire_is_opened_steered_read_and_judged(tmp_path: Path) -> None:
     assert not running.is_running
     summary = json.loads((tmp_path / "wire" / "summary.json").read_text())
     assert running.summary() == summary
+    assert running.typed_summary().links["scan"].delivered == len(got)
     assert summary["links"]["scan"]["delivered"] == len(got)
     page = checked(tmp_path / "wire")
     assert {"1 of 1 expectations FAILED", "partition robot, base", *summary["made_with"].values()} <= set(page.texts)
@@ -204,7 +205,7 @@ def test_figures_from_the_disk_are_those_of_the_wire(tmp_path: Path) -> None:
         scan={"loss": {"model": "bernoulli", "quality": 0.6}}, rest={"loss": {"model": "bernoulli", "quality": 1.0}}
     )
     with WireJournal(tmp_path, plan) as journal:
-        summary = WireSummary(plan, journal)
+        keeper = WireScorekeeper(plan, journal)
         fates = [*Crossing]
         for n in range(600):
             kind = list(Kind)[n % 4] | (AGAIN if n % 7 == 0 and fates[n % 5] == Crossing.DELIVERED else 0)
@@ -215,15 +216,15 @@ def test_figures_from_the_disk_are_those_of_the_wire(tmp_path: Path) -> None:
             if n == 500:
                 journal.amend(row, Crossing.UNDERWAY)
         journal.flush()
-        live, on_disk = summary.as_dict(), summary_on_disk(tmp_path, plan).as_dict()
-        assert on_disk["links"] == live["links"]
-        assert on_disk["heard"] == 600
-    assert summary_on_disk(tmp_path, plan).as_dict()["links"] == summary.as_dict()["links"]
+        live, on_disk = keeper.summary(), scorekeeper_on_disk(tmp_path, plan).summary()
+        assert on_disk.links == live.links
+        assert on_disk.heard == 600
+    assert scorekeeper_on_disk(tmp_path, plan).summary().links == keeper.summary().links
     with WireJournal(tmp_path, plan) as journal:
         journal.record(1e9, 50, -1, 0.0, journal.key_code("scan/0"), 0, 64, 0, Kind.PUT, Crossing.DELIVERED)
         journal.flush()
-        found = summary_on_disk(tmp_path, plan).as_dict()
-    assert (found["start"], found["heard"], found["links"]["scan"]["delivered"]) == (2, 1, 1)
+        found = scorekeeper_on_disk(tmp_path, plan).summary()
+    assert (found.start, found.heard, found.links["scan"].delivered) == (2, 1, 1)
 
 
 def test_the_page_shows_the_example_and_every_method() -> None:

@@ -55,10 +55,10 @@ def test_a_wire_without_a_summary_is_summed_up_from_its_journal(
     """Its latest start: a message that was still delayed when the wire was killed did not arrive."""
     folder = folders[state]
     found = summary_of_wire(folder)
-    link = found["links"]["robot-base"]
-    assert (found["state"], found["start"], found["heard"]) == (state, 2, DELIVERED + LOST + DELAYED)
-    assert (link["delivered"], link["lost_by"], link["dropped_by"]) == (delivered, {"loss": LOST}, dropped)
-    assert 0.0 < found["seconds"] < 100.0
+    link = found.links["robot-base"]
+    assert (found.state, found.start, found.heard) == (state, 2, DELIVERED + LOST + DELAYED)
+    assert (link.delivered, link.lost_by, link.dropped_by) == (delivered, {"loss": LOST}, dropped)
+    assert 0.0 < found.seconds < 100.0
     assert main(["view", str(folder), "--table"]) == 0
     sentence = f"{says}: these are the figures that its journal gives so far"
     printed = capfd.readouterr().out
@@ -98,8 +98,8 @@ def test_a_wire_that_heard_nothing_has_lasted_until_it_was_last_alive(tmp_path: 
     with WireJournal(tmp_path, plan):
         (tmp_path / WIRE_FILE).write_text(resolved_wire(plan))
         found = summary_of_wire(tmp_path)
-    assert (found["heard"], found["state"]) == (0, "running")
-    assert 0.0 < found["seconds"] < 100.0
+    assert (found.heard, found.state) == (0, "running")
+    assert 0.0 < found.seconds < 100.0
 
 
 @pytest.mark.parametrize("corrupt", [5, -0.1, "0.1"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 import tomllib
 from pathlib import Path
@@ -17,6 +18,7 @@ from evedrop.errors import ScenarioError, UsageError
 from evedrop.report.wire import wire_failures, wire_sentences, wire_table
 from evedrop.report.writing import write_report
 from evedrop.results.wire_folder import WIRE_FILE
+from evedrop.results.wire_summary import WireSummary
 from evedrop.wire.closing import closing_lines
 from evedrop.wire.crossing import AGAIN, RECORD, UNLINKED, Crossing, Kind
 from evedrop.wire.expect import WireExpectTable
@@ -24,7 +26,7 @@ from evedrop.wire.fates import KeyFates
 from evedrop.wire.file import resolved_wire, wire_of
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.plan import Side, WirePlan
-from evedrop.wire.summary import WireSummary
+from evedrop.wire.scorekeeper import WireScorekeeper
 from evedrop.wire.tallies import LinkTally, StreamTally
 from tests.pages import checked
 from tests.wire.wire_links import LOSSES
@@ -38,7 +40,7 @@ def run(
 ) -> tuple[dict[str, Any], int]:
     """A wire through whose links messages of three keys go; its summary and exit status. actual: whose models decide instead."""
     with WireJournal(folder, plan) as journal:
-        summary = WireSummary(plan, journal)
+        keeper = WireScorekeeper(plan, journal)
         for link in (actual or plan).links:
             for at in range(3):
                 key = f"{link.name}/{at}"
@@ -48,9 +50,16 @@ def run(
                     kind = Kind.PUT | AGAIN if again else Kind.PUT
                     journal.record(n / 10, n, -1, delay, journal.key_code(key), 0, 10, link.number, kind, fate)
         journal.close()
-        status = summary.finish(folder)
-    found: dict[str, Any] = json.loads((folder / "summary.json").read_text())
+        status = keeper.finish(folder)
+    path = folder / "summary.json"
+    found: dict[str, Any] = json.loads(path.read_text())
+    assert WireSummary.read(path).text == path.read_text()
     return found, status
+
+
+def read(folder: Path) -> WireSummary:
+    """The summary in a wire's folder."""
+    return WireSummary.read(folder / "summary.json")
 
 
 def test_links_agree_with_their_models(tmp_path: Path) -> None:
@@ -89,7 +98,9 @@ def test_a_wrong_model_is_told(tmp_path: Path, model: str, wrong: dict[str, Any]
     actual = wire_plan(link={"loss": {**LOSSES[model], **wrong}})
     found, _ = run(tmp_path, wire_plan(link={"loss": LOSSES[model]}), actual)
     assert found["links"]["link"]["within_bounds"] is False
-    assert any(line.startswith("link is outside the 99 % bounds of its model") for line in wire_failures(found))
+    assert any(
+        line.startswith("link is outside the 99 % bounds of its model") for line in wire_failures(read(tmp_path))
+    )
 
 
 def test_changes_and_cuts_are_part_of_the_law(tmp_path: Path) -> None:
@@ -97,7 +108,7 @@ def test_changes_and_cuts_are_part_of_the_law(tmp_path: Path) -> None:
     plan = wire_plan(link=BURSTS)
     other = {"loss": {"model": "bernoulli", "quality": 0.3}}
     with WireJournal(tmp_path, plan) as journal:
-        summary = WireSummary(plan, journal)
+        keeper = WireScorekeeper(plan, journal)
         fates, key = KeyFates(plan.links[0], "link/1", "put", 7), journal.key_code("link/1")
         for n in range(4000):
             if n == 2000:
@@ -106,7 +117,7 @@ def test_changes_and_cuts_are_part_of_the_law(tmp_path: Path) -> None:
             if 1000 <= n < 1500:
                 fate = Crossing.CUT
             journal.record(time.time(), n, -1, 0.0, key, 0, 10, 0, Kind.PUT, fate)
-    link = summary.links()["link"]
+    link = keeper.links()["link"]
     assert link.expected_rate == pytest.approx((1500 * 0.2 / 0.22 + 2000 * 0.3) / 3500)
     assert link.within_bounds is True
     assert link.lost_by["cut"] == link.gap_messages == 500
@@ -118,7 +129,7 @@ def test_what_no_model_decides_is_named_apart(tmp_path: Path) -> None:
         7, {"robot": Side("robot"), "base": Side("base")}, wire_plan(link=BURSTS).links, lossless=("link/stop",)
     )
     with WireJournal(tmp_path, plan) as journal:
-        summary = WireSummary(plan, journal)
+        keeper = WireScorekeeper(plan, journal)
         keys = [journal.key_code(key) for key in ("link/1", "link/stop", "other")]
         for n, fate in enumerate(Crossing):
             journal.record(1.0 * n, n, -1, 0.1, keys[0], 0, 1, 0, Kind.DELETE if n % 2 else Kind.PUT, fate)
@@ -127,7 +138,7 @@ def test_what_no_model_decides_is_named_apart(tmp_path: Path) -> None:
         row = journal.record(21.0, 11, -1, 0.2, keys[0], 0, 1, 0, Kind.PUT | AGAIN, Crossing.DELIVERED)
         journal.flush()
         journal.amend(row, Crossing.REFUSED)
-    assert summary.finish(tmp_path) == 0
+    assert keeper.finish(tmp_path) == 0
     found = json.loads((tmp_path / "summary.json").read_text())
     link = found["links"]["link"]
     assert (found["heard"], found["unlinked"], found["unaccounted"]) == (24, 1, 0)
@@ -137,11 +148,11 @@ def test_what_no_model_decides_is_named_apart(tmp_path: Path) -> None:
     assert link["dropped_by"] == {**dict.fromkeys(dropped, 1), "refused": 2}
     assert link["rate"] == pytest.approx(5 / 7)  # of delivered, lost, corrupted, held up, underway and twice refused
     assert link["gap_messages"] == 10
-    said = "\n".join(wire_sentences(found))
+    said = "\n".join(wire_sentences(read(tmp_path)))
     assert "link lost 1 by loss, 1 by corrupted, 1 by overflow, 1 by cut" in said
     assert "the wire itself, or Zenoh, dropped 1 by unlinked, 1 by too large" in said
     assert "no link of the file takes 1 message" in said
-    title, heading, _, first = [line for line in closing_lines(found) if line.strip()][:4]
+    title, heading, _, first = [line for line in closing_lines(read(tmp_path)) if line.strip()][:4]
     assert title.startswith("wire · seed 7 · 24 messages · ")
     assert heading.split() == [
         "link",
@@ -204,17 +215,18 @@ link = "scan"
     found, status = run(tmp_path, plan)
     assert status == 1
     assert [one["held"] for one in found["expectations"]] == [True, True, False, False, True]
-    said = list(wire_sentences(found))
+    summary = read(tmp_path)
+    said = list(wire_sentences(summary))
     assert "expected 0.9 quantile of scan.latency below 0.025: held, found 0.02" in said
-    assert any(line.startswith("expected scan.gap_messages below 3: FAILED") for line in wire_failures(found))
+    assert any(line.startswith("expected scan.gap_messages below 3: FAILED") for line in wire_failures(summary))
     (tmp_path / WIRE_FILE).write_text(resolved_wire(plan))
     write_report(tmp_path)
     page = checked(tmp_path)
     assert page.headings == ["Wire of robot and base", "Expectations", "Links", "Losses by reason", "Repeat it"]
     assert "2 of 5 expectations FAILED" in page.texts
-    assert {cell for row in wire_table(found).rows for cell in row} <= set(page.texts)
+    assert {cell for row in wire_table(summary).rows for cell in row} <= set(page.texts)
     assert {"{:.4f} to {:.4f}".format(*found["links"]["scan"]["bounds"]), "lost: loss"} <= set(page.texts)
-    assert {*said[1:], *wire_failures(found)} <= set(page.texts)
+    assert {*said[1:], *wire_failures(summary)} <= set(page.texts)
     assert "bernoulli: quality = 0.6" in page.texts
     (tmp_path / "summary.json").write_text("{}")
     with pytest.raises(UsageError, match="not the summary of a wire of this version"):
@@ -225,6 +237,69 @@ link = "scan"
     nothing, status = run(tmp_path / "silent", plan, messages=0)
     assert status == 0
     assert {one["held"] for one in nothing["expectations"]} == {None}
+
+
+@pytest.mark.parametrize(
+    ("entries", "said"),
+    [
+        ({"heard": "many"}, "heard: Input should be a valid integer"),
+        ({"seed": None}, "seed: Input should be a valid integer"),
+        ({"state": "asleep"}, "state: Input should be 'running', 'ended' or 'killed'"),
+        ({"journal": []}, "journal: "),
+        ({"links": []}, "links: "),
+        ({"links": {"link": {"heard": 5}}}, "links.link.source: Field required"),
+        ({"events": [{"event": "cut link"}]}, "events.0.seconds: Field required"),
+        ({"expectations": 7}, "expectations: "),
+        ({"made_with": ["python"]}, "made_with: "),
+    ],
+)
+def test_a_summary_with_another_entry_is_refused(entries: dict[str, Any], said: str, tmp_path: Path) -> None:
+    """With its file, the entry, and what is wrong with it."""
+    found, _ = run(tmp_path, wire_plan(), messages=1)
+    path = tmp_path / "summary.json"
+    path.write_text(json.dumps(found | entries))
+    with pytest.raises(UsageError, match=re.escape(f"{path} is not the summary of a wire of this version ({said}")):
+        WireSummary.read(path)
+
+
+@pytest.mark.parametrize("name", ["rate", "expected_rate", "bounds", "within_bounds"])
+def test_a_link_that_lacks_a_part_of_its_comparison_is_refused(name: str, tmp_path: Path) -> None:
+    """The rate is given with all that the models say about it."""
+    found, _ = run(tmp_path, wire_plan(), messages=1)
+    for link in found["links"].values():
+        link[name] = None
+    (tmp_path / "summary.json").write_text(json.dumps(found))
+    with pytest.raises(UsageError, match="rate, expected_rate, bounds and within_bounds must be given together"):
+        read(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["", "[", "7", "[" * 100_000, "\ud800"])
+def test_a_file_that_is_no_summary_is_refused(text: str, tmp_path: Path) -> None:
+    """Also one that is not JSON, or not text."""
+    path = tmp_path / "summary.json"
+    path.write_bytes(text.encode("utf-8", "surrogatepass"))
+    with pytest.raises(UsageError, match=re.escape(f"{path} is not the summary of a wire ")):
+        WireSummary.read(path)
+    with pytest.raises(UsageError, match="is not the summary of a wire"):
+        WireSummary.read(tmp_path)
+
+
+def test_a_wire_without_links_has_a_summary_and_a_page(tmp_path: Path) -> None:
+    """The page says so."""
+    plan = wire_of({"side": {"robot": {}, "base": {}}})
+    run(tmp_path, plan)
+    (tmp_path / WIRE_FILE).write_text(resolved_wire(plan))
+    assert read(tmp_path).links == {}
+    write_report(tmp_path)
+    assert checked(tmp_path).headings[0] == "Wire without links"
+
+
+def test_the_summary_of_an_older_version_is_of_a_wire_that_ended(tmp_path: Path) -> None:
+    """It has no state."""
+    found, _ = run(tmp_path, wire_plan(), messages=1)
+    del found["state"]
+    (tmp_path / "summary.json").write_text(json.dumps(found))
+    assert read(tmp_path).state == "ended"
 
 
 def test_mistakes_in_expectations() -> None:
@@ -278,27 +353,27 @@ def test_a_latency_is_that_of_its_quantile(tmp_path: Path) -> None:
     """Of 100 different delays, the 90th."""
     plan = expecting('[[expect]]\nfigure = "scan.latency"\nquantile = 0.9\nbelow = 1\n')
     with WireJournal(tmp_path, plan) as journal:
-        summary = WireSummary(plan, journal)
+        keeper = WireScorekeeper(plan, journal)
         for n in range(100):
             journal.record(1.0, n, -1, (n + 1) / 1000, journal.key_code("a"), 0, 0, 0, Kind.PUT, Crossing.DELIVERED)
-    (judged,) = summary.judged(summary.links())
+    (judged,) = keeper.judged(keeper.links())
     assert judged.found == 0.09
 
 
 def test_the_exit_status_tells_of_an_incomplete_journal_and_of_unaccounted_messages(tmp_path: Path) -> None:
     """The exit status is 1 or 3, each with a line."""
     with WireJournal(tmp_path, wire_plan()) as journal:
-        summary = WireSummary(wire_plan(), journal)
-    assert summary.finish(tmp_path) == 0
-    assert list(wire_failures(summary.as_dict())) == []
+        keeper = WireScorekeeper(wire_plan(), journal)
+    assert keeper.finish(tmp_path) == 0
+    assert list(wire_failures(keeper.summary())) == []
     journal.incomplete_since = 5.0
-    assert summary.finish(tmp_path) == 1
-    assert "the journal has all messages" in "".join(wire_failures(summary.as_dict()))
+    assert keeper.finish(tmp_path) == 1
+    assert "the journal has all messages" in "".join(wire_failures(keeper.summary()))
     journal.missing = 7
-    assert list(wire_failures(summary.as_dict())) == ["the journal lacks 7 messages, because the disk was full"]
+    assert list(wire_failures(keeper.summary())) == ["the journal lacks 7 messages, because the disk was full"]
     journal.recorded += 1
-    assert summary.finish(tmp_path) == 3
-    assert "unaccounted for: 1 message; this is a fault of Evedrop" in wire_failures(summary.as_dict())
+    assert keeper.finish(tmp_path) == 3
+    assert "unaccounted for: 1 message; this is a fault of Evedrop" in wire_failures(keeper.summary())
 
 
 def by_hand(rows: list[tuple[float, bool]]) -> tuple[int, float]:

@@ -1,4 +1,4 @@
-"""The summary of a wire: what became of all messages, each link against its model, and whether expectations held.
+"""Adds up the summary of a wire: what became of all messages, each link against its model, and whether expectations held.
 
 Source: docs/wire.md, the summary.
 """
@@ -6,13 +6,11 @@ Source: docs/wire.md, the summary.
 from __future__ import annotations
 
 import importlib.metadata
-import json
 import platform
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol, final
+from typing import Protocol, final
 
 import numpy as np
 import zenoh
@@ -21,13 +19,19 @@ from numpy.typing import NDArray
 from evedrop.model.slot.link import Change
 from evedrop.output import warn
 from evedrop.results.folder import replace_private
-from evedrop.results.summary_file import plain
+from evedrop.results.wire_summary import (
+    WIRE_SUMMARY_FILE,
+    JournalState,
+    JournalSummary,
+    WireEventSummary,
+    WireLinkSummary,
+    WireSummary,
+)
 from evedrop.score.summary import Judged
 from evedrop.wire.crossing import UNLINKED, Crossing, Kind
 from evedrop.wire.expect import WireExpectTable
 from evedrop.wire.journal import AmendmentListener, Listener
 from evedrop.wire.journal_part import REASONS, Records
-from evedrop.wire.journal_reader import JournalState
 from evedrop.wire.law import bounds, expected
 from evedrop.wire.plan import WireLink, WirePlan
 from evedrop.wire.tallies import LinkTally, StreamTally
@@ -71,38 +75,8 @@ class SummarisedJournal(Protocol):
         """The settings that the messages of a stream had."""
 
 
-@dataclass(frozen=True)
-class WireLinkSummary:
-    """What became of the messages of a link."""
-
-    source: str
-    target: str
-    keys: str
-    heard: int
-    bytes: int
-    delivered: int
-    again: int
-    """How many messages were delivered twice."""
-    lost_by: Mapping[str, int]
-    """Reason → messages that the link's settings stopped."""
-    dropped_by: Mapping[str, int]
-    """Reason → messages that the wire itself or Zenoh stopped."""
-    rate: float | None
-    """The fraction that the link's models let through, of the messages on which they decided; None if there were none."""
-    expected_rate: float | None
-    bounds: tuple[float, float] | None
-    """Between which this fraction is in 99 % of all wires with these models."""
-    within_bounds: bool | None
-    delays: Mapping[str, float]
-    """Quantile → seconds for which delivered messages were held back."""
-    gap_messages: int
-    """The most messages of one key in a row that were not delivered."""
-    gap_seconds: float
-    """The longest time from a delivered message of a key to its next one, if messages between them were not delivered."""
-
-
 @final
-class WireSummary:
+class WireScorekeeper:
     """Listens to a wire's journal, and adds up. Threads may call its methods at the same time."""
 
     def __init__(self, plan: WirePlan, journal: SummarisedJournal) -> None:
@@ -163,30 +137,26 @@ class WireSummary:
         tallies = [*self._links.values(), self._unlinked]
         return abs(self._journal.recorded - sum(int(tally.fates.sum()) for tally in tallies))
 
-    def as_dict(self) -> dict[str, Any]:
-        """The entries of summary.json."""
+    def summary(self) -> WireSummary:
+        """The summary so far."""
         journal, links = self._journal, self.links()
-        return {
-            "seed": self._plan.seed,
-            "start": journal.start,
-            "state": journal.state,
-            "seconds": journal.seconds,
-            "heard": journal.recorded,
-            "unlinked": self._unlinked.heard,
-            "unaccounted": self.unaccounted,
-            "journal": {
-                "recovered": journal.recovered,
-                "missing": journal.missing,
-                "incomplete_since": journal.incomplete_since,
-            },
-            "links": {name: asdict(link) for name, link in links.items()},
-            "expectations": [judged.as_dict() for judged in self.judged(links)],
-            "events": [{"seconds": seconds, "event": event} for seconds, event in journal.events],
-            "made_with": {
+        return WireSummary(
+            seed=self._plan.seed,
+            start=journal.start,
+            state=journal.state,
+            seconds=journal.seconds,
+            heard=journal.recorded,
+            unlinked=self._unlinked.heard,
+            unaccounted=self.unaccounted,
+            journal=JournalSummary(journal.recovered, journal.missing, journal.incomplete_since),
+            links=links,
+            expectations=self.judged(links),
+            events=[WireEventSummary(seconds, event) for seconds, event in journal.events],
+            made_with={
                 "python": platform.python_version(),
                 **{name: importlib.metadata.version(name) for name in ("evedrop", "eclipse-zenoh")},
             },
-        }
+        )
 
     def judged(self, links: Mapping[str, WireLinkSummary]) -> list[Judged]:
         """The expectations of the wire, and whether they held."""
@@ -198,16 +168,15 @@ class WireSummary:
 
         1 if an expectation failed or the journal is incomplete, 3 if a message is unaccounted for.
         """
-        found = self.as_dict()
+        found = self.summary()
         try:
-            replace_private(out / "summary.json", json.dumps(plain(found), indent=1, ensure_ascii=False) + "\n")
+            replace_private(out / WIRE_SUMMARY_FILE, found.text)
         except OSError as error:
             warn(f"the summary of the wire cannot be written ({error})")
             return 1
-        if self.unaccounted:
+        if found.unaccounted:
             return 3
-        failed = any(one["held"] is False for one in found["expectations"])
-        return 1 if failed or self._journal.incomplete_since is not None else 0
+        return 1 if found.failed_expectations or found.journal.incomplete_since is not None else 0
 
     def _judged(self, table: WireExpectTable, link: WireLinkSummary) -> Judged:
         if table.link is not None:
