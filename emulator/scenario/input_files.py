@@ -13,8 +13,12 @@ import numpy as np
 
 from evedrop.errors import DisturbanceError, TraceError, UsageError
 from evedrop.model.checks import is_number
+from evedrop.model.delays import DELAY_MODELS
+from evedrop.model.delays.delay import DelayModel
 from evedrop.model.delays.trace import MOST_DELAYS
 from evedrop.model.given_states import deviations
+from evedrop.model.links import LOSS_MODELS
+from evedrop.model.links.link import LossModel
 from evedrop.model.process import Floats
 from evedrop.recordings.disturbance_file import found_file, read_disturbances
 from evedrop.recordings.link_recording import LinkRecording
@@ -102,7 +106,7 @@ _STAND_IN = "1"  # the outcomes of a recording that cannot be read: later checks
 
 def recordings_located(tables: Mapping[str, Any], folder: Path) -> None:
     """Replace the name of every recording with its path, in place; folder: that of the scenario."""
-    for _, trace in _traces(tables):
+    for _, trace, _ in _recorded(tables):
         if isinstance(trace.get("file"), str):
             trace["file"] = str(folder / trace["file"])
 
@@ -112,46 +116,54 @@ def read_recordings(tables: Mapping[str, Any]) -> list[str]:
     mistakes = []
     delays = 0
     slots = tables.get("slots")
-    for path, loss in _traces(tables):
-        if path.endswith("delay"):
-            mistakes += [f"{path}.{entry}: {what}" for entry, what in _replace(loss, "values")]
-            before, delays = delays, delays + (len(loss["values"]) if isinstance(loss["values"], list) else 0)
+    for path, trace, parameter in _recorded(tables):
+        given, of_delays = parameter in trace, path.endswith("delay")
+        wrong = [f"{path}.{entry}: {what}" for entry, what in _replace(trace, parameter, of_delays)]
+        mistakes += wrong
+        contents = trace[parameter]
+        if of_delays:
+            before, delays = delays, delays + (len(contents) if isinstance(contents, list) else 0)
             if before <= MOST_DELAYS < delays:
                 mistakes.append(
                     f"{path}.file: is one too many; expected at most {MOST_DELAYS} delays on all links together"
                 )
             continue
-        source = "outcomes" if "outcomes" in loss else "file"
-        wrong = [f"{path}.{entry}: {what}" for entry, what in _replace(loss, "outcomes")]
-        mistakes += wrong
-        outcomes = loss["outcomes"]
         if wrong:
-            loss.pop("once", None)
-        elif loss.get("once") is True and isinstance(outcomes, str) and type(slots) is int and len(outcomes) < slots:
-            few = f"has {len(outcomes)} outcomes and is read once; expected slots, which is {slots}, or more"
-            mistakes.append(f"{path}.{source}: {few}")
+            trace.pop("once", None)
+        elif trace.get("once") is True and isinstance(contents, str) and type(slots) is int and len(contents) < slots:
+            few = f"has {len(contents)} outcomes and is read once; expected slots, which is {slots}, or more"
+            mistakes.append(f"{path}.{parameter if given else 'file'}: {few}")
     return mistakes
 
 
-def _traces(tables: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
-    """The path and table of every loss or delay model that is a trace, at any depth."""
+def _recorded(tables: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any], str]]:
+    """Path and table of every loss or delay model that reads a recording, at any depth, and the parameter for its contents."""
     entries = tables.items() if isinstance(tables, dict) else enumerate(tables) if isinstance(tables, list) else ()
     for name, inner in entries:
         if not isinstance(inner, (dict, list)):
             continue
-        if name in ("loss", "delay") and isinstance(inner, dict) and inner.get("model") == "trace":
-            yield f"{path}{name}", inner
+        parameter = _parameter_of(name, inner) if isinstance(inner, dict) else None
+        if isinstance(inner, dict) and parameter is not None:
+            yield f"{path}{name}", inner, parameter
         else:
-            yield from _traces(inner, f"{path}{name}.")
+            yield from _recorded(inner, f"{path}{name}.")
 
 
-def _replace(trace: dict[str, Any], entry: str) -> list[tuple[str, str]]:
-    """Put a recording's contents into `entry`, `outcomes` or `values`; returns the mistakes, (entry, description) each."""
+def _parameter_of(entry: str | int, table: Mapping[str, Any]) -> str | None:
+    """The parameter for the contents of a recording; None unless the table is a built-in loss or delay model that reads one."""
+    models: Mapping[str, type[LossModel | DelayModel]]
+    models = LOSS_MODELS if entry == "loss" else DELAY_MODELS if entry == "delay" else {}
+    model = table.get("model")
+    return models[model].recorded if isinstance(model, str) and model in {*models} else None
+
+
+def _replace(trace: dict[str, Any], entry: str, of_delays: bool) -> list[tuple[str, str]]:
+    """Put a recording's outcomes, or its delays, into an entry; returns the mistakes, (entry, description) each."""
     file, column = trace.pop("file", None), trace.pop("column", None)
     if entry in trace:
         extra = "file" if file is not None else "column" if column is not None else None
         return [(extra, f"is given together with {entry}; expected one of them")] if extra else []
-    trace[entry] = _STAND_IN if entry == "outcomes" else [0.0]
+    trace[entry] = [0.0] if of_delays else _STAND_IN
     if file is None:
         return [("file", 'is missing; expected file = "walk.csv"')]
     wrong = [
@@ -163,13 +175,13 @@ def _replace(trace: dict[str, Any], entry: str) -> list[tuple[str, str]]:
         return wrong
     try:
         recording = LinkRecording(Path(file))
-        if entry == "outcomes":
-            trace[entry] = (recording.outcomes(column) + ord("0")).tobytes().decode()
-        else:
+        if of_delays:
             delays = recording.delays(column)
             trace[entry] = delays[~np.isnan(delays)].tolist()
             if not trace[entry]:
                 return [("file", f"{file} has no delays; expected one for at least one packet")]
+        else:
+            trace[entry] = (recording.outcomes(column) + ord("0")).tobytes().decode()
     except TraceError as error:
         return [(error.entry, f"{file} {error.what}" if error.entry == "file" else error.what)]
     return []

@@ -17,6 +17,8 @@ import pytest
 from evedrop.errors import UsageError
 from evedrop.files import Limit, Unreadable, contents, lines_of
 from evedrop.loading import load, parse
+from evedrop.model.links.pattern import Pattern
+from evedrop.scenario.input_files import read_recordings
 from tests.conftest import Evedrop
 from tests.loading.refused import BASE, mistakes
 
@@ -183,3 +185,13 @@ def test_lines_end_with_the_limit(tmp_path: Path) -> None:
     assert contents(path, 20) == b"a\n" * 10
     with pytest.raises(Unreadable, match="more than 19 bytes"):
         contents(path, 19)
+
+
+def test_a_model_whose_class_says_so_reads_a_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Into the parameter that the class names, by whatever name a scenario calls the model; other models keep their entries."""
+    recording = tmp_path / "walk.csv"
+    recording.write_text("received\n1\n0\n1\n")
+    loss = {"model": "pattern", "file": str(recording)}
+    assert (read_recordings({"loss": loss}), list(loss)) == ([], ["model", "file"])
+    monkeypatch.setattr(Pattern, "recorded", "outcomes")
+    assert (read_recordings({"loss": loss}), loss) == ([], {"model": "pattern", "outcomes": "101"})

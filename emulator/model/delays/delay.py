@@ -28,6 +28,8 @@ class DelayModel(ABC):
 
     parameters: ClassVar[Mapping[str, Any]] = MappingProxyType({})
     optional: ClassVar[frozenset[str]] = frozenset()
+    recorded: ClassVar[str | None] = None
+    """The parameter that gets the contents of the recording `file`; None if there is none. Only for built-in models."""
     lengths: ClassVar[tuple[str, ...]] = ()
     """The parameters that are lengths of time, and may therefore be given in seconds."""
     normal: ClassVar[bool] = False

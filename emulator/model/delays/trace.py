@@ -24,6 +24,7 @@ class RecordedDelay(DelayModel):
 
     parameters = MappingProxyType({"values": [0.5, 2.0, 1.25]})
     lengths = ("values",)
+    recorded = "values"
 
     def __init__(self, values: list[float]) -> None:
         self._values = np.array(values, np.float64)

@@ -77,6 +77,8 @@ class LossModel(ABC):
 
     parameters: ClassVar[Mapping[str, Any]] = MappingProxyType({})
     optional: ClassVar[frozenset[str]] = frozenset()
+    recorded: ClassVar[str | None] = None
+    """The parameter that gets the contents of the recording `file`; None if there is none. Only for built-in models."""
     ways: tuple[Way, Way] | None = None
     """Where sender and receiver are in every slot; None if losses do not depend on that."""
     uniforms_per_slot: int = 1

@@ -31,6 +31,7 @@ class RecordedLoss(LossModel):
 
     parameters = MappingProxyType({"outcomes": "1101", "once": True, "random_start": True})
     optional = frozenset({"once", "random_start"})
+    recorded = "outcomes"
     uniforms_per_slot = 1
 
     def __init__(self, outcomes: str, once: bool = False, random_start: bool = False) -> None:
