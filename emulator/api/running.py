@@ -104,10 +104,8 @@ def sweep(
     """
     from evedrop.studies.sweep import MOST_POINTS, sweep_over  # noqa: PLC0415 - no other call needs it
 
-    values = plain_tables(dotted(over), "over")
     given = {**dotted(changes), "trials": trials}
-    if isinstance(folder := values.pop("modules", None), str):
-        given.setdefault("modules", folder)
+    values = _named(dotted(over), "over", scenario, given)
     for key, found in values.items():
         if not isinstance(found, list) or not found:
             raise UsageError(f"over: {key} is {found!r}; expected a list of values, such as [0.2, 0.4]")
@@ -150,10 +148,7 @@ def compare(
     from evedrop.studies.matchups import matchups_of  # noqa: PLC0415 - the same
 
     given = {**dotted(changes), "trials": trials}
-    modules = scenario.modules if isinstance(scenario, Scenario) else given.get("modules")
-    chosen = plain_tables({"schemes": schemes, "adversaries": adversaries}, "compare", modules)
-    if "modules" in chosen:
-        given["modules"] = chosen["modules"]
+    chosen = _named({"schemes": schemes, "adversaries": adversaries}, "compare", scenario, given)
     made = scenario_of(scenario, given)
     matchups = matchups_of(made, chosen.get("schemes"), chosen.get("adversaries"), parameters)
     with place_for(out, overwrite) as place, progress(tell, 0) as told:
@@ -161,3 +156,14 @@ def compare(
         results = ComparisonResults.of(found, place.folder)
         place.keep_for(results)
         return results
+
+
+def _named(
+    values: Mapping[str, Any], source: str, scenario: str | Path | Scenario, given: dict[str, Any]
+) -> dict[str, Any]:
+    """The values as plain tables, with the names of classes. The folder of their modules is added to the changes `given`."""
+    modules = given.get("modules", scenario.modules if isinstance(scenario, Scenario) else None)
+    tables = plain_tables(values, source, modules)
+    if isinstance(tables.get("modules"), str):
+        given["modules"] = tables.pop("modules")
+    return tables

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop import Scenario, montecarlo
+from evedrop import Scenario, montecarlo, sweep
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.loading import load, shipped
 from evedrop.memory.montecarlo import Plan
@@ -146,6 +146,25 @@ def test_a_class_of_a_module_is_named_and_its_folder_known(own: Any, tmp_path: P
     many = made.replace(slots=2)
     found = [montecarlo(many, trials=501, out=tmp_path / f"{n}", plan=Plan(workers=n)) for n in (1, 2)]
     assert digests_of(found[0]) == digests_of(found[1])
+
+
+def test_a_sweep_knows_the_folder_of_the_classes_in_it(
+    own: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Workers import them from there; a scenario or a call with modules elsewhere is refused."""
+    over = {"encoding": [{"scheme": own.Flipped}, {"scheme": "plain"}]}
+    (tmp_path / "other").mkdir()
+    elsewhere = str(tmp_path / "other")
+    for scenario, changes in ((vehicle(modules=elsewhere), {}), (vehicle(), {"modules": elsewhere})):
+        with pytest.raises(ScenarioError, match="of several folders"):
+            sweep(scenario, over, **changes)
+
+    def stopped(_: object, given: dict[str, Any], values: dict[str, Any], *rest: object) -> None:
+        raise UsageError(f"{given['modules']} {values['encoding'][0]['scheme']}, {len(rest)} others")
+
+    monkeypatch.setattr("evedrop.studies.sweep.sweep_over", stopped)
+    with pytest.raises(UsageError, match=re.escape(f"{tmp_path} flipped:Flipped, ")):
+        sweep(vehicle(), over)
 
 
 def test_classes_of_two_folders_are_refused(own: Any, tmp_path: Path) -> None:
