@@ -7,17 +7,17 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Protocol, Self, TypeVar, final
+from typing import TYPE_CHECKING, Literal, Protocol, Self
 
 import pyarrow as pa
 
 from evedrop.api.notebook import table_text
-from evedrop.errors import UnknownName
 from evedrop.figures import shown_figure
 from evedrop.figures.text import figure_text
 from evedrop.report import closing
 from evedrop.report.sweep import sweep_table
 from evedrop.report.text_table import TextTable
+from evedrop.results.by_name import ByName
 from evedrop.results.comparison import Comparison
 from evedrop.results.reading import Results
 from evedrop.results.reading import load_results as read_results
@@ -26,22 +26,8 @@ from evedrop.score.summary import Judged, LinkSummary, PeerSummary, SecrecySumma
 if TYPE_CHECKING:
     from evedrop.view.shown_figure import ShownFigure
 
-T = TypeVar("T")
 Panels = Literal["errors", "lanes", "plane"]
 _MOST_ROWS = 40  # of a table in a notebook
-
-
-@final
-class ByName(dict[str, T]):
-    """Entries of results by name. An unknown name raises UnknownName, a KeyError that lists the known ones."""
-
-    def __init__(self, what: str, entries: Mapping[str, T]) -> None:
-        """what: the kind of entry, such as "receiver"."""
-        super().__init__(entries)
-        self._what = what
-
-    def __missing__(self, name: object) -> T:
-        raise UnknownName(self._what, name, self)
 
 
 class _InFolder(Protocol):

@@ -14,6 +14,7 @@ from typing import Any
 
 import pyarrow as pa
 
+from evedrop.results.by_name import ByName
 from evedrop.results.writer import plain
 from evedrop.score.summary import RareEvents
 from evedrop.score.verdict import Secrecy, SecrecyKept, Verdict
@@ -259,8 +260,8 @@ class Comparison:
         )
 
     def cell(self, scheme: str, adversary: str) -> Cell:
-        """The cell of one pair."""
-        return self.schemes[scheme].cells[adversary]
+        """The cell of one pair. Raises UnknownName, a KeyError, for a scheme or an adversary that was not compared."""
+        return ByName("adversary", ByName("scheme", self.schemes)[scheme].cells)[adversary]
 
     def as_dict(self) -> dict[str, Any]:
         """The comparison in the form of compare.json, except for infinite numbers."""

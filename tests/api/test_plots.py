@@ -161,6 +161,10 @@ def test_a_comparison_takes_a_class_and_has_a_figure_and_a_page(own: Any) -> Non
     assert isinstance(found, ComparisonResults)
     assert list(found.schemes) == ["flipped:Flipped", "plain"]
     assert found.adversaries == ("naive",)
+    for scheme, adversary, said in (("plane", "naive", "scheme 'plane'; expected one of flipped:Flipped, plain"),
+                                    ("plain", "naiv", "adversary 'naiv'; expected one of naive")):  # fmt: skip
+        with pytest.raises(KeyError, match=f"there is no {said}$"):
+            found.cell(scheme, adversary)
     texts = {one.get_text() for one in found.plot().axes[0].texts}
     assert {*found.schemes, *found.adversaries} <= texts
     assert found.report() == found.folder / REPORT

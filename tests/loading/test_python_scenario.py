@@ -155,7 +155,11 @@ def test_a_sweep_knows_the_folder_of_the_classes_in_it(
     over = {"encoding": [{"scheme": own.Flipped}, {"scheme": "plain"}]}
     (tmp_path / "other").mkdir()
     elsewhere = str(tmp_path / "other")
-    for scenario, changes in ((vehicle(modules=elsewhere), {}), (vehicle(), {"modules": elsewhere})):
+    cases: list[tuple[Scenario, dict[str, Any]]] = [
+        (vehicle(modules=elsewhere), {}),
+        (vehicle(), {"modules": elsewhere}),
+    ]
+    for scenario, changes in cases:
         with pytest.raises(ScenarioError, match="of several folders"):
             sweep(scenario, over, **changes)
 
