@@ -104,7 +104,7 @@ def test_refusals(changes: dict[str, Any], said: str) -> None:
 def test_the_design_of_one_probability_refuses_a_list() -> None:
     """It names the remedy; the design of a schedule does not need the scenario's own."""
     scenario = checked(tables_of(eavesdroppers={"smart": tables_of()["eavesdroppers"]["smart"]}), "it")
-    with pytest.raises(UsageError, match=r"give --set encoding\.state_probability=0\.6"):
+    with pytest.raises(UsageError, match=r"change it, as by encoding\.state_probability=0\.6"):
         design(scenario)
     assert design_schedule(scenario, 3, weight=0.5).schedules["smart"].best.mu_d[0] == 1.0
 

@@ -150,7 +150,7 @@ def test_a_replay_is_seen_only_with_a_watermark() -> None:
 
 @pytest.mark.parametrize("k", [0, 1])
 def test_replaced_measurements_are_stationary_from_slot_0_on(k: int) -> None:
-    """Z of 4000 trials has its stationary variance, 0.1 / (1 − 0.8²), to 6 standard errors; its noise alone has 0.1."""
+    """The values z of 4000 trials have the variance 0.1 / (1 − 0.8²) to 6 standard errors; the noise w_a alone has 0.1."""
     feed = SENSOR_ATTACKS["replace"].read({"matrix": [[0.8]], "noise": [[0.1]]}).feed(b"k" * 32, Batch(20, 4000))
     z = [feed.take(slot, np.zeros((1, 4000)), True) for slot in range(k + 1)][k]
     expected = 0.1 / (1.0 - 0.8**2)
