@@ -26,7 +26,7 @@ def print_schedules(design: ScheduleDesign) -> None:
         on_grid = (
             "the best schedule of the grid"
             if found.exact
-            else "the best schedule found on the part of the grid that was searched,"
+            else "the best schedule found on the part of the grid that was searched"
         )
         console.print(
             f"{on_grid} has {found.grid.value:.6g}; "
