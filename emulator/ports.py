@@ -18,4 +18,6 @@ def free_port() -> int:
             except OSError:
                 continue
             return port
-    raise UsageError("no free port between 10000 and 32000 on loopback; end some programs, or give --listen")
+    raise UsageError(
+        "no free port between 10000 and 32000 on loopback; end some programs, or give the router's endpoint"
+    )

@@ -70,7 +70,7 @@ def _adversaries(made: Scenario) -> tuple[float, list[Adversary], dict[str, str]
             raise UsageError(
                 "the design of μ_d is for independent losses that stay the same, without late packets and outages, and "
                 f"the link of {name} is different; give it only a quality, such as "
-                f"--set '{'' if name == LEGITIMATE else 'eavesdroppers.'}{name}.link={{quality = 0.9}}'"
+                f"{'' if name == LEGITIMATE else 'eavesdroppers.'}{name}.link={{quality = 0.9}}"
             )
         quality[name] = float(alike.quality[0])
     adversaries, left_out = [], {}
@@ -125,7 +125,7 @@ def design_schedule(
     if not found:
         raise UsageError(
             "a schedule is designed against eavesdroppers whose error has a closed form, and the scenario has none; add one, "
-            "such as --set 'eavesdroppers.genie={strategy = \"genie\", link = {quality = 0.9}}'"
+            'such as eavesdroppers.genie={strategy = "genie", link = {quality = 0.9}}'
         )
     return ScheduleDesign(found, left_out)
 
@@ -170,7 +170,7 @@ def _not_for(scheme: str) -> str:
     """The reason why a scheme cannot be designed, and an alternative."""
     designed = [name for name in SCHEMES if SCHEMES[name].sends_states_and_innovations]
     why = f"the design of μ_d is for the scheme {listed(designed)}"
-    instead = "give --set 'encoding={scheme = \"innovation\", state_probability = 0.6}' to design that on this process"
+    instead = 'give encoding={scheme = "innovation", state_probability = 0.6} to design that on this process'
     if SCHEMES.foreign(scheme):
         return f"{why}; no closed form is known for {scheme}; {instead}, or study it by evedrop sweep"
     if SCHEMES[scheme].needs_acknowledgements:

@@ -95,7 +95,7 @@ def budget_of(scenario: Scenario, budget: float) -> BudgetDesign:
         raise UsageError(
             "the design for a budget is for independent losses that stay the same, without late packets and outages, and for an "
             "attack on acknowledgements that is always on; give the legitimate link only a quality, such as "
-            "--set 'legitimate.link={quality = 0.9}', and remove events"
+            "legitimate.link={quality = 0.9}, and remove events"
         )
     scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
     model, arrives = scenario.energy_model, sum(user.acknowledged)

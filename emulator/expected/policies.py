@@ -80,7 +80,7 @@ def policies_of(scenario: Scenario, weights: Sequence[float], prices: Sequence[f
             "the design of a policy is for independent losses that stay the same, without late packets and outages, and for "
             "an attack on acknowledgements that is always on; the link of "
             f"{', '.join(unknown)} is different; give each link only a quality, such as "
-            "--set 'legitimate.link={quality = 0.9}', and remove events"
+            "legitimate.link={quality = 0.9}, and remove events"
         )
     user = closed[LEGITIMATE]
     assert user is not None  # noqa: S101 - refused above
@@ -96,7 +96,7 @@ def policies_of(scenario: Scenario, weights: Sequence[float], prices: Sequence[f
         bound = max(0.0, 1.0 - process.spectral_radius**-2)
         raise UsageError(
             f"no policy keeps the user's error bounded: the legitimate link's quality μ = {mu:g} must exceed "
-            f"max(0, 1 − ρ⁻²) = {bound:.6g}; give a better link, such as --set legitimate.link.quality={0.5 + 0.5 * bound:.3g}"
+            f"max(0, 1 − ρ⁻²) = {bound:.6g}; give a better link, such as legitimate.link.quality={0.5 + 0.5 * bound:.3g}"
         )
     fronts = {}
     for name, one in closed.items():

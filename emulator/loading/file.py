@@ -206,10 +206,10 @@ def set_entry(tables: dict[str, Any], dotted: str, value: Any) -> None:
 
 def _no_such_key(dotted: str, name: str, inner: Any) -> UsageError:
     if isinstance(inner, list):
-        return UsageError(f"--set {dotted}: {name} is not an entry of a list of {len(inner)}; give 0 to {len(inner)}")
+        return UsageError(f"{dotted}: {name} is not an entry of a list of {len(inner)}; give 0 to {len(inner)}")
     if isinstance(inner, dict):
-        return UsageError(f"--set {dotted}: it has an empty part; give a dotted key such as legitimate.link.quality")
-    return UsageError(f"--set {dotted}: {name} is not in a table or list; give the dotted key of a scenario entry")
+        return UsageError(f"{dotted}: it has an empty part; give a dotted key such as legitimate.link.quality")
+    return UsageError(f"{dotted}: {name} is not in a table or list; give the dotted key of a scenario entry")
 
 
 def value_of(text: str) -> Any:

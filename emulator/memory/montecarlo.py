@@ -169,7 +169,7 @@ def check_mode(scenario: Scenario, mode: Mode) -> None:
         if beyond.size:
             raise UsageError(
                 f"{name}'s expected error leaves double precision at slot {beyond[0]}; "
-                f"give --slots {beyond[0]} or fewer, or remove {name} from the scenario"
+                f"give {beyond[0]} slots or fewer, or remove {name} from the scenario"
             )
 
 

@@ -56,12 +56,14 @@ class SplitMeans:
         """Why the estimate is not to be trusted; None if it is."""
         found = self.of_populations
         if not np.isfinite(found).all():
-            return "an error leaves double precision; give fewer --slots"
+            return "an error leaves double precision; give fewer slots"
         mean, error = float(found.mean()), standard_error(found)
         if mean == 0.0 or error is None:
             return None
         if error > _WIDEST * mean:
-            return f"its standard error would be {100 * error / mean:.0f} % of the mean; give more --trials or fewer --slots"
+            return (
+                f"its standard error would be {100 * error / mean:.0f} % of the mean; give more trials or fewer slots"
+            )
         return None
 
     def estimate(self, trials: int, expected: Expectation) -> RareEstimate:

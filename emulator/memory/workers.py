@@ -197,7 +197,7 @@ def connected(scheduler: str | None, patience: float = REACH_SECONDS) -> Iterato
         from distributed import Client  # noqa: PLC0415 - an optional extra
         from distributed.comm.core import connect  # noqa: PLC0415 - the same
     except ImportError as error:
-        raise UsageError("--scheduler needs Dask: pip install 'evedrop[cluster]'") from error
+        raise UsageError("a scheduler needs Dask: pip install 'evedrop[cluster]'") from error
 
     async def reach() -> None:  # a client without a scheduler may hang, and prints useless messages
         reached = connect(scheduler, timeout=patience)  # type: ignore[no-untyped-call]
@@ -209,7 +209,7 @@ def connected(scheduler: str | None, patience: float = REACH_SECONDS) -> Iterato
         client = Client(scheduler, timeout=patience, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, ValueError, TimeoutError) as error:
         raise UsageError(
-            f"--scheduler {scheduler}: no Dask scheduler answers there within {patience:g} s; start one with "
+            f"the scheduler {scheduler}: no Dask scheduler answers there within {patience:g} s; start one with "
             "`dask scheduler`, and give its address, such as tcp://127.0.0.1:8786"
         ) from error
     with contextlib.closing(client):

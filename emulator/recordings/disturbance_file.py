@@ -85,7 +85,7 @@ def read_disturbances(
         mistakes = list(_few(_time_mistakes(found.lines, times, slot_seconds, recorded), "times"))
     if not mistakes and slots is not None and len(numbers) < slots:
         few = f"has {len(numbers)} rows; expected slots, which is {slots}, or more"
-        mistakes = [f"{few}: a longer file, or --slots {len(numbers)}" if numbers else few]
+        mistakes = [f"{few}: a longer file, or slots = {len(numbers)}" if numbers else few]
     if mistakes:
         raise DisturbanceError(str(path), mistakes)
     return [row[1:] for row in numbers] if timed else numbers

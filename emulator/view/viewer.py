@@ -49,10 +49,10 @@ def choose(mode: str) -> str:
     if mode == "auto":
         return "native" if has_screen() else "web"
     if mode not in {"native", "web", "off"}:
-        raise UsageError(f"--view {mode} is not a way to view a run; give auto, native, web or off")
+        raise UsageError(f"{mode} is not a way to view a run; give auto, native, web or off")
     if mode == "native" and not has_screen():
         raise UsageError(
-            "--view native needs a screen, and neither DISPLAY nor WAYLAND_DISPLAY is set; give --view web, and open "
+            "a native view needs a screen, and neither DISPLAY nor WAYLAND_DISPLAY is set; choose the web view, and open "
             "the address it prints in a browser"
         )
     return mode
@@ -231,10 +231,10 @@ def open_run(run: Path, mode: str, stand: WebAddress | None = None, recording: P
     """
     recording = run / "recording.rrd" if recording is None else recording
     if not recording.is_file():
-        raise UsageError(f"{recording} does not exist; give the results folder of a run made without --view off")
+        raise UsageError(f"{recording} does not exist; give the results folder of a run made with a view")
     if stand is not None:
         return Viewer.serve(stand, run / "logs", recording, complete=True)
     viewer = Viewer.start(mode, run / "logs", recording, complete=True)
     if viewer is None:
-        raise UsageError("a finished run cannot be opened with --view off; give auto, native or web")
+        raise UsageError("a finished run cannot be opened with the view off; give auto, native or web")
     return viewer

@@ -118,7 +118,7 @@ def spawn(
         end(process)
         log.seek(start)
         last = log.read().decode(errors="replace").strip().splitlines()[-5:]
-    raise UsageError("\n".join([f"the viewer {found}; give --view off to do without it. Its log ends:", *last]))
+    raise UsageError("\n".join([f"the viewer {found}; turn the view off to do without it. Its log ends:", *last]))
 
 
 def end(process: subprocess.Popen[bytes]) -> None:
@@ -136,7 +136,7 @@ def executable() -> Path:
     """Rerun's command. Raises UsageError if rerun-sdk is not installed."""
     found = importlib.util.find_spec("rerun_cli")
     if found is None or found.origin is None:
-        raise UsageError("the viewer is not installed; install rerun-sdk, or give --view off")
+        raise UsageError("the viewer is not installed; install rerun-sdk, or turn the view off")
     folder = Path(found.origin).parent
     return folder / ("rerun.exe" if sys.platform == "win32" else "rerun")
 

@@ -43,7 +43,7 @@ class WebPage:
         try:
             html = own_page(_page_of(rerun))
         except (OSError, http.client.HTTPException) as error:
-            raise UsageError(f"the viewer sends no page ({error}); give --view off to do without it") from error
+            raise UsageError(f"the viewer sends no page ({error}); turn the view off to do without it") from error
         try:
             self._server = _Server(rerun, html, (seen, recordings), host, port)
         except OSError as error:

@@ -165,8 +165,8 @@ def test_a_scheme_without_such_a_choice_is_refused(evedrop: Evedrop, scheme: str
     done = evedrop("design", "twin-track", *changes(encoding=f'{{scheme = "{scheme}"{parameter}}}'))
     assert (done.status, done.out) == (2, "")
     (line,) = done.err.splitlines()
-    assert f"for the scheme innovation or plain, and this scenario has {scheme}; give --set" in line
-    remedy = line.partition("--set '")[2].partition("'")[0]
+    assert f"for the scheme innovation or plain, and this scenario has {scheme}; give encoding={{" in line
+    remedy = line.partition("give ")[2].partition(" to design")[0]
     assert designed(evedrop, "twin-track", "--set", remedy)["legitimate"]["bound"] == pytest.approx(LOW, abs=1e-6)
 
 

@@ -137,9 +137,9 @@ def test_design_is_for_independent_losses(every_model: Path, evedrop: Evedrop) -
     assert (done.status, done.out) == (2, "")
     (line,) = done.err.splitlines()
     assert "the link of legitimate is different" in line
-    assert "--set 'legitimate.link={quality = 0.9}'" in line
+    assert "such as legitimate.link={quality = 0.9}" in line
     quality = {"quality": 0.9}
-    with pytest.raises(UsageError, match=r"--set 'eavesdroppers\.distance\.link="):
+    with pytest.raises(UsageError, match=r"such as eavesdroppers\.distance\.link="):
         design(every_model, changes={"legitimate.link": quality})
     links = {f"eavesdroppers.{name}.link": quality for name in scenario()["eavesdroppers"]}
     found = design(every_model, changes={"legitimate.link": quality, **links})

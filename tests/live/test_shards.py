@@ -329,8 +329,8 @@ def test_what_shards_cannot_do_is_refused(evedrop: Evedrop) -> None:
     sharded = ("--trials", "4", "--set", "shards=2")
     for words, said in (
         (("brief", "eavesdroppers", *sharded, "--out", "briefs", "--results", "there"), "give --set shards=1"),
-        (("run", "eavesdroppers", *sharded, "--view", "off", "--listen", "tcp/127.0.0.1:17461"), "give --set shards=1"),
-        (("run", "eavesdroppers", *sharded, "--view", "off", "--relay", "tcp/127.0.0.1:17461"), "give --set shards=1"),
+        (("run", "eavesdroppers", *sharded, "--view", "off", "--listen", "tcp/127.0.0.1:17461"), "give shards=1"),
+        (("run", "eavesdroppers", *sharded, "--view", "off", "--relay", "tcp/127.0.0.1:17461"), "give shards=1"),
         (("run", "eavesdroppers", "--set", "shards=2"), "shards: is 2; expected at most trials, which is 1"),
         (("run", "eavesdroppers", "--set", "shards=0"), "shards: is 0; expected a number at least 1"),
     ):

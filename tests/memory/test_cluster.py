@@ -134,7 +134,7 @@ def test_an_unreachable_scheduler_is_refused(evedrop: Evedrop, command: str) -> 
     )
     assert (done.status, done.out) == (2, "")
     (line,) = done.err.splitlines()
-    assert line.startswith(f"evedrop: --scheduler {address}: no Dask scheduler answers there")
+    assert line.startswith(f"evedrop: the scheduler {address}: no Dask scheduler answers there")
     assert not (evedrop.folder / "run").exists()
 
 

@@ -240,11 +240,11 @@ def test_what_leaves_double_precision_is_refused(plan: Plan, tmp_path: Path) -> 
         "eavesdroppers__naive__link__quality": 0.9,
     }
     with pytest.raises(
-        UsageError, match=r"naive's expected error leaves double precision at slot \d+; give --slots"
+        UsageError, match=r"naive's expected error leaves double precision at slot (\d+); give \1 slots or fewer"
     ) as told:
         montecarlo("numerical", trials=2, plan=plan, out=tmp_path / "run", **changes)
     assert not (tmp_path / "run").exists()
-    slots = int(str(told.value).partition("--slots ")[2].split()[0])
+    slots = int(str(told.value).partition("; give ")[2].split()[0])
     results = montecarlo("numerical", trials=2, plan=plan, out=tmp_path / "run", **{**changes, "slots": slots})
     assert results.summary["slots"] == slots
     with pytest.raises(ScenarioError, match="can be followed up to slot"):

@@ -190,7 +190,7 @@ def test_what_is_too_skewed_is_refused() -> None:
         return found.doubt
 
     assert str(doubt([1.0] * 15 + [9.0])).startswith(
-        "its standard error would be 33 % of the mean; give more --trials or"
+        "its standard error would be 33 % of the mean; give more trials or"
     )
     assert "leaves double precision" in str(doubt([1.0, math.inf]))
     assert doubt([1.0, 1.01]) is None

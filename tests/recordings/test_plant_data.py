@@ -74,7 +74,7 @@ def test_slots_may_last_longer(tmp_path: Path) -> None:
         (GOOD.replace("2,0.7", "2.05,0.7"), "line 4: the time is 2.05 s after 1 s; expected 2 s, for slots of 1 s"),
         (GOOD.replace("2,0.7", "1,0.7"), "line 4: the time is 1 s after 1 s; expected 2 s, for slots of 1 s: times must grow"),
         (GOOD.replace("0,0.5,0.2\n", ""), "line 2: the time starts at 1 s; expected 0"),
-        (GOOD.replace("2,0.7,1.25\n", ""), "has 2 rows; expected slots, which is 3, or more: a longer file, or --slots 2"),
+        (GOOD.replace("2,0.7,1.25\n", ""), "has 2 rows; expected slots, which is 3, or more: a longer file, or slots = 2"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_with_a_day_is_said(tmp_path: Path, text: str, said: str) -> None:

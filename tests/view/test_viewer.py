@@ -75,7 +75,7 @@ def test_auto_takes_a_window_only_with_a_screen(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.delenv("DISPLAY")
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     assert choose("auto") == "web"
-    with pytest.raises(UsageError, match="--view web"):
+    with pytest.raises(UsageError, match="choose the web view"):
         choose("native")
     with pytest.raises(UsageError, match="auto, native, web or off"):
         choose("hologram")

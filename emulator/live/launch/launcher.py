@@ -54,12 +54,12 @@ def launch(
             return launch_one(scenario, folder, view, places, tell, stop, start, paused=paused)
         from evedrop.live.launch.shards import launch_shards  # noqa: PLC0415 - not needed for one set of processes
 
-        given = {"--listen": listen, "--relay": relay}
+        given = {"listen": listen, "relay": relay}
         for option, endpoint in given.items():
             if endpoint is not None:
                 raise UsageError(
-                    f"{option} {endpoint} is one router's endpoint, and each of the {scenario.shards} shards has its own; "
-                    "leave it out, or give --set shards=1"
+                    f"{option}: {endpoint} is one router's endpoint, and each of the {scenario.shards} shards has its own; "
+                    "leave it out, or give shards=1"
                 )
         if paused:
             raise UsageError(f"--paused: a run in {scenario.shards} shards cannot be steered; give --set shards=1")
