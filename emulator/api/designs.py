@@ -107,7 +107,8 @@ def design_schedule(
         raise UsageError(_not_for(made.encoding.scheme))
     if not 2 <= slots <= _LONGEST_SCHEDULE:
         raise UsageError(
-            f"a schedule of {slots} slots: expected a whole number from 2 to {_LONGEST_SCHEDULE}, the slots of the run"
+            f"a schedule of {slots} slot{'' if slots == 1 else 's'}: "
+            f"expected a whole number from 2 to {_LONGEST_SCHEDULE}, the slots of the run"
         )
     if not 1 <= block < slots:
         raise UsageError(

@@ -121,7 +121,8 @@ def _check_numbers(scenario: Scenario, weights: Sequence[float], prices: Sequenc
     most = math.isqrt(_LARGEST_CHAIN // scenario.process.process.n**2)
     if not 2 <= states <= max(2, most):
         raise UsageError(
-            f"{states} states: expected a whole number from 2 to {max(2, most)}, how many holding times are distinguished"
+            f"{states} state{'' if states == 1 else 's'}: "
+            f"expected a whole number from 2 to {max(2, most)}, how many holding times are distinguished"
         )
 
 

@@ -101,7 +101,7 @@ def test_in_python(scenario: str) -> None:
         (("--weight", "nan"), "a weight of nan: expected"),
         (("--price", "-1"), "a price of -1: expected a finite number of at least 0"),
         (("--price", "inf"), "a price of inf: expected"),
-        (("--states", "1"), "1 states: expected a whole number from 2 to 22"),
+        (("--states", "1"), "1 state: expected a whole number from 2 to 22"),
         (("--states", "23"), "expected a whole number from 2 to 22"),
         (
             ("--states", "22", "--set", "process.A=[[1e8,0.0],[0.0,0.5]]", "--set", "legitimate.link.quality=1.0"),

@@ -73,7 +73,7 @@ def test_in_python() -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("--schedule", "1", "--max-trace", "1"), "a schedule of 1 slots: expected a whole number from 2 to 100"),
+        (("--schedule", "1", "--max-trace", "1"), "a schedule of 1 slot: expected a whole number from 2 to 100"),
         (("--schedule", "101", "--max-trace", "1"), "a schedule of 101 slots: expected"),
         ((*SHORT, "--block", "8"), "blocks of 8 slots: expected a whole number from 1 to 7"),
         ((*SHORT, "--block", "0"), "blocks of 0 slots: expected"),
