@@ -1,7 +1,9 @@
+import contextlib
 import socket
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from urllib.parse import urlsplit
 from urllib.request import urlopen
 
 import pytest
@@ -79,6 +81,16 @@ def test_a_lost_connection_is_counted(tmp_path: Path) -> None:
         found = scraped(page)
     assert (found["evedrop_running",], found["evedrop_lost_connections_total", "smart"]) == (1, 2)
     assert told == news
+
+
+def test_programs_that_only_connect_are_turned_away(tmp_path: Path) -> None:
+    """More of them than there are places: each connection is closed, and then the metrics can be read."""
+    with contextlib.ExitStack() as stack:
+        page = stack.enter_context(metrics_served(ANY_PORT, RunMetrics(load("vehicle"), tmp_path, silent), 0.02))
+        port = urlsplit(page).port
+        idle = [stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=20.0)) for _ in range(40)]
+        assert [one.recv(1) for one in idle] == [b""] * len(idle)
+        assert scraped(page)["evedrop_running",] == 0
 
 
 def test_a_run_that_is_paused_is_held(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ipaddress
 import re
+import socket
 import threading
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -24,7 +25,9 @@ from evedrop.news import ConnectionOutage, FolderMoved, Held, News, RunProgress,
 from evedrop.results.reading import load_results
 from evedrop.scenario import Scenario
 from evedrop.scenario.application import APPLICATIONS
+from evedrop.view.bounded_http import BoundedServer, QuietHandler
 
+_REQUEST_SECONDS = 2.0
 _FORM = re.compile(r"(?:\[([0-9a-fA-F:.%]+)\]|([^\[\]:]+)):([0-9]{1,5})")
 
 
@@ -161,26 +164,43 @@ def _summary(folder: Path) -> Mapping[str, Any]:
 
 
 @contextmanager
-def metrics_served(address: MetricsAddress, metrics: RunMetrics) -> Iterator[str]:
+def metrics_served(address: MetricsAddress, metrics: RunMetrics, patience: float = _REQUEST_SECONDS) -> Iterator[str]:
     """Serve metrics while the block runs; gives the address of their page.
+
+    patience: for a request, in seconds; a program that connects and does not send one then loses its connection.
 
     Raises UsageError if the extra is not installed, or nothing can listen there.
     """
     try:
-        from prometheus_client import CollectorRegistry, start_http_server  # noqa: PLC0415 - an optional extra
+        from prometheus_client import CollectorRegistry, MetricsHandler  # noqa: PLC0415 - an optional extra
     except ImportError as error:
         raise UsageError("--metrics needs pip install 'evedrop[metrics]' first") from error
     registry = CollectorRegistry()
     registry.register(metrics)
+    handler = type("ScrapeHandler", (_Scrape, MetricsHandler.factory(registry)), {"timeout": patience})
     try:
-        server, thread = start_http_server(address.port, address.host, registry)
+        server = _Server(address, handler)
     except OSError as error:
         raise UsageError(
             f"--metrics: {address.page(address.port)} cannot be served ({error.strerror}); give another address or port"
         ) from error
+    server.start()
     try:
         yield address.page(server.server_port)
     finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
+        server.stop()
+
+
+@final
+class _Server(BoundedServer):
+    request_queue_size = 64
+
+    def __init__(self, address: MetricsAddress, handler: type[QuietHandler]) -> None:
+        self.address_family = socket.AF_INET6 if ":" in address.host else socket.AF_INET
+        super().__init__((address.host, address.port), handler)
+
+
+class _Scrape(QuietHandler):
+    """A scrape: one request for each connection, because the answers of prometheus_client do not say how long they are."""
+
+    protocol_version = "HTTP/1.0"
