@@ -304,7 +304,7 @@ def test_a_process_that_stays_stopped_ends_the_run(evedrop: Evedrop, name: str) 
 
 def test_results_that_cannot_be_written_end_the_run(evedrop: Evedrop) -> None:
     """A full disk, played by a limit on the size of files: one clear line, exit 3, nothing left."""
-    live = evedrop.live("eavesdroppers", "--slots", "1000000", "--pace", "0.002", largest_file=200_000)
+    live = evedrop.live("eavesdroppers", "--slots", "1000000", "--pace", "0.0005", largest_file=200_000)
     done = live.end()
     assert done.status == 3
     assert "the results cannot be written" in done.err.splitlines()[0]

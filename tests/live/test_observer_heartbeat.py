@@ -44,8 +44,8 @@ def slow(evedrop: Evedrop, finish: float, silence: float, *arguments: str) -> Li
 
 
 def test_a_run_that_takes_long_to_finish_is_not_given_up(evedrop: Evedrop) -> None:
-    """Much longer than a silence may last: the observer says that it lives, and the run is complete."""
-    live = slow(evedrop, 9.0, 3.0)
+    """More than twice as long as a silence may last: the observer says that it lives, and the run is complete."""
+    live = slow(evedrop, 7.0, 3.0)
     done = live.end()
     assert done.status == 0, done.err
     live.nothing_left()

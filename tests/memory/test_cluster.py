@@ -124,7 +124,7 @@ def test_a_folder_that_is_not_empty_is_refused_there_too(evedrop: Evedrop, sched
     assert (done.status, done.err) == (2, "evedrop: full is not empty; give another folder, or empty it\n")
 
 
-@pytest.mark.parametrize("command", ["montecarlo", "sweep"])
+@pytest.mark.parametrize("command", ["montecarlo", pytest.param("sweep", marks=pytest.mark.long)])
 def test_an_unreachable_scheduler_is_refused(evedrop: Evedrop, command: str) -> None:
     """Nobody listens: one line, exit 2, nothing left on disk."""
     over = ("--over", "seed=1,2") if command == "sweep" else ()
