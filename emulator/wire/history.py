@@ -17,6 +17,7 @@ from typing import Any, final
 
 from evedrop.errors import UsageError
 from evedrop.model.checks import as_toml
+from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.links import LOSS_MODELS
 from evedrop.model.slot.link import NEVER, Change
 from evedrop.scenario.table import model_mistakes
@@ -112,10 +113,12 @@ class WireHistory:
         return tuple(Change(at, settings) for at, settings in sorted(found.items()))
 
     def expect_laws(self) -> None:
-        """Raise UsageError unless each link had settings from which the law of its losses can be computed."""
+        """Raise UsageError unless each link had settings from which the fates of its messages, and their law, can be computed."""
         for link, known in self._settings.items():
             for one in known:
                 mistakes = model_mistakes("loss", one.settings["loss"], LOSS_MODELS)
+                if "delay" in one.settings:
+                    mistakes += model_mistakes("delay", one.settings["delay"], DELAY_MODELS)
                 corrupt = one.settings.get("corrupt", 0.0)
                 if not isinstance(corrupt, float | int) or not 0.0 <= corrupt <= 1.0:
                     mistakes.append(("corrupt", f"is {as_toml(corrupt)}; expected a probability"))

@@ -121,6 +121,7 @@ class WireJournal:
 
     def _begin(self, plan: WirePlan) -> None:
         self._history = WireHistory.read(self._folder)
+        self._history.expect_laws()
         self.recovered = recover(self._folder, self._history)
         """The number of records that an earlier start left behind, because it was killed or the disk was full."""
         self.counts: dict[Numbered, int] = dict(self._history.counts)

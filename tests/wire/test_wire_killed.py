@@ -111,3 +111,13 @@ def test_a_history_with_settings_that_no_link_has_is_refused(corrupt: object, fo
         file.write(json.dumps({"change": "robot-base", "time": time.time(), "settings": settings, "since": []}) + "\n")
     with pytest.raises(UsageError, match=r"history\.jsonl has settings of the link robot-base in which corrupt is"):
         summary_of_wire(folders["killed"])
+
+
+def test_a_wire_does_not_go_on_after_a_delay_that_no_link_has(folders: dict[str, Path]) -> None:
+    """With its file, the link and the entry: otherwise the first message on the link would end the wire."""
+    history = folders["killed"] / "journal" / "history.jsonl"
+    settings = {"loss": {"model": "bernoulli", "quality": 0.5}, "delay": {"model": "constant", "value": -3.0}}
+    with history.open("a") as file:
+        file.write(json.dumps({"change": "robot-base", "time": time.time(), "settings": settings, "since": []}) + "\n")
+    with pytest.raises(UsageError, match=r"history\.jsonl has settings of the link robot-base in which delay\."):
+        WireJournal(folders["killed"], both_ways(LOSSY))
