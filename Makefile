@@ -8,13 +8,22 @@ READY := $(VENV)/.ready
 DOCS_READY := $(VENV)/.docs-ready
 NOTEBOOKS_READY := $(VENV)/.notebooks-ready
 
-.PHONY: demo test notebooks bench coverage test-long test-hosts test-compose test-faults docs lint lint-types lint-rest setup clean
+.PHONY: demo test test-wheel test-pictures notebooks bench coverage test-long test-hosts test-compose test-faults docs lint lint-types lint-rest setup clean
 
 demo: $(READY)
 	$(BIN)/evedrop demo
 
+# What needs more than processors and a disk has a target of its own, below: packages to install, a driver that draws, root.
 test: $(READY)
-	$(BIN)/python -m pytest -n 4 --dist loadfile -m "not long and not hosts and not containers and not notebooks"
+	$(BIN)/python -m pytest -n 4 --dist loadfile -m "not (long or hosts or containers or notebooks or wheel or pictures)"
+
+# The wheel, built and installed into environments of its own.
+test-wheel: $(READY)
+	$(BIN)/python -m pytest -n 2 -m wheel tests/test_wheel.py
+
+# Pictures and videos, drawn by Rerun's viewer without a screen. Without a Vulkan driver they are skipped.
+test-pictures: $(READY)
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "pictures and not long" tests/view
 
 COVERING := $(addprefix tests/,model live/protocol live/network/test_protocol.py live/network/test_wire.py)
 

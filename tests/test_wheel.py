@@ -18,6 +18,7 @@ import pytest
 
 from evedrop.kernels import choice
 
+pytestmark = pytest.mark.wheel
 ROOT = Path(__file__).parents[1]
 REQUIRED = "EVEDROP_KERNELS_REQUIRED"
 SOURCES = ("pyproject.toml", "hatch_build.py", "README.md", "LICENSE")

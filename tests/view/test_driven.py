@@ -92,6 +92,7 @@ def test_slots_may_come_in_any_pieces() -> None:
     assert guesses[0].tolist() == [0.0, 60.0, 120.0, 180.0]
 
 
+@pytest.mark.pictures
 def test_every_panel_of_a_house_is_filled(day: Path) -> None:
     """Each draws something, and complains of nothing."""
     panels_are_filled(replay(day), 11)

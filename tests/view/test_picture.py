@@ -43,6 +43,7 @@ def drawing(rrd: Path) -> int | None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.pictures
 def test_nobody_can_connect_to_who_draws(simulated: Callable[..., Simulated], tmp_path: Path) -> None:
     """A picture is drawn by a process with a network of its own, where the system allows that: its port is for anybody."""
     rrd = recorded(simulated(60), tmp_path / "r.rrd")
@@ -69,6 +70,7 @@ def test_nobody_can_connect_to_who_draws(simulated: Callable[..., Simulated], tm
     assert np.asarray(matplotlib.image.imread(tmp_path / "r.png")).shape[:2] == (950, 1600)
 
 
+@pytest.mark.pictures
 @pytest.mark.parametrize(
     ("n", "growth"),
     [pytest.param(1, 1.0, marks=pytest.mark.long), (2, 1.12), pytest.param(4, 1.0, marks=pytest.mark.long)],
@@ -79,6 +81,7 @@ def test_every_panel_is_filled(n: int, growth: float, simulated: Callable[..., S
     panels_are_filled(rrd, 9)
 
 
+@pytest.mark.pictures
 def test_picture_is_a_png_of_that_size(simulated: Callable[..., Simulated], tmp_path: Path) -> None:
     """A picture is written in the size asked for, without complaints."""
     rrd = recorded(simulated(60), tmp_path / "r.rrd")

@@ -168,6 +168,7 @@ def test_options_that_do_not_fit_are_refused(
     assert advice in done.err
 
 
+@pytest.mark.pictures
 def test_the_video_of_a_run_shows_its_slots(finished: Path, evedrop: Evedrop, tmp_path: Path) -> None:
     """The whole way, from the command to the file: two slots give two frames that differ."""
     path = tmp_path / "run.gif"
