@@ -152,7 +152,7 @@ SHIPPED = load("two-eavesdroppers")
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"modules": "/home/here"}, r"^modules = /home/here: .*evedrop brief SCENARIO --out DIR"),
+        ({"modules": "/srv/here"}, r"^modules = /srv/here: .*evedrop brief SCENARIO --out DIR"),
         (
             {"process": SHIPPED.process.model_copy(update={"source": "zenoh"})},
             r"^process\.zenoh: no container can reach",

@@ -277,7 +277,7 @@ modules = "/srv/classes"
             ['relay: is missing; expected [relay] with listen = "tls/HOST:PORT": the scenario has two routers'],
         ),
         (
-            {"modules": "/home/here"},
+            {"modules": "/srv/here"},
             [
                 "hosts.alpha.modules: is missing; expected the folder there of the modules that the scenario names (line 4)"
             ],

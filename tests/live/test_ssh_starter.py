@@ -56,7 +56,7 @@ def test_a_host_gets_the_brief_and_what_differs_from_its_own_environment(connect
     host = connect(GREETING, modules="/srv/classes")
     ready(host)
     brief, log = tmp_path / "smart.json", tmp_path / "smart.log"
-    brief.write_text(json.dumps({"process": "smart", "part": {"modules": "/home/here"}}))
+    brief.write_text(json.dumps({"process": "smart", "part": {"modules": "/srv/here"}}))
     with log.open("wb") as file:
         process = host.start(7, "eavesdropper", brief, file, {**own_environment(), "OMP_NUM_THREADS": "one"})
     assert not brief.exists()

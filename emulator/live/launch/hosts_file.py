@@ -15,7 +15,7 @@ from pydantic import AfterValidator, Field, ValidationError
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.files import Unreadable, shown, text_of
 from evedrop.hints import near
-from evedrop.live.launch.ports import RouterEndpoint, RouterEndpoints, meeting_at
+from evedrop.live.launch.ports import RouterEndpoint, RouterEndpoints, router_endpoint
 from evedrop.loading import tables_in
 from evedrop.loading.line_numbers import with_line_numbers
 from evedrop.names import CONTROLLER, LEGITIMATE, OBSERVER, RELAY, ROUTER, SENSOR
@@ -63,7 +63,7 @@ class RouterTable(Table):
 
     def endpoint(self) -> RouterEndpoint:
         """The endpoint. Raises UsageError if the router cannot listen there or the others cannot connect there."""
-        return meeting_at(self.listen, self.connect, self.insecure, ("listen =", "connect ="))
+        return router_endpoint(self.listen, self.connect, self.insecure, ("listen =", "connect ="))
 
 
 class HostTable(Table):

@@ -75,15 +75,15 @@ def places_at(
     """The endpoints that the options of `evedrop brief` name, on any hosts. Raises UsageError if they are malformed."""
     second = None
     if relay is not None:
-        second = meeting_at(relay, relay_connect, insecure, ("--relay", "--relay-connect"))
+        second = router_endpoint(relay, relay_connect, insecure, ("--relay", "--relay-connect"))
     elif relay_connect is not None:
         raise UsageError(
             "--relay-connect belongs to a second router; add --relay ENDPOINT with the endpoint where it listens"
         )
-    return RouterEndpoints(meeting_at(listen, connect, insecure), second)
+    return RouterEndpoints(router_endpoint(listen, connect, insecure), second)
 
 
-def meeting_at(
+def router_endpoint(
     listen: str,
     connect: str | None = None,
     insecure: bool = False,
@@ -133,18 +133,18 @@ def loopback_places(listen: str | None, relay: str | None = None, relayed: bool 
     Raises UsageError unless they are on loopback and a router can listen there.
     """
     asked = next((one.partition("/")[0] for one in (listen, relay) if one is not None), "tls" if relayed else "tcp")
-    router = _loopback_meeting(listen, "--listen", asked)
-    second = _loopback_meeting(relay, "--relay", asked) if relayed or relay is not None else None
+    router = _loopback_endpoint(listen, "--listen", asked)
+    second = _loopback_endpoint(relay, "--relay", asked) if relayed or relay is not None else None
     while relay is None and second is not None and second.listen.port == router.listen.port:
-        second = _loopback_meeting(None, "--relay", asked)
+        second = _loopback_endpoint(None, "--relay", asked)
     places = RouterEndpoints(router, second)
     places.check(relayed)
     return places
 
 
-def _loopback_meeting(listen: str | None, option: str, protocol: str) -> RouterEndpoint:
+def _loopback_endpoint(listen: str | None, option: str, protocol: str) -> RouterEndpoint:
     if listen is None:
-        return meeting_at(f"{protocol}/127.0.0.1:{free_port()}")
+        return router_endpoint(f"{protocol}/127.0.0.1:{free_port()}")
     try:
         endpoint = Endpoint.of(listen)
     except ValueError as error:
@@ -154,12 +154,12 @@ def _loopback_meeting(listen: str | None, option: str, protocol: str) -> RouterE
             f"{option} {listen} is not a loopback endpoint; give one such as tcp/127.0.0.1:17460, or start the processes by "
             "hand: evedrop brief"
         )
-    meeting = meeting_at(listen)
+    found = router_endpoint(listen)
     try:
         endpoint.try_to_listen()
     except OSError as error:
         raise UsageError(f"{option} {listen}: {error.strerror}; leave it out to use a free port") from error
-    return meeting
+    return found
 
 
 @dataclass(frozen=True)

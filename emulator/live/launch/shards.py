@@ -164,7 +164,7 @@ def _places(scenario: Scenario) -> list[RouterEndpoints]:
     taken = set[int]()
     while len(found) < scenario.shards:
         places = loopback_places(None, None, scenario.relayed)
-        ports = {meeting.listen.port for meeting in (places.router, places.relay) if meeting is not None}
+        ports = {one.listen.port for one in (places.router, places.relay) if one is not None}
         if not ports & taken:
             found.append(places)
             taken |= ports

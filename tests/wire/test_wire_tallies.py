@@ -1,0 +1,81 @@
+"""Tallies of a wire's streams and links: gaps, the numbers on which models decided, and quantiles of delays."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evedrop.wire.crossing import RECORD, Crossing
+from evedrop.wire.tallies import LinkTally, StreamTally
+
+
+def by_hand(rows: list[tuple[float, bool]]) -> tuple[int, float]:
+    """The longest run of missing messages, and the longest silence, of (time, delivered)."""
+    longest, silence, run, since = 0, 0.0, 0, rows[0][0]
+    for at, delivered in rows:
+        run = 0 if delivered and not run else run + (not delivered)
+        longest = max(longest, run)
+        if run:
+            silence = max(silence, at - since)
+        if delivered:
+            run, since = 0, at
+    return longest, silence
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    rows=st.lists(st.tuples(st.integers(1, 9), st.sampled_from([0, 0, 1, 4, 19])), min_size=1, max_size=60),
+    size=st.integers(1, 6),
+)
+def test_gaps_and_numbers_do_not_depend_on_the_blocks(rows: list[tuple[int, int]], size: int) -> None:
+    """The longest gap, and the numbers on which the models decided, against a loop over the messages."""
+    records = np.zeros(len(rows), RECORD)
+    records["time"], records["fate"] = np.cumsum([pause for pause, _ in rows]), [fate for _, fate in rows]
+    records["n"] = np.arange(len(rows))
+    stream = StreamTally()
+    for first in range(0, len(rows), size):
+        stream.add(records[first : first + size], True)
+    pairs = [(float(one["time"]), one["fate"] == 0) for one in records]
+    assert (stream.longest, stream.silence) == by_hand(pairs)
+    decided = [n for n, (_, fate) in enumerate(rows) if fate in {0, 1}]
+    assert [n for start, stop in stream.ranges for n in range(start, stop)] == decided
+    assert (stream.tried, stream.passed) == (len(decided), sum(fate == 0 for _, fate in rows))
+
+
+def test_a_stream_with_many_interruptions_is_judged_as_a_sample() -> None:
+    """Numbers that are too scattered to be kept count as one range."""
+    stream, records = StreamTally(), np.zeros(6000, RECORD)
+    records["n"] = np.arange(6000)
+    records["fate"][::2] = Crossing.OVERFLOW
+    stream.add(records, True)
+    assert (stream.scattered, stream.ranges, stream.tried) == (True, [(1, 6000)], 3000)
+
+
+def test_quantiles_of_delays_are_exact_until_there_are_too_many_to_keep() -> None:
+    """Then they are those of every second, fourth and so on."""
+    tally, records = LinkTally(), np.zeros(100_000, RECORD)
+    records["delay"] = np.random.default_rng(5).permutation(np.arange(1, 100_001)) / 1e5
+    tally.add(records)
+    assert tally.delay_quantile(0.9) == 0.9
+    for _ in range(9):
+        tally.add(records)
+    found = tally.delay_quantile(0.9)
+    assert found is not None
+    assert found == pytest.approx(0.9, abs=0.005)
+    assert LinkTally().delay_quantile(0.5) is None
+
+
+def test_the_delays_that_are_kept_are_evenly_spaced() -> None:
+    """Whatever the sizes of the blocks, and without the messages that were not delivered."""
+    tally, rng, count = LinkTally(), np.random.default_rng(5), 1_000_000
+    records = np.zeros(count, RECORD)
+    records["delay"] = np.arange(count)
+    lost = np.zeros(count, RECORD)
+    lost["fate"], lost["delay"] = Crossing.LOST, -1.0
+    for places in np.split(np.arange(count), np.cumsum(rng.integers(1, 9000, 150))):
+        tally.add(np.concatenate([records[places], lost[places]]))
+    kept = np.arange(0, count, 8)
+    for at in (0, 1, 1000, 30_001, 60_000, len(kept) - 1):
+        assert tally.delay_quantile((at + 0.5) / len(kept)) == kept[at]
