@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -121,6 +121,18 @@ def test_pairs_that_mean_nothing_say_why(everything: Everything, scheme: str, ad
     reason = everything[0].cell(scheme, adversary).match.not_defined
     assert reason is not None
     assert why in reason
+
+
+def test_an_adversary_that_learns_a_state_is_not_the_closest(literature: Comparison) -> None:
+    """Of two adversaries, the one with the larger error is the closest if the other is given a true state."""
+    one = literature.schemes["innovation"]
+    first = one.closest
+    assert first is not None
+    betrayed = replace(first, match=replace(first.match, betrayed=True))
+    then = replace(one, cells={**one.cells, first.match.adversary: betrayed})
+    assert then.closest is not None
+    assert then.closest.match.adversary != first.match.adversary
+    assert then.kept > one.kept
 
 
 def test_every_adversary_is_played_somewhere(everything: Everything) -> None:
