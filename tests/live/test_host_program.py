@@ -7,21 +7,18 @@ import os
 import signal
 import threading
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
 import pytest
 
+from evedrop.live.launch.host_messages import LogText, ProcessEnded, StartProcess, answer_in
 from evedrop.live.launch.host_program import HostProcesses
 from evedrop.live.launch.starter import StartedProcess
 from tests.conftest import LIMIT, wait_until
 
-ORDER: Mapping[str, Any] = {
-    "start": 7,
-    "role": "eavesdropper",
-    "brief": {"process": "smart", "part": {}},
-    "environment": {},
-}
+ORDER = StartProcess(7, "eavesdropper", "smart", {"process": "smart", "part": {}}, {})
 
 
 def unable(role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:
@@ -75,17 +72,14 @@ def test_a_process_has_its_files_in_the_private_folder(tmp_path: Path) -> None:
 
     host = HostProcesses(tmp_path, start, send)
     part = {"state_file": "/launcher/smart.state"}
-    host.obey({**ORDER, "brief": {"process": "smart", "part": part}, "environment": {"TMPDIR": "/launcher", "A": "1"}})
+    host.obey(replace(ORDER, brief={"process": "smart", "part": part}, environment={"TMPDIR": "/launcher", "A": "1"}))
     ((brief, environment, mode),) = started
     assert brief["part"] == {"state_file": str(tmp_path / "smart.state")}
     assert (environment["TMPDIR"], environment["A"], mode) == (str(tmp_path), "1", 0o600)
     wait_until(lambda: b"".join(sent).endswith(b"\n"), "the log")
     host.end()
     wait_until(lambda: b"".join(sent).count(b"\n") == 2, "the end")
-    assert [json.loads(line) for line in b"".join(sent).splitlines()] == [
-        {"log": 7, "text": "a line\n"},
-        {"ended": 7, "status": -15},
-    ]
+    assert [answer_in(line) for line in b"".join(sent).splitlines()] == [LogText(7, "a line\n"), ProcessEnded(7, -15)]
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="reads /proc")
@@ -102,18 +96,19 @@ def test_a_process_that_cannot_be_started_is_reported(folder: str, why: str, tmp
     before = os.listdir("/proc/self/fd")
     host.obey(ORDER)
     assert os.listdir("/proc/self/fd") == before
-    log, end = (json.loads(line) for line in sent)
-    assert log["log"] == 7
-    assert log["text"].startswith("evedrop: smart cannot be started (")
-    assert why in log["text"]
-    assert end == {"ended": 7, "status": 1}
+    log, end = (answer_in(line) for line in sent)
+    assert isinstance(log, LogText)
+    assert log.number == 7
+    assert log.written.startswith("evedrop: smart cannot be started (")
+    assert why in log.written
+    assert end == ProcessEnded(7, 1)
     host.end()
 
 
 @pytest.mark.parametrize("name", ["../smart", "/etc/smart"])
 def test_a_brief_is_written_only_into_the_folder_of_the_run(name: str, tmp_path: Path) -> None:
     """The launcher's name of a process is not a path."""
-    order = {**ORDER, "brief": {"process": name, "part": {}}}
+    order = replace(ORDER, process=name)
     (tmp_path / "private").mkdir()
     with pytest.raises(ValueError, match="is not the name of a process"):
         HostProcesses(tmp_path / "private", unable, len).obey(order)

@@ -22,6 +22,7 @@ from typing import Any
 import pytest
 
 from evedrop.errors import ScenarioError
+from evedrop.live.launch.host_messages import LauncherHeartbeat, StartProcess, greeting_in, line_of, order_in
 from evedrop.live.launch.hosts_file import load_hosts
 from evedrop.live.launch.ssh_starter import ssh_command
 from evedrop.loading import load
@@ -96,8 +97,8 @@ def test_over_ssh_it_is_the_same_run(evedrop: Evedrop, server: Sshd) -> None:
     assert "schedule" in received["alpha"]
     assert "schedule" not in received["beta"]
     for host, text in received.items():
-        orders = [json.loads(line) for line in text.splitlines()]
-        assert {order["brief"]["process"] for order in orders if "start" in order} == set(PLACES[host])
+        orders = [order_in(line.encode()) for line in text.splitlines()]
+        assert {order.process for order in orders if isinstance(order, StartProcess)} == set(PLACES[host])
 
 
 def running(evedrop: Evedrop, server: Sshd) -> Live:
@@ -343,8 +344,8 @@ def test_a_host_ends_when_its_launcher_is_silent(evedrop: Evedrop) -> None:
     host = evedrop.start(["-m", "evedrop"], ("host",), {"stdin": subprocess.PIPE})
     assert host.stdin is not None
     assert host.stdout is not None
-    assert json.loads(host.stdout.readline()) == {"evedrop": version("evedrop")}
-    host.stdin.write('{"silence": 0.2}\n')
+    assert greeting_in(host.stdout.readline().encode()).evedrop == version("evedrop")
+    host.stdin.write(line_of(LauncherHeartbeat(0.2)).decode())
     host.stdin.flush()
     assert host.wait(LIMIT) == 130
     for stream in (host.stdin, host.stdout, host.stderr):

@@ -14,13 +14,22 @@ import pytest
 from evedrop.environment import own_environment
 from evedrop.errors import UsageError
 from evedrop.live.launch import ssh_starter
-from evedrop.live.launch.host_messages import MOST_NOISE, own_version
+from evedrop.live.launch.host_messages import (
+    MOST_NOISE,
+    Greeting,
+    LauncherHeartbeat,
+    Order,
+    StartProcess,
+    line_of,
+    order_in,
+    own_version,
+)
 from evedrop.live.launch.hosts_file import HostTable
 from evedrop.live.launch.ssh_starter import SshHost
 from evedrop.live.launch.starter import CONNECTION_LOST
 from tests.conftest import LIMIT, wait_until
 
-GREETING = json.dumps({"evedrop": own_version()})
+GREETING = line_of(Greeting(own_version())).decode().strip()
 Connect = Callable[..., SshHost]
 
 
@@ -46,9 +55,9 @@ def ready(host: SshHost) -> None:
     host.wait_until_ready(time.monotonic() + LIMIT, threading.Event())
 
 
-def told(folder: Path) -> list[dict[str, Any]]:
+def told(folder: Path) -> list[Order]:
     """What the host has been told."""
-    return [json.loads(line) for line in (folder / "told").read_text().splitlines()]
+    return [order_in(line) for line in (folder / "told").read_bytes().splitlines()]
 
 
 def test_a_host_gets_the_brief_and_what_differs_from_its_own_environment(connect: Connect, tmp_path: Path) -> None:
@@ -64,7 +73,7 @@ def test_a_host_gets_the_brief_and_what_differs_from_its_own_environment(connect
     host.close(time.monotonic() + LIMIT)
     (order,) = told(tmp_path)
     made = {"process": "smart", "part": {"modules": "/srv/classes"}}
-    assert order == {"start": 7, "role": "eavesdropper", "brief": made, "environment": {"OMP_NUM_THREADS": "one"}}
+    assert order == StartProcess(7, "eavesdropper", "smart", made, {"OMP_NUM_THREADS": "one"})
     assert process.wait(LIMIT) == CONNECTION_LOST
     assert log.read_text() == "evedrop: the connection with host beta ended: ssh ended with status 0\n"
 
@@ -78,7 +87,9 @@ def test_a_brief_without_classes_gets_no_folder_of_classes(connect: Connect, tmp
     with (tmp_path / "smart.log").open("wb") as file:
         host.start(7, "eavesdropper", brief, file, {})
     host.close(time.monotonic() + LIMIT)
-    assert told(tmp_path)[0]["brief"]["part"] == {"modules": None}
+    (order,) = told(tmp_path)
+    assert isinstance(order, StartProcess)
+    assert order.brief["part"] == {"modules": None}
 
 
 def test_what_a_login_shell_prints_is_passed_over(connect: Connect) -> None:
@@ -105,4 +116,4 @@ def test_a_host_is_told_that_the_launcher_lives(
     ready(host)
     wait_until(lambda: len((tmp_path / "told").read_bytes().splitlines()) > 2, "three heartbeats")
     host.close(time.monotonic() + LIMIT)
-    assert told(tmp_path)[:3] == [{"silence": 600.0}] * 3
+    assert told(tmp_path)[:3] == [LauncherHeartbeat(600.0)] * 3

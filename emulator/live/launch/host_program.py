@@ -20,7 +20,19 @@ from typing import Any, final
 
 from evedrop.environment import own_environment
 from evedrop.errors import UsageError
-from evedrop.live.launch.host_messages import line_of, message_in, own_version
+from evedrop.live.launch.host_messages import (
+    Answer,
+    Greeting,
+    LauncherHeartbeat,
+    LogText,
+    Order,
+    ProcessEnded,
+    SendSignal,
+    StartProcess,
+    line_of,
+    order_in,
+    own_version,
+)
 from evedrop.live.launch.preloading import preloaded_without_observer
 from evedrop.live.launch.private_folder import private_folder
 from evedrop.live.launch.starter import StartedProcess, Starter, end_all
@@ -39,10 +51,10 @@ def serve_launcher() -> None:
     with raise_on_signals(), private_folder() as private, preloaded_without_observer() as start:
         host, silence = HostProcesses(private, start, answers.write), _Silence()
         try:
-            host.answer({"evedrop": own_version()})
+            host.answer(Greeting(own_version()))
             for line in sys.stdin.buffer:
-                order = message_in(line)
-                silence.heard(order.get("silence"))
+                order = order_in(line)
+                silence.heard(order)
                 host.obey(order)
         finally:
             host.end()
@@ -56,9 +68,10 @@ class _Silence:
         self._timer: threading.Timer | None = None
         self._seconds = 0.0
 
-    def heard(self, seconds: float | None) -> None:
-        """Note that an order came; seconds: how long the launcher may be silent from now on, if the order says so."""
-        self._seconds = self._seconds if seconds is None else float(seconds)
+    def heard(self, order: Order) -> None:
+        """Note that an order came. A heartbeat says how long the launcher may be silent from now on."""
+        if isinstance(order, LauncherHeartbeat):
+            self._seconds = order.silence
         if self._timer is not None:
             self._timer.cancel()
         if self._seconds:
@@ -79,48 +92,54 @@ class HostProcesses:
         self._sending = threading.Lock()
         self._processes: dict[int, StartedProcess] = {}
 
-    def answer(self, message: Mapping[str, Any]) -> None:
+    def answer(self, message: Greeting | Answer) -> None:
         """Send a message to the launcher; harmless if it is gone."""
         with self._sending, contextlib.suppress(OSError):
             left = memoryview(line_of(message))
             while left:
                 left = left[self._send(left) :]
 
-    def obey(self, order: Mapping[str, Any]) -> None:
-        """Start a process, or send a signal to one. Raises KeyError, TypeError or ValueError if the order is malformed."""
-        if "start" in order:
-            self._begin(order["start"], order["role"], order["brief"], order["environment"])
-        elif "signal" in order and (process := self._processes.get(order["signal"])) is not None:
+    def obey(self, order: Order) -> None:
+        """Start a process, or send a signal to one. Raises ValueError if the name of a process cannot be that of a file."""
+        if isinstance(order, StartProcess):
+            self._begin(order)
+        elif isinstance(order, SendSignal) and (process := self._processes.get(order.number)) is not None:
             with contextlib.suppress(ProcessLookupError):
-                process.send_signal(order["number"])
+                process.send_signal(order.signal)
 
     def end(self) -> None:
         """End all processes."""
         end_all(self._processes.values())
 
-    def _begin(self, number: int, role: str, brief: dict[str, Any], added: Mapping[str, str]) -> None:
-        process = brief["process"]
+    def _begin(self, order: StartProcess) -> None:
+        process, number = order.process, order.number
         if Path(process).name != process:
             raise ValueError(f"{process} is not the name of a process")
-        if brief["part"].get("state_file") is not None:
-            brief["part"]["state_file"] = str((self._private / f"{process}.state").absolute())
-        environment = {**own_environment(), **added}
-        if "TMPDIR" in added:
+        environment = {**own_environment(), **order.environment}
+        if "TMPDIR" in order.environment:
             environment["TMPDIR"] = str(self._private)
         read, write = os.pipe()
         try:
             with os.fdopen(write, "wb") as log:
                 path = self._private / f"{process}.json"
                 with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
-                    json.dump(brief, file)
+                    json.dump(self._brief_of(order), file)
                 with held_back():
-                    self._processes[number] = self._start(role, path, log, environment)
+                    self._processes[number] = self._start(order.role, path, log, environment)
         except OSError as error:
             os.close(read)
-            self.answer({"log": number, "text": f"evedrop: {process} cannot be started ({error})\n"})
-            self.answer({"ended": number, "status": 1})
+            self.answer(LogText(number, f"evedrop: {process} cannot be started ({error})\n"))
+            self.answer(ProcessEnded(number, 1))
             return
         threading.Thread(target=self._follow, args=(number, read), daemon=True).start()
+
+    def _brief_of(self, order: StartProcess) -> Mapping[str, Any]:
+        """The brief of an order; a process that keeps its state does so in the private folder of this host."""
+        part = order.brief["part"]
+        if part.get("state_file") is None:
+            return order.brief
+        state_file = str((self._private / f"{order.process}.state").absolute())
+        return {**order.brief, "part": {**part, "state_file": state_file}}
 
     def _follow(self, number: int, log: int) -> None:
         """Send what a process writes to its log, and how it ended."""
@@ -131,9 +150,9 @@ class HostProcesses:
         if process.stdin is not None:
             process.stdin.close()
         reader.join(_LAST_LINES_SECONDS)
-        self.answer({"ended": number, "status": status})
+        self.answer(ProcessEnded(number, status))
 
     def _read(self, number: int, log: int) -> None:
         with os.fdopen(log, "rb", buffering=0) as lines:
             while text := lines.read(65536):
-                self.answer({"log": number, "text": text.decode("utf-8", "replace")})
+                self.answer(LogText(number, text.decode("utf-8", "replace")))

@@ -20,11 +20,23 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import IO, Any, final
+from typing import IO, final
 
 from evedrop.environment import own_environment
 from evedrop.errors import Interrupted, UsageError
-from evedrop.live.launch.host_messages import MOST_NOISE, line_of, message_in, own_version
+from evedrop.live.launch.host_messages import (
+    MOST_NOISE,
+    Answer,
+    LauncherHeartbeat,
+    LogText,
+    Order,
+    SendSignal,
+    StartProcess,
+    answer_in,
+    greeting_in,
+    line_of,
+    own_version,
+)
 from evedrop.live.launch.hosts_file import HostsPlan, HostTable
 from evedrop.live.launch.starter import CONNECTION_LOST, ReportedProcess, StartedProcess, Starter
 
@@ -69,7 +81,7 @@ class HostedProcess(ReportedProcess):
     def send_signal(self, sig: int) -> None:
         """Send a signal to it, if it still runs."""
         if self._status is None:
-            self._host.send({"signal": self.pid, "number": int(sig)})
+            self._host.send(SendSignal(self.pid, sig))
 
 
 @final
@@ -106,7 +118,7 @@ class SshHost:
         """Tell the host from time to time that this launcher is still there."""
         while not self._lost.wait(_BEAT_SECONDS if self._answered.is_set() else _LOOK_SECONDS):
             if self._answered.is_set():
-                self.send({"silence": _SILENCE_SECONDS})
+                self.send(LauncherHeartbeat(_SILENCE_SECONDS))
 
     def wait_until_ready(self, deadline: float, stop: threading.Event) -> None:
         """Wait until Evedrop answers there. Raises UsageError if it does not, or has another version; Interrupted if stopped."""
@@ -142,10 +154,10 @@ class SshHost:
             self._processes[number] = process
         own = own_environment()
         added = {name: value for name, value in environment.items() if own.get(name) != value}
-        self.send({"start": number, "role": role, "brief": found, "environment": added})
+        self.send(StartProcess(number, role, found["process"], found, added))
         return process
 
-    def send(self, order: Mapping[str, Any]) -> None:
+    def send(self, order: Order) -> None:
         """Send an order; harmless if the connection is lost, which ends all processes there."""
         assert self._ssh.stdin is not None  # noqa: S101 - it was started with a pipe
         with self._sending, contextlib.suppress(OSError, ValueError):
@@ -172,29 +184,29 @@ class SshHost:
     def _follow(self) -> None:
         """Read the host's messages until the connection ends; all processes there have ended then."""
         assert self._ssh.stdout is not None  # noqa: S101 - it was started with a pipe
-        with self._ssh.stdout as answers, contextlib.suppress(ValueError, KeyError, TypeError, OSError):
+        with self._ssh.stdout as answers, contextlib.suppress(ValueError, OSError):
             for line in itertools.islice(answers, MOST_NOISE):  # of the login shell
-                with contextlib.suppress(ValueError, KeyError):
-                    self._version = str(message_in(line)["evedrop"])
+                with contextlib.suppress(ValueError):
+                    self._version = greeting_in(line).evedrop
                     break
             else:
                 raise ValueError
             self._answered.set()
             for line in answers:
-                self._take(message_in(line))
+                self._take(answer_in(line))
         self._lose()
 
-    def _take(self, answer: Mapping[str, Any]) -> None:
+    def _take(self, answer: Answer) -> None:
         with self._guard:
-            process = self._processes.get(answer["log"] if "log" in answer else answer["ended"])
+            process = self._processes.get(answer.number)
             if process is None:
                 return
-            if "log" not in answer:
+            if not isinstance(answer, LogText):
                 del self._processes[process.pid]
-        if "log" in answer:
-            process.write(str(answer["text"]))
+        if isinstance(answer, LogText):
+            process.write(answer.written)
         else:
-            process.ended(int(answer["status"]))
+            process.ended(answer.status)
 
     def _lose(self) -> None:
         self.hang_up()

@@ -1,0 +1,81 @@
+"""Messages between a launcher and a host's program: read as they were written, and anything else is refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from evedrop.live.launch.host_messages import (
+    Greeting,
+    HostMessage,
+    LauncherHeartbeat,
+    LogText,
+    ProcessEnded,
+    SendSignal,
+    StartProcess,
+    answer_in,
+    greeting_in,
+    line_of,
+    order_in,
+)
+
+START = StartProcess(2**32, "eavesdropper", "smart", {"process": "smart", "part": {"modules": None}}, {"A": "ä\n"})
+DEEP = b"[" * 100_000
+
+
+@pytest.mark.parametrize(
+    ("message", "read"),
+    [
+        (START, order_in),
+        (SendSignal(7, 15), order_in),
+        (LauncherHeartbeat(600.0), order_in),
+        (LogText(7, "two\nlines\n"), answer_in),
+        (ProcessEnded(7, -9), answer_in),
+        (Greeting("1.2.3"), greeting_in),
+    ],
+)
+def test_a_message_is_a_line_and_read_as_it_was(message: HostMessage, read: Callable[[bytes], HostMessage]) -> None:
+    """Whatever its texts contain."""
+    line = line_of(message)
+    assert line.count(b"\n") == 1
+    assert line.endswith(b"\n")
+    assert read(line) == message
+
+
+def test_a_greeting_of_another_version_is_understood() -> None:
+    """It may have more entries, or no kind: the launcher says which version is there."""
+    assert greeting_in(b'{"evedrop": "0.0.9"}').evedrop == "0.0.9"
+    assert greeting_in(b'{"kind": "hello", "evedrop": "9.0", "python": "4"}').evedrop == "9.0"
+
+
+@pytest.mark.parametrize("read", [order_in, answer_in, greeting_in])
+@pytest.mark.parametrize("line", [b"", b"Welcome", b"7", b"[1]", b"{}", b'"evedrop"', b'{"evedrop": 7}', DEEP, b"\xff"])
+def test_other_lines_are_no_messages(line: bytes, read: Callable[[bytes], HostMessage]) -> None:
+    """Nor are those of a login shell."""
+    with pytest.raises(ValueError, match=r"is not a message|evedrop is (missing|7)"):
+        read(line)
+
+
+@pytest.mark.parametrize(
+    ("change", "mistake"),
+    [
+        ({"number": -1}, "start.number is -1"),
+        ({"number": None}, "start.number is None"),
+        ({"role": 3}, "start.role is 3"),
+        ({"brief": {}}, "start.brief.part is missing"),
+        ({"brief": {"part": []}}, "start.brief.part is list of 0"),
+        ({"environment": {"A": 1}}, "start.environment.A is 1"),
+        ({"more": 1}, "start.more is an unknown entry"),
+        ({"kind": "stop"}, "is not a message"),
+        ({"kind": "log"}, "is not a message"),
+        ({"kind": None}, "is not a message"),
+    ],
+)
+def test_a_malformed_order_names_the_entry(change: dict[str, Any], mistake: str) -> None:
+    """An answer is not an order either."""
+    found = {**json.loads(line_of(START)), **change}
+    with pytest.raises(ValueError, match=mistake):
+        order_in(json.dumps(found).encode())
