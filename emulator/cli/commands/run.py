@@ -31,9 +31,9 @@ def demo(options: argparse.Namespace) -> int:
 
 def run(options: argparse.Namespace) -> int:
     """Run a scenario live."""
-    from evedrop.live.launch.preloading import preloaded_for_one_run
+    from evedrop.live.launch.preloading import process_starter
 
-    with preloaded_for_one_run():  # the servers make their imports while the scenario is read
+    with process_starter():  # the servers make their imports while the scenario is read
         ended = _run(options)
     if ended.viewer is not None:
         _keep_open(ended.viewer)

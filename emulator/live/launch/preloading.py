@@ -232,11 +232,14 @@ _kept: list[_Kept] = []
 
 @contextmanager
 def process_starter() -> Iterator[Starter]:
-    """The fastest way to start processes on this system, until the block ends. Raises OSError."""
+    """The fastest way to start processes on this system, until the block ends. Raises OSError.
+
+    Outside a `preloaded` block, a summary's own imports are not made in advance, so that one run starts as early as it can.
+    """
     if _kept and _kept[-1].usable:
         yield _kept[-1].starter
         return
-    with preloaded_for_one_run() as starter:
+    with _kept_servers(OF_OTHERS, OF_OBSERVERS) as starter:
         yield starter
 
 
@@ -254,15 +257,8 @@ def preloaded() -> Iterator[Starter]:
 
 
 @contextmanager
-def preloaded_for_one_run() -> Iterator[Starter]:
-    """The same without what only a summary needs, so that one run starts as early as it can."""
-    with _kept_servers(OF_OTHERS, OF_OBSERVERS) as starter:
-        yield starter
-
-
-@contextmanager
 def preloaded_without_observer() -> Iterator[Starter]:
-    """The same on a host that carries only other processes of a run: the imports of an observer are not made."""
+    """The same on a host that carries only other processes of a run: the imports of an observer are not made. Raises OSError."""
     with _kept_servers(OF_OTHERS) as starter:
         yield starter
 
