@@ -138,11 +138,21 @@ def write_private(path: Path, text: str) -> None:
 
 def replace_private(path: Path, text: str) -> None:
     """Write a text to a file that only this user can read; at any moment the file is the old or the new one. Raises OSError."""
+    with private_replacement(path) as unfinished:
+        unfinished.write_text(text, encoding="utf-8")
+
+
+@contextlib.contextmanager
+def private_replacement(path: Path) -> Iterator[Path]:
+    """An empty file that only this user can read: it replaces `path` when the block ends, and is removed if the block fails.
+
+    Raises OSError.
+    """
     unfinished = path.with_name(f"{path.name}.new")
     try:
-        write_private(unfinished, text)
+        yield private_file(unfinished)
         os.replace(unfinished, path)
-    except OSError:
+    except BaseException:
         with suppress(OSError):
             unfinished.unlink()
         raise

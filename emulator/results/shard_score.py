@@ -5,10 +5,10 @@ They never leave the machine or the user: a pickle, written by one process of a 
 
 from __future__ import annotations
 
-import os
 import pickle
 from pathlib import Path
 
+from evedrop.results.folder import private_replacement
 from evedrop.scenario import Scenario
 from evedrop.score.totals import Totals
 
@@ -16,11 +16,9 @@ _NAME = "score"
 
 
 def dump_score(totals: Totals, folder: Path) -> None:
-    """Write the totals to a results folder; the file is complete at any moment, and private to this user."""
-    unfinished = folder / f"{_NAME}.new"
-    with os.fdopen(os.open(unfinished, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
+    """Write the totals to a results folder; the file is complete at any moment, and private to this user. Raises OSError."""
+    with private_replacement(folder / _NAME) as unfinished, unfinished.open("wb") as file:
         pickle.dump(totals, file)
-    os.replace(unfinished, folder / _NAME)
 
 
 def load_score(folder: Path, scenario: Scenario) -> Totals:

@@ -6,7 +6,6 @@ import contextlib
 import itertools
 import json
 import math
-import os
 import re
 import shutil
 import time
@@ -25,7 +24,7 @@ from evedrop.memory.montecarlo import Merger, Plan, check_mode, disk_errors, res
 from evedrop.memory.trials import BatchResult, tasks_of
 from evedrop.memory.workers import connected
 from evedrop.news import Tell
-from evedrop.results.folder import new_folder, private_file, private_pictures, write_private
+from evedrop.results.folder import new_folder, private_pictures, private_replacement, write_private
 from evedrop.scenario import Scenario
 from evedrop.scenario.application import APPLICATIONS
 from evedrop.score.scorekeeper import Ending
@@ -142,9 +141,8 @@ def sweep_over(
 def _write_table(folder: Path, rows: list[dict[str, Any]]) -> pa.Table:
     """Write the table of the points so far; replaces the file atomically."""
     table = pa.Table.from_pylist(rows)
-    unfinished = folder / "sweep.parquet.new"
-    pq.write_table(table, private_file(unfinished))
-    os.replace(unfinished, folder / "sweep.parquet")
+    with private_replacement(folder / "sweep.parquet") as unfinished:
+        pq.write_table(table, unfinished)
     return table
 
 

@@ -9,7 +9,6 @@ Source: docs/wire.md, the journal.
 
 from __future__ import annotations
 
-import contextlib
 import mmap
 import os
 from collections.abc import Mapping, Sequence
@@ -22,7 +21,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from evedrop.results.folder import private_opener
+from evedrop.results.folder import private_replacement
 from evedrop.wire.crossing import AGAIN, RECORD, UNLINKED, Crossing, Kind
 
 Records = NDArray[Any]
@@ -132,23 +131,13 @@ class JournalPart:
 
 def _mapped(path: Path, size: int) -> mmap.mmap:
     """A new file, complete at once under its name. Raises OSError if the disk is full."""
-    unfinished = path.with_suffix(".new")
-    descriptor = os.open(unfinished, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o600)
-    try:
+    with private_replacement(path) as unfinished, unfinished.open("r+b") as file:
         if hasattr(os, "posix_fallocate"):  # not on macOS
-            os.posix_fallocate(descriptor, 0, size)
+            os.posix_fallocate(file.fileno(), 0, size)
         else:
-            left = memoryview(bytes(size))
-            while left:
-                left = left[os.write(descriptor, left) :]
-        buffer = mmap.mmap(descriptor, size, flags=mmap.MAP_SHARED | _POPULATE)
-        os.replace(unfinished, path)
-    except OSError:
-        unfinished.unlink(missing_ok=True)
-        raise
-    finally:
-        os.close(descriptor)
-    return buffer
+            file.write(bytes(size))
+            file.flush()
+        return mmap.mmap(file.fileno(), size, flags=mmap.MAP_SHARED | _POPULATE)
 
 
 def _whole(stored: Records) -> Records:
@@ -220,15 +209,8 @@ def _codes(column: pa.ChunkedArray, codes: Mapping[str, int], none: int) -> NDAr
 
 def write_parquet(path: Path, table: pa.Table) -> None:
     """Write a Parquet file, which is complete under its name. Raises OSError if the disk is full."""
-    unfinished = path.with_suffix(".new")
-    try:
-        with open(unfinished, "wb", opener=private_opener) as file:
-            pq.write_table(table, file, compression="zstd", compression_level=1)
-        os.replace(unfinished, path)
-    except OSError:
-        with contextlib.suppress(OSError):
-            unfinished.unlink()
-        raise
+    with private_replacement(path) as unfinished, unfinished.open("wb") as file:
+        pq.write_table(table, file, compression="zstd", compression_level=1)
 
 
 def amend_parquet(path: Path, fates: Mapping[int, Crossing]) -> pa.Table:

@@ -6,7 +6,6 @@ every few thousand slots, one receiver after the other, like the table of an uns
 
 from __future__ import annotations
 
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from itertools import count
@@ -19,7 +18,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from evedrop.results.folder import private_file
+from evedrop.results.folder import private_replacement
 from evedrop.results.growing_tables import parquet_or_stream
 from evedrop.results.writer import NULLABLE
 
@@ -41,14 +40,15 @@ class Gathered(ABC):
         """Merge the tables of the shards, in order, and replace the empty table of the run with the result."""
         schema = pq.read_schema(table)
         rows = [_Rows(source, schema, self) for source in sources]
-        unfinished = table.with_suffix(".new")
-        with pq.ParquetWriter(private_file(unfinished), schema, compression="zstd", compression_level=1) as writer:
+        with (
+            private_replacement(table) as unfinished,
+            pq.ParquetWriter(unfinished, schema, compression="zstd", compression_level=1) as writer,
+        ):
             for first in count(0, self.slots_at_once):
                 parts = [one.below(first + self.slots_at_once) for one in rows]
                 if not any(part.num_rows for part in parts):
                     break
                 writer.write_table(self._one(first, parts, schema))
-        os.replace(unfinished, table)
 
     def codes(self, table: pa.Table) -> NDArray[np.int64]:
         """The index of the receiver of every row; 0 for a table without receivers."""
