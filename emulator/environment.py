@@ -53,7 +53,7 @@ def own_environment() -> dict[str, str]:
 
 
 SINGLE_THREADED: Mapping[str, str] = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
-"""For a process of a run: one thread for linear algebra, and output that is written at once."""
+"""For a process of a run, or a worker: one thread for linear algebra, and output that is written at once."""
 
 _CLIENT = "(rx: (worker_threads: 1), tx: (handover: rx), net: (handover: rx), acc: (handover: rx), app: (handover: rx))"
 # A router's receiving must never wait for its sending threads.

@@ -16,7 +16,7 @@ from multiprocessing import connection
 from multiprocessing.connection import Connection, Pipe
 from typing import Any, final
 
-from evedrop.environment import own_environment
+from evedrop.environment import SINGLE_THREADED, own_environment
 from evedrop.errors import EvedropError, RunError, UsageError
 from evedrop.interrupts import SIGNALS
 from evedrop.memory.trials import BatchResult, Task, carry_out
@@ -81,7 +81,7 @@ class _Worker:
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,
-                env=own_environment(),
+                env={**own_environment(), **SINGLE_THREADED},
             )
         except OSError as error:
             self.pipe.close()
