@@ -68,13 +68,19 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> Iterat
 
 
 def wait_until(condition: Callable[[], Any], what: str, limit: float = LIMIT) -> Any:
-    """The first true value of a condition; fails the test if it stays false for this number of seconds."""
+    """The first true value of a condition; fails the test if it stays false for this number of seconds.
+
+    It sleeps longer between looks that take long, for what it waits for needs a processor, too.
+    """
     deadline = time.monotonic() + limit
-    while not (found := condition()):
-        if time.monotonic() > deadline:
+    while True:
+        began = time.monotonic()
+        if found := condition():
+            return found
+        looked = time.monotonic()
+        if looked > deadline:
             pytest.fail(f"within {limit:g} s: {what}")
-        time.sleep(0.01)
-    return found
+        time.sleep(min(0.1, max(0.01, 4 * (looked - began))))
 
 
 def with_mark(mark: str) -> dict[int, str]:
