@@ -158,10 +158,13 @@ class UnknownName(KeyError):
 
     def __init__(self, what: str, name: object, known: Iterable[str]) -> None:
         """what: the kind of thing, such as "receiver"."""
-        super().__init__(f"there is no {what} {name!r}; expected one of {', '.join(known)}")
+        names = [*known]
+        super().__init__(what, name, names)  # what a copy is made from in another process
+        expected = f"expected one of {', '.join(names)}" if names else "these results have none"
+        self._said = f"there is no {what} {name!r}; {expected}"
 
     def __str__(self) -> str:
-        return str(self.args[0])  # KeyError would show its repr
+        return self._said
 
 
 class NotRegistered(KeyError):

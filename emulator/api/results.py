@@ -149,11 +149,11 @@ class SweepResults(ReportedResults):
 
     @property
     def _facts(self) -> str:
-        return f"{', '.join(self.keys)}: {self.points} points"
+        return f"{', '.join(self.keys)}: {self.points} point{'' if self.points == 1 else 's'}"
 
     def _repr_html_(self) -> str:
         more = self.table.num_rows - _MOST_ROWS
-        notes = [f"and {more} rows more: .table has all of them"] if more > 0 else []
+        notes = [f"and {more} more row{'' if more == 1 else 's'}: .table has all of them"] if more > 0 else []
         rows = self.table.slice(0, _MOST_ROWS).to_pylist()
         return table_text(f"Sweep over {self._facts}", sweep_table(rows, self.keys), notes)
 

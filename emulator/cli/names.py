@@ -14,7 +14,7 @@ def name_lines(described: Mapping[str, str], width: int, columns: int) -> Iterat
     """The lines of the two columns; width: of the first one; columns: of the terminal."""
     below = columns - width < _LEAST
     for name, description in described.items():
-        lines = textwrap.wrap(description, columns - (4 if below else width)) or [""]
+        lines = textwrap.wrap(description, max(1, columns - (4 if below else width))) or [""]
         first = "" if below else lines.pop(0)
         yield f"{name:<{width}}{first}".rstrip()
         yield from (" " * (4 if below else width) + line for line in lines)

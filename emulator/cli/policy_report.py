@@ -38,7 +38,8 @@ def print_policies(design: PolicyDesign) -> None:
                     f"left out, because the best policy never sends: with λ = {price:g} the weights {weights}"
                 )
         if front.dominated:
-            console.print(f"left out: {front.dominated} policies that another one dominates")
+            policies = "policy" if front.dominated == 1 else "policies"
+            console.print(f"left out: {front.dominated} {policies} that another one dominates")
     if design.left_out:
         console.print(left_out_line(design.left_out, "no closed form of its error is known under this scheme"))
 

@@ -36,7 +36,7 @@ def plain_tables(values: Mapping[str, Any], source: str, modules: str | None = N
     reader = _Reader()
     tables = {name: plain for name, value in values.items() if (plain := reader.plain(name, value)) is not None}
     given = tables.get("modules", modules)
-    if reader.folders and not reader.mistakes:
+    if reader.folders and not reader.mistakes and isinstance(given, (str, Path, type(None))):
         folders = dict.fromkeys(reader.folders) if given is None else {str(Path(given).absolute()): None}
         folders |= dict.fromkeys(reader.folders)
         if len(folders) > 1:

@@ -159,17 +159,26 @@ class SweepRepeat(Section[SweepSource]):
         given = of.folder / "scenario.toml"  # of a scenario that was made in Python, whose name is only its title
         words = ["evedrop", "sweep", str(given.absolute()) if given.exists() else of.scenario]
         for key, values in of.grid.items():
-            words += ["--over", f"{key}={','.join(_toml(value) for value in values)}"]
+            words += ["--over", f"{key}={','.join(_listed(values))}"]
         for key, value in of.changes.items():
             words += [f"--{key}", _toml(value)] if key == "trials" else ["--set", f"{key}={_toml(value)}"]
         words += _MODES.get(of.mode, [])
         yield element("pre", element("code", shlex.join(words)))
 
 
+def _listed(values: Sequence[Any]) -> list[str]:
+    """Values as the command line takes a list of them: all with quotes where one needs them, for they are read together."""
+    return [str(value) if all(map(_is_plain, values)) else toml_of(value) for value in values]
+
+
 def _toml(value: Any) -> str:
     """A value as the command line takes it; a word without quotes unless it would be read as something else."""
-    plain = isinstance(value, str) and value_of(value) == value and not {",", ":"} & set(value)
-    return str(value) if plain else toml_of(value)
+    return str(value) if _is_plain(value) else toml_of(value)
+
+
+def _is_plain(value: Any) -> bool:
+    """Whether a value is a word that is read as such without quotes."""
+    return isinstance(value, str) and value_of(value) == value and not {",", ":"} & set(value)
 
 
 SWEEP_SECTIONS: tuple[type[Section[SweepSource]], ...] = (

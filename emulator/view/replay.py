@@ -41,7 +41,7 @@ def replay(folder: Path, path: Path | None = None) -> Path:
     peers = {name: _peer(results, name) for name in scenario.receivers}
     x, nu, sent = _truth(results, scenario.receivers[0])
     if not len(x):
-        raise UsageError(f"{folder} has no recorded trial to show; run it again, for example without --covariance-only")
+        raise UsageError(f"{folder} has no recorded trial to show; run it again, for example in the exact mode")
     _check_shapes(folder, len(scenario.process.A), x, peers)
     inputs, monitored, showing = _inputs(results), _monitored(results), showing_of(scenario)
     if showing is not None and len(inputs) != len(x):

@@ -120,8 +120,8 @@ class Viewer:
         if address is None and not is_apart(process):
             self.warning = (
                 "other users of this machine can find the window's port, control the window and take pictures of what it "
-                "shows, for this system allows it no network of its own; --view web, whose address is a secret, or --view "
-                "off keep it from them (docs/view.md, who sees it)"
+                "shows, for this system allows it no network of its own; the web view, whose address is a secret, or no view "
+                "keeps it from them (docs/view.md, who sees it)"
             )
 
     @property

@@ -6,6 +6,7 @@ import fcntl
 import gc
 import json
 import os
+import pickle
 import shlex
 import shutil
 import subprocess
@@ -31,6 +32,7 @@ from evedrop.memory.montecarlo import Plan
 from evedrop.memory.simulation import Mode
 from evedrop.news import News, RunProgress
 from evedrop.report import closing
+from evedrop.results.by_name import ByName
 from evedrop.score.built_in_figures import BuiltInFigures
 from evedrop.score.summary import PeerSummary
 from evedrop.studies.sweep import grid_of
@@ -187,6 +189,10 @@ def test_an_unknown_name_is_named_with_the_known_ones(results: RunResults) -> No
     with pytest.raises(KeyError, match="there is no link 'smrt'"):
         results.links["smrt"]
     assert results.peers.get("antena") is None
+    with pytest.raises(KeyError, match=r"^there is no verdict on 'smart'; these results have none$"):
+        ByName("verdict on", {})["smart"]
+    copy = pickle.loads(pickle.dumps(caught.value))  # noqa: S301 - as it comes from another process
+    assert (type(copy), str(copy)) == (type(caught.value), str(caught.value))
 
 
 def test_workers_change_no_digest() -> None:
@@ -218,7 +224,7 @@ def test_a_sweep_takes_arrays_and_gives_a_table() -> None:
     html = found._repr_html_()
     assert ("4 points" in html, html.count("<tr>"), "more:" in html) == (True, 9, False)
     wide = replace(found, table=pa.concat_tables([found.table] * 6))
-    assert "and 8 rows more: .table has all of them" in wide._repr_html_()
+    assert "and 8 more rows: .table has all of them" in wide._repr_html_()
     found.report()
     (command,) = (text for text in checked(found.folder).texts if text.startswith("evedrop sweep"))
     options = parser_of("sweep").parse_whole(shlex.split(command)[1:])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import shlex
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -184,6 +185,18 @@ def test_words_whole_numbers_and_other_modes_can_be_swept(tmp_path: Path) -> Non
     assert "All 4 points were done" in page.texts
     assert "4 points of eavesdroppers.smart.strategy, slots · 10 to 20 slots · 5 trials" in page.texts
     assert ("path", "class", "bar") in page.attributes
+
+
+def test_the_page_quotes_all_values_of_an_entry_if_one_needs_it(tmp_path: Path) -> None:
+    """The command line reads them together, so that a comma in a title does not part it."""
+    values = ["a, b", "c"]
+    sweep_over(
+        "vehicle", {"trials": 2, "slots": 2}, {"title": values}, tmp_path / "run", lambda _: None, Plan(workers=1)
+    )
+    write_report(tmp_path / "run")
+    command = next(text for text in checked(tmp_path / "run").texts if text.startswith("evedrop sweep"))
+    words = shlex.split(command)
+    assert grid_of([words[words.index("--over") + 1]]) == {"title": values}
 
 
 BASE = ("sweep", "eavesdroppers", "--slots", "20", "--out", "run")

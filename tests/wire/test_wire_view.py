@@ -388,6 +388,7 @@ def test_a_video_of_a_wire(folder: Path, capfd: pytest.CaptureFixture[str]) -> N
         ((), "--times FIRST:LAST"),
         (("--slots", "0:3"), "give --times"),
         (("--times", "0:1e12"), "more than 1,000,000 frames"),
+        (("--times", "0:1000000:1"), "more than 1,000,000 frames"),
     ],
 )
 def test_a_video_of_a_wire_needs_times(

@@ -112,7 +112,7 @@ def _times_of(options: argparse.Namespace) -> Sequence[float]:
         raise UsageError("a video of a wire needs --times FIRST:LAST, in seconds, such as --times 0:10")
     first, last, step = options.times
     step = 1.0 / (options.fps or FRAME_RATE) if step is None else step
-    if (last - first) / step > _MOST_TIMES:
+    if (last - first) / step >= _MOST_TIMES:
         raise UsageError(
             f"--times gives more than {_MOST_TIMES:,} frames; give a shorter time, or a larger step as in 0:60:0.1"
         )

@@ -144,14 +144,15 @@ class RunMetrics:
         for figure, kind in estimated_figures().items():
             if kind.only_in_mode is not None:
                 continue
-            family = gauge(f"evedrop_{figure}", f"{figure} so far: {kind.meaning}.", labels=["receiver"])
+            family = gauge(f"evedrop_{figure}", f"{figure} so far, as in the summary.", labels=["receiver"])
             for name, figures in summary.get("peers", {}).items():
                 if isinstance(value := figures.get(figure), (int, float)):
                     family.add_metric([name], value)
             yield family
         for name in self._scenario.applications:
-            for figure in APPLICATIONS[name].metrics if summary.get(name) else ():
-                if (value := APPLICATIONS[name].figure(summary[name], (figure,))) is not None:
+            figures = summary.get(name) or {}
+            for figure in APPLICATIONS[name].metrics:
+                if isinstance(value := figures.get(figure), (int, float)):
                     yield gauge(f"evedrop_{figure}", f"{figure} of {name} so far.", value)
 
 
