@@ -16,9 +16,11 @@ import pytest
 from evedrop.live.launch.host_messages import LogText, ProcessEnded, StartProcess, answer_in
 from evedrop.live.launch.host_program import HostProcesses
 from evedrop.live.launch.starter import StartedProcess
+from evedrop.live.protocol.brief import brief_from
 from tests.conftest import LIMIT, wait_until
+from tests.live.network.bench import brief_of_eve
 
-ORDER = StartProcess(7, "eavesdropper", "smart", {"process": "smart", "part": {}}, {})
+ORDER = StartProcess(7, brief_of_eve(), {})
 
 
 def unable(role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:
@@ -61,7 +63,7 @@ def test_a_process_has_its_files_in_the_private_folder(tmp_path: Path) -> None:
     sent: list[bytes] = []
 
     def start(role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:
-        assert (role, brief) == ("eavesdropper", tmp_path / "smart.json")
+        assert (role, brief) == ("eavesdropper", tmp_path / "eve.json")
         started.append((json.loads(brief.read_text()), environment, brief.stat().st_mode & 0o777))
         log.write(b"a line\n")
         return Process()
@@ -71,10 +73,11 @@ def test_a_process_has_its_files_in_the_private_folder(tmp_path: Path) -> None:
         return len(sent[-1])
 
     host = HostProcesses(tmp_path, start, send)
-    part = {"state_file": "/launcher/smart.state"}
-    host.obey(replace(ORDER, brief={"process": "smart", "part": part}, environment={"TMPDIR": "/launcher", "A": "1"}))
+    given = brief_of_eve(state_file="/launcher/eve.state")
+    host.obey(StartProcess(7, given, {"TMPDIR": "/launcher", "A": "1"}))
     ((brief, environment, mode),) = started
-    assert brief["part"] == {"state_file": str(tmp_path / "smart.state")}
+    assert brief["part"]["state_file"] == str(tmp_path / "eve.state")
+    assert brief_from(brief).keys == given.keys
     assert (environment["TMPDIR"], environment["A"], mode) == (str(tmp_path), "1", 0o600)
     wait_until(lambda: b"".join(sent).endswith(b"\n"), "the log")
     host.end()
@@ -99,16 +102,16 @@ def test_a_process_that_cannot_be_started_is_reported(folder: str, why: str, tmp
     log, end = (answer_in(line) for line in sent)
     assert isinstance(log, LogText)
     assert log.number == 7
-    assert log.written.startswith("evedrop: smart cannot be started (")
+    assert log.written.startswith("evedrop: eve cannot be started (")
     assert why in log.written
     assert end == ProcessEnded(7, 1)
     host.end()
 
 
-@pytest.mark.parametrize("name", ["../smart", "/etc/smart"])
+@pytest.mark.parametrize("name", ["../eve", "/etc/eve"])
 def test_a_brief_is_written_only_into_the_folder_of_the_run(name: str, tmp_path: Path) -> None:
     """The launcher's name of a process is not a path."""
-    order = replace(ORDER, process=name)
+    order = replace(ORDER, brief=replace(ORDER.brief, process=name))
     (tmp_path / "private").mkdir()
     with pytest.raises(ValueError, match="is not the name of a process"):
         HostProcesses(tmp_path / "private", unable, len).obey(order)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from collections.abc import Callable
@@ -28,6 +27,7 @@ from evedrop.live.launch.hosts_file import HostTable
 from evedrop.live.launch.ssh_starter import SshHost
 from evedrop.live.launch.starter import CONNECTION_LOST
 from tests.conftest import LIMIT, wait_until
+from tests.live.network.bench import brief_of_eve
 
 GREETING = line_of(Greeting(own_version())).decode().strip()
 Connect = Callable[..., SshHost]
@@ -64,16 +64,16 @@ def test_a_host_gets_the_brief_and_what_differs_from_its_own_environment(connect
     """No brief stays on disk here, and classes are in the folder there; with the connection its processes are lost."""
     host = connect(GREETING, modules="/srv/classes")
     ready(host)
-    brief, log = tmp_path / "smart.json", tmp_path / "smart.log"
-    brief.write_text(json.dumps({"process": "smart", "part": {"modules": "/srv/here"}}))
+    brief = brief_of_eve(modules="/srv/here")
+    path, log = brief.write(tmp_path), tmp_path / "eve.log"
     with log.open("wb") as file:
-        process = host.start(7, "eavesdropper", brief, file, {**own_environment(), "OMP_NUM_THREADS": "one"})
-    assert not brief.exists()
+        process = host.start(7, path, file, {**own_environment(), "OMP_NUM_THREADS": "one"})
+    assert not path.exists()
     assert process.poll() is None
     host.close(time.monotonic() + LIMIT)
-    (order,) = told(tmp_path)
-    made = {"process": "smart", "part": {"modules": "/srv/classes"}}
-    assert order == StartProcess(7, "eavesdropper", "smart", made, {"OMP_NUM_THREADS": "one"})
+    (order,) = (one for one in told(tmp_path) if isinstance(one, StartProcess))
+    assert order.brief.text == brief.text.replace("/srv/here", "/srv/classes")
+    assert (order.number, order.environment) == (7, {"OMP_NUM_THREADS": "one"})
     assert process.wait(LIMIT) == CONNECTION_LOST
     assert log.read_text() == "evedrop: the connection with host beta ended: ssh ended with status 0\n"
 
@@ -82,14 +82,12 @@ def test_a_brief_without_classes_gets_no_folder_of_classes(connect: Connect, tmp
     """It has no use for it."""
     host = connect(GREETING, modules="/srv/classes")
     ready(host)
-    brief = tmp_path / "smart.json"
-    brief.write_text(json.dumps({"process": "smart", "part": {"modules": None}}))
-    with (tmp_path / "smart.log").open("wb") as file:
-        host.start(7, "eavesdropper", brief, file, {})
+    path = brief_of_eve().write(tmp_path)
+    with (tmp_path / "eve.log").open("wb") as file:
+        host.start(7, path, file, {})
     host.close(time.monotonic() + LIMIT)
-    (order,) = told(tmp_path)
-    assert isinstance(order, StartProcess)
-    assert order.brief["part"] == {"modules": None}
+    (order,) = (one for one in told(tmp_path) if isinstance(one, StartProcess))
+    assert order.brief.part == brief_of_eve().part
 
 
 def test_what_a_login_shell_prints_is_passed_over(connect: Connect) -> None:

@@ -28,6 +28,7 @@ from evedrop.entries import (
     text,
     whole,
 )
+from evedrop.live.protocol.brief import AnyBrief, brief_from
 
 MOST_NOISE = 200
 """The most lines that the login shell of a host may print before the program begins."""
@@ -49,11 +50,7 @@ class StartProcess(HostMessage):
     kind = "start"
     number: int = field(metadata=_NUMBER)
     """Distinguishes it from all other processes of the run."""
-    role: str = field(metadata=entry(text))
-    process: str = field(metadata=entry(text))
-    """Its name in the run."""
-    brief: Mapping[str, Any] = field(metadata=entry(table({"part": named(anything)}, strict=False)))
-    """As JSON; the process itself checks the rest."""
+    brief: AnyBrief = field(repr=False, metadata=entry(anything, brief_from))
     environment: Mapping[str, str] = field(metadata=entry(named(text)))
     """Variables in addition to those of the host."""
 
@@ -115,7 +112,7 @@ M = TypeVar("M", bound=HostMessage)
 
 def line_of(message: HostMessage) -> bytes:
     """A message as a line."""
-    return json.dumps({_KIND: message.kind, **plain(message)}).encode() + b"\n"
+    return json.dumps({_KIND: message.kind, **plain(message)}, default=plain).encode() + b"\n"
 
 
 def order_in(line: bytes) -> Order:

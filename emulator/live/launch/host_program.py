@@ -9,12 +9,11 @@ Source: docs/hosts.md, how it works.
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import signal
 import sys
 import threading
-from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, final
 
@@ -36,6 +35,8 @@ from evedrop.live.launch.host_messages import (
 from evedrop.live.launch.preloading import preloaded_without_observer
 from evedrop.live.launch.private_folder import private_folder
 from evedrop.live.launch.starter import StartedProcess, Starter, end_all
+from evedrop.live.protocol.brief import AnyBrief
+from evedrop.live.protocol.brief_parts import ReceiverPart
 from evedrop.signals import held_back, raise_on_signals
 
 _LAST_LINES_SECONDS = 1.0  # for the last lines of a process that has ended, whose own children may hold its log open
@@ -112,34 +113,31 @@ class HostProcesses:
         end_all(self._processes.values())
 
     def _begin(self, order: StartProcess) -> None:
-        process, number = order.process, order.number
-        if Path(process).name != process:
-            raise ValueError(f"{process} is not the name of a process")
+        number, brief = order.number, self._kept_here(order.brief)
+        if Path(brief.process).name != brief.process:
+            raise ValueError(f"{brief.process} is not the name of a process")
         environment = {**own_environment(), **order.environment}
         if "TMPDIR" in order.environment:
             environment["TMPDIR"] = str(self._private)
         read, write = os.pipe()
         try:
             with os.fdopen(write, "wb") as log:
-                path = self._private / f"{process}.json"
-                with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
-                    json.dump(self._brief_of(order), file)
+                path = brief.write(self._private)
                 with held_back():
-                    self._processes[number] = self._start(order.role, path, log, environment)
+                    self._processes[number] = self._start(brief.role, path, log, environment)
         except OSError as error:
             os.close(read)
-            self.answer(LogText(number, f"evedrop: {process} cannot be started ({error})\n"))
+            self.answer(LogText(number, f"evedrop: {brief.process} cannot be started ({error})\n"))
             self.answer(ProcessEnded(number, 1))
             return
         threading.Thread(target=self._follow, args=(number, read), daemon=True).start()
 
-    def _brief_of(self, order: StartProcess) -> Mapping[str, Any]:
-        """The brief of an order; a process that keeps its state does so in the private folder of this host."""
-        part = order.brief["part"]
-        if part.get("state_file") is None:
-            return order.brief
-        state_file = str((self._private / f"{order.process}.state").absolute())
-        return {**order.brief, "part": {**part, "state_file": state_file}}
+    def _kept_here(self, brief: AnyBrief) -> AnyBrief:
+        """The same brief for a process that keeps its state in a file: the file is in the private folder of this host."""
+        if not isinstance(brief.part, ReceiverPart) or brief.part.state_file is None:
+            return brief
+        state_file = str((self._private / f"{brief.process}.state").absolute())
+        return replace(brief, part=replace(brief.part, state_file=state_file))
 
     def _follow(self, number: int, log: int) -> None:
         """Send what a process writes to its log, and how it ended."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import json
 import os
 import shlex
 import subprocess
@@ -19,6 +18,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, final
 
@@ -39,6 +39,8 @@ from evedrop.live.launch.host_messages import (
 )
 from evedrop.live.launch.hosts_file import HostsPlan, HostTable
 from evedrop.live.launch.starter import CONNECTION_LOST, ReportedProcess, StartedProcess, Starter
+from evedrop.live.protocol.brief import read_brief
+from evedrop.live.protocol.brief_parts import ImportingPart
 
 ANSWER_SECONDS = 60.0
 """How long a host may take to connect and to start Python."""
@@ -138,14 +140,12 @@ class SshHost:
                 "since their messages and digests may differ"
             )
 
-    def start(
-        self, number: int, role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]
-    ) -> HostedProcess:
-        """Start the process of a brief there. Raises OSError if the connection is lost."""
-        found = json.loads(brief.read_text(encoding="utf-8"))
-        brief.unlink()  # its keys should not stay on disk
-        if self._table.modules is not None and found["part"].get("modules") is not None:
-            found["part"]["modules"] = self._table.modules
+    def start(self, number: int, path: Path, log: IO[bytes], environment: Mapping[str, str]) -> HostedProcess:
+        """Start the process of the brief at a path there. Raises OSError if the connection is lost."""
+        brief = read_brief(path)
+        path.unlink()  # its keys should not stay on disk
+        if self._table.modules is not None and isinstance(brief.part, ImportingPart) and brief.part.modules is not None:
+            brief = replace(brief, part=replace(brief.part, modules=self._table.modules))
         process = HostedProcess(number, self, os.dup(log.fileno()))
         with self._guard:
             if self._lost.is_set():
@@ -154,7 +154,7 @@ class SshHost:
             self._processes[number] = process
         own = own_environment()
         added = {name: value for name, value in environment.items() if own.get(name) != value}
-        self.send(StartProcess(number, role, found["process"], found, added))
+        self.send(StartProcess(number, brief, added))
         return process
 
     def send(self, order: Order) -> None:
@@ -271,7 +271,7 @@ class SshStarter:
         host = self._plan.host_of(brief.stem)
         if host is None:
             return self._here(role, brief, log, environment)
-        return self._hosts[host].start(next(self._numbers), role, brief, log, environment)
+        return self._hosts[host].start(next(self._numbers), brief, log, environment)
 
 
 @contextmanager

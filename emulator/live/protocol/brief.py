@@ -159,7 +159,7 @@ def read_brief(path: Path, role: str | None = None) -> AnyBrief:
     try:
         if found is None:
             raise ValueError(f"it has more than {_MOST_BYTES} bytes")
-        brief = _parsed(json.loads(found.decode("utf-8")))
+        brief = brief_from(json.loads(found.decode("utf-8")))
     except (ValueError, RecursionError) as error:
         raise BriefError(f"{path} is not a brief of this version ({error}); {WRITE_AGAIN}") from error
     if role is not None and brief.role != role:
@@ -169,7 +169,8 @@ def read_brief(path: Path, role: str | None = None) -> AnyBrief:
     return brief
 
 
-def _parsed(found: Any) -> AnyBrief:
+def brief_from(found: Any) -> AnyBrief:
+    """The brief of a decoded JSON text. Raises ValueError if it is not one."""
     expect(table_of(Brief), "", found)
     if found["role"] not in PARTS:
         raise ValueError(f"unknown role {found['role']:.40}, expected one of {', '.join(PARTS)}")

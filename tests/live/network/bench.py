@@ -20,7 +20,7 @@ import zenoh
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.launch.ports import loopback_places
 from evedrop.live.network.session import client_config
-from evedrop.live.protocol.brief import AnyBrief, Flow
+from evedrop.live.protocol.brief import AnyBrief, Flow, brief_from
 from evedrop.live.protocol.envelope import enclosed, payload_of
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.ports import free_port
@@ -185,3 +185,9 @@ def bench_of(scenario: Scenario, folder: Path, protocol: str = "tcp") -> Iterato
     """A bench that is gone when the block ends."""
     with ExitStack() as stack:
         yield Bench(scenario, folder, stack, protocol)
+
+
+def brief_of_eve(**part: Any) -> AnyBrief:
+    """The brief of the smart eavesdropper of that scenario, as it is read; part: entries of its part that differ."""
+    brief = briefs_of(scenario_of(), loopback_places(None, None, False), ObserverTask(Path("nowhere"), False))["eve"]
+    return brief_from(json.loads(replace(brief, part=replace(brief.part, **part)).text))
