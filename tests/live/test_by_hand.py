@@ -268,12 +268,12 @@ def test_a_certificate_of_another_process_is_said(evedrop: Evedrop) -> None:
 def test_who_does_not_come_is_named(evedrop: Evedrop) -> None:
     """After the time that `--wait` gives, the observer names who is missing; exit 3, and a folder that says so."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    briefs = written(evedrop, "--listen", endpoint, "--wait", "8")
+    briefs = written(evedrop, "--listen", endpoint, "--wait", "15")
     lives = {name: begun(evedrop, name, path) for name, path in briefs.items() if name != "smart"}
     done = lives["observer"].end()
     assert done.status == 3
-    assert done.err == "evedrop: smart did not appear within 8 s; start it, or look at its log\n"
-    assert closing(done)[0] == "smart did not appear within 8 s; start it, or look at its log; the results so far:"
+    assert done.err == "evedrop: smart did not appear within 15 s; start it, or look at its log\n"
+    assert closing(done)[0] == "smart did not appear within 15 s; start it, or look at its log; the results so far:"
     assert load_results(evedrop.folder / "results").summary["ended"].startswith("smart did not appear")
     said = {name: live.end() for name, live in lives.items() if name != "observer"}
     assert {name: one.status for name, one in said.items()} == dict.fromkeys(said, 3)

@@ -18,6 +18,7 @@ from evedrop.model.links.link import REASONS
 from evedrop.results.writer import ResultsWriter
 from evedrop.score.slots import ReceiverSlots, Slots
 from evedrop.score.sums import slot_sums, squared_errors
+from tests.examples import examples
 
 NAMES = ("legitimate", "smart", "naive")
 N, SLOTS, TRIALS, RECORDED = 2, 40, 11, 5
@@ -123,7 +124,7 @@ in_parts = given(
 )
 
 
-@settings(max_examples=8)
+@settings(max_examples=examples(32))
 @in_parts
 def test_two_shards_are_the_whole(cut: int, first: list[int], second: list[int], at_once: int, seed: int) -> None:
     """Wherever the trials are cut, in whatever parts their slots came, and however many slots fit into memory."""

@@ -1,7 +1,7 @@
 import contextlib
 import socket
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from urllib.parse import urlsplit
 from urllib.request import urlopen
@@ -14,7 +14,7 @@ from evedrop.live.launch.metrics import MetricsAddress, RunMetrics, metrics_serv
 from evedrop.loading import load
 from evedrop.news import ConnectionOutage, FolderMoved, Held, News, RunProgress, Started, silent
 from evedrop.results.reading import load_results
-from tests.conftest import Evedrop
+from tests.conftest import LIMIT, Evedrop, wait_until
 
 pytest.importorskip("prometheus_client")
 ANY_PORT = MetricsAddress("127.0.0.1", 0)
@@ -83,14 +83,35 @@ def test_a_lost_connection_is_counted(tmp_path: Path) -> None:
     assert told == news
 
 
-def test_programs_that_only_connect_are_turned_away(tmp_path: Path) -> None:
-    """More of them than there are places: each connection is closed, and then the metrics can be read."""
+@contextlib.contextmanager
+def crowded(folder: Path, patience: float) -> Iterator[tuple[str, list[socket.socket]]]:
+    """The page of metrics, and more programs that only connect than there are places; patience: in seconds, for each."""
     with contextlib.ExitStack() as stack:
-        page = stack.enter_context(metrics_served(ANY_PORT, RunMetrics(load("vehicle"), tmp_path, silent), 0.02))
+        page = stack.enter_context(metrics_served(ANY_PORT, RunMetrics(load("vehicle"), folder, silent), patience))
         port = urlsplit(page).port
-        idle = [stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=20.0)) for _ in range(40)]
+        yield page, [stack.enter_context(socket.create_connection(("127.0.0.1", port), LIMIT)) for _ in range(40)]
+
+
+def test_programs_that_only_connect_keep_nobody_out_for_long(tmp_path: Path) -> None:
+    """Each connection is closed, and then the metrics can be read."""
+    with crowded(tmp_path, 0.5) as (page, idle):
         assert [one.recv(1) for one in idle] == [b""] * len(idle)
         assert scraped(page)["evedrop_running",] == 0
+
+
+def test_places_are_limited(tmp_path: Path) -> None:
+    """The last that connects is turned away at once; a place that somebody leaves is free again."""
+    with crowded(tmp_path, 10 * LIMIT) as (page, idle):
+        assert idle[-1].recv(1) == b""
+        for one in idle:
+            one.close()
+
+        def answered() -> bool:
+            with contextlib.suppress(OSError):
+                return scraped(page)["evedrop_running",] == 0
+            return False
+
+        wait_until(answered, "a free place")
 
 
 def test_a_run_that_is_paused_is_held(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from evedrop.model.slot.link import NEVER
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.scenario import Scenario
 from tests.builders import scalar_tables
+from tests.examples import examples
 
 NEMESIS: dict[str, Any] = {"faults": ["kill", "pause", "cut"], "every": 20, "lasting": 8}
 LOOP: dict[str, Any] = {
@@ -199,7 +200,7 @@ def test_it_can_be_changed_on_the_command_line() -> None:
     assert load("numerical", changes).event
 
 
-@settings(max_examples=25)
+@settings(max_examples=examples(40))
 @given(
     seed=st.integers(0, 2**64),
     every=st.sampled_from([1, 1.0, 2.5, 40]),

@@ -82,7 +82,7 @@ qualities = st.floats(0.3, 1.0)
 
 
 @given(st.floats(1.0, 1.3), st.floats(-0.5, 0.5), qualities, qualities, st.floats(0.02, 0.98))
-@settings(deadline=None, max_examples=12)
+@settings(deadline=None, max_examples=examples(40))
 def test_relative_secrecy_is_the_sign_of_the_difference(
     growth: float, coupling: float, mu: float, mu_e: float, at: float
 ) -> None:

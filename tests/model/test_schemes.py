@@ -17,6 +17,7 @@ from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.theory.covariances import state_covariances
 from evedrop.streams import Batch, Stream, normals, uniforms
 from tests.builders import DRIFTING, UNSTABLE, stream_keys
+from tests.examples import examples
 
 STREAMS = {stream for scheme in SCHEMES.values() for stream in scheme.secret_streams}
 KEYS = stream_keys(4, ("process", *sorted(STREAMS)))
@@ -84,7 +85,7 @@ def test_packets_are_the_papers(process: Process, slots: int) -> None:
 
 
 @pytest.mark.parametrize(("process", "slots"), [(DRIFTING, 60), (UNSTABLE, 40)])
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(seed=st.integers(0, 2**31), quality=st.sampled_from([0.0, 0.3, 0.8, 1.0]))
 def test_legitimate_estimator_is_the_textbooks(process: Process, slots: int, seed: int, quality: float) -> None:
     """Lost: (A x̂, A P Aᵀ + Q); state: (z, 0); innovation: (A x̂ + z − χ, A P Aᵀ); before slot 0: (0, Σ0), not predicted."""

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import matplotlib.image
 import numpy as np
-import pytest
 
 from evedrop.errors import UsageError
 from evedrop.view.picture import opened
+from tests.privileged import CannotRun, skip
 
 
 @contextmanager
@@ -23,7 +23,7 @@ def skipped_without_driver() -> Iterator[None]:
     except UsageError as error:
         if "no Vulkan driver" not in str(error):
             raise
-        pytest.skip(str(error))
+        skip(CannotRun(str(error)))
 
 
 def filled(png: bytes) -> float:

@@ -12,6 +12,7 @@ from evedrop.errors import UsageError
 from evedrop.view import video
 from evedrop.view.video import check_video, video_apart
 from tests.conftest import Evedrop
+from tests.privileged import CannotRun, skip
 
 SIZE = (64, 48)
 COLOURS = ((255, 0, 0), (0, 255, 0), (0, 0, 255))
@@ -174,7 +175,7 @@ def test_the_video_of_a_run_shows_its_slots(finished: Path, evedrop: Evedrop, tm
     path = tmp_path / "run.gif"
     done = evedrop("view", str(finished), "--video", str(path), "--slots", "20:40:20", "--size", "400x320")
     if "Vulkan" in done.err:
-        pytest.skip(done.err)
+        skip(CannotRun(done.err))
     assert (done.status, done.err) == (0, "")
     assert done.out == f"2 frames are in {path}\n"
     with Image.open(path) as gif:

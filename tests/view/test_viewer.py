@@ -26,6 +26,7 @@ from evedrop.view.recording import ViewRecording
 from evedrop.view.viewer import Viewer, WebAddress, choose, open_run
 from evedrop.view.web_page import WebPage, own_page
 from tests.conftest import LIMIT, wait_until
+from tests.privileged import CannotRun, skip
 from tests.view.simulated_run import Simulated
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
@@ -214,12 +215,13 @@ def window(logs: Path, recording: Path) -> Viewer:
     except UsageError as error:
         if "graphics adapter" not in str(error) and "render context" not in str(error):
             raise
-        pytest.skip(f"no Vulkan driver: {error}")
+        skip(CannotRun(f"no Vulkan driver: {error}"))
     assert started is not None
     return started
 
 
 @LINUX
+@pytest.mark.pictures
 @pytest.mark.usefixtures("headless")
 def test_nobody_can_connect_to_a_window(tmp_path: Path) -> None:
     """Its port is in a network of its own where the system allows that, and else a warning says so."""
@@ -236,6 +238,7 @@ def test_nobody_can_connect_to_a_window(tmp_path: Path) -> None:
 
 
 @LINUX
+@pytest.mark.pictures
 @pytest.mark.usefixtures("headless")
 def test_a_window_without_a_network_of_its_own_is_warned_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the system allows none it is started all the same, and the user is told what others can do."""
@@ -307,6 +310,7 @@ STARTER = """
 import sys, time
 from pathlib import Path
 from evedrop.view.viewer import Viewer
+from tests.privileged import CannotRun, skip
 viewer = Viewer.start("web", Path(sys.argv[1]), Path(sys.argv[1]) / "r.rrd")
 print(viewer.pid, flush=True)
 time.sleep(600)

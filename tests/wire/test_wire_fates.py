@@ -15,6 +15,7 @@ from evedrop.model.links.link import Fate
 from evedrop.model.slot.link import Change
 from evedrop.streams import Stream, normals, root_of_seed, stream_key, uniforms
 from evedrop.wire.fates import KeyFates, MessageFate
+from tests.examples import examples
 from tests.wire.wire_links import DELAYS, LOSSES, wire_link
 
 SEED = 7
@@ -98,7 +99,7 @@ def test_other_keys_kinds_links_and_seeds_have_other_fates() -> None:
     assert list(in_turn[0]) == taken(of_scan(FULL), 300)
 
 
-@settings(deadline=None, max_examples=20)
+@settings(deadline=None, max_examples=examples(40))
 @given(
     model=st.sampled_from(sorted(LOSSES)),
     start=st.integers(0, 3000),
@@ -122,7 +123,7 @@ def test_many_messages_before_the_start() -> None:
     assert taken(of_scan(bursts, start=70_000), 50) == taken(whole, 50)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(deadline=None, max_examples=examples(40))
 @given(st.lists(st.tuples(st.integers(0, 1200), st.integers(0, 3)), max_size=4))
 def test_changes_while_messages_pass(turns: list[tuple[int, int]]) -> None:
     """A change holds from the next message on, as if it had been known from the beginning."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from evedrop.wire.crossing import RECORD, UNLINKED, Crossing
 from evedrop.wire.step_counts import DELIVERED, OUTCOMES, StepCounter, WireSteps, quantile
+from tests.examples import examples
 from tests.wire.wire_rows import START, robot_plan, traffic
 
 STEP = 0.1
@@ -48,7 +49,7 @@ rows_of_any_time = st.lists(
 )
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=examples(40))
 @given(st.lists(rows_of_any_time, max_size=4))
 def test_every_message_is_counted_once(found: list[list[tuple[float, int, int]]]) -> None:
     """Whatever the times, also before the start, long after it and out of order; steps do not overlap, and they are few."""

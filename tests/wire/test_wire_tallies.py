@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from evedrop.wire.crossing import RECORD, Crossing
 from evedrop.wire.tallies import LinkTally, StreamTally
+from tests.examples import examples
 
 
 def by_hand(rows: list[tuple[float, bool]]) -> tuple[int, float]:
@@ -24,7 +25,7 @@ def by_hand(rows: list[tuple[float, bool]]) -> tuple[int, float]:
     return longest, silence
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(
     rows=st.lists(st.tuples(st.integers(1, 9), st.sampled_from([0, 0, 1, 4, 19])), min_size=1, max_size=60),
     size=st.integers(1, 6),

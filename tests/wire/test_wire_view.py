@@ -30,6 +30,7 @@ from evedrop.wire.replay import PICTURE_SIZE, replay_wire
 from evedrop.wire.run import run_wire
 from evedrop.wire.view import WireView
 from tests.conftest import LIMIT, wait_until
+from tests.privileged import CannotRun, skip
 from tests.wire.wire_at_work import LOSSY, both_ways, sending
 from tests.wire.wire_rows import START, robot_plan, traffic
 
@@ -313,7 +314,7 @@ def test_a_picture_of_a_wire(folder: Path, capfd: pytest.CaptureFixture[str]) ->
     status = main(["view", str(folder), "--picture", str(folder / "w.png")])
     said = capfd.readouterr()
     if "no Vulkan driver" in said.err:
-        pytest.skip(said.err)
+        skip(CannotRun(said.err))
     assert (status, said.err) == (0, "")
     pixels = np.asarray(matplotlib.image.imread(folder / "w.png"))
     assert pixels.shape[1::-1] == PICTURE_SIZE
@@ -374,7 +375,7 @@ def test_a_video_of_a_wire(folder: Path, capfd: pytest.CaptureFixture[str]) -> N
     status = main([*words, "0:99999:50000"])
     said = capfd.readouterr().err
     if "Vulkan" in said:
-        pytest.skip(said)
+        skip(CannotRun(said))
     assert status == 2
     assert "50000 s is not a time of the wire" in said
     assert main([*words, "2:10:4"]) == 0

@@ -23,6 +23,7 @@ from evedrop.model.receiver import Belief, Reception
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
 from evedrop.model.slot.link import Change
 from evedrop.model.slot.transit import Late
+from tests.examples import examples
 
 SIZES = st.builds(
     Sizes,
@@ -92,7 +93,7 @@ def largest(sizes: Sizes) -> dict[str, bytes]:
     }
 
 
-@settings(max_examples=50)
+@settings(max_examples=examples(100))
 @given(SIZES)
 def test_whatever_a_run_sends_fits(sizes: Sizes) -> None:
     """The largest message of every kind is within its limit, and the limit is not far above it where messages are large."""

@@ -28,6 +28,7 @@ from evedrop.model.receiver import Belief, Reception
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
 from evedrop.model.slot.transit import Late
 from tests.builders import mirrored
+from tests.examples import examples
 from tests.live.network.readers import EXAMPLES, READERS, fields_of
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False, width=64)
@@ -235,7 +236,7 @@ def parts() -> st.SearchStrategy[Any]:
     )
 
 
-@settings(deadline=None, max_examples=150)
+@settings(deadline=None, max_examples=examples(200))
 @given(st.data(), st.sampled_from(sorted(READERS)))
 def test_anything_else_is_an_error_of_ours(data: st.DataObject, name: str) -> None:
     """Whatever arrives, a reader gives values or raises one of the two errors of messages, which names the key and its writer."""

@@ -17,6 +17,7 @@ from evedrop.live.protocol.packets import delivery, packed_header, read_delivery
 from evedrop.model.flag_bits import packed_flags
 from evedrop.model.receiver import Reception
 from evedrop.model.slot.transit import Late
+from tests.examples import examples
 
 UP, DOWN = "evedrop/r/uplink", "evedrop/r/downlink/eve"
 FIRST, WINDOW = 7, 3
@@ -60,7 +61,7 @@ def readers(key: str, payloads: Sequence[bytes]) -> list[Reader]:
     return [Reader(key, payload) for payload in payloads]
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=examples(60))
 @given(RANDOM, SHAPES, st.sampled_from([0, 2]), st.booleans())
 def test_packets_of_many_slots_are_those_of_each(
     random: np.random.Generator, shape: tuple[int, int], header: int, odd: bool
@@ -95,7 +96,7 @@ def expect_same_packets(payloads: list[bytes], shape: tuple[int, int], header: i
             assert np.array_equal(found.truth[row], extras.truth)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=examples(60))
 @given(RANDOM, SHAPES, st.sampled_from([0, 2]), st.booleans())
 def test_deliveries_of_many_slots_are_those_of_each(
     random: np.random.Generator, shape: tuple[int, int], header: int, odd: bool
