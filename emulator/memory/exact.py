@@ -37,7 +37,7 @@ from evedrop.scenario import Scenario
 from evedrop.scenario.controlled import monitor_of
 from evedrop.scenario.input_files import disturbances_of, states_of
 from evedrop.scenario.stream_keys import StreamKeys
-from evedrop.score.acknowledging import chart_of, way_back_of
+from evedrop.score.acknowledging import ack_channel_of, chart_of
 from evedrop.score.closed_loop_tally import SolveTimes
 from evedrop.score.filtering import local_filter_of
 from evedrop.score.slots import InputSlots, ReceiverSlots, Slots
@@ -91,9 +91,9 @@ class ExactSimulation:
             None if chart is None else CusumBatch(chart, batch.trials),
             None if plan is None else Monitor(plan, keys.watermark, batch),
         )
-        way_back = way_back_of(scenario)
-        self._jammer = None if way_back is None else way_back.jammer
-        self._way_back = None if way_back is None else AckChannel.of(way_back, keys.way_back, batch)
+        ack_channel = ack_channel_of(scenario)
+        self._jammer = None if ack_channel is None else ack_channel.jammer
+        self._ack_channel = None if ack_channel is None else AckChannel.of(ack_channel, keys.acknowledgements, batch)
         self._steering = None
         if scenario.controller is not None and scenario.assignment is not None:
             controller = ControllerCore(scenario.controller.strategy, scenario.assignment, disturbances, batch.trials)
@@ -112,7 +112,7 @@ class ExactSimulation:
 
     def play(self, chunk: range, links: Mapping[str, LinkCore]) -> Chunk:
         """Simulate the next slots, which are those that the links have planned. No receiver leaves or returns among them."""
-        answered = self._way_back is not None or self._steering is not None
+        answered = self._ack_channel is not None or self._steering is not None
         sent: list[Sent] = []
         alarms: list[Flags] = []
         users: list[FollowedSlots] = []
@@ -124,8 +124,8 @@ class ExactSimulation:
             if made.packets.sent is not None:
                 for link in links.values():
                     link.silence(slots, made.packets.sent)
-            if self._way_back is not None:
-                alarm = self._acknowledge(self._way_back, slots.start, made.packets.sent, links)
+            if self._ack_channel is not None:
+                alarm = self._acknowledge(self._ack_channel, slots.start, made.packets.sent, links)
                 alarms += [] if alarm is None else [alarm]
             if self._steering is not None and inputs is not None:
                 if self._steering.awaits_estimate:
@@ -146,12 +146,12 @@ class ExactSimulation:
         return self._chunk(chunk, whole, followed, links, np.array(alarms) if alarms else None, inputs)
 
     def _acknowledge(
-        self, way_back: AckChannel, k: int, sent: Flags | None, links: Mapping[str, LinkCore]
+        self, ack_channel: AckChannel, k: int, sent: Flags | None, links: Mapping[str, LinkCore]
     ) -> Flags | None:
         """Return the acknowledgements of slot k to the sensor; where they raise an alarm, (R,), or None."""
         gamma = links[LEGITIMATE].gamma(k)
         gamma_e = gamma if self._jammer is None else links[self._jammer].gamma(k)
-        arrived = way_back.arrived(k, None if sent is None else sent[0], gamma, gamma_e)
+        arrived = ack_channel.arrived(k, None if sent is None else sent[0], gamma, gamma_e)
         with self._guard.asking(LEGITIMATE, range(k, k + 1)):
             return self._sensor.acknowledged(k, arrived, None if sent is None else sent[0])
 

@@ -1,4 +1,4 @@
-"""Which acknowledgements reach the sensor: over a lossy way back, and past a jammer that also hears the packets.
+"""Which acknowledgements reach the sensor: over a lossy channel, and past a jammer that also hears the packets.
 
 Source: docs/mathematics.md, attacks on acknowledgements.
 """
@@ -106,8 +106,8 @@ def heeding_of(attack: str, quality: float, overheard: float) -> Heeding | None:
 
 
 @dataclass(frozen=True)
-class WayBackSpec:
-    """The way back as the router needs to know it."""
+class AckChannelSpec:
+    """The acknowledgement channel as the router needs to know it."""
 
     quality: float
     attack: str
@@ -150,8 +150,8 @@ class AckChannel:
         self._counted = -1
 
     @classmethod
-    def of(cls, spec: WayBackSpec, key: bytes, batch: Batch) -> AckChannel:
-        """The channel of a way back."""
+    def of(cls, spec: AckChannelSpec, key: bytes, batch: Batch) -> AckChannel:
+        """The channel that a specification describes."""
         return cls(spec.attack, spec.quality, key, batch, spec.spans, spec.flip, spec.overheard)
 
     def arrived(self, k: int, sent: Flags | None, gamma: Flags, gamma_e: Flags) -> Flags:
@@ -191,7 +191,7 @@ class AcknowledgementRates(NamedTuple):
 
 
 def rates_of(attack: str, mu: float, mu_e: float, quality: float = 1.0, flip: float = 0.0) -> AcknowledgementRates:
-    """The rates under an attack, for independent links of qualities μ and μ_e and an independent way back.
+    """The rates under an attack, for independent links of qualities μ and μ_e and an independent acknowledgement channel.
 
     Under `hijack` those of a packet alone: what the sensor heeds then depends on earlier packets as well.
 

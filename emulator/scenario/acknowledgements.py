@@ -15,16 +15,16 @@ from evedrop.scenario.table import Found, Probability, Table, one_of
 from evedrop.scenario.words import as_toml
 
 
-class WayBackTable(Table):
+class AckChannelTable(Table):
     """`link = {…}` of the acknowledgements: each is lost independently or arrives at once."""
 
     quality: Annotated[Probability, Field(examples=[0.9])]
 
 
 class AcknowledgementsTable(Table):
-    """`[acknowledgements]`: their way back to the sensor, for schemes that need them, and an attack on it."""
+    """`[acknowledgements]`: their channel to the sensor, for schemes that need them, and an attack on it."""
 
-    link: Annotated[WayBackTable, Field(examples=[{"quality": 0.9}])]
+    link: Annotated[AckChannelTable, Field(examples=[{"quality": 0.9}])]
     attack: Annotated[str, Field(strict=True, examples=["critical"]), AfterValidator(one_of(ATTACKS))] = "none"
     jammer: Annotated[str | None, Field(strict=True, examples=["smart"])] = None
     flip: Annotated[Probability | None, Field(examples=[0.1])] = None

@@ -86,7 +86,7 @@ class StreamKeys:
         return stream_key(self.seed_root, "spoofing")
 
     @property
-    def way_back(self) -> bytes:
+    def acknowledgements(self) -> bytes:
         """The key of the losses of acknowledgements."""
         return stream_key(self.seed_root, f"link/{ACKNOWLEDGEMENTS}")
 

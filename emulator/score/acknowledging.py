@@ -1,4 +1,4 @@
-"""Acknowledgements of a scenario: their way back, the attack on it, and the chart with which the sensor detects the attack.
+"""Acknowledgements of a scenario: their channel, the attack on it, and the chart with which the sensor detects the attack.
 
 Source: docs/mathematics.md, attacks on acknowledgements and detecting an attack.
 """
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.figures.standard_error import standard_error
-from evedrop.model.acknowledgements import WayBackSpec, rates_of
+from evedrop.model.acknowledgements import AckChannelSpec, rates_of
 from evedrop.model.numeric.detection import Chart, chart_for
 from evedrop.model.receiver import Flags
 from evedrop.names import LEGITIMATE
@@ -24,14 +24,14 @@ _ALIKE = 1e-9  # relative difference of two rates that differ by rounding only
 _ATTACK_LOOKED_FOR = "all"  # by the sensor of a scenario without an attack
 
 
-def way_back_of(scenario: Scenario) -> WayBackSpec | None:
-    """The way back of a scenario; None if its scheme needs no acknowledgements."""
+def ack_channel_of(scenario: Scenario) -> AckChannelSpec | None:
+    """The acknowledgement channel of a scenario; None if its scheme needs no acknowledgements."""
     table = scenario.acknowledgements
     if table is None:
         return None
     overheard = 1.0 if table.jammer is None else scenario.quality[table.jammer]
     spans, flip = scenario.timeline.jams, table.flip or 0.0
-    return WayBackSpec(table.link.quality, table.attack, table.jammer, spans, flip, overheard)
+    return AckChannelSpec(table.link.quality, table.attack, table.jammer, spans, flip, overheard)
 
 
 def chart_of(scenario: Scenario) -> Chart | None:
@@ -79,7 +79,7 @@ class Detection:
 
     def summary(self, scenario: Scenario) -> DetectionSummary | None:
         """The sensor's detection for the summary; None if the sensor does not watch for attacks."""
-        chart, spec = chart_of(scenario), way_back_of(scenario)
+        chart, spec = chart_of(scenario), ack_channel_of(scenario)
         if chart is None or spec is None:
             return None
         start = None if spec.attack == "none" else 0 if spec.spans is None else min(s for s, _ in spec.spans)

@@ -40,7 +40,7 @@ ATTACKERS: Mapping[str, str] = {
 _FLIP = 0.1
 """The probability with which `flips` flips an acknowledgement, unless the scenario has one."""
 
-_WAY_BACK = {"link": {"quality": 1.0}}
+_ACK_CHANNEL = {"link": {"quality": 1.0}}
 
 Tables = dict[str, Any]
 
@@ -240,14 +240,14 @@ def _scenario(scenario: Scenario, encoding: Tables, attack: str, matches: Sequen
         "record_trials": 1,
     }
     tables[LEGITIMATE]["link"].pop("correlation", None)  # with an eavesdropper that may not be in this scenario
-    way_back = tables.pop("acknowledgements", _WAY_BACK)
+    ack_channel = tables.pop("acknowledgements", _ACK_CHANNEL)
     if SCHEMES[scheme].needs_acknowledgements:
-        flip = way_back.get("flip", _FLIP)
-        way_back = {name: value for name, value in way_back.items() if name not in ("attack", "jammer", "flip")}
+        flip = ack_channel.get("flip", _FLIP)
+        ack_channel = {name: value for name, value in ack_channel.items() if name not in ("attack", "jammer", "flip")}
         more = {"flip": flip} if attack == "flip" else {}
         if attack in OVERHEARING:
             more = {"jammer": matches[0].receiver}
-        tables["acknowledgements"] = {**way_back, "attack": attack, **more}
+        tables["acknowledgements"] = {**ack_channel, "attack": attack, **more}
     return checked(tables, scenario.title)
 
 

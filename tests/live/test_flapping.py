@@ -69,7 +69,7 @@ KINDS = (
     },
     {**PLAIN, "more": LOOP.format("period = 5"), "more_of_legitimate": "knows_input = true"},
 )
-"""Of a run: with no way back, with one from slot to slot, and with a closed loop."""
+"""Of a run: with no acknowledgement channel, with one from slot to slot, and with a closed loop."""
 
 
 def scenario_of(folder: Path, kind: dict[str, str]) -> Scenario:

@@ -41,7 +41,7 @@ def played_over(
 
 
 def all_events(slots: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Every course that γ, γᵉ and the acknowledgement link may take, one a trial: three of (slots, 8^slots)."""
+    """Every course that γ, γᵉ and the acknowledgement channel may take, one a trial: three of (slots, 8^slots)."""
     courses = np.array(list(itertools.product(range(8), repeat=slots))).T
     return courses % 2 == 1, courses // 2 % 2 == 1, courses // 4 == 1
 

@@ -1,4 +1,4 @@
-"""Acknowledgements on their way back, and the detection of an attack on them."""
+"""Acknowledgements on their channel, and the detection of an attack on them."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ def test_rates_are_those_of_the_arrivals(attack: str) -> None:
     """Counted over a million packets, each rate lies within binomial bounds at 1e-6 confidence."""
     mu, mu_e, quality, slots, trials = 0.8, 0.6, 0.7, 100, 10_000
     batch = Batch(slots, trials)
-    way = AckChannel(attack, quality, KEY, batch, flip=0.2, overheard=mu_e)
+    channel = AckChannel(attack, quality, KEY, batch, flip=0.2, overheard=mu_e)
     gamma, gamma_e = coins(mu, slots, trials, 1), coins(mu_e, slots, trials, 2)
-    arrived = np.array([way.arrived(k, None, gamma[k], gamma_e[k]) for k in range(slots)])
+    arrived = np.array([channel.arrived(k, None, gamma[k], gamma_e[k]) for k in range(slots)])
     rates = rates_of(attack, mu, mu_e, quality, 0.2)
     for found, rate in (
         (arrived, rates.arrives),
@@ -60,7 +60,7 @@ def test_rates_are_those_of_the_arrivals(attack: str) -> None:
 
 
 def test_what_was_not_sent_is_not_acknowledged() -> None:
-    """Not even where it is forged; and a trial's way back is the same alone and among others, slots in any order."""
+    """Not even where it is forged; and a trial's channel is the same alone and among others, slots in any order."""
     gamma = np.zeros(50, bool)
     sent = np.arange(50) % 2 == 0
     among, alone = AckChannel("forge", 0.5, KEY, Batch(20, 50, 7)), AckChannel("forge", 0.5, KEY, Batch(20, 1, 7 + 12))
@@ -76,14 +76,14 @@ def test_attacks_on_state_secrecy_codes_cost_what_theory_says(attack: str) -> No
     mu, mu_e, slots, trials = 0.8, 0.7, 6, 20_000
     batch = Batch(slots, trials)
     quality = 0.6 if attack == "hijack" else 0.9  # above μ_e a hijacked sensor has a memory, and theory another form
-    way = AckChannel(attack, quality, KEY, batch, overheard=mu_e)
+    channel = AckChannel(attack, quality, KEY, batch, overheard=mu_e)
     eve = STRATEGIES["reference"](Knowledge(UNSTABLE, 1.0, {}, {}), batch)
     played = play(
         Acknowledged(UNSTABLE),
         batch,
         {"legitimate": coins(mu, slots, trials, 3), "eve": coins(mu_e, slots, trials, 4)},
         {"eve": eve},
-        lambda k, sent, received: way.arrived(k, sent, received["legitimate"], received["eve"]),
+        lambda k, sent, received: channel.arrived(k, sent, received["legitimate"], received["eve"]),
     )
     rates = rates_of(attack, mu, mu_e, quality)
     for name, quality, acknowledged in (("legitimate", mu, rates.user), ("eve", mu_e, rates.eavesdropper)):

@@ -128,7 +128,7 @@ def test_without_lost_acknowledgements_it_is_the_honest_sensor() -> None:
         (6, 0.99, math.inf, 0.05682),
     ],
 )
-def test_perfect_secrecy_needs_a_way_back_that_loses_nothing(
+def test_perfect_secrecy_needs_an_acknowledgement_channel_that_loses_nothing(
     threshold: int, alpha: float, honest: float, hijacked: float
 ) -> None:
     """Of `scheduled`: the table of docs/schemes.md. The user's error stays what it was, and so does the rate of packets."""

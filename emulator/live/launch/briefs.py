@@ -36,7 +36,7 @@ from evedrop.scenario.controlled import monitor_of
 from evedrop.scenario.input_files import states_of
 from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.stream_keys import StreamKeys
-from evedrop.score.acknowledging import chart_of, way_back_of
+from evedrop.score.acknowledging import ack_channel_of, chart_of
 
 _WINDOW_BYTES = 64 * 2**20
 _MOST_SLOTS_AHEAD = 4096
@@ -129,7 +129,7 @@ def briefs_of(
     public, mu_d = scenario.process, scenario.encoding.mu_d
     matrices, header = (public.A, public.Q, public.initial_covariance), len(scheme.header)
     model = Model(*matrices, mu_d, header, public.singular_noise, scenario.encoding.state_probabilities)
-    leaks, back, chart = scenario.leaks, way_back_of(scenario), chart_of(scenario)
+    leaks, channel, chart = scenario.leaks, ack_channel_of(scenario), chart_of(scenario)
     identities = identities_of(run, places, tuple(users))
     loop, flow = LoopBriefs(scenario), flow_of(scenario)
     states = None if public.source == "zenoh" else states_of(scenario)
@@ -162,14 +162,14 @@ def briefs_of(
 
     schedules = {name: scenario.schedule(name) for name in scenario.receivers}
     link_keys = keys.links(schedules)
-    if back is not None:
-        link_keys[f"link/{ACKNOWLEDGEMENTS}"] = keys.way_back
+    if channel is not None:
+        link_keys[f"link/{ACKNOWLEDGEMENTS}"] = keys.acknowledgements
     router = RouterPart(
         links={name: LinkEntry.of(schedule) for name, schedule in schedules.items()},
         pace=scenario.pace,
         users=routers.at_router,
         leaks=leaks,
-        acknowledgements=back,
+        acknowledgements=channel,
         controller=loop.wiring,
         zid=routers.zid,
         limits=limits,

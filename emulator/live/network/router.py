@@ -46,7 +46,7 @@ from evedrop.live.protocol.packets import (
     read_resend,
 )
 from evedrop.live.protocol.telemetry import Journal
-from evedrop.model.acknowledgements import AckChannel, WayBackSpec
+from evedrop.model.acknowledgements import AckChannel, AckChannelSpec
 from evedrop.model.flag_bits import packed_flags
 from evedrop.model.receiver import Flags
 from evedrop.model.slot.account import COUNTED_BURSTS, Account, Accountant
@@ -171,12 +171,12 @@ class Burst:
 
 
 @final
-class WayBackLink:
+class AckLink:
     """The link of the acknowledgements, from the legitimate estimator to the sensor, and the attack on it."""
 
-    def __init__(self, brief: AnyBrief, session: ProcessSession, spec: WayBackSpec) -> None:
+    def __init__(self, brief: AnyBrief, session: ProcessSession, spec: AckChannelSpec) -> None:
         key = brief.stream_keys[f"link/{ACKNOWLEDGEMENTS}"]
-        self._way = AckChannel.of(spec, key, brief.batch)
+        self._channel = AckChannel.of(spec, key, brief.batch)
         self._jammer = spec.jammer
         self._trials, self._place = brief.trials, session.place
         self._key = session.keys.acknowledged
@@ -195,7 +195,7 @@ class WayBackLink:
         if downlinks[LEGITIMATE].present(k):
             gamma = self._acknowledged(k, commands)
         gamma_e = gamma if self._jammer is None else downlinks[self._jammer].gamma(k)
-        self._put(acknowledgement(k, self._way.arrived(k, sent, gamma, gamma_e)))
+        self._put(acknowledgement(k, self._channel.arrived(k, sent, gamma, gamma_e)))
 
     def _acknowledged(self, k: int, commands: Commands) -> Flags:
         while True:
@@ -246,10 +246,10 @@ class Routing:
         self._schedules = {name: entry.schedule for name, entry in brief.part.links.items()}
         self._outlets = {name: outlet(name, schedule) for name, schedule in self._schedules.items()}
         acknowledgements = brief.part.acknowledgements
-        self._way_back = WayBackLink(brief, session, acknowledgements) if acknowledgements is not None else None
+        self._ack_link = AckLink(brief, session, acknowledgements) if acknowledgements is not None else None
         # A message to the router's own uplink wakes the thread that waits there: only the conductor ends a router.
         knock = session.outlet(session.keys.uplink)
-        waiting = [] if self._way_back is None else [self._way_back.sent]
+        waiting = [] if self._ack_link is None else [self._ack_link.sent]
         self._commands = Commands(
             session, tuple(self._schedules), lambda: knock(barrier(brief.slots)), waiting, brief.flow.longest_outage
         )
@@ -321,7 +321,7 @@ class Routing:
                 self._hold(k)
             return
         stop = self._slots.stop if k >= self._done else min(self._slots.stop, self._done)
-        self._route(k, self._uplink.take(k, 1 if self._way_back is not None else stop - k))
+        self._route(k, self._uplink.take(k, 1 if self._ack_link is not None else stop - k))
         if self._k == self._slots.stop:
             self._flush()
             self._journal(self._k)
@@ -333,9 +333,9 @@ class Routing:
         slots, known = range(first, first + len(messages)), first < self._done
         for downlink in self._downlinks.values():
             downlink.deliver(slots, packets, known)
-        if self._way_back is not None and not known:
+        if self._ack_link is not None and not known:
             sent = None if packets.sent is None else packets.sent[0]
-            self._way_back.carry(first, sent, self._downlinks, self._commands)
+            self._ack_link.carry(first, sent, self._downlinks, self._commands)
         self._k = self._session.place.slot = slots.stop
 
     def _flush(self) -> None:

@@ -40,7 +40,7 @@ from evedrop.live.protocol.brief_closed_loop import (
     Wiring,
 )
 from evedrop.live.protocol.keys import KINDS
-from evedrop.model.acknowledgements import WayBackSpec
+from evedrop.model.acknowledgements import AckChannelSpec
 from evedrop.model.links.link import Fate
 from evedrop.model.noise_law import NoiseLaw
 from evedrop.model.numeric.detection import Chart
@@ -54,7 +54,7 @@ _WINDOW = whole(0, MOST_SLOTS)
 _OUTAGES = listed(row(SLOT, SLOT, flag))
 _SCORE = whole(-NEVER)
 _CHART: Check = maybe(table(dict.fromkeys(("acknowledged", "missing", "threshold"), _SCORE)))
-_WAY_BACK: Check = maybe(
+_ACK_CHANNEL: Check = maybe(
     table(
         {
             "quality": number,
@@ -129,8 +129,8 @@ class RouterPart:
     """User → password."""
     leaks: Mapping[str, int] = field(metadata=entry(named(SLOT)))
     """Receiver → the slot whose state it learns."""
-    acknowledgements: WayBackSpec | None = field(
-        metadata=entry(_WAY_BACK, lambda found: None if found is None else WayBackSpec(**found))
+    acknowledgements: AckChannelSpec | None = field(
+        metadata=entry(_ACK_CHANNEL, lambda found: None if found is None else AckChannelSpec(**found))
     )
     controller: Wiring | None = field(metadata=inner(Wiring, or_null=True))
     zid: str | None = field(metadata=entry(maybe(text)))
