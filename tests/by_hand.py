@@ -16,7 +16,7 @@ from typing import IO, Any
 
 from evedrop import montecarlo
 from evedrop.live.launch.briefs import write_briefs
-from evedrop.live.launch.ports import places_at
+from evedrop.live.launch.ports import endpoints_at
 from evedrop.live.launch.preloading import process_starter
 from evedrop.live.launch.starter import StartedProcess, Starter
 from evedrop.live.network.endpoint import Endpoint
@@ -54,9 +54,9 @@ class ByHand:
     def write(self, **endpoints: str) -> None:
         """Write the briefs; endpoints: process → where it finds the router, if that is elsewhere."""
         self._elsewhere = bool(endpoints)
-        places = places_at(self.endpoint, insecure=self.insecure, relay=self.relay)
+        router_endpoints = endpoints_at(self.endpoint, insecure=self.insecure, relay=self.relay)
         folders = (self.results, self.folder / "briefs")
-        for path in write_briefs(self.scenario, places, *folders, int(LONG), paused=self.paused):
+        for path in write_briefs(self.scenario, router_endpoints, *folders, int(LONG), paused=self.paused):
             if path.stem in endpoints:
                 brief = json.loads(path.read_text())
                 path.write_text(json.dumps({**brief, "router": endpoints[path.stem]}))

@@ -149,16 +149,17 @@ class Viewer:
         return _repeatedly(lambda: cls._window(followed, free_port(), logs))
 
     @classmethod
-    def serve(cls, stand: WebAddress, logs: Path, recording: Path, complete: bool = False) -> Viewer:
+    def serve(cls, web_address: WebAddress, logs: Path, recording: Path, complete: bool = False) -> Viewer:
         """Start a viewer for browsers at a given address; otherwise as `start`.
 
         Raises UsageError if it cannot be started, for example because a port is taken.
         """
         from evedrop.view.growing_recording import Followed  # noqa: PLC0415 - only with a view
 
-        stand.check_free()
+        web_address.check_free()
         followed = Followed(recording, complete)
-        return _repeatedly(lambda: cls._page(followed, stand.host, stand.seen, stand.port, stand.port + 1, logs))
+        host, seen, port = web_address.host, web_address.seen, web_address.port
+        return _repeatedly(lambda: cls._page(followed, host, seen, port, port + 1, logs))
 
     @classmethod
     def _page(cls, followed: Followed, host: str, seen: str, port: int, data_port: int, logs: Path) -> Viewer:
@@ -224,16 +225,16 @@ def _screen_is_remote() -> bool:
     return not os.environ.get("WAYLAND_DISPLAY") and not display.startswith((":", "/", "unix:"))
 
 
-def open_run(run: Path, mode: str, stand: WebAddress | None = None, recording: Path | None = None) -> Viewer:
-    """Start a viewer of the recording of a results folder, or of another recording; with `stand`, for browsers at that address.
+def open_run(run: Path, mode: str, web_address: WebAddress | None = None, recording: Path | None = None) -> Viewer:
+    """Start a viewer of the recording of a results folder, or of another recording; with `web_address`, for browsers there.
 
     Raises UsageError if there is no recording, or no viewer can be started.
     """
     recording = run / "recording.rrd" if recording is None else recording
     if not recording.is_file():
         raise UsageError(f"{recording} does not exist; give the results folder of a run made with a view")
-    if stand is not None:
-        return Viewer.serve(stand, run / "logs", recording, complete=True)
+    if web_address is not None:
+        return Viewer.serve(web_address, run / "logs", recording, complete=True)
     viewer = Viewer.start(mode, run / "logs", recording, complete=True)
     if viewer is None:
         raise UsageError("a finished run cannot be opened with the view off; give auto, native or web")

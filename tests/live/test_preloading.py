@@ -15,7 +15,7 @@ import pytest
 from evedrop import preloaded
 from evedrop.environment import own_environment
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
-from evedrop.live.launch.ports import loopback_places
+from evedrop.live.launch.ports import loopback_endpoints
 from evedrop.live.launch.preloading import fork_servers, process_starter
 from evedrop.live.launch.starter import StartedProcess, Starter, start_process
 from evedrop.names import KERNELS_VARIABLE
@@ -36,7 +36,7 @@ class Bench:
     def start(self, role: str = "router", brief: Path | None = None, **environment: str) -> StartedProcess:
         """Start a process; brief: None for that of a router with a port of its own."""
         if brief is None:
-            briefs = briefs_of(scenario_of(), loopback_places(None, None, False), ObserverTask(self._folder, False))
+            briefs = briefs_of(scenario_of(), loopback_endpoints(None, None, False), ObserverTask(self._folder, False))
             brief = briefs["router"].write(Path(mkdtemp(dir=self._folder)))  # which it removes
         with process_starter() as starter, self.log.open("wb") as log:
             process = starter(role, brief, log, {**own_environment(), **environment})

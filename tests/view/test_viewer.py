@@ -373,16 +373,16 @@ def test_a_browser_gets_the_run(simulated: Callable[..., Simulated], viewer: Vie
 
 def test_a_view_is_served_where_it_is_wanted(tmp_path: Path) -> None:
     """The page at the port that was asked for, the data at the next; a second request for the same port is refused."""
-    stand = WebAddress("127.0.0.1", free_port())
-    viewer = Viewer.serve(stand, tmp_path / "logs", tmp_path / "r.rrd")
+    web_address = WebAddress("127.0.0.1", free_port())
+    viewer = Viewer.serve(web_address, tmp_path / "logs", tmp_path / "r.rrd")
     try:
         assert viewer.address is not None
-        assert viewer.address.startswith(f"http://127.0.0.1:{stand.port}/?url=")
-        assert data_of(viewer).startswith(f"http://127.0.0.1:{stand.port + 1}/")
-        with urllib.request.urlopen(f"http://127.0.0.1:{stand.port}/") as page:
+        assert viewer.address.startswith(f"http://127.0.0.1:{web_address.port}/?url=")
+        assert data_of(viewer).startswith(f"http://127.0.0.1:{web_address.port + 1}/")
+        with urllib.request.urlopen(f"http://127.0.0.1:{web_address.port}/") as page:
             assert page.status == 200
-        with pytest.raises(UsageError, match=f":{stand.port} cannot be used"):
-            Viewer.serve(stand, tmp_path / "logs", tmp_path / "r.rrd")
+        with pytest.raises(UsageError, match=f":{web_address.port} cannot be used"):
+            Viewer.serve(web_address, tmp_path / "logs", tmp_path / "r.rrd")
     finally:
         viewer.stop()
 

@@ -31,7 +31,7 @@ _MOST_TOLD = 5  # mistakes of a scenario in a brief, which is not written by han
 def brief(options: argparse.Namespace) -> int:
     """Write the briefs of a scenario's processes, or the files of their containers."""
     from evedrop.live.launch.briefs import write_briefs
-    from evedrop.live.launch.ports import places_at
+    from evedrop.live.launch.ports import endpoints_at
 
     if options.compose is not None:
         return _compose(options)
@@ -40,8 +40,8 @@ def brief(options: argparse.Namespace) -> int:
     if not 1 <= options.wait <= 30 * 86_400:
         raise UsageError(f"--wait {options.wait}: expected 1 or more seconds, and 2592000 at most")
     scenario = loaded(options)
-    places = places_at(options.listen, options.connect, options.relay, options.relay_connect, options.insecure)
-    for path in write_briefs(scenario, places, options.results, options.out, options.wait, paused=options.paused):
+    endpoints = endpoints_at(options.listen, options.connect, options.relay, options.relay_connect, options.insecure)
+    for path in write_briefs(scenario, endpoints, options.results, options.out, options.wait, paused=options.paused):
         print(path)
     return 0
 

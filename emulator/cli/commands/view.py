@@ -44,7 +44,7 @@ def view(options: argparse.Namespace) -> int:
     from evedrop.signals import raise_on_signals
     from evedrop.view.viewer import WebAddress, open_run
 
-    stand = None if options.serve is None else WebAddress.of(options.serve)
+    web_address = None if options.serve is None else WebAddress.of(options.serve)
     results = load_results(options.run) if not (options.run / "summary.json").is_file() else None
     if results is not None:
         print(f"evedrop: {results.remark}", file=sys.stderr)
@@ -59,7 +59,7 @@ def view(options: argparse.Namespace) -> int:
         if options.video is not None:
             return _film(recording, options, _slots_of(options))
         if options.picture is None:
-            _hold("run", open_run(options.run, options.view, stand, recording))
+            _hold("run", open_run(options.run, options.view, web_address, recording))
             return 0
         from evedrop.view.picture import SIZE, picture_apart
 
@@ -166,13 +166,13 @@ def _view_wire(options: argparse.Namespace) -> int:
         summary = summary_of_wire(options.run)
         print("\n".join([*closing_lines(summary), *wire_failures(summary)]))
         return 0
-    stand = None if options.serve is None else WebAddress.of(options.serve)
+    web_address = None if options.serve is None else WebAddress.of(options.serve)
     with raise_on_signals(), tempfile.TemporaryDirectory(prefix="evedrop-view-") as temporary:
         recording = replay_wire(options.run, Path(temporary) / "recording.rrd")
         if options.video is not None:
             return _film(recording, options, _times_of(options))
         if options.picture is None:
-            _hold("wire", open_run(options.run, options.view, stand, recording))
+            _hold("wire", open_run(options.run, options.view, web_address, recording))
             return 0
         for complaint in picture_apart(recording, options.picture, options.time, options.size or PICTURE_SIZE):
             print(complaint, file=sys.stderr)

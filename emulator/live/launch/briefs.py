@@ -10,7 +10,7 @@ from typing import Any
 
 from evedrop.errors import NoAnswer, UsageError
 from evedrop.live.launch.closed_loop_briefs import LoopBriefs
-from evedrop.live.launch.ports import RouterEndpoints, Routers, identities_of, places_at
+from evedrop.live.launch.ports import RouterEndpoints, Routers, endpoints_at, identities_of
 from evedrop.live.protocol.brief import AnyBrief, Brief, Flow, Model
 from evedrop.live.protocol.brief_closed_loop import encoded
 from evedrop.live.protocol.brief_parts import (
@@ -104,33 +104,33 @@ class ObserverTask:
 
 def briefs_of(
     scenario: Scenario,
-    places: RouterEndpoints | str,
+    endpoints: RouterEndpoints | str,
     observation: ObserverTask,
     ends_with_stdin: bool = True,
     patience: int = LAUNCHED_PATIENCE,
 ) -> dict[str, AnyBrief]:
     """Process name → brief, with a new run name, new passwords and, if the router takes them, new certificates.
 
-    places: a string is the endpoint of one router, both to listen on and to connect to. Raises UsageError if their number
+    endpoints: a string is the endpoint of one router, both to listen on and to connect to. Raises UsageError if their number
     differs from the scenario's number of routers.
     """
     run = f"r{secrets.token_hex(4)}"
-    if isinstance(places, str):
-        places = places_at(places)
-    places.check(scenario.relayed)
+    if isinstance(endpoints, str):
+        endpoints = endpoints_at(endpoints)
+    endpoints.check(scenario.relayed)
     keys = StreamKeys.of(scenario)
     steered = () if scenario.controller is None else (CONTROLLER,)
     users = {
         name: secrets.token_urlsafe(24) for name in (ROUTER, SENSOR, *scenario.receivers, *steered, OBSERVER, OPERATOR)
     }
-    routers = Routers.of(users, places)
+    routers = Routers.of(users, endpoints)
     spec = scenario.encoding.spec
     scheme = scheme_of(scenario.process.process, spec)
     public, mu_d = scenario.process, scenario.encoding.mu_d
     matrices, header = (public.A, public.Q, public.initial_covariance), len(scheme.header)
     model = Model(*matrices, mu_d, header, public.singular_noise, scenario.encoding.state_probabilities)
     leaks, channel, chart = scenario.leaks, ack_channel_of(scenario), chart_of(scenario)
-    identities = identities_of(run, places, tuple(users))
+    identities = identities_of(run, endpoints, tuple(users))
     loop, flow = LoopBriefs(scenario), flow_of(scenario)
     states = None if public.source == "zenoh" else states_of(scenario)
     limits = sizes_of(scenario, flow.batch).of_kinds
@@ -144,7 +144,7 @@ def briefs_of(
             run=run,
             process=process,
             role=part.role,
-            router=str(places.router.listen if process == ROUTER else routers.endpoint(process)),
+            router=str(endpoints.router.listen if process == ROUTER else routers.endpoint(process)),
             user=process,
             password=routers.password(process),
             slots=scenario.slots,
@@ -176,8 +176,8 @@ def briefs_of(
         modules=scenario.modules,  # even if no link names a class: an operator can set another link model
     )
     made = [brief(ROUTER, link_keys, router)]
-    if places.relay is not None and routers.zid is not None:
-        listen = str(places.relay.listen)
+    if endpoints.relay is not None and routers.zid is not None:
+        listen = str(endpoints.relay.listen)
         relay = RelayPart(routers.at_relay, scenario.receivers, listen, routers.zid, loop.wiring, limits)
         made.append(brief(RELAY, {}, relay))
     sensor = SensorPart(
@@ -266,7 +266,7 @@ def _outages(scenario: Scenario, receiver: str) -> list[tuple[int, int, bool]]:
 
 
 def write_briefs(
-    scenario: Scenario, places: RouterEndpoints, results: Path, folder: Path, patience: int, *, paused: bool = False
+    scenario: Scenario, endpoints: RouterEndpoints, results: Path, folder: Path, patience: int, *, paused: bool = False
 ) -> list[Path]:
     """Write the briefs into a folder, for processes that are started by hand, on any hosts.
 
@@ -280,7 +280,7 @@ def write_briefs(
             "separately, with its own --first-trial and --trials"
         )
     made = briefs_of(
-        scenario, places, ObserverTask(results, True, paused=paused), ends_with_stdin=False, patience=patience
+        scenario, endpoints, ObserverTask(results, True, paused=paused), ends_with_stdin=False, patience=patience
     )
     try:
         new_folder(folder)

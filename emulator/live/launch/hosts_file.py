@@ -95,7 +95,7 @@ class HostsPlan:
     """The hosts of a run, and the endpoints of its routers."""
 
     hosts: Mapping[str, HostTable]
-    places: RouterEndpoints
+    endpoints: RouterEndpoints
     ssh_config: Path | None
     """The configuration file for ssh; None for the user's own."""
 
@@ -120,11 +120,11 @@ def load_hosts(path: Path, scenario: Scenario) -> HostsPlan:
         except ValidationError as error:
             raise ScenarioError(source, sentences(error, HostsFile)) from error
         mistakes = [*_of_processes(file, scenario)]
-        places = _places(file, scenario, mistakes)
-        if mistakes or places is None:
+        endpoints = _endpoints(file, scenario, mistakes)
+        if mistakes or endpoints is None:
             raise ScenarioError(source, mistakes)
     config = None if file.ssh_config is None else (path.parent / file.ssh_config).absolute()
-    return HostsPlan(file.hosts, places, config)
+    return HostsPlan(file.hosts, endpoints, config)
 
 
 def processes_of(scenario: Scenario) -> tuple[str, ...]:
@@ -154,7 +154,7 @@ def _of_processes(file: HostsFile, scenario: Scenario) -> list[str]:
     return found
 
 
-def _places(file: HostsFile, scenario: Scenario, mistakes: list[str]) -> RouterEndpoints | None:
+def _endpoints(file: HostsFile, scenario: Scenario, mistakes: list[str]) -> RouterEndpoints | None:
     """The endpoints of the routers; adds the mistakes in them to the others, and returns None if there are any."""
     made: dict[str, Any] = {}
     for name, table in {ROUTER: file.router, RELAY: file.relay}.items():
@@ -171,10 +171,10 @@ def _places(file: HostsFile, scenario: Scenario, mistakes: list[str]) -> RouterE
         mistakes.append("relay: the scenario has one router; leave it out, or add --set network.routers=2")
     if mistakes:
         return None
-    places = RouterEndpoints(made[ROUTER], made[RELAY])
+    endpoints = RouterEndpoints(made[ROUTER], made[RELAY])
     try:
-        places.check(scenario.relayed)
+        endpoints.check(scenario.relayed)
     except UsageError as error:
         mistakes.append(f"relay: {str(error).removeprefix('--relay: ').replace('--relay ', '')}")
         return None
-    return places
+    return endpoints

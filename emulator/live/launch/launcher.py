@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from evedrop.errors import UsageError
-from evedrop.live.launch.ports import loopback_places
+from evedrop.live.launch.ports import loopback_endpoints
 from evedrop.live.launch.preloading import process_starter
 from evedrop.live.launch.process_set import Ended, launch_one
 from evedrop.news import Tell
@@ -50,8 +50,8 @@ def launch(
         if hosts is not None:
             return _on_hosts(scenario, folder, view, tell, stop, start, hosts, paused)
         if scenario.shards == 1:
-            places = loopback_places(listen, relay, scenario.relayed)
-            return launch_one(scenario, folder, view, places, tell, stop, start, paused=paused)
+            endpoints = loopback_endpoints(listen, relay, scenario.relayed)
+            return launch_one(scenario, folder, view, endpoints, tell, stop, start, paused=paused)
         from evedrop.live.launch.shards import launch_shards  # noqa: PLC0415 - not needed for one set of processes
 
         given = {"listen": listen, "relay": relay}
@@ -85,5 +85,5 @@ def _on_hosts(
         )
     with ssh_starter(hosts, here, stop, scenario.longest_outage) as start:
         return launch_one(
-            scenario, folder, view, hosts.places, tell, stop, start, paused=paused, patience=_HOSTS_PATIENCE
+            scenario, folder, view, hosts.endpoints, tell, stop, start, paused=paused, patience=_HOSTS_PATIENCE
         )

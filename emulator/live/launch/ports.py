@@ -65,7 +65,7 @@ class RouterEndpoints:
             raise UsageError(f"--relay {self.relay.connect} is where the first router is; give another port")
 
 
-def places_at(
+def endpoints_at(
     listen: str,
     connect: str | None = None,
     relay: str | None = None,
@@ -126,7 +126,7 @@ def _endpoint(option: str, text: str) -> Endpoint:
         raise UsageError(f"{option} {error}; {_EXAMPLE}") from error
 
 
-def loopback_places(listen: str | None, relay: str | None = None, relayed: bool = False) -> RouterEndpoints:
+def loopback_endpoints(listen: str | None, relay: str | None = None, relayed: bool = False) -> RouterEndpoints:
     """The endpoints of a run whose processes are all on this host: the requested ones, or free ports.
 
     Two routers take certificates by default: without them, a router is recognised by its id alone, which is not a secret.
@@ -137,9 +137,9 @@ def loopback_places(listen: str | None, relay: str | None = None, relayed: bool 
     second = _loopback_endpoint(relay, "--relay", asked) if relayed or relay is not None else None
     while relay is None and second is not None and second.listen.port == router.listen.port:
         second = _loopback_endpoint(None, "--relay", asked)
-    places = RouterEndpoints(router, second)
-    places.check(relayed)
-    return places
+    endpoints = RouterEndpoints(router, second)
+    endpoints.check(relayed)
+    return endpoints
 
 
 def _loopback_endpoint(listen: str | None, option: str, protocol: str) -> RouterEndpoint:
@@ -166,7 +166,7 @@ def _loopback_endpoint(listen: str | None, option: str, protocol: str) -> Router
 class Routers:
     """The users of each router, with their passwords."""
 
-    places: RouterEndpoints
+    endpoints: RouterEndpoints
     at_router: Mapping[str, str] = field(repr=False)
     """User of the router → password."""
     at_relay: Mapping[str, str] = field(repr=False)
@@ -174,35 +174,35 @@ class Routers:
     """The router's Zenoh id, by which the relay recognises it; None without a relay."""
 
     @classmethod
-    def of(cls, users: Mapping[str, str], places: RouterEndpoints) -> Routers:
+    def of(cls, users: Mapping[str, str], endpoints: RouterEndpoints) -> Routers:
         """Assign all users to the router; with a relay, the sensor and the relay to the router, all others to the relay."""
-        if places.relay is None:
-            return cls(places, users, {}, None)
+        if endpoints.relay is None:
+            return cls(endpoints, users, {}, None)
         # Router and relay are users, too: each asks itself whether it is present.
         near = {**{user: users[user] for user in (ROUTER, SENSOR)}, RELAY: secrets.token_urlsafe(24)}
         far = {**{user: password for user, password in users.items() if user not in near}, RELAY: near[RELAY]}
         # Zenoh takes ids of up to 16 bytes, in hexadecimal without zeros at the ends.
         zid = f"e{secrets.token_hex(15)}e"
-        return cls(places, near, far, zid)
+        return cls(endpoints, near, far, zid)
 
     def endpoint(self, process: str) -> str:
         """The endpoint that a process connects to."""
-        return str((self.places.router if process in self.at_router else self.places.far).connect)
+        return str((self.endpoints.router if process in self.at_router else self.endpoints.far).connect)
 
     def password(self, process: str) -> str:
         """The password of a process."""
         return {**self.at_router, **self.at_relay}.get(process, "")
 
 
-def identities_of(run: str, places: RouterEndpoints, users: tuple[str, ...]) -> dict[str, Identity]:
+def identities_of(run: str, endpoints: RouterEndpoints, users: tuple[str, ...]) -> dict[str, Identity]:
     """Process name, or operator → its certificate; empty if the router listens without TLS."""
-    if not places.router.secure:
+    if not endpoints.router.secure:
         return {}
     from evedrop.live.launch.authority import Authority  # noqa: PLC0415 - saves most runs 50 ms
 
     authority = Authority(run)
     return {
         **{user: authority.identity(user) for user in users},
-        ROUTER: authority.identity(ROUTER, hosts=places.router.names),
-        **({} if places.relay is None else {RELAY: authority.identity(RELAY, hosts=places.relay.names)}),
+        ROUTER: authority.identity(ROUTER, hosts=endpoints.router.names),
+        **({} if endpoints.relay is None else {RELAY: authority.identity(RELAY, hosts=endpoints.relay.names)}),
     }

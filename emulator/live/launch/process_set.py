@@ -48,7 +48,7 @@ def launch_one(
     scenario: Scenario,
     folder: Path,
     view: str,
-    places: RouterEndpoints,
+    endpoints: RouterEndpoints,
     tell: Tell,
     stop: threading.Event,
     starter: Starter,
@@ -66,7 +66,7 @@ def launch_one(
         viewer = None
         try:
             task = ObserverTask(folder.absolute(), view != "off", shard, paused)
-            briefs = briefs_of(scenario, places, task, patience=patience)
+            briefs = briefs_of(scenario, endpoints, task, patience=patience)
             observer = briefs.pop(OBSERVER)
             with Children(held, private, scenario.controller is not None, starter) as children:
                 for brief in briefs.values():

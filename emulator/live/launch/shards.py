@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import final
 
 from evedrop.errors import Interrupted, RunError, UsageError
-from evedrop.live.launch.ports import RouterEndpoints, loopback_places
+from evedrop.live.launch.ports import RouterEndpoints, loopback_endpoints
 from evedrop.live.launch.process_set import Ended, launch_one
 from evedrop.live.launch.shard import SHARDS_FOLDER, Shard, shards_of
 from evedrop.live.launch.starter import Starter
@@ -128,11 +128,11 @@ def launch_shards(
 
     The view shows the first shard, which has the recorded trials.
     """
-    places = _places(scenario)
+    endpoints = _endpoints(scenario)
     held = HeldFolder(new_folder(folder))
     shards = shards_of(scenario, folder)
     progress, course = OneProgress(shards, tell), _Course()
-    first, *others = [(shard, at, progress.of(shard)) for shard, at in zip(shards, places, strict=True)]
+    first, *others = [(shard, at, progress.of(shard)) for shard, at in zip(shards, endpoints, strict=True)]
     threads = [threading.Thread(target=course.launched, args=(*one, "off", stop, starter)) for one in others]
     for thread in threads:
         thread.start()
@@ -158,15 +158,15 @@ def launch_shards(
         held.close()
 
 
-def _places(scenario: Scenario) -> list[RouterEndpoints]:
+def _endpoints(scenario: Scenario) -> list[RouterEndpoints]:
     """Router endpoints for all shards; free ports found one by one may coincide as long as no router listens on them."""
     found: list[RouterEndpoints] = []
     taken = set[int]()
     while len(found) < scenario.shards:
-        places = loopback_places(None, None, scenario.relayed)
-        ports = {one.listen.port for one in (places.router, places.relay) if one is not None}
+        endpoints = loopback_endpoints(None, None, scenario.relayed)
+        ports = {one.listen.port for one in (endpoints.router, endpoints.relay) if one is not None}
         if not ports & taken:
-            found.append(places)
+            found.append(endpoints)
             taken |= ports
     return found
 

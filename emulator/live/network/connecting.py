@@ -110,22 +110,22 @@ def _reason(error: OSError | zenoh.ZError) -> object:
 
 
 def connected(
-    door: RouterAddress, patience: float, meanwhile: Callable[[], None] = lambda: None, clock: Clock = SYSTEM_CLOCK
+    address: RouterAddress, patience: float, meanwhile: Callable[[], None] = lambda: None, clock: Clock = SYSTEM_CLOCK
 ) -> zenoh.Session:
     """Open a session with the router; `meanwhile` is called before each attempt.
 
     Raises BriefError for an error that waiting cannot mend, RunError if no router has answered after `patience` seconds.
     """
-    endpoint = endpoint_of(door.router, door.identity)
+    endpoint = endpoint_of(address.router, address.identity)
     began = clock.monotonic()
-    failures, waiting = Failures(clock, endpoint.secure), Waiting(door.process, door.router, clock)
+    failures, waiting = Failures(clock, endpoint.secure), Waiting(address.process, address.router, clock)
     pause, longest = _AGAIN_SECONDS
     while True:
         meanwhile()
         tried = clock.monotonic()
         try:
-            _knock(endpoint, door)
-            return zenoh.open(zenoh.Config.from_json5(json.dumps(door.config)))
+            _knock(endpoint, address)
+            return zenoh.open(zenoh.Config.from_json5(json.dumps(address.config)))
         except (OSError, zenoh.ZError) as error:
             failures.add(error, clock.monotonic() - tried)
             why = _reason(error)
@@ -138,12 +138,12 @@ def connected(
                 failures = Failures(clock, endpoint.secure)
             if failures.refused:
                 raise BriefError(
-                    f"{door.router} does not let this brief in, which is of run {door.run}: the router there is of another run, "
-                    "or another program listens there; start the router of this run, or give the brief of that one"
+                    f"{address.router} does not let this brief in, which is of run {address.run}: the router there is of another "
+                    "run, or another program listens there; start the router of this run, or give the brief of that one"
                 ) from error
             if clock.monotonic() - began > patience:
                 raise RunError(
-                    f"no router answered at {door.router} within {patience:.0f} s ({why}); start it there, and check that no "
+                    f"no router answered at {address.router} within {patience:.0f} s ({why}); start it there, and check that no "
                     "firewall is in between"
                 ) from error
             waiting.look(why)
@@ -230,39 +230,40 @@ def endpoint_of(router: str, identity: Identity | None) -> Endpoint:
     return endpoint
 
 
-def _knock(endpoint: Endpoint, door: RouterAddress) -> None:
+def _knock(endpoint: Endpoint, address: RouterAddress) -> None:
     """Check that a program listens there and, by its certificate, is the router of this run.
 
     Raises OSError if none does, BriefError if the certificate cannot be trusted.
     """
     try:
         with socket.create_connection((endpoint.host, endpoint.port), _ATTEMPT_SECONDS) as link:
-            if door.identity is not None:
-                trust = ssl.create_default_context(cadata=door.identity.authority)
+            if address.identity is not None:
+                trust = ssl.create_default_context(cadata=address.identity.authority)
                 # The router shows its certificate first; nothing more is needed here.
                 trust.wrap_socket(link, server_hostname=endpoint.host).close()
     except ssl.SSLCertVerificationError as error:
-        raise _mistrusted(endpoint, door, error) from error
+        raise _mistrusted(endpoint, address, error) from error
 
 
-def _mistrusted(endpoint: Endpoint, door: RouterAddress, error: ssl.SSLCertVerificationError) -> BriefError:
+def _mistrusted(endpoint: Endpoint, address: RouterAddress, error: ssl.SSLCertVerificationError) -> BriefError:
     """The error that says why an endpoint's certificate cannot be trusted."""
     if error.verify_code in {_NOT_YET_VALID, _EXPIRED}:
         return BriefError(
-            f"{door.router}: the router's certificate is not valid now by this host's clock ({error.verify_message}); set the "
+            f"{address.router}: the router's certificate is not valid now by this host's clock ({error.verify_message}); set the "
             "clock, or write the briefs again with `evedrop brief`, all of them"
         )
     maker = _maker_at(endpoint)
     if error.verify_code == _WRONG_HOST:
         return BriefError(
-            f"{door.router}: the router's certificate does not name {endpoint.host}; write the briefs again with "
+            f"{address.router}: the router's certificate does not name {endpoint.host}; write the briefs again with "
             f"--connect tls/{endpoint.host}:{endpoint.port}, all of them"
         )
-    whose = f"has a certificate of {maker}, and this brief is of run {door.run}"
+    whose = f"has a certificate of {maker}, and this brief is of run {address.run}"
     if error.verify_code == _WRONG_PURPOSE:
         whose = f"has the certificate of another process of {maker}, and is not a router"
     return BriefError(
-        f"{door.router}: the program listening there {whose}; start the router of this run there, or give the brief of that one"
+        f"{address.router}: the program listening there {whose}; start the router of this run there, or give the brief "
+        "of that one"
     )
 
 

@@ -23,7 +23,7 @@ class DelayedSender:
         self._due: list[tuple[float, int, Put, bytes]] = []
         self._numbers = itertools.count()
         self._news = threading.Condition()
-        threading.Thread(target=self._go_round, name="postman", daemon=True).start()
+        threading.Thread(target=self._go_round, name="delayed-sender", daemon=True).start()
 
     def round(self, put: Put) -> Callable[[bytes, float], None]:
         """An outlet that sends each message the given seconds later, but never before the previous message."""

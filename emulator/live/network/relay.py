@@ -8,7 +8,7 @@ from __future__ import annotations
 from evedrop.live.network.access import access_control, at_relay, grants
 from evedrop.live.network.connecting import connected
 from evedrop.live.network.router_users import until_all_left, users_file
-from evedrop.live.network.session import ATTEMPT, Session, client_config, door_of, router_config
+from evedrop.live.network.session import ATTEMPT, Session, client_config, router_address_of, router_config
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.brief_parts import RelayPart
 from evedrop.live.protocol.commands import End
@@ -23,10 +23,10 @@ def relay(brief: Brief[RelayPart]) -> None:
     part = brief.part
     table = at_relay(brief.run, grants(brief.run, tuple(part.receivers), part.controller, relayed=True), part.zid)
     # Connect as a client first, which reports errors; Zenoh links routers in the background and reports none.
-    with connected(door_of(brief), float(brief.patience)):
+    with connected(router_address_of(brief), float(brief.patience)):
         pass
     with _opened(brief, access_control(table, brief.identity is not None)) as session:
-        present = session.attendance(grant.process for grant in table if grant.token is not None and grant.zid is None)
+        present = session.presence(grant.process for grant in table if grant.token is not None and grant.zid is None)
         session.wait_for_link()
         session.ready()
         session.wait_for(End)

@@ -215,7 +215,7 @@ def route(brief: Brief[RouterPart]) -> None:
     table = grants(brief.run, tuple(brief.part.links), brief.part.controller)
     let_in = table if brief.part.zid is None else at_router(brief.run, table)
     with _opened(brief, access_control(let_in, brief.identity is not None)) as session:
-        present = session.attendance(grant.process for grant in table if grant.token is not None)
+        present = session.presence(grant.process for grant in table if grant.token is not None)
         Routing(brief, session).carry_on()
         session.conclude()
         until_all_left(present, session.linked)
@@ -231,17 +231,19 @@ class Routing:
         self._uplink = Pending(session.inbox(session.keys.uplink), session.keys.uplink, most_slots(brief))
         self._due = GapDetector(session.keys.uplink, brief.flow.longest_outage)
         self._put_journal = session.outlet(session.keys.journal)
-        postman = DelayedSender() if brief.part.pace else None
+        delayed_sender = DelayedSender() if brief.part.pace else None
         self._bursts: list[Burst] = []
 
         def outlet(name: str, schedule: LinkSchedule) -> Callable[[bytes, float], None]:
             put = session.outlet(session.keys.downlink(name))
             wiring = brief.part.controller
-            if postman is None and wiring is not None and not self._is_waited_for(name, wiring):
+            if delayed_sender is None and wiring is not None and not self._is_waited_for(name, wiring):
                 self._bursts.append(Burst(put))
                 return self._bursts[-1].hold
             delays = any("delay" in (one or {}) for one in (schedule.settings, *(c.settings for c in schedule.changes)))
-            return (lambda payload, _: put(payload)) if postman is None or not delays else postman.round(put)
+            return (
+                (lambda payload, _: put(payload)) if delayed_sender is None or not delays else delayed_sender.round(put)
+            )
 
         self._schedules = {name: entry.schedule for name, entry in brief.part.links.items()}
         self._outlets = {name: outlet(name, schedule) for name, schedule in self._schedules.items()}

@@ -104,17 +104,17 @@ def client_config(entry: Credentials) -> ZenohConfig:
     }
 
 
-def door_of(entry: Credentials) -> RouterAddress:
+def router_address_of(entry: Credentials) -> RouterAddress:
     """The router's address for a brief, or for the operator."""
     return RouterAddress(entry.router, entry.run, client_config(entry), entry.identity, entry.user)
 
 
-def _once(door: RouterAddress) -> RouterAddress:
+def _once(address: RouterAddress) -> RouterAddress:
     """The same address for sessions that are closed when their connection is lost: Zenoh must not reconnect them."""
-    config = dict(door.config)
+    config = dict(address.config)
     config["connect"] = {**config["connect"], "retry": {"period_init_ms": _NEVER_MS, "period_max_ms": _NEVER_MS}}
     config["transport"] = {**config["transport"], "unicast": dict(ATTEMPT)}
-    return replace(door, config=config)
+    return replace(address, config=config)
 
 
 def router_config(brief: Brief[RoutingPart], users_file: str, access: ZenohConfig, listen: str) -> ZenohConfig:
@@ -183,9 +183,9 @@ class Session:
         self._lifeline = Lifeline(brief) if brief.role not in ("router", "relay", "observer") else None
         self._waiting = Waiting(brief.process, brief.router, clock)
         if config is None or listen is None:
-            door = _once(door_of(brief))
-            once = zenoh.Config.from_json5(json.dumps(door.config))
-            first = connected(door, self.patience, meanwhile, clock)
+            address = _once(router_address_of(brief))
+            once = zenoh.Config.from_json5(json.dumps(address.config))
+            first = connected(address, self.patience, meanwhile, clock)
             self.connection = Connection(first, lambda: self._waiting.attempt(lambda: zenoh.open(once)), self._changed)
         else:
             self.connection = Connection(_listening(listen, brief.identity, config), None)
@@ -284,7 +284,7 @@ class Session:
         """Zenoh id of the connected router; a restarted router has another id."""
         return next((str(found) for found in self.connection.session.info.routers_zid()), None)
 
-    def attendance(self, processes: Iterable[str]) -> dict[str, bool]:
+    def presence(self, processes: Iterable[str]) -> dict[str, bool]:
         """Process → whether it is present, kept up to date by a thread of Zenoh's."""
         present = dict.fromkeys(processes, False)
         for name in present:

@@ -114,9 +114,9 @@ class ObservedRun:
         """Open the results folder, so that it is found even if it is renamed. Raises OSError if it does not exist."""
         self._held = HeldFolder(self._place)
 
-    def show(self, stand: WebAddress) -> Viewer:
+    def show(self, web_address: WebAddress) -> Viewer:
         """Start a viewer for browsers at this address, which follows the recording of the run."""
-        viewer = Viewer.serve(stand, self.folder / "logs", self.folder / "recording.rrd")
+        viewer = Viewer.serve(web_address, self.folder / "logs", self.folder / "recording.rrd")
         tell(ViewOpened(viewer.address))
         return viewer
 

@@ -41,7 +41,7 @@ def observe(brief: Brief[ObserverPart], report: Report, serve: str | None = None
     report: prints the end of a run that was started by hand. serve: HOST:PORT where browsers may see the run, if anywhere.
     Raises UsageError, BriefError, RunError or Interrupted only before the run has begun, and if started by hand.
     """
-    stand = None if serve is None else WebAddress.of(serve)
+    web_address = None if serve is None else WebAddress.of(serve)
     stop, confirmations = Stop(launcher_is_gone if brief.ends_with_stdin else lambda: False), SimpleQueue[bytes]()
     for number in heeded():
         signal.signal(number, lambda *_: setattr(stop, "wanted", True))
@@ -58,7 +58,7 @@ def observe(brief: Brief[ObserverPart], report: Report, serve: str | None = None
         new_folder(observation.folder)
         with Session(brief, meanwhile=stop.check):
             pass
-    viewer = None if stand is None else observation.show(stand)
+    viewer = None if web_address is None else observation.show(web_address)
     status, how = 0, "complete"
     try:
         observation.hold()

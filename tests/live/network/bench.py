@@ -18,7 +18,7 @@ import numpy as np
 import zenoh
 
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
-from evedrop.live.launch.ports import loopback_places
+from evedrop.live.launch.ports import loopback_endpoints
 from evedrop.live.network.session import client_config
 from evedrop.live.protocol.brief import AnyBrief, Flow, brief_from
 from evedrop.live.protocol.envelope import enclosed, payload_of
@@ -107,8 +107,8 @@ class Bench:
     def __init__(self, scenario: Scenario, folder: Path, stack: ExitStack, protocol: str = "tcp") -> None:
         observation = ObserverTask(folder / "results", False)
         listen = f"{protocol}/127.0.0.1:{free_port()}"
-        places = loopback_places(listen, None, scenario.relayed)
-        made = briefs_of(scenario, places, observation, ends_with_stdin=False)
+        endpoints = loopback_endpoints(listen, None, scenario.relayed)
+        made = briefs_of(scenario, endpoints, observation, ends_with_stdin=False)
         self.briefs: Mapping[str, AnyBrief] = {
             name: replace(brief, flow=Flow(32, 8, scenario.longest_outage)) for name, brief in made.items()
         }
@@ -189,5 +189,5 @@ def bench_of(scenario: Scenario, folder: Path, protocol: str = "tcp") -> Iterato
 
 def brief_of_eve(**part: Any) -> AnyBrief:
     """The brief of the smart eavesdropper of that scenario, as it is read; part: entries of its part that differ."""
-    brief = briefs_of(scenario_of(), loopback_places(None, None, False), ObserverTask(Path("nowhere"), False))["eve"]
+    brief = briefs_of(scenario_of(), loopback_endpoints(None, None, False), ObserverTask(Path("nowhere"), False))["eve"]
     return brief_from(json.loads(replace(brief, part=replace(brief.part, **part)).text))

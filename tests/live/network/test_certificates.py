@@ -21,11 +21,11 @@ from cryptography.x509.oid import NameOID
 from evedrop.errors import BriefError, RunError, UsageError
 from evedrop.live.launch.authority import Authority
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
-from evedrop.live.launch.ports import places_at
+from evedrop.live.launch.ports import endpoints_at
 from evedrop.live.network.certificates import check_identity
 from evedrop.live.network.connecting import RouterAddress, connected
 from evedrop.live.network.control_file import Control, read_control
-from evedrop.live.network.session import client_config, door_of
+from evedrop.live.network.session import client_config, router_address_of
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets
 from evedrop.live.protocol.brief import AnyBrief, read_brief
@@ -174,7 +174,7 @@ def test_an_eavesdropper_cannot_pose_as_the_router(stage: Bench) -> None:
         with pytest.raises(
             BriefError, match=r"has the certificate of another process of evedrop r.*, and is not a router"
         ):
-            connected(door_of(lured), 20.0)
+            connected(router_address_of(lured), 20.0)
 
 
 def test_a_router_is_believed_at_its_own_names_alone(stage: Bench) -> None:
@@ -182,14 +182,14 @@ def test_a_router_is_believed_at_its_own_names_alone(stage: Bench) -> None:
     brief = stage.briefs[EVE]
     port = brief.router.rpartition(":")[2]
     with pytest.raises(BriefError, match=rf"does not name localhost; .* --connect tls/localhost:{port}, all of them"):
-        connected(door_of(replace(brief, router=f"tls/localhost:{port}")), 20.0)
+        connected(router_address_of(replace(brief, router=f"tls/localhost:{port}")), 20.0)
 
 
 def test_another_runs_router_is_told_apart(stage: Bench) -> None:
     """A brief of another run says whose router it found, within seconds."""
     other = briefs_of(stage.scenario, stage.briefs[EVE].router, ObserverTask(Path("nowhere"), False))[EVE]
     with pytest.raises(BriefError) as caught:
-        connected(door_of(other), 60.0)
+        connected(router_address_of(other), 60.0)
     assert f"has a certificate of evedrop {stage.keys.run}, and this brief is of run {other.run}" in str(caught.value)
 
 
@@ -213,7 +213,9 @@ def test_the_operator_has_a_certificate_too(stage: Bench, tmp_path: Path) -> Non
 
 def test_private_keys_are_in_the_own_brief_alone(tmp_path: Path) -> None:
     """Every process has a key of its own, the operator's is with the observer, and the authority's is nowhere."""
-    made = briefs_of(scenario_of(), places_at("tls/0.0.0.0:7447", "tls/router.lan:7447"), ObserverTask(tmp_path, False))
+    made = briefs_of(
+        scenario_of(), endpoints_at("tls/0.0.0.0:7447", "tls/router.lan:7447"), ObserverTask(tmp_path, False)
+    )
     texts = {name: brief.write(tmp_path).read_text() for name, brief in made.items()}
     keys = {name: json.loads(text)["identity"]["key"] for name, text in texts.items()}
     assert len(set(keys.values())) == len(made)
@@ -236,7 +238,7 @@ def certificate_of(brief: AnyBrief) -> x509.Certificate:
 def test_certificates_say_what_they_are_for(tmp_path: Path) -> None:
     """The router's names its hosts and is for a server; all are for a client, and the others' name no host."""
     made = briefs_of(
-        scenario_of(), places_at("tls/10.0.0.7:7447", "tls/router.lan:7447"), ObserverTask(tmp_path, False)
+        scenario_of(), endpoints_at("tls/10.0.0.7:7447", "tls/router.lan:7447"), ObserverTask(tmp_path, False)
     )
     names = certificate_of(made["router"]).extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     assert names.get_values_for_type(x509.DNSName) == ["router.lan"]
@@ -309,23 +311,23 @@ def test_a_router_whose_clock_is_wrong_is_told_apart(stage: Bench) -> None:
 def test_a_router_that_is_not_there_is_waited_for() -> None:
     """Nobody listens: the process says so when its patience ends, as a failure of the run."""
     calls: list[None] = []
-    door = RouterAddress(f"tcp/127.0.0.1:{free_port()}", "r01", {})
+    address = RouterAddress(f"tcp/127.0.0.1:{free_port()}", "r01", {})
     with pytest.raises(
         RunError, match=r"no router answered at tcp/.* within 1 s \(Connection refused\); start it there"
     ):
-        connected(door, 1.0, lambda: calls.append(None))
+        connected(address, 1.0, lambda: calls.append(None))
     assert len(calls) > 1
 
 
 def test_briefs_that_fit_no_endpoint_are_refused() -> None:
     """Certificates for a router without TLS, none for a router that requires them, and malformed endpoints."""
-    for door, said in (
+    for address, said in (
         (RouterAddress("tls/127.0.0.1:7447", "r01", {}), "there is no identity"),
         (RouterAddress("tcp/127.0.0.1:7447", "r01", {}, EVES), "takes no identity"),
         (RouterAddress("7447", "r01", {}), "7447 is not an endpoint"),
     ):
         with pytest.raises(BriefError, match=said):
-            connected(door, 1.0)
+            connected(address, 1.0)
 
 
 def test_the_routers_certificate_passes_the_strictest_check(stage: Bench) -> None:

@@ -13,7 +13,7 @@ import pytest
 import zenoh
 
 from evedrop.errors import UsageError
-from evedrop.live.launch.ports import loopback_places, places_at
+from evedrop.live.launch.ports import endpoints_at, loopback_endpoints
 from evedrop.live.network.access import Grant, access_control, at_relay, at_router, grants
 from evedrop.live.network.health import is_there
 from evedrop.live.network.session import client_config
@@ -200,13 +200,13 @@ def test_the_router_is_known_at_the_relay_by_id_and_certificate() -> None:
 
 def test_a_run_of_two_routers_takes_certificates_unless_it_is_told_otherwise() -> None:
     """On loopback, with free ports of their own, or with those that are given."""
-    found = loopback_places(None, None, relayed=True)
+    found = loopback_endpoints(None, None, relayed=True)
     assert found.relay is not None
     assert (found.router.secure, found.relay.secure) == (True, True)
     assert found.router.listen.port != found.relay.listen.port
-    assert not loopback_places(None).router.secure
+    assert not loopback_endpoints(None).router.secure
     port = found.router.listen.port
-    clear = loopback_places(f"tcp/127.0.0.1:{port}", None, relayed=True)
+    clear = loopback_endpoints(f"tcp/127.0.0.1:{port}", None, relayed=True)
     assert (clear.router.secure, clear.far.secure) == (False, False)
 
 
@@ -230,4 +230,4 @@ def test_a_run_of_two_routers_takes_certificates_unless_it_is_told_otherwise() -
 def test_places_that_do_not_fit_are_refused(options: tuple[str | None, ...], relayed: bool, said: str) -> None:
     """Too few, too many, of two kinds, the same place twice: each with the option that mends it."""
     with pytest.raises(UsageError, match=said):
-        places_at(*options).check(relayed)  # type: ignore[arg-type]
+        endpoints_at(*options).check(relayed)  # type: ignore[arg-type]

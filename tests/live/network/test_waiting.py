@@ -61,21 +61,21 @@ def listener(lasting: float | None) -> Iterator[RouterAddress]:
 
 def test_a_network_that_cuts_connections_is_no_refusal() -> None:
     """Connections that flap are lost in the middle of a handshake, as of a router that refuses; an idle one is lost as well."""
-    with listener(0.3) as door, pytest.raises(RunError, match="no router answered"):
-        connecting.connected(door, 6.0)
+    with listener(0.3) as address, pytest.raises(RunError, match="no router answered"):
+        connecting.connected(address, 6.0)
 
 
 @pytest.mark.parametrize("lasting", [0.0, None], ids=["hangs up on everybody", "says nothing"])
 def test_what_ends_connections_by_itself_is_not_the_network(lasting: float | None) -> None:
     """A program that hangs up at once, and one, as a router that refused a brief, that keeps an idle connection."""
-    with listener(lasting) as door:
-        assert not connecting.cut_off(connecting.endpoint_of(door.router, None))
+    with listener(lasting) as address:
+        assert not connecting.cut_off(connecting.endpoint_of(address.router, None))
 
 
 def test_a_connection_that_ends_before_there_is_a_certificate_is_no_refusal(tmp_path: Path) -> None:
     """A proxy accepts and hangs up while its router is down: a process waits for it as for one that does not listen."""
-    with listener(0.0) as door:
-        endpoint = door.router.replace("tcp/", "tls/")
+    with listener(0.0) as address:
+        endpoint = address.router.replace("tcp/", "tls/")
         brief = briefs_of(scenario_of(), endpoint, ObserverTask(tmp_path, False), ends_with_stdin=False)["eve"]
         assert brief.identity is not None
         with pytest.raises(RunError, match=r"no router answered at .* within 10 s"):

@@ -14,7 +14,7 @@ import pytest
 
 from evedrop.errors import BriefError
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
-from evedrop.live.launch.ports import places_at
+from evedrop.live.launch.ports import endpoints_at
 from evedrop.live.protocol.brief import has_part, read_brief
 from evedrop.live.protocol.brief_parts import EavesdropperPart, ObserverPart, RouterPart, SensorPart
 from evedrop.scenario.stream_keys import StreamKeys
@@ -199,7 +199,7 @@ def test_model_is_the_only_thing_all_share() -> None:
 
 def test_no_secret_is_in_what_python_shows_of_a_brief() -> None:
     """Neither keys, passwords, private keys nor the seed: they would be in a traceback, and so in a log."""
-    made_for = places_at("tls/0.0.0.0:7447", "tls/router.lan:7447")
+    made_for = endpoints_at("tls/0.0.0.0:7447", "tls/router.lan:7447")
     for brief in briefs_of(scenario_of(seed=987_654_321), made_for, ObserverTask(Path("nowhere"), False)).values():
         shown, found = repr(brief), json.loads(brief.text)
         secrets = [brief.password, *brief.keys.values(), *found["part"].get("users", {}).values()]

@@ -10,9 +10,9 @@ from evedrop.live.network.delayed_sender import DelayedSender
 
 def test_messages_go_out_when_they_are_due_and_in_order() -> None:
     """A message waits its time; one that is due at once goes before it on another round, and after it on its own."""
-    postman, out = DelayedSender(), SimpleQueue[tuple[str, bytes, float]]()
-    slow = postman.round(lambda payload: out.put(("slow", payload, time.monotonic())))
-    quick = postman.round(lambda payload: out.put(("quick", payload, time.monotonic())))
+    sender, out = DelayedSender(), SimpleQueue[tuple[str, bytes, float]]()
+    slow = sender.round(lambda payload: out.put(("slow", payload, time.monotonic())))
+    quick = sender.round(lambda payload: out.put(("quick", payload, time.monotonic())))
     began = time.monotonic()
     slow(b"1", 0.3)
     slow(b"2", 0.0)
