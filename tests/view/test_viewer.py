@@ -310,7 +310,6 @@ STARTER = """
 import sys, time
 from pathlib import Path
 from evedrop.view.viewer import Viewer
-from tests.privileged import CannotRun, skip
 viewer = Viewer.start("web", Path(sys.argv[1]), Path(sys.argv[1]) / "r.rrd")
 print(viewer.pid, flush=True)
 time.sleep(600)
