@@ -71,7 +71,7 @@ ifndef BUILD_ONLY
 endif
 	@echo "the site is in build/site; to read it: python3 -m http.server --bind 127.0.0.1 --directory build/site"
 
-# `make -j2 -O lint` checks types beside the rest.
+# `make -j2 -O lint` checks types in parallel with the rest.
 lint: lint-types lint-rest
 
 lint-types: $(READY)

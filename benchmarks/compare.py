@@ -1,4 +1,4 @@
-"""How long a whole comparison takes, what the Bayesian eavesdropper costs beside the smart one, and theory behind chains.
+"""How long a whole comparison takes, what the Bayesian eavesdropper costs compared with the smart one, and theory behind chains.
 
     python benchmarks/compare.py [--quick]
 

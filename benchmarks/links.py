@@ -2,7 +2,7 @@
 
     python benchmarks/links.py [--quick]      # --quick: two models live, within seconds
 
-Machines are noisy: every model is measured in turn, over and over, and the median is quoted beside that of `bernoulli`.
+Machines are noisy: every model is measured in turn, over and over, and the median is quoted next to that of `bernoulli`.
 """
 
 from __future__ import annotations

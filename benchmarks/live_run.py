@@ -22,7 +22,7 @@ _MEASURED = (0, 1)  # 1: the scenario did not meet an expectation of its own, bu
 
 @contextmanager
 def started(scenario: str | Path, *options: str) -> Iterator[tuple[subprocess.Popen[bytes], Path]]:
-    """A run that goes on, and its results folder; without a view unless the options say otherwise.
+    """A run in progress, and its results folder; without a view unless the options say otherwise.
 
     Raises RuntimeError if it has failed when the block is left, which waits for its end.
     """
@@ -47,7 +47,7 @@ def started(scenario: str | Path, *options: str) -> Iterator[tuple[subprocess.Po
 def measured(
     scenario: str | Path, *options: str, watch: Callable[[subprocess.Popen[bytes], Path], None] | None = None
 ) -> dict[str, Any]:
-    """The summary of one run; watch: is called with its process and its results folder while it goes on."""
+    """The summary of one run; watch: is called with its process and its results folder while it is running."""
     with started(scenario, *options) as (process, out):
         if watch is not None:
             watch(process, out)

@@ -24,7 +24,7 @@ from processes import processes_of
 from table import Row, judged, run_alone
 
 _LOOK_SECONDS = 0.1
-_FLAT = 10.0  # MB in a million slots, which is ten bytes a slot: less than one number of each slot kept for ever
+_FLAT = 10.0  # MB in a million slots, which is ten bytes a slot: less than one number of each slot kept forever
 _PEERS = frozenset({"sensor", "legitimate", "eavesdropper"})
 _BARE = """
 import msgpack, numpy, sys, zenoh
@@ -100,7 +100,7 @@ class Looks:
 
 
 def bare_interpreter() -> float:
-    """Private MB of an interpreter with numpy and a session of Zenoh, beside another one that shares its libraries."""
+    """Private MB of an interpreter with numpy and a session of Zenoh, next to another one that shares its libraries."""
     command = [sys.executable, "-c", _BARE.format(folder=str(Path(__file__).parent))]
     with ExitStack() as stack:
         pair = [stack.enter_context(subprocess.Popen(command, stdin=PIPE, stdout=PIPE)) for _ in range(2)]

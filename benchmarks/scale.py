@@ -3,9 +3,9 @@
     python benchmarks/scale.py [--quick] [PICTURE]
 
 About seven minutes, `--quick` one. A delivery is one packet's fate at one receiver in one trial, counted once its slot is in the
-results. Rates are those of the steady part of a run: start, end and the making one of shards left out. Memory is the largest
-sum of all processes' resident memory, in which what they share counts in each. Compare within one table, not between tables:
-what else runs on the machine is in all of its numbers, and the load is printed at its head and its foot.
+results. Rates are those of the steady part of a run, without the start, the end and the merging of shards. Memory is the
+largest sum of all processes' resident memory; shared pages count once for each process. Compare numbers within one table, not
+between tables: other load on the machine affects them all, and is printed above and below each table.
 """
 
 from __future__ import annotations
@@ -238,7 +238,7 @@ def draw(found: list[Measured], picture: Path) -> None:
 
 
 def _alone(found: list[Measured], trials: int) -> float:
-    """The rate of so many trials in one shard."""
+    """The rate of this number of trials in one shard."""
     return next(one.rate for one in found if one.shards == 1 and one.trials == trials)
 
 

@@ -32,7 +32,7 @@ def carried(trials: int, slots: int, rounds: int) -> tuple[float, float, float]:
 
 
 def one_trial(slots: int, rounds: int) -> Row:
-    """One trial, beside raw Zenoh."""
+    """One trial, compared with raw Zenoh."""
     ours, bare, ratio = carried(1, slots, rounds)
     return Row(
         f"one trial, sensor and {RECEIVERS} receivers, into the results",
@@ -45,7 +45,7 @@ def one_trial(slots: int, rounds: int) -> Row:
 
 
 def web_view(slots: int, rounds: int) -> Row:
-    """One trial with the web view, which no browser looks at, beside one without a view."""
+    """One trial with the web view, which no browser looks at, compared with one without a view."""
     options = ("--pace", "0", "--slots", str(slots))
     pairs = [(rate(SCENARIO, *options, "--view", "web"), rate(SCENARIO, *options)) for _ in range(rounds)]
     ratio = statistics.median(a / b for a, b in pairs)
@@ -61,7 +61,7 @@ def web_view(slots: int, rounds: int) -> Row:
 
 
 def thousand_trials(slots: int, rounds: int) -> Row:
-    """A batch of a thousand trials, beside raw Zenoh."""
+    """A batch of a thousand trials, compared with raw Zenoh."""
     each = 1000 * RECEIVERS / 1e6
     ours, bare, ratio = carried(1000, slots, rounds)
     return Row(

@@ -161,7 +161,7 @@ def latencies(rounds: int, count: int) -> Iterator[Row]:
 
 
 def large(rounds: int, count: int, size: int) -> Iterator[Row]:
-    """Bytes a second in large messages, beside Zenoh's router alone."""
+    """Bytes a second in large messages, compared with Zenoh's router alone."""
     through, raw = [], []
     for _ in range(rounds):
         with a_wire(("robot/**", PERFECT)) as wire:
@@ -196,7 +196,7 @@ def accounted(count: int) -> Iterator[Row]:
 
 
 def losses(count: int) -> Iterator[Row]:
-    """The messages that each model lets through, beside its 99 % bounds."""
+    """The messages that each model lets through, next to its 99 % bounds."""
     models = {
         name: {"model": name, **found} for name, found in tomllib.loads(_LOSSES.read_text(encoding="utf-8")).items()
     }

@@ -15,7 +15,7 @@ from evedrop.files import Unreadable, text_of
 
 _HEADINGS = tuple(re.compile(rf"^\s*\[{name}\]", re.MULTILINE) for name in ("process", "encoding"))
 _MOST_BYTES = 2**28  # as for every scenario
-_OF_RESULTS = ("summary.json", "slots.parquet", "unfinished")  # the last one exists while a run goes on
+_OF_RESULTS = ("summary.json", "slots.parquet", "unfinished")  # the last one exists while a run is in progress
 
 
 def is_scenario(path: Path) -> bool:

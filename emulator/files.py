@@ -65,7 +65,7 @@ def shown(path: object) -> str:
 def opened(path: Path) -> BinaryIO:
     """Open a regular file for reading. Raises Unreadable if it does not exist, or is not a regular file."""
     try:
-        # Opening a pipe without a writer would wait for ever.
+        # Opening a pipe without a writer would wait forever.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except (OSError, ValueError) as error:
         raise Unreadable(why_of(error)) from error

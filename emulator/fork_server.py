@@ -109,7 +109,7 @@ def _become(request: bytes, files: list[int], own: tuple[int, int]) -> NoReturn:
             os.close(file)
         found = json.loads(request)
         sys.argv[1:] = found["words"]
-        # Before the environment changes, beside which the system keeps the command line.
+        # Before the environment changes, next to which the system keeps the command line.
         setproctitle(" ".join([sys.executable, "-P", "-m", "evedrop", *found["words"]]))
         os.environ.clear()
         os.environ.update(found["environment"])

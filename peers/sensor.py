@@ -115,7 +115,7 @@ class Window:
 
 @final
 class Barriers:
-    """The barriers at which the sensor stops until it is told to go on: those in the brief, and on the conductor's command.
+    """The barriers at which the sensor stops until it is told to continue: those in the brief, and on the conductor's command.
 
     flush: reports all slots below one.
     """

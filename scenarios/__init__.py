@@ -16,7 +16,7 @@ def shipped() -> dict[str, Path]:
 
 
 def built_in_text(name: str) -> str:
-    """The path of a built-in scenario. Raises UsageError if no built-in scenario has this name."""
+    """The text of a built-in scenario. Raises UsageError if no built-in scenario has this name."""
     if name not in shipped():
         raise UsageError(
             f"there is no built-in scenario {name}{near(name, shipped()) or '; evedrop list prints the names'}"

@@ -1,4 +1,4 @@
-"""A Zenoh router that is asked for its queryables while a client declares some stops for ever. Needs only eclipse-zenoh."""
+"""A Zenoh router that is asked for its queryables while a client declares some stops forever. Needs only eclipse-zenoh."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ def print_ending(folder: Path, status: int, how: str) -> None:
     except UsageError:
         pass
     except OSError:
-        silence()  # what is left in its buffer must not fail later
+        silence()  # discard the rest of the buffer, or a later flush would fail
     if status not in {0, 1}:
         with contextlib.suppress(OSError):
             sys.stderr.write(f"evedrop: {how}\n")

@@ -38,7 +38,10 @@ def memory(parser: argparse.ArgumentParser) -> None:
 
 
 def studied(options: argparse.Namespace, study: Callable[[Scenario, Callable[[int], None]], T]) -> tuple[Scenario, T]:
-    """The scenario of a command, of 100 trials unless told otherwise, and what the study finds of it, with a progress line."""
+    """Run a study of a command's scenario, with 100 trials by default, and show its progress.
+
+    Returns the scenario and what the study found.
+    """
     from evedrop.cli.progress_line import ProgressLine
     from evedrop.memory.montecarlo import teller
 

@@ -54,7 +54,7 @@ def _unfailing(stream: TextIO | None) -> TextIO:
 
 @final
 class _TimeLeft(TimeRemainingColumn):
-    """The time left; nothing before it is known how much is to be done."""
+    """The time left; nothing while the total is unknown."""
 
     def render(self, task: Task) -> Text:
         time = super().render(task)

@@ -1,4 +1,4 @@
-"""Checks the results of classes that are not built in while a run goes on, live and in memory.
+"""Checks the results of classes that are not built in while a run is in progress, live and in memory.
 
 A dry run calls these classes for the first slots only (`evedrop.scenario.dry_run`). An error or a wrong result in any later slot
 ends the run, and the message names class, slots and trials.

@@ -189,7 +189,7 @@ def acknowledged_form(scenario: Scenario, receiver: str) -> Closed | None:
 
 
 def _remembers(scenario: Scenario) -> bool:
-    """Whether a hijacked sensor goes by more than the last packet: if α > μ_e, and some acknowledgements are lost."""
+    """Whether a hijacked sensor depends on more than the last packet: if α > μ_e, and some acknowledgements are lost."""
     heeding = _heeding_of(scenario)
     return heeding is not None and heeding.patience > 0
 

@@ -112,7 +112,7 @@ class Expectation:
 
     @property
     def has_limit(self) -> bool:
-        """Whether there may be a limit: slots go on as they are, and do not follow a list that ends."""
+        """Whether there may be a limit: slots continue as they are, and do not follow a list that ends."""
         return self.slots_at is None
 
     def stream(self) -> ExpectedTraceStream:

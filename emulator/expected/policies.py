@@ -53,10 +53,9 @@ def policies_of(scenario: Scenario, weights: Sequence[float], prices: Sequence[f
     weights: of the user's error, from 0 to 1, the eavesdropper's has the rest; prices: of a transmission; states: how many
     holding times are distinguished.
 
-    Raises UsageError if the scheme does not go by acknowledgements when to send, if the losses of a link are not independent
-    and alike in all slots, if the user's error is unbounded under every policy, for weights at which the best policy
-    never sends, for numbers out of range,
-    and for holding times in which the error grows too large.
+    Raises UsageError if acknowledgements do not decide when the scheme sends, if the losses of a link are not independent and
+    alike in all slots, if the user's error is unbounded under every policy, for weights at which the best policy never sends,
+    for numbers out of range, and for so many holding times that the error grows too large.
     """
     _check_numbers(scenario, weights, prices, states)
     forms = SCHEMES[scenario.encoding.scheme].closed_forms

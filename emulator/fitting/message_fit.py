@@ -132,7 +132,7 @@ def _counted(found: MessageFit) -> list[str]:
             "not counted as losses; in a wire file they are an [[event]] with cut"
         )
     if series.parts > 1:
-        told.append(f"{series.parts} parts, joined: what was lost between two parts is not known")
+        told.append(f"{series.parts} parts, joined: losses between two parts are not known")
     return told
 
 

@@ -24,7 +24,7 @@ class NumberVerdict(StrEnum):
     ERRATUM = "erratum"
     """The difference is larger, and the reason says why the paper is wrong."""
     NOT_PUBLIC = "not public"
-    """What is needed to compute or to compare the number is not published."""
+    """The data needed to compute or to compare the number is not published."""
     NOT_COMPARABLE = "not comparable"
     """The two numbers are not estimates of the same thing, or one of them is too uncertain."""
     DIFFERS = "differs"

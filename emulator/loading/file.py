@@ -56,7 +56,7 @@ def load(source: str | Path, changes: Mapping[str, Any] | None = None, *, beyond
     Raises ScenarioError with every mistake, UsageError if there is no such scenario.
     """
     path = shipped().get(str(source), Path(source))
-    # A built-in scenario names no files beside it, so the names in a change refer to the current folder.
+    # A built-in scenario names no files of its own, so the names in a change refer to the current folder.
     folder = Path() if str(source) in shipped() else path if is_folder(path) else path.parent
     return parse(read(source), shown(source), changes, beyond_horizon=beyond_horizon, folder=folder)
 

@@ -1,7 +1,7 @@
 """Exact mode: the same cores as in a live run, without messages between them.
 
-Slots are simulated a chunk at a time. Where something flows back to the sensor, what it waits for is simulated one slot at a
-time, and all else follows a chunk at a time.
+Slots are simulated a chunk at a time. Where something flows back to the sensor, the parts that it depends on are simulated one
+slot at a time, and all others follow a chunk at a time.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Checks the classes of a scenario in memory that are not built in: an error in any slot names class, slots and trials.
 
-Encoders and receivers are checked as in a live run (`evedrop.conformance.checked`); what else a simulation asks of a class is
-checked here.
+Encoders and receivers are checked as in a live run (`evedrop.conformance.checked`); the further requirements of a
+simulation are checked here.
 
 Source: docs/your-own.md, mistakes.
 """

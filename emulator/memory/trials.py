@@ -147,7 +147,7 @@ def _empty_block(
 
 @np.errstate(over="ignore")
 def _score(block: TrialBlock, keeper: Scorekeeper, rows: slice, chunk: Chunk, slots: Slots) -> None:
-    """Add a chunk in exact mode to a block, which has some rows of its trials: what is counted is counted here.
+    """Add a chunk in exact mode to a block, which has some rows of its trials; all counting happens here.
 
     The square of a naive receiver's error may leave double precision; then it is inf, as it should be.
     """

@@ -13,7 +13,7 @@ import numpy as np
 from evedrop.model.digest import Blocks
 from evedrop.model.process import Floats
 
-_FEW_TRIALS = 64  # of which numpy adds a slot at a time more slowly than it accumulates all slots
+_FEW_TRIALS = 64  # up to this number, numpy adds a slot at a time more slowly than it accumulates all slots
 
 
 def added_in_order(total: Floats, numbers: Floats) -> Floats:

@@ -40,8 +40,8 @@ class LinearBlock:
     def of(cls, process: Process, chain: Chain, odds: Sequence[Mapping[str, Floats]]) -> LinearBlock:
         """The block of a chain; leaks are not supported.
 
-        odds: lag → the probabilities of the outcomes in the chain's states, (S,) each, of a slot that is so many slots ago; the
-        last lag is that of settled slots.
+        odds: lag → the probabilities of the outcomes in the chain's states, (S,) each, of a slot this number of slots ago;
+        the last lag is that of settled slots.
         """
         misleads = any(bool(np.any(one["misled"] > 0.0)) for one in odds)
         *since, M = (_operator(process, chain, one, misleads) for one in odds)

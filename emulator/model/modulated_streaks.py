@@ -125,7 +125,7 @@ def _begun(process: Process, course: _Course) -> list[tuple[Floats, Floats]]:
 
 
 def _lasting(course: _Course, carry: Floats, w: Floats, C: Floats, length: int) -> tuple[Floats, Floats]:
-    """The same one slot later, of the streaks that go on, when they have lasted for `length` slots."""
+    """The same one slot later, of the streaks that continue, when they have lasted for `length` slots."""
     count = min(len(w), len(course.law) - length)
     some = slice(length, length + count)
     kept, T, noise = course.odds["kept"][some], course.transitions[some], course.noise[some]

@@ -53,7 +53,7 @@ def _known(found: Outcomes | None) -> Outcomes:
 
 
 def noise_taken(scheme: Scheme, strategy: str, parameters: Mapping[str, Any]) -> Callable[[float], NoiseTaken] | None:
-    """Maps a link's quality to the error of a receiver that uses packets of which some are noise; None if no error is defined."""
+    """Maps a link's quality to the error of a receiver that uses packets, some of them noise; None if no error is defined."""
     kind, law = STRATEGIES[strategy], scheme.noise_law
     if law is None or not issubclass(kind, PacketTaker):
         return None

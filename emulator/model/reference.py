@@ -178,7 +178,7 @@ class ReferenceReceiver(Receiver):
         shown = np.where(state, x, x - r)
         top = np.where(state, X, X - R)
         if self._singular:
-            # What is known of a direction without noise is known up to the rounding of x, r and z.
+            # A direction without noise is known up to the rounding of x, r and z.
             size = np.abs(x) + np.abs(r) + np.abs(z) + self._code.deviation(k)[:, None]
             top = np.concatenate([top, ROUNDING_OF_REFERENCES * size[:, None, :] * np.eye(n)[:, :, None]], axis=1)
             R = np.concatenate([R, 0.0 * noise], axis=1)

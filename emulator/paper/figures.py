@@ -64,7 +64,7 @@ def _report(captions: dict[str, str], table: str, formulas: str) -> str:
     parts = [
         "# The paper's figures and numbers, and ours",
         'The paper is "Innovation-Based Remote State Estimation Secrecy with no Acknowledgments" (Kennedy, Ford, Quevedo, '
-        "Dressler). Every figure is also there as PDF. What differs is explained in docs/errata.md.",
+        "Dressler). Every figure is also there as PDF. docs/errata.md explains the differences.",
     ]
     for name, caption in captions.items():
         parts += [f"## {_TITLES[name]}", f"![{_TITLES[name]}]({name}.png)", caption]

@@ -35,7 +35,7 @@ _MOST_SHOWN = 10  # topics that a message lists
 _MOST_OFF = 0.01  # of the messages of a periodic sender, which may be a quarter of a period early or late
 _SHARED = 0.9  # of the missing numbers, which another topic has: then one counter numbers all topics
 _OWN = 0.01  # of the numbers, which two topics may both have by chance if one counter numbers all
-_OLD = 1.0  # seconds before the recording began: what was sent earlier was kept for those who come late
+_OLD = 1.0  # seconds before the recording began: earlier messages were kept for late subscribers
 _LONGEST_DELAY = 3600.0  # seconds; a longer one is a difference of clocks
 _RELIABLE = ("reliability: reliable", "reliability: 1\n")
 
@@ -121,8 +121,8 @@ class _Reader:
         name = f"{self._path}, {chosen.topic}"
         if _RELIABLE[0] in chosen.metadata or _RELIABLE[1] in chosen.metadata:
             self._notes.append(
-                "its publisher offers reliable delivery: what the network lost was sent again, so these are the losses that "
-                "remained, and what was sent again counts as delay"
+                "its publisher offers reliable delivery: messages that the network lost were sent again, so these are the losses "
+                "that remained, and resent messages count as delayed"
             )
         chosen = self._without_old(chosen)
         series = self._numbered(chosen, longest) if period is None else self._periodic(chosen, period, longest)
@@ -241,7 +241,7 @@ class _Reader:
         return series
 
     def _check_counter(self, messages: _Messages) -> None:
-        """Raise TraceError if one counter numbers the messages of all topics, so that a gap is no loss."""
+        """Raise TraceError if one counter numbers the messages of all topics, so a gap is not a loss."""
         own = set(messages.sequences.tolist())
         others = {number for one in self._channels if one is not messages for number in one.sequences.tolist()}
         span = range(min(own), max(own) + 1)
@@ -337,7 +337,7 @@ def _keep(records: Iterator[Any], channels: dict[tuple[int, int], _Channel], fil
 
 
 def _joined_by_topic(channels: Iterable[tuple[tuple[int, int], _Channel]]) -> list[_Messages]:
-    """The messages of each channel in the order of recording; a channel goes on in the next file of a split bag."""
+    """The messages of each channel in the order of recording; a channel continues in the next file of a split bag."""
     found: dict[tuple[str, int], list[_Channel]] = {}
     met: Counter[tuple[int, str]] = Counter()
     for (file, _), channel in channels:

@@ -39,7 +39,7 @@ class MessageArrivals:
 @final
 @dataclass(frozen=True)
 class MessageSeries:
-    """The outcomes of consecutive messages, in one part or several; what was lost between two parts is not known."""
+    """The outcomes of consecutive messages, in one part or several; losses between two parts are not known."""
 
     outcomes: Outcomes
     """1 delivered, 0 lost, (n,), all parts one after the other."""
@@ -99,7 +99,7 @@ def numbers_of_times(times: Floats, period: float) -> tuple[NDArray[np.int64], f
 
 
 class _Reading:
-    """Reads the numbers of one sender once, and cuts them into parts where they do not go on."""
+    """Reads the numbers of one sender once, and cuts them into parts where they are not consecutive."""
 
     def __init__(self, arrivals: MessageArrivals, longest: float | None, wrap: int | None) -> None:
         self._numbers: list[int] = arrivals.numbers.tolist()
@@ -159,7 +159,7 @@ class _Reading:
         return (number - top + self._wrap // 2) % self._wrap - self._wrap // 2
 
     def _breaks(self, step: int, top_at: int, i: int) -> bool:
-        """Whether the numbers that were left out are no losses, and counts why."""
+        """Whether the numbers that were left out are not losses, and counts why."""
         time = self._times[i] - self._times[top_at]
         if self._longest is not None and step > 1 and time > self._longest:
             self.outages.append(time)

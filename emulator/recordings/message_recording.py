@@ -1,4 +1,4 @@
-"""What a recording tells of the messages on a link: which were lost, and how long the others took.
+"""Reads from a recording which messages of a link were lost, and how long the others took.
 
 Source: docs/links.md, recordings of messages.
 """

@@ -210,8 +210,8 @@ def _rare_lines(summary: Summary) -> Iterator[str]:
 
 
 def rare_events_words(trials: int) -> str:
-    """Events that are too rare for so few trials."""
-    return f"events of which {trials:,} trials contain fewer than one on average"
+    """Events that are too rare for this number of trials."""
+    return f"events that occur less than once on average in {trials:,} trials"
 
 
 def _count(number: float) -> str:

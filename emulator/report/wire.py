@@ -107,7 +107,7 @@ def wire_faults(summary: WireSummary) -> Iterator[str]:
 
 
 def _unfinished(summary: WireSummary) -> str:
-    """That the wire has not ended, if its summary was made from its journal."""
+    """What to say of a wire that has not ended; empty for one that has."""
     return {"running": "the wire still runs", "killed": "the wire was killed"}.get(summary.state, "")
 
 

@@ -144,7 +144,9 @@ def replace_private(path: Path, text: str) -> None:
 
 @contextlib.contextmanager
 def private_replacement(path: Path) -> Iterator[Path]:
-    """An empty file that only this user can read: it replaces `path` when the block ends, and is removed if the block fails.
+    """The path of an empty file that only this user can read.
+
+    The file replaces `path` when the block ends, and is removed if the block fails.
 
     Raises OSError.
     """

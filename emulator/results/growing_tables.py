@@ -148,14 +148,14 @@ class TableRound:
 
 
 class Unfinished:
-    """The writer's side of the folder `unfinished`. Holds a lock on it, which tells readers that the run goes on."""
+    """The writer's side of the folder `unfinished`. Holds a lock on it, which tells readers that the run is in progress."""
 
     def __init__(self, folder: Path) -> None:
         """Create the folder in a results folder. Raises OSError on failure."""
         place = folder / UNFINISHED
         make_private(place, exist_ok=False)
         self._descriptor = os.open(place, os.O_RDONLY)
-        with contextlib.suppress(OSError):  # on a file system without locks, a run that goes on looks killed
+        with contextlib.suppress(OSError):  # on a file system without locks, a run in progress looks killed
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._rounds = os.open(place / _ROUNDS, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o600)
 

@@ -1,4 +1,4 @@
-"""Reads results folders: the summary, and the tables as Arrow, of a run that ended, goes on, or was killed.
+"""Reads results folders: the summary, and the tables as Arrow, of a run that ended, is in progress, or was killed.
 
 Source: docs/results.md.
 """
@@ -156,7 +156,7 @@ def _one_line(error: Exception) -> str:
 
 
 def load_results(folder: str | Path) -> Results:
-    """Read a results folder, also one of a run that goes on or was killed: `ended` in its summary says so.
+    """Read a results folder, also one of a run that is in progress or was killed: `ended` in its summary says so.
 
     Raises UsageError naming the missing or broken file if it is not a results folder.
     """
@@ -164,7 +164,7 @@ def load_results(folder: str | Path) -> Results:
     path = place / "summary.json"
     if not path.exists() and (place / "shards").is_dir():
         raise UsageError(
-            f"{folder} is of a run in shards that goes on or was killed; each of its shards is a results folder by "
+            f"{folder} is of a run in shards that is in progress or was killed; each of its shards is a results folder by "
             f"itself, such as {place / 'shards' / '1'}"
         )
     if not path.exists() and is_unfinished(place):

@@ -100,7 +100,7 @@ class ConditionalError:
 def conditional_error_of(scenario: Scenario, receiver: str, trials: int) -> ConditionalError | None:
     """The conditional error of a receiver's trials, of no slots yet; None if actions do not determine its covariance.
 
-    That is so for a receiver that may be misled, reads packets that are no states, waits for late packets or goes away, for a
+    That is so for a receiver that may be misled, reads packets that are not states, waits for late packets or goes away, for a
     scheme that acts on acknowledgements, and for a plant, whose inputs and disturbances add to the error.
     """
     outcomes_at = outcomes_of(scenario, receiver)

@@ -46,7 +46,7 @@ class ReceiverSlots:
         return kernels.traces(self.P) if self.P.shape[3] == self.action.shape[1] else None
 
     def part(self, trials: slice) -> ReceiverSlots:
-        """The same for some of the trials; what is counted over all trials stays as it is."""
+        """The same for some of the trials; counts over all trials stay as they are."""
         late, used, delivered = (
             None if one is None else one[:, trials] for one in (self.late, self.late_used, self.late_delivered)
         )
@@ -109,7 +109,7 @@ class Slots:
         return int(self.x.shape[2])
 
     def part(self, trials: slice) -> Slots:
-        """The same for some of the trials; what is counted over all trials stays as it is."""
+        """The same for some of the trials; counts over all trials stay as they are."""
         sent, alarms = (None if one is None else one[:, trials] for one in (self.sent, self.alarms))
         return replace(
             self,

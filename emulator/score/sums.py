@@ -261,7 +261,7 @@ class Tally(ReceiverTotals):
     def of_trials(self, name: str) -> Floats | None:
         """What a figure is the mean of, for every trial, (R,).
 
-        None if the figure is no such mean, if that is not known, or if trials were cut short at different slots.
+        None if the figure is not such a mean, if that is not known, or if trials were cut short at different slots.
         """
         found = figure(name)
         if not (found.averages_trials and self.alike):

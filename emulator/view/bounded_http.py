@@ -1,4 +1,4 @@
-"""The HTTP server behind a view in a browser: a bounded number of readers, each on a thread of its own, and no log."""
+"""The HTTP server of views in a browser and of metrics: a bounded number of readers, each on its own thread, and no log."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 _LOOK_SECONDS = 0.05  # between two checks of whether the server is to stop
-_REQUEST_SECONDS = 10.0  # for a browser to send its request
+_REQUEST_SECONDS = 10.0  # for a reader to send its request
 _MOST_READERS = 32  # at a time; further ones are turned away, so another user can use up all places
 
 
@@ -24,7 +24,7 @@ class BoundedServer(ThreadingHTTPServer):
 
     def start(self) -> None:
         """Accept readers, on a thread of its own."""
-        threading.Thread(target=self.serve_forever, args=(_LOOK_SECONDS,), name="view", daemon=True).start()
+        threading.Thread(target=self.serve_forever, args=(_LOOK_SECONDS,), name="http server", daemon=True).start()
 
     def stop(self) -> None:
         """Accept no more readers. Those in progress continue by themselves."""

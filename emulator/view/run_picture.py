@@ -71,7 +71,7 @@ def run_figure(results: Results, wanted: Sequence[str], slots: range | None, tri
 def _errors(axes: Axes, rows: pa.Table, receivers: list[str], slots: range | None, floor: float) -> None:
     """The mean squared error of each slot, theory dashed, and a band of two standard errors of its logarithm.
 
-    floor: what is less is drawn there.
+    floor: values below it are drawn at it.
     """
     many, heights = False, list[Floats]()
     for i, name in enumerate(receivers):

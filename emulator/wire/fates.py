@@ -1,8 +1,8 @@
 """The fates of the messages of a key on a link: seed, link, kind, key and n determine the fate of the n-th message.
 
 A link of a scenario decides the fate of a packet in each slot. Here the n-th message of a key is slot n, and a slot lasts a
-second, so that every model of losses and delays is used unchanged. What depends on time is not in here: the queue of a link
-of limited rate, cuts and partitions.
+second, so that every model of losses and delays is used unchanged. Time-dependent effects are not part of a fate: the queue
+of a link of limited rate, cuts and partitions.
 
 Source: docs/wire.md, the same traffic, the same losses.
 """

@@ -1,6 +1,6 @@
 """The history of a wire's folder: its starts, the settings of its links and their changes, and how many messages it numbered.
 
-A wire that starts again in the same folder goes on from here, so that the n-th message of a key has the same fate whether or
+A wire that starts again in the same folder continues from here, so that the n-th message of a key has the same fate whether or
 not the wire was ended or killed between.
 
 Source: docs/wire.md, a wire that starts again.

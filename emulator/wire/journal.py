@@ -160,7 +160,7 @@ class WireJournal:
         return self._words.key_of(code)
 
     def changes_of(self, link: str, key: str, kind: str) -> tuple[Change, ...]:
-        """The settings that the messages of a stream had, from message 0 on: what `KeyFates` needs to go on."""
+        """The settings that the messages of a stream had, from message 0 on: what `KeyFates` needs to continue."""
         return self._history.changes_of(link, key, kind)
 
     def change(self, link: str, settings: Mapping[str, Any], since: Mapping[tuple[str, str], int]) -> None:
@@ -307,7 +307,7 @@ class WireJournal:
             self.flush()
             with contextlib.suppress(OSError):  # if the wire is killed, more of the delayed messages count as underway
                 self._beat()
-            with self._state, contextlib.suppress(OSError):  # `_room` tries again, and tells of it
+            with self._state, contextlib.suppress(OSError):  # `_room` tries again, and reports it
                 part = self._parts.get(self._next)
                 if part is not None and 2 * part.handed > self._rows and self._next + 1 not in self._buffers:
                     self._add_part(self._next + 1)

@@ -56,7 +56,7 @@ def journal_tables(folder: Path | str, start: int | None = None, alive: float | 
 
 def _table(journal: Path, name: str, links: dict[int, list[str]], alive: float | None) -> pa.Table:
     path = journal / UNFINISHED / f"{name}.rows"
-    with contextlib.suppress(FileNotFoundError):  # a wire that goes on may just have made the Parquet file
+    with contextlib.suppress(FileNotFoundError):  # a running wire may just have made the Parquet file
         if not parquet_path(journal, name).exists():
             return unfinished_table(path, links, alive)
     return pq.read_table(parquet_path(journal, name), schema=PARQUET)

@@ -1,8 +1,7 @@
 """How many messages of a key a link's models let through: the mean and the variance over seeds.
 
-What the models decide is apart from what depends on time: a message that was cut, or for which the queue was full, is left out
-of `ranges`. The sums of several keys, or links, are means and variances that add up, since their random numbers are
-independent.
+Time-dependent effects are counted apart: a message that was cut, or for which the queue was full, is left out of `ranges`. The
+means and variances of several keys, or links, add up, since their random numbers are independent.
 
 Source: docs/wire.md, a link and its model; docs/mathematics.md, losses in bursts.
 """
@@ -97,7 +96,7 @@ def _variance(loss: LossModel, parts: Sequence[_Part]) -> float:
 
 
 def _variance_of_chain(chain: Chain, parts: Sequence[_Part]) -> float:
-    """The variance for parts of one chain, which goes on between them.
+    """The variance for parts of one chain, which continues between them.
 
     w is the row Σ passes_i E[(γ_i − mean); state at the present message] over the messages i so far, so that the covariance of
     all of them with the message is w · (quality − mean). Its entries sum to 0; so the chain's stationary part can be left out.

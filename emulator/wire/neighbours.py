@@ -40,7 +40,7 @@ class Neighbours:
         ]
 
     def update(self) -> None:
-        """Look again; cut the links between sides that are joined outside the wire, and let those go on that no longer are."""
+        """Look again; cut the links between sides that are joined outside the wire, and restore those no longer joined."""
         programs, routers = {}, {}
         for name, side in self._sides.items():
             transports = side.session.info.transports()

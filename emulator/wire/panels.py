@@ -159,7 +159,7 @@ class WirePanels:
         self.notes(self._watcher.watch(steps), to)
 
     def end(self, to: rr.RecordingStream) -> None:
-        """Record that nothing follows: otherwise the last state of a lane would go on."""
+        """Record that nothing follows: otherwise the last state of a lane would continue."""
         last = [(path, LaneState.QUIET.word) for path in self._lane_paths]
         for path, word in (*last, (self._cut_path, _WHOLE)):
             _send(to, path, [self._next * self._pace.step], rr.StateChange.columns(state=[word]))

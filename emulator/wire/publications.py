@@ -133,7 +133,7 @@ class PublicationRelay:
     def _run(self, samples: Any, earlier: tuple[zenoh.KeyExpr, ...]) -> None:
         try:
             self._take_all(samples, earlier)
-        except Exception as error:  # whatever it is: nothing may stop to cross silently
+        except Exception as error:  # whatever it is: nothing may silently stop crossing
             self._tell(f"messages from the side {self._name} no longer cross ({error!r}); end the wire and report this")
 
     def _take_all(self, samples: Any, earlier: tuple[zenoh.KeyExpr, ...]) -> None:

@@ -1,4 +1,4 @@
-"""What the journal of a wire tells of one of its links, or of the network before the wire: for `evedrop links fit`.
+"""Reads from a wire's journal the losses and delays of one link, or of the network before the wire: for `evedrop links fit`.
 
 Source: docs/links.md, recordings of messages.
 """

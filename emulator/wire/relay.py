@@ -76,7 +76,7 @@ class WireRelay:
         return self._queries.mirrored(side)
 
     def apply(self, moment: Moment) -> None:
-        """Cut the links that are cut from now on, let the others go on, and give all of them their settings."""
+        """Cut the links that are cut from now on, restore the others, and give all of them their settings."""
         for name, state in self.links.items():
             state.cut = name in moment.cut
             state.change(moment.settings[name])
@@ -114,7 +114,10 @@ class WireRelay:
             self._journal.amend(row, Crossing.UNDERWAY)
 
     def _look(self) -> None:
-        """Follow what programs declare. Queryables come before tokens: who sees a service's token may ask it at once."""
+        """Follow what programs declare.
+
+        Queryables come before tokens: a program that sees a service's token may query it at once.
+        """
         self._liveliness.note()
         held = self._liveliness.tokens.items()
         found = ((side, service_key(token)) for side, tokens in held for token in tokens)

@@ -23,7 +23,7 @@ MOST_ENTITIES = 65_536
 class EntityLog:
     """Writes down each entity of ROS 2 once, as its liveliness token describes it, when its token first appears.
 
-    A file that cannot be written ends the log with a warning; the wire goes on.
+    A file that cannot be written ends the log with a warning; the wire continues.
     """
 
     def __init__(self, folder: Path) -> None:

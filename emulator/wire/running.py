@@ -131,7 +131,7 @@ class RunningWire:
 
     @property
     def is_running(self) -> bool:
-        """Whether the wire goes on."""
+        """Whether the wire is running."""
         return self._process is not None and self._process.poll() is None
 
     def endpoint(self, side: str) -> str:

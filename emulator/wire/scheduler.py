@@ -26,7 +26,7 @@ class Scheduler:
     """A thread that carries out what is due. It holds a limited number of messages, and of bytes."""
 
     def __init__(self, most: int, most_bytes: int, failed: Callable[[int], None]) -> None:
-        """most, most_bytes: what it may hold; failed: is given the row of a message that raised an error."""
+        """most, most_bytes: how much it may hold; failed: is given the row of a message that raised an error."""
         self._most, self._most_bytes, self._failed = most, most_bytes, failed
         self._heap: list[_Held] = []
         self._bytes = 0

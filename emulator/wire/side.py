@@ -71,7 +71,7 @@ class SideSession:
         if all(not one.split("?")[0].split("#")[0].endswith(":0") for one in self.side.listen):
             return self.side.listen
         # Asked once, before programs can connect. Zenoh answers most questions about a router while it holds a lock that it needs
-        # again for the answer: a declaration that comes in between stops the router for ever.
+        # again for the answer: a declaration that comes in between stops the router forever.
         told = [
             json.loads(reply.ok.payload.to_bytes()) for reply in self.session.get(f"@/{self.zid}/router") if reply.ok
         ]

@@ -176,7 +176,10 @@ def test_a_table_in_a_notebook_has_the_cautions_of_the_terminal(results: RunResu
     changed["peers"]["smart"]["rare_events"] = rare
     html = RunResults(results.folder, changed)._repr_html_()
     assert f"{results.folder}: a process died" in html
-    assert "smart: 50 % of its expected error is carried by events of which 4 trials contain fewer than one" in html
+    assert (
+        "smart: 50 % of its expected error is carried by events that occur less than once on average in 4 trials"
+        in html
+    )
 
 
 def test_an_unknown_name_is_named_with_the_known_ones(results: RunResults) -> None:

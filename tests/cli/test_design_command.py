@@ -154,7 +154,8 @@ def test_who_has_no_closed_form_is_left_out_and_said(evedrop: Evedrop) -> None:
     assert found["eavesdroppers"]["deaf"]["bound"] is None
     (line,) = [line for line in evedrop("design", "numerical", *extra).out.splitlines() if "left out" in line]
     assert line == (
-        "left out: clever (bayesian): no closed form of its error is known; what holds against a genie holds against all"
+        "left out: clever (bayesian): no closed form of its error is known; a guarantee against a genie holds against every "
+        "eavesdropper"
     )
 
 

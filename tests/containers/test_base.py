@@ -1,4 +1,4 @@
-"""The base image is made, killed and removed without harm to the machine; debootstrap is a stand-in that takes for ever."""
+"""The base image is made, killed and removed without harm to the machine; debootstrap is a stand-in that takes forever."""
 
 from __future__ import annotations
 

@@ -89,7 +89,7 @@ def test_a_killed_router_costs_nothing_but_time(what: str, evedrop: Evedrop, tmp
         with stepping(evedrop, live.folder, 300):
             live.kill("router")
             # Losses that overlap are one outage: this one must be over before the next.
-            wait_until(partial(has_told, live, "reconnected", times), "a run that goes on")
+            wait_until(partial(has_told, live, "reconnected", times), "a run that continues")
     assert evedrop("resume", str(live.folder)).status == 0
     done = live.end(120)
     assert done.status == 0, done.err
@@ -245,7 +245,7 @@ def is_taken_up(
     ],
 )
 def test_a_cut_connection_costs_nothing_but_time(name: str, how: str, evedrop: Evedrop, tmp_path: Path) -> None:
-    """Closed for a second, or without a word for longer than its lease: who was cut off is listed, and all is as ever."""
+    """Closed for a second, or without a word for longer than its lease: the outage is listed, and all else is as ever."""
     _, scenario = scenario_in(tmp_path, encoding=SCHEDULED, strategy="naive", more=ACKNOWLEDGED)
 
     def cut_off(wire: Cable) -> None:
@@ -261,7 +261,7 @@ def test_a_cut_connection_costs_nothing_but_time(name: str, how: str, evedrop: E
 
 @pytest.mark.parametrize("name", [pytest.param("controller", marks=long), "legitimate"])
 def test_a_loop_is_taken_up_where_it_was_cut(name: str, evedrop: Evedrop, tmp_path: Path) -> None:
-    """Estimates and inputs that were lost on the way are sent again: no process waits for ever, and no input changes."""
+    """Estimates and inputs that were lost on the way are sent again: no process waits forever, and no input changes."""
     _, scenario = scenario_in(tmp_path, more=LOOP.format("period = 5"), more_of_legitimate="knows_input = true")
 
     def cut_off(wire: Cable) -> None:

@@ -70,7 +70,7 @@ def test_a_launcher_that_is_gone_is_known_without_waiting() -> None:
 
 
 def test_a_run_without_its_launcher_is_interrupted_and_not_at_fault() -> None:
-    """The others leave together with the launcher: who misses them looks for it, and for a signal, before it blames them."""
+    """The others leave together with the launcher: a process that misses them looks for it, and for a signal, first."""
     Stop().check(0.01)
     with pytest.raises(Interrupted):
         Stop(orphaned=lambda: True).check()

@@ -100,7 +100,7 @@ RUNS = {
         },
         ["legitimate"],
     ),
-    "a peer that does not know the question is no suspect before one that idles": (
+    "a peer that does not know the question is not suspected before one that idles": (
         {"sensor": 100, "router": 100, "legitimate": 100, "eve": 100},
         {"sensor": at(110), "router": at(110, KEYS.uplink), "eve": at(110, KEYS.downlink("eve"))},
         ["sensor"],

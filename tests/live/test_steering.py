@@ -231,7 +231,7 @@ def test_a_run_may_begin_paused() -> None:
 
 
 def test_resuming_a_run_that_goes_on_holds_nothing() -> None:
-    """It is answered at once, and is no event."""
+    """It is answered at once, and is not an event."""
     run = Run()
     assert run.asks("resume", reported=9).answers == [Answer(9, "the run is not paused")]
     assert (run.conductor.told(), run.events) == ([], [])
@@ -372,7 +372,7 @@ def test_a_router_that_missed_a_go_hears_it_while_the_sensor_holds_again() -> No
 
 
 def test_a_hold_that_is_told_once_more_is_one_hold() -> None:
-    """The sensor may say twice that it holds; when the run has gone on since, that is no news."""
+    """The sensor may say twice that it holds; when the run has gone on since, that is not news."""
     run = Run()
     run.asks("pause")
     run.holds(12)

@@ -1,4 +1,4 @@
-"""Files that a scenario names: what is no file, too large, damaged or not text is refused."""
+"""Files that a scenario names: one that is not a file, too large, damaged or not text is refused."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_a_results_folder_whose_scenario_is_not_text_is_refused(evedrop: Evedrop
 
 
 def special(folder: Path, kind: str) -> Path:
-    """A path that is no file to be read."""
+    """A path that is not a file to be read."""
     path = folder / f"{kind}.csv"
     if kind == "folder":
         path.mkdir()

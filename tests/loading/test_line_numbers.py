@@ -81,7 +81,7 @@ def test_what_is_inside_a_value_has_the_line_of_the_value() -> None:
 
 
 def paths(value: Any, path: str) -> set[str]:
-    """The paths of all entries that are no tables."""
+    """The paths of all entries that are not tables."""
     if isinstance(value, list) and value and all(isinstance(one, dict) for one in value):
         return {place for i, one in enumerate(value) for place in paths(one, f"{path}.{i}")}
     if not isinstance(value, dict):

@@ -168,7 +168,7 @@ def test_error_coordinates_go_where_states_cannot_be_followed() -> None:
 
 
 def test_heavy_tails_agree_by_quantiles() -> None:
-    """Where the mean is no test: upper quantiles of |e|² in slot 300 of the paper's example, error coordinates against chains.
+    """Where the mean is not a test: upper quantiles of |e|² in slot 300 of the paper's example, error coordinates against chains.
 
     The reference is independent: one long list of geometric times since the last state packet, each with its own
     covariance and a normal error. 6000 samples each, compared by the two-sample binomial bound at 4.5 σ.

@@ -191,7 +191,7 @@ def test_slots_without_a_packet_tell_nothing() -> None:
 
 @pytest.mark.parametrize(("normal", "attacked"), [(1.0, 0.5), (0.0, 0.5), (0.5, 0.5), (0.5, -0.1), (0.5, math.nan)])
 def test_rates_that_are_none_are_refused(normal: float, attacked: float) -> None:
-    """Equal ones, certain ones and what is no probability."""
+    """Equal ones, certain ones and numbers that are not probabilities."""
     with pytest.raises(ValueError, match="expected two different ones"):
         chart_for(normal, attacked, 100.0)
 

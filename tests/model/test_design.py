@@ -265,8 +265,8 @@ def test_eavesdroppers_without_a_closed_form_are_named() -> None:
     assert "left_out" not in found.as_dict()
     other = replace(found, left_out={"eve": "bayesian", "mallory": "likelihood"})
     assert other.omission == (
-        "left out: eve (bayesian), mallory (likelihood): no closed form of its error is known; what holds against a genie "
-        "holds against all"
+        "left out: eve (bayesian), mallory (likelihood): no closed form of its error is known; a guarantee against a genie "
+        "holds against every eavesdropper"
     )
     assert other.as_dict()["left_out"] == {"eve": "bayesian", "mallory": "likelihood"}
 

@@ -112,7 +112,7 @@ def test_a_late_packet_counts_as_if_it_had_been_in_time(name: str, window: int) 
 
 
 def test_duplicates_change_nothing() -> None:
-    """A second copy, of this slot or an earlier one, is no news."""
+    """A second copy, of this slot or an earlier one, is not news."""
     one, z = receivers()["legitimate"], packets()
     everybody = np.ones(BATCH.trials, bool)
     plain, twice = OneByOne(one, 3), OneByOne(one, 3)
@@ -195,7 +195,7 @@ def test_every_packet_is_accounted_for(window: int) -> None:
 
 
 def test_slots_that_a_receiver_was_away_are_lost_and_end_its_window() -> None:
-    """It predicts through them, and a packet from before them is no news any more."""
+    """It predicts through them, and a packet from before them is not news any more."""
     one, z = receivers()["legitimate"], packets()
     everybody = np.ones(BATCH.trials, bool)
     follower, expected = OneByOne(one, 3), one.prior()

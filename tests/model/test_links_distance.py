@@ -107,7 +107,7 @@ def test_a_million_packets_have_the_quality_of_their_slots(spec: dict[str, Any],
 
 @pytest.mark.parametrize("deviation", [0.0, 0.1, 1.0, 2.3, 6.9])
 def test_the_quality_is_exact(deviation: float) -> None:
-    """Beside adaptive integration over the shadowing, deviations in nepers up to those of 30 dB: within 1e-11."""
+    """Compared with adaptive integration over the shadowing, deviations in nepers up to those of 30 dB: within 1e-11."""
     for middle in np.linspace(-6.0 * deviation - 2.0, 4.0 * deviation + 2.0, 9):
         needed = math.exp(middle)
         if deviation == 0.0:

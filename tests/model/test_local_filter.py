@@ -91,7 +91,7 @@ def test_it_is_the_kalman_filter_slot_by_slot() -> None:
     ],
 )
 def test_a_filter_without_an_end_is_refused(C: np.ndarray, noise: np.ndarray) -> None:
-    """Its covariance grows for ever, or it trusts no measurement any more."""
+    """Its covariance grows forever, or it trusts no measurement any more."""
     with pytest.raises(ValueError, match="does not settle"):
         settled(PROCESS, plant(C, np.array([[0.01]]), noise))
 

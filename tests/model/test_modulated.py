@@ -168,7 +168,7 @@ def test_bursts_that_last_too_long_have_no_limit(r: float) -> None:
 
 
 def test_a_perfect_link_has_no_error() -> None:
-    """A receiver of every packet is exact for ever, however unstable the process is, and has no tail."""
+    """A receiver of every packet is exact forever, however unstable the process is, and has no tail."""
     chain = bursts(0.1, 0.3, 0.0, 0.0)
 
     def rarely(quality: float) -> Outcomes:

@@ -201,7 +201,7 @@ def test_who_is_told_the_inputs_predicts_with_them() -> None:
         aware.learn(k, u)
         errors.append((np.abs(x - one.x_hat).max(), np.abs(x - other.x_hat).max()))
     known = np.array(errors)[60:]
-    assert known[:, 0].max() < 1e-9, "without noise, who knows the inputs and has had one state knows all"
+    assert known[:, 0].max() < 1e-9, "without noise, a receiver that knows the inputs and has had one state knows all"
     assert known[:, 1].max() > 1e-3
 
 

@@ -121,7 +121,7 @@ class Words:
 @pytest.mark.parametrize("learns_at", [0, 3])
 @pytest.mark.parametrize("process", [CLOSE, RESTLESS, STABLE], ids=["close", "restless", "stable"])
 def test_it_is_the_exact_posterior(process: Process, learns_at: int) -> None:
-    """Against all words of coins over six slots, with losses, and a state betrayed in one beside a packet or without."""
+    """Against all words of coins over six slots, with losses, and a state betrayed in one, with a packet or without."""
     words, gamma = Words(process, 6), coins(0.7, 6, 40)
     scale = float(np.sqrt(np.trace(process.initial_covariance + process.Q)))
     heard: list[dict[int, np.ndarray]] = [{} for _ in range(40)]
@@ -182,7 +182,7 @@ def test_before_the_leak_it_is_half_way_between_the_tracks(process: Process) -> 
 
 @pytest.mark.thorough
 def test_one_betrayed_state_breaks_twin_tracks() -> None:
-    """Beside a drifting process its mean error is below 1.5 times the user's after the leak, at five standard errors.
+    """With a drifting process its mean error is below 1.5 times the user's after the leak, at five standard errors.
 
     Behind a link as good as the user's; before the leak it is a thousand times as large.
     """

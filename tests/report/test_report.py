@@ -226,7 +226,7 @@ def test_a_lane_has_a_pixel_for_every_slot_or_the_worst_of_several() -> None:
 
 
 def test_a_chart_has_gaps_where_nothing_is_known_and_few_points() -> None:
-    """A curve of 10⁵ slots is drawn with 400 points; nothing to show is no chart; zeros and ∞ do not break the axis."""
+    """A curve of 10⁵ slots is drawn with 400 points; no chart is drawn of nothing; zeros and ∞ do not break the axis."""
     x = np.arange(100_000.0)
     node = LogChart("label", "slot", "error", [Curve("one", "#123456", x, 1.0 + x, x, 2.0 + x, theory=1.0 + x)]).node
     assert isinstance(node, ET.Element)

@@ -63,7 +63,7 @@ def watched(live: Live, top: Path) -> list[dict[str, str]]:
 
 
 def test_a_run_under_way_and_its_results_are_private(evedrop: Evedrop) -> None:
-    """Nothing of a live run is open to others before slot 0, while it goes on, and at its end; the view's recording included."""
+    """Nothing of a live run is open to others before slot 0, while it runs, and at its end; the view's recording included."""
     live = evedrop.started(
         "run", "vehicle", "--slots", "150", "--pace", "0.002", "--view", "web", out="new/run", **OPEN
     )
@@ -160,7 +160,7 @@ def test_a_folder_of_somebody_else_is_refused(tmp_path: Path, monkeypatch: pytes
 
 
 def test_another_user_of_the_host_gets_nothing(evedrop: Evedrop) -> None:
-    """A process of another user lists no folder and reads no file of a run that goes on.
+    """A process of another user lists no folder and reads no file of a run in progress.
 
     Only root can start such a process. Others look at the modes alone.
     """

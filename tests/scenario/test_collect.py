@@ -37,7 +37,7 @@ def test_what_looks_like_a_scenario_is_taken(tmp_path: Path, name: str, text: st
 
 
 def test_what_cannot_be_read_is_no_scenario(tmp_path: Path) -> None:
-    """Bytes that are no text, a folder of that name, nothing at all."""
+    """Bytes that are not text, a folder of that name, nothing at all."""
     (tmp_path / "a.toml").write_bytes(b"\xff process encoding")
     (tmp_path / "b.toml").mkdir()
     assert not any(is_scenario(tmp_path / f"{name}.toml") for name in "abc")

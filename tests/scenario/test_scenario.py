@@ -262,7 +262,7 @@ def test_a_scenario_that_is_not_there_is_named(tmp_path: Path, source: str, said
 
 
 def test_what_is_no_toml_is_said_with_its_place(tmp_path: Path) -> None:
-    """A slip of the pen is told with line and column, and bytes that are no text are told as such."""
+    """A slip of the pen is told with line and column, and bytes that are not text are reported as such."""
     file = tmp_path / "slip.toml"
     file.write_text("title = 'x'\nslots = = 3\n")
     with pytest.raises(ScenarioError, match="line 2"):

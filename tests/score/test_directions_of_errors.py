@@ -56,7 +56,7 @@ def test_the_error_in_a_direction_is_that_of_its_sum(found: Results) -> None:
 
 
 def test_what_is_encrypted_is_secret_and_nothing_else(found: Results) -> None:
-    """The position and what it is a part of; the speed is no secret, and theory denies that it is."""
+    """The position and what it is a part of; the speed is not secret, and theory denies that it is."""
     antenna = found.summary["directions"]["antenna"]
     assert {name: entry["unbounded"] for name, entry in antenna.items()} == {
         "position": True,

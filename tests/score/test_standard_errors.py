@@ -246,7 +246,7 @@ def test_the_report_says_where_rare_events_carry_the_error(capsys: pytest.Captur
     assert rare is not None
     assert rare.share > 0.9
     assert rare.trials > 40
-    said = "of its expected error is carried by events of which 40 trials contain fewer than one"
+    said = "of its expected error is carried by events that occur less than once on average in 40 trials"
     assert said in report_of(few, capsys)
     assert many.peers["legitimate"].rare_events is not None
     assert many.peers["legitimate"].rare_events.share < RARE_SHARE

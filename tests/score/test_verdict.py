@@ -77,7 +77,7 @@ def test_relative_secrecy_failed_where_one_window_is_below() -> None:
 
 
 def test_a_window_that_is_only_slightly_unlikely_does_not_fail_the_claim() -> None:
-    """Windows share the error rate: below 0 at 1 % in one window of eight is no failure, and at 1 % / 8 it is."""
+    """Windows share the error rate: below 0 at 1 % in one window of eight is not a failure, and at 1 % / 8 it is."""
     p_values = dict.fromkeys(range(WINDOWS), 0.5)
     assert rejected({**p_values, 3: 0.005}) == []
     assert rejected({**p_values, 3: 0.00124}) == [3]

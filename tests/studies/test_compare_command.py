@@ -202,7 +202,9 @@ def test_rare_events_are_said_below_the_table(evedrop: Evedrop) -> None:
     names = ("--schemes", "innovation,plain", "--adversaries", "naive,smart", "--slots", "100", "--out", "found")
     done = evedrop("compare", "eavesdroppers", *names, "--trials", "30")
     (line,) = (
-        line for line in done.out.splitlines() if line.startswith("events of which 30 trials contain fewer than one")
+        line
+        for line in done.out.splitlines()
+        if line.startswith("events that occur less than once on average in 30 trials")
     )
     found = json.loads((evedrop.folder / "found" / "compare.json").read_text())
     for scheme, one in found["schemes"].items():

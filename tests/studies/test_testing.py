@@ -107,7 +107,7 @@ def test_a_live_test_that_fails_says_how_to_see_it_again(evedrop: Evedrop) -> No
 
 
 def test_shipped_names_and_expectations_that_nobody_can_tell(evedrop: Evedrop) -> None:
-    """A shipped scenario by its name; a figure that the run does not have is no pass, though it is no failed run."""
+    """A shipped scenario by its name; a figure that the run does not have is not a pass, though not a failed run either."""
     written(evedrop.folder, unknown=SCENARIO + '[[expect]]\nfigure = "links.smart.lost_by.gremlins"\nbelow = 1\n')
     done = evedrop("test", "bursts", "unknown.toml", "--in-memory", "--trials", "2")
     assert done.status == 1
@@ -215,7 +215,7 @@ def test_tests_end_with_the_process_that_started_them(evedrop: Evedrop) -> None:
 
 
 def test_pytest_collects_scenarios_as_tests(evedrop: Evedrop) -> None:
-    """One test a file; what is no scenario is left alone; failures say found, wanted and command, and no traceback."""
+    """One test a file; files that are not scenarios are left alone; failures say found, wanted and command, and no traceback."""
     written(evedrop.folder, fails=FAILS, holds=HOLDS, wrong=WRONG, _not=HOLDS)
     (evedrop.folder / "pyproject.toml").write_text("[project]\n")
     done = pytest_in(

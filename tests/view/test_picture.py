@@ -180,7 +180,7 @@ BROKEN: dict[str, Callable[[bytes], bytes]] = {
 def test_a_broken_recording_is_said_before_a_viewer_is_started(
     what: str, simulated: Callable[..., Simulated], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One line with the file, what is wrong and a remedy; the viewer would wait for ever."""
+    """One line with the file, what is wrong and a remedy; the viewer would wait forever."""
     monkeypatch.setattr("evedrop.view.picture.subprocess", None)  # no process is started
     rrd = recorded(simulated(60), tmp_path / "r.rrd")
     rrd.write_bytes(BROKEN[what](rrd.read_bytes()))

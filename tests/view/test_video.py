@@ -55,7 +55,7 @@ def ffmpeg() -> str:
 
 @pytest.mark.usefixtures("drawn")
 def test_a_gif_has_all_frames_in_order_and_the_length_that_was_asked_for(tmp_path: Path) -> None:
-    """Fifteen frames a second are no whole number of hundredths of a second; the frames share the difference."""
+    """Fifteen frames a second are not a whole number of hundredths of a second; the frames share the difference."""
     path, told = tmp_path / "v.gif", list[int]()
     assert video_apart(tmp_path / "r.rrd", path, range(15), SIZE, 15.0, told.append) == ["a complaint"]
     with Image.open(path) as gif:

@@ -366,5 +366,5 @@ def test_places(one: str, other: str, overlap: bool) -> None:
 
 @pytest.mark.parametrize("endpoint", ["tcp/h:65536", "tcp/h", "tcp", "serial/x:1", "h:1", "tcp/a:b:1", "tcp/:1"])
 def test_malformed_endpoints(endpoint: str) -> None:
-    """They are no places."""
+    """They are not places."""
     assert place_of(endpoint) is None

@@ -213,7 +213,7 @@ def test_services_and_actions_have_time_to_reply(key: str, seconds: float) -> No
 
 
 def test_each_entity_is_written_down_once(tmp_path: Path) -> None:
-    """A line for each entity that a side shows, however often its token comes; other tokens are no entities."""
+    """A line for each entity that a side shows, however often its token comes; other tokens are not entities."""
     log = EntityLog(tmp_path)
     for token in [NODE, SERVICE, NODE, "other/token", SERVICE]:
         log.add("robot", token)

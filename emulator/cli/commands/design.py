@@ -86,7 +86,7 @@ def _designs(parser: argparse.ArgumentParser) -> None:
     kind.add_argument(
         "--policy",
         action="store_true",
-        help="when to send, for a scheme that goes by acknowledgements: the Pareto front",
+        help="when to send, for a scheme that depends on acknowledgements: the Pareto front",
     )
     kind.add_argument(
         "--budget",

@@ -53,7 +53,7 @@ def _journal(options: argparse.Namespace) -> tuple[dict[str, Any], Sequence[str]
 
     _refuse_others(options, "a folder", ("link", "key", "gaps", "outage", "slot", "save"))
     if options.outage is not None and not options.gaps:
-        raise UsageError("--outage: expected --gaps with it; what a wire itself cuts is never counted as lost")
+        raise UsageError("--outage: expected --gaps with it; losses by the wire itself are never counted")
     recording = journal_recording(options.trace, options.link, options.key, gaps=options.gaps, longest=options.outage)
     return _messages(recording, options)
 

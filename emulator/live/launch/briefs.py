@@ -56,7 +56,7 @@ def flow_of(scenario: Scenario) -> Flow:
     if scenario.pace:
         batch = max(1, min(batch, round(_REPORT_SECONDS / scenario.pace)))
     elif scenario.process.source == "zenoh":
-        batch = 1  # the program's pace is not known, and what it has sent should be on disk when it falls silent
+        batch = 1  # the program's pace is not known, and its messages should be on disk when it falls silent
     sizes = sizes_of(scenario, batch)
     return Flow(window, batch, scenario.longest_outage, max(sizes.of_kinds.values()))
 
@@ -99,7 +99,7 @@ class ObserverTask:
     shard: bool = False
     """Whether the run is a shard of a larger one: its score will be merged, and it cannot be steered."""
     paused: bool = False
-    """Whether the run is held before slot 0, until the operator lets it go on."""
+    """Whether the run is held before slot 0, until the operator lets it continue."""
 
 
 def briefs_of(

@@ -43,6 +43,6 @@ class HeartbeatFile:
     def _keep(self, path: Path) -> None:
         while not self._over.is_set():
             if self._connected():
-                with suppress(OSError):  # the process then counts as unhealthy, but goes on
+                with suppress(OSError):  # the process then counts as unhealthy, but continues
                     path.touch()
             self._over.wait(self._seconds)

@@ -1,4 +1,4 @@
-"""The operator's access to a run while it goes on: `control.json` in the run's results folder, mode 0600.
+"""The operator's access to a run in progress: `control.json` in the run's results folder, mode 0600.
 
 The file is written when the run starts and removed when it ends, for whatever reason.
 """
@@ -46,20 +46,20 @@ def remove_control(folder: Path) -> None:
 
 
 def no_run(folder: Path, why: str) -> UsageError:
-    """The error for steering a run that is not going on; why: how that was found out."""
+    """The error for steering a run that is not in progress; why: how that was found out."""
     return UsageError(
         f"no run is going on in {folder}; {why}; give the results folder of a run or wire between its start and its end"
     )
 
 
 def read_controls(folder: Path) -> list[Control]:
-    """Read the control file of a run that goes on, or those of its shards. Raises UsageError as `read_control` does."""
+    """Read the control file of a run in progress, or those of its shards. Raises UsageError as `read_control` does."""
     shards = sorted(path.parent for path in folder.glob(f"shards/*/{_NAME}"))
     return [read_control(shard) for shard in shards] or [read_control(folder)]
 
 
 def read_control(folder: Path) -> Control:
-    """Read the control file of a run that goes on. Raises UsageError if there is none, or it is malformed."""
+    """Read the control file of a run in progress. Raises UsageError if there is none, or it is malformed."""
     path = folder / _NAME
     try:
         found = json.loads(text_of(path, _MOST_BYTES))

@@ -65,7 +65,7 @@ class Inbox:
         while len(found) < most and self._subscriber is not None:
             try:
                 sample = self._subscriber.try_recv()
-            except zenoh.ZError:  # as for `recv`, which goes on with the next session
+            except zenoh.ZError:  # as for `recv`, which continues with the next session
                 break
             if sample is None:
                 break

@@ -1,4 +1,4 @@
-"""Deliveries delayed by a fraction of a slot in real time: sent when they are due, in order, while the router goes on.
+"""Deliveries delayed by a fraction of a slot in real time: sent when they are due, in order, while the router continues.
 
 Delays of whole slots are emulated time, the same in every run; this module only decides when a message is really sent.
 """

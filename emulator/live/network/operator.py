@@ -1,4 +1,4 @@
-"""The operator's requests to a run that goes on, and the answers: a Zenoh query to the observer.
+"""The operator's requests to a run in progress, and the answers: a Zenoh query to the observer.
 
 Source: docs/protocol.md, request and answer.
 """
@@ -102,7 +102,7 @@ def ask(control: Control, request: Request, patience: float) -> Answer | None:
     """
     zenoh.init_log_from_env_or("off")
     key = RunKeys(control.run).control(OBSERVER)
-    # A run that goes on has a router: one attempt is enough.
+    # A run in progress has a router: one attempt is enough.
     with zenoh.open(zenoh.Config.from_json5(json.dumps(client_config(control)))) as session:
         for reply in session.get(key, payload=enclosed(key, request.pack()), timeout=patience):
             answer = None if reply.ok is None else payload_of(key, reply.ok.payload.to_bytes())

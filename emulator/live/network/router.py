@@ -5,7 +5,7 @@
                      └── …
 
 A receiver that is present gets one delivery in every slot, with everything that arrives in the slot. At a barrier on the
-uplink the router journals all slots before it and waits until the conductor lets it go on; links change nowhere else. When
+uplink the router journals all slots before it and waits until the conductor lets it continue; links change nowhere else. When
 packets are sent again, the router routes them again, with the same fates, as a restarted router would.
 """
 
@@ -365,7 +365,7 @@ class Routing:
                 self._put_journal(Journal(slots.start, len(slots), accounts).pack())
 
     def _hold(self, k: int) -> None:
-        """Pass a barrier on, and obey the conductor until it lets the router go on."""
+        """Pass a barrier on, and obey the conductor until it lets the router continue."""
         for downlink in self._downlinks.values():
             downlink.mark(k)
         self._flush()

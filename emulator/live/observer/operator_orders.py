@@ -1,4 +1,4 @@
-"""The operator's requests that await an answer, and steps, in which a held run goes on for some slots."""
+"""The operator's requests that await an answer, and steps, in which a held run continues for some slots."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Order:
 
 @dataclass(frozen=True)
 class OperatorStep:
-    """A step: the run goes on from `first`, before which it was held, and is held again before `until`."""
+    """A step: the run continues from `first`, before which it was held, and is held again before `until`."""
 
     order: Order
     first: int

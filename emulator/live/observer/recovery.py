@@ -98,7 +98,7 @@ class Recovery:
         self._close(done, now)
 
     def _close(self, done: int, now: float) -> None:
-        """Record the outages that ended, now that the run goes on."""
+        """Record the outages that ended, now that the run continues."""
         for name, (slot, since) in self._back.items():
             outage = ConnectionOutage(name, slot, done, now - since)
             self.outages.append(outage)

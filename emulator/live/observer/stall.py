@@ -64,11 +64,11 @@ class Stall:
         held: bool,
         missing: bool,
     ) -> None:
-        """Check whether the run goes on; all slots below `done` are joined. Raises Silence if a process has held it up too long.
+        """Check whether the run makes progress. Raises Silence if a process has held it up too long.
 
-        reported: process → the first slot that it has not reported; unneeded: processes whose reports are not needed to join
-        slots. held: the run is held, and no process has anything to do; missing: some process is not on the network, which
-        is handled elsewhere.
+        All slots below `done` are joined. reported: process → the first slot that it has not reported; unneeded: processes
+        whose reports are not needed to join slots. held: the run is held, and no process has anything to do; missing: some
+        process is not on the network, which is handled elsewhere.
         """
         now = self._clock.monotonic()
         if done > self._done or held:

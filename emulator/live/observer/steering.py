@@ -1,4 +1,4 @@
-"""Steers a run: when it is held and every process has reported all earlier slots, carries out due events, and lets it go on.
+"""Steers a run: when it is held and every process has reported all earlier slots, carries out due events, and lets it continue.
 
 So an event takes effect exactly between two slots, whether it is the scenario's or the operator's. While the sensor holds,
 only packets delayed by links are under way.

@@ -279,7 +279,7 @@ class ObserverPart:
     shard: bool = field(metadata=entry(flag))
     """Whether the run is a shard of a larger one."""
     paused: bool = field(metadata=entry(flag))
-    """Whether it holds the run before slot 0, until the operator lets it go on."""
+    """Whether it holds the run before slot 0, until the operator lets it continue."""
     operator_identity: Identity | None = field(metadata=inner(Identity, or_null=True))
     classes: Mapping[str, Mapping[str, Any]] = field(metadata=entry(named(named(anything))))
     """Question → answer, of eavesdroppers' classes that are not built in."""

@@ -95,7 +95,7 @@ class Abandon(ControlCommand):
 
 @dataclass(frozen=True)
 class Go(ControlCommand):
-    """To router and sensor: go on after a hold."""
+    """To router and sensor: continue after a hold."""
 
     do = "go"
     slot: int

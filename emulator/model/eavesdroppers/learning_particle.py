@@ -165,7 +165,7 @@ class LearningParticle(Learner):
         return cloud.moved(chosen, theta, moments)._replace(weight=np.where(chosen, 0.0, cloud.weight))
 
     def _portion(self, weight: Floats) -> Floats:
-        """Probabilities of the particles, (N, R), from logarithms of which the largest is 0 in every trial."""
+        """Probabilities of the particles, (N, R), from logarithms, the largest of which is 0 in every trial."""
         likely = exp(np.maximum(self._narrow(weight), -700.0))
         return likely / summed(likely)
 

@@ -22,7 +22,7 @@ class DitheredQuantiser:
     """Rounds a state plus dither to one of 2^bits levels; a reader of the level subtracts the dither.
 
     State i of slot k has levels over [−H, H), H = `deviations` · √Σ_k[i, i], in steps Δ = 2H · 2^−bits. The dither d is uniform
-    on [−Δ/2, Δ/2). What is read differs from the state by a number that is uniform on (−Δ/2, Δ/2] and independent of the state,
+    on [−Δ/2, Δ/2). The value read differs from the state by a number that is uniform on (−Δ/2, Δ/2] and independent of the state,
     as long as state plus dither lies in the range; beyond, it is cut to the last level (overload).
 
     Source: docs/mathematics.md, quantised packets.

@@ -123,7 +123,7 @@ class PartialEncryption(Scheme):
 
     @property
     def secret_bits(self) -> int:
-        """The pads of the encrypted states. The schedule is no secret: the header says the type."""
+        """The pads of the encrypted states. The schedule is not secret: the header says the type."""
         return _WORD_BITS * int(self._hidden.sum())
 
     def outcomes(self, mu: float) -> Outcomes:

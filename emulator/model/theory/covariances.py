@@ -329,7 +329,7 @@ def _stationary(process: Process, kept: float, source: Floats) -> Floats:
 
 
 def _fixed_point(F: Floats, source: Floats) -> Floats:
-    """S = F S Fᵀ + source, (n, n). Raises LinAlgError; near the bound of stability S may be no covariance."""
+    """S = F S Fᵀ + source, (n, n). Raises LinAlgError; near the bound of stability S may not be a covariance."""
     n = len(F)
     if n <= _FEW_STATES:
         squared = (F[:, None, :, None] * F[None, :, None, :]).reshape(n * n, n * n)

@@ -134,7 +134,10 @@ class Design:
         if not self.left_out:
             return None
         who = ", ".join(f"{name} ({strategy})" for name, strategy in self.left_out.items())
-        return f"left out: {who}: no closed form of its error is known; what holds against a genie holds against all"
+        return (
+            f"left out: {who}: no closed form of its error is known; a guarantee against a genie holds against every "
+            "eavesdropper"
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """The JSON of `evedrop design`; inf is null, and `minimum` and `left_out` are present only if they have values."""

@@ -41,7 +41,7 @@ class RemainingCovariances:
         """M_k of the next slot, (n, n)."""
         joint = _triangularised(product(self._A, self._state)[None], self._noise, self._noise)[0]
         n = len(self._noise)
-        # A column that is scaled down still means a variance that is as good as infinite, beside which M_k is the same.
+        # A column that is scaled down still means a variance that is as good as infinite, compared with which M_k is the same.
         self._state = joint[:n, :n] / np.maximum(1.0, np.abs(joint[:n, :n]).max(axis=0) / self._largest)
         return _squared(joint[n:, n:])
 

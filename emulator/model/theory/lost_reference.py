@@ -64,6 +64,6 @@ def _growths(process: Process, received: float, acknowledged: tuple[float, float
 
 
 def _growth_until(square: float, ends: float, goes_on: float) -> float:
-    """The sum over j of square^{j+1} times the probability that j slots go on before one ends; inf if it has no bound."""
+    """The sum over j of square^{j+1} times the probability that the growth ends after j slots; inf if it has no bound."""
     rest = 1.0 - square * goes_on
     return square * ends / rest if rest > 0.0 else math.inf

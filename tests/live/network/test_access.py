@@ -177,7 +177,7 @@ def test_eavesdropper_gets_nothing_by_asking(stage: Bench) -> None:
     with connect(stage.briefs[EVE]) as attacker:
         for key in [*all_keys(stage).values(), *wildcards(stage)]:
             replies = [str(reply.ok.key_expr) for reply in attacker.get(key, timeout=5.0) if reply.ok is not None]
-            # A session may look at itself: its own part of Zenoh's administration is no news from anybody.
+            # A session may look at itself: its own part of Zenoh's administration tells of no other process.
             assert [found for found in replies if not found.startswith(f"@/{attacker.zid()}/")] == [], key
     talk(stage)
     assert asked == []
@@ -338,7 +338,7 @@ def test_the_table_grants_nothing_twice_and_no_wildcard() -> None:
         "eve",
         writes=("evedrop/r/telemetry/eve", "evedrop/r/progress/eve"),
         reads=("evedrop/r/downlink/eve", "evedrop/r/control/eve"),
-        token="evedrop/r/alive/eve",  # noqa: S106 - a liveliness token is no secret
+        token="evedrop/r/alive/eve",  # noqa: S106 - a liveliness token is not secret
         checks=("evedrop/r/alive/eve",),
     )
     assert eve == own

@@ -46,7 +46,7 @@ from pathlib import Path
 
 from evedrop.model.eavesdroppers.naive import Naive
 
-SEED = int("{str(SEED)[::-1]}"[::-1])  # so that its constants are no find
+SEED = int("{str(SEED)[::-1]}"[::-1])  # so that its own constants are not found
 OURS = {OURS!r}
 
 

@@ -124,5 +124,5 @@ def test_what_waits_is_bounded_by_sender() -> None:
 
 
 def test_a_window_in_some_rounds_is_allowed() -> None:
-    """All that is sent again in four rounds, before anything is read, is no flood."""
+    """All that is sent again in four rounds, before anything is read, is not a flood."""
     assert allowance(10**6, 100, 25) > 4 * (100 // 25 + 2) * 10**6

@@ -155,7 +155,7 @@ def test_an_answer_that_names_another_key_is_none(stage: Stage) -> None:
 
 
 def test_a_malformed_message_of_its_own_key_is_an_error(stage: Stage) -> None:
-    """What names its key and is no message is not dropped: the error names the key, and with it the sender."""
+    """Bytes that name their key but are not a message are not dropped: the error names the key, and with it the sender."""
     key = stage.keys.downlink("eve")
     with Session(stage.eve) as session:
         inbox = session.inbox(key)
@@ -222,7 +222,7 @@ def test_a_connection_that_takes_one_key_for_another_is_replaced(stage: Stage) -
 
 
 def test_an_inbox_that_is_closed_says_so(stage: Stage) -> None:
-    """Nobody waits for ever for what cannot arrive any more."""
+    """Nobody waits forever for what cannot arrive any more."""
     with Session(stage.eve) as session:
         inbox = session.inbox(stage.keys.downlink("eve"))
         caught: list[Any] = []

@@ -97,7 +97,7 @@ def test_a_late_packet_from_the_future_is_refused() -> None:
 
 @given(SLOTS)
 def test_marks(k: int) -> None:
-    """A mark is no packet and no delivery, a word that the sensor holds no truth, and each says before which slot."""
+    """A mark is neither packet nor delivery, a word that the sensor holds is not truth, and each says before which slot."""
     mark, held = Reader("u", packets.barrier(k)), Reader("t", telemetry.held(k))
     assert (packets.is_barrier(mark), packets.is_barrier(Reader("u", packets.uplink(k, np.zeros((1, 1)))))) == (
         True,

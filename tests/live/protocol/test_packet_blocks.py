@@ -130,7 +130,7 @@ def expect_same_deliveries(payloads: list[bytes], shape: tuple[int, int], header
 
 SPOILT: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     "another slot": lambda fields: {**fields, "k": 99},
-    "a slot that is no number": lambda fields: {**fields, "k": "8"},
+    "a slot that is not a number": lambda fields: {**fields, "k": "8"},
     "NaN": lambda fields: {**fields, "z": np.full(2, np.nan).tobytes() + fields["z"][16:]},
     "too short": lambda fields: {**fields, "z": fields["z"][:-8]},
     "no bytes": lambda fields: {**fields, "z": [1.0]},
