@@ -13,7 +13,6 @@ from evedrop.kernels.elementary import semidefinite_factor
 from evedrop.model.controllers import CONTROLLERS
 from evedrop.model.schemes import SCHEMES
 from evedrop.names import LEGITIMATE
-from evedrop.scenario.events.effects import Leave
 from evedrop.scenario.plant import ControllerTable, PlantTable, assignment_of, limit_mistakes, plant_of
 from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.valid import ValidTables
@@ -147,7 +146,7 @@ def _outages(tables: ValidTables, controller: ControllerTable) -> Iterator[str]:
         return
     for i, event in tables.event:
         for act in event.acts():
-            if isinstance(act.effect, Leave) and LEGITIMATE in act.names:
+            if act.effect.present is False and LEGITIMATE in act.names:
                 yield (
                     f"event.{i}.{act.entry}: is {LEGITIMATE}, but {why}, and the loop would stand still; expected a cut of its "
                     "link, over which the estimate is carried on"

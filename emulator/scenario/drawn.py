@@ -21,7 +21,6 @@ from evedrop.model.process import Floats
 from evedrop.model.slot.link import NEVER
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.events import EVENTS
-from evedrop.scenario.events.effects import Leave, LinkCut, LinkHealed, LinkSettings, Return
 from evedrop.scenario.events.event import EventKind, Fault
 from evedrop.scenario.link_table import LinkTable, changed_link
 from evedrop.scenario.nemesis import NEMESIS, NemesisTable
@@ -117,21 +116,26 @@ class _Nemesis:
         loop = scenario.controller is not None and (
             scenario.controller.acts_on == "estimate" or scenario.legitimate.knows_input
         )
-        barred: set[object] = set()
-        if loop and name == LEGITIMATE:  # the loop would stand still
-            barred.add(Leave)
-        if any(event.does is LinkSettings and name in event.names for event in scenario.event):
-            barred.add(LinkSettings)
-        return [kind for kind in self._kinds if kind.does not in barred and not _fault(kind).together]
+        stays = loop and name == LEGITIMATE  # the loop would stand still
+        changed = any(event.does.changes_settings and name in event.names for event in scenario.event)
+        return [
+            kind
+            for kind in self._kinds
+            if not _fault(kind).together
+            and not (stays and kind.does.present is False)
+            and not (changed and kind.does.changes_settings)
+        ]
 
     def _taken_by_file(self, name: str) -> list[Span]:
         """The slots in which the file's own events cut a receiver off or make it leave."""
         spans: list[Span] = []
         begun: dict[Fate, int] = {}
         for act in acts_of(self._scenario.event):
-            if name in act.names and isinstance(act.effect, (LinkCut, Leave)):
+            if name not in act.names or act.effect.loses is None:
+                continue
+            if act.effect.loses:
                 begun[act.effect.reason] = act.at
-            elif name in act.names and isinstance(act.effect, (LinkHealed, Return)):
+            else:
                 spans.append((begun.pop(act.effect.reason, act.at), act.at))
         return spans + [(start, NEVER) for start in begun.values()]
 
@@ -154,7 +158,7 @@ class _Nemesis:
         kinds, needed = self.kinds(name), self._scenario.leaks.get(name)
         for start, end, choice in self._spans(f"receiver/{name}") if kinds else ():
             kind = kinds[int(choice * len(kinds))]
-            missed = kind.does is Leave and needed is not None and start <= needed < end
+            missed = kind.does.present is False and needed is not None and start <= needed < end
             if missed or not self._free(name, start, end):
                 continue
             yield self._event(kind, start, end, name)

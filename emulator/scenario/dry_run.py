@@ -23,7 +23,6 @@ from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.names import LEGITIMATE
 from evedrop.plugins import names_in
-from evedrop.scenario.events.effects import LinkSettings
 from evedrop.scenario.receivers import EavesdropperTable
 from evedrop.scenario.table import model_mistakes
 from evedrop.scenario.tables import Scenario
@@ -111,7 +110,7 @@ def _link_mistakes(scenario: Scenario, problem: Problem) -> Iterator[str]:
     for i, event in enumerate(scenario.event):
         # An event's models are checked when tables are compared: mistakes are reported there, not here.
         for act in event.acts():
-            settings = act.effect.entries if isinstance(act.effect, LinkSettings) else None
+            settings = act.effect.entries
             if settings is not None and not _model_mistakes(settings):
                 yield from _settings_mistakes(f"event.{i}.{act.entry}", settings, problem)
 

@@ -13,7 +13,6 @@ from pydantic import ValidationError
 
 from evedrop.model.links.link import Fate
 from evedrop.model.registry import place_of
-from evedrop.scenario.events.effects import Leave, LinkCut, LinkHealed, LinkSettings, Return
 from evedrop.scenario.events.event import Act, EventKind, Surroundings
 from evedrop.scenario.link_table import CHANGEABLE, OTHER_MODEL, LinkTable, changed_link, unchangeable
 from evedrop.scenario.sentences import sentences
@@ -43,7 +42,7 @@ def event_mistakes(tables: ValidTables) -> Iterator[str]:
                 yield f"{path}.{event.names_in}: names {as_toml(name)}{hint}; expected {listed(tables.receivers)}"
         yield from _own(path, type(event), partial(_compared, path, event, surroundings))
         for act in event.acts():
-            if isinstance(act.effect, LinkSettings) and act.effect.entries is not None:
+            if act.effect.changes_settings and act.effect.entries is not None:
                 for name in act.names:
                     yield from _change_mistakes(f"{path}.{act.entry}", name, act.effect.entries, tables)
     yield from _order_mistakes(tables)
@@ -74,8 +73,8 @@ def away_in(tables: ValidTables, name: str, slot: int) -> str | None:
     """Say that a receiver is down or paused in a slot, and by which event; None if it is present."""
     away = None
     for i, act in _acts(tables):
-        if act.at <= slot and name in act.names and isinstance(act.effect, (Leave, Return)):
-            away = (i, act.at, act.effect.reason) if isinstance(act.effect, Leave) else None
+        if act.at <= slot and name in act.names and act.effect.present is not None:
+            away = None if act.effect.present else (i, act.at, act.effect.reason)
     return None if away is None else f"{name} is {_said(away[2])} (event.{away[0]}, from slot {away[1]} on)"
 
 
@@ -127,24 +126,24 @@ def _order_mistakes_of(name: str, acts: Sequence[Numbered]) -> Iterator[str]:
     ended = -1
     for i, act in acts:
         path = f"event.{i}.{act.entry}: {name}"
-        match act.effect:
-            case LinkCut():
-                if cut is not None:
-                    yield f"{path} is cut already, from slot {cut} on; expected a heal before"
-                cut = act.at
-            case LinkHealed():
-                if cut is None:
-                    yield f"{path} is not cut at slot {act.at}; expected a cut before"
-                cut = None
-            case Leave(reason):
-                if away is not None:
-                    yield f"{path} is {_said(away[1])} already, from slot {away[0]} on; expected it to be back"
-                elif act.at == ended:
-                    yield f"{path} comes back only in slot {act.at}; expected a later slot"
-                away = act.at, reason
-            case Return(reason, after=after):
-                if away is None or away[1] != reason:
-                    yield f"{path} is not {_said(reason)} at slot {act.at}; expected a {after} before"
-                elif act.at <= away[0]:
-                    yield f"{path} leaves in the same slot, {act.at}; expected a later slot"
-                away, ended = None, act.at
+        effect = act.effect
+        if effect.cuts is True:
+            if cut is not None:
+                yield f"{path} is cut already, from slot {cut} on; expected a heal before"
+            cut = act.at
+        if effect.cuts is False:
+            if cut is None:
+                yield f"{path} is not cut at slot {act.at}; expected a cut before"
+            cut = None
+        if effect.present is False:
+            if away is not None:
+                yield f"{path} is {_said(away[1])} already, from slot {away[0]} on; expected it to be back"
+            elif act.at == ended:
+                yield f"{path} comes back only in slot {act.at}; expected a later slot"
+            away = act.at, effect.reason
+        if effect.present is True:
+            if away is None or away[1] != effect.reason:
+                yield f"{path} is not {_said(effect.reason)} at slot {act.at}; expected a {effect.after} before"
+            elif act.at <= away[0]:
+                yield f"{path} leaves in the same slot, {act.at}; expected a later slot"
+            away, ended = None, act.at

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from evedrop.model.slot.link import NEVER, Change, ReceiverOutage
-from evedrop.scenario.events.effects import Jamming, Leave, LinkCut, LinkHealed, LinkSettings, Return, Spoofing
+from evedrop.scenario.events.effects import Jamming, Spoofing
 from evedrop.scenario.events.event import Act, EventKind
 
 Changed = Callable[[str, Mapping[str, Any]], dict[str, Any]]
@@ -47,17 +47,17 @@ class Timeline:
     @property
     def jams(self) -> list[list[int]] | None:
         """Slots [from, to) in which acknowledgements are attacked; None without such events: an attack then lasts all run."""
-        return self._spans(Jamming) or None
+        return self._spans(Jamming.attacked) or None
 
     @property
     def spoofs(self) -> list[list[int]]:
         """Slots [from, to) of events in which measurements are attacked."""
-        return self._spans(Spoofing)
+        return self._spans(Spoofing.attacked)
 
-    def _spans(self, kind: type[Jamming | Spoofing]) -> list[list[int]]:
+    def _spans(self, attacked: str) -> list[list[int]]:
         spans: list[list[int]] = []
         for act in self.acts:
-            if isinstance(act.effect, kind):
+            if act.effect.attacked == attacked:
                 if act.effect.on:
                     spans.append([act.at, NEVER])
                 else:
@@ -85,14 +85,11 @@ def _changes(name: str, acts: Sequence[Act], changed: Changed) -> Iterator[Chang
     for act in acts:
         if name not in act.names:
             continue
-        match act.effect:
-            case LinkSettings(changes):
-                entries = {} if changes is None else _over(entries, changes)
-                yield Change(act.at, settings=changed(name, entries))
-            case LinkCut():
-                yield Change(act.at, cut=True)
-            case LinkHealed():
-                yield Change(act.at, cut=False)
+        if act.effect.changes_settings:
+            entries = {} if act.effect.entries is None else _over(entries, act.effect.entries)
+            yield Change(act.at, settings=changed(name, entries))
+        if act.effect.cuts is not None:
+            yield Change(act.at, cut=act.effect.cuts)
 
 
 def _over(entries: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -103,14 +100,14 @@ def _over(entries: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, A
 
 
 def _outages(name: str, acts: Sequence[Act]) -> Iterator[Away]:
-    began: tuple[int, Leave] | None = None
+    began: Act | None = None
     for act in acts:
-        if name not in act.names:
+        if name not in act.names or act.effect.present is None:
             continue
-        if isinstance(act.effect, Leave):
-            began = act.at, act.effect
-        elif began is not None and isinstance(act.effect, Return):
-            yield Away(began[0], act.at, began[1].reason, act.effect.keeps_state)
+        if not act.effect.present:
+            began = act
+        elif began is not None:
+            yield Away(began.at, act.at, began.effect.reason, act.effect.keeps_state)
             began = None
     if began is not None:
-        yield Away(began[0], NEVER, began[1].reason, began[1].keeps_state)
+        yield Away(began.at, NEVER, began.effect.reason, began.effect.keeps_state)

@@ -234,7 +234,7 @@ def _scenario(scenario: Scenario, encoding: Tables, attack: str, matches: Sequen
         "event": [
             table
             for event, table in zip(scenario.event, tables["event"], strict=True)
-            if event.does is not Jamming and set(event.names) <= {LEGITIMATE}
+            if event.does.attacked != Jamming.attacked and set(event.names) <= {LEGITIMATE}
         ],
         "expect": [],
         "record_trials": 1,

@@ -21,10 +21,9 @@ from evedrop.live.protocol.commands import Go, Hold, LinkChange
 from evedrop.live.protocol.news import ProcessRequest
 from evedrop.loading.file import with_event
 from evedrop.model.slot.link import Change
-from evedrop.names import ROUTER, SENSOR
+from evedrop.names import ROUTER, SENSOR, ProcessAction
 from evedrop.news import Held, RunEvent, Tell
 from evedrop.scenario import Scenario
-from evedrop.scenario.events.effects import Leave, Return
 from evedrop.scenario.events.event import Act
 
 
@@ -52,7 +51,7 @@ class Steering:
         """The slot before which the sensor holds; None while it does not."""
         self._pending: list[Act] = []
         self._left: dict[str, int] = {}
-        self._waiting: tuple[Act, Leave | Return] | None = None
+        self._waiting: tuple[Act, ProcessAction] | None = None
         self._confirmed = True
         self._since = 0.0
         self._orders: deque[Order] = deque()
@@ -147,10 +146,10 @@ class Steering:
         """Whether the last act on a process has taken effect."""
         if self._waiting is None:
             return True
-        act, effect = self._waiting
-        there = effect.action.connected
+        act, action = self._waiting
+        there = action.connected
         if self._confirmed and (there is None or self._conductor.there(act.names[0]) is there):
-            if isinstance(effect, Return):
+            if act.effect.present:
                 self._conductor.absent -= set(act.names)
             self._waiting = None
             return True
@@ -166,15 +165,16 @@ class Steering:
 
     def _may(self, act: Act) -> bool:
         """Whether an act may begin: a receiver is ended or stopped only after it has left, in case it missed the hold."""
-        return not isinstance(act.effect, Leave) or all(self._left.get(name) == act.at for name in act.names)
+        return act.effect.present is not False or all(self._left.get(name) == act.at for name in act.names)
 
     def _do(self, k: int, act: Act) -> None:
         self._note(k, act.said, "scenario")
-        if isinstance(act.effect, (Leave, Return)):
-            if isinstance(act.effect, Leave):
-                self._conductor.absent |= set(act.names)
-            self._waiting, self._confirmed, self._since = (act, act.effect), False, time.monotonic()
-            self._tell(ProcessRequest(act.effect.action, act.names[0], k, len(self.events)))
+        if act.effect.present is False:
+            self._conductor.absent |= set(act.names)
+        action = act.effect.action
+        if action is not None:
+            self._waiting, self._confirmed, self._since = (act, action), False, time.monotonic()
+            self._tell(ProcessRequest(action, act.names[0], k, len(self.events)))
 
     def _obey(self, k: int, order: Order) -> None:
         """Carry out a request of the operator before slot k."""

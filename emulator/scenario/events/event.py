@@ -17,7 +17,7 @@ from pydantic_core import PydanticCustomError
 from evedrop.errors import NoAnswer
 from evedrop.model.registry import place_of
 from evedrop.model.schemes.scheme import Scheme
-from evedrop.scenario.events.effects import Effect, Jamming, Leave, Nothing, Return, Spoofing
+from evedrop.scenario.events.effects import Effect
 from evedrop.scenario.table import Found, Table
 from evedrop.streams import MOST_SLOTS
 
@@ -152,9 +152,9 @@ def _expect_acts(acts: Sequence[object]) -> None:
     for act in acts:
         if not isinstance(act, Act) or not isinstance(act.effect, Effect):
             raise NoAnswer(f"acts() gave {act!r:.60}; expected an Act with an effect")
-        if not act.names and not isinstance(act.effect, (Nothing, Jamming, Spoofing)):
+        if not act.names and act.effect.needs_receivers:
             raise NoAnswer("it names no receiver; expected one, or several")
-        if len(act.names) != 1 and isinstance(act.effect, (Leave, Return)):
+        if len(act.names) != 1 and act.effect.one_receiver:
             raise NoAnswer("it names several receivers; expected one")
 
 

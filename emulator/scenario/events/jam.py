@@ -18,7 +18,7 @@ class Jam(Attack):
     jam: Annotated[str, Field(examples=["acknowledgements"])]
 
     kind = "jam"
-    attacked = "acknowledgements"
+    attacked = Jamming.attacked
     does = Jamming
 
     def undescribed(self, surroundings: Surroundings) -> Iterator[str]:

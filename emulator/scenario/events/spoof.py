@@ -19,7 +19,7 @@ class Spoof(Attack):
     spoof: Annotated[str, Field(examples=["measurements"])]
 
     kind = "spoof"
-    attacked = "measurements"
+    attacked = Spoofing.attacked
     does = Spoofing
 
     def undescribed(self, surroundings: Surroundings) -> Iterator[str]:
