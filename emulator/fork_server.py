@@ -1,4 +1,4 @@
-"""A fork server: a bare process from which the processes of a run are forked, so that their imports are made once.
+"""A fork server: a bare process from which the processes of a run are forked, so that modules are imported only once.
 
 It knows no scenario, no seed and no brief. For each process the launcher (`evedrop.live.launch.preloading`) sends the words
 of its command, its environment, folder, umask and standard files; a fork then runs that command as a new interpreter would.

@@ -1,4 +1,4 @@
-"""Tables on narrow terminals: one that does not fit is shown row by row, an entry a line."""
+"""Tables on narrow terminals: a table that does not fit is shown row by row, one entry per line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The results of runs and sweeps on the terminal: the tables and sentences of `evedrop.report`, in its width."""
+"""The results of runs and sweeps on the terminal: the tables and sentences of `evedrop.report`, at its width."""
 
 from __future__ import annotations
 

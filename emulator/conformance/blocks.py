@@ -1,4 +1,4 @@
-"""The rule for many slots at once: blocks of slots give the bits of single slots, wherever the blocks begin.
+"""The rule for many slots at once: blocks of slots give the same bits as single slots, wherever the blocks begin.
 
 Source: docs/your-own.md, many slots at once.
 """

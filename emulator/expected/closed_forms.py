@@ -1,4 +1,4 @@
-"""Closed forms for receivers whose slots differ, because the packets depend on acknowledgements, or that take noise for states.
+"""Closed forms for receivers whose slots differ, because packets depend on acknowledgements, or that mistake noise for states.
 
 Source: docs/mathematics.md, acknowledged references, schedules by holding time and noise packets.
 """

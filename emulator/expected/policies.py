@@ -1,4 +1,4 @@
-"""The best policies of sending for a scenario, against each of its eavesdroppers.
+"""The best transmission policies for a scenario, against each of its eavesdroppers.
 
 Source: docs/mathematics.md, the best policy.
 """

@@ -1,4 +1,4 @@
-"""Figures as text: with their standard errors, to the digits that these leave."""
+"""Figures as text: with their standard errors, and only the digits that these leave significant."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Monte Carlo: simulates the trials of a live run in memory, to the same bits, without a network.
+"""Monte Carlo: simulates the trials of a live run in memory, with the same bits, without a network.
 
 Trials run in fixed blocks of 500 and are merged in trial order: the results are the same for any number of workers.
 """

@@ -1,4 +1,4 @@
-"""Means that rare events carry, by splitting: trials with large errors are copied, and every copy counts for less.
+"""Estimates means that rare events dominate, by splitting: trials with large errors are copied, and copies weigh less.
 
 A copy is a trial that reads the random numbers of its ancestor up to the slot of the split (`evedrop.streams.Lineage`), so
 the simulation is that of all other trials, and nothing in it has to be copied. After a split the slots before it are simulated

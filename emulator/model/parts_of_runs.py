@@ -1,4 +1,4 @@
-"""The slots of a long run in parts, so that what is computed of them needs no more memory the longer the run."""
+"""The slots of a long run in parts, so that computations need no more memory for a longer run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What one twin track tells about the other: the distribution of their distance.
+"""What one twin track reveals about the other: the distribution of their distance.
 
 A track of slot k is a = F ξ + η, its twin b = F ξ' + η, with F = A^k L0 and the same noise η ~ N(0, N_k).
 Given a, the distance b − a has mean −A^k Σ0 A^kᵀ Σ_k⁻¹ a, whichever of the two is the true one. One triangularisation

@@ -1,4 +1,4 @@
-"""What became of a sender's messages, from the numbers that it gave those that arrived: a missing number is a lost message.
+"""Finds a sender's lost messages by the numbers of those that arrived: a missing number is a lost message.
 
 Source: docs/links.md, recordings of messages.
 """

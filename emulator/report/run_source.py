@@ -1,4 +1,4 @@
-"""What the report of a run is made from: its summary, its scenario, and the parts of its tables that it shows."""
+"""The data for the report of a run: its summary, its scenario, and the parts of its tables that the report shows."""
 
 from __future__ import annotations
 

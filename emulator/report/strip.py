@@ -1,4 +1,4 @@
-"""A lane as a picture in the page: a row of pixels, one for a slot, as a PNG of a few hundred bytes."""
+"""A lane as a picture in the page: a row of pixels, one for each slot, as a PNG of a few hundred bytes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The files of a wire's folder that other rooms look for. Imports neither Zenoh nor Rerun."""
+"""The files of a wire's folder that other packages look for. Imports neither Zenoh nor Rerun."""
 
 from __future__ import annotations
 

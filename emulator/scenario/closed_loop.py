@@ -1,4 +1,4 @@
-"""Mistakes in plant, controller and given states that only show with process, scheme, legitimate estimator and events.
+"""Mistakes in plant, controller and given states that only show next to process, scheme, legitimate estimator and events.
 
 Source: docs/scenario.md, process, plant and controller.
 """

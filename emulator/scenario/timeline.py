@@ -1,4 +1,4 @@
-"""The events of a scenario in order: the slots before which the run is held, the acts then, and the effects on each link.
+"""The events of a scenario in order: the slots before which the run is held, the actions there, and the effects on each link.
 
 Source: docs/scenario.md, events.
 """

@@ -1,4 +1,4 @@
-"""Tables as the text of a TOML file that people can read: a list of numbers or words, or a row of a matrix, on a line."""
+"""Tables as the text of a TOML file that people can read: a list of numbers or words, or a row of a matrix, on one line."""
 
 from __future__ import annotations
 

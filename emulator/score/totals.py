@@ -1,4 +1,4 @@
-"""The totals of a set of trials, kept as their slots come, live or in memory; the summary is made from them."""
+"""The totals of a set of trials, updated slot by slot, live or in memory; the summary is made from them."""
 
 from __future__ import annotations
 

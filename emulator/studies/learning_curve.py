@@ -1,4 +1,4 @@
-"""What eavesdroppers that learn have learned of the process by a slot, and what that is worth.
+"""How much learning eavesdroppers know of the process by a slot, and how that affects their error.
 
 All eavesdroppers hear the same trials, so the errors of two of them are compared trial by trial.
 

@@ -1,4 +1,4 @@
-"""What a wire file means: the links in order, which of them a key takes, and what is probably not what its author wants.
+"""Explains a wire file: its links in order, which of them each key takes, and entries that are probably mistakes.
 
 Source: docs/wire.md, which link a key takes.
 """

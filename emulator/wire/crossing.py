@@ -1,4 +1,4 @@
-"""What becomes of a message on a wire, and its record: one row for each message and link, made when its fate is known.
+"""The fate of a message on a wire, and its record: one row for each message and link, made when its fate is known.
 
 Source: docs/wire.md, the journal.
 """

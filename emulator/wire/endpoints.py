@@ -1,4 +1,4 @@
-"""Endpoints of sides: their form, and which of them would be the same place.
+"""Endpoints of sides: their form, and which of them would clash.
 
 Source: docs/wire.md, sides.
 """

@@ -1,4 +1,4 @@
-"""What a wire does with a journal that an earlier start left behind, because it was killed or the disk was full.
+"""Recovers a journal that an earlier start of the wire left behind, because it was killed or the disk was full.
 
 Source: docs/wire.md, a wire that starts again.
 """

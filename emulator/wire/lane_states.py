@@ -1,4 +1,4 @@
-"""What became of a link's messages in a step of time, as its coloured lane shows it. Does not use Rerun.
+"""The fates of a link's messages in a time step, as its coloured lane shows them. Does not use Rerun.
 
 Source: docs/wire.md, the view.
 """

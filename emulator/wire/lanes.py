@@ -1,4 +1,4 @@
-"""What a link does with messages at this moment: it is cut or not, its queue has room or not, and each key has its fates.
+"""The state of a link at this moment: whether it is cut, whether its queue has room, and the fates of each key.
 
 A message meets, in this order: the queue of a link of limited rate, the limit of its size, sides that are joined outside the
 wire, a cut, and the fate that the link's models give it. A message that is never lost meets the limit and joined sides only.

@@ -1,4 +1,4 @@
-"""What a wire file describes: sides, links between them, events. Made by `evedrop.wire.file` and read by everything else.
+"""The content of a wire file: sides, links between them, events. Made by `evedrop.wire.file` and read by everything else.
 
 Source: docs/wire.md, the file.
 """

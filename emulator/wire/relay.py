@@ -1,4 +1,4 @@
-"""A wire at work: the sessions of its sides, and everything that crosses between them.
+"""A running wire: the sessions of its sides, and everything that crosses between them.
 
 Source: docs/wire.md.
 """

@@ -1,4 +1,4 @@
-"""What rmw_zenoh, which carries ROS 2 over Zenoh, says about its messages: who sent them, and who offers a service.
+"""Reads the metadata of rmw_zenoh, which carries ROS 2 over Zenoh: who sent a message, and who offers a service.
 
 A wire passes ROS 2 on as it passes on everything else. It reads this to name publishers in its journal, to offer the services of
 one side on the others, and to wait long enough for their replies.

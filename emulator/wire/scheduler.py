@@ -1,4 +1,4 @@
-"""Holds messages back until their delay is over, and gives them on in the order of their times.
+"""Holds messages back until their delay is over, and passes them on in the order of their times.
 
 Source: docs/wire.md, how messages cross.
 """

@@ -1,4 +1,4 @@
-"""Adds up the summary of a wire: what became of all messages, each link against its model, and whether expectations held.
+"""Adds up the summary of a wire: the fates of all messages, each link against its model, and whether expectations held.
 
 Source: docs/wire.md, the summary.
 """

@@ -1,4 +1,4 @@
-"""The session of a side: a Zenoh router to which programs connect, with what it lets them do, and where it listens.
+"""The session of a side: a Zenoh router to which programs connect, their permissions, and where it listens.
 
 Source: docs/wire.md, sides.
 """

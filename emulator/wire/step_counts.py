@@ -1,4 +1,4 @@
-"""Counts what becomes of messages in steps of time: from rows of the journal to a few numbers for each link and step.
+"""Counts the fates of messages in time steps: from rows of the journal to a few numbers for each link and step.
 
 Memory and work are bounded: rows are counted with three passes over a block, and at most `_SPAN` steps are open at a time.
 

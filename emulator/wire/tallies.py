@@ -1,4 +1,4 @@
-"""What the summary of a wire counts while the wire runs: fates, delays and runs of missing messages of each link.
+"""The counts for the summary of a wire, kept while the wire runs: fates, delays and runs of missing messages of each link.
 
 Source: docs/wire.md, the summary.
 """

@@ -1,4 +1,4 @@
-"""`evedrop learned`: what eavesdroppers that learn have learned by a slot, and what that is worth."""
+"""`evedrop learned`: how much learning eavesdroppers know of the process by a slot, and how that affects their error."""
 
 from __future__ import annotations
 

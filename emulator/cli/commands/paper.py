@@ -1,4 +1,4 @@
-"""`evedrop paper`: the numbers of a paper, with ours."""
+"""`evedrop paper`: the numbers of a paper, next to ours."""
 
 from __future__ import annotations
 

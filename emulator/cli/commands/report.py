@@ -1,4 +1,4 @@
-"""`evedrop report`: the page of a results folder, made again."""
+"""`evedrop report`: makes the page of a results folder again."""
 
 from __future__ import annotations
 

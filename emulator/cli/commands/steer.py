@@ -51,12 +51,12 @@ def pause(options: argparse.Namespace) -> int:
 
 
 def resume(options: argparse.Namespace) -> int:
-    """Let a held run go on."""
+    """Let a held run continue."""
     return _ask(options.run, "resume", "resume")
 
 
 def step(options: argparse.Namespace) -> int:
-    """Let the run go on for some slots, and hold it again."""
+    """Let the run continue for some slots, and hold it again."""
     from evedrop.streams import MOST_SLOTS
 
     if not 1 <= options.slots <= MOST_SLOTS:

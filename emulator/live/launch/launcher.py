@@ -39,7 +39,7 @@ def launch(
     """Run a scenario live into a results folder; `tell` gets the observer's news as they come.
 
     view: auto, native, web or off; listen, relay: the endpoints of router and relay, if there is one; free ports by default;
-    paused: whether the run is held before slot 0, until the operator lets it go on; hosts: the hosts of processes that are not
+    paused: whether the run is held before slot 0, until the operator lets it continue; hosts: the hosts of processes that are not
     on this machine, and the endpoints of the routers then.
 
     Raises UsageError before any process is started, RunError if the run failed, Interrupted on Ctrl-C or SIGTERM; in the

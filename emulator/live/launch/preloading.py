@@ -1,4 +1,4 @@
-"""Starts the processes of a run by fork servers, bare processes that have already made the imports (`evedrop.fork_server`).
+"""Starts the processes of a run by fork servers, bare processes that have already imported the modules (`evedrop.fork_server`).
 
 Source: docs/architecture.md, why it is built this way.
 """

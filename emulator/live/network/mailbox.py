@@ -1,4 +1,4 @@
-"""A mailbox of unread messages: holds as many bytes of each sender as a run can have under way, and no more."""
+"""A mailbox of unread messages: holds at most as many bytes from each sender as a run can have in flight."""
 
 from __future__ import annotations
 

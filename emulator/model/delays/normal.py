@@ -1,4 +1,4 @@
-"""Normally distributed delays, as netem's."""
+"""Normally distributed delays, as in netem."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A receiver from slot to slot. With late packets it repeats its recursion from where they belong.
+"""A receiver from slot to slot. After late packets it repeats its recursion from their slots on.
 
 A packet of slot j that arrives in slot k > j still fixes x_j, or gives w_{j−1}: because the window's packets and the belief
 before them are kept, the belief after slot k is the same as if the packet had been in time.

@@ -1,4 +1,4 @@
-"""The sensor from slot to slot: states, the filter of its measurements, packets, and its watch over acknowledgements.
+"""The sensor from slot to slot: states, the filter of its measurements, packets, and the monitoring of acknowledgements.
 
 Source: docs/mathematics.md, model, a filter at the sensor, and detecting an attack.
 """

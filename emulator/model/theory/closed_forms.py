@@ -1,4 +1,4 @@
-"""Closed forms for schemes to which the outcomes of single slots are not enough: bounds, and chains with a memory.
+"""Closed forms for schemes that the outcomes of single slots do not determine: bounds, and chains with a memory.
 
 Source: docs/mathematics.md, twin track, acknowledged references, schedules by holding time.
 """

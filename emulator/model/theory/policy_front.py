@@ -1,4 +1,4 @@
-"""What the policies of sending reach: each figure of user, eavesdropper and sensor in the limit, and the front of the best.
+"""The performance of transmission policies: figures of user, eavesdropper and sensor in the limit, and the Pareto front.
 
 Source: docs/mathematics.md, the best policy.
 """

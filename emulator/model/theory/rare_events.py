@@ -1,4 +1,4 @@
-"""How much of an expected error rare events carry, and how many trials it takes to meet them, behind independent losses.
+"""The share of an expected error that is due to rare events, and how many trials it takes to see them, behind independent losses.
 
 A *streak* begins where the error leaves 0, where an innovation misleads the receiver, or in slot 0 if its packet was not
 used; it lasts until a state, or the next misleading innovation, replaces the error. Long streaks are rare, and may
