@@ -58,7 +58,7 @@ def difference(a: Results, b: Results) -> RunDifference:
 
 
 def _unequal_digests(a: Results, b: Results) -> list[str]:
-    """The entries of the summaries, such as `integrity`, whose digests differ although both are of the same slots and trials."""
+    """The entries of the summaries whose digests differ although both are of the same slots and trials."""
     one, other = a.summary, b.summary
     if any(one.get(name) != other.get(name) for name in ("slots", "trials", "first_trial")):
         return []

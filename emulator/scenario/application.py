@@ -1,4 +1,4 @@
-"""The hook for applications: uses of a closed loop's plant, such as the household of a microgrid.
+"""The hook for applications: uses of a closed loop's plant.
 
 An application has a table of its own in a scenario, figures in the summary and in expectations, lines in the closing report,
 panels in the view and a picture of a sweep. No other room names an application: each asks those whose tables a scenario contains.

@@ -1,4 +1,4 @@
-"""The panels of applications, such as the energy that a household bought."""
+"""The panels of the scenario's applications."""
 
 from __future__ import annotations
 
