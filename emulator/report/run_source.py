@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from evedrop.errors import UsageError
 from evedrop.files import Unreadable, text_of
 from evedrop.loading.process_noise import process_noise
+from evedrop.model.packet_words import NOTHING, SILENT
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes
 from evedrop.results.reading import Results, load_results
@@ -142,8 +143,8 @@ def _trial(rows: pa.Table, noise: float) -> RecordedTrial:
     if unknown:
         raise UsageError(f"trials.parquet has the unknown action {unknown[0]}; run the scenario again")
     codes = np.array([OUTCOMES.index(word) for word in actions[1]], np.uint8)[actions[0]]
-    silent = np.array([word == "nothing" for word in sent[1]], np.bool_)[sent[0]]
-    outcome = np.where(silent, np.uint8(OUTCOMES.index("silent")), codes)
+    silent = np.array([word == NOTHING for word in sent[1]], np.bool_)[sent[0]]
+    outcome = np.where(silent, np.uint8(OUTCOMES.index(SILENT)), codes)
     errors, traces = _numbers(rows["squared_error"]), _numbers(rows["trace_covariance"])
     slots, track = _numbers(rows["slot"]), track_of(errors, traces, noise)
     return RecordedTrial(slots, outcome, track, lost_spans(track, int(slots[0])))

@@ -49,11 +49,6 @@ JOURNAL = pa.schema(
         ("delivered_mask", pa.binary()),
     ]
 )
-ACTIONS = ("dropped", "state", "innovation", "discarded", "misled")
-"""A receiver's actions as the observer knows them: `misled` is an innovation used as the state."""
-SENT = ("state", "innovation", "nothing")
-"""The kinds of packet."""
-
 
 NULLABLE = {
     "mean_squared_error",

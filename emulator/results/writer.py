@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from evedrop.model.digest import Digests
 from evedrop.model.flag_bits import packed_flags
 from evedrop.model.links.link import REASONS
+from evedrop.model.packet_words import ACTIONS, MISLED, NOTHING, TYPES
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Codes, Flags
@@ -29,11 +30,9 @@ from evedrop.results.growing_tables import BATCH_BYTES, UNFINISHED, TableStream,
 from evedrop.results.reading import Results, load_results
 from evedrop.results.summary_file import plain, summary_text, write_summary
 from evedrop.results.tables import (
-    ACTIONS,
     DIGESTS,
     JOURNAL,
     NULLABLE,
-    SENT,
     SLOTS,
     input_columns,
     inputs_schema,
@@ -55,7 +54,7 @@ _ROUND_SHARE = 8  # at most this fraction (one in 8) of the bytes on disk is hel
 _FIGURES_SHARE = 50  # after figures took some time, none are computed for 50 times as long
 
 __all__ = [
-    "ACTIONS", "DIGESTS", "JOURNAL", "NULLABLE", "SENT", "SLOTS", "Results", "ResultsWriter", "load_results", "plain",
+    "DIGESTS", "JOURNAL", "NULLABLE", "SLOTS", "Results", "ResultsWriter", "load_results", "plain",
     "seen_actions", "write_summary",
 ]  # fmt: skip
 
@@ -91,7 +90,7 @@ class ResultsWriter:
         self._loop = loop
         self._taken = None if program is None else TakenStates(folder, program)
         peers = {"peer": self._digested}
-        words = {**peers, "sent": SENT, "action": ACTIONS}
+        words = {**peers, "sent": TYPES, "action": ACTIONS}
         self._kinds: dict[str, tuple[pa.Schema, Mapping[str, tuple[str, ...]]]] = {
             "slots": (SLOTS, peers),
             "trials": (trials_schema(n), words),
@@ -256,7 +255,7 @@ class ResultsWriter:
         k = np.repeat(np.arange(slots.first, slots.first + slots.count), recorded)
         trials = np.tile(np.arange(first_trial, first_trial + recorded), slots.count)
         nu = slots.nu[:, :recorded]
-        packets = nu if slots.sent is None else np.where(slots.sent[:, :recorded], nu, len(SENT) - 1)
+        packets = nu if slots.sent is None else np.where(slots.sent[:, :recorded], nu, TYPES.index(NOTHING))
         x = self._levels(slots.x[:, :, :recorded])
         for name, receiver in slots.receivers.items():
             self._add(
@@ -328,4 +327,4 @@ class ResultsWriter:
 def seen_actions(action: Codes, nu: Flags) -> Codes:
     """Indices into `ACTIONS`: the actions, with the truth about each packet's type."""
     misled = (action == Action.STATE) & nu
-    return np.where(misled, np.uint8(ACTIONS.index("misled")), action)
+    return np.where(misled, np.uint8(ACTIONS.index(MISLED)), action)

@@ -11,7 +11,7 @@ from typing import NamedTuple, final
 import numpy as np
 
 from evedrop.model.receiver import Action, Codes, Flags
-from evedrop.view.lanes import MISLED, SILENT
+from evedrop.view.lanes import MISLED_CODE, SILENT_CODE
 from evedrop.view.scene import Scene, Shown
 
 _SHORTEST = 3  # packets in a row; missing fewer is normal
@@ -60,7 +60,7 @@ class Watcher:
 
     def watch(self, first: int, codes: Codes) -> list[Event]:
         """Events of the chunk that starts at slot `first`, in order of slot."""
-        misled, silent = codes == MISLED, codes == SILENT
+        misled, silent = codes == MISLED_CODE, codes == SILENT_CODE
         good = (codes == Action.STATE) | (codes == Action.INNOVATION)
         events: list[Event] = []
         if not self._ever_misled and misled.any():

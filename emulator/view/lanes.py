@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from evedrop.model.packet_words import DISCARDED, DROPPED, INNOVATION, MISLED, SILENT, STATE
 from evedrop.model.receiver import Action, Codes
 from evedrop.view import palette
 from evedrop.view.palette import Colour
@@ -29,15 +30,15 @@ class Lane:
     colours: tuple[Colour, ...]
 
 
-SENT = Lane(("state", "innovation", "silent"), (palette.STATE, palette.DISCARDED, palette.SILENT))
+SENT = Lane((STATE, INNOVATION, SILENT), (palette.STATE, palette.DISCARDED, palette.SILENT))
 LEGITIMATE = Lane(
-    ("dropped", "state", "innovation", "discarded", "silent"),
+    (DROPPED, STATE, INNOVATION, DISCARDED, SILENT),
     (palette.DROPPED, palette.STATE, palette.DECODED, palette.DISCARDED, palette.SILENT),
 )
-EAVESDROPPER = Lane((*LEGITIMATE.words, "misled"), (*LEGITIMATE.colours, palette.MISLED))
-SILENT = 4
+EAVESDROPPER = Lane((*LEGITIMATE.words, MISLED), (*LEGITIMATE.colours, palette.MISLED))
+SILENT_CODE = np.uint8(EAVESDROPPER.words.index(SILENT))
 """Code of a slot in which nothing was sent, so that nothing could be lost."""
-MISLED = 5
+MISLED_CODE = np.uint8(EAVESDROPPER.words.index(MISLED))
 """Code of the only outcome that an eavesdropper does not know itself."""
 
 
@@ -54,7 +55,7 @@ def lane_of(shown: Shown) -> Lane:
 def sent(slots: SceneSlots) -> Codes:
     """Codes of the sensor's lane, (c,): the packets' types, or silence."""
     types = slots.nu.astype(np.uint8)
-    return types if slots.sent is None else np.where(slots.sent, types, np.uint8(SENT.words.index("silent")))
+    return types if slots.sent is None else np.where(slots.sent, types, np.uint8(SENT.words.index(SILENT)))
 
 
 def received(shown: Shown, slots: SceneSlots) -> Codes:
@@ -66,5 +67,5 @@ def received(shown: Shown, slots: SceneSlots) -> Codes:
     action = slots.peers[shown.name].action
     codes: Codes = action
     if shown.role != "legitimate":
-        codes = np.where(slots.nu & (action == Action.STATE), np.uint8(MISLED), action)
-    return codes if slots.sent is None else np.where(slots.sent, codes, np.uint8(SILENT))
+        codes = np.where(slots.nu & (action == Action.STATE), MISLED_CODE, action)
+    return codes if slots.sent is None else np.where(slots.sent, codes, SILENT_CODE)

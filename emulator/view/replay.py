@@ -14,20 +14,14 @@ import pyarrow.compute as pc
 from evedrop.errors import UsageError
 from evedrop.loading import load
 from evedrop.model.integrity.monitor import MonitoredSlots
+from evedrop.model.packet_words import ACTION_OF, INNOVATION, NOTHING
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Action, Flags
+from evedrop.model.receiver import Flags
 from evedrop.results.writer import Results, load_results
 from evedrop.view.scene import PeerSlots, SceneSlots
 from evedrop.view.scored_slots import open_recording, showing_of
 
 _CHUNK = 1000  # slots recorded at once
-_CODES = {
-    "dropped": Action.LOST,
-    "state": Action.STATE,
-    "misled": Action.STATE,
-    "innovation": Action.INNOVATION,
-    "discarded": Action.DISCARDED,
-}
 
 
 def replay(folder: Path, path: Path | None = None) -> Path:
@@ -87,8 +81,8 @@ def _truth(results: Results, name: str) -> tuple[Floats, Flags, Flags]:
     """True states, ν, and whether a packet was sent, in the first recorded trial; name: any receiver."""
     rows = _first_trial(results, name)
     words = rows["sent"].cast(pa.string()).to_pylist()
-    nu = np.array([word == "innovation" for word in words], np.bool_)
-    return _matrix(rows["x"]), nu, np.array([word != "nothing" for word in words], np.bool_)
+    nu = np.array([word == INNOVATION for word in words], np.bool_)
+    return _matrix(rows["x"]), nu, np.array([word != NOTHING for word in words], np.bool_)
 
 
 def _inputs(results: Results) -> Floats:
@@ -114,7 +108,7 @@ def _peer(results: Results, name: str) -> PeerSlots:
     x_hat, P = _matrix(rows["x_hat"]), _matrix(rows["P"])
     n = x_hat.shape[1] if x_hat.ndim == 2 else 0
     words = rows["action"].cast(pa.string()).to_pylist()
-    unknown = sorted(set(words) - _CODES.keys())
+    unknown = sorted(set(words) - ACTION_OF.keys())
     if unknown:
         raise UsageError(
             f"{results.folder}: trials.parquet has the unknown action {unknown[0]}; run the scenario again"
@@ -122,7 +116,7 @@ def _peer(results: Results, name: str) -> PeerSlots:
     return PeerSlots(
         x_hat=x_hat,
         P=P.reshape(-1, n, n),
-        action=np.array([_CODES[word] for word in words], np.uint8),
+        action=np.array([ACTION_OF[word] for word in words], np.uint8),
         squared_error=means["mean_squared_error"].to_numpy(),
         standard_error=means["standard_error"].to_numpy(),
         trace=means["mean_trace_covariance"].to_numpy(),

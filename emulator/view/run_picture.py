@@ -16,6 +16,7 @@ from matplotlib.patches import Patch
 from evedrop.errors import UsageError
 from evedrop.loading import load
 from evedrop.loading.process_noise import process_noise
+from evedrop.model.packet_words import NOTHING, SILENT
 from evedrop.model.process import Floats
 from evedrop.results.reading import Results
 from evedrop.view.error_floor import error_floor, floor_words
@@ -161,9 +162,7 @@ class _RecordedTrial:
 
     @staticmethod
     def _codes(rows: pa.Table) -> NDArray[np.uint8]:
-        shown = pc.if_else(
-            pc.equal(rows["sent"].cast(pa.string()), "nothing"), "silent", rows["action"].cast(pa.string())
-        )
+        shown = pc.if_else(pc.equal(rows["sent"].cast(pa.string()), NOTHING), SILENT, rows["action"].cast(pa.string()))
         return np.array([EAVESDROPPER.words.index(word) for word in shown.to_pylist()], np.uint8)
 
     def plane(self, axes: Axes) -> None:

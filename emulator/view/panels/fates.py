@@ -8,6 +8,7 @@ from typing import final
 import rerun.blueprint as rrb
 from rerun import AsComponents
 
+from evedrop.model import packet_words
 from evedrop.view import lanes
 from evedrop.view.column import Column
 from evedrop.view.drawn_graph import LETTER, LINE, DrawnGraph, Place
@@ -22,12 +23,12 @@ _PATH = "graph"
 _SENSOR, _ROUTER = "the sensor", "the router"
 _LINKS, _RECEIVERS = 150.0, 320.0  # where their columns are, right of sensor and router
 FATES = {
-    "state": STATE,
-    "innovation": STATE,
-    "misled": MISLED,
-    "discarded": TRUTH_CURVE,
-    "dropped": DROPPED_TEXT,
-    "silent": TRUTH_CURVE,
+    packet_words.STATE: STATE,
+    packet_words.INNOVATION: STATE,
+    packet_words.MISLED: MISLED,
+    packet_words.DISCARDED: TRUTH_CURVE,
+    packet_words.DROPPED: DROPPED_TEXT,
+    packet_words.SILENT: TRUTH_CURVE,
 }
 """The colour of each word of a lane."""
 KNOWN = {KnowledgeState.IN_TRACK: IN_TRACK_TEXT, KnowledgeState.DRIFTING: MISLED, KnowledgeState.FOOLED: DROPPED_TEXT}
