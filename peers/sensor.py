@@ -220,7 +220,7 @@ class Sensing:
                 self._slots = range(k, min(k + self._most, self._end_of_report(k)))
                 try:
                     self._made = self._core.send(self._slots)
-                except RunError:  # the program gave no state: what it gave so far should be in the results
+                except RunError:  # the program gave no state: its states so far should be in the results
                     self._window.settle(k - k % self._brief.flow.batch, _SETTLE_SECONDS)
                     raise
                 if self._program is not None:

@@ -1,4 +1,4 @@
-"""What many tests are made of: processes, keys, the tables of small scenarios, and what is read from results."""
+"""Shared by many tests: processes, keys, the tables of small scenarios, and readers of results."""
 
 from __future__ import annotations
 

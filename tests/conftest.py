@@ -62,7 +62,7 @@ def pytest_collection() -> Iterator[None]:
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> Iterator[None]:
-    """What this machine could not test has the last word."""
+    """The last lines say what this machine could not test."""
     yield
     say_what_was_skipped(terminalreporter)
 

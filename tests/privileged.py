@@ -23,7 +23,7 @@ _REASON = "this machine cannot run it: "
 
 
 class CannotRun(Exception):
-    """What is to be tested cannot be tested on this machine; why, in words."""
+    """A feature cannot be tested on this machine; why, in words."""
 
 
 def skip(error: CannotRun) -> NoReturn:
@@ -83,5 +83,5 @@ def _install(missing: list[str]) -> None:
     names = " ".join(missing)
     install = ("apt-get", "install", "-q", "-y", "--no-install-recommends", "-o", "DPkg::Lock::Timeout=120")
     tried(*install, "--download-only", *missing, what=f"the download of {names}", env=quiet)
-    # What was downloaded is installed without a limit: killed in the middle, dpkg would need repair.
+    # Downloaded packages are installed without a limit: killed in the middle, dpkg would need repair.
     tried(*install, *missing, what=f"apt-get install {names}", env=quiet, timeout=None)

@@ -92,7 +92,7 @@ def _plain(block: range, steps: Sequence[Step]) -> bool:
 def _in_order(
     receiver: Receiver, blocks: list[range], every: int, steps: Sequence[Step], problem: Problem, kind: type
 ) -> Iterator[_Followed]:
-    """What a receiver makes of blocks, one after the other; only one block in `every` is taken at once."""
+    """The beliefs of a receiver after blocks, one after the other; only one block in `every` is taken at once."""
     belief = steps[0][0]
     for number, block in enumerate(blocks):
         if number % every == 0 and _plain(block, steps):

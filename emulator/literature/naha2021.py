@@ -49,7 +49,7 @@ class Naha2021(Paper):
     published = "arXiv 2201.09389, 2022, and arXiv 2101.01466, 2021"
 
     def rows(self, quick: bool, progress: Progress) -> Iterator[PublishedNumber]:
-        """Divergence, delay, false alarms and cost; then what is not public."""
+        """Divergence, delay, false alarms and cost; then the numbers that are not public."""
         trials = 400 if quick else 4000
         for level in _LEVELS:
             progress(f"watermark of variance {level:g}")

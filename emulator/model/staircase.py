@@ -20,7 +20,7 @@ from evedrop.model.noise_law import NoiseLaw
 from evedrop.model.process import Process, product
 
 NOT_REACHED = 2.0**-44
-"""What is left of a direction, relative to the numbers it was computed from, if it is in the range that is reached already."""
+"""The largest rest of a direction that is already reached, relative to the numbers it was computed from."""
 REACHED = 2.0**-20
 """The same if it certainly is not. Double precision cannot tell what lies between the two."""
 ROUNDING = 2.0**-50

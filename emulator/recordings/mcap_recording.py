@@ -254,7 +254,7 @@ class _Reader:
             )
 
     def _periodic(self, messages: _Messages, period: float, longest: float | None) -> MessageSeries:
-        """What became of messages that are sent regularly."""
+        """The fates of messages that are sent regularly."""
         sent = np.sort(messages.sent)
         numbers, off = numbers_of_times(sent, period)
         if off > _MOST_OFF:

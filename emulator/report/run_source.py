@@ -28,7 +28,7 @@ from evedrop.view.lanes import EAVESDROPPER
 
 _MOST_BYTES = 2**24
 OUTCOMES = EAVESDROPPER.words
-"""What became of a packet; the index of a word is its code."""
+"""The fates of a packet; the index of a word is its code."""
 _INTERVAL = 1.96  # standard errors on either side: 95 %
 
 

@@ -58,7 +58,7 @@ class Secrecy:
     ratio_error: float | None = None
     """Standard error of the ratio; None for one trial, and where an error has infinite variance."""
     leak: LeakSummary | None = None
-    """What its packets revealed; None where that is unknown."""
+    """The leak of its packets; None where that is unknown."""
     has_bound: bool = True
     """Whether a bound of the legitimate error is known, against which the run was tested."""
 

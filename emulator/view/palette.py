@@ -44,7 +44,7 @@ KNOWLEDGE: tuple[Colour, ...] = (DECODED, MISLED, DROPPED)
 """What a receiver knows: in track, drifting, fooled."""
 
 WIRE_LANES: tuple[Colour, ...] = (STATE, DECODED, DISCARDED, MISLED, DROPPED, SILENT, TRUTH)
-"""What became of the messages of a wire's link; white is cut."""
+"""The fates of the messages of a wire's link; white is cut."""
 
 DROPPED_TEXT: Colour = (230, 78, 44)
 """`DROPPED` for letters on the background of the theme, which need to be brighter than a lane."""

@@ -71,7 +71,7 @@ class WireJournal:
     def __init__(
         self, folder: Path, plan: WirePlan, *, tell: Callable[[str], None] = warn, part_rows: int = PART_ROWS
     ) -> None:
-        """Recover what an earlier start left behind, and begin. folder: the wire's; tell: for what the user must know.
+        """Recover the records of an earlier start, and begin. folder: the wire's; tell: for what the user must know.
 
         Raises UsageError if another wire uses the folder, if it was made with another seed, or if it cannot be written.
         """

@@ -171,7 +171,7 @@ class WirePanels:
         self._last_delays = np.zeros((before, *steps.delays.shape[1:]), np.int64)
         if self._total is None:
             self._total = np.zeros(steps.counts.shape[1:], np.int64)
-        else:  # the graph forgets what is older than its window
+        else:  # the graph forgets values older than its window
             silent = np.zeros(steps.counts.shape[1:], np.int64)
             self._recent.extend(silent for _ in range(min(steps.first - self._next, self._recent.maxlen or 0)))
 

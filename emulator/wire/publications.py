@@ -66,7 +66,7 @@ class _Way:
         self._last: tuple[zenoh.Publisher, Any, Any, bool] | None = None
 
     def forget(self) -> None:
-        """Give up what the key needs; its next message gets the next fate all the same."""
+        """Release the resources of the key; its next message gets the next fate all the same."""
         self._state.forget("put", self._key)
 
     def publisher(self, sample: zenoh.Sample) -> zenoh.Publisher:

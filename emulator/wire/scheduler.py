@@ -23,7 +23,7 @@ class _Held(NamedTuple):
 
 @final
 class Scheduler:
-    """A thread that carries out what is due. It holds a limited number of messages, and of bytes."""
+    """A thread that carries out tasks when they are due. It holds a limited number of messages, and of bytes."""
 
     def __init__(self, most: int, most_bytes: int, failed: Callable[[int], None]) -> None:
         """most, most_bytes: how much it may hold; failed: is given the row of a message that raised an error."""

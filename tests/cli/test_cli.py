@@ -322,7 +322,7 @@ def test_an_output_that_cannot_be_written_is_named(evedrop: Evedrop) -> None:
 def test_other_errors_of_the_system_are_not_blamed_on_the_output(
     evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What fails within a study is said as it is, exit 3."""
+    """An error within a study is reported as it is, exit 3."""
     from evedrop.studies import sweep
 
     def fail(_: object) -> None:

@@ -124,7 +124,7 @@ def test_in_python(scenario: str) -> None:
     ],
 )
 def test_refusals(evedrop: Evedrop, scenario: str, words: tuple[str, ...], said: str) -> None:
-    """What cannot be designed is refused, with the bound and the remedy."""
+    """A design that does not exist is refused, with the bound and the remedy."""
     done = evedrop("design", scenario, "--policy", *words)
     assert (done.status, done.out) == (2, "")
     assert said in done.err

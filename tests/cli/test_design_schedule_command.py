@@ -92,7 +92,7 @@ def test_in_python() -> None:
     ],
 )  # fmt: skip
 def test_refusals(evedrop: Evedrop, words: tuple[str, ...], said: str) -> None:
-    """What cannot be designed is refused, with the bound and the remedy."""
+    """A design that does not exist is refused, with the bound and the remedy."""
     words = words if "--set" in words else (*words, "--set", SMART)
     done = evedrop("design", "numerical", *words)
     assert (done.status, done.out) == (2, "")

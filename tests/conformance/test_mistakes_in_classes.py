@@ -97,7 +97,7 @@ def test_a_mistake_in_a_class_is_named_before_anything_starts(case: str, evedrop
 
 @pytest.mark.parametrize("name", ["mine", "nowhere.at.all:Mine", "mine:", ":Mine", "__main__:Mine", "os:path"])
 def test_a_name_that_names_nothing_is_refused(name: str, evedrop: Evedrop) -> None:
-    """Whatever is wrong with it, it is a mistake of the scenario with its path."""
+    """Every fault of a class is reported as a mistake of the scenario, with its path."""
     (evedrop.folder / "mine.toml").write_text(SCENARIO)
     for entry in ("encoding.scheme", "eavesdroppers.eve.strategy"):
         done = evedrop("check", "mine.toml", "--set", f'{entry}="{name}"')

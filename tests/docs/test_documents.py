@@ -1,4 +1,4 @@
-"""What the documents tell people to type can be typed, and what they link to is there."""
+"""The commands in the documents work, and their links lead somewhere."""
 
 from __future__ import annotations
 

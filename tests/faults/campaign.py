@@ -41,7 +41,7 @@ _HEADS = {"kind": "fault", "target": "target"}
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of a case."""
+    """The outcome of a case."""
 
     case: Case
     hits: tuple[Fault, ...]
@@ -88,7 +88,7 @@ class Campaign:
         return verdict
 
     def known(self, variant: Variant) -> tuple[Reference, Usual]:
-        """What an undisturbed run of a variant comes to, and how long it takes."""
+        """The result of an undisturbed run of a variant, and how long it takes."""
         if variant.name not in self._known:
             folder = self.folder / variant.name
             folder.mkdir()

@@ -1,4 +1,4 @@
-"""What became of a disturbed run, held against what is promised."""
+"""Compares the outcome of a disturbed run with the promises."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Launcher(Protocol):
 
 
 class Run(Protocol):
-    """What is looked at of a run that has ended: a `Disturbed` has it."""
+    """The part of an ended run that the judge examines: a `Disturbed` has it."""
 
     @property
     def variant(self) -> Variant:
@@ -78,7 +78,7 @@ class Run(Protocol):
 def misses(
     run: Run, hits: Sequence[Fault], longest_outage: float, reference: Reference, before: frozenset[int]
 ) -> list[str]:
-    """What was promised and does not hold, now that the launcher has ended; hits: the faults that hit something."""
+    """The broken promises, now that the launcher has ended; hits: the faults that hit something."""
     left = ours.none_left(before, _LEAVE_SECONDS)
     found = [f"process {one.pid} is left: {' '.join(one.words)}; {ours.doing(one.pid)}" for one in left]
     ours.end_all(left)

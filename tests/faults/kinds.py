@@ -84,7 +84,7 @@ _T = TypeVar("_T")
 
 
 def _awaited(look: Callable[[], list[_T]], run: Disturbed) -> list[_T]:
-    """What there is, as soon as there is something, within some seconds."""
+    """The first non-empty answer, within some seconds."""
     found: list[_T] = []
     for _ in range(int(_APPEARS_SECONDS / 0.02)):
         found = look()

@@ -88,7 +88,7 @@ def none_left(before: frozenset[int], seconds: float) -> list[Process]:
 
 
 def doing(pid: int) -> str:
-    """What a process waits for, by thread, and what else holds its standard input: why it did not end."""
+    """Why a process did not end: what each thread waits for, and what else holds its standard input."""
     try:
         stdin = os.readlink(f"/proc/{pid}/fd/0")
         waits = [

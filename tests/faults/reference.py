@@ -123,7 +123,7 @@ def _nothing(value: Any) -> bool:
 
 
 def unlike(summary: Mapping[str, Any], reference: Reference) -> Iterator[str]:
-    """What of a whole run's summary is not as in memory."""
+    """The entries of a whole run's summary that differ from those in memory."""
     wanted = reference.summary
     for entry in ("slots", "trials"):
         if summary[entry] != wanted[entry]:

@@ -134,7 +134,7 @@ class Ended:
 
 @pytest.fixture
 def ended(tmp_path: Path, memory: Path, reference: Reference) -> Ended:
-    """What the judge looks at of a run, which ended as nothing had happened."""
+    """A run for the judge, which ended as if nothing had happened."""
     out = tmp_path / "run"
     shutil.copytree(memory, out)
     pq.write_table(JOURNAL.empty_table(), out / "journal.parquet")

@@ -288,7 +288,7 @@ def test_the_command_prints_what_can_be_pasted(evedrop: Evedrop) -> None:
 
 
 def test_json_has_no_infinities(tmp_path: Path) -> None:
-    """What is not a number is null, so that every program can read it."""
+    """NaN and infinities are null, so that every program can read the file."""
     outcomes = np.array([1, 0] * 60, np.uint8)
     path = save(tmp_path, outcomes, delay=np.ones(120))
     json.dumps(fit(path).as_dict(), allow_nan=False)

@@ -70,7 +70,7 @@ def test_the_estimates_are_those_of_the_normal_equations(tmp_path: Path) -> None
 
 
 def test_the_fit_is_a_scenario(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """What the command prints is read, remarks included; with a reference, and units."""
+    """The command's output, remarks included, is TOML that a scenario can use; with a reference, and units."""
     (tmp_path / "pose.csv").write_text(
         "time [s],x [m],who,y [m]\n"
         + "".join(f"{3 + 0.1 * k},{x},a,{y}\n" for k, (x, y) in enumerate(path_of(1, around=5.0)))

@@ -70,7 +70,7 @@ def broken_by(reader: Reader, data: bytes, folder: Path) -> Failure | None:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     try:
-        # What is wrong with numbers in a file that nobody can use is said by the error, not by numpy.
+        # For unusable numbers in a file, the error says what is wrong, not numpy.
         with _limited(LONGEST_SECONDS), warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
             reader.read(data, folder)

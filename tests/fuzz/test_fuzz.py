@@ -50,7 +50,7 @@ def test_what_broke_a_reader_once_does_so_no_more(path: Path, tmp_path: Path) ->
 
 @pytest.mark.parametrize("name", READERS)
 def test_examples_are_read(name: str, tmp_path: Path) -> None:
-    """What is changed is right before: so a reader is changed bytes that it all but understands."""
+    """The bytes are valid before they are changed: so a reader gets bytes that it almost understands."""
     reader = READERS[name]
     for data in reader.examples()[:4]:
         (tmp_path / "of-one").mkdir(exist_ok=True)

@@ -145,7 +145,7 @@ def test_a_process_that_was_never_told_is_waited_for(network: Network) -> None:
 
 @pytest.mark.parametrize("name", ["router", "relay"])
 def test_a_router_is_told_until_it_confirms(name: str, network: Network) -> None:
-    """What a router is told may be lost with a connection too."""
+    """A message to a router may be lost with a connection too."""
     network.does[name] = lambda times: network.ends(name) if times == 3 else None
     ended(network)
     assert network.told[name] == 3

@@ -1,4 +1,4 @@
-"""Whatever ends a run: the process at fault is named, what was measured is on disk, and no process is left."""
+"""However a run ends, the process at fault is named, its measurements are on disk, and no process is left."""
 
 from __future__ import annotations
 

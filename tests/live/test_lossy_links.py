@@ -96,7 +96,7 @@ def test_live_and_memory_are_the_same_bits(live: Results, memory: Results) -> No
 
 
 def test_where_there_is_no_theory_the_results_say_null(memory: Results) -> None:
-    """What follows no chain has no expected trace: null in the summary and in the table, and no verdict of theory."""
+    """A link that follows no chain has no expected trace: null in the summary and in the table, and no verdict of theory."""
     peers = memory.summary["peers"]
     assert [name for name, peer in peers.items() if peer["expected_trace_covariance"] is None] == [*UNKNOWN]
     assert json.loads((memory.folder / "summary.json").read_text())["peers"]["pattern"]["infinite_variance"] is False

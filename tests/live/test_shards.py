@@ -254,7 +254,7 @@ def test_a_killed_process_of_a_shard_ends_all(evedrop: Evedrop, name: str) -> No
 
 
 def test_a_killed_observer_costs_no_slot_that_is_on_disk(evedrop: Evedrop) -> None:
-    """What both shards have measured is in the folder, up to what the observer had written when it was killed."""
+    """The slots of both shards are in the folder, up to those that the observer had written when it was killed."""
     live = evedrop.live("eavesdroppers", *ENDLESS)
     wait_until(lambda: last_round(live.folder / "shards" / "2").slots > 0, "slots of the second shard on disk")
     os.kill(child(live, 2, "observer"), signal.SIGKILL)
@@ -342,7 +342,7 @@ def test_what_shards_cannot_do_is_refused(evedrop: Evedrop) -> None:
 
 
 def test_a_secret_that_is_gone_leaves_no_folder(tmp_path: Path) -> None:
-    """What keeps all shards from starting is told once, and the folder can be used again."""
+    """An error that keeps all shards from starting is reported once, and the folder can be used again."""
     secret = tmp_path / "secret.bin"
     secret.write_bytes(bytes(32))
     scenario = load("eavesdroppers", {"trials": 2, "shards": 2, "slots": 10, "secret_file": str(secret)})

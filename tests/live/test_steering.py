@@ -101,7 +101,7 @@ SETTINGS = {"loss": {"model": "bernoulli", "quality": 0.2}}
 
 
 def go(k: int, until: int | None = None) -> list[Sent]:
-    """What is told when the run goes on with slot k, perhaps for some slots."""
+    """The messages when the run continues with slot k, perhaps for some slots."""
     return [("router", Go(k)), ("sensor", Go(k, (), until))]
 
 

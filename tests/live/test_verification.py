@@ -1,4 +1,4 @@
-"""What the observer makes of reports: honest ones pass, and each way to contradict is found out, with both values."""
+"""The observer verifies reports: honest ones pass, and each kind of contradiction is found, with both values."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def test_traces_of_recorded_trials_are_theirs() -> None:
 
 @given(st.floats(-1e150, 1e150), st.floats(-1e300, 1e300))
 def test_any_sums_are_judged(first: float, second: float) -> None:
-    """Whatever numbers are claimed as sums, they pass or are a contradiction."""
+    """Any numbers claimed as sums either pass or are a contradiction."""
     report = replace(reports(1)[0], trace=np.array([[first, second]]))
     try:
         Verifier({"eve": Blocks(SLOTS, CUTS)}, RECORDED, 0).report("eve", report)

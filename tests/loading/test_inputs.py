@@ -115,7 +115,7 @@ def test_more_states_than_can_be_worked_out_are_refused_at_once(n: int, tmp_path
     ids=["states", "slots", "operator", "threshold"],
 )
 def test_the_largest_that_is_accepted_is_checked_soon(text: str, warning: str, evedrop: Evedrop) -> None:
-    """What theory would need gigabytes or minutes for is not worked out."""
+    """Theory that would need gigabytes or minutes is not computed."""
     (evedrop.folder / "large.toml").write_text(text)
     started = time.process_time()
     done = evedrop("check", "large.toml")
@@ -180,7 +180,7 @@ def test_what_no_entry_can_be_is_refused(text: str, said: str) -> None:
     ],
 )
 def test_changes_are_held_against_the_same_bounds(change: str, evedrop: Evedrop) -> None:
-    """What --set is given is refused as what a file says."""
+    """Values of --set are refused as those of a file are."""
     done = evedrop("check", "eavesdroppers", "--set", change)
     assert done.status == 2
     assert "Traceback" not in done.err

@@ -72,7 +72,7 @@ def play(
         sent = np.ones(batch.trials, bool) if packet.sent is None else packet.sent
         received = {name: gamma[name][k] & sent for name in receivers}
         for name, receiver in receivers.items():
-            # What is not received must not matter, whatever it is.
+            # A packet that is not received must not matter, whatever its content.
             z = np.where(received[name], packet.z, np.nan)
             header = None if packet.header is None else np.where(received[name], packet.header, -(2**62))
             beliefs[name] = receiver.step(k, beliefs[name], Reception(received[name], z, header))

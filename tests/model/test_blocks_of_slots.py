@@ -190,7 +190,7 @@ class Half(Naive):
 
 @pytest.mark.parametrize("kind", [DeafNaive, PickyNaive, Quick, PickyQuick, Half])
 def test_blocks_are_of_the_class_that_slots_are_of(kind: type[Naive]) -> None:
-    """Whatever a class changes, and wherever it inherits it from, its blocks are its slots."""
+    """The blocks of a class equal its slots, no matter what it overrides and where it inherits from."""
     receiver, slots = kind(Knowledge(MARGINAL, 0.4, {}, {}), BATCH), range(BATCH.slots)
     gamma, z = coins(0.7, BATCH.slots, BATCH.trials), np.ones((BATCH.slots, MARGINAL.n, BATCH.trials))
     found, _ = receiver.follow(slots, receiver.prior(), gamma, z)

@@ -22,7 +22,7 @@ KEY = stream_key(ROOT, "mask")
 
 
 def masked_in_words(process: Process, k: int, x: np.ndarray, trial: int) -> list[float]:
-    """What docs/mathematics.md says of one state, in Python's integers."""
+    """The formula of docs/mathematics.md for one state, in Python's integers."""
     words = Stream(KEY, range(trial, trial + 1), process.n).words(range(k, k + 1))[0, 0].tolist()
     found = []
     for i, word in enumerate(words):
@@ -59,7 +59,7 @@ def test_any_slot_may_be_asked_for(slots: list[int]) -> None:
 
 @pytest.mark.parametrize("value", [0.0, 1e300, -1e300, 1.0])
 def test_what_is_masked_is_finite_and_in_range(value: float) -> None:
-    """Whatever the number, the packet is one of the range, and a number beyond the range is read as its end."""
+    """The packet of any number is in the range, and a number beyond the range is read as its end."""
     mask = Mask(STABLE, KEY, Batch(1, 4))
     z = mask.hide(0, np.full((2, 4), value))
     H = mask.steps(0)[:, None] * 2.0**52

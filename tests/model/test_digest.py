@@ -131,7 +131,7 @@ def test_the_hash_is_the_published_one() -> None:
 @given(cuts=st.lists(st.integers(1, 39), max_size=9), trials=st.sampled_from([3, 700, 3000]), seed=st.integers(0, 99))
 @settings(max_examples=examples(30), deadline=None)
 def test_a_block_may_be_digested_in_parts(cuts: list[int], trials: int, seed: int) -> None:
-    """Whatever slots the parts have, and whether they are held or hashed at once, its digests are those of the whole block."""
+    """Parts of any slots, held or hashed at once, give the digests of the whole block."""
     beliefs = random_beliefs(40, 2, trials, seed)
     parts = PartialDigests(trials)
     bounds = [0, *sorted(set(cuts)), 40]
@@ -213,7 +213,7 @@ def test_a_run_has_one_digest_of_all_its_blocks() -> None:
 
 
 def test_a_log_of_digests_is_a_mapping_of_them() -> None:
-    """Whatever the blocks' starts are, and however many blocks are added at a time."""
+    """For any starts of the blocks, and any number of blocks added at a time."""
     random = np.random.default_rng(1)
     blocks = {start: random.integers(0, 256, (3, 16), np.uint8) for start in (0, 100, 256, 300, 512)}
     log = DigestLog()

@@ -193,7 +193,7 @@ def test_the_parsimonious_policy_saves_watermark_and_still_detects() -> None:
 
 @pytest.mark.parametrize("name", POLICIES)
 def test_the_statistic_stays_as_it_is_after_an_alarm(name: str) -> None:
-    """Whatever evidence follows, and there is no further watermark; below the threshold it goes on."""
+    """For any later evidence, and there is no further watermark; below the threshold the watermark continues."""
     policy = POLICIES[name].of(POLICIES[name].parameters)
     alarm = policy.threshold
     statistic = np.array([alarm, alarm, 0.5 * alarm])

@@ -129,7 +129,7 @@ def reference(schedule: LinkSchedule, batch: Batch) -> tuple[np.ndarray, np.ndar
     ],
 )
 def test_fates_are_those_of_the_reference(schedule: LinkSchedule) -> None:
-    """What befalls a packet, in the documented order, from the documented streams."""
+    """The fate of a packet, in the documented order, from the documented streams."""
     batch = Batch(80, 7, 11)
     fates = link(schedule, batch).fates(range(80))
     codes, delays = reference(schedule, batch)

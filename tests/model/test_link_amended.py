@@ -65,7 +65,7 @@ def test_an_amended_link_is_one_that_knew(k: int) -> None:
 
 
 def test_only_slots_that_are_planned_can_be_amended() -> None:
-    """What has been decided for good, or is not decided yet, is refused."""
+    """Slots that are decided for good, or not decided yet, are refused."""
     one = link()
     with pytest.raises(ValueError, match="slot 3 is not among those last planned"):
         one.amended(3, ())

@@ -175,7 +175,7 @@ def test_a_value_is_shown_as_a_scenario_has_it(value: object, text: str) -> None
 
 
 def test_checks_of_flags_and_counts() -> None:
-    """What is not given has no mistake."""
+    """A parameter that is not given has no mistake."""
     flags = {"once": True, "random_start": 1}
     assert flag_mistakes(flags, "once", "random_start", "absent") == [("random_start", "is 1; expected true or false")]
     assert count_mistakes({"count": 1_000_000}, "count") == []

@@ -85,7 +85,7 @@ def test_a_trial_alone_is_the_same_trial(process: Process) -> None:
 
 
 def test_states_follow_the_process() -> None:
-    """What is not A x is white noise of covariance Q, and x_0 has Σ0: chi-squared over 20 000 trials at 1e-6 confidence."""
+    """x⁺ − A x is white noise of covariance Q, and x_0 has Σ0: chi-squared over 20 000 trials at 1e-6 confidence."""
     trajectory = Trajectory(DRIFTING, KEY, Batch(4, 20_000))
     before = np.zeros((3, 20_000))
     for k in range(4):
@@ -168,7 +168,7 @@ MISTAKES = {
 
 @pytest.mark.parametrize("name", MISTAKES)
 def test_mistakes_are_named(name: str) -> None:
-    """What keeps matrices from being a process is said of the right entry."""
+    """The reason why matrices are not a process is given for the right entry."""
     *matrices, entry, sentence = MISTAKES[name]
     A, Q, initial = (np.array(M, float) for M in matrices)
     found = mistakes_of(A, Q, initial)

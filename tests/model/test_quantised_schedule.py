@@ -34,7 +34,7 @@ MU, MU_E, ARRIVES = 0.7, 0.6, 0.8
 
 
 def quantised_in_words(process: Process, k: int, x: float, i: int, trial: int, bits: int, deviations: float) -> float:
-    """What docs/mathematics.md says is read of one state, from the words of the stream."""
+    """The value read of one state by docs/mathematics.md, from the words of the stream."""
     word = int(Stream(DITHER, range(trial, trial + 1), process.n).words(range(k, k + 1))[0, 0, i])
     step = 2.0 * deviations * float(np.sqrt(state_covariances(process, k + 1)[k, i, i])) / 2.0**bits
     dither = ((word >> 11) / 2.0**53 - 0.5) * step
@@ -77,7 +77,7 @@ def test_the_error_is_white_and_uniform_whatever_the_state_is() -> None:
 
 
 def test_masked_levels_say_nothing() -> None:
-    """Whatever the level is, the masked one is uniform (p > 1e-4); the pad is undone exactly, in any order of slots."""
+    """The masked value of any level is uniform (p > 1e-4); the pad is undone exactly, in any order of slots."""
     pad = LevelPad(2, 4, MASK, Batch(6, 8000))
     for level in (0, 7, 15):
         levels = np.full((2, 8000), level)

@@ -156,7 +156,7 @@ def checks(found: Any) -> type[Any]:
 
 
 def test_the_mistakes_that_a_class_finds_are_texts() -> None:
-    """Whatever it returns or raises, its parameters have mistakes or none."""
+    """Any return value or exception leaves its parameters with mistakes or none."""
     assert asked(LOSS_MODELS["bernoulli"], {"quality": 0.5}) == []
     assert asked(checks(lambda _: [("depth", 3)]), {"depth": 3}) == [("depth", "3")]
 

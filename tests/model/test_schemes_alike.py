@@ -1,4 +1,4 @@
-"""What holds of every scheme: its declarations, its keys, and that a trial is the same trial in any company."""
+"""Rules for every scheme: its declarations, its keys, and that a trial is the same in any batch."""
 
 from __future__ import annotations
 

@@ -145,7 +145,7 @@ def enumerated(process: Process, z: Matrix, heard: Sequence[bool]) -> tuple[Floa
 
 
 def knowledge(process: Process) -> Knowledge:
-    """What eavesdroppers are told."""
+    """The knowledge of the eavesdroppers."""
     return Knowledge(process, MU_D, {}, {"schedule": bytes(32)})
 
 

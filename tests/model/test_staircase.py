@@ -43,7 +43,7 @@ def test_directions_without_noise_are_zeros_to_the_bit(case: str) -> None:
 @settings(max_examples=examples(60), deadline=None)
 @given(st.integers(2, 5), st.integers(1, 3), st.integers(0, 2**32 - 1))
 def test_units_of_the_states_do_not_matter(n: int, rank: int, seed: int) -> None:
-    """What noise reaches, and the probability of a type, are the same in metres and in millimetres."""
+    """The directions that noise reaches, and the probability of a type, are the same in metres and in millimetres."""
     random = np.random.default_rng(seed)
     A = np.round(random.standard_normal((n, n)) * 8.0) / 8.0 + 2.0 * np.eye(n)
     G = np.round(random.standard_normal((n, min(rank, n - 1))) * 8.0) / 8.0

@@ -1,4 +1,4 @@
-"""What a slot does to covariances and errors, against the table of `evedrop.model.update`."""
+"""The effect of a slot on covariances and errors, against the table of `evedrop.model.update`."""
 
 from __future__ import annotations
 

@@ -370,7 +370,7 @@ def test_sensor_refuses_malformed_progress(k: float, stage: Stage) -> None:
 
 @pytest.mark.parametrize("window", range(2, 40))
 def test_a_full_window_always_holds_the_end_of_a_batch(window: int) -> None:
-    """Whatever has been reported, some report is due within the next window: no two can wait for each other."""
+    """In every state some report is due within the next window: no two processes can wait for each other."""
     for batch in range(1, window + 1):
         brief = replace(briefs()["sensor"], flow=Flow(window, batch), slots=101)
         ends = [0, *(k + 1 for k in range(101) if is_due(brief, k))]

@@ -19,7 +19,7 @@ from tests.recordings.recorded_messages import BURSTS, heard, lossy, trimmed
     st.randoms(use_true_random=False),
 )
 def test_late_and_repeated_messages_are_no_losses(word: list[int], first: int, random: Any) -> None:
-    """Whatever is late or comes twice, and wherever the numbers wrap: the outcomes are those of the link."""
+    """With any late or repeated messages, and any wrap of the numbers, the outcomes are those of the link."""
     places = [i for i, outcome in enumerate(word) if outcome]
     arrived = places + [place for place in places if random.random() < 0.3]
     arrived.sort(key=lambda place: place + random.random() * 5.0)

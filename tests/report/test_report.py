@@ -140,7 +140,7 @@ def test_a_page_has_cautions_events_and_outages_and_does_not_depend_on_the_order
 
 
 def test_a_slot_without_a_packet_is_silent_in_its_lane(study: Path, tmp_path: Path) -> None:
-    """Whatever the receiver's action is: nothing was sent."""
+    """For every action of the receiver: nothing was sent."""
     for name in ("summary.json", "scenario.toml"):
         (tmp_path / name).write_bytes((study / name).read_bytes())
     table = pq.read_table(study / "trials.parquet")

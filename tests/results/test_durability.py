@@ -1,4 +1,4 @@
-"""What was measured is on disk and can be read: after kill -9 of everything, on a full disk, in a folder that was renamed."""
+"""Measurements are on disk and can be read: after kill -9 of everything, on a full disk, in a folder that was renamed."""
 
 from __future__ import annotations
 

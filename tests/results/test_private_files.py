@@ -51,7 +51,7 @@ def open_to_others(folder: Path) -> dict[str, str]:
 
 
 def watched(live: Live, top: Path) -> list[dict[str, str]]:
-    """What was open to others at any look while a command went on, from its first file on; it must end well."""
+    """The files that were ever open to others while a command ran, from its first file on; it must end well."""
     found = []
     while live.process.poll() is None:
         if top.exists() and (bad := open_to_others(top)):

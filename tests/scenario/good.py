@@ -26,7 +26,7 @@ GOOD: dict[str, Any] = {
 
 
 def mistakes(changes: dict[str, Any], without: str = "") -> list[str]:
-    """What is said of the good scenario with these changes, and without one entry."""
+    """The messages about the good scenario with these changes, and without one entry."""
     tables = copy.deepcopy(GOOD)
     *above, last = without.split(".")
     inner = tables

@@ -253,7 +253,7 @@ def test_events_survive_being_written_and_read() -> None:
 def test_an_expectation_that_events_leave_without_theory_is_refused(
     event: dict[str, Any], receiver: str, more: dict[str, Any]
 ) -> None:
-    """What would come out as null is refused, also where link and strategy by themselves have a theory."""
+    """Figures that would be null are refused, even where link and strategy by themselves have a theory."""
     figure = f"{receiver}.expected_trace_covariance"
     expect = [{"figure": figure, "below": 1.0}]
     (line,) = mistakes(event, expect=expect, **more)

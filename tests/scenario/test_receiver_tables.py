@@ -35,7 +35,7 @@ SPY = {"strategy": "replay-informed", "learns_at": 5, "reads_as": "bayesian", "l
     ],
 )  # fmt: skip
 def test_a_mistake_of_an_eavesdropper_is_named(table: dict[str, Any], said: list[str]) -> None:
-    """What a strategy lacks, what it has too much of, and what is wrong with it: a line each."""
+    """Missing, superfluous and wrong entries of a strategy: a line each."""
     given = {name: value for name, value in table.items() if value is not None}
     found = mistakes({"eavesdroppers.eve": given})
     assert len(found) == len(said), found

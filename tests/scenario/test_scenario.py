@@ -93,7 +93,7 @@ def test_a_mistake_is_named_with_path_found_and_expected(key: str, value: Any, s
 
 @pytest.mark.parametrize("entry", ["title", "slots", "process", "process.Q", "encoding.scheme", "legitimate.link"])
 def test_a_missing_entry_is_named(entry: str) -> None:
-    """What must be there and is not is named by its path."""
+    """A missing entry is named by its path."""
     assert any(line.startswith(f"{entry}: is missing; expected ") for line in mistakes({}, entry))
 
 
@@ -217,7 +217,7 @@ def test_any_entry_can_be_set() -> None:
 
 @given(st.one_of(st.integers(), st.booleans(), st.floats(allow_nan=False), st.lists(st.integers()), st.text("abc d")))
 def test_values_on_the_command_line_are_toml_or_text(value: Any) -> None:
-    """What is TOML is read as such, everything else is the string it is."""
+    """A value that is TOML is read as such, everything else as a string."""
     text = value if isinstance(value, str) else tomli_w.dumps({"v": value}).removeprefix("v = ").strip()
     assert value_of(text) == value
 

@@ -85,7 +85,7 @@ def test_right_links_are_within_their_intervals() -> None:
 
 @pytest.mark.parametrize("name", ["coins", "bursts", "pattern", "far", "slow"])
 def test_a_link_with_another_model_is_flagged(name: str) -> None:
-    """What was counted on one link is outside the interval of a model that loses otherwise."""
+    """The counts of one link are outside the interval of a model with other losses."""
     one = scenario(3)
     changed = scenario(3, [{"at": 1, "link": name, "set": {"quality": 0.45}}])
     assert link_summary_of(changed, name, tally_of(one, name)).within_interval is False

@@ -66,7 +66,7 @@ def test_zero_and_infinity_have_their_places() -> None:
 
 
 def test_slots_without_values_have_no_quantiles() -> None:
-    """What no trial came to is NaN, and so is what is left out of a long run."""
+    """Slots that no trial reached are NaN, and so are those left out of a long run."""
     found = histograms(np.full((2, 5), SCALE), first=1, slots=5).quantiles()
     assert np.isnan(found[[0, 3, 4]]).all()
     assert np.isfinite(found[[1, 2]]).all()
@@ -120,7 +120,7 @@ def test_what_is_sent_is_small_and_adds_up_as_before() -> None:
 
 
 def test_beyond_the_bins_only_the_side_is_known() -> None:
-    """What is too large for the bins is infinite, what is too small is 0: never a wrong number."""
+    """A value too large for the bins is infinite, one too small is 0: never a wrong number."""
     histograms = SlotHistograms(2, 1.0)
     histograms.add(0, np.array([[1e80, 1e90, 1e85], [1e-30, 0.0, 1e-25]]))
     found = histograms.quantiles()

@@ -86,7 +86,7 @@ def test_every_pair_is_there_or_says_why_not(everything: Everything) -> None:
 
 
 def test_a_comparison_is_read_back_and_has_its_page(everything: Everything) -> None:
-    """What compare.json says is what was found, but for the sentences of verdicts; every pair has its cell on the page."""
+    """compare.json has the results, except for the sentences of verdicts; every pair has its cell on the page."""
     found, folder = everything
 
     def without_sentences(of: dict[str, Any]) -> dict[str, Any]:

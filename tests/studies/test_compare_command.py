@@ -56,7 +56,7 @@ def test_flips_have_the_probability_of_the_scenario() -> None:
 
 @pytest.mark.parametrize("name", ["numerical", "vehicle", "fading", "colluding", "restart", "late", "driving-away"])
 def test_shipped_scenarios_can_be_compared(name: str) -> None:
-    """Whatever their links, events and eavesdroppers are."""
+    """For any links, events and eavesdroppers."""
     assert len(matchups_of(load(name)).groups) >= len(SCHEMES)
 
 

@@ -1,4 +1,4 @@
-"""What learners have learned, and what it is worth: against a Monte Carlo study of the same trials, and by the command."""
+"""How much learners know, and what their errors are: against a Monte Carlo study of the same trials, and by the command."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ def test_the_graph_tells_fates_and_errors(simulated: Callable[..., Simulated], t
 
 
 def test_every_fate_and_state_has_a_colour_of_the_table() -> None:
-    """Whatever a lane says, the graph can say it, too."""
+    """The graph can show everything that a lane shows."""
     assert {*lanes.LEGITIMATE.words, *lanes.EAVESDROPPER.words} == set(FATES)
     assert set(KNOWN) == set(KNOWLEDGE)
     assert {*FATES.values(), *KNOWN.values()} <= set(RUN_TEXTS)

@@ -76,7 +76,7 @@ def test_nobody_can_connect_to_who_draws(simulated: Callable[..., Simulated], tm
     [pytest.param(1, 1.0, marks=pytest.mark.long), (2, 1.12), pytest.param(4, 1.0, marks=pytest.mark.long)],
 )
 def test_every_panel_is_filled(n: int, growth: float, simulated: Callable[..., Simulated], tmp_path: Path) -> None:
-    """Whatever the process, each panel draws something, in more than one colour, and complains of nothing."""
+    """For every process, each panel draws something, in more than one colour, without a warning."""
     rrd = recorded(simulated(120, n=n, growth=growth), tmp_path / "r.rrd")
     panels_are_filled(rrd, 9)
 

@@ -359,7 +359,7 @@ def test_faulty_viewer_changes_nothing(
 
 
 def test_a_browser_gets_the_run(simulated: Callable[..., Simulated], viewer: Viewer, tmp_path: Path) -> None:
-    """What is served while a run is recorded is the recording, whole."""
+    """The bytes served while a run is recorded are the whole recording."""
     run = simulated(SLOTS)
     recording = ViewRecording(tmp_path / "r.rrd", run.scene)
     with urllib.request.urlopen(data_of(viewer), timeout=LIMIT) as reply:  # noqa: S310 - our own address
@@ -394,5 +394,5 @@ def test_a_place_that_is_none_is_refused(text: str) -> None:
 
 
 def test_every_address_is_seen_at_loopback() -> None:
-    """What a browser on this machine is to be pointed at."""
+    """The address for a browser on this machine."""
     assert WebAddress.of("0.0.0.0:17450").seen == WebAddress.of("127.0.0.1:17450").seen == "127.0.0.1"

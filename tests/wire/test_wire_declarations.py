@@ -1,4 +1,4 @@
-"""What programs declare crosses a wire, however much it is and while others declare; routers that join sides are found."""
+"""Declarations of programs cross a wire, however many, and while others declare; routers that join sides are found."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def router(*connect: str) -> Iterator[tuple[zenoh.Session, str]]:
 def test_sides_that_routers_join_outside_the_wire_carry_nothing(tmp_path: Path, lossless: tuple[str, ...]) -> None:
     """Each side has a router of its own, and these are connected with each other: without the wire, too, everything passes.
 
-    What is never lost does not cross either: it would go round forever.
+    Lossless messages do not cross either: it would go round forever.
     """
     with router() as (_, first), router(first) as (_, second):
         sides = {"robot": Side("robot", (ANYWHERE,), (first,)), "base": Side("base", (ANYWHERE,), (second,))}

@@ -1,4 +1,4 @@
-"""What a link does with the messages of a key: their numbers, and which reason comes first."""
+"""A link and the messages of a key: their numbers, and which reason for a loss comes first."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ def test_a_token_crosses_with_its_history_and_goes_with_its_program(tmp_path: Pa
 
 
 def test_a_tap_shows_tokens_and_hides_the_listener(tmp_path: Path) -> None:
-    """What listens is not seen by those it listens to."""
+    """A listener is not seen by those it listens to."""
     plan = plan_of(link("robot", "base"), link("robot", "listener", tap=True))
     with (
         at_work(plan, tmp_path) as wire,

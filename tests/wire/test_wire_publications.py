@@ -85,7 +85,7 @@ def test_everything_that_a_message_carries_crosses(tmp_path: Path) -> None:
 
 
 def test_the_nth_message_of_a_key_has_the_fate_that_the_seed_gives(tmp_path: Path) -> None:
-    """Whatever else flows, and deletes are numbered like puts."""
+    """No matter what else flows; deletes are numbered like puts."""
     plan = both_ways(LOSSY)
     with at_work(plan, tmp_path) as wire, wire.program("robot") as sender, wire.program("base") as far:
         ready(wire, sender, far)

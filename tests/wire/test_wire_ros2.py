@@ -70,7 +70,7 @@ def test_a_message_is_known_by_gid_and_sequence_number(named: bool) -> None:
 
 @given(st.binary(max_size=90))
 def test_no_attachment_confuses_the_reader(octets: bytes) -> None:
-    """Whatever a program attaches, the reader names a sender or none."""
+    """For any attachment of a program, the reader names a sender or none."""
     code, sequence = SourceReader(Codes())(zenoh.ZBytes(octets), None)
     assert (code, sequence) == (0, -1) or (code == 1 and len(octets) in {33, 77})
 
@@ -140,7 +140,7 @@ def test_the_key_of_a_service_is_that_of_its_requests() -> None:
     ],
 )
 def test_qos_of_a_token(text: str, qos: Qos) -> None:
-    """What a token leaves out has the default of rmw_zenoh; deadline, lifespan and liveliness are not read."""
+    """Entries that a token leaves out have the default of rmw_zenoh; deadline, lifespan and liveliness are not read."""
     entity = read_token(SUBSCRIPTION.rpartition("/")[0] + "/" + text)
     assert entity is not None
     assert entity.qos == qos

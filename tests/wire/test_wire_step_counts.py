@@ -52,7 +52,7 @@ rows_of_any_time = st.lists(
 @settings(deadline=None, max_examples=examples(40))
 @given(st.lists(rows_of_any_time, max_size=4))
 def test_every_message_is_counted_once(found: list[list[tuple[float, int, int]]]) -> None:
-    """Whatever the times, also before the start, long after it and out of order; steps do not overlap, and they are few."""
+    """For any times, also before the start, long after it and out of order; steps do not overlap, and they are few."""
     blocks = []
     for one in found:
         block = np.zeros(len(one), RECORD)

@@ -69,7 +69,7 @@ def test_quantiles_of_delays_are_exact_until_there_are_too_many_to_keep() -> Non
 
 
 def test_the_delays_that_are_kept_are_evenly_spaced() -> None:
-    """Whatever the sizes of the blocks, and without the messages that were not delivered."""
+    """For any sizes of the blocks, and without the messages that were not delivered."""
     tally, rng, count = LinkTally(), np.random.default_rng(5), 1_000_000
     records = np.zeros(count, RECORD)
     records["delay"] = np.arange(count)

@@ -107,7 +107,7 @@ def test_an_operator_ends_partitions() -> None:
 
 
 def refused(*arguments: Any) -> list[str]:
-    """What is said of a change by an operator that is refused: a function and its arguments."""
+    """The message for an operator's change that is refused: a function and its arguments."""
     with pytest.raises(ScenarioError) as caught:
         arguments[0](*arguments[1:])
     return caught.value.mistakes

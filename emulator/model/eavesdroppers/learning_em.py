@@ -89,7 +89,7 @@ class LearningEm(Learner):
         return self._believed(np.zeros(trials, np.uint8), memory)
 
     def knowing(self, k: int, x: Floats, belief: Belief) -> Belief:
-        """One component with covariance 0; what it has learned stays."""
+        """One component with covariance 0; its parameters stay."""
         memory = Memory.read(belief.memory)
         course = memory.learned.course.knowing(x)
         after = super().knowing(k, x, belief)

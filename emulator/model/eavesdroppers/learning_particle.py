@@ -96,7 +96,7 @@ class LearningParticle(Learner):
         return self._believed(cloud, np.zeros(self.trials, np.uint8), np.ones(self.trials), nothing)
 
     def knowing(self, k: int, x: Floats, belief: Belief) -> Belief:
-        """Every particle has the state; what they have learned stays."""
+        """Every particle has the state; their parameters stay."""
         cloud, scale, largest = self._read(belief)
         stored = self._stored(cloud._replace(course=cloud.course.knowing(self._wide(x))), scale, largest)
         return super().knowing(k, x, belief)._replace(memory=stored)

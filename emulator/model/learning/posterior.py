@@ -43,7 +43,7 @@ class Parameters(NamedTuple):
 
 
 class Transition(NamedTuple):
-    """What is known of x_{k−1} if the packet of slot k is the state x_k, for each component of slot k − 1."""
+    """The knowledge of x_{k−1} if the packet of slot k is the state x_k, for each component of slot k − 1."""
 
     share: Floats
     """Probability of the component and that the packet is the state, (C, R)."""

@@ -56,7 +56,7 @@ class QuantisedScheduleEncoder(Encoder):
 
 @final
 class QuantisedScheduleEstimator(Receiver):
-    """Reads every packet; what it reads has the error of the quantiser, of covariance R_k = diag(Δ²)/12."""
+    """Reads every packet; the value read has the error of the quantiser, of covariance R_k = diag(Δ²)/12."""
 
     def __init__(self, process: Process, trials: int, quantiser: DitheredQuantiser, pad: LevelPad) -> None:
         super().__init__(process, trials)
@@ -67,7 +67,7 @@ class QuantisedScheduleEstimator(Receiver):
         return gamma.astype(np.uint8)
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
-        """(A x̂, A P Aᵀ + Q) if lost, otherwise (what is read, R_k)."""
+        """(A x̂, A P Aᵀ + Q) if lost, otherwise (the value read, R_k)."""
         action = self.act(k, heard.gamma)
         encrypted = encrypted_packets(heard)
         masked = self._quantiser.levels_of(k, np.where(encrypted, heard.z, 0.0))
@@ -122,7 +122,7 @@ class QuantisedSchedule(Scheme):
 
     @property
     def quantisation(self) -> QuantisationError:
-        """The error of what is read."""
+        """The error of the value read."""
         return QuantisationError.of(self._width, self._deviations)
 
     def encrypted(self, packets: PacketBlock) -> Flags:

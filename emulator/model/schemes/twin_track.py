@@ -16,7 +16,7 @@ from evedrop.model.theory.closed_forms import twin_track_bound
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.streams import Ahead, Batch, BlockReader
 
-_SOON, _LATE, _GROWN = 2**10, 2**30, 1e3  # powers of A: what does not grow by so much between the two is bounded
+_SOON, _LATE, _GROWN = 2**10, 2**30, 1e3  # powers of A: bounded if the later one is not larger by this factor
 
 
 @final

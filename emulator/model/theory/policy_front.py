@@ -104,7 +104,7 @@ class FrontPoint:
 
 @dataclass(frozen=True)
 class Front:
-    """What `scheduled` reaches against one eavesdropper, and what a sensor that knew both holding times would reach."""
+    """The performance of `scheduled` against one eavesdropper, and that of a sensor that knew both holding times."""
 
     thresholds: tuple[PolicyFigures, ...]
     """`scheduled` with the thresholds 1, 2 … S."""

@@ -21,7 +21,7 @@ from evedrop.view.panels.state_plane import frames
 from evedrop.view.scene import Scene, SceneSlots
 
 _PATH = "map"
-_FLATTEST = 0.35  # height of what is shown, compared with its width
+_FLATTEST = 0.35  # height of the map section shown, compared with its width
 _ROOM = 0.75  # from the middle to each side, so that labels fit
 
 

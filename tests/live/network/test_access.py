@@ -114,7 +114,7 @@ def test_eavesdropper_hears_only_its_own_downlink(mode: str, stage: Bench) -> No
         slots = range(first, stage.due)
         while wire.Reader(*ears_of_own.hear()).integer("k") < slots[-1]:
             pass
-        # What is let through to one subscription of a session reaches its wildcards too: only that may.
+        # A message let through to one subscription of a session reaches its wildcards too: only that may.
         allowed = {own, stage.keys.control(EVE)}
         for key, ear in ears.items():
             assert {found for found, _ in ear.all()} <= allowed, key
@@ -141,7 +141,7 @@ def attacking(stage: Bench, mode: str) -> Iterator[zenoh.Session]:
 
 
 def assert_heard(stage: Bench, attacker: zenoh.Session) -> None:
-    """What the attacker may put arrives, so the router has dealt with all that it put and asked for before."""
+    """A permitted message of the attacker arrives, so the router has handled all its earlier messages and queries."""
     block = zenoh.CongestionControl.BLOCK
     attacker.put(stage.keys.progress(EVE), enclosed(stage.keys.progress(EVE), b"mine"), congestion_control=block)
     attacker.put(stage.keys.telemetry(EVE), enclosed(stage.keys.telemetry(EVE), b"mine"), congestion_control=block)

@@ -215,7 +215,7 @@ LIES: dict[str, tuple[Any, Callable[[Any], Any]]] = {
 
 
 def said_by(lies: dict[str, Any]) -> Any:
-    """What stands for a class that gives these answers, whatever it should say."""
+    """The stand-in for a class that gives these answers, right or wrong."""
     answers = Answers()
     truth = {"mistakes": [], "streams": [], "betrayed": None, "follows_gamma": True, "use_probabilities": [1.0, 1.0]}
     said = {**truth, "outcomes": True, "outcomes_at": SHARES, **lies}

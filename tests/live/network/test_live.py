@@ -79,7 +79,7 @@ ENOUGH = 20  # messages on each of the keys that are meant to be heard
 
 @dataclass
 class Evidence:
-    """What came of the attack."""
+    """The outcome of the attack."""
 
     scenario: Scenario
     folder: Path

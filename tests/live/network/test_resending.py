@@ -1,4 +1,4 @@
-"""What is kept for a lost connection, and what is sent again."""
+"""The messages that are kept for a lost connection, and sent again."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def head(number: int, k: int, first: int) -> bytes:
 def test_a_round_announces_the_slot_that_follows(
     slots: int, done: int, asked: int, back: int, span: int | None
 ) -> None:
-    """Whatever was forgotten, however late a round is asked for: the head names the message behind it, and none is missing."""
+    """However much was forgotten, however late a round is requested: the head names the next message, and none is missing."""
     sent: list[bytes] = []
     kept = ReplayBuffer(sent.append, span=span, head=head, back=back)
     for k in range(slots):

@@ -239,7 +239,7 @@ def parts() -> st.SearchStrategy[Any]:
 @settings(deadline=None, max_examples=examples(200))
 @given(st.data(), st.sampled_from(sorted(READERS)))
 def test_anything_else_is_an_error_of_ours(data: st.DataObject, name: str) -> None:
-    """Whatever arrives, a reader gives values or raises one of the two errors of messages, which names the key and its writer."""
+    """For any bytes, a reader returns values or raises one of the two errors of messages, which names the key and its writer."""
     key, read = READERS[name]
     fields = fields_of(name)
     for field in data.draw(st.sets(st.sampled_from(sorted(fields)), max_size=2)):

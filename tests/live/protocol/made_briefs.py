@@ -81,7 +81,7 @@ def every_brief() -> dict[str, dict[str, Any]]:
 
 
 def refusal(found: dict[str, Any], folder: Path) -> str | None:
-    """What is said of a brief; None if it can be used."""
+    """The message about a brief; None if it can be used."""
     path = folder / "brief.json"
     path.unlink(missing_ok=True)  # a new file: to write over the old one takes ten times as long
     path.write_text(json.dumps(found))
