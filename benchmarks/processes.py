@@ -14,7 +14,7 @@ _PAGE = os.sysconf("SC_PAGE_SIZE")
 
 
 @dataclass(frozen=True)
-class Process:
+class ProcessUsage:
     """One process of a run, at one moment."""
 
     pid: int
@@ -34,7 +34,7 @@ class Process:
         return sum(int(line.split()[1]) for line in lines if line.startswith("Private_")) * 1024 / 1e6
 
 
-def processes_of(launcher: int) -> list[Process]:
+def processes_of(launcher: int) -> list[ProcessUsage]:
     """The launcher of a run and all its descendants, by process id."""
     stats = dict(_stats())
     inside = {launcher} & stats.keys()
@@ -48,7 +48,7 @@ def processes_of(launcher: int) -> list[Process]:
         except OSError:
             continue
         seconds = (int(fields[11]) + int(fields[12])) / _TICK
-        found.append(Process(pid, name, role, seconds, int(fields[21]) * _PAGE / 1e6))
+        found.append(ProcessUsage(pid, name, role, seconds, int(fields[21]) * _PAGE / 1e6))
     return found
 
 

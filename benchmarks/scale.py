@@ -57,7 +57,7 @@ QUICK = Grid((1, 10), (1, 2), (1,), 0.1)
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredRun:
     """One run."""
 
     trials: int
@@ -95,13 +95,13 @@ def changes_of(slots: int, trials: int, receivers: int, shards: int) -> dict[str
     return {"slots": slots, "trials": trials, "shards": shards, "pace": 0.0, "eavesdroppers": eavesdroppers}
 
 
-def measure(trials: int, receivers: int, shards: int, seconds: float) -> Measured:
+def measure(trials: int, receivers: int, shards: int, seconds: float) -> MeasuredRun:
     """Run one point of the grid and watch it."""
     expected = 60e-6 + 11e-6 * receivers + trials * (0.3e-6 + 0.075e-6 * receivers)  # a slot, on two cores of 2024
     return _measure(trials, receivers, shards, max(6000 if trials < 100 else 40, int(seconds / expected)))
 
 
-def _measure(trials: int, receivers: int, shards: int, slots: int) -> Measured:
+def _measure(trials: int, receivers: int, shards: int, slots: int) -> MeasuredRun:
     looks: list[tuple[float, float, dict[str, list[float]]]] = []
     told: list[tuple[float, int]] = []
 
@@ -121,7 +121,7 @@ def _measure(trials: int, receivers: int, shards: int, slots: int) -> Measured:
     end = next(at for at, now in steady if now == last[1])
     used = processor_seconds(looks, begin, end)
     busiest = max(used, key=lambda kind: max(used[kind]))
-    return Measured(
+    return MeasuredRun(
         *(trials, receivers, shards, slots),
         slots_per_second=(last[1] - done) / (end - begin),
         megabytes=max(resident for _, resident, _ in looks),
@@ -165,7 +165,7 @@ def named(power: float) -> str:
     return words[int(np.searchsorted((-0.1, 0.1, 0.9, 1.1), power))]
 
 
-def laws(found: list[Measured]) -> None:
+def laws(found: list[MeasuredRun]) -> None:
     """Growth along each axis, and what a slot costs."""
     alone = [one for one in found if one.shards == 1]
     axes = {"trials": sorted({one.trials for one in alone}), "receivers": sorted({one.receivers for one in alone})}
@@ -197,7 +197,7 @@ def laws(found: list[Measured]) -> None:
             )
 
 
-def draw(found: list[Measured], picture: Path) -> None:
+def draw(found: list[MeasuredRun], picture: Path) -> None:
     """Three panels: deliveries a second and memory against trials, and what shards change."""
     receivers = sorted({one.receivers for one in found})
     with panels(picture, 3, 13.0, 4.2) as (speed, memory, gain):
@@ -237,7 +237,7 @@ def draw(found: list[Measured], picture: Path) -> None:
             which(lambda value, _: f"{value:,.0f}" if f"{value:g}"[0] in "1257" else "")
 
 
-def _alone(found: list[Measured], trials: int) -> float:
+def _alone(found: list[MeasuredRun], trials: int) -> float:
     """The rate of this number of trials in one shard."""
     return next(one.rate for one in found if one.shards == 1 and one.trials == trials)
 

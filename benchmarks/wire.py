@@ -38,7 +38,7 @@ BURSTS: Mapping[str, Any] = {"loss": {"model": "gilbert-elliott", "p": 0.01, "r"
 _LOSSES = Path(__file__).parents[1] / "tests" / "wire" / "losses.toml"
 
 
-class Measured:
+class MeasuredWire:
     """A wire in this process: where to connect, and the fates of the messages so far."""
 
     def __init__(self, relay: WireRelay, journal: WireJournal) -> None:
@@ -70,7 +70,7 @@ class Measured:
 
 
 @contextmanager
-def a_wire(*links: tuple[str, Mapping[str, Any]]) -> Iterator[Measured]:
+def a_wire(*links: tuple[str, Mapping[str, Any]]) -> Iterator[MeasuredWire]:
     """A wire from robot to base with these links: key expression, settings."""
     made = [WireLink(f"link-{at}", at, "robot", "base", keys, settings) for at, (keys, settings) in enumerate(links)]
     made.append(WireLink("rest", len(made), "robot", "base", "**", PERFECT))
@@ -80,7 +80,7 @@ def a_wire(*links: tuple[str, Mapping[str, Any]]) -> Iterator[Measured]:
         WireJournal(Path(folder), plan) as journal,
         WireRelay(plan, journal) as relay,
     ):
-        yield Measured(relay, journal)
+        yield MeasuredWire(relay, journal)
 
 
 @contextmanager

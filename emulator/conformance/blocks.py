@@ -17,9 +17,9 @@ from evedrop.conformance.packets import (
     expect_packets,
     frozen_belief,
     row_of,
-    said_of,
     sent_of,
     sides,
+    slots_text,
 )
 from evedrop.conformance.problems import Problem
 from evedrop.conformance.receivers import Step
@@ -108,7 +108,7 @@ def _encoded(
     encoder: Encoder, some: range, slots: Sequence[Slot], problem: Problem, scheme: Scheme, kind: type
 ) -> PacketBlock:
     x, predicted = (frozen(np.array([getattr(slots[k], name) for k in some])) for name in ("x", "predicted"))
-    with calling(f"{said_of(some)}: {_name(encoder, 'encode_block')}", kind):
+    with calling(f"{slots_text(some)}: {_name(encoder, 'encode_block')}", kind):
         packets = encoder.encode_block(some, x, predicted)
     expect_packets(some, packets, scheme, problem)
     if scheme.needs_acknowledgements:
@@ -122,7 +122,7 @@ def _followed(
     receiver: Receiver, some: range, belief: Belief, steps: Sequence[Step], problem: Problem, kind: type
 ) -> _Followed:
     gamma, z = (frozen(np.array([getattr(steps[k][1], name) for k in some])) for name in ("gamma", "z"))
-    with calling(f"{said_of(some)}: {_name(receiver, 'follow')}", kind):
+    with calling(f"{slots_text(some)}: {_name(receiver, 'follow')}", kind):
         found: Any = receiver.follow(some, belief, gamma, z)
     expect_beliefs(some, found, problem)
     return some, *found
@@ -155,18 +155,18 @@ def _expect_same_uses(receiver: Receiver, blocks: list[range], problem: Problem,
     every = np.ones(problem.batch.trials, np.bool_)
     for some in blocks:
         name = _name(receiver, "uses_block")
-        with calling(f"{said_of(some)}: {name}", kind):
+        with calling(f"{slots_text(some)}: {name}", kind):
             found, single = receiver.uses_block(some), [receiver.uses(k) for k in some]
         if found is not None:
             shape = (len(some), problem.batch.trials)
-            expect_array(f"{said_of(some)}: {name}", found, np.bool_, shape, "slots, R trials; or None: always")
+            expect_array(f"{slots_text(some)}: {name}", found, np.bool_, shape, "slots, R trials; or None: always")
         rows = [{"whether a packet is used": every if found is None else found[row]} for row in range(len(some))]
         once = [{"whether a packet is used": every if one is None else one} for one in single]
         _expect_same(once, rows, some, problem, name)
 
 
 def _expect_same(once: Sequence[Row], rows: Sequence[Row], some: range, problem: Problem, name: str) -> None:
-    said = f"{{0!r}} in a single slot and {{1!r}} by {name} of {said_of(some)}"
+    said = f"{{0!r}} in a single slot and {{1!r}} by {name} of {slots_text(some)}"
     expect_same(once, rows, slice(None), problem.batch.first_trial, said, _REMEDY, some.start)
 
 

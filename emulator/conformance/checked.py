@@ -13,7 +13,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from typing import Any, final
 
-from evedrop.conformance.packets import expect_belief, expect_beliefs, expect_packet, expect_packets, said_of
+from evedrop.conformance.packets import expect_belief, expect_beliefs, expect_packet, expect_packets, slots_text
 from evedrop.conformance.problems import Problem
 from evedrop.conformance.rules import Broken
 from evedrop.errors import EvedropError, RunError
@@ -31,8 +31,8 @@ def failed(what: str, slots: range, batch: Batch, how: str) -> RunError:
     """The error of a class that failed in consecutive slots; what: such as `the scheme mine:Mine`."""
     first = batch.first_trial
     trials = f"trial {first}" if batch.trials == 1 else f"trials {first} to {first + batch.trials - 1}"
-    said = how.removeprefix(f"{said_of(slots)}: ")
-    return RunError(f"{what} failed in {said_of(slots)}, {trials}: {said}; run `evedrop check` on the class")
+    said = how.removeprefix(f"{slots_text(slots)}: ")
+    return RunError(f"{what} failed in {slots_text(slots)}, {trials}: {said}; run `evedrop check` on the class")
 
 
 @contextlib.contextmanager

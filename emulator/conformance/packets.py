@@ -144,7 +144,7 @@ def expect_packet(k: int, packet: Any, scheme: Scheme, problem: Problem) -> None
 def expect_packets(slots: range, packets: Any, scheme: Scheme, problem: Problem) -> None:
     """Raise Broken unless these are valid packets of a scheme for consecutive slots."""
     if not isinstance(packets, PacketBlock):
-        raise Broken(f"{said_of(slots)}: encode_block() returned {type(packets).__name__}; expected a PacketBlock")
+        raise Broken(f"{slots_text(slots)}: encode_block() returned {type(packets).__name__}; expected a PacketBlock")
     _expect_columns(slots, packets, scheme, problem)
 
 
@@ -153,7 +153,7 @@ def _expect_columns(slots: range, packet: Packet | PacketBlock, scheme: Scheme, 
     n, trials = problem.process.n, problem.batch.trials
     several = isinstance(packet, PacketBlock)
     rows, axes = ((len(slots),), "slots, ") if several else ((), "")
-    where, name = said_of(slots), type(packet).__name__
+    where, name = slots_text(slots), type(packet).__name__
     subject = "the packets have" if several else "the packet has"
     expect_array(f"{where}: {name}.z", packet.z, np.float64, (*rows, n, trials), f"{axes}n states, R trials")
     expect_array(f"{where}: {name}.nu", packet.nu, np.bool_, (*rows, trials), f"{axes}{_TRIALS}")
@@ -203,10 +203,10 @@ def expect_beliefs(slots: range, found: Any, problem: Problem) -> None:
             else type(found).__name__
         )
         raise Broken(
-            f"{said_of(slots)}: follow() returned {what}; expected the Beliefs after each slot, and the Belief after the last"
+            f"{slots_text(slots)}: follow() returned {what}; expected the Beliefs after each slot, and the Belief after the last"
         )
     beliefs, after = found
-    _expect_arrays(f"{said_of(slots)}: Beliefs", beliefs, (len(slots),), problem)
+    _expect_arrays(f"{slots_text(slots)}: Beliefs", beliefs, (len(slots),), problem)
     if not (np.isfinite(beliefs.x_hat).all() and np.isfinite(beliefs.P).all() and asymmetry(beliefs.P) is None):
         for row, k in enumerate(slots):
             expect_belief(f"slot {k}: Belief", Belief(*(column[row] for column in beliefs)), problem)
@@ -224,6 +224,6 @@ def _expect_arrays(where: str, belief: Belief | Beliefs, rows: tuple[int, ...], 
     expect_array(f"{where}.action", belief.action, np.uint8, (*rows, trials), means)
 
 
-def said_of(slots: range) -> str:
+def slots_text(slots: range) -> str:
     """Consecutive slots, at least one, in words."""
     return f"slot {slots.start}" if len(slots) == 1 else f"slots {slots.start} to {slots.stop - 1}"

@@ -158,7 +158,7 @@ def test_trials_that_were_cut_short_have_no_standard_errors() -> None:
 def test_a_figure_that_is_not_known_trial_by_trial_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
     """A mean that is kept for all trials together, and totals that say nothing about trials."""
 
-    class Kept(MeanFigure):
+    class KeptFraction(MeanFigure):
         by_trial = False
 
         @staticmethod
@@ -166,7 +166,7 @@ def test_a_figure_that_is_not_known_trial_by_trial_has_none(monkeypatch: pytest.
             return slots.error
 
     tally = Tally(9, 3, done=4, offered=12)
-    monkeypatch.setattr("evedrop.score.sums.figure", lambda _: Kept)
+    monkeypatch.setattr("evedrop.score.sums.figure", lambda _: KeptFraction)
     assert tally.of_trials("kept") is None
     monkeypatch.setattr("evedrop.score.sums.figure", lambda _: UsedFraction)
     assert tally.of_trials("used") is not None

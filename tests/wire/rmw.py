@@ -54,7 +54,7 @@ def ros_context(endpoint: str) -> Iterator[zenoh.Session]:
         yield session
 
 
-class Heard(NamedTuple):
+class ReceivedMessage(NamedTuple):
     """A message that a subscription, a client or a service took."""
 
     sequence: int
@@ -133,13 +133,13 @@ class Node:
 
         return publish
 
-    def subscription(self, topic: str, kept: int = 0, depth: int = 10, reliable: bool = True) -> list[Heard]:
+    def subscription(self, topic: str, kept: int = 0, depth: int = 10, reliable: bool = True) -> list[ReceivedMessage]:
         """A subscription to strings; returns the list to which it adds them."""
         key, token = self._entity("MS", topic, STRING, string_hash(), kept, depth, reliable)
-        heard: list[Heard] = []
+        heard: list[ReceivedMessage] = []
 
         def take(sample: zenoh.Sample) -> None:
-            heard.append(Heard(*detach(sample.attachment), from_cdr(STRING, sample.payload).data))
+            heard.append(ReceivedMessage(*detach(sample.attachment), from_cdr(STRING, sample.payload).data))
 
         self._held.append(
             ext.declare_advanced_subscriber(
@@ -154,16 +154,16 @@ class Node:
         self._held.append(self.session.liveliness().declare_token(token))
         return heard
 
-    def service(self, name: str) -> list[Heard]:
+    def service(self, name: str) -> list[ReceivedMessage]:
         """A service that adds two numbers; returns the list of the requests that it took."""
         key, token = self._entity("SS", name, ADD, ADD_HASH)
-        taken: list[Heard] = []
+        taken: list[ReceivedMessage] = []
 
         def answer(query: zenoh.Query) -> None:
             assert query.payload is not None
             sequence, gid = detach(query.attachment)
             request = from_cdr(REQUEST, query.payload)
-            taken.append(Heard(sequence, gid, (request.a, request.b)))
+            taken.append(ReceivedMessage(sequence, gid, (request.a, request.b)))
             reply = to_cdr(RESPONSE, sum=request.a + request.b)
             query.reply(key, reply, attachment=attach(sequence, bytes.fromhex(gid)))
             query.drop()
@@ -172,7 +172,7 @@ class Node:
         self._held.append(self.session.liveliness().declare_token(token))
         return taken
 
-    def client(self, name: str) -> tuple[Callable[[int, int], int], list[Heard]]:
+    def client(self, name: str) -> tuple[Callable[[int, int], int], list[ReceivedMessage]]:
         """A client of such a service: what sends a request and gives its sequence number, and the list of the responses."""
         key, token = self._entity("SC", name, ADD, ADD_HASH)
         querier = self.session.declare_querier(
@@ -180,11 +180,11 @@ class Node:
         )
         self._held.append(querier)
         self._held.append(self.session.liveliness().declare_token(token))
-        gid, numbers, heard = gid_of(token), count(1), list[Heard]()
+        gid, numbers, heard = gid_of(token), count(1), list[ReceivedMessage]()
 
         def take(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
-                heard.append(Heard(*detach(reply.ok.attachment), from_cdr(RESPONSE, reply.ok.payload).sum))
+                heard.append(ReceivedMessage(*detach(reply.ok.attachment), from_cdr(RESPONSE, reply.ok.payload).sum))
 
         def send(a: int, b: int) -> int:
             sequence = next(numbers)

@@ -19,7 +19,7 @@ from evedrop.wire.journal_reader import journal_tables
 from evedrop.wire.plan import Side, WireLink, WirePlan
 from evedrop.wire.relay import WireRelay
 from tests.conftest import LIMIT, wait_until
-from tests.wire.rmw import Heard, Node, ros_context
+from tests.wire.rmw import Node, ReceivedMessage, ros_context
 
 LOSSY = {"loss": {"model": "gilbert-elliott", "p": 0.2, "r": 0.4}}
 WHOLE = {"loss": {"model": "bernoulli", "quality": 1.0}}
@@ -149,7 +149,7 @@ def test_a_late_joiner_gets_the_history_and_what_follows(field: Field) -> None:
     assert [one.sequence for one in heard] == [3, 4, 5, 6]
 
 
-def has(heard: list[Heard], text: str) -> bool:
+def has(heard: list[ReceivedMessage], text: str) -> bool:
     """Whether a message was heard."""
     return any(one.text == text for one in heard)
 

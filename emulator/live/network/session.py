@@ -198,7 +198,7 @@ class Session:
         self._by_hand = not brief.ends_with_stdin
         # A router connects to no other process, so it is always on its network.
         self._heartbeat = HeartbeatFile((lambda: True) if brief.role in ("router", "relay") else self.linked)
-        self.funnel(self._control, self._told)
+        self.funnel(self._control, self._sort_command)
 
     def __enter__(self) -> Self:
         return self
@@ -361,7 +361,7 @@ class Session:
             for kept in self._kept:
                 kept.again(asked.round, asked.slot)
 
-    def _told(self, payload: bytes) -> None:
+    def _sort_command(self, payload: bytes) -> None:
         """Sort the conductor's commands; a malformed one is left to the reader of the commands, which raises the error."""
         with suppress(MalformedMessage):
             match self._read(payload):

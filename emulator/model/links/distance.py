@@ -98,9 +98,9 @@ class Distance(LossModel):
                     (name, f"is {as_toml(value)}; expected a whole number of slots from 1 to {_LONGEST_BLOCK}")
                 )
         if len(ways) == 2 and not any(ways.values()):
-            meeting = _meeting(Way(given["sender"]), Way(given["receiver"]))
-            if meeting is not None:
-                found.append(("receiver", f"is where the sender is, in slot {meeting}; expected another place"))
+            shared_slot = _shared_slot(Way(given["sender"]), Way(given["receiver"]))
+            if shared_slot is not None:
+                found.append(("receiver", f"is where the sender is, in slot {shared_slot}; expected another place"))
         return found
 
     @property
@@ -203,7 +203,7 @@ def _held(
     return drawn, drawn[-1].copy()
 
 
-def _meeting(sender: Way, receiver: Way) -> int | None:
+def _shared_slot(sender: Way, receiver: Way) -> int | None:
     """A slot of a waypoint in which both are in one place, if there is one."""
     slots = np.array(sorted({*sender.slots, *receiver.slots}), np.float64)
     (x, y), (to_x, to_y) = sender.at(slots), receiver.at(slots)
