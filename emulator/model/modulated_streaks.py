@@ -26,7 +26,7 @@ _LARGEST_RUN = 2**18
 
 
 @dataclass(frozen=True)
-class _Course:
+class _SlotLaws:
     """The link and the outcomes of every slot, for T slots and S states of the link."""
 
     transitions: Floats
@@ -59,8 +59,8 @@ def modulated_streaks(
     too_long = slots * process.n**2 * max(states) > _LARGEST_RUN
     if law.window or law.outages or len(states) > 1 or not np.isfinite(total) or too_long:
         return None
-    course = _course_of(process, law, slots, outcomes_at, slots_at)
-    groups = _begun(process, course)
+    laws = _slot_laws_of(process, law, slots, outcomes_at, slots_at)
+    groups = _begun(process, laws)
     carry: Floats = np.kron(process.A, process.A).T.astype(np.float64)
     diagonal = np.eye(process.n).reshape(-1)
     number, carried, done, length = [], [], 0, 0
@@ -72,12 +72,12 @@ def modulated_streaks(
             return None
         if np.sum(carried) >= (1.0 - REST) * total or length == slots:
             return Streaks(np.array(number).T, np.array(carried).T, total)
-        groups = [_lasting(course, carry, *one, length) for one in groups]
+        groups = [_lasting(laws, carry, *one, length) for one in groups]
 
 
-def _course_of(
+def _slot_laws_of(
     process: Process, law: LinkLaw, slots: int, outcomes_at: OutcomesAt, slots_at: SlotOutcomes | None
-) -> _Course:
+) -> _SlotLaws:
     starts = [*(one.start for one in law.segments[1:]), slots]
     shape = (slots, len(law.last.law))
     transitions, stationary, quality = np.empty((*shape, shape[1])), np.empty(shape), np.empty(shape)
@@ -97,38 +97,38 @@ def _course_of(
         M = np.array([np.zeros_like(process.Q), *(remaining.next() for _ in range(1, slots))])
         noise = noise + odds["leaked"][:, :, None] * M.reshape(slots, 1, -1)
     misled = misled_covariances(process, slots) if odds["misled"].any() else np.zeros((slots, process.n**2))
-    return _Course(transitions, stationary, odds, noise, misled.reshape(slots, -1))
+    return _SlotLaws(transitions, stationary, odds, noise, misled.reshape(slots, -1))
 
 
-def _begun(process: Process, course: _Course) -> list[tuple[Floats, Floats]]:
+def _begun(process: Process, laws: _SlotLaws) -> list[tuple[Floats, Floats]]:
     """The probability of a streak that begins in each slot, (T, S), and P there, (T, S, n²), for each row of `Streaks`.
 
     Streaks that begin in slot 0, and those of a receiver that is never misled, have that slot alone.
     """
-    odds, law = course.odds, course.law
+    odds, law = laws.odds, laws.law
     leaving = odds["predicted"] + odds["leaked"]
     decoded = odds["kept"] - leaving
     state = 1.0 - odds["kept"] - odds["misled"]
     first = (law * odds["initial"])[:1]
     before, in_step = np.zeros(law.shape), law[0] - first[0]
     for k in range(1, len(law)):
-        before[k] = in_step @ course.transitions[k]
+        before[k] = in_step @ laws.transitions[k]
         in_step = law[k] * state[k] + decoded[k] * before[k]
     misled = law * odds["misled"]
     misled[0] = 0.0
     misled = misled if misled.any() else misled[:1]
     return [
-        (before * leaving, before[:, :, None] * course.noise),
-        (misled, misled[:, :, None] * course.misled[: len(misled), None]),
+        (before * leaving, before[:, :, None] * laws.noise),
+        (misled, misled[:, :, None] * laws.misled[: len(misled), None]),
         (first, first[:, :, None] * process.initial_covariance.reshape(-1)),
     ]
 
 
-def _lasting(course: _Course, carry: Floats, w: Floats, C: Floats, length: int) -> tuple[Floats, Floats]:
+def _lasting(laws: _SlotLaws, carry: Floats, w: Floats, C: Floats, length: int) -> tuple[Floats, Floats]:
     """The same one slot later, of the streaks that continue, when they have lasted for `length` slots."""
-    count = min(len(w), len(course.law) - length)
+    count = min(len(w), len(laws.law) - length)
     some = slice(length, length + count)
-    kept, T, noise = course.odds["kept"][some], course.transitions[some], course.noise[some]
+    kept, T, noise = laws.odds["kept"][some], laws.transitions[some], laws.noise[some]
     states = range(w.shape[1])
     before, moved = np.zeros(kept.shape), np.zeros(noise.shape)
     for s in states:

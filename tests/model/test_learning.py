@@ -13,7 +13,7 @@ from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.bayesian import Bayesian
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
 from evedrop.model.eavesdroppers.learning_em import LearningEm, climbing_slots
-from evedrop.model.learning.course import CAPACITY
+from evedrop.model.learning.learner_posterior import CAPACITY
 from evedrop.model.learning.moments import RIDGE, divided, factored
 from evedrop.model.process import Floats, Process, Trajectory
 from evedrop.model.receiver import Belief, Receiver, Reception

@@ -14,9 +14,9 @@ from evedrop.model.eavesdroppers.bayesian import Bayesian
 from evedrop.model.eavesdroppers.delegate import Delegate
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.eavesdroppers.learning_particle import LearningParticle
-from evedrop.model.learning.course import CAPACITY
 from evedrop.model.learning.draws import drawn, lattice, numbers_of
 from evedrop.model.learning.known import known
+from evedrop.model.learning.learner_posterior import CAPACITY
 from evedrop.model.learning.moments import Moments
 from evedrop.model.process import Process
 from evedrop.model.receiver import Reception

@@ -84,7 +84,7 @@ class OneProgress:
 
 @final
 @dataclass
-class _Course:
+class _ShardsState:
     """The state of the shards so far."""
 
     failures: list[tuple[Shard, BaseException]] = field(default_factory=list)
@@ -131,13 +131,13 @@ def launch_shards(
     endpoints = _endpoints(scenario)
     held = HeldFolder(new_folder(folder))
     shards = shards_of(scenario, folder)
-    progress, course = OneProgress(shards, tell), _Course()
+    progress, state = OneProgress(shards, tell), _ShardsState()
     first, *others = [(shard, at, progress.of(shard)) for shard, at in zip(shards, endpoints, strict=True)]
-    threads = [threading.Thread(target=course.launched, args=(*one, "off", stop, starter)) for one in others]
+    threads = [threading.Thread(target=state.launched, args=(*one, "off", stop, starter)) for one in others]
     for thread in threads:
         thread.start()
     # On this thread, not on another one: a viewer ends with the thread that started it.
-    course.launched(*first, view, stop, starter)
+    state.launched(*first, view, stop, starter)
     for thread in threads:
         thread.join()
     try:
@@ -145,10 +145,10 @@ def launch_shards(
         if now != folder:
             tell(FolderMoved(str(now)))
             shards = [replace(shard, folder=now / SHARDS_FOLDER / str(shard.number)) for shard in shards]
-        return Ended(_made_one(scenario, now, shards, course, progress.started), course.viewer, now)
+        return Ended(_made_one(scenario, now, shards, state, progress.started), state.viewer, now)
     except BaseException as error:
-        if course.viewer is not None:
-            course.viewer.stop()
+        if state.viewer is not None:
+            state.viewer.stop()
         if isinstance(error, FileNotFoundError):
             raise RunError(
                 f"{folder} was removed while the run went on; run again, and leave it where it is"
@@ -171,11 +171,13 @@ def _endpoints(scenario: Scenario) -> list[RouterEndpoints]:
     return found
 
 
-def _made_one(scenario: Scenario, folder: Path, shards: Sequence[Shard], course: _Course, started: float | None) -> int:
+def _made_one(
+    scenario: Scenario, folder: Path, shards: Sequence[Shard], state: _ShardsState, started: float | None
+) -> int:
     """Merge the shards' results into the run's; returns its exit status. Raises the error that ended it, if there was one."""
     from evedrop.live.launch.gathering import gather  # noqa: PLC0415 - slow to import: start the run first
 
-    fault, how = course.fault, "interrupted" if course.failures else "complete"
+    fault, how = state.fault, "interrupted" if state.failures else "complete"
     if fault is not None:
         shard, error = fault
         if isinstance(error, UsageError):
@@ -192,6 +194,6 @@ def _made_one(scenario: Scenario, folder: Path, shards: Sequence[Shard], course:
         ) from error
     if fault is not None:
         raise RunError(how)
-    if course.failures:
-        raise course.failures[0][1]
+    if state.failures:
+        raise state.failures[0][1]
     return 1 if summary.failed_expectations else 0

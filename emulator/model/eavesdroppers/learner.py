@@ -6,8 +6,8 @@ Source: docs/mathematics.md, eavesdroppers that learn.
 from __future__ import annotations
 
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
-from evedrop.model.learning.course import bounded
 from evedrop.model.learning.known import known
+from evedrop.model.learning.learner_posterior import bounded
 from evedrop.model.process import Floats
 from evedrop.streams import Batch
 

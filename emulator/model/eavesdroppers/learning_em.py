@@ -22,8 +22,8 @@ from evedrop.model.checks import as_toml, number_mistakes
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.eavesdroppers.learner import Learner
 from evedrop.model.learning.climb import NARROW, Learned, climbed
-from evedrop.model.learning.course import Course, advanced, scale_of, unheard
 from evedrop.model.learning.known import knowing_mistakes
+from evedrop.model.learning.learner_posterior import LearnerPosterior, advanced, scale_of, unheard
 from evedrop.model.learning.moments import Moments
 from evedrop.model.learning.posterior import Parameters
 from evedrop.model.process import Floats
@@ -49,14 +49,14 @@ class Memory(NamedTuple):
 
     def stored(self) -> tuple[NDArray[Any], ...]:
         """The arrays one after the other."""
-        course, theta, moments, scale = self.learned
-        return (*course, *theta, *moments, scale, *self[1:])
+        posterior, theta, moments, scale = self.learned
+        return (*posterior, *theta, *moments, scale, *self[1:])
 
     @classmethod
     def read(cls, stored: tuple[NDArray[Any], ...]) -> Memory:
         """The memory of these arrays."""
         a, b, c = 7, 11, 18
-        learned = Learned(Course(*stored[:a]), Parameters(*stored[a:b]), Moments(*stored[b:c]), stored[c])
+        learned = Learned(LearnerPosterior(*stored[:a]), Parameters(*stored[a:b]), Moments(*stored[b:c]), stored[c])
         return cls(learned, *stored[c + 1 :])
 
 
@@ -81,9 +81,9 @@ class LearningEm(Learner):
     def prior(self, first: int = 0) -> Belief:
         """x̂ = 0, and the covariance I for want of Σ0."""
         n, trials = self.process.n, self.trials
-        one, course = np.ones(trials), unheard(self.known, np.ones(trials))
+        one, posterior = np.ones(trials), unheard(self.known, np.ones(trials))
         theta = self.known.start(one)
-        learned = Learned(course, theta, Moments.imagined(theta.A, one), one)
+        learned = Learned(posterior, theta, Moments.imagined(theta.A, one), one)
         none = np.zeros((0, trials), np.bool_), np.zeros((0, n, trials))
         memory = Memory(learned, np.zeros((n, trials)), np.full((1, trials), first), *none)
         return self._believed(np.zeros(trials, np.uint8), memory)
@@ -91,9 +91,9 @@ class LearningEm(Learner):
     def knowing(self, k: int, x: Floats, belief: Belief) -> Belief:
         """One component with covariance 0; its parameters stay."""
         memory = Memory.read(belief.memory)
-        course = memory.learned.course.knowing(x)
+        posterior = memory.learned.posterior.knowing(x)
         after = super().knowing(k, x, belief)
-        return after._replace(memory=memory._replace(learned=memory.learned._replace(course=course)).stored())
+        return after._replace(memory=memory._replace(learned=memory.learned._replace(posterior=posterior)).stored())
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """Weigh the packet by the parameters so far, and learn from it."""
@@ -107,7 +107,7 @@ class LearningEm(Learner):
             )
         if age in self._climbs and not self.known.everything:
             so_far = learned.theta if age > self._climbs[0] else None
-            state = advanced(k, self.known, learned.theta, learned.course, gamma, z).state
+            state = advanced(k, self.known, learned.theta, learned.posterior, gamma, z).state
             learned = climbed(self.known, first, memory.gamma, memory.z, so_far)
         else:
             learned, state = self._small_step(k, learned, gamma, z, age)
@@ -123,22 +123,22 @@ class LearningEm(Learner):
 
     def _believed(self, action: Codes, memory: Memory) -> Belief:
         """The mean and covariance of the posterior, made smaller where they are out of all proportion to the packets."""
-        x_hat, P = moments_of(memory.learned.course.mixture)
+        x_hat, P = moments_of(memory.learned.posterior.mixture)
         x_hat, P = self.in_proportion(x_hat, P, memory.largest)
         return Belief(x_hat, P, action, memory.stored())
 
     def _small_step(self, k: int, learned: Learned, gamma: Flags, z: Floats, age: int) -> tuple[Learned, Floats]:
         """What is known after a slot, and the probability that its packet is the state."""
-        course, theta, moments, scale = learned
-        after = advanced(k, self.known, theta, course, gamma, z)
+        posterior, theta, moments, scale = learned
+        after = advanced(k, self.known, theta, posterior, gamma, z)
         if age < self._climbs[0]:
-            scale = np.where((course.packets == 0.0) & gamma, scale_of(gamma[None], z[None]), scale)
+            scale = np.where((posterior.packets == 0.0) & gamma, scale_of(gamma[None], z[None]), scale)
             theta = self.known.start(NARROW[0] * scale)
         elif not self.known.everything:
             share = np.where(gamma, 1.0 - 1.0 / (age + 1.0), 1.0)
             moments = moments.faded(share).added(theta.A, z, gamma.astype(np.float64), after.last)
             moments, theta = moments.most_likely(theta, scale, self.known.names)
-        return Learned(after.course, theta, moments, scale), after.state
+        return Learned(after.posterior, theta, moments, scale), after.state
 
 
 def climbing_slots(n: int, keeps: int) -> list[int]:

@@ -22,9 +22,9 @@ from evedrop.kernels.mixtures import summed
 from evedrop.model.checks import as_toml, number_mistakes
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.eavesdroppers.learner import Learner
-from evedrop.model.learning.course import Course, advanced, scale_of, unheard
 from evedrop.model.learning.draws import drawn, lattice, numbers_of
 from evedrop.model.learning.known import knowing_mistakes
+from evedrop.model.learning.learner_posterior import LearnerPosterior, advanced, scale_of, unheard
 from evedrop.model.learning.moments import Moments
 from evedrop.model.learning.posterior import Parameters
 from evedrop.model.process import Floats
@@ -38,7 +38,7 @@ _RIDGE = 0.3  # weight of the imagined transition in which the state stays: more
 class Cloud(NamedTuple):
     """N particles for each of R trials, side by side: column p R + r."""
 
-    course: Course
+    posterior: LearnerPosterior
     theta: Parameters
     moments: Moments
     weight: Floats
@@ -46,8 +46,8 @@ class Cloud(NamedTuple):
 
     def at(self, columns: NDArray[np.intp]) -> Cloud:
         """Some of the columns."""
-        course, theta, moments = ([part[..., columns] for part in one] for one in self[:3])
-        return Cloud(Course(*course), Parameters(*theta), Moments(*moments), self.weight[columns])
+        posterior, theta, moments = ([part[..., columns] for part in one] for one in self[:3])
+        return Cloud(LearnerPosterior(*posterior), Parameters(*theta), Moments(*moments), self.weight[columns])
 
     def moved(self, chosen: Flags, theta: Parameters, moments: Moments) -> Cloud:
         """These with other parameters and moments where chosen, (N R,)."""
@@ -98,7 +98,7 @@ class LearningParticle(Learner):
     def knowing(self, k: int, x: Floats, belief: Belief) -> Belief:
         """Every particle has the state; their parameters stay."""
         cloud, scale, largest = self._read(belief)
-        stored = self._stored(cloud._replace(course=cloud.course.knowing(self._wide(x))), scale, largest)
+        stored = self._stored(cloud._replace(posterior=cloud.posterior.knowing(self._wide(x))), scale, largest)
         return super().knowing(k, x, belief)._replace(memory=stored)
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
@@ -106,12 +106,12 @@ class LearningParticle(Learner):
         cloud, scale, largest = self._read(belief)
         gamma = heard.gamma
         z = np.where(gamma, heard.z, 0.0)
-        first = gamma & (cloud.course.packets[: self.trials] == 0.0)
+        first = gamma & (cloud.posterior.packets[: self.trials] == 0.0)
         if first.any():
             cloud, scale = self._scaled(cloud, scale, first, z)
-        course, theta, moments, weight = cloud
+        posterior, theta, moments, weight = cloud
         many, packet = self._wide(gamma), self._wide(z)
-        after = advanced(k, self.known, theta, course, many, packet)
+        after = advanced(k, self.known, theta, posterior, many, packet)
         if k and not self.known.everything:
             share = np.where(many, 1.0 - 1.0 / (k + 2.0), 1.0)
             moments = moments.faded(share).added(theta.A, packet, many.astype(np.float64), after.last)
@@ -120,7 +120,7 @@ class LearningParticle(Learner):
         weight = weight - self._wide(most)
         portion = self._portion(weight)
         state = summed(portion * self._narrow(after.state))
-        cloud = self._renewed(k, Cloud(after.course, theta, moments, weight), portion, scale)
+        cloud = self._renewed(k, Cloud(after.posterior, theta, moments, weight), portion, scale)
         action = np.where(
             gamma, np.where(state > 0.5, np.uint8(Action.STATE), np.uint8(Action.INNOVATION)), np.uint8(0)
         )
@@ -177,7 +177,7 @@ class LearningParticle(Learner):
         return total
 
     def _believed(self, cloud: Cloud, action: Codes, scale: Floats, largest: Floats) -> Belief:
-        means, within = moments_of(cloud.course.mixture)
+        means, within = moments_of(cloud.posterior.mixture)
         portion = self._portion(cloud.weight)
         x_hat = self._mean(portion, means)
         away = means - self._wide(x_hat)
@@ -194,11 +194,15 @@ class LearningParticle(Learner):
         return values.reshape(self._count, self.trials)
 
     def _stored(self, cloud: Cloud, scale: Floats, largest: Floats) -> tuple[NDArray[Any], ...]:
-        course, theta, moments, weight = cloud
-        columns = (*course, *theta, *moments, weight)
+        posterior, theta, moments, weight = cloud
+        columns = (*posterior, *theta, *moments, weight)
         return (*(part.reshape(*part.shape[:-1], self._count, self.trials) for part in columns), scale, largest)
 
     def _read(self, belief: Belief) -> tuple[Cloud, Floats, Floats]:
         *columns, scale, largest = belief.memory
         flat = [part.reshape(*part.shape[:-2], self._count * self.trials) for part in columns]
-        return Cloud(Course(*flat[:7]), Parameters(*flat[7:11]), Moments(*flat[11:18]), flat[18]), scale, largest
+        return (
+            Cloud(LearnerPosterior(*flat[:7]), Parameters(*flat[7:11]), Moments(*flat[11:18]), flat[18]),
+            scale,
+            largest,
+        )

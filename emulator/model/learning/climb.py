@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from evedrop.kernels.elementary import Floats
-from evedrop.model.learning.course import Course, advanced, scale_of, unheard
 from evedrop.model.learning.known import Known
+from evedrop.model.learning.learner_posterior import LearnerPosterior, advanced, scale_of, unheard
 from evedrop.model.learning.moments import Moments
 from evedrop.model.learning.posterior import Parameters
 from evedrop.model.receiver import Flags
@@ -27,7 +27,7 @@ NARROW = (0.1, 0.01, 1e-4)
 class Learned(NamedTuple):
     """The result of a climb."""
 
-    course: Course
+    posterior: LearnerPosterior
     theta: Parameters
     moments: Moments
     scale: Floats
@@ -50,11 +50,11 @@ def climbed(known: Known, first: int, gamma: Flags, z: Floats, so_far: Parameter
     theta = Parameters(*(np.concatenate(parts, axis=-1) for parts in zip(*starts, strict=True)))
     gamma, z, scales = (np.concatenate([part] * several, axis=-1) for part in (gamma, z, scale))
     for _ in range(PASSES):
-        course, moments, evidence = _passed(known, theta, first, gamma, z, scales)
+        posterior, moments, evidence = _passed(known, theta, first, gamma, z, scales)
         moments, theta = moments.most_likely(theta, scales, known.names)
     best = np.argmax(evidence.reshape(several, trials), axis=0) * trials + np.arange(trials)
     return Learned(
-        Course(*(part[..., best] for part in course)),
+        LearnerPosterior(*(part[..., best] for part in posterior)),
         Parameters(*(part[..., best] for part in theta)),
         Moments(*(part[..., best] for part in moments)),
         scale,
@@ -63,13 +63,13 @@ def climbed(known: Known, first: int, gamma: Flags, z: Floats, so_far: Parameter
 
 def _passed(
     known: Known, theta: Parameters, first: int, gamma: Flags, z: Floats, scale: Floats
-) -> tuple[Course, Moments, Floats]:
+) -> tuple[LearnerPosterior, Moments, Floats]:
     """The posterior after the slots from `first` on, the moments of their transitions, and the logarithm of their density."""
-    course, moments = unheard(known, scale), Moments.imagined(theta.A, scale)
+    posterior, moments = unheard(known, scale), Moments.imagined(theta.A, scale)
     evidence = np.zeros(len(scale))
     for k, (heard, packet) in enumerate(zip(gamma, z, strict=True), first):
-        course, _, density, last = advanced(k, known, theta, course, heard, packet)
+        posterior, _, density, last = advanced(k, known, theta, posterior, heard, packet)
         evidence = evidence + density
         if k:
             moments = moments.added(theta.A, packet, heard.astype(np.float64), last)
-    return course, moments, evidence
+    return posterior, moments, evidence

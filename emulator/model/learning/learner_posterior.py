@@ -22,7 +22,7 @@ _EARLY = 4  # packets whose mean square is the scale of all
 _FARTHEST = 4.0  # times the largest packet: no state and no deviation is taken to be larger, because A may be wrong
 
 
-class Course(NamedTuple):
+class LearnerPosterior(NamedTuple):
     """The posterior of a slot."""
 
     weight: Floats
@@ -50,17 +50,17 @@ class Course(NamedTuple):
         """Σ_k as estimated."""
         return Factors(self.sigma_lower, self.sigma_diagonal)
 
-    def knowing(self, x: Floats) -> Course:
+    def knowing(self, x: Floats) -> LearnerPosterior:
         """The posterior once the slot's state x, (n, R), is known: one component, with covariance 0."""
         n, trials = x.shape
         none = np.zeros((n * (n - 1) // 2, 1, trials)), np.zeros((n, 1, trials))
-        return Course(np.ones((1, trials)), x[:, None, :], *none, *self[4:])
+        return LearnerPosterior(np.ones((1, trials)), x[:, None, :], *none, *self[4:])
 
 
 class Advanced(NamedTuple):
     """A slot's result."""
 
-    course: Course
+    posterior: LearnerPosterior
     state: Floats
     """Probability that the packet is the state, (R,)."""
     evidence: Floats
@@ -69,19 +69,19 @@ class Advanced(NamedTuple):
     """The transition to the slot; of no component in slot 0."""
 
 
-def unheard(known: Known, scale: Floats) -> Course:
+def unheard(known: Known, scale: Floats) -> LearnerPosterior:
     """The posterior before the first packet; scale: a variance, (R,), for want of Σ0."""
     n, trials = len(known.A), len(scale)
     sigma = Factors(*(np.repeat(part, trials, axis=-1) for part in known.initial))
     if "initial_covariance" not in known.names:
         sigma = Factors(np.zeros_like(sigma.lower), np.repeat(scale[None], n, axis=0))
     one = Mixture(np.ones((1, trials)), np.zeros((n, 1, trials)), *(part[:, None, :].copy() for part in sigma))
-    return Course(*one, *sigma, np.zeros(trials))
+    return LearnerPosterior(*one, *sigma, np.zeros(trials))
 
 
-def advanced(k: int, known: Known, theta: Parameters, course: Course, gamma: Flags, z: Floats) -> Advanced:
+def advanced(k: int, known: Known, theta: Parameters, posterior: LearnerPosterior, gamma: Flags, z: Floats) -> Advanced:
     """The posterior after slot k; gamma (R,); z (n, R), 0 where nothing was received."""
-    mixture, sigma, packets = course.mixture, course.sigma, course.packets
+    mixture, sigma, packets = posterior.mixture, posterior.sigma, posterior.packets
     evidence, last = np.zeros(len(gamma)), nothing(*z.shape)
     if k:
         mixture, sigma, evidence, state, last = weighed(theta, sigma, mixture, gamma, z, CAPACITY)
@@ -89,7 +89,7 @@ def advanced(k: int, known: Known, theta: Parameters, course: Course, gamma: Fla
         mixture, state = begun(mixture, gamma, z, CAPACITY)
     if not known.sigma:
         sigma = _corrected(sigma, packets, gamma, z)
-    return Advanced(Course(*mixture, *sigma, packets + gamma), state, evidence, last)
+    return Advanced(LearnerPosterior(*mixture, *sigma, packets + gamma), state, evidence, last)
 
 
 def _corrected(sigma: Factors, packets: Floats, gamma: Flags, z: Floats) -> Factors:
