@@ -45,7 +45,7 @@ def follow(
         following = Following(brief, core, replies, session)
         session.ready()
         following.carry_on()
-        replies.over(following.deliveries)
+        replies.acknowledge_after_end(following.deliveries)
         session.wait_for(End)
 
 
@@ -94,7 +94,7 @@ class Following:
                 continue
             self.deliveries.drop()
             if found < self._k:
-                self._replies.had(found, message)
+                self._replies.acknowledge_again(found, message)
             self._due.missed(self._k, found)
 
     def _hold(self) -> None:
@@ -142,7 +142,7 @@ class ReceiverReplies:
         self._acknowledge = session.outlet(session.keys.acknowledged) if acknowledges else None
         self._consultation = consultation
 
-    def had(self, k: int, delivery: Reader) -> None:
+    def acknowledge_again(self, k: int, delivery: Reader) -> None:
         """Handle a delivery of slot k that has arrived again: the first acknowledgement may have been lost."""
         if self._acknowledge is not None:
             self._acknowledge(_acknowledged(delivery, k, self._trials))
@@ -164,7 +164,7 @@ class ReceiverReplies:
         if self._consultation is not None:
             self._consultation.after(k, belief)
 
-    def over(self, deliveries: Iterable[Reader]) -> None:
+    def acknowledge_after_end(self, deliveries: Iterable[Reader]) -> None:
         """After the last slot, acknowledge deliveries that still arrive, on a thread of its own that ends with the session."""
         if self._acknowledge is not None:
             threading.Thread(target=self._go_on, args=(deliveries,), name="acknowledges", daemon=True).start()
@@ -172,7 +172,7 @@ class ReceiverReplies:
     def _go_on(self, deliveries: Iterable[Reader]) -> None:
         for message in deliveries:
             if not is_barrier(message):
-                self.had(message.integer("k"), message)
+                self.acknowledge_again(message.integer("k"), message)
 
 
 def _acknowledged(delivery: Reader, k: int, trials: int) -> bytes:

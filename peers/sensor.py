@@ -257,7 +257,7 @@ class Sensing:
         if self._steered is not None:
             u, failed = self._steered.wait(k, made.true[0])
             if self._steered.decides(k):
-                self._core.hold(u)
+                self._core.set_inputs(u)
             steered = u[None], failed[None]
         return None if alarms is None else alarms[None], steered
 

@@ -235,7 +235,7 @@ class _Steering:
             decision = self._controller.decide(k, true if self._on_truth or x_hat is None else x_hat)
             self._u, self._failed = decision.u, decision.failed
             self._times.add([decision.seconds])
-            self._sensor.hold(self._u)
+            self._sensor.set_inputs(self._u)
         if self._estimator is not None:
             self._estimator.learn(k, self._u)
         inputs.u[row], inputs.failed[row] = self._u, self._failed

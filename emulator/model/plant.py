@@ -89,11 +89,11 @@ class Drive:
         self._moved: Floats
         self._e: Floats | None = None
 
-    def hold(self, u: Floats) -> None:
+    def set_inputs(self, u: Floats) -> None:
         """Apply the inputs u (m, R) from now on, until others come."""
         self._u, self._moved = u, self._plant.moved(u)
 
-    def mark(self, e: Floats) -> None:
+    def add_watermark(self, e: Floats) -> None:
         """Add the watermark e, (m, R), to the inputs from now on, until there is another one."""
         self._e = e
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from evedrop.live.observer.conductor import Conductor, Stop
-from evedrop.live.protocol.codec import over
+from evedrop.live.protocol.codec import end_report
 from evedrop.live.protocol.commands import End
 from evedrop.live.protocol.keys import RunKeys
 from tests.clock import TestClock
@@ -73,7 +73,7 @@ class Network:
         if name == "relay":
             self.watches[name](False)
             return
-        self.reads[self.keys.journal if name == "router" else self.keys.telemetry(name)](over(misdelivered))
+        self.reads[self.keys.journal if name == "router" else self.keys.telemetry(name)](end_report(misdelivered))
         if name != "router":
             self.watches[name](False)
 
@@ -110,7 +110,7 @@ def test_a_process_that_loses_its_connection_just_then_is_told_again(network: Ne
         if times == 1:
             network.watches["smart"](True)
         else:
-            network.reads[network.keys.telemetry("smart")](over(0))
+            network.reads[network.keys.telemetry("smart")](end_report(0))
 
     network.does["smart"] = lost
     ended(network)

@@ -305,7 +305,7 @@ def test_a_step_beyond_the_end_ends_with_the_run() -> None:
     run = Run()
     stepped = run.asks("step", slots=SLOTS)
     run.holds(90)
-    run.steering.over(SLOTS, complete=True)
+    run.steering.answer_open_orders(SLOTS, complete=True)
     assert stepped.answers == [Answer(SLOTS, f"slots 90 to {SLOTS - 1} passed; the run is over")]
 
 
@@ -314,7 +314,7 @@ def test_what_comes_after_the_last_slot_is_refused(do: str) -> None:
     """The sensor has sent all slots and does not hold again: the operator is told, and nothing has changed."""
     run = Run()
     asked = run.asks(do, reported=SLOTS - 3, event=SET, slots=2)
-    run.steering.over(SLOTS, complete=True)
+    run.steering.answer_open_orders(SLOTS, complete=True)
     assert asked.answers[0].refused == ("the run ended first; nothing was done",)
     assert (run.events, run.kept) == ([], [])
 
@@ -325,7 +325,7 @@ def test_an_interrupt_answers_who_waits() -> None:
     stepped = run.asks("step", slots=50)
     run.holds(20)
     waiting = run.asks("pause")
-    run.steering.over(31, complete=False)
+    run.steering.answer_open_orders(31, complete=False)
     assert stepped.answers[0].refused == ("slots 20 to 30 passed; the run was ended before the step was over",)
     assert len(waiting.answers[0].refused) == 1
 

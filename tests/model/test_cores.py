@@ -91,7 +91,7 @@ def test_what_is_sent_does_not_depend_on_blocks(scheme: str, driven: bool) -> No
         for slots in ranges(edges):
             parts.append(core.send(slots))
             if slots.stop == 10:
-                core.hold(np.full((1, BATCH.trials), 0.5))
+                core.set_inputs(np.full((1, BATCH.trials), 0.5))
         made.append(Sent.joined(parts))
     if driven:  # the inputs came at another slot
         made = made[1:]

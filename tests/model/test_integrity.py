@@ -266,7 +266,7 @@ def test_a_sensor_says_whether_it_has_a_detector() -> None:
 def test_slots_of_a_monitored_sensor_are_joined_and_cut() -> None:
     """The monitor's results are joined and cut with them; a plant without inputs has nothing to mark."""
     states = PlantCore(SCALAR.process, bytes(32), Batch(4, 1))
-    states.mark(ONE)
+    states.add_watermark(ONE)
     assert states.entered is None
     packets = PacketBlock(np.zeros((1, 1, 2)), np.zeros((1, 2), np.bool_))
     parts = [

@@ -79,7 +79,7 @@ def test_it_is_the_kalman_filter_slot_by_slot() -> None:
         assert np.abs((error @ error.T / 4000 - P) / spread).max() < 0.1
         added = x_hat - local.predicted - pushed
         assert np.allclose(added - gain @ np.linalg.lstsq(gain, added, rcond=None)[0], 0.0, atol=1e-12), "in K's range"
-        drive.hold(random.normal(size=(1, 4000)))
+        drive.set_inputs(random.normal(size=(1, 4000)))
         x_before = x_hat
 
 

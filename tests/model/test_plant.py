@@ -133,7 +133,7 @@ def test_states_are_moved_by_inputs_disturbances_and_noise() -> None:
     states = []
     for k in range(30):
         states.append(trajectory.advance(drive.pushed(k)))
-        drive.hold(u[k])
+        drive.set_inputs(u[k])
     assert np.allclose(states[0], quiet.advance() + of.start[:, None])
     rest = []
     for k in range(1, 30):
@@ -197,7 +197,7 @@ def test_who_is_told_the_inputs_predicts_with_them() -> None:
         assert np.array_equal(one.P, other.P)
         if (one.action == Action.STATE).all():
             assert np.array_equal(one.x_hat, x)
-        drive.hold(u)
+        drive.set_inputs(u)
         aware.learn(k, u)
         errors.append((np.abs(x - one.x_hat).max(), np.abs(x - other.x_hat).max()))
     known = np.array(errors)[60:]

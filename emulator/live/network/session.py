@@ -36,7 +36,7 @@ from evedrop.live.network.mailbox import allowance
 from evedrop.live.network.resending import ReplayBuffer
 from evedrop.live.protocol.brief import AnyBrief, Brief
 from evedrop.live.protocol.brief_parts import Identity, RouterPart, RoutingPart
-from evedrop.live.protocol.codec import Reader, over, refusal
+from evedrop.live.protocol.codec import Reader, end_report, refusal
 from evedrop.live.protocol.commands import Abandon, Again, Bounds, ControlCommand, End, Where, read_command
 from evedrop.live.protocol.envelope import Dropped
 from evedrop.live.protocol.keys import RunKeys, ZenohConfig, reader_of
@@ -343,7 +343,7 @@ class Session:
         """
         outlet = self._reporting
         if outlet is not None:
-            outlet(over(self.dropped))
+            outlet(end_report(self.dropped))
         else:
             self.connection.disappear()
 

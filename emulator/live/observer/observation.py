@@ -226,7 +226,7 @@ class ObservedRun:
         """Remove the control file of the run, which is over, and answer all open questions."""
         with suppress(FileNotFoundError):
             remove_control(self.folder)
-        self._steering.over(self._joiner.done, complete=self._joiner.done == self._scenario.slots)
+        self._steering.answer_open_orders(self._joiner.done, complete=self._joiner.done == self._scenario.slots)
         while not conductor.questions.empty():
             conductor.questions.get().answer(Answer(refused=("the run is over",)).pack())
 

@@ -127,7 +127,7 @@ class Steering:
                     self._release()
                 return
 
-    def over(self, reported: int, *, complete: bool) -> None:
+    def answer_open_orders(self, reported: int, *, complete: bool) -> None:
         """Answer all open requests, because the run has ended.
 
         reported: all slots below it are joined; complete: whether these are all slots of the run.

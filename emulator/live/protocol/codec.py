@@ -213,7 +213,7 @@ def read_progress(key: str, payload: bytes, sent: int) -> int:
     return Reader(key, payload).integer("k", 0, sent)
 
 
-def over(dropped: int) -> bytes:
+def end_report(dropped: int) -> bytes:
     """Encode the last message of a process that ends on command; dropped: how many messages it dropped that named another key."""
     return pack({"over": True, **({"misdelivered": dropped} if dropped else {})})
 

@@ -57,7 +57,7 @@ def simulate(assignment: Assignment, plan: MonitorPlan, slots: int, trials: int,
     for k in range(slots):
         made = sensor.send(range(k, k + 1))
         u = -product(loop.L, made.x[0])
-        sensor.hold(u)
+        sensor.set_inputs(u)
         applied, x = u + monitor.watermark, made.true[0]
         cost = assignment.state_weights @ (x * x) + assignment.input_weights @ (applied * applied)
         for column, values in zip(found, (monitor.statistic, monitor.watermark, local.normalised, cost), strict=True):

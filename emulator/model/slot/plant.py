@@ -61,15 +61,15 @@ class PlantCore:
             predicted.append(self._trajectory.predicted)
         return States(np.array(x), np.array(predicted), pushed)
 
-    def hold(self, u: Floats) -> None:
+    def set_inputs(self, u: Floats) -> None:
         """Apply the inputs u (m, R) from the next slot on, until others come."""
         if self._drive is not None:
-            self._drive.hold(u)
+            self._drive.set_inputs(u)
 
-    def mark(self, e: Floats) -> None:
+    def add_watermark(self, e: Floats) -> None:
         """Add the watermark e, (m, R), to the inputs from the next slot on, until there is another one."""
         if self._drive is not None:
-            self._drive.mark(e)
+            self._drive.add_watermark(e)
 
     @property
     def entered(self) -> Floats | None:

@@ -88,10 +88,10 @@ class SensorCore:
         return Sent(states.x, x, self._encoder.encode_block(slots, x, predicted), monitored)
 
     def _monitored(self, k: int, monitor: Monitor) -> MonitoredSlots:
-        """Test the filter's innovation of slot k, and mark the input of this slot."""
+        """Test the filter's innovation of slot k, and add the watermark to the input of this slot."""
         assert self._local is not None  # noqa: S101 - a monitor is there only with a filter
         monitor.take(k, self._local.normalised, self._plant.entered)
-        self._plant.mark(monitor.watermark)
+        self._plant.add_watermark(monitor.watermark)
         return MonitoredSlots(monitor.statistic[None], monitor.watermark[None])
 
     def _filtered(self, slots: range, states: States) -> tuple[Floats, Floats]:
@@ -112,6 +112,6 @@ class SensorCore:
         self._encoder.acknowledged(k, acknowledged)
         return None if self._watch is None else self._watch.take(acknowledged, sent)
 
-    def hold(self, u: Floats) -> None:
+    def set_inputs(self, u: Floats) -> None:
         """Apply the inputs u (m, R) from the next slot on, until others come."""
-        self._plant.hold(u)
+        self._plant.set_inputs(u)

@@ -350,7 +350,7 @@ CODECS: dict[str, tuple[Encode, Decode]] = {
     ),
     "decisions": (encode_decisions, decode_decisions),
     "over": (
-        lambda _shape, value: wire.over(value.get("misdelivered", 0)),
+        lambda _shape, value: wire.end_report(value.get("misdelivered", 0)),
         lambda _shape, _value, raw: decode_over(raw),
     ),
     "envelope": (
