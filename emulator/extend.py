@@ -38,6 +38,7 @@ if TYPE_CHECKING:
         Panel,
         PanelCurve,
         PanelFeed,
+        PowerFeed,
     )
     from evedrop.scenario.events.effects import (
         Jamming,
@@ -109,6 +110,7 @@ __all__ = [
     "Plain",
     "PlainEncoder",
     "PlainEstimator",
+    "PowerFeed",
     "Process",
     "ProcessAction",
     "Receiver",
@@ -145,6 +147,7 @@ _LATER = {
         "Panel",
         "PanelCurve",
         "PanelFeed",
+        "PowerFeed",
     ),
     "evedrop.scenario.events.effects": (
         "Jamming",

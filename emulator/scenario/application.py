@@ -179,6 +179,17 @@ class PanelFeed(ABC):
         return {}
 
 
+class PowerFeed(ABC):
+    """The power that an application takes from the grid in a set of trials, whose slots come in order."""
+
+    @abstractmethod
+    def take(self, x: Floats, u: Floats) -> tuple[Floats, Floats]:
+        """Add the next c slots: true states (c, n, R), and inputs as decided (c, m, R).
+
+        Returns its power in each of them, and that of a controller that sees the truth, in kW, (c, R) each; negative if sold.
+        """
+
+
 class Application(ABC):
     """A use of a plant with a controller. A class, never an instance, is registered.
 
@@ -197,6 +208,10 @@ class Application(ABC):
     """Those of `figures` that `evedrop run --metrics` serves."""
     has_monitor: ClassVar[bool] = False
     """Whether it can have a monitor."""
+    has_power: ClassVar[bool] = False
+    """Whether it has a `power`, so that `evedrop cost` can compute the energy that secrecy costs it."""
+    example: ClassVar[str | None] = None
+    """A shipped scenario that has it, for messages; None for an application of a package."""
 
     @classmethod
     def objections(cls, loop: ControlledPlant, table: Table) -> list[str]:
@@ -208,6 +223,12 @@ class Application(ABC):
     def monitor(cls, loop: ControlledPlant, table: Table) -> MonitorPlan | None:
         """The watermark, the detector for the sensor's filter and the attack that it wants; by default none."""
         del loop, table
+        return None
+
+    @classmethod
+    def power(cls, loop: ControlledPlant, table: Table, trials: int) -> PowerFeed | None:
+        """The power that it takes, from slot 0 on; by default none. trials: R."""
+        del loop, table, trials
         return None
 
     @classmethod

@@ -1,4 +1,4 @@
-"""The energy that secrecy costs a house: its scheme against `plain`, over the same link, on the same days.
+"""The energy that secrecy costs: a scenario's scheme against `plain`, over the same link, in the same trials.
 
 A trial is run with the scenario's scheme and with `plain`, with the same noise of the plant and the same losses, and each
 time also with a controller that sees the truth. Every figure is made from differences within a trial, so its standard error
@@ -16,14 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from evedrop.applications.microgrid.energy import Meter, energy
-from evedrop.applications.microgrid.household_tally import HouseholdTable, PerfectLoop
 from evedrop.errors import UsageError
 from evedrop.loading import checked
 from evedrop.memory.simulation import Simulation
 from evedrop.model.process import Floats
 from evedrop.scenario import Scenario
+from evedrop.scenario.application import APPLICATIONS, applications_in
 from evedrop.scenario.controlled import controlled_plant
+from evedrop.score.energy import Meter, energy
 
 _SIDE_BY_SIDE = 50  # trials
 MEASURES = ("net", "total", "summed")
@@ -52,12 +52,12 @@ class MeanEstimate:
 
 @dataclass(frozen=True)
 class SecrecyCost:
-    """What a scheme costs a house."""
+    """What a scheme costs an application."""
 
     scheme: str
     trials: int
     more_than_plain: Mapping[str, MeanEstimate]
-    """`net_energy` and `total_energy`: the house's with the scheme less that with `plain`, in Wh."""
+    """`net_energy` and `total_energy`: that with the scheme less that with `plain`, in Wh."""
     differences: Mapping[str, Mapping[str, MeanEstimate]]
     """`scheme_from_plain`, `scheme_from_truth`, `plain_from_truth` → measure → the difference, as a share."""
 
@@ -65,11 +65,11 @@ class SecrecyCost:
 def secrecy_cost(scenario: Scenario, tell: Callable[[int], None]) -> SecrecyCost:
     """Compare a scenario's scheme with `plain`; tell gets the trial-slots done since its last call.
 
-    Raises UsageError for a scenario without a household, or with fewer than two trials.
+    Raises UsageError for a scenario without an application that has a power, or with fewer than two trials.
     """
     loop = controlled_plant(scenario)
-    if "household" not in scenario.applications or loop is None:
-        raise UsageError(f"{scenario.title}: there is no household with a controller; try the scenario microgrid")
+    if loop is None or not any(APPLICATIONS[name].has_power for name in scenario.applications):
+        raise UsageError(f"{scenario.title}: {_lacking()}")
     if scenario.trials < 2:
         raise UsageError(f"--trials {scenario.trials}: expected 2 or more, so that there is a standard error")
     end = scenario.first_trial + scenario.trials
@@ -93,13 +93,12 @@ def secrecy_cost(scenario: Scenario, tell: Callable[[int], None]) -> SecrecyCost
 
 
 def _meters_of(scenario: Scenario, trials: range, tell: Callable[[int], None]) -> tuple[Meter, Meter, Meter]:
-    """For some trials, the grid power of scheme and plain, of scheme and truth, and of plain and truth."""
+    """For some trials, the power of scheme and plain, of scheme and truth, and of plain and truth."""
     found = [Meter.zero(len(trials)) for _ in range(3)]
     tables: dict[str, Any] = scenario.model_dump(mode="json", exclude_none=True)
     alone = {**tables, "eavesdroppers": {}, "expect": []}  # eavesdroppers change nothing
     ours, plain = (
-        _grid_powers(checked(one, scenario.title), trials)
-        for one in (alone, {**alone, "encoding": {"scheme": "plain"}})
+        _powers(checked(one, scenario.title), trials) for one in (alone, {**alone, "encoding": {"scheme": "plain"}})
     )
     for (power, truth), (other, other_truth) in zip(ours, plain, strict=True):
         pairs = ((power, other), (power, truth), (other, other_truth))
@@ -108,21 +107,23 @@ def _meters_of(scenario: Scenario, trials: range, tell: Callable[[int], None]) -
     return found[0], found[1], found[2]
 
 
-def _grid_powers(scenario: Scenario, trials: range) -> Iterator[tuple[Floats, Floats]]:
-    """The house's grid power, and that of a controller that sees the truth, in kW, (c, R) each, some slots at a time."""
-    loop, table = controlled_plant(scenario), scenario.applications["household"]
+def _powers(scenario: Scenario, trials: range) -> Iterator[tuple[Floats, Floats]]:
+    """The application's power, and that of a controller that sees the truth, in kW, (c, R) each, some slots at a time."""
+    loop = controlled_plant(scenario)
     assert loop is not None  # noqa: S101 - there is a controller
-    assert isinstance(table, HouseholdTable)  # noqa: S101 - by its name
-    grid, plant = loop.input(table.grid), loop.plant
-    perfect = PerfectLoop(
-        loop.process, plant, loop.strategy(loop.assignment, len(trials)), loop.period, loop.disturbances
-    )
+    name, table = next(one for one in scenario.applications.items() if APPLICATIONS[one[0]].has_power)
+    feed = APPLICATIONS[name].power(loop, table, len(trials))
+    assert feed is not None  # noqa: S101 - it has a power
     for chunk in Simulation(scenario, trials).chunks():
         slots = chunk.slots
         assert slots is not None  # noqa: S101 - there are states in this mode
         assert slots.inputs is not None  # noqa: S101 - there is a controller
-        states = slots.x if slots.true is None else slots.true
-        power, seen = np.empty(slots.inputs.failed.shape), np.empty(slots.inputs.failed.shape)
-        for row, (x, u) in enumerate(zip(states, slots.inputs.u, strict=True)):
-            power[row], seen[row] = plant.limited(u)[grid], perfect.follow(x, u)[grid]
-        yield power, seen
+        yield feed.take(slots.x if slots.true is None else slots.true, slots.inputs.u)
+
+
+def _lacking() -> str:
+    """Say that a scenario lacks an application that has a power, and name a scenario that does not."""
+    able = {name: one for name, one in applications_in(APPLICATIONS.names).items() if one.has_power}
+    examples = [one.example for one in able.values() if one.example is not None]
+    hint = f"; try the scenario {' or '.join(examples)}" if examples else ""
+    return f"there is no {' or '.join(able)} with a controller{hint}"

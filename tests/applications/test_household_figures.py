@@ -13,12 +13,12 @@ import pytest
 
 from evedrop.api import montecarlo
 from evedrop.applications.microgrid import privacy
-from evedrop.applications.microgrid.energy import Meter, energy
 from evedrop.cli import main as cli
 from evedrop.errors import ScenarioError
 from evedrop.loading import checked
 from evedrop.memory.montecarlo import Plan
 from evedrop.model.controllers import mpc
+from evedrop.score.energy import Meter, energy
 from tests.applications.test_microgrid import part_of_day
 from tests.conftest import Evedrop
 from tests.scenario.test_plant_tables import LOOP

@@ -103,7 +103,7 @@ def test_the_command_prints_the_table_and_json(evedrop: Evedrop) -> None:
     (line,) = (line for line in shown.out.splitlines() if "summed: innovation from plain" in line)
     assert f" {100.0 * share:.3g} %" in line
     for words, said in (
-        (("cost", "vehicle"), "there is no household with a controller"),
+        (("cost", "vehicle"), "there is no household with a controller; try the scenario microgrid"),
         (("cost", "microgrid", "--trials", "1"), "--trials 1: expected 2 or more"),
     ):
         refused = evedrop(*words)

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, ClassVar, final
 
 import numpy as np
 
-from evedrop.applications.microgrid.energy import energy
-from evedrop.applications.microgrid.household_tally import HouseholdTable, HouseholdTally, guesses_of
+from evedrop.applications.microgrid.household_tally import HouseholdTable, HouseholdTally, HousePower, guesses_of
 from evedrop.applications.microgrid.privacy import means
 from evedrop.figures.text import estimate
 from evedrop.model.process import Floats
@@ -27,6 +26,7 @@ from evedrop.scenario.application import (
     Summary,
 )
 from evedrop.scenario.table import Table
+from evedrop.score.energy import energy
 from evedrop.view.palette import PLANT, TRUTH_CURVE
 
 if TYPE_CHECKING:
@@ -49,6 +49,13 @@ class Household(Application):
     }
     figures = ("bought_energy", "sold_energy", "net_difference", "total_difference", "summed_difference")
     receiver_figures = ("activity_area", "detection_rate")
+    has_power = True
+    example = "microgrid"
+
+    @classmethod
+    def power(cls, loop: ControlledPlant, table: Table, trials: int) -> HousePower:
+        """The grid power."""
+        return HousePower(loop, _house(table), trials)
 
     @classmethod
     def tally(cls, loop: ControlledPlant, table: Table, trials: int) -> HouseholdTally:

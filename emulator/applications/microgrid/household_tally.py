@@ -14,14 +14,14 @@ import numpy as np
 from pydantic import Field
 
 from evedrop.applications.microgrid import privacy
-from evedrop.applications.microgrid.energy import Meter, energy
 from evedrop.model.controllers import Assignment, Controller
 from evedrop.model.controllers.lqr import held
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process, product
 from evedrop.model.receiver import Flags
-from evedrop.scenario.application import RECEIVERS, ApplicationTally, ControlledPlant
+from evedrop.scenario.application import RECEIVERS, ApplicationTally, ControlledPlant, PowerFeed
 from evedrop.scenario.table import Table
+from evedrop.score.energy import Meter, energy
 
 Name = Annotated[str, Field(strict=True, min_length=1)]
 
@@ -52,18 +52,34 @@ def guesses_of(loop: ControlledPlant, table: HouseholdTable, trials: int) -> dic
 
 
 @final
+class HousePower(PowerFeed):
+    """A house's grid power over a set of trials, and that of a controller that sees the truth."""
+
+    def __init__(self, loop: ControlledPlant, table: HouseholdTable, trials: int) -> None:
+        own = loop.strategy(loop.assignment, trials)
+        self._plant, self._grid = loop.plant, loop.input(table.grid)
+        self._perfect = PerfectLoop(loop.process, loop.plant, own, loop.period, loop.disturbances)
+
+    def take(self, x: Floats, u: Floats) -> tuple[Floats, Floats]:
+        """Add the next slots."""
+        grid, other = np.empty(u[:, 0].shape), np.empty(u[:, 0].shape)
+        for row, (state, inputs) in enumerate(zip(x, u, strict=True)):
+            other[row] = self._perfect.follow(state, inputs)[self._grid]
+            grid[row] = self._plant.limited(inputs)[self._grid]
+        return grid, other
+
+
+@final
 class HouseholdTally(ApplicationTally):
     """A house's totals over a set of trials, whose slots come in order."""
 
     def __init__(self, loop: ControlledPlant, table: HouseholdTable, trials: int) -> None:
-        self._table, self._plant = table, loop.plant
+        self._table = table
         self._slot_seconds = loop.slot_seconds
         self._disturbances = loop.disturbances
-        self._grid = loop.input(table.grid)
         self._period = loop.period
         self._window = table.window(self._period * self._slot_seconds)
-        own = loop.strategy(loop.assignment, trials)
-        self._perfect = PerfectLoop(loop.process, loop.plant, own, self._period, self._disturbances)
+        self._power = HousePower(loop, table, trials)
         self._load = loop.disturbance(table.load)
         self._guesses = guesses_of(loop, table, trials)
         self._guessed: dict[str, list[Floats]] = {name: [] for name in loop.receivers}
@@ -72,11 +88,7 @@ class HouseholdTally(ApplicationTally):
 
     def add(self, x: Floats, u: Floats, estimates: Mapping[str, Floats]) -> None:
         """Add the next slots: states (c, n, R), inputs as decided (c, m, R), and every receiver's estimates, (c, n, R)."""
-        grid, other = np.empty(u[:, 0].shape), np.empty(u[:, 0].shape)
-        for row, (state, inputs) in enumerate(zip(x, u, strict=True)):
-            other[row] = self._perfect.follow(state, inputs)[self._grid]
-            grid[row] = self._plant.limited(inputs)[self._grid]
-        self.meter = self.meter.then(grid, other)
+        self.meter = self.meter.then(*self._power.take(x, u))
         for row in range(-self.done % self._period, len(x), self._period):
             for name, guess in self._guesses.items():
                 load = guess.take(self.done + row, estimates[name][row])
@@ -86,7 +98,7 @@ class HouseholdTally(ApplicationTally):
 
     def __getstate__(self) -> dict[str, Any]:
         """The state without the controllers, which may hold objects bound to their process: a copy takes no further slots."""
-        return {name: value for name, value in self.__dict__.items() if name not in ("_perfect", "_guesses")}
+        return {name: value for name, value in self.__dict__.items() if name not in ("_power", "_guesses")}
 
     @classmethod
     def merged(cls, parts: Sequence[Self]) -> Self:

@@ -1,4 +1,4 @@
-"""`evedrop cost`: the energy that secrecy costs a house."""
+"""`evedrop cost`: the energy that secrecy costs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def cost(options: argparse.Namespace) -> int:
-    """Compare a house's scheme with `plain`, day by day."""
+    """Compare a scenario's scheme with `plain`, trial by trial."""
     from evedrop.studies.secrecy_cost import secrecy_cost
 
     _, found = studied(options, secrecy_cost)

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from evedrop.applications.microgrid.energy import EnergyDifference, Meter, energy
+from evedrop.score.energy import EnergyDifference, Meter, energy
 
 
 def difference(run: np.ndarray, reference: np.ndarray) -> EnergyDifference:

@@ -1,6 +1,6 @@
-"""The energy that a house buys and sells over a run, and its difference between two runs: the price of a link or of secrecy.
+"""The energy bought and sold over a run, and its difference between two runs: the price of a link or of secrecy.
 
-Powers are in kW, positive where the house takes from the grid, slot by slot along the first axis; trials may follow.
+Powers are in kW, positive where it is bought, slot by slot along the first axis; trials may follow.
 Source: docs/microgrid.md, energy.
 """
 
