@@ -249,7 +249,7 @@ class Sensing:
             self._reported = end
 
     def _answers(self, k: int, made: Sent) -> tuple[Flags | None, tuple[Floats, Flags] | None]:
-        """Wait for the answers to slot k, and heed them: alarms (1, R), and the inputs (1, m, R) with their failures (1, R)."""
+        """Wait for the answers to slot k, and apply them: alarms (1, R), and the inputs (1, m, R) with their failures (1, R)."""
         alarms, steered = None, None
         if self._back is not None:
             sent = made.packets.at(0).sent

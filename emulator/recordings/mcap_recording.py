@@ -203,7 +203,7 @@ class _Reader:
         return usable[0]
 
     def _unnumbered(self, candidates: Sequence[_Messages]) -> NoReturn:
-        """Say why nothing can be told of messages without numbers."""
+        """Say why nothing can be learned from messages without numbers."""
         one = candidates[0]
         usual = float(np.median(np.diff(np.sort(one.sent)))) if len(one.sent) > 1 else 0.0
         hint = f" (the median of {one.topic} is {usual:.4g} s)" if len(candidates) == 1 else ""
@@ -276,7 +276,7 @@ class _Reader:
             self._no(str(error), error)
 
     def _delays(self, messages: _Messages, series: MessageSeries) -> Floats:
-        """Seconds from sending to recording, of each message that arrived; empty if they cannot be told."""
+        """Seconds from sending to recording, of each message that arrived; empty if they are unknown."""
         if not messages.has_sending_times:
             self._notes.append(
                 "no delays: the recorder wrote its own time as the time of publication, as ros2 bag record did before Jazzy"

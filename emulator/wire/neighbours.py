@@ -25,7 +25,7 @@ _PROBE_SECONDS = 2.0  # after which a probe that was heard says nothing any more
 
 @final
 class Neighbours:
-    """Looks at who is connected to the sides, and tells what has changed."""
+    """Watches which programs are connected to the sides, and reports changes."""
 
     def __init__(
         self, sides: Mapping[str, SideSession], states: Sequence[LinkState], tell: Callable[[str], None]

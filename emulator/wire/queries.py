@@ -33,7 +33,7 @@ _MOST_WAITING = 100_000
 
 @final
 class _Asked:
-    """A query that was heard, until all its replies are there: then the asker is told that there are no more."""
+    """A query that was heard, until all its replies have arrived: then the asker is told that there are no more."""
 
     def __init__(self, query: zenoh.Query, side: str) -> None:
         self.query, self.side = query, side

@@ -148,7 +148,7 @@ class RunningWire:
         return zenoh.Config.from_json5(json.dumps(settings))
 
     def partition(self, one: str, other: str) -> None:
-        """Let nothing pass between two sides, except liveliness and what is lossless."""
+        """Let nothing pass between two sides, except liveliness and lossless messages."""
         self._steer({"partition": [one, other]})
 
     def heal(self, one: str, other: str | None = None) -> None:
@@ -156,7 +156,7 @@ class RunningWire:
         self._steer({"heal": one} if other is None else {"join": [one, other]})
 
     def cut(self, link: str) -> None:
-        """Let nothing pass over a link, except what is lossless."""
+        """Let nothing pass over a link, except lossless messages."""
         self._steer({"cut": link})
 
     def link(self, name: str, **settings: Any) -> None:
@@ -243,7 +243,7 @@ class RunningWire:
         return status
 
     def _failure(self, status: int) -> EvedropError:
-        """The error for a process that failed: what it said itself."""
+        """The error for a process that failed, in its own words."""
         said = "".join(self._errors).strip().removeprefix("evedrop: ")
         text = said or f"the wire in {self.folder} ended with status {status}"
         return UsageError(text) if status == UsageError.exit_status else RunError(text)

@@ -44,7 +44,7 @@ class IntegrityFeed(PanelFeed):
         self._alarmed = False
 
     def take(self, first: int, u: Floats, estimates: Mapping[str, Floats]) -> Mapping[str, Floats]:
-        """Nothing: all of it comes from the monitor."""
+        """Do nothing: all figures come from the monitor."""
         del first, u, estimates
         return {}
 

@@ -67,7 +67,7 @@ class IntegrityTally(ApplicationTally):
         self._digests: dict[int, Digests] = {}
 
     def add(self, x: Floats, u: Floats, estimates: Mapping[str, Floats]) -> None:
-        """Nothing: all of it comes from the monitor."""
+        """Do nothing: all figures come from the monitor."""
 
     def add_monitored(self, x: Floats, u: Floats, monitored: MonitoredSlots) -> None:
         """Add the next slots, one by one, so that the sums have the same bits however the slots are divided."""

@@ -15,7 +15,7 @@ from evedrop.streams import Floats, Stream, normals, root_of_seed, stream_key, u
 
 @final
 class Draws:
-    """The numbers of one stream, one after the other."""
+    """The numbers of one stream, in order."""
 
     def __init__(self, seed: int, name: str) -> None:
         self._stream = Stream(stream_key(root_of_seed(seed), name), range(1), 1)

@@ -84,6 +84,6 @@ class Acknowledged(Scheme):
         return Outcomes.plain(mu)
 
     def lost_reference(self, received: float, acknowledged: tuple[float, float]) -> LostReference:  # noqa: ARG002 - it lasts
-        """Nothing ends the growth: no later packet tells the reference."""
+        """Nothing ends the growth: no later packet reveals the reference."""
         remedy = "random-code or threshold-code is used, which send the state now and then"
         return LostReference(growth_by_coin(self.process, 0.0, received), remedy)

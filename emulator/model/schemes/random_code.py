@@ -81,7 +81,7 @@ class RandomCode(Scheme):
         return ReferenceReceiver(self.process, batch.trials)
 
     def outcomes(self, mu: float) -> None:
-        """None: what a packet tells depends on the acknowledgements before it."""
+        """None: the information in a packet depends on the acknowledgements before it."""
 
     def lost_reference(self, received: float, acknowledged: tuple[float, float]) -> LostReference:  # noqa: ARG002 - only states count
         """A state in clear ends the growth: ρ²(1 − αμ) a slot."""

@@ -100,7 +100,7 @@ class ThresholdCode(Scheme):
         return ReferenceReceiver(self.process, batch.trials)
 
     def outcomes(self, mu: float) -> None:
-        """None: what a packet tells depends on the acknowledgements before it."""
+        """None: the information in a packet depends on the acknowledgements before it."""
 
     def lost_reference(self, received: float, acknowledged: tuple[float, float]) -> LostReference:
         """The sensor sends states until one is acknowledged, then m acknowledged coded packets until b exceeds θ again."""

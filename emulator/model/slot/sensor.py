@@ -48,7 +48,7 @@ class Sent(NamedTuple):
 
 @final
 class SensorCore:
-    """Makes the packets of many slots at once; or of one slot at a time, if the next packet depends on what comes back.
+    """Makes the packets of many slots at once; or of one slot at a time, if the next packet depends on feedback.
 
     watch: over the acknowledgements, None if it does not watch them. monitor: of the filter's innovations; it needs inputs in
     every slot, so slots are made one at a time.

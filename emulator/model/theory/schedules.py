@@ -285,7 +285,7 @@ def _ascended(problem: ScheduleProblem, mu_d: Floats, blocks: list[slice]) -> Fl
 
 
 def _improved_by_pairs(problem: ScheduleProblem, mu_d: Floats, blocks: list[slice]) -> Floats:
-    """A schedule, (N,), that no change of two neighbouring blocks improves by more than 1e-6, as far as a mesh tells."""
+    """A schedule, (N,), that no change of two neighbouring blocks improves by more than 1e-6, as far as a mesh shows."""
     mu_d = mu_d.copy()
     while True:
         before = best = float(problem.sums(mu_d[None])[0])
