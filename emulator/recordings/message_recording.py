@@ -38,7 +38,7 @@ class MessageRecording:
 
 
 def check_parts(name: str, series: MessageSeries, why: str) -> None:
-    """Raise TraceError if the messages are cut into parts so short that nothing can be learned about bursts; why: what cuts them."""
+    """Raise TraceError if the messages are cut into parts too short to learn anything about bursts; why: what cuts them."""
     count = len(series.outcomes)
     if count < _SHORTEST_PART * series.parts and series.parts > 1:
         raise TraceError(

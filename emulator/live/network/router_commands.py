@@ -85,7 +85,7 @@ class Commands:
         return self._ended
 
     def check(self) -> None:
-        """Raise ReplayRequested if the conductor has ended the run, or asked for packets since the last request that was obeyed."""
+        """Raise ReplayRequested if the conductor has ended the run, or asked for packets since the last request obeyed."""
         if self.over() or self._asked.round != self._heeded:
             raise ReplayRequested
 
