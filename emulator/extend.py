@@ -26,6 +26,7 @@ from evedrop.model.receiver import Action, Belief, Beliefs, Codes, Flags, Receiv
 from evedrop.model.schemes.innovation import Innovation
 from evedrop.model.schemes.plain import Plain, PlainEncoder, PlainEstimator
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, PacketBlock, Scheme, Shared
+from evedrop.model.theory.closed_form import ClosedForm, ReceiverConditions
 from evedrop.model.theory.covariances import Outcomes, OutcomesAt
 from evedrop.names import ProcessAction
 from evedrop.streams import Batch, BlockReader
@@ -69,6 +70,7 @@ __all__ = [
     "Bernoulli",
     "BlockReader",
     "Chain",
+    "ClosedForm",
     "Codes",
     "Column",
     "Command",
@@ -114,6 +116,7 @@ __all__ = [
     "Process",
     "ProcessAction",
     "Receiver",
+    "ReceiverConditions",
     "Reception",
     "Return",
     "Scene",

@@ -19,7 +19,7 @@ from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.eavesdroppers import READERS, STRATEGIES
 from evedrop.model.links import LOSS_MODELS
 from evedrop.model.registry import Registry, asked
-from evedrop.model.schemes import SCHEMES, scheme_of
+from evedrop.model.schemes import PAPERS_SCHEME, SCHEMES, scheme_of
 from evedrop.plugins import look_in
 
 _REGISTRIES: Mapping[str, Registry[Any]] = {
@@ -128,7 +128,7 @@ def _streams(one: _Named) -> list[str]:
 def _scheme_for(one: _Named) -> _Named:
     """The paper's scheme, or the first scheme that has the keys the eavesdropper asks for."""
     needed = {*_streams(one)}
-    for name in ("innovation", *SCHEMES):
+    for name in (PAPERS_SCHEME, *SCHEMES):
         if needed <= {*SCHEMES[name].secret_streams}:
             return _Named(name, SCHEMES[name], dict(SCHEMES[name].parameters))
-    return _Named("innovation", SCHEMES["innovation"], dict(SCHEMES["innovation"].parameters))
+    return _Named(PAPERS_SCHEME, SCHEMES[PAPERS_SCHEME], dict(SCHEMES[PAPERS_SCHEME].parameters))

@@ -9,7 +9,7 @@ import math
 from dataclasses import asdict, dataclass
 
 from evedrop.errors import UsageError
-from evedrop.expected.closed_forms import acknowledged_form
+from evedrop.expected.closed_forms import conditions_of, stated_form
 from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.theory.closed_forms import encrypted_fraction, threshold_for
 from evedrop.model.theory.covariances import LARGEST_OPERATOR
@@ -17,7 +17,6 @@ from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
 from evedrop.scenario.words import listed
 
-_CLOSED_FORM = "always sent"
 _SHOWN = 5  # whole thresholds
 
 
@@ -82,23 +81,23 @@ def budget_of(scenario: Scenario, budget: float) -> BudgetDesign:
     if not 0.0 <= budget < math.inf:
         raise UsageError(f"a budget of {budget:g}: expected a finite number of at least 0, an energy in a slot")
     name = scenario.encoding.scheme
-    if SCHEMES[name].closed_forms.get(LEGITIMATE) != _CLOSED_FORM:
-        able = [one for one in SCHEMES if SCHEMES[one].closed_forms.get(LEGITIMATE) == _CLOSED_FORM]
+    if not SCHEMES[name].meets_energy_budget:
+        able = [one for one in SCHEMES if SCHEMES[one].meets_energy_budget]
         raise UsageError(
             f"an energy budget is met by the threshold of the scheme {listed(able)}, and this scenario has {name}; "
             f"evedrop compare SCENARIO --schemes {able[0]} --out DIR writes DIR/scenarios/{able[0]}.toml, which can be designed"
         )
-    user = acknowledged_form(_with(scenario, 1.0), LEGITIMATE)
-    forms = {one: acknowledged_form(_with(scenario, 1.0), one) for one in scenario.eavesdroppers}
+    user, acknowledged = stated_form(_with(scenario, 1.0), LEGITIMATE), conditions_of(scenario, LEGITIMATE).acknowledged
+    forms = {one: stated_form(_with(scenario, 1.0), one) for one in scenario.eavesdroppers}
     left_out = {one: scenario.eavesdroppers[one].strategy for one, form in forms.items() if form is None}
-    if user is None:
+    if user is None or acknowledged is None:
         raise UsageError(
             "the design for a budget is for independent losses that stay the same, without late packets and outages, and for an "
             "attack on acknowledgements that is always on; give the legitimate link only a quality, such as "
             "legitimate.link={quality = 0.9}, and remove events"
         )
     scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
-    model, arrives = scenario.energy_model, sum(user.acknowledged)
+    model, arrives = scenario.energy_model, sum(acknowledged)
     in_clear, encrypted = model.spent(scheme, 1.0, 0.0), model.spent(scheme, 1.0, 1.0)
     threshold = 1.0
     if budget < encrypted:
@@ -116,7 +115,7 @@ def budget_of(scenario: Scenario, budget: float) -> BudgetDesign:
         fraction = encrypted_fraction(one, arrives)
         errors = {}
         for eavesdropper in forms:
-            form = acknowledged_form(_with(scenario, one), eavesdropper)
+            form = stated_form(_with(scenario, one), eavesdropper)
             if form is not None:
                 errors[eavesdropper] = form.limit
         return ThresholdFigures(one, fraction, model.spent(scheme, 1.0, fraction), errors)

@@ -21,7 +21,6 @@ from evedrop.model.schemes import scheme_of
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.slot.link_law import LinkLaw, law_of
 from evedrop.model.theory import covariances as theory
-from evedrop.model.theory.clear_states import ClearStatesForm
 from evedrop.model.theory.closed_form import ClosedForm
 from evedrop.model.theory.covariances import ExpectedCovariance, Outcomes, OutcomesAt, SlotOutcomes
 from evedrop.model.theory.directions import Growth, growth
@@ -154,9 +153,9 @@ class Expectation:
     def growth(self) -> Growth | None:
         """The directions in which the expected error grows without bound; None if theory knows none."""
         closed = self.closed_bound if self.closed is None else self.closed
-        if isinstance(closed, ClearStatesForm):
+        if closed is not None:
             return closed.growth
-        outcomes = None if closed is not None else self._outcomes
+        outcomes = self._outcomes
         return None if outcomes is None else growth(self.process, outcomes)
 
     def streaks(self, slots: int) -> Streaks | None:

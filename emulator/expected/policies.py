@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from evedrop.errors import UsageError
-from evedrop.expected.closed_forms import acknowledged_form
+from evedrop.expected.closed_forms import conditions_of, stated_form
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.theory.covariances import LARGEST_OPERATOR, stability_bound
 from evedrop.model.theory.policy import held_traces, least_weight
@@ -21,7 +21,6 @@ from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
 from evedrop.scenario.words import listed
 
-_CLOSED_FORM = "scheduled"
 _LARGEST_CHAIN = 4 * LARGEST_OPERATOR  # rows of the linear equation of a policy's chain, which then takes a second
 _LARGEST_ERROR = 1e200  # the sums of value iteration are then far from overflow
 
@@ -58,21 +57,21 @@ def policies_of(scenario: Scenario, weights: Sequence[float], prices: Sequence[f
     for numbers out of range, and for so many holding times that the error grows too large.
     """
     _check_numbers(scenario, weights, prices, states)
-    forms = SCHEMES[scenario.encoding.scheme].closed_forms
-    if forms.get(LEGITIMATE) != _CLOSED_FORM:
+    kind = SCHEMES[scenario.encoding.scheme]
+    if not kind.sends_by_holding_time:
         raise UsageError(_not_for(scenario.encoding.scheme))
     left_out = {
         name: table.strategy
         for name, table in scenario.eavesdroppers.items()
-        if forms.get(table.strategy) != _CLOSED_FORM
+        if table.strategy not in kind.closed_forms
     }
-    closed = {name: acknowledged_form(scenario, name) for name in scenario.receivers if name not in left_out}
-    if len(closed) == 1:
+    heard = {name: _heard(scenario, name) for name in scenario.receivers if name not in left_out}
+    if len(heard) == 1:
         raise UsageError(
             "the design of a policy needs an eavesdropper whose error has a closed form under this scheme; expected a "
-            f"strategy of {listed(sorted(set(forms) - {LEGITIMATE}))}"
+            f"strategy of {listed(sorted(set(kind.closed_forms) - {LEGITIMATE}))}"
         )
-    unknown = [name for name, one in closed.items() if one is None]
+    unknown = [name for name, one in heard.items() if one is None]
     unknown = [LEGITIMATE] if LEGITIMATE in unknown else unknown  # without the user's, no other closed form is known
     if unknown:
         raise UsageError(
@@ -81,9 +80,9 @@ def policies_of(scenario: Scenario, weights: Sequence[float], prices: Sequence[f
             f"{', '.join(unknown)} is different; give each link only a quality, such as "
             "legitimate.link={quality = 0.9}, and remove events"
         )
-    user = closed[LEGITIMATE]
+    user = heard[LEGITIMATE]
     assert user is not None  # noqa: S101 - refused above
-    process, mu = scenario.process.process, user.received
+    process, (mu, acknowledged) = scenario.process.process, user
     with np.errstate(over="ignore", invalid="ignore"):
         largest = float(held_traces(process, states)[-1])
     if not largest <= _LARGEST_ERROR:
@@ -98,14 +97,22 @@ def policies_of(scenario: Scenario, weights: Sequence[float], prices: Sequence[f
             f"max(0, 1 − ρ⁻²) = {bound:.6g}; give a better link, such as legitimate.link.quality={0.5 + 0.5 * bound:.3g}"
         )
     fronts = {}
-    for name, one in closed.items():
+    for name, one in heard.items():
         if name == LEGITIMATE or one is None:
             continue
-        links = ScheduledLinks(mu, one.received, user.acknowledged, one.acknowledged)
+        links = ScheduledLinks(mu, one[0], acknowledged, one[1])
         fronts[name] = front(process, links, weights, prices, states)
         if not fronts[name].points:
             raise UsageError(_never(scenario, name, links, max(weights), min(prices), states))
     return PolicyDesign(mu, states, fronts, left_out)
+
+
+def _heard(scenario: Scenario, receiver: str) -> tuple[float, tuple[float, float]] | None:
+    """`received` and `acknowledged` of a receiver's conditions; None if its error has no closed form under them."""
+    found = conditions_of(scenario, receiver)
+    if found.received is None or found.acknowledged is None or stated_form(scenario, receiver) is None:
+        return None
+    return found.received, found.acknowledged
 
 
 def _check_numbers(scenario: Scenario, weights: Sequence[float], prices: Sequence[float], states: int) -> None:
@@ -126,7 +133,7 @@ def _check_numbers(scenario: Scenario, weights: Sequence[float], prices: Sequenc
 
 
 def _not_for(scheme: str) -> str:
-    able = [name for name in SCHEMES if SCHEMES[name].closed_forms.get(LEGITIMATE) == _CLOSED_FORM]
+    able = [name for name in SCHEMES if SCHEMES[name].sends_by_holding_time]
     return (
         f"a policy decides, by acknowledgements, when to send: its design is for the scheme {listed(able)}, and this scenario "
         f"has {scheme}; evedrop compare SCENARIO --schemes {able[0]} --out DIR writes DIR/scenarios/{able[0]}.toml, "

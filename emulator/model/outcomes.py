@@ -5,7 +5,7 @@ Source: docs/mathematics.md, eavesdroppers; docs/schemes.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from evedrop.model.eavesdroppers import READERS, STRATEGIES
@@ -14,7 +14,6 @@ from evedrop.model.eavesdroppers.eavesdropper import PacketTaker
 from evedrop.model.schemes.innovation import Innovation
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.theory.covariances import Outcomes, OutcomesAt
-from evedrop.model.theory.noise_taken import NoiseTaken
 
 
 def legitimate_outcomes(scheme: Scheme) -> OutcomesAt | None:
@@ -52,10 +51,7 @@ def _known(found: Outcomes | None) -> Outcomes:
     return found
 
 
-def noise_taken(scheme: Scheme, strategy: str, parameters: Mapping[str, Any]) -> Callable[[float], NoiseTaken] | None:
-    """Maps a link's quality to the error of a receiver that uses packets, some of them noise; None if no error is defined."""
-    kind, law = STRATEGIES[strategy], scheme.noise_law
-    if law is None or not issubclass(kind, PacketTaker):
-        return None
-    uses = kind.use_probabilities(parameters)
-    return lambda mu_e: NoiseTaken(scheme.process, law, scheme.mu_d, mu_e, uses)
+def uses_of(strategy: str, parameters: Mapping[str, Any]) -> tuple[float, float] | None:
+    """The probabilities that a strategy uses a packet with ν = 0, and with ν = 1; None unless it decides by ν alone."""
+    kind = STRATEGIES[strategy]
+    return kind.use_probabilities(parameters) if issubclass(kind, PacketTaker) else None

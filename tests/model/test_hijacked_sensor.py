@@ -14,7 +14,8 @@ from evedrop.expected.expectations import expectations_of
 from evedrop.loading import checked
 from evedrop.memory.simulation import Simulation
 from evedrop.model.acknowledgements import AckChannel, Heeding, heeding_of, rates_of
-from evedrop.model.theory.closed_forms import Hears, hijacked_schedule, scheduled
+from evedrop.model.theory.closed_form import Hears
+from evedrop.model.theory.closed_forms import hijacked_schedule, scheduled
 from evedrop.score.acknowledging import chart_of
 from evedrop.streams import Batch, stream_key
 from tests.builders import UNSTABLE

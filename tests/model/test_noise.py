@@ -16,14 +16,15 @@ from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.bayesian import Bayesian
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.noise_law import PACKETS, NoiseLaw
-from evedrop.model.outcomes import noise_taken
+from evedrop.model.outcomes import uses_of
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Action, Receiver, Reception
 from evedrop.model.schemes.noise import Noise
 from evedrop.model.schemes.plain import Plain
+from evedrop.model.theory.closed_form import ReceiverConditions
 from evedrop.model.theory.covariances import NOBODY, Outcomes, expected_covariances, limit, state_covariances
 from evedrop.model.theory.leak import Leaks
-from evedrop.model.theory.noise_taken import NoiseTaken
+from evedrop.model.theory.noise_taken import NoiseTaken, TakesNoise
 from evedrop.streams import Batch
 from tests.builders import UNSTABLE
 from tests.model.slot_loop import STABLE, Played, coins, keys_of, play
@@ -77,6 +78,17 @@ def test_blocks_of_packets_are_those_of_single_slots(given: Any) -> None:
         assert np.array_equal(block.nu, [packet.nu for packet in single[first:]])
 
 
+def taken_by(scheme: Noise, strategy: str, mu_e: float, **parameters: float) -> NoiseTaken:
+    """The noise that a strategy takes for states, by the closed form that the scheme states for it."""
+    form = scheme.closed_forms[strategy](scheme, ReceiverConditions(8, False, mu_e, uses_of(strategy, parameters)))
+    assert isinstance(form, TakesNoise)
+    assert form.growth is None
+    assert not form.infinite_variance
+    assert form.traces.tolist() == np.trace(form.taken.covariances(8), axis1=1, axis2=2).tolist()
+    assert form.limit == np.trace(form.taken.limit)
+    return form.taken
+
+
 @LAWS
 def test_errors_are_the_closed_forms(given: Any) -> None:
     """User, smart, naive and suspicious: the mean squared error is that of theory in every slot, at 5 standard errors."""
@@ -90,9 +102,8 @@ def test_errors_are_the_closed_forms(given: Any) -> None:
     for name in gamma:
         outcomes = known.get(name)
         if outcomes is None:
-            taken = noise_taken(scheme, name, some if name == "suspicious" else {})
-            assert taken is not None
-            expected = taken(0.8).covariances(slots)
+            taken = taken_by(scheme, name, 0.8, **(some if name == "suspicious" else {}))
+            expected = taken.covariances(slots)
         else:
             expected = expected_covariances(STABLE, outcomes, slots)
         errors = played.squared_error(name)
@@ -113,10 +124,9 @@ def test_noise_may_begin_later() -> None:
     played = play(scheme, batch, gamma, made)
     assert not any(packet.nu.any() for packet in played.packets[:6])
     assert all(0.68 < packet.nu.mean() < 0.72 for packet in played.packets[6:])
-    taken = noise_taken(scheme, "naive", {})
-    assert taken is not None
+    taken = taken_by(scheme, "naive", 0.8)
     errors = played.squared_error("naive")
-    apart = np.abs(errors.mean(axis=1) - np.trace(taken(0.8).covariances(12), axis1=1, axis2=2))
+    apart = np.abs(errors.mean(axis=1) - np.trace(taken.covariances(12), axis1=1, axis2=2))
     assert (apart < 5.0 * errors.std(axis=1) / np.sqrt(20_000) + 1e-15).all()
     actions = np.array([belief.action for belief in played.beliefs["power-test"]])
     assert not (actions[:6] == Action.DISCARDED).any()
@@ -153,8 +163,10 @@ def test_limits_of_taking_noise() -> None:
     assert np.isinf(found[-1]).all()
     never = NoiseTaken(STABLE, NoiseLaw(PACKETS), 0.6, 0.7, (1.0, 0.0))
     assert np.array_equal(never.limit, limit(STABLE, Outcomes.eavesdropper(0.7, 0.6, 1.0, 0.0)))
-    assert noise_taken(Plain(STABLE), "naive", {}) is None
-    assert noise_taken(Noise(STABLE, 0.4, PACKETS), "bayesian", {}) is None
+    assert Plain.closed_forms == {}
+    make = Noise.closed_forms["naive"]
+    assert make(Noise(STABLE, 0.4, PACKETS), ReceiverConditions(5, False, 0.7, uses_of("bayesian", {}))) is None
+    assert make(Noise(STABLE, 0.4, PACKETS), ReceiverConditions(5, False, None, (1.0, 1.0))) is None
 
 
 def test_the_published_recursions_are_these() -> None:
@@ -179,9 +191,8 @@ def test_the_published_recursions_are_these() -> None:
         used = (1.0 - mu) * P + mu * (open_loop + P)
         eve = (1.0 - losses) * used + losses * (A @ eve @ A.T + W)
     np.testing.assert_allclose(limit(network, scheme.outcomes(1.0 - losses)) + P, user, rtol=1e-9)
-    taken = noise_taken(scheme, "naive", {})
-    assert taken is not None
-    np.testing.assert_allclose(taken(1.0 - losses).limit + P, eve, rtol=1e-9)
+    taken = taken_by(scheme, "naive", 1.0 - losses)
+    np.testing.assert_allclose(taken.limit + P, eve, rtol=1e-9)
     assert (np.trace(open_loop), np.trace(P)) == pytest.approx((0.0388, 0.0109), abs=5e-5)
 
 

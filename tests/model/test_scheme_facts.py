@@ -26,10 +26,13 @@ def test_theory_of_packets_is_not_inherited(base: type[Scheme]) -> None:
     assert other.error_floor is Scheme.error_floor
     assert other.revealed_bits is Scheme.revealed_bits
     assert other.lost_reference is Scheme.lost_reference
-    claims = {"sends_states_and_innovations": True, "closed_forms": {"naive": "scheduled"}}
+    assert not other.sends_by_holding_time
+    assert not other.meets_energy_budget
+    own = {"naive": lambda scheme, conditions: None}  # noqa: ARG005 - it is only compared
+    claims = {"sends_states_and_innovations": True, "closed_forms": own}
     again: type[Scheme] = type("Again", (other,), claims)
     assert again.sends_states_and_innovations
-    assert again.closed_forms == {"naive": "scheduled"}
+    assert again.closed_forms == own
 
 
 def test_the_built_in_classes_say_what_theory_knows() -> None:
@@ -48,7 +51,9 @@ def test_the_built_in_classes_say_what_theory_knows() -> None:
         "partial-encryption",
         "twin-track",
     }
-    assert Acknowledged.closed_forms["legitimate"] == "reference"
+    assert [name for name in SCHEMES if SCHEMES[name].sends_by_holding_time] == ["scheduled"]
+    assert [name for name in SCHEMES if SCHEMES[name].meets_energy_budget] == ["quantised-schedule"]
+    assert "legitimate" in Acknowledged.closed_forms
     assert Plain(PROCESS).error_floor(3) is None
     floor, grows = Cipher(PROCESS).error_floor(3)
     np.testing.assert_array_equal(floor, [2.0, 4.0, 6.0])  # tr Σ_k, Σ_k = Σ_{k−1} + Q

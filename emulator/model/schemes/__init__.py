@@ -40,6 +40,8 @@ _BUILT_IN: Mapping[str, type[Scheme]] = {
     "withholding": Withholding,
 }
 SCHEMES: Registry[Scheme] = Registry("scheme", Scheme, "evedrop.schemes", _BUILT_IN, ("scheme",))  # type: ignore[type-abstract]
+PAPERS_SCHEME = "innovation"
+"""The scheme that is meant where none is named."""
 
 
 def scheme_of(process: Process, spec: Mapping[str, Any]) -> Scheme:

@@ -11,7 +11,9 @@ from evedrop.model.process import Floats, product
 from evedrop.model.receiver import Flags, Receiver
 from evedrop.model.reference import ReferenceReceiver
 from evedrop.model.reference_code import NONE, ReferenceCode, singular_warnings
+from evedrop.model.reference_form import ReferenceForm
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
+from evedrop.model.theory.closed_form import ReceiverConditions
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.model.theory.lost_reference import LostReference, growth_by_coin
 from evedrop.streams import Batch
@@ -46,6 +48,10 @@ class AcknowledgedEncoder(Encoder):
         self._slot = np.where(acknowledged, k, self._slot)
 
 
+def _reference_form(scheme: Acknowledged, conditions: ReceiverConditions) -> ReferenceForm | None:
+    return ReferenceForm.of(scheme.process, conditions, open_loop=False)
+
+
 class Acknowledged(Scheme):
     """Subtracts a reference that the user has; an eavesdropper that missed a reference can never recover it.
 
@@ -57,7 +63,7 @@ class Acknowledged(Scheme):
     """
 
     best_reader = "reference"
-    closed_forms = MappingProxyType({"legitimate": "reference", "reference": "reference"})
+    closed_forms = MappingProxyType({"legitimate": _reference_form, "reference": _reference_form})
     needs_acknowledgements = True
     reads_packets = True
     header = ("slot t of the reference; −1: none, z is the state",)

@@ -15,7 +15,10 @@ from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Flags, select
 from evedrop.model.schemes.cipher import CipherEstimator
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, PacketBlock, Scheme, Shared
-from evedrop.model.theory.covariances import Outcomes
+from evedrop.model.theory.chain_form import ChainForm
+from evedrop.model.theory.closed_form import ReceiverConditions
+from evedrop.model.theory.closed_forms import encrypted_schedule
+from evedrop.model.theory.covariances import LARGEST_OPERATOR, Outcomes
 from evedrop.streams import Batch
 
 
@@ -45,6 +48,19 @@ class EncryptedScheduleEncoder(Encoder):
         self._held.acknowledged(k, acknowledged)
 
 
+def selective_form(scheme: Scheme, threshold: float, conditions: ReceiverConditions) -> ChainForm | None:
+    """That of a receiver that uses the packets in clear; None if the chain, with a state for each holding time, is too long."""
+    received, acknowledged = conditions.received, conditions.acknowledged
+    if received is None or acknowledged is None or conditions.hijack is not None or threshold > LARGEST_OPERATOR:
+        return None
+    chain = encrypted_schedule(threshold, received, acknowledged)
+    return ChainForm(scheme.process, conditions.slots, chain, scheme.quantisation)
+
+
+def _selective_form(scheme: EncryptedSchedule, conditions: ReceiverConditions) -> ChainForm | None:
+    return selective_form(scheme, scheme.threshold, conditions)
+
+
 class EncryptedSchedule(Scheme):
     """Encrypts from `threshold` slots after the last acknowledged slot until the next acknowledgement; with 1, always.
 
@@ -55,7 +71,7 @@ class EncryptedSchedule(Scheme):
     """
 
     best_reader = "selective"
-    closed_forms = MappingProxyType({"selective": "selective"})
+    closed_forms = MappingProxyType({"selective": _selective_form})
     parameters = MappingProxyType({"threshold": 2})
     secret_streams = ("mask",)
     estimator_streams = ("mask",)

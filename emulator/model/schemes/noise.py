@@ -17,8 +17,10 @@ from evedrop.model.process import Floats, Process, product
 from evedrop.model.receiver import Flags, Receiver, select
 from evedrop.model.schedule import Schedule
 from evedrop.model.schemes.scheme import Encoder, Packet, PacketBlock, Scheme, Shared
+from evedrop.model.theory.closed_form import ReceiverConditions
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.model.theory.leaked_bits import RevealedBits
+from evedrop.model.theory.noise_taken import NoiseTaken, TakesNoise
 from evedrop.streams import Ahead, Batch, BlockReader
 
 
@@ -85,6 +87,13 @@ class NoiseShared(Shared):
         return NoiseEstimator(self._scheme.process, self._batch.trials, self._schedule)
 
 
+def _takes_noise(scheme: Noise, conditions: ReceiverConditions) -> TakesNoise | None:
+    received, uses = conditions.received, conditions.uses
+    if received is None or uses is None:
+        return None
+    return TakesNoise(NoiseTaken(scheme.process, scheme.noise_law, scheme.mu_d, received, uses), conditions.slots)
+
+
 class Noise(Scheme):
     """The state with probability μ_d = `state_probability`, otherwise noise of covariance `noise_covariance`.
 
@@ -96,7 +105,7 @@ class Noise(Scheme):
     """
 
     best_reader = "bayesian"
-    closed_forms = MappingProxyType(dict.fromkeys(("naive", "suspicious"), "noise"))
+    closed_forms = MappingProxyType(dict.fromkeys(("naive", "suspicious"), _takes_noise))
     parameters = MappingProxyType({"state_probability": 0.6, "noise_covariance": PACKETS})
     secret_streams = ("schedule", "noise")
     estimator_streams = ("schedule",)

@@ -12,8 +12,10 @@ from evedrop.model.process import Floats
 from evedrop.model.receiver import Receiver
 from evedrop.model.reference import Content, ReferenceReceiver
 from evedrop.model.reference_code import NONE, ReferenceCode
+from evedrop.model.reference_form import ReferenceForm
 from evedrop.model.schemes.acknowledged import AcknowledgedEncoder
 from evedrop.model.schemes.scheme import NoInnovations, Packet, Scheme, Shared
+from evedrop.model.theory.closed_form import ReceiverConditions
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.model.theory.lost_reference import LostReference, growth_by_coin
 from evedrop.streams import Batch
@@ -31,6 +33,10 @@ class OpenLoopEncoder(AcknowledgedEncoder):
         return packet._replace(header=np.concatenate([packet.header, content]))
 
 
+def _reference_form(scheme: OpenLoop, conditions: ReceiverConditions) -> ReferenceForm | None:
+    return ReferenceForm.of(scheme.process, conditions, open_loop=True)
+
+
 class OpenLoop(Scheme):
     """Subtracts a reference that the user has, carried by A; an eavesdropper that missed it follows the stable modes later.
 
@@ -38,7 +44,7 @@ class OpenLoop(Scheme):
     """
 
     best_reader = "reference"
-    closed_forms = MappingProxyType({"legitimate": "open-loop", "reference": "open-loop"})
+    closed_forms = MappingProxyType({"legitimate": _reference_form, "reference": _reference_form})
     needs_acknowledgements = True
     reads_packets = True
     header = ("slot t of the reference; −1: no reference", "0: z is the state; 2: z is the state minus A^{k−t} x_t")

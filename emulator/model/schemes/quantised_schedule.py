@@ -16,8 +16,12 @@ from evedrop.model.numeric.quantiser import MOST_BITS, DitheredQuantiser, LevelP
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Belief, Codes, Flags, Receiver, Reception
 from evedrop.model.schemes.cipher import encrypted_packets
-from evedrop.model.schemes.encrypted_schedule import encrypted_by_header
+from evedrop.model.schemes.encrypted_schedule import encrypted_by_header, selective_form
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, PacketBlock, Scheme, Shared
+from evedrop.model.theory.chain_form import ChainForm
+from evedrop.model.theory.closed_form import ReceiverConditions
+from evedrop.model.theory.closed_forms import always_sent
+from evedrop.model.theory.covariances import LARGEST_OPERATOR
 from evedrop.model.theory.quantisation import QuantisationError
 from evedrop.streams import Ahead, Batch, BlockReader
 
@@ -78,6 +82,18 @@ class QuantisedScheduleEstimator(Receiver):
         return after._replace(P=after.P + np.where(heard.gamma, error[:, :, None], 0.0))
 
 
+def _always_read(scheme: QuantisedSchedule, conditions: ReceiverConditions) -> ChainForm | None:
+    """That of the user, which reads every packet."""
+    received = conditions.received
+    if received is None or conditions.acknowledged is None or scheme.threshold > LARGEST_OPERATOR:
+        return None
+    return ChainForm(scheme.process, conditions.slots, always_sent(received), scheme.quantisation)
+
+
+def _selective_form(scheme: QuantisedSchedule, conditions: ReceiverConditions) -> ChainForm | None:
+    return selective_form(scheme, scheme.threshold, conditions)
+
+
 class QuantisedSchedule(Scheme):
     """Quantises the state with subtractive dither, and encrypts as `encrypted-schedule` does, from a threshold θ on.
 
@@ -88,7 +104,8 @@ class QuantisedSchedule(Scheme):
     """
 
     best_reader = "selective"
-    closed_forms = MappingProxyType({"legitimate": "always sent", "selective": "selective"})
+    closed_forms = MappingProxyType({"legitimate": _always_read, "selective": _selective_form})
+    meets_energy_budget = True
     parameters = MappingProxyType({"threshold": 1.5, "bits": 8, "deviations": 6.0})
     secret_streams = ("dither", "mask", "threshold")
     estimator_streams = ("dither", "mask")
@@ -99,7 +116,7 @@ class QuantisedSchedule(Scheme):
 
     def __init__(self, process: Process, threshold: float, bits: int, deviations: float) -> None:
         super().__init__(process)
-        self._threshold, self._width, self._deviations = threshold, bits, deviations
+        self.threshold, self._width, self._deviations = threshold, bits, deviations
 
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -135,7 +152,7 @@ class QuantisedSchedule(Scheme):
         return NoInnovations(
             self.process,
             batch.trials,
-            lambda: QuantisedScheduleEncoder(self._threshold, batch, quantiser, pad, keys["threshold"]),
+            lambda: QuantisedScheduleEncoder(self.threshold, batch, quantiser, pad, keys["threshold"]),
             lambda: QuantisedScheduleEstimator(self.process, batch.trials, quantiser, pad),
         )
 

@@ -14,6 +14,10 @@ from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Flags, Receiver
 from evedrop.model.schemes.plain import PlainEstimator
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
+from evedrop.model.theory.chain_form import ChainForm
+from evedrop.model.theory.closed_form import ReceiverConditions
+from evedrop.model.theory.closed_forms import hijacked_schedule, scheduled
+from evedrop.model.theory.covariances import LARGEST_OPERATOR
 from evedrop.streams import Batch
 
 
@@ -33,6 +37,20 @@ class ScheduledEncoder(Encoder):
         self._held.acknowledged(k, acknowledged)
 
 
+def _chain_form(scheme: Scheduled, conditions: ReceiverConditions) -> ChainForm | None:
+    """That of a receiver that uses every packet; None if the chain, which has a state for each slot of silence, is too long."""
+    received, acknowledged, hijack = conditions.received, conditions.acknowledged, conditions.hijack
+    threshold, process = scheme.threshold, scheme.process
+    if received is None or acknowledged is None or threshold > LARGEST_OPERATOR:
+        return None
+    if hijack is None:
+        return ChainForm(process, conditions.slots, scheduled(threshold, received, acknowledged))
+    if threshold * (hijack.heeding.patience + 2) * process.n**2 > LARGEST_OPERATOR:
+        return None
+    chain = hijacked_schedule(threshold, hijack.mu, hijack.mu_e, hijack.heeding, hijack.hears)
+    return ChainForm(process, conditions.slots, chain)
+
+
 class Scheduled(Scheme):
     """Sends from `threshold` slots after the last acknowledged slot until the next acknowledgement; with 1, always.
 
@@ -42,7 +60,8 @@ class Scheduled(Scheme):
     Source: Leong, Quevedo, Dolz, Dey (2019); docs/mathematics.md, schedules by holding time.
     """
 
-    closed_forms = MappingProxyType(dict.fromkeys(("legitimate", "naive", "reference", "selective"), "scheduled"))
+    closed_forms = MappingProxyType(dict.fromkeys(("legitimate", "naive", "reference", "selective"), _chain_form))
+    sends_by_holding_time = True
     parameters = MappingProxyType({"threshold": 4})
     needs_acknowledgements = True
     may_be_silent = True
@@ -70,5 +89,5 @@ class Scheduled(Scheme):
         return PlainEstimator(self.process, batch.trials)
 
     def outcomes(self, mu: float) -> None:  # noqa: ARG002 - its slots differ behind any link
-        """None, because its slots differ: see `closed_forms.scheduled`."""
+        """None, because its slots differ: see `closed_forms`."""
         return

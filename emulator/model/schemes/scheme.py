@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal, NamedTuple, final
+from typing import Any, ClassVar, NamedTuple, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,18 +16,26 @@ from evedrop.model.noise_law import NoiseLaw
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Flags, Receiver
 from evedrop.model.schedule import StateProbability, in_slot, mean_of
-from evedrop.model.theory.closed_form import ClosedForm
+from evedrop.model.theory.closed_form import ClosedForm, ClosedFormMaker
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.model.theory.leaked_bits import RevealedBits
 from evedrop.model.theory.lost_reference import LostReference
 from evedrop.model.theory.quantisation import QuantisationError
 from evedrop.streams import Batch
 
-ClosedFormName = Literal["always sent", "noise", "open-loop", "reference", "scheduled", "selective"]
-"""A closed form in `evedrop.expected.closed_forms`."""
-
 _WORD_BITS = 64
-_THEORY = ("error_floor", "revealed_bits", "bound_outcomes", "reader_outcomes", "closed_form", "lost_reference")
+_THEORY = (
+    "sends_states_and_innovations",
+    "closed_forms",
+    "sends_by_holding_time",
+    "meets_energy_budget",
+    "error_floor",
+    "revealed_bits",
+    "bound_outcomes",
+    "reader_outcomes",
+    "closed_form",
+    "lost_reference",
+)
 
 
 class Packet(NamedTuple):
@@ -180,15 +188,21 @@ class Scheme(ABC):
     """The strategy that, without the secret, reads its packets best. `evedrop compare` has attackers read with it."""
     sends_states_and_innovations: ClassVar[bool] = False
     """Whether every packet is a state or an innovation, so that no eavesdropper without the secret does better than the genie."""
-    closed_forms: ClassVar[Mapping[str, ClosedFormName]] = MappingProxyType({})
-    """Receiver (a strategy, or `legitimate`) → the closed form for slots that differ."""
+    closed_forms: ClassVar[Mapping[str, ClosedFormMaker]] = MappingProxyType({})
+    """Receiver (a strategy, or `legitimate`) → the function that makes its closed form for slots that differ."""
+    sends_by_holding_time: ClassVar[bool] = False
+    """Whether the slots since the last acknowledged packet decide when it sends.
+    `evedrop design --policy` is for such schemes."""
+    meets_energy_budget: ClassVar[bool] = False
+    """Whether it encrypts from its parameter `threshold` on, any number of at least 1, as `quantised-schedule` does.
+    `evedrop design --budget` is for such schemes."""
     mu_d: StateProbability = 1.0
     """μ_d, or μ_d(k) of each slot."""
 
     def __init_subclass__(cls, **options: Any) -> None:
         """Reset the theory of the packets: a subclass may send others, and has to state again what holds of them."""
         super().__init_subclass__(**options)
-        for name in ("sends_states_and_innovations", "closed_forms", *_THEORY):
+        for name in _THEORY:
             if name not in vars(cls):
                 setattr(cls, name, getattr(Scheme, name))
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from evedrop.model.acknowledgements import Heeding
 from evedrop.model.process import Floats, Process
+from evedrop.model.theory.closed_form import Hears
 from evedrop.model.theory.covariances import LARGEST_OPERATOR, Outcomes, limit_trace, radius
 from evedrop.model.theory.quantisation import QuantisationError
 
@@ -93,9 +94,6 @@ def reference_limit(process: Process, received: float, acknowledged: tuple[float
     source = np.concatenate([(1.0 - received) * process.Q.reshape(-1), unheard * process.Q.reshape(-1)])
     operator = np.kron(carried, np.kron(process.A, process.A))
     return float(np.trace(np.linalg.solve(np.eye(2 * n * n) - operator, source)[: n * n].reshape(n, n)))
-
-
-Hears = Callable[[bool, bool], float]
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import final
 
 import numpy as np
@@ -14,7 +15,16 @@ import numpy as np
 from evedrop.model.noise_law import NoiseLaw
 from evedrop.model.process import Floats, Process
 from evedrop.model.schedule import StateProbability, in_slot, mean_of
-from evedrop.model.theory.covariances import NOBODY, Outcomes, limit, lyapunov, radius, state_covariances
+from evedrop.model.theory.closed_form import ClosedForm
+from evedrop.model.theory.covariances import (
+    NOBODY,
+    Outcomes,
+    has_infinite_variance,
+    limit,
+    lyapunov,
+    radius,
+    state_covariances,
+)
 
 
 @final
@@ -64,3 +74,28 @@ class NoiseTaken:
         sigma = limit(self.process, NOBODY)
         source = one.predicted * self.process.Q + one.misled * (sigma + (sigma if N is None else N))
         return lyapunov(replace(self.process, Q=source), one.kept)
+
+
+@final
+@dataclass(frozen=True)
+class TakesNoise(ClosedForm):
+    """That of a receiver that mistakes noise packets for states, behind a link of independent losses."""
+
+    taken: NoiseTaken
+    slots: int
+
+    @cached_property
+    def traces(self) -> Floats:
+        """The traces of all slots, (slots,)."""
+        traces: Floats = np.trace(self.taken.covariances(self.slots), axis1=1, axis2=2)
+        return traces
+
+    @cached_property
+    def limit(self) -> float:
+        """Trace of the limit; inf if it is unbounded."""
+        return float(np.trace(self.taken.limit))
+
+    @property
+    def infinite_variance(self) -> bool:
+        """Whether the variance of tr P over trials has no bound: not where noise is used, which leaves an error like x itself."""
+        return has_infinite_variance(self.taken.process, self.taken.outcomes)
