@@ -234,7 +234,7 @@ class _Steering:
         if k % self._controller.period == 0:
             decision = self._controller.decide(k, true if self._on_truth or x_hat is None else x_hat)
             self._u, self._failed = decision.u, decision.failed
-            self._times.add([decision.seconds])
+            self._times.add_seconds([decision.seconds])
             self._sensor.set_inputs(self._u)
         if self._estimator is not None:
             self._estimator.learn(k, self._u)

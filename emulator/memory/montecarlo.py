@@ -271,7 +271,7 @@ class Merger:
             self._totals.append(block.totals)
             self._packets.append(block.packets)
             for name in self._scenario.receivers:
-                self._sums[name].add(0, block.sums[name])
+                self._sums[name].add_trials(0, block.sums[name])
             if self._mode is Mode.EXACT:
                 self._add_digests(block.start, block.digests, writer)
         for mine, theirs in ((self._errors, result.errors), (self._traces, result.traces)):

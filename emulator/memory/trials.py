@@ -109,8 +109,8 @@ def carry_out(task: Task, tell: Callable[[int], None], stopped: Callable[[], boo
             else:
                 _score(block, keeper, rows, chunk, chunk.slots)
         for name, one in chunk.receivers.items():
-            result.errors[name].add(chunk.first, one.error)
-            result.traces[name].add(chunk.first, one.trace)
+            result.errors[name].add_values(chunk.first, one.error)
+            result.traces[name].add_values(chunk.first, one.trace)
         if chunk.slots is not None and recorded:
             result.recorded.append(chunk.slots.part(slice(0, recorded)).copied())
         tell(len(trials) * count)
@@ -167,8 +167,8 @@ def _score(block: TrialBlock, keeper: Scorekeeper, rows: slice, chunk: Chunk, sl
         )
         keeper.totals.tallies[name].count(account)
     known = {name: (one.error[:, rows], one.trace[:, rows]) for name, one in chunk.receivers.items()}
-    for name, scored in keeper.add(replace(part, receivers=receivers), known).items():
-        block.sums[name].add(chunk.first, scored.sums)
+    for name, scored in keeper.add_slots(replace(part, receivers=receivers), known).items():
+        block.sums[name].add_trials(chunk.first, scored.sums)
 
 
 @np.errstate(over="ignore")
@@ -179,14 +179,14 @@ def _add(block: TrialBlock, mode: Mode, rows: slice, chunk: Chunk, expected: Map
         sums = slot_sums(error, action)
         if one.error is not one.trace:
             sums = slot_sums(error, action, np.stack([trace.sum(axis=1), (trace * trace).sum(axis=1)], axis=1))
-        block.sums[name].add(chunk.first, sums)
+        block.sums[name].add_trials(chunk.first, sums)
         tally = block.totals.tallies[name]
-        tally.watched.add(ScoredSlots(chunk.first, error, action, sums.trace, expected[name]))
-        tally.add(chunk.first, error, sums, expected[name])
+        tally.watched.add_slots(ScoredSlots(chunk.first, error, action, sums.trace, expected[name]))
+        tally.add_slots(chunk.first, error, sums, expected[name])
         if (
             tally.conditional is not None and mode is not Mode.COVARIANCE_ONLY
         ):  # there, the error is its own expectation
-            tally.conditional.add(action)
+            tally.conditional.add_actions(action)
         tally.add_traces(chunk.first, trace)
         account = _account(block, name, rows, chunk)
         tally.account(account.delivered, action, account.lost, account.unsent)

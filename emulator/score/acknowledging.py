@@ -72,7 +72,7 @@ class Detection:
         whole.first = np.concatenate([part.first for part in parts])
         return whole
 
-    def add(self, first: int, alarms: Flags) -> None:
+    def add_alarms(self, first: int, alarms: Flags) -> None:
         """Add slots from `first` on, alarms (c, R)."""
         raised = alarms.any(axis=0)
         self.first = np.where(raised & (self.first < 0), first + np.argmax(alarms, axis=0), self.first)

@@ -57,7 +57,7 @@ class SolveTimes:
     seconds: float = 0.0
     longest: float = 0.0
 
-    def add(self, seconds: Iterable[float]) -> None:
+    def add_seconds(self, seconds: Iterable[float]) -> None:
         """Add some decisions."""
         for one in seconds:
             self.decisions += 1
@@ -99,7 +99,7 @@ class LoopTally:
         """Application → its totals, for those that the scenario uses."""
 
     @classmethod
-    def of(cls, scenario: Scenario, trials: int) -> LoopTally | None:
+    def from_scenario(cls, scenario: Scenario, trials: int) -> LoopTally | None:
         """The totals of some trials of a scenario; None without a controller."""
         loop = controlled_plant(scenario)
         if loop is None:
@@ -111,7 +111,7 @@ class LoopTally:
         }
         return tally
 
-    def add(self, acted: Acted) -> None:
+    def add_slots(self, acted: Acted) -> None:
         """Add the next slots."""
         inputs = acted.inputs
         for application in self.applications.values():

@@ -44,7 +44,7 @@ class ConditionalError:
         self.slots = 0
         """The number of slots so far; 0 in a mode without errors."""
 
-    def add(self, action: Codes) -> None:
+    def add_actions(self, action: Codes) -> None:
         """Add the next slots: the actions (c, R)."""
         process = self._process
         covariances = kernels.follow_covariance(process.A, process.Q, self._P, action, self.slots == 0)

@@ -50,12 +50,12 @@ class FilterTally:
         """The same for each trial, (R,)."""
 
     @classmethod
-    def of(cls, scenario: Scenario) -> FilterTally | None:
+    def from_scenario(cls, scenario: Scenario) -> FilterTally | None:
         """A tally for a scenario; None if its sensor knows the state."""
         driven = scenario.driven
         return None if driven is None or driven.output_matrix is None else cls()
 
-    def add(self, errors: Mapping[str, Floats]) -> None:
+    def add_errors(self, errors: Mapping[str, Floats]) -> None:
         """Add the next slots, errors as from `true_errors`, (c, R) each."""
         self.slots += len(errors[SENSOR])
         self.count += errors[SENSOR].size

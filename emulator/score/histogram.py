@@ -34,7 +34,7 @@ class SlotHistograms:
         self.counts = np.zeros((-(-slots // self._stride), _BINS), np.uint32)
         """The number of values in each histogram and bin, (histograms, 512)."""
 
-    def add(self, first: int, values: Floats) -> None:
+    def add_values(self, first: int, values: Floats) -> None:
         """Add the values (c, R), none negative, of slots first … first+c−1."""
         skip = -first % self._stride
         chosen = values[skip :: self._stride]

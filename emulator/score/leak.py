@@ -54,7 +54,7 @@ class LeakTally:
         self.slots = 0
         """The number of slots so far; 0 in a mode without packets."""
 
-    def add(self, action: Codes, nu: Flags, revealed: HeardBits) -> None:
+    def add_slots(self, action: Codes, nu: Flags, revealed: HeardBits) -> None:
         """Add the next slots: the receiver's actions, and the packets' types, (c, R) each."""
         self.slots += len(action)
         of_state, of_other = revealed.by_type.T[:, :, None]

@@ -61,9 +61,9 @@ class Scorekeeper:
             theory = {name: one.stream() for name, one in expectations_of(scenario).items()}
         self._theory = theory
         self._revealed = HeardBitsStream(scenario)
-        self.totals = Totals.of(scenario, trials)
+        self.totals = Totals.from_scenario(scenario, trials)
 
-    def add(self, slots: Slots, known: Mapping[str, tuple[Floats, Floats]] | None = None) -> dict[str, Scored]:
+    def add_slots(self, slots: Slots, known: Mapping[str, tuple[Floats, Floats]] | None = None) -> dict[str, Scored]:
         """Score the next slots: receiver → its errors, sums and theory.
 
         known: receiver → its squared errors, and tr P of every trial, (c, R) each, if they have been computed.
@@ -80,13 +80,13 @@ class Scorekeeper:
                 errors, slot_sums(errors, receiver.action, receiver.trace), self._theory[name].next_traces(slots.count)
             )
             tally = self.totals.tallies[name]
-            tally.add(slots.first, *one)
+            tally.add_slots(slots.first, *one)
             if tally.conditional is not None:
-                tally.conditional.add(receiver.action)
+                tally.conditional.add_actions(receiver.action)
             if tally.leak is not None:
-                tally.leak.add(receiver.action, slots.nu, revealed[name])
+                tally.leak.add_slots(receiver.action, slots.nu, revealed[name])
             for direction in tally.directions.values():
-                direction.add(slots.first, slots.x, receiver.x_hat)
+                direction.add_slots(slots.first, slots.x, receiver.x_hat)
             tally.add_traces(slots.first, traces)
             tally.account(receiver.delivered, receiver.action, receiver.lost, receiver.unsent)
             if slots.sent is not None:
@@ -95,7 +95,7 @@ class Scorekeeper:
             if receiver.late is not None and receiver.late_used is not None and receiver.late_delivered is not None:
                 late = (receiver.late, receiver.late_used)
                 tally.account_late(receiver.late_delivered, *late)
-            tally.watched.add(
+            tally.watched.add_slots(
                 ScoredSlots(
                     slots.first, errors, receiver.action, one.sums.trace, one.expected, late, slots.x, receiver.x_hat
                 )
@@ -107,12 +107,12 @@ class Scorekeeper:
         """Add the slots' alarms, the controller's decisions, and the true errors of a sensor that filters."""
         totals, estimates = self.totals, {name: one.x_hat for name, one in slots.receivers.items()}
         if slots.alarms is not None and totals.detection is not None:
-            totals.detection.add(slots.first, slots.alarms)
+            totals.detection.add_alarms(slots.first, slots.alarms)
         if slots.true is not None and totals.filter is not None:
-            totals.filter.add(true_errors(slots.true, slots.x, estimates))
+            totals.filter.add_errors(true_errors(slots.true, slots.x, estimates))
         if slots.inputs is not None and totals.loop is not None:
             true = slots.x if slots.true is None else slots.true
-            totals.loop.add(Acted(slots.inputs, slots.x, estimates, slots.receivers[LEGITIMATE].action, true))
+            totals.loop.add_slots(Acted(slots.inputs, slots.x, estimates, slots.receivers[LEGITIMATE].action, true))
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ class SlotSums:
         """Sums of no trials, to add to."""
         return cls(*(np.zeros(slots) for _ in fields(cls)))
 
-    def add(self, first: int, other: SlotSums) -> None:
+    def add_trials(self, first: int, other: SlotSums) -> None:
         """Add the sums of further trials over some slots from `first` on."""
         rows = slice(first, first + len(other.error))
         for one in fields(self):
@@ -116,7 +116,7 @@ class DirectionErrors:
         self.done = 0
         """The number of slots so far; 0 in a mode without estimates."""
 
-    def add(self, first: int, x: Floats, x_hat: Floats) -> None:
+    def add_slots(self, first: int, x: Floats, x_hat: Floats) -> None:
         """Add the slots from `first` on, from x and x̂, (c, n, R) each."""
         self.done += len(x)
         error = np.zeros((len(x), x.shape[2]))
@@ -172,7 +172,7 @@ class Tally(ReceiverTotals):
         self._unfinished = BlockSums(self.trials, self.slots, self.cuts)
         self.packets = np.zeros((2, self.trials), np.int64)
 
-    def add(self, first: int, error: Floats, sums: SlotSums, expected: Floats) -> None:
+    def add_slots(self, first: int, error: Floats, sums: SlotSums, expected: Floats) -> None:
         """Add the c slots from `first` on: their errors (c, R), sums, and expected traces (c,)."""
         count = len(error)
         self.done += count
@@ -308,7 +308,7 @@ _COUNTED = [one.name for one in fields(ReceiverTotals) if one.name != "lost"]
 def merged(parts: Sequence[Tally]) -> Tally:
     """The tally of several disjoint sets of trials, in their order."""
     total = Tally(parts[0].slots, sum(part.trials for part in parts))
-    total.watched = Watched.of([part.watched for part in parts])
+    total.watched = Watched.merged([part.watched for part in parts])
     total.done = min(part.done for part in parts)
     for part in parts:
         for name in _COUNTED:

@@ -42,13 +42,13 @@ class Totals:
         return cls(tallies)
 
     @classmethod
-    def of(cls, scenario: Scenario, trials: int) -> Totals:
+    def from_scenario(cls, scenario: Scenario, trials: int) -> Totals:
         """Empty totals of trials that are about to begin, in a mode with states."""
         return cls(
             cls.nothing(scenario, trials).tallies,
             Detection(trials),
-            LoopTally.of(scenario, trials),
-            FilterTally.of(scenario),
+            LoopTally.from_scenario(scenario, trials),
+            FilterTally.from_scenario(scenario),
         )
 
     @property

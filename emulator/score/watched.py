@@ -174,7 +174,7 @@ class Watched:
     def __init__(self, watches: Iterable[WatchedSlots], trials: int) -> None:
         self._kept = {watch: _tally(watch.what, trials) for watch in watches}
 
-    def add(self, slots: ScoredSlots) -> None:
+    def add_slots(self, slots: ScoredSlots) -> None:
         """Add the next slots."""
         for watch, kept in self._kept.items():
             start, stop = max(watch.first - slots.first, 0), min(watch.end - slots.first, len(slots.error))
@@ -192,7 +192,7 @@ class Watched:
         return self._kept[watch]
 
     @classmethod
-    def of(cls, parts: Sequence[Watched]) -> Watched:
+    def merged(cls, parts: Sequence[Watched]) -> Watched:
         """The quantities of disjoint sets of trials, in their order."""
         total = cls((), 0)
         total._kept = {

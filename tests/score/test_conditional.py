@@ -40,7 +40,7 @@ def test_probabilities_are_not_too_small(process: Process) -> None:
     """
     action = actions(1)
     own = ConditionalError(process, process.initial_covariance, TRIALS)
-    own.add(action)
+    own.add_actions(action)
     probability = own.probability(errors(process, action, 2))
     for level in (0.5, 0.1, 0.01, 0.001):
         share = float((probability < level).mean())
@@ -52,7 +52,7 @@ def test_the_expectation_is_the_mean_of_many_trials_with_the_same_events() -> No
     """4000 trials with the actions of one: their mean error is the expected one."""
     action = np.repeat(actions(3, 1), TRIALS, axis=1)
     own = ConditionalError(MARGINAL, MARGINAL.initial_covariance, TRIALS)
-    own.add(action)
+    own.add_actions(action)
     found = errors(MARGINAL, action, 4)
     assert found.mean() == pytest.approx(own.expected[0], abs=4.5 * found.std() / np.sqrt(TRIALS))
     assert 0.5 < found.var() / own.variance[0] < 1.3  # a bound; beyond 1 by chance only
@@ -63,11 +63,11 @@ def test_blocks_of_slots_and_sets_of_trials_do_not_matter(length: int) -> None:
     """To the bit: slots in parts, and trials in sets, one of them of one trial, that are merged."""
     action = actions(5, 20)
     whole = ConditionalError(UNSTABLE, UNSTABLE.initial_covariance, 20)
-    whole.add(action)
+    whole.add_actions(action)
     parts = [ConditionalError(UNSTABLE, UNSTABLE.initial_covariance, count) for count in (8, 11, 1)]
     for part, trials in zip(parts, (slice(0, 8), slice(8, 19), slice(19, 20)), strict=True):
         for first in range(0, SLOTS, length):
-            part.add(action[first : first + length, trials])
+            part.add_actions(action[first : first + length, trials])
     merged = ConditionalError.merged(parts)
     assert merged.slots == whole.slots == SLOTS
     assert np.array_equal(merged.expected, whole.expected)
@@ -78,6 +78,6 @@ def test_blocks_of_slots_and_sets_of_trials_do_not_matter(length: int) -> None:
 def test_without_an_expected_error_there_is_no_probability() -> None:
     """A trial that heard every state."""
     own = ConditionalError(MARGINAL, MARGINAL.initial_covariance, 1)
-    own.add(np.full((5, 1), Action.STATE, np.uint8))
+    own.add_actions(np.full((5, 1), Action.STATE, np.uint8))
     assert own.expected == [0.0]
     assert np.isnan(own.probability(np.zeros(1))).all()

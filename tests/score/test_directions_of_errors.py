@@ -135,12 +135,12 @@ def test_trials_and_slots_in_parts_have_the_same_bits() -> None:
     x, x_hat = random.standard_normal((2, 40, 3, 6))
     v = np.array([1.0, 0.0, -0.3])
     whole = DirectionErrors(v, 40, 6)
-    whole.add(0, x, x_hat)
+    whole.add_slots(0, x, x_hat)
     parts = []
     for trials in (slice(0, 1), slice(1, 6)):
         part = DirectionErrors(v, 40, trials.stop - trials.start)
         for first, end in ((0, 7), (7, 8), (8, 40)):
-            part.add(first, x[first:end, :, trials], x_hat[first:end, :, trials])
+            part.add_slots(first, x[first:end, :, trials], x_hat[first:end, :, trials])
         parts.append(part)
     merged = DirectionErrors.merged(parts)
     np.testing.assert_array_equal(merged.window_errors, whole.window_errors)

@@ -150,11 +150,11 @@ def test_what_is_watched_does_not_depend_on_how_it_is_cut(cuts: set[int], blocks
         one = Watched([*watches, *steps], error[:, trials].shape[1])
         for first, end in zip([0, *ends], [*ends, 40], strict=True):
             nothing = np.zeros(end - first)
-            one.add(ScoredSlots(first, error[first:end, trials], action[first:end, trials], nothing, nothing))
+            one.add_slots(ScoredSlots(first, error[first:end, trials], action[first:end, trials], nothing, nothing))
         return one
 
     edges = [0, *sorted(blocks), 7]
-    parts = Watched.of([watched(slice(*ends), sorted(cuts)) for ends in pairwise(edges)])
+    parts = Watched.merged([watched(slice(*ends), sorted(cuts)) for ends in pairwise(edges)])
     whole = watched(slice(0, 7), [])
     for watch in watches:
         found, expected = parts.tally(watch).of_trials, whole.tally(watch).of_trials

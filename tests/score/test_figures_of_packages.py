@@ -125,7 +125,7 @@ def test_a_figure_over_all_slots_is_that_of_the_totals(name: str) -> None:
     error, action = draw.lognormal(size=(30, 4)), draw.integers(0, 4, (30, 4)).astype(np.uint8)
     trace, expected = draw.lognormal(size=(30, 2)), draw.lognormal(size=30)
     tally, kept = Tally(30, 4), figure(name).tally(4)
-    tally.add(0, error, slot_sums(error, action, trace), expected)
+    tally.add_slots(0, error, slot_sums(error, action, trace), expected)
     for first in (0, 11):
         rows = slice(first, 11 if first == 0 else 30)
         kept.add(ScoredSlots(first, error[rows], action[rows], trace[rows, 0], expected[rows]))

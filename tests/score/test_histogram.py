@@ -25,7 +25,7 @@ values = st.floats(SCALE * 2.0**-23, SCALE * 2.0**100)
 def histograms(samples: Floats, first: int = 0, slots: int | None = None) -> SlotHistograms:
     """Of samples (c, R) in slots from `first` on."""
     made = SlotHistograms(first + len(samples) if slots is None else slots, SCALE)
-    made.add(first, samples)
+    made.add_values(first, samples)
     return made
 
 
@@ -81,7 +81,7 @@ def test_a_long_run_is_looked_at_in_even_steps(slots: int, lengths: list[int]) -
     numbers = SCALE * 2.0 ** np.arange(end)[:, None].clip(max=90) * np.ones((1, 3))
     first = 0
     for length in lengths:
-        made.add(first, numbers[first : first + length])
+        made.add_values(first, numbers[first : first + length])
         first = min(first + length, end)
     stride = -(-slots // 4096)
     found = made.quantiles()
@@ -114,7 +114,7 @@ def test_what_is_sent_is_small_and_adds_up_as_before() -> None:
     arrived = pickle.loads(sent)  # noqa: S301 - our own
     assert np.array_equal(arrived.quantiles(), made.quantiles(), equal_nan=True)
     for one in (arrived, made):
-        one.add(0, samples[:, :7])
+        one.add_values(0, samples[:, :7])
         one.merge(histograms(samples))
     assert np.array_equal(arrived.counts, made.counts)
 
@@ -122,7 +122,7 @@ def test_what_is_sent_is_small_and_adds_up_as_before() -> None:
 def test_beyond_the_bins_only_the_side_is_known() -> None:
     """A value too large for the bins is infinite, one too small is 0: never a wrong number."""
     histograms = SlotHistograms(2, 1.0)
-    histograms.add(0, np.array([[1e80, 1e90, 1e85], [1e-30, 0.0, 1e-25]]))
+    histograms.add_values(0, np.array([[1e80, 1e90, 1e85], [1e-30, 0.0, 1e-25]]))
     found = histograms.quantiles()
     assert np.isinf(found[0]).all()
     assert (found[1] == 0.0).all()

@@ -75,12 +75,12 @@ def test_trials_in_parts_have_the_same_bits() -> None:
     by_type = np.stack([np.full(30, np.inf), random.random(30)], axis=1)
     expected_bits = random.random(30)
     whole = LeakTally(8)
-    whole.add(action, nu, HeardBits(by_type, expected_bits))
+    whole.add_slots(action, nu, HeardBits(by_type, expected_bits))
     parts = []
     for trials in (slice(0, 3), slice(3, 8)):
         part = LeakTally(trials.stop - trials.start)
         for rows in (slice(0, 7), slice(7, 30)):
-            part.add(action[rows, trials], nu[rows, trials], HeardBits(by_type[rows], expected_bits[rows]))
+            part.add_slots(action[rows, trials], nu[rows, trials], HeardBits(by_type[rows], expected_bits[rows]))
         parts.append(part)
     found, expected = LeakTally.merged(parts).summary, whole.summary
     assert found is not None
@@ -92,7 +92,7 @@ def test_trials_in_parts_have_the_same_bits() -> None:
         expected.standard_error,
     )
     short = LeakTally(2)
-    short.add(action[:5, :2], nu[:5, :2], HeardBits(by_type[:5], expected_bits[:5]))
+    short.add_slots(action[:5, :2], nu[:5, :2], HeardBits(by_type[:5], expected_bits[:5]))
     assert LeakTally.merged([*parts, short]).summary is None
 
 

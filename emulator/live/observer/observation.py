@@ -249,7 +249,7 @@ class ObservedRun:
             for name, account in self._joiner.journal(message).items():
                 self._keeper.totals.tallies[name].count(account)
         elif source == CONTROLLER:
-            self._keeper.totals.solve_times.add(self._joiner.decisions(message).tolist())
+            self._keeper.totals.solve_times.add_seconds(self._joiner.decisions(message).tolist())
         elif source != SENSOR and is_leaving(message):
             self._leave(source, message)
         elif source != SENSOR:
@@ -263,7 +263,7 @@ class ObservedRun:
         if slots is None:
             return
         self._verifier.joined(slots)
-        scored = self._keeper.add(slots)
+        scored = self._keeper.add_slots(slots)
         write_rows(self._writer, slots, scored, self._scenario.first_trial)
         self._digest_rows.write(self._writer)
         if self._recording is not None:
