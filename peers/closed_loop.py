@@ -34,7 +34,7 @@ class Decided:
     def of(self, k: int) -> tuple[Floats, Flags]:
         """The inputs (m, R) of slot k, and where the decision failed, (R,); call it for slots in order."""
         if k % self._period == 0:
-            message = self._due.take(lambda: Reader(self._key, self._inbox.recv()), k)
+            message = self._due.take_message(lambda: Reader(self._key, self._inbox.recv()), k)
             self._now = read_decided(message, k, self._shape)
         return self._now
 

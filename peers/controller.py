@@ -38,9 +38,9 @@ def steer(brief: Brief[ControllerPart], connect: Callable[[AnyBrief], ProcessSes
         session.ready()
         for k in range(0, brief.slots, assignment.period):
             session.place.slot = k
-            message = due.take(lambda: Reader(key, inbox.recv()), k)
+            message = due.take_message(lambda: Reader(key, inbox.recv()), k)
             x = read_known(message, name, k, (process.n, brief.trials))
             made = controller.decide(k, x)
             put(k, decided(k, made.u, made.failed))
-            reporter.add(k, *made)
+            reporter.add_decision(k, *made)
         session.wait_for(End)

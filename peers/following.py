@@ -114,14 +114,14 @@ class Following:
     def _take(self) -> None:
         """Take the deliveries of this slot, and of those after it that have arrived."""
         brief, k = self._brief, self._k
-        messages = self.deliveries.take(k, 1 if self._replies.awaited else self._end_of_block - k)
+        messages = self.deliveries.take_messages(k, 1 if self._replies.awaited else self._end_of_block - k)
         slots = range(k, k + len(messages))
         shape = len(brief.model.A), brief.trials
         arrivals = read_deliveries(messages, k, shape, brief.model.header, brief.part.window)
         self._replies.before(k, arrivals.gamma[0])
-        followed = self._core.take(slots, arrivals)
+        followed = self._core.take_slots(slots, arrivals)
         self._replies.after(k, self._core.belief)
-        self._reporter.add(slots, *followed)
+        self._reporter.add_slots(slots, *followed)
         self._k = slots.stop
 
     @property

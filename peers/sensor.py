@@ -165,7 +165,7 @@ class Acknowledgements:
 
     def wait(self, k: int) -> Flags:
         """The acknowledgements of slot k, (R,)."""
-        message = self._due.take(lambda: Reader(self._key, self._inbox.recv()), k)
+        message = self._due.take_message(lambda: Reader(self._key, self._inbox.recv()), k)
         return read_acknowledgement(message, k, self._trials)
 
 
@@ -245,7 +245,7 @@ class Sensing:
             first = self._slots.start
             made = self._made.rows(slice(some.start - first, end - first))
             alarms, steered = self._answers(some.start, made) if self._answered else (None, None)
-            self._reporter.add(some, made, alarms, steered)
+            self._reporter.add_slots(some, made, alarms, steered)
             self._reported = end
 
     def _answers(self, k: int, made: Sent) -> tuple[Flags | None, tuple[Floats, Flags] | None]:

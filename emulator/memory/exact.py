@@ -93,7 +93,9 @@ class ExactSimulation:
         )
         ack_channel = ack_channel_of(scenario)
         self._jammer = None if ack_channel is None else ack_channel.jammer
-        self._ack_channel = None if ack_channel is None else AckChannel.of(ack_channel, keys.acknowledgements, batch)
+        self._ack_channel = (
+            None if ack_channel is None else AckChannel.from_spec(ack_channel, keys.acknowledgements, batch)
+        )
         self._steering = None
         if scenario.controller is not None and scenario.assignment is not None:
             controller = ControllerCore(scenario.controller.strategy, scenario.assignment, disturbances, batch.trials)
@@ -134,7 +136,7 @@ class ExactSimulation:
                 self._steering.act(slots.start, slots.start - chunk.start, made.true[0], x_hat, inputs)
         whole = Sent.joined(sent)
         with self._guard.asking(LEGITIMATE, chunk):
-            self._packets.add(self._roles.scheme.encrypted(whole.packets), whole.packets.sent)
+            self._packets.add_slots(self._roles.scheme.encrypted(whole.packets), whole.packets.sent)
         followed = {
             name: FollowedSlots.joined(users)
             if users and name == LEGITIMATE
@@ -162,7 +164,7 @@ class ExactSimulation:
             row = betrayed - slots.start
             arrivals = arrivals._replace(truth={row: made.x[row]})
         with self._guard.asking(name, slots):
-            return self._receivers[name].take(slots, arrivals)
+            return self._receivers[name].take_slots(slots, arrivals)
 
     def _chunk(
         self,

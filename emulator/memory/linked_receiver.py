@@ -32,7 +32,7 @@ class LinkedReceiver:
         """Its belief after the last slot in which it was present, or that it passed."""
         return self._core.belief
 
-    def take(self, slots: range, arrivals: Arrivals) -> FollowedSlots:
+    def take_slots(self, slots: range, arrivals: Arrivals) -> FollowedSlots:
         """The beliefs after consecutive slots, at least one. The receiver is present in all of them, or away in all."""
         k = slots.start
         if k in self._outages:
@@ -41,11 +41,11 @@ class LinkedReceiver:
             if self._away.keeps_state:
                 self._core.miss(slots)
             late = np.zeros((2, len(slots), self._receiver.trials), np.uint16) if self._window else None
-            return FollowedSlots(self._absence.take(slots), late)
+            return FollowedSlots(self._absence.take_slots(slots), late)
         if self._away is not None and not self._away.keeps_state:
             self._core = ReceiverCore(self._receiver, self._window, k)
         self._away = None
-        return self._core.take(slots, arrivals)
+        return self._core.take_slots(slots, arrivals)
 
     def _leave(self, away: Away) -> None:
         process, trials = self._receiver.process, self._receiver.trials

@@ -98,7 +98,7 @@ def simulate(scenario: Scenario, folder: Path, tell: Tell, plan: Plan = Plan()) 
             ):
                 try:
                     for result in results:
-                        merger.add(result, writer)
+                        merger.add_batch(result, writer)
                         writer.checkpoint(merger.at, lambda: merger.summary(ending("")), lambda: merger.write(writer))
                 except RunError as error:
                     failure = error
@@ -264,7 +264,7 @@ class Merger:
         return self.trials == self._scenario.trials and all(done)
 
     @np.errstate(over="ignore")
-    def add(self, result: BatchResult, writer: ResultsWriter | None = None) -> None:
+    def add_batch(self, result: BatchResult, writer: ResultsWriter | None = None) -> None:
         """Add the next batch; writes its digests and recorded trials if there is a writer."""
         for block in result.blocks:
             self.trials += block.trials

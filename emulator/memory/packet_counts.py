@@ -32,7 +32,7 @@ class PacketCounts:
         """The counts of several sets of trials, at least one, in order."""
         return cls(np.concatenate([one.sent for one in parts]), np.concatenate([one.encrypted for one in parts]))
 
-    def add(self, encrypted: Flags, sent: Flags | None) -> None:
+    def add_slots(self, encrypted: Flags, sent: Flags | None) -> None:
         """Add some slots: whether each packet is encrypted, and whether it is sent, (c, R) each; None: all are sent."""
         if sent is None:
             self.sent += len(encrypted)

@@ -90,7 +90,7 @@ class _Worker:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             theirs.close()
 
-    def give(self, number: int, task: Task) -> None:
+    def send_task(self, number: int, task: Task) -> None:
         self.number = number
         with contextlib.suppress(OSError):  # the worker died; the next read of its pipe reports it
             self.pipe.send(task)
@@ -109,7 +109,7 @@ def _results(tasks: list[Task], crew: list[_Worker], tell: Tell, stopped: Stoppe
     """The results as they come, with their numbers; after a stop, the partial results of the current tasks."""
     waiting = iter(enumerate(tasks))
     for worker, (number, task) in zip(crew, waiting, strict=False):
-        worker.give(number, task)
+        worker.send_task(number, task)
     deadline: float | None = None
     while busy := {worker.pipe: worker for worker in crew if worker.number is not None}:
         if deadline is None and stopped():
@@ -130,7 +130,7 @@ def _results(tasks: list[Task], crew: list[_Worker], tell: Tell, stopped: Stoppe
                 yield worker.number, news
             worker.number = None
             if deadline is None and (following := next(waiting, None)) is not None:
-                worker.give(*following)
+                worker.send_task(*following)
 
 
 def _received(worker: _Worker) -> int | str | BatchResult:

@@ -150,7 +150,7 @@ class AckChannel:
         self._counted = -1
 
     @classmethod
-    def of(cls, spec: AckChannelSpec, key: bytes, batch: Batch) -> AckChannel:
+    def from_spec(cls, spec: AckChannelSpec, key: bytes, batch: Batch) -> AckChannel:
         """The channel that a specification describes."""
         return cls(spec.attack, spec.quality, key, batch, spec.spans, spec.flip, spec.overheard)
 

@@ -99,7 +99,7 @@ def compare_all(matchups: Matchups, folder: Path, tell: Tell, plan: Plan) -> Com
 def _merged(group: Group, plan: Plan, results: Iterator[BatchResult]) -> Merger:
     merger = Merger(group.scenario, plan.mode)
     for result in results:
-        merger.add(result)
+        merger.add_batch(result)
     return merger
 
 

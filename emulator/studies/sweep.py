@@ -159,7 +159,7 @@ def _summary(scenario: Scenario, plan: Plan, results: Iterator[BatchResult]) -> 
     started = time.monotonic()
     merger = Merger(scenario, plan.mode)
     for result in results:
-        merger.add(result)
+        merger.add_batch(result)
     if not merger.complete:
         return None
     ending = Ending(time.monotonic() - started)

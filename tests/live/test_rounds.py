@@ -44,7 +44,7 @@ class Conducted:
         """As the test says."""
         return self.another_router
 
-    def command(self, name: str, command: ControlCommand) -> None:
+    def send_to(self, name: str, command: ControlCommand) -> None:
         """Note the rounds."""
         if name == "sensor" and isinstance(command, Again):
             self.rounds.append(command.slot)
@@ -52,7 +52,7 @@ class Conducted:
     def start(self) -> None:
         """Nothing to start."""
 
-    def report(self, done: int) -> None:
+    def report_progress(self, done: int) -> None:
         """Nobody to tell."""
 
     def remind(self) -> None:

@@ -132,7 +132,7 @@ class Run:
         """Everybody is asked, and answers."""
         self.asked += 1
         for name, where in self.answers.items():
-            self.stall.take(name, where)
+            self.stall.add_answer(name, where)
 
     def wait(
         self, seconds: float, done: int = 50, step: float = 0.25, *, held: bool = False, missing: bool = False

@@ -45,7 +45,7 @@ class Told:
     away: set[str] = field(default_factory=set)
     sent: list[Sent] = field(default_factory=list)
 
-    def command(self, name: str, command: ControlCommand) -> None:
+    def send_to(self, name: str, command: ControlCommand) -> None:
         """Keep it."""
         self.sent.append((name, command))
 
@@ -78,7 +78,7 @@ class Run:
     def asks(self, do: str, reported: int = 0, **fields: Any) -> Asked:
         """An operator asks for something after this number of slots was reported."""
         asked = Asked()
-        self.steering.take(Order(Request(do, **fields), asked), reported)  # type: ignore[arg-type]
+        self.steering.take_order(Order(Request(do, **fields), asked), reported)  # type: ignore[arg-type]
         return asked
 
     def holds(self, k: int) -> list[Sent]:

@@ -123,7 +123,7 @@ def test_arrivals_and_beliefs_do_not_depend_on_blocks(window: int) -> None:
             for slots in ranges(edges):
                 part = range(max(slots.start, batch.start), min(slots.stop, batch.stop))
                 if part:
-                    parts.append(receiver.take(part, core.arrivals(part, sent.packets.z[part.start : part.stop])))
+                    parts.append(receiver.take_slots(part, core.arrivals(part, sent.packets.z[part.start : part.stop])))
         found.append(FollowedSlots.joined(parts))
     assert (found[0].late is None) is (window == 0)
     for one in found[1:]:

@@ -53,8 +53,8 @@ def test_packets_that_are_not_sent_are_not_counted() -> None:
     encrypted = np.array([[True, False, True], [True, True, True]])
     sent = np.array([[True, True, False], [True, False, True]])
     counts = PacketCounts.zero(3)
-    counts.add(encrypted, sent)
-    counts.add(encrypted[:1], None)
+    counts.add_slots(encrypted, sent)
+    counts.add_slots(encrypted[:1], None)
     assert counts.sent.tolist() == [3, 2, 2]
     assert counts.encrypted.tolist() == [3, 0, 2]
     whole = PacketCounts.merged([counts.part(slice(2, 3)), counts])

@@ -57,7 +57,7 @@ class OneByOne:
         """The belief after a slot."""
         heard = arrival.heard
         header = None if heard.header is None else heard.header[None]
-        found = self.core.take(
+        found = self.core.take_slots(
             range(k, k + 1),
             Arrivals(heard.gamma[None], heard.z[None], header, {0: arrival.late} if arrival.late else {}),
         )
@@ -143,7 +143,7 @@ def test_an_absence_is_a_receiver_that_hears_nothing() -> None:
     for first in (0, 1, 7):
         absence, belief = Absence(PROCESS, prior(PROCESS, BATCH.trials, first)), one.prior(first)
         for slots in (range(first, first + 1), range(first + 1, first + 5)):
-            found = absence.take(slots)
+            found = absence.take_slots(slots)
             for row, k in enumerate(slots):
                 belief = one.step(k, belief, nothing)
                 assert same(Belief(found.x_hat[row], found.P[row], found.action[row]), belief)

@@ -320,7 +320,7 @@ def merged(scenario: Scenario, workers: int = 1, mode: Mode = Mode.EXACT) -> Mer
     """The trials of a scenario, in as many tasks as for this many workers."""
     merger = Merger(scenario, mode)
     for task in tasks_of(scenario, mode, workers):
-        merger.add(carry_out(task, lambda _: None, lambda: False))
+        merger.add_batch(carry_out(task, lambda _: None, lambda: False))
     return merger
 
 

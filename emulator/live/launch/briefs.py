@@ -123,7 +123,7 @@ def briefs_of(
     users = {
         name: secrets.token_urlsafe(24) for name in (ROUTER, SENSOR, *scenario.receivers, *steered, OBSERVER, OPERATOR)
     }
-    routers = Routers.of(users, endpoints)
+    routers = Routers.for_users(users, endpoints)
     spec = scenario.encoding.spec
     scheme = scheme_of(scenario.process.process, spec)
     public, mu_d = scenario.process, scenario.encoding.mu_d

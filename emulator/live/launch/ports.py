@@ -174,7 +174,7 @@ class Routers:
     """The router's Zenoh id, by which the relay recognises it; None without a relay."""
 
     @classmethod
-    def of(cls, users: Mapping[str, str], endpoints: RouterEndpoints) -> Routers:
+    def for_users(cls, users: Mapping[str, str], endpoints: RouterEndpoints) -> Routers:
         """Assign all users to the router; with a relay, the sensor and the relay to the router, all others to the relay."""
         if endpoints.relay is None:
             return cls(endpoints, users, {}, None)

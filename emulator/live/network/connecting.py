@@ -127,7 +127,7 @@ def connected(
             _knock(endpoint, address)
             return zenoh.open(zenoh.Config.from_json5(json.dumps(address.config)))
         except (OSError, zenoh.ZError) as error:
-            failures.add(error, clock.monotonic() - tried)
+            failures.add_attempt(error, clock.monotonic() - tried)
             why = _reason(error)
             if failures.unknown_seconds > _UNKNOWN_HOST_SECONDS:
                 raise BriefError(
@@ -162,7 +162,7 @@ class Failures:
         self._refused: float | None = None
         self._refusals = 0
 
-    def add(self, error: Exception, seconds: float) -> None:
+    def add_attempt(self, error: Exception, seconds: float) -> None:
         """Add an attempt that failed after `seconds`."""
         now = self._clock.monotonic()
         unknown = isinstance(error, socket.gaierror)

@@ -62,7 +62,7 @@ class Connection:
             self._keeper = threading.Thread(target=self._keep_open, name="keeps-open", daemon=True)
             self._keeper.start()
 
-    def add(self, one: One) -> One:
+    def declare(self, one: One) -> One:
         """Declare an object, now and on every later session."""
         with self._lock:
             self._declared.append(one)

@@ -39,7 +39,7 @@ class Pending:
         """Remove the next message, which `peek` has returned."""
         self._messages.popleft()
 
-    def take(self, first: int, most: int) -> list[Reader]:
+    def take_messages(self, first: int, most: int) -> list[Reader]:
         """Take the packets of slots `first`, `first` + 1, … without a gap or a barrier, as many as have arrived, up to `most`.
 
         The next message must be the packet of slot `first`.

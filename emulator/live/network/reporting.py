@@ -60,7 +60,7 @@ class TruthReporter:
         self._watermark = np.empty((brief.flow.batch, inputs, brief.trials)) if monitors else None
         self._first = 0
 
-    def add(
+    def add_slots(
         self,
         slots: range,
         made: Sent,
@@ -115,7 +115,7 @@ class DecisionReporter:
         self._seconds: list[float] = []
         self._first = 0
 
-    def add(self, k: int, u: Floats, failed: Flags, seconds: float) -> None:
+    def add_decision(self, k: int, u: Floats, failed: Flags, seconds: float) -> None:
         """Add the decision of slot k, which holds until the next decision; report if a report is due."""
         end, batch = min(k + self._period, self._brief.slots), self._brief.flow.batch
         for slot in range(k, end):
@@ -162,7 +162,7 @@ class BeliefReporter:
         self._late = np.empty((2, batch, brief.trials), np.uint16) if counts_late else None
         self._first = first
 
-    def add(self, slots: range, beliefs: Beliefs, late: NDArray[np.uint16] | None = None) -> None:
+    def add_slots(self, slots: range, beliefs: Beliefs, late: NDArray[np.uint16] | None = None) -> None:
         """Add consecutive slots, and report where a report is due.
 
         late: how many late packets arrived and how many were used, (2, c, R), if the receiver can use them.

@@ -76,7 +76,7 @@ class GapDetector:
         self._key, self._patience, self._clock = key, patience, clock
         self._slot, self._since = -1, 0.0
 
-    def take(self, receive: Callable[[], Reader], due: int) -> Reader:
+    def take_message(self, receive: Callable[[], Reader], due: int) -> Reader:
         """Wait for the message of slot `due`. Raises Gap as `missed` does."""
         while (found := (message := receive()).integer("k")) != due:
             self.missed(due, found)

@@ -176,7 +176,7 @@ class AckLink:
 
     def __init__(self, brief: AnyBrief, session: ProcessSession, spec: AckChannelSpec) -> None:
         key = brief.stream_keys[f"link/{ACKNOWLEDGEMENTS}"]
-        self._channel = AckChannel.of(spec, key, brief.batch)
+        self._channel = AckChannel.from_spec(spec, key, brief.batch)
         self._jammer = spec.jammer
         self._trials, self._place = brief.trials, session.place
         self._key = session.keys.acknowledged
@@ -323,7 +323,7 @@ class Routing:
                 self._hold(k)
             return
         stop = self._slots.stop if k >= self._done else min(self._slots.stop, self._done)
-        self._route(k, self._uplink.take(k, 1 if self._ack_link is not None else stop - k))
+        self._route(k, self._uplink.take_messages(k, 1 if self._ack_link is not None else stop - k))
         if self._k == self._slots.stop:
             self._flush()
             self._journal(self._k)

@@ -244,15 +244,15 @@ class Session:
 
     def inbox(self, key: str) -> Inbox:
         """Subscribe to one exact key; read its messages in order with `recv`."""
-        return self.connection.add(Inbox(key, self._dropped, self.place, self._room))
+        return self.connection.declare(Inbox(key, self._dropped, self.place, self._room))
 
     def funnel(self, key: str, receive: Callable[[bytes], None]) -> None:
         """Subscribe to one exact key; `receive` is called on a thread of Zenoh's and must only hand the bytes on."""
-        self.connection.add(Funnel(key, self._dropped, receive))
+        self.connection.declare(Funnel(key, self._dropped, receive))
 
     def outlet(self, key: str) -> Callable[[bytes], None]:
         """A publisher for one exact key."""
-        self._outlets[key] = self.connection.add(Outlet(key))
+        self._outlets[key] = self.connection.declare(Outlet(key))
         return self._outlets[key]
 
     def kept(
@@ -273,11 +273,11 @@ class Session:
 
     def asked(self, key: str, receive: Callable[[Question], None]) -> None:
         """Answer questions at one exact key; a thread of Zenoh's calls `receive`, which must only hand the question on."""
-        self.connection.add(Questions(key, self._dropped, receive))
+        self.connection.declare(Questions(key, self._dropped, receive))
 
     def watch(self, process: str, changed: Callable[[bool], None]) -> None:
         """Call `changed` with true when a process appears, with false when it leaves; it must only hand that on."""
-        self.connection.add(Watch(self.keys.alive(process), changed))
+        self.connection.declare(Watch(self.keys.alive(process), changed))
 
     @property
     def router_id(self) -> str | None:

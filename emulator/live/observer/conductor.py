@@ -126,7 +126,7 @@ class Conductor:
 
     def start(self) -> None:
         """Tell the sensor to begin."""
-        self.command(SENSOR, Start())
+        self.send_to(SENSOR, Start())
 
     def news(self) -> tuple[str, bytes] | None:
         """The next message with its sender, or None if there was none for a moment.
@@ -145,17 +145,17 @@ class Conductor:
         self._stop.check(AFTERTHOUGHT_SECONDS)
         raise RunError(f"{', '.join(names)} cut off from the network for {patience:g} s; look at the logs")
 
-    def command(self, name: str, command: ControlCommand) -> None:
+    def send_to(self, name: str, command: ControlCommand) -> None:
         """Send a command to one process."""
         self._commands[name](command.pack())
 
-    def ask(self, command: ControlCommand) -> None:
+    def send_to_all(self, command: ControlCommand) -> None:
         """Send a command to every process that reports and is present."""
         for name in self.keys:
             if self._present[name]:
-                self.command(name, command)
+                self.send_to(name, command)
 
-    def report(self, done: int) -> None:
+    def report_progress(self, done: int) -> None:
         """Tell the sensor that all slots below `done` are scored."""
         self._progress(progress(done))
 
@@ -176,7 +176,7 @@ class Conductor:
                 said = self._clock.monotonic()
                 for name in left:
                     if self._present[name]:
-                        self.command(name, End())
+                        self.send_to(name, End())
                         told.add(name)
             self._hear_out(self._next())
         # The relay after the router: the router's messages pass through it.
@@ -200,7 +200,7 @@ class Conductor:
                 return
             if self._clock.monotonic() - said > _END_SECONDS:
                 said = self._clock.monotonic()
-                self.command(name, End())
+                self.send_to(name, End())
             self._hear_out(self._next())
 
     def _hear_out(self, news: tuple[str, bytes | bool] | None) -> None:
@@ -218,7 +218,7 @@ class Conductor:
         for names in (others, [ROUTER], [RELAY]):
             told = [name for name in names if name in self._commands]
             for name in told:
-                self.command(name, Abandon(why))
+                self.send_to(name, Abandon(why))
             deadline = self._clock.monotonic() + _ABANDON_SECONDS
             while any(self._reaches(name) for name in told) and self._clock.monotonic() < deadline:
                 self._clock.sleep(0.01)

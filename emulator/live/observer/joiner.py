@@ -81,19 +81,19 @@ class Joiner:
         """Whether this many slots have been returned and, if there is a controller, it has reported them, too."""
         return self._done == slots and (self._period is None or self._decided == slots)
 
-    def decisions(self, telemetry: Reader) -> Floats:
+    def add_decisions(self, telemetry: Reader) -> Floats:
         """Take the controller's telemetry; returns the seconds that each decision took."""
         message = read_decisions(telemetry, self._decided, self._extent, self._blocks[CONTROLLER], self._period or 1)
         self._decided += message.count
         self.digests[CONTROLLER].add(message.digests)
         return message.seconds
 
-    def truth(self, telemetry: Reader) -> None:
+    def add_truth(self, telemetry: Reader) -> None:
         """Take the sensor's telemetry."""
         message = read_truth(telemetry, self._truth.end, self._extent)
         self._truth.add(message, message.count)
 
-    def report(self, name: str, telemetry: Reader) -> None:
+    def add_report(self, name: str, telemetry: Reader) -> None:
         """Take a receiver's telemetry."""
         column = self._reports[name]
         message = read_report(telemetry, column.end, self._extent, self._blocks[name], self._windows[name])
@@ -103,13 +103,13 @@ class Joiner:
         for block in sorted(message.trace_sums):
             self.trace_sums[name] = self.trace_sums.get(name, 0.0) + message.trace_sums[block]
 
-    def journal(self, journal: Reader) -> Mapping[str, Account]:
+    def add_journal(self, journal: Reader) -> Mapping[str, Account]:
         """Take the router's journal; returns the accounts in it."""
         message = read_journal(journal, self._journal.end, self._windows, self._extent)
         self._journal.add(message, message.count)
         return message.links
 
-    def take(self) -> Slots | None:
+    def take_slots(self) -> Slots | None:
         """The next slots that all processes have reported, or None."""
         count = min(self._truth.available, self._journal.available, *(c.available for c in self._reports.values()))
         if count == 0:

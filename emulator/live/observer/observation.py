@@ -141,7 +141,7 @@ class ObservedRun:
             self._recovery = Recovery(conductor, self._steering, self._brief.flow, self._scenario.pace, tell)
             program = self._scenario.process.source == "zenoh"
             limit = patience_of(patience, self._scenario.pace, self._brief.flow.batch, program)
-            self._stall = Stall(limit, self._brief.flow.batch, lambda: conductor.ask(Where()))
+            self._stall = Stall(limit, self._brief.flow.batch, lambda: conductor.send_to_all(Where()))
             try:
                 conductor.assemble()
                 self._started = self._ended = time.monotonic()
@@ -220,7 +220,7 @@ class ObservedRun:
         elif self._brief.part.shard:
             order.refuse("this run is in shards, which cannot be steered; run it with --set shards=1 to steer it")
         else:
-            self._steering.take(order, self._joiner.done)
+            self._steering.take_order(order, self._joiner.done)
 
     def _dismiss(self, conductor: Conductor) -> None:
         """Remove the control file of the run, which is over, and answer all open questions."""
@@ -241,25 +241,25 @@ class ObservedRun:
         if is_refusal(message):
             raise read_refusal(message, source)
         if is_whereabouts(message):
-            self._stall.take(source, read_whereabouts(message, self._scenario.slots))
+            self._stall.add_answer(source, read_whereabouts(message, self._scenario.slots))
             return
         if not self._news(source, message):
             return
         if source == ROUTER:
-            for name, account in self._joiner.journal(message).items():
+            for name, account in self._joiner.add_journal(message).items():
                 self._keeper.totals.tallies[name].count(account)
         elif source == CONTROLLER:
-            self._keeper.totals.solve_times.add_seconds(self._joiner.decisions(message).tolist())
+            self._keeper.totals.solve_times.add_seconds(self._joiner.add_decisions(message).tolist())
         elif source != SENSOR and is_leaving(message):
             self._leave(source, message)
         elif source != SENSOR:
-            self._joiner.report(source, message)
+            self._joiner.add_report(source, message)
         elif is_held(message):
             self._steering.held(message.slot(self._joiner.sent))
         else:
-            self._joiner.truth(message)
+            self._joiner.add_truth(message)
         self._stand_in()
-        slots = self._joiner.take()
+        slots = self._joiner.take_slots()
         if slots is None:
             return
         self._verifier.joined(slots)
@@ -268,7 +268,7 @@ class ObservedRun:
         self._digest_rows.write(self._writer)
         if self._recording is not None:
             self._recording.add(shown(slots, scored, self._scenario.process.around, self._showing))
-        conductor.report(self._joiner.done)
+        conductor.report_progress(self._joiner.done)
         self._progress(scored)
 
     def _stand_in(self) -> None:
@@ -302,7 +302,7 @@ class ObservedRun:
         key = message.key
 
         def put(payload: bytes) -> None:
-            self._joiner.report(name, Reader(key, payload))
+            self._joiner.add_report(name, Reader(key, payload))
 
         self._verifier.left(name, k, left)
         self._steering.left(name, k)

@@ -144,11 +144,11 @@ class Recovery:
         for name, there in self._conductor.processes.items():
             if there:
                 links = self._steering.changes if name == ROUTER else None
-                self._conductor.command(name, Again(self._number, self._done, links))
+                self._conductor.send_to(name, Again(self._number, self._done, links))
         if self._done == 0:
             self._conductor.start()
         self._steering.remind()
-        self._conductor.report(self._done)
+        self._conductor.report_progress(self._done)
 
     def give_up(self, done: int) -> None:
         """Record the outages that are open when the run ends; all slots below `done` are joined."""

@@ -51,7 +51,7 @@ class Stall:
         self._moved: dict[str, tuple[tuple[int, int], float]] = {}
         """Process → the slot it is at by its answer and by its reports, and when in this stall that last changed."""
 
-    def take(self, process: str, where: Whereabouts) -> None:
+    def add_answer(self, process: str, where: Whereabouts) -> None:
         """Take a process's answer."""
         self._answers[process] = where
 

@@ -44,6 +44,6 @@ class StandIn:
         """Report the slots of the outage below `end`."""
         slots = range(self.next, min(end, self._stop))
         if slots:
-            self._reporter.add(slots, self._absence.take(slots))
+            self._reporter.add_slots(slots, self._absence.take_slots(slots))
             self.next = slots.stop
         self._reporter.flush(self.next)

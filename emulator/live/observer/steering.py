@@ -88,7 +88,7 @@ class Steering:
         """Take the launcher's confirmation of an act on a process; number: that of the event, from 1 on."""
         self._confirmed = self._confirmed or number == len(self.events)
 
-    def take(self, order: Order, reported: int) -> None:
+    def take_order(self, order: Order, reported: int) -> None:
         """Take a request from the operator, which is carried out at the next hold; ask the sensor to hold.
 
         reported: all slots below it are joined.
@@ -100,7 +100,7 @@ class Steering:
         self._orders.append(order)
         if self.at is None and not self._asked:
             self._asked = True
-            self._conductor.command(SENSOR, Hold())
+            self._conductor.send_to(SENSOR, Hold())
 
     def carry_on(self, reported: int) -> None:
         """Carry out as many events as possible, given that all slots below `reported` are joined.
@@ -216,7 +216,7 @@ class Steering:
         for name in act.names:
             self._changed.add(name)
             changes = tuple(one for one in changed.timeline.changes[name] if one.at >= k)
-            self._conductor.command(ROUTER, LinkChange(name, changes))
+            self._conductor.send_to(ROUTER, LinkChange(name, changes))
         order.done(k, f"from slot {k} on: {act.said}")
 
     def _pause(self, k: int, said: str | None = None) -> None:
@@ -247,8 +247,8 @@ class Steering:
 
     def _go(self) -> None:
         if self._gone is not None:
-            self._conductor.command(ROUTER, Go(self._gone.slot))
-            self._conductor.command(SENSOR, self._gone)
+            self._conductor.send_to(ROUTER, Go(self._gone.slot))
+            self._conductor.send_to(SENSOR, self._gone)
 
     @property
     def changes(self) -> dict[str, tuple[Change, ...]]:
@@ -264,4 +264,4 @@ class Steering:
         self._since = time.monotonic()
         self._go()
         if self._asked:
-            self._conductor.command(SENSOR, Hold())
+            self._conductor.send_to(SENSOR, Hold())

@@ -62,7 +62,7 @@ class ReceiverCore:
         self.belief = receiver.prior(first)
         self._late = np.zeros((2, receiver.trials), np.uint16)
 
-    def take(self, slots: range, arrivals: Arrivals) -> FollowedSlots:
+    def take_slots(self, slots: range, arrivals: Arrivals) -> FollowedSlots:
         """The beliefs after consecutive slots, at least one."""
         if arrivals.plain and not self._history.maxlen:
             beliefs, self.belief = self._receiver.follow(slots, self.belief, arrivals.gamma, arrivals.z)
@@ -135,7 +135,7 @@ class Absence:
     def __init__(self, process: Process, belief: Belief) -> None:
         self._process, self._belief = process, belief
 
-    def take(self, slots: range) -> Beliefs:
+    def take_slots(self, slots: range) -> Beliefs:
         """The beliefs after consecutive slots, at least one, in which nothing was received."""
         n, trials = self._belief.x_hat.shape
         nothing = np.zeros((len(slots), trials), np.uint8)

@@ -147,8 +147,8 @@ def hang(): threading.Event().wait()
 """
 RECEIVER = """
 from evedrop.live.network.reporting import BeliefReporter
-def add(self, slots, *rest, honest=BeliefReporter.add): hang() if SLOT in slots else honest(self, slots, *rest)
-BeliefReporter.add = add
+def add_slots(self, slots, *rest, honest=BeliefReporter.add_slots): hang() if SLOT in slots else honest(self, slots, *rest)
+BeliefReporter.add_slots = add_slots
 """
 SENSOR = """
 import evedrop.peers.sensor as sensor
@@ -281,13 +281,13 @@ def test_nobody_is_accused_of_keys_that_are_not_its_own() -> None:
 
 BOMB = """
 from evedrop.live.network.reporting import BeliefReporter
-def add(self, slots, *rest, honest=BeliefReporter.add):
+def add_slots(self, slots, *rest, honest=BeliefReporter.add_slots):
     for k in slots:
         for _ in range(5 if k % 500 == 0 else 0):
             self._put(k, bytes([0xdd, 0, 0x98, 0x96, 0x80]) + bytes([0x90]) * 10**7)
             self._put_progress(k, bytes([0x90]) * 10**7)
     honest(self, slots, *rest)
-BeliefReporter.add = add
+BeliefReporter.add_slots = add_slots
 """
 
 

@@ -89,6 +89,6 @@ def test_a_connection_that_ends_is_a_refusal_only_in_clear(error: type[OSError],
     clock = TestClock()
     failures = Failures(clock, secure)
     for _ in range(8):
-        failures.add(error("the connection has been closed"), 0.1)
+        failures.add_attempt(error("the connection has been closed"), 0.1)
         clock.sleep(1.0)
     assert failures.refused is not secure

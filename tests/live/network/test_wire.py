@@ -368,9 +368,9 @@ def test_observer_notices_gaps_and_doubles(what: str, second: int) -> None:
     """Truth, report or journal that does not begin where the last one ended is a gap."""
     joiner = Joiner(extent(1, 3), {"a": 0}, {"a": Blocks(9)})
     takes: dict[str, Callable[[bytes], object]] = {
-        "truth": lambda raw: joiner.truth(Reader("key", raw)),
-        "report": lambda raw: joiner.report("a", Reader("key", raw)),
-        "journal": lambda raw: joiner.journal(Reader("key", raw)),
+        "truth": lambda raw: joiner.add_truth(Reader("key", raw)),
+        "report": lambda raw: joiner.add_report("a", Reader("key", raw)),
+        "journal": lambda raw: joiner.add_journal(Reader("key", raw)),
     }
     take = takes[what]
     take(TELEMETRY[what](0))
