@@ -11,6 +11,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from evedrop.command import Command
+from evedrop.errors import EvedropError, UsageError
 from evedrop.figures.figure import Figure, FigureColumn, FigureTally, MeanFigure, ScoredSlots
 from evedrop.kernels import elementary
 from evedrop.model import update
@@ -79,6 +80,7 @@ __all__ = [
     "DelayModel",
     "Eavesdropper",
     "Encoder",
+    "EvedropError",
     "EventKind",
     "Fate",
     "Figure",
@@ -127,6 +129,7 @@ __all__ = [
     "Shown",
     "Spoofing",
     "Table",
+    "UsageError",
     "ViewPanel",
     "colour",
     "curves_view",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Callable, Collection
 from functools import partial
 from queue import Empty
@@ -22,7 +21,7 @@ from evedrop.live.network.resending import GapDetector, ReplayBuffer
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import AnyBrief, Brief
 from evedrop.live.protocol.brief_closed_loop import decoded
-from evedrop.live.protocol.brief_parts import SensorPart
+from evedrop.live.protocol.brief_parts import ProgramEntry, SensorPart
 from evedrop.live.protocol.codec import Reader, read_progress
 from evedrop.live.protocol.commands import End, Go, Hold, Start
 from evedrop.live.protocol.packets import barrier, read_acknowledgement, resend, uplink
@@ -184,10 +183,11 @@ class Sensing:
         core: SensorCore,
         session: ProcessSession,
         program: ProgramStates | None = None,
+        clock: Clock = SYSTEM_CLOCK,
     ) -> None:
-        """program: from which the core takes the states, if from any."""
+        """program: from which the core takes the states, if from any. clock: by which slots are due."""
         part = brief.part
-        self._program = program
+        self._program, self._clock = program, clock
         self._brief, self._session, self._core = brief, session, core
         self._send = session.kept(session.keys.uplink, head=resend, back=part.history)
         self._window = Window(session, (*part.receivers, OBSERVER), brief.flow.window, self._send)
@@ -213,7 +213,7 @@ class Sensing:
 
     def carry_on(self) -> None:
         """Send all slots."""
-        self._start = time.monotonic()
+        self._start = self._clock.monotonic()
         for k in range(self._brief.slots):
             self._wait(k)
             if k == self._slots.stop:
@@ -268,18 +268,18 @@ class Sensing:
         pace = self._brief.part.pace
         # With a pace, a hold may be requested at any moment before the slot is due; each slot has at most one barrier.
         while not (wanted := self._barriers.wanted(k)) and pace and (left := self._left(k)) > 0.0:
-            time.sleep(min(left, _LOOK_SECONDS))
+            self._clock.sleep(min(left, _LOOK_SECONDS))
         if wanted:
             self._report(k)  # before the barrier is sent: at a barrier, nothing else may be on its way
             self._send(k, barrier(k))
-            began = time.monotonic()
+            began = self._clock.monotonic()
             self._barriers.wait_at(k)
-            self._start += time.monotonic() - began
-            time.sleep(max(0.0, self._left(k)) if pace else 0.0)
+            self._start += self._clock.monotonic() - began
+            self._clock.sleep(max(0.0, self._left(k)) if pace else 0.0)
 
     def _left(self, k: int) -> float:
         """The seconds until slot k is due."""
-        return self._start + k * self._brief.part.pace - time.monotonic()
+        return self._start + k * self._brief.part.pace - self._clock.monotonic()
 
 
 def _core_of(brief: Brief[SensorPart], scheme: Scheme, program: ProgramStates | None) -> SensorCore:
@@ -310,14 +310,22 @@ def _core_of(brief: Brief[SensorPart], scheme: Scheme, program: ProgramStates | 
     )
 
 
-def sense(brief: Brief[SensorPart], connect: Callable[[AnyBrief], ProcessSession] = Session) -> None:
-    """Run the sensor of a brief; connect: opens its session."""
+def sense(
+    brief: Brief[SensorPart],
+    connect: Callable[[AnyBrief], ProcessSession] = Session,
+    listen: Callable[[ProgramEntry, bool, float], ProgramStates] = ProgramStates,
+    clock: Clock = SYSTEM_CLOCK,
+) -> None:
+    """Run the sensor of a brief.
+
+    connect: opens its session. listen: takes the states of a program, if the brief names one. clock: by which slots are due.
+    """
     scheme = scheme_of(brief.model.process, brief.part.scheme)
     entry = brief.part.program
     patience = brief.flow.longest_outage
-    source = None if entry is None else ProgramStates(entry, bool(brief.part.pace), patience)
+    source = None if entry is None else listen(entry, bool(brief.part.pace), patience)
     with source or contextlib.nullcontext() as program, connect(brief) as session:
-        sensing = Sensing(brief, scheme, _core_of(brief, scheme, program), session, program)
+        sensing = Sensing(brief, scheme, _core_of(brief, scheme, program), session, program, clock)
         session.ready()
         session.wait_for(Start)
         sensing.carry_on()

@@ -70,19 +70,19 @@ def most_likely(outcomes: Outcomes, starts: Iterable[TwoStates]) -> tuple[TwoSta
 
     All starting points take some steps on the first part of the recording; the best two continue to the end on all of it.
     """
-    some = _Chunks(outcomes[:_SCOUTED])
+    some = ChunkedOutcomes(outcomes[:_SCOUTED])
     scouted = sorted((_climb(some, start, _SCOUTING) for start in starts), key=lambda found: -found[1])
-    whole = _Chunks(outcomes)
+    whole = ChunkedOutcomes(outcomes)
     model, likelihood = max((_climb(whole, start, _MOST) for start, _ in scouted[:2]), key=lambda found: found[1])
     return model.ordered(), likelihood
 
 
 def log_likelihood(outcomes: Outcomes, model: TwoStates) -> float:
     """The log-likelihood of a recording under a model that starts in its stationary law."""
-    return _Chunks(outcomes).step(model)[1]
+    return ChunkedOutcomes(outcomes).step(model)[1]
 
 
-def _climb(chunks: _Chunks, model: TwoStates, steps: int) -> tuple[TwoStates, float]:
+def _climb(chunks: ChunkedOutcomes, model: TwoStates, steps: int) -> tuple[TwoStates, float]:
     """Alternate expectation and maximisation until little can be gained; returns the best model and its log-likelihood.
 
     The gains of the steps decrease like a geometric series, whose remainder is estimated from two gains (Aitken).
@@ -101,7 +101,7 @@ def _climb(chunks: _Chunks, model: TwoStates, steps: int) -> tuple[TwoStates, fl
 
 
 @final
-class _Chunks:
+class ChunkedOutcomes:
     """A recording divided into chunks: step t of all chunks is row t."""
 
     def __init__(self, outcomes: Outcomes) -> None:

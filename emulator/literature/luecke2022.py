@@ -39,7 +39,8 @@ _RUN_SLOTS = 50_000
 """The slots of one of their runs in the search for a policy; they averaged several runs."""
 _START = 50
 """Slots that are not counted: the law of the covariances has then forgotten the start."""
-_BATCH = 2500
+_SIDE_BY_SIDE = 2500
+"""Trials that are simulated at once."""
 
 
 @dataclass(frozen=True)
@@ -187,15 +188,18 @@ def mean_traces(
     trials: int,
     slots: int,
     open_loop: bool = False,
+    side_by_side: int = _SIDE_BY_SIDE,
 ) -> Floats:
     """The mean of tr P over the slots of each trial, after a start that is left out: receivers × trials.
 
     The first receiver is the user. open_loop: L = A. Only covariances are followed, which do not depend on the states, so an
-    unstable process has no horizon.
+    unstable process has no horizon. side_by_side: trials that are simulated at once.
     """
     parts = [
-        _batch_traces(process, policy, qualities, Batch(_START + slots, min(_BATCH, trials - first), first), open_loop)
-        for first in range(0, trials, _BATCH)
+        _batch_traces(
+            process, policy, qualities, Batch(_START + slots, min(side_by_side, trials - first), first), open_loop
+        )
+        for first in range(0, trials, side_by_side)
     ]
     return np.concatenate(parts, axis=1)
 

@@ -21,7 +21,7 @@ NONE = -1
 _SLOTS_AT_ONCE = 64
 _NUMBERS_KEPT = 1 << 22  # of matrices L in memory, unless two blocks have more
 _LARGEST = 1e150  # a deviation of the state whose square is a double
-_OLDEST_KEPT = 1 << 12  # slots; an older one is computed again
+_OLDEST_KEPT = 1 << 12  # slots
 _WATCHED = 16  # references whose size is followed
 
 
@@ -30,13 +30,13 @@ class ReferenceCode:
     """The matrices L_k that carry a reference from slot k − 1 to slot k, and the age at which a reference is dropped.
 
     L_{t,k} = L_k ⋯ L_{t+1} = Σ_k A^{−mᵀ} Σ_t⁻¹ with m = k − t, so that Cov(x_k − L_{t,k} x_t, x_k) = 0. If A is singular, L = A.
-    open_loop: L = A for any A.
+    open_loop: L = A for any A. ages_kept: slots whose ages are kept; that of an older slot is computed again.
 
     Source: docs/mathematics.md, acknowledged references.
     """
 
-    def __init__(self, process: Process, open_loop: bool = False) -> None:
-        self._process = process
+    def __init__(self, process: Process, open_loop: bool = False, ages_kept: int = _OLDEST_KEPT) -> None:
+        self._process, self._ages_kept = process, ages_kept
         self.decorrelates = not open_loop and is_regular(process.A)
         """Whether packets are independent of the state that they are sent for: L is not A."""
         self._states = StateFactors(process)
@@ -81,7 +81,7 @@ class ReferenceCode:
         """Follow the sizes of references from slot 0 on; only the results of the last slots are kept."""
         self._watch = _Watch(self._process)
         self._watched = 0
-        self._oldest = deque([0], _OLDEST_KEPT)
+        self._oldest = deque([0], self._ages_kept)
 
     def _block_of(self, k: int) -> tuple[Floats, Floats]:
         number = k // _SLOTS_AT_ONCE

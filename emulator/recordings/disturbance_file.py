@@ -30,8 +30,9 @@ _KILOWATTS = {"W": 1e-3, "kW": 1.0}
 _HEADER = re.compile(r"^(?P<name>[^\[\]]*?)\s*\[(?P<unit>[^\[\]]*)\]$")
 _TIME = "time"
 _EXAMPLE = "time [s], P_solar [kW], P_load [kW]"
-_MOST_SAID = 5
 _TIME_ERROR, _SCATTER = 1e-6, 0.1  # in slots: times may be rounded, and those that were measured scatter
+MOST_REPORTED = 5
+"""The most lines of one kind of mistake in a message: more would not be read."""
 MOST_NUMBERS = 10_000_000
 """The most numbers in a table of disturbances, slots times columns: more than a month of two columns by the second."""
 _ROWS_UNASKED = 10_000  # for a scenario without a number of slots, which is reported as a mistake of its own
@@ -250,7 +251,7 @@ def _numbers(rows: Iterable[_Row], width: int, columns: Sequence[_Column]) -> _F
             lines.append(line)
             continue
         all_wrong += 1
-        if all_wrong <= _MOST_SAID + 1:  # more are not reported, and need not be kept
+        if all_wrong <= MOST_REPORTED + 1:  # more are not reported, and need not be kept
             wrong.append(row)
     mistakes = list(_few(_cell_mistakes(wrong, width, columns), f"{all_wrong} of {all_lines} lines"))
     return _Found(numbers, lines, mistakes)
@@ -289,7 +290,7 @@ def _time_mistakes(lines: Sequence[int], times: Sequence[float], slot_seconds: f
 def _few(mistakes: Iterator[str], where: str) -> Iterator[str]:
     """The first of the mistakes, and a note if there are more."""
     for i, mistake in enumerate(mistakes):
-        if i == _MOST_SAID:
+        if i == MOST_REPORTED:
             yield f"and more such mistakes, in {where}"
             return
         yield mistake

@@ -45,10 +45,13 @@ _LOG = {
 }
 
 
-def export_mcap(results: Results, path: Path, period: float | None = None) -> Mapping[str, int]:
+def export_mcap(
+    results: Results, path: Path, period: float | None = None, batch_rows: int = _BATCH_ROWS
+) -> Mapping[str, int]:
     """Write the results of a run to an MCAP file; returns topic → number of messages. The file appears when it is complete.
 
-    period: seconds per slot; None: the scenario's slot_seconds, its pace, or 1 s, whichever comes first.
+    period: seconds per slot; None: the scenario's slot_seconds, its pace, or 1 s, whichever comes first. batch_rows: rows of a
+    table that are read at once.
 
     Raises UsageError if the extra is not installed, the tables cannot be read, or the file cannot be written.
     """
@@ -67,26 +70,27 @@ def export_mcap(results: Results, path: Path, period: float | None = None) -> Ma
         writer.add_metadata("evedrop", title)
         for event in results.events:
             messages.add_event(event)
-        _add_trial(results.folder, scenario.receivers[0], messages)
-        for row in _rows(results.folder, "slots"):
+        tables = _Tables(results.folder, batch_rows)
+        _add_trial(tables, scenario.receivers[0], messages)
+        for row in tables.rows("slots"):
             messages.add(f"/statistics/{row.pop('peer')}", "evedrop.Statistics", row)
-        for row in _rows(results.folder, "journal"):
+        for row in tables.rows("journal"):
             del row["delivered_mask"]
             messages.add(f"/packets/{row.pop('link')}", "evedrop.Packets", row)
         writer.finish()
     return messages.counts
 
 
-def _add_trial(folder: Path, first: str, messages: _Messages) -> None:
+def _add_trial(tables: _Tables, first: str, messages: _Messages) -> None:
     """The first recorded trial: truth, estimates and inputs. first: a receiver, whose rows also have the truth."""
-    for row in _rows(folder, "trials", _first_trial(folder, "trials")):
+    for row in tables.rows("trials", tables.first_trial("trials")):
         del row["trial"]
         sent, x = row.pop("sent"), row.pop("x")
         name = row.pop("peer")
         if name == first:
             messages.add("/truth", "evedrop.Truth", {"slot": row["slot"], "sent": sent, "x": x})
         messages.add(f"/estimates/{name}", "evedrop.Estimate", row)
-    for row in _rows(folder, "inputs", _first_trial(folder, "inputs")):
+    for row in tables.rows("inputs", tables.first_trial("inputs")):
         del row["trial"]
         messages.add("/inputs", "evedrop.Inputs", row)
 
@@ -159,36 +163,40 @@ def _kind(value: Any) -> dict[str, Any]:
     return {"type": "number"}
 
 
-def _first_trial(folder: Path, name: str) -> pc.Expression | None:
-    """A filter for the rows of the first recorded trial; None for a table without rows."""
-    least = [pc.min(batch["trial"]).as_py() for batch in _batches(folder, name, ["trial"]) if batch.num_rows]
-    return pc.field("trial") == min(least) if least else None
+@final
+class _Tables:
+    """The tables of a run, read some rows at a time."""
 
+    def __init__(self, folder: Path, batch_rows: int) -> None:
+        self._folder, self._batch_rows = folder, batch_rows
 
-def _rows(folder: Path, name: str, which: pc.Expression | None = None) -> Iterator[dict[str, Any]]:
-    """The rows of a table, all or some; none if there is no such table. Raises UsageError if it cannot be read."""
-    for batch in _batches(folder, name):
-        yield from (batch if which is None else batch.filter(which)).to_pylist()
+    def first_trial(self, name: str) -> pc.Expression | None:
+        """A filter for the rows of the first recorded trial; None for a table without rows."""
+        least = [pc.min(batch["trial"]).as_py() for batch in self._batches(name, ["trial"]) if batch.num_rows]
+        return pc.field("trial") == min(least) if least else None
 
+    def rows(self, name: str, which: pc.Expression | None = None) -> Iterator[dict[str, Any]]:
+        """The rows of a table, all or some; none if there is no such table. Raises UsageError if it cannot be read."""
+        for batch in self._batches(name):
+            yield from (batch if which is None else batch.filter(which)).to_pylist()
 
-def _batches(folder: Path, name: str, columns: list[str] | None = None) -> Iterator[pa.RecordBatch]:
-    """The rows of a table in batches, from its Parquet file, or from the stream of a run in progress or killed."""
-    path = folder / f"{name}.parquet"
-    if not path.exists():
-        for batch in batches_of(folder, name):
-            yield from _parts(batch if columns is None else batch.select(columns))
-        return
-    try:
-        with opened(path):  # reading a pipe would block
-            pass
-        for batch in pq.ParquetFile(path).iter_batches(_BATCH_ROWS, columns=columns):
-            batch.validate(full=True)
-            yield batch
-    except (Unreadable, OSError, pa.ArrowException) as error:
-        why = " ".join(str(error).split())
-        raise UsageError(f"{path} cannot be read ({why}); run the scenario again") from error
+    def _batches(self, name: str, columns: list[str] | None = None) -> Iterator[pa.RecordBatch]:
+        """The rows of a table in batches, from its Parquet file, or from the stream of a run in progress or killed."""
+        path = self._folder / f"{name}.parquet"
+        if not path.exists():
+            for batch in batches_of(self._folder, name):
+                yield from self._parts(batch if columns is None else batch.select(columns))
+            return
+        try:
+            with opened(path):  # reading a pipe would block
+                pass
+            for batch in pq.ParquetFile(path).iter_batches(self._batch_rows, columns=columns):
+                batch.validate(full=True)
+                yield batch
+        except (Unreadable, OSError, pa.ArrowException) as error:
+            why = " ".join(str(error).split())
+            raise UsageError(f"{path} cannot be read ({why}); run the scenario again") from error
 
-
-def _parts(batch: pa.RecordBatch) -> Iterator[pa.RecordBatch]:
-    for start in range(0, batch.num_rows, _BATCH_ROWS):
-        yield batch.slice(start, _BATCH_ROWS)
+    def _parts(self, batch: pa.RecordBatch) -> Iterator[pa.RecordBatch]:
+        for start in range(0, batch.num_rows, self._batch_rows):
+            yield batch.slice(start, self._batch_rows)

@@ -61,8 +61,12 @@ class LearningRow:
     """Learner → every other receiver → the learner's mean squared error over the other's."""
 
 
-def learning_curve(scenario: Scenario, tell: Callable[[int], None]) -> list[LearningRow]:
+def learning_curve(
+    scenario: Scenario, tell: Callable[[int], None], side_by_side: int = _SIDE_BY_SIDE
+) -> list[LearningRow]:
     """A row for every power of two from 8 slots on, and for the whole run; tell gets the trial-slots done since its last call.
+
+    side_by_side: trials that are simulated at once.
 
     Raises UsageError for a scenario in which no eavesdropper learns.
     """
@@ -72,7 +76,7 @@ def learning_curve(scenario: Scenario, tell: Callable[[int], None]) -> list[Lear
     stops = [*(stop for stop in stops if stop < scenario.slots), scenario.slots]
     windows = [*pairwise([0, *stops])]
     end = scenario.first_trial + scenario.trials
-    bounds = [*range(scenario.first_trial, end, _SIDE_BY_SIDE), end]
+    bounds = [*range(scenario.first_trial, end, side_by_side), end]
     parts = [_measured(scenario, range(*pair), windows, tell) for pair in pairwise(bounds)]
     return [_row(window, [part[i] for part in parts]) for i, window in enumerate(windows)]
 

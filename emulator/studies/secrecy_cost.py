@@ -62,8 +62,10 @@ class SecrecyCost:
     """`scheme_from_plain`, `scheme_from_truth`, `plain_from_truth` → measure → the difference, as a share."""
 
 
-def secrecy_cost(scenario: Scenario, tell: Callable[[int], None]) -> SecrecyCost:
+def secrecy_cost(scenario: Scenario, tell: Callable[[int], None], side_by_side: int = _SIDE_BY_SIDE) -> SecrecyCost:
     """Compare a scenario's scheme with `plain`; tell gets the trial-slots done since its last call.
+
+    side_by_side: trials that are simulated at once.
 
     Raises UsageError for a scenario without an application that has a power, or with fewer than two trials.
     """
@@ -73,7 +75,7 @@ def secrecy_cost(scenario: Scenario, tell: Callable[[int], None]) -> SecrecyCost
     if scenario.trials < 2:
         raise UsageError(f"--trials {scenario.trials}: expected 2 or more, so that there is a standard error")
     end = scenario.first_trial + scenario.trials
-    bounds = [*range(scenario.first_trial, end, _SIDE_BY_SIDE), end]
+    bounds = [*range(scenario.first_trial, end, side_by_side), end]
     parts = [_meters_of(scenario, range(*pair), tell) for pair in pairwise(bounds)]
     plain, truth, plain_truth = (Meter.of_all(list(meters)) for meters in zip(*parts, strict=True))
     more = {

@@ -27,7 +27,11 @@ _APPLICATION = "evedrop"
 _PERIOD = 0.1  # seconds between batches at most
 _MOST_SLOTS = 1024  # in a batch
 _MOST_WAITING = 20_000  # slots that the file may be behind before the run waits for it
-_FILE_TIMEOUT = 5.0  # seconds that the run waits for the file before it continues without one
+FILE_TIMEOUT = 5.0
+"""Seconds that a run waits for the file before it continues without one.
+
+Public, because the tests of whole runs, which begin recordings deep inside, allow a busy machine more.
+"""
 
 Chunk = TypeVar("Chunk")
 Note = TypeVar("Note")
@@ -91,7 +95,7 @@ class RecordingThread(ABC, Generic[Chunk, Note]):
         with self._changed:
             self._closing = True
             self._changed.notify_all()
-        self._writer.join(_FILE_TIMEOUT)
+        self._writer.join(FILE_TIMEOUT)
         if self._writer.is_alive():
             self._give_up("the disk did not keep up with the run")
         return self.failure is None
@@ -122,7 +126,7 @@ class RecordingThread(ABC, Generic[Chunk, Note]):
             return
         try:
             # When Rerun cannot write a file any more, the only sign is that it never finishes.
-            self._file.flush(timeout_sec=_FILE_TIMEOUT)
+            self._file.flush(timeout_sec=FILE_TIMEOUT)
         except RuntimeError:
             self._give_up("the file could not be written")
 
@@ -139,7 +143,7 @@ class ViewRecording(RecordingThread[SceneSlots, Event]):
     def add(self, slots: SceneSlots) -> None:
         """Record the next slots. Waits only for a disk that is thousands of slots behind, and for a few seconds at most."""
         if slots.count:
-            self._append(slots, slots.count, _MOST_WAITING, _FILE_TIMEOUT)
+            self._append(slots, slots.count, _MOST_WAITING, FILE_TIMEOUT)
 
     def note(self, k: int, level: str, text: str) -> None:
         """Add a line to the events: level is INFO, WARN or ERROR."""

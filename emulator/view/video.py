@@ -10,7 +10,7 @@ import os
 import subprocess
 import tempfile
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from io import BytesIO
 from itertools import chain
@@ -148,7 +148,8 @@ class GifFile(VideoFile):
         return round(100.0 * frames / self._rate)
 
 
-_KINDS: dict[str, Callable[[Path, float], VideoFile]] = {".mp4": Mp4File, ".gif": GifFile}
+VIDEO_FILES: Mapping[str, Callable[[Path, float], VideoFile]] = {".mp4": Mp4File, ".gif": GifFile}
+"""The end of a name → what writes such a video: called with its path and the frames per second."""
 
 
 def ffmpeg() -> str:
@@ -167,7 +168,7 @@ def ffmpeg() -> str:
 def check_video(path: Path, size: tuple[int, int], rate: float) -> None:
     """Raise UsageError if such a video cannot be made here."""
     kind = path.suffix.lower()
-    if kind not in _KINDS:
+    if kind not in VIDEO_FILES:
         raise UsageError(f"--video {path} is not the name of an MP4 or a GIF; give one that ends in .mp4 or .gif")
     if kind == ".gif" and rate > _MOST_GIF_RATE:
         raise UsageError(
@@ -180,11 +181,18 @@ def check_video(path: Path, size: tuple[int, int], rate: float) -> None:
 
 
 def video_apart(
-    rrd: Path, path: Path, moments: Sequence[float], size: tuple[int, int], rate: float, tell: Callable[[int], None]
+    rrd: Path,
+    path: Path,
+    moments: Sequence[float],
+    size: tuple[int, int],
+    rate: float,
+    tell: Callable[[int], None],
+    files: Mapping[str, Callable[[Path, float], VideoFile]] = VIDEO_FILES,
 ) -> list[str]:
     """Draw some moments of a recording as a video; returns the panels' complaints. The file appears when it is complete.
 
-    rate: frames per second. tell: is called with the number of frames so far.
+    rate: frames per second. tell: is called with the number of frames so far. files: the end of a name → what writes the
+    video.
 
     Raises UsageError as `picture_apart` does, and if such a video cannot be made here.
     """
@@ -192,7 +200,7 @@ def video_apart(
     complaints: list[str] = []
     # The last moment first: if it is not in the recording, nothing is drawn in vain.
     pictures = frames_apart(rrd, chain([moments[-1]], moments), size, complaints)
-    with whole_file(path) as temporary, closing(pictures), _opened(temporary, path.suffix.lower(), rate) as file:
+    with whole_file(path) as temporary, closing(pictures), _opened(files[path.suffix.lower()](temporary, rate)) as file:
         next(pictures)
         for done, picture in enumerate(pictures, 1):
             file.add(picture)
@@ -201,8 +209,7 @@ def video_apart(
 
 
 @contextmanager
-def _opened(path: Path, kind: str, rate: float) -> Iterator[VideoFile]:
-    file = _KINDS[kind](path, rate)
+def _opened(file: VideoFile) -> Iterator[VideoFile]:
     try:
         yield file
         file.finish()

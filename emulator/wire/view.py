@@ -25,7 +25,7 @@ from evedrop.wire.panels import Pace, WirePanels
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.step_counts import StepCounter
 
-_MOST_ROWS = 2_000_000  # that the thread may be behind: 100 MB
+_MOST_ROWS = 2_000_000  # 100 MB
 _LATE = 0.3  # seconds after which the rows of a step are there
 _BATCH = 0.5  # seconds between two additions to the recording, each of which takes some kilobytes
 _JUMP = 1.0  # seconds by which the system's clock and a steady clock may differ
@@ -43,15 +43,17 @@ class WireView(RecordingThread[NDArray[Any], Notice]):
         start: float,
         pace: Pace | None = None,
         clocks: Callable[[], tuple[float, float]] = lambda: (time.time(), time.monotonic()),
+        most_rows: int = _MOST_ROWS,
     ) -> None:
         """name: identifies the recording. start: when the wire started, in seconds since 1970.
 
-        clocks: seconds since 1970, and those of a clock that is never set.
+        clocks: seconds since 1970, and those of a clock that is never set; called once by each round of the thread.
+        most_rows: that the thread may be behind.
         """
         self._pace = Pace() if pace is None else pace
         self._panels = WirePanels(plan, self._pace)
         self._counter = StepCounter(len(plan.links), self._pace.step, start)
-        self._start, self._clocks = start, clocks
+        self._start, self._clocks, self._most_rows = start, clocks, most_rows
         now, steady = clocks()
         self._ahead, self._shift = now - steady, 0.0
         self._amended: list[tuple[NDArray[Any], int]] = []
@@ -61,7 +63,7 @@ class WireView(RecordingThread[NDArray[Any], Notice]):
     def add(self, rows: NDArray[Any]) -> None:
         """Record a block of `RECORD` rows, which must not change afterwards."""
         if len(rows):
-            self._append(rows, len(rows), _MOST_ROWS, 0.0)
+            self._append(rows, len(rows), self._most_rows, 0.0)
 
     def follow(self, journal: WireJournal) -> None:
         """Record the rows of a journal and its events from now on."""

@@ -20,7 +20,7 @@ from evedrop.errors import TraceError
 from evedrop.fitting import candidate
 from evedrop.fitting.candidate import delay_candidates, wilson
 from evedrop.fitting.fit import fit
-from evedrop.fitting.hidden import TwoStates, _Chunks, log_likelihood
+from evedrop.fitting.hidden import ChunkedOutcomes, TwoStates, log_likelihood
 from evedrop.fitting.run_lengths import RunLaw, lengths_of, p_value
 from evedrop.loading import load
 from evedrop.model.links import loss_of
@@ -84,7 +84,7 @@ def test_a_step_is_the_textbooks(p: float, r: float, good: float, bad: float, ou
     """Likelihood and all four parameters after a step, for recordings that fill their chunks and such that do not."""
     model, word = TwoStates(p, r, good, bad), np.array(outcomes, np.uint8)
     likelihood, moves, lost = textbook(word, model)
-    following, found = _Chunks(word).step(model)
+    following, found = ChunkedOutcomes(word).step(model)
     assert found == pytest.approx(likelihood, rel=1e-9)
     assert log_likelihood(word, model) == found
     expected = (
@@ -96,7 +96,7 @@ def test_a_step_is_the_textbooks(p: float, r: float, good: float, bad: float, ou
 
 def test_steps_climb() -> None:
     """The likelihood never falls by more than the first outcome's share, which the step neglects."""
-    chunks, model, before = _Chunks(recorded(SOFT, 5000)), TwoStates(0.3, 0.4, 0.2, 0.5), -math.inf
+    chunks, model, before = ChunkedOutcomes(recorded(SOFT, 5000)), TwoStates(0.3, 0.4, 0.2, 0.5), -math.inf
     for _ in range(60):
         model, likelihood = chunks.step(model)
         assert likelihood > before - 0.01

@@ -12,7 +12,6 @@ import pytest
 
 from evedrop.environment import own_environment
 from evedrop.errors import UsageError
-from evedrop.live.launch import ssh_starter
 from evedrop.live.launch.host_messages import (
     MOST_NOISE,
     Greeting,
@@ -38,14 +37,14 @@ def connect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Connect:
     """Begin a connection; the script says these lines, keeps all that it is told, and ends with its standard input."""
     monkeypatch.setenv("PATH", str(tmp_path / "bin"), prepend=":")
 
-    def begin(*said: str, **table: Any) -> SshHost:
+    def begin(*said: str, beat_seconds: float = 30.0, **table: Any) -> SshHost:
         (tmp_path / "bin").mkdir()
         (tmp_path / "told").touch()
         (tmp_path / "said").write_text("".join(f"{line}\n" for line in said))
         script = tmp_path / "bin" / "ssh"
         script.write_text(f"#!/bin/sh\ncat '{tmp_path}/said'\ncat >'{tmp_path}/told'\n")
         script.chmod(0o700)
-        return SshHost("beta", HostTable(address="beta.lan", processes=("smart",), **table), None, 30.0)
+        return SshHost("beta", HostTable(address="beta.lan", processes=("smart",), **table), None, 30.0, beat_seconds)
 
     return begin
 
@@ -105,12 +104,9 @@ def test_a_host_that_only_talks_is_given_up(connect: Connect) -> None:
     host.close(time.monotonic() + LIMIT)
 
 
-def test_a_host_is_told_that_the_launcher_lives(
-    connect: Connect, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_host_is_told_that_the_launcher_lives(connect: Connect, tmp_path: Path) -> None:
     """From time to time; the order says how long it may wait for the next."""
-    monkeypatch.setattr(ssh_starter, "_BEAT_SECONDS", 0.01)
-    host = connect(GREETING)
+    host = connect(GREETING, beat_seconds=0.01)
     ready(host)
     wait_until(lambda: len((tmp_path / "told").read_bytes().splitlines()) > 2, "three heartbeats")
     host.close(time.monotonic() + LIMIT)

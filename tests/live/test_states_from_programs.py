@@ -136,10 +136,10 @@ def test_states_are_taken_from_messages_as_they_come() -> None:
     for newest, expected in ((True, [2.0]), (False, [0.0, 1.0, 2.0])):
         with ProgramStates(entry, newest, 5.0) as states:
             for sample in samples:
-                states._hear(sample)
+                states.hear(sample)
             assert [states.take(range(k, k + 1))[0, 0] for k in range(len(expected))] == expected
             for _ in range(100_001):
-                states._hear(samples[0])
+                states.hear(samples[0])
             if not newest:
                 with pytest.raises(RunError, match="more than 100000 states wait at slot 3"):
                     states.take(range(3, 4))

@@ -125,16 +125,13 @@ def test_the_largest_that_is_accepted_is_checked_soon(text: str, warning: str, e
 
 
 @pytest.mark.parametrize(("n", "radius"), [(1, 1.0001), (2, 1.00002), (3, 1.01)])
-def test_the_horizon_is_the_same_slot_by_slot_and_in_halves(
-    n: int, radius: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_horizon_is_the_same_slot_by_slot_and_in_halves(n: int, radius: float) -> None:
     """Few slots are looked at each, or all: the last one that float64 can follow is the same."""
     A = np.random.default_rng(n).normal(size=(n, n))
     process = Process(A * radius / np.abs(np.linalg.eigvals(A)).max(), 1e-3 * np.eye(n), np.eye(n))
     halves = []
     for each in (2**12, 2**26):
-        monkeypatch.setattr("evedrop.model.theory.horizon._EACH", each)
-        halves.append(horizon(process, 10_000_000))
+        halves.append(horizon(process, 10_000_000, each))
     assert halves[0] is not None
     assert halves[0] == pytest.approx(halves[1], rel=1e-5)
 

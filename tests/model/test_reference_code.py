@@ -8,7 +8,6 @@ import math
 import numpy as np
 import pytest
 
-from evedrop.model import reference_code
 from evedrop.model.process import Process
 from evedrop.model.reference_code import ReferenceCode
 from evedrop.model.schemes import SCHEMES, scheme_of
@@ -165,12 +164,11 @@ def test_slots_of_the_code_may_be_read_in_any_order() -> None:
     assert np.array_equal(code.at(3), first)
 
 
-def test_the_age_of_a_reference_in_an_early_slot_is_computed_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_age_of_a_reference_in_an_early_slot_is_computed_again() -> None:
     """Only the ages of the last slots are kept, and those of earlier slots are the same when they are computed again."""
     process = Process(np.array([[0.2]]), np.array([[1.0]]), np.array([[1.0]]))
     ages = [ReferenceCode(process).oldest(k) for k in range(60)]
     assert ages[-1] > 0
-    monkeypatch.setattr(reference_code, "_OLDEST_KEPT", 5)
-    code = ReferenceCode(process)
+    code = ReferenceCode(process, ages_kept=5)
     assert [code.oldest(k) for k in range(60)] == ages
     assert [code.oldest(k) for k in (59, 55, 54, 3, 0, 20)] == [ages[k] for k in (59, 55, 54, 3, 0, 20)]

@@ -23,6 +23,7 @@ from evedrop.model.eavesdroppers.likelihood import Likelihood
 from evedrop.model.noise_law import PACKETS, NoiseLaw
 from evedrop.model.process import Process, StateFactors
 from evedrop.model.receiver import Action, Belief, Reception
+from evedrop.model.schedule import Schedule
 from evedrop.model.theory.covariances import Outcomes, expected_traces, limit_trace
 from evedrop.model.theory.leak import Leaks, RemainingCovariances, remaining_limit
 from evedrop.streams import Batch
@@ -212,7 +213,9 @@ def test_the_genie_is_the_exact_posterior_of_known_types(case: str) -> None:
     """Mean and covariance, after every slot, given the schedule."""
     process, random = PROCESSES[case], np.random.default_rng(5)
     genie, slots = Genie(knowledge(process), Batch(12, 1)), 12
-    word = [bool(k and genie._schedule.at(k)[0]) for k in range(slots)]
+    known = knowledge(process)
+    schedule = Schedule(known.keys["schedule"], known.mu_d, Batch(12, 1))
+    word = [bool(k and schedule.at(k)[0]) for k in range(slots)]
     z = [[Fraction(int(value), 64) for value in random.integers(-96, 97, process.n)] for _ in range(slots)]
     A, G = exact(process.A), exact(process.noise_factor)
     x = [[value] for value in z[0]]

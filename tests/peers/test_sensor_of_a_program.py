@@ -43,7 +43,7 @@ class LateProgram:
         return np.zeros((1, 2))
 
 
-def test_slots_after_a_late_state_are_due_that_much_later(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slots_after_a_late_state_are_due_that_much_later() -> None:
     """They do not hurry to make up for it: each takes its state a pace after the slot before."""
     clock, stage = TestClock(), Stage()
     program = LateProgram(clock)
@@ -53,8 +53,6 @@ def test_slots_after_a_late_state_are_due_that_much_later(monkeypatch: pytest.Mo
         asked.append(newest)
         return program
 
-    monkeypatch.setattr("evedrop.peers.sensor.ProgramStates", opened)
-    monkeypatch.setattr("evedrop.peers.sensor.time", clock)
     link = {"link": {"quality": 0.8}}
     source = {"source": "zenoh", "states": ["x", "v"], "zenoh": {"key": "pose", "connect": "tcp/127.0.0.1:1"}}
     tables = {
@@ -66,7 +64,9 @@ def test_slots_after_a_late_state_are_due_that_much_later(monkeypatch: pytest.Mo
         "legitimate": link,
     }
     made = briefs_of(checked(tables, "file"), "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False))["sensor"]
-    thread = threading.Thread(target=sense, args=(replace(made, flow=Flow(12, 4)), stage.session), daemon=True)
+    thread = threading.Thread(
+        target=sense, args=(replace(made, flow=Flow(12, 4)), stage.session, opened, clock), daemon=True
+    )
     thread.start()
     stage.commands.put(Start().pack())
     wait_until(lambda: len(program.taken) == 8, "all slots have a state")

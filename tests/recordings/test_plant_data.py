@@ -98,7 +98,7 @@ def test_all_that_is_wrong_is_said_at_once(tmp_path: Path) -> None:
         'line 3: P_load is "y"; expected a finite number',
     ]
     assert found[-1] == "and more such mistakes, in 20 of 20 lines"
-    assert len(found) == plant_data._MOST_SAID + 1
+    assert len(found) == plant_data.MOST_REPORTED + 1
 
 
 @pytest.mark.parametrize(

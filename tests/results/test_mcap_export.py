@@ -85,13 +85,10 @@ def expected(results: Results) -> dict[str, list[tuple[int, dict[str, Any]]]]:
 
 
 @pytest.mark.parametrize("kind", ["live", "loop"])
-def test_the_file_has_every_value_of_the_results(
-    kind: str, request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_file_has_every_value_of_the_results(kind: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
     """At the time of its slot, in batches that are smaller than the tables; a value that JSON cannot represent is left out."""
-    monkeypatch.setattr("evedrop.results.mcap_export._BATCH_ROWS", 97)
     results: Results = request.getfixturevalue(kind)
-    counts = export_mcap(results, tmp_path / "r.mcap", PERIOD)
+    counts = export_mcap(results, tmp_path / "r.mcap", PERIOD, batch_rows=97)
     found, wanted = read_back(tmp_path / "r.mcap"), expected(results)
     assert found.keys() == wanted.keys() >= {"/truth", "/estimates/legitimate", "/statistics/legitimate"}
     assert ("/inputs" in found, "/packets/legitimate" in found) == (kind == "loop", kind == "live")

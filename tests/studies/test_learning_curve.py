@@ -51,12 +51,11 @@ def test_before_it_has_learned_the_errors_are_those_of_its_start() -> None:
     assert off["Q"].standard_error is not None
 
 
-def test_sets_of_trials_side_by_side_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sets_of_trials_side_by_side_change_nothing() -> None:
     """The same rows with two trials at a time."""
     scenario = load("learning", SMALL)
     whole = learning_curve(scenario, lambda _: None)
-    monkeypatch.setattr("evedrop.studies.learning_curve._SIDE_BY_SIDE", 2)
-    assert learning_curve(scenario, lambda _: None) == whole
+    assert learning_curve(scenario, lambda _: None, side_by_side=2) == whole
 
 
 def test_somebody_has_to_learn() -> None:

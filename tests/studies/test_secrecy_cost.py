@@ -58,13 +58,12 @@ def test_figures_are_those_of_pairs_of_studies(tmp_path: Path) -> None:
         assert found.differences[name]["total"].mean == pytest.approx(total.mean(), rel=1e-6)
 
 
-def test_sets_of_trials_side_by_side_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sets_of_trials_side_by_side_change_nothing() -> None:
     """The same bits with two trials at a time."""
     scenario = load("microgrid", {"slots": 130, "trials": 5})
     whole = secrecy_cost(scenario, lambda _: None)
-    monkeypatch.setattr("evedrop.studies.secrecy_cost._SIDE_BY_SIDE", 2)
     done: list[int] = []
-    assert secrecy_cost(scenario, done.append) == whole
+    assert secrecy_cost(scenario, done.append, side_by_side=2) == whole
     assert sum(done) == 130 * 5
 
 

@@ -16,7 +16,7 @@ from tests.view.simulated_run import Simulated, orbit, simulate
 @pytest.fixture(scope="session", autouse=True)
 def unhurried() -> Iterator[None]:
     """However busy the machine is, it gets the time to finish the file of a recording."""
-    with patch.object(recording, "_FILE_TIMEOUT", LIMIT):
+    with patch.object(recording, "FILE_TIMEOUT", LIMIT):
         yield
 
 

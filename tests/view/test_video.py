@@ -10,7 +10,7 @@ from PIL import Image
 from evedrop import montecarlo
 from evedrop.errors import UsageError
 from evedrop.view import video
-from evedrop.view.video import check_video, video_apart
+from evedrop.view.video import VIDEO_FILES, check_video, video_apart
 from tests.conftest import Evedrop
 from tests.privileged import CannotRun, skip
 
@@ -103,14 +103,14 @@ def test_an_interrupt_leaves_no_file(name: str, tmp_path: Path, monkeypatch: pyt
 
 @pytest.mark.usefixtures("drawn")
 @pytest.mark.parametrize("name", ["v.gif", "v.mp4"])
-def test_a_full_disk_is_said_and_leaves_no_file(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_said_and_leaves_no_file(name: str, tmp_path: Path) -> None:
     """Writing to /dev/full fails as on a full disk."""
     if name.endswith("mp4"):
         ffmpeg()
-    kinds = {suffix: lambda _, rate, kind=kind: kind(Path("/dev/full"), rate) for suffix, kind in video._KINDS.items()}
-    monkeypatch.setattr(video, "_KINDS", kinds)
+    kind = VIDEO_FILES[Path(name).suffix]
+    files = {Path(name).suffix: lambda _, rate: kind(Path("/dev/full"), rate)}
     with pytest.raises(UsageError, match=r"cannot be written \(.*No space left on device"):
-        video_apart(tmp_path / "r.rrd", tmp_path / name, range(9), SIZE, 15.0, lambda _: None)
+        video_apart(tmp_path / "r.rrd", tmp_path / name, range(9), SIZE, 15.0, lambda _: None, files)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 import time
+import weakref
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -39,15 +41,29 @@ SECONDS = 12.0
 CUT = (6.0, 8.0)
 
 
+class Text(str):
+    """A text to which there can be a weak reference."""
+
+
 class Clocks:
     """The system's clock and a steady clock, as a test sets them."""
 
     def __init__(self) -> None:
         self._now = (START, 77.0)
+        self._calls = 0
 
     def __call__(self) -> tuple[float, float]:
         """What both show."""
+        self._calls += 1
         return self._now
+
+    def wait_for_rounds(self, count: int) -> None:
+        """Wait until the thread of a view, which looks once in each round, has looked so often from now on.
+
+        After the second look it has all messages from before, and it has shown the time of the first.
+        """
+        last = self._calls + count
+        wait_until(lambda: self._calls >= last, "the thread looks at the clocks")
 
     def advance(self, by: float) -> None:
         """Let the time go on."""
@@ -91,7 +107,7 @@ def rows() -> NDArray[Any]:
 @pytest.fixture(scope="module", autouse=True)
 def unhurried() -> Any:
     """However busy the machine is, it gets the time to finish the file of a recording."""
-    with patch.object(recording, "_FILE_TIMEOUT", LIMIT):
+    with patch.object(recording, "FILE_TIMEOUT", LIMIT):
         yield
 
 
@@ -175,7 +191,7 @@ def test_time_goes_on_without_messages(tmp_path: Path) -> None:
     clocks.advance(2.0)
     for _ in range(6):
         clocks.advance(1.0)
-        wait_until(lambda: view._sent == clocks()[0], "the thread has seen the time")
+        clocks.wait_for_rounds(1)
     assert view.close()
     rates = shown(tmp_path / "r.rrd", "rates", "Scalars:scalars")
     assert rates[-1][0] > 6.0
@@ -193,9 +209,9 @@ def test_a_clock_that_is_set_does_not_stop_the_view(by: float, tmp_path: Path) -
     view = WireView(tmp_path / "r.rrd", robot_plan(), "wire", START, None, clocks)
     view.add(before)
     clocks.advance(2.0)
-    wait_until(lambda: view._sent == clocks()[0], "the thread has the messages")
+    clocks.wait_for_rounds(2)
     clocks.set(by)
-    wait_until(lambda: view._shift == by, "the thread has noticed")
+    clocks.wait_for_rounds(1)
     after["time"] += by
     view.add(after)
     clocks.advance(2.0)
@@ -215,7 +231,7 @@ def test_rows_from_before_the_clock_was_set_back_are_not_in_the_future(tmp_path:
     view = WireView(tmp_path / "r.rrd", robot_plan(), "wire", START, None, clocks)
     clocks.advance(2.0)
     clocks.set(-3600.0)
-    wait_until(lambda: view._shift == -3600.0, "the thread has noticed")
+    clocks.wait_for_rounds(1)
     view.add(traffic(robot_plan(), 2.0, RATES))
     assert view.close()
     assert shown(tmp_path / "r.rrd", "rates", "Scalars:scalars")[-1][0] < 3.0
@@ -235,31 +251,45 @@ def test_the_graph_of_a_running_wire_forgets_what_is_old(pause: float, tmp_path:
     for part in (early, late):
         view.add(part)
         clocks.advance(float(part["time"][-1]) - clocks()[0] + 0.01)
-        wait_until(lambda: not view._waiting, "the thread has the messages")
+        clocks.wait_for_rounds(2)
     assert view.close()
     assert shown(path, "graph", "GraphNodes:labels")[-1][1][3] == "scan: 0 % lost"
     assert "300 lost" in shown(path, "table", "TextDocument:text")[-1][1][0]
 
 
 def test_a_disk_that_takes_nothing_harms_only_the_view(tmp_path: Path, rows: NDArray[Any]) -> None:
-    """No method raises, and the reason is kept."""
+    """No method raises, nothing that is added is kept in memory, and the reason is kept."""
     view = WireView(tmp_path / "nowhere" / "r.rrd", robot_plan(), "wire", START)
-    view.add(rows)
-    view.amend(rows[:1], Crossing.UNDERWAY)
-    view.note(START, "INFO", "a note")
-    assert not [*view._waiting, *view._amended, *view._notes[1:]]
+    added, amended, note = rows.copy(), rows[:1].copy(), Text("a note")
+    kept = [weakref.ref(one) for one in (added, amended, note)]
+    view.add(added)
+    view.amend(amended, Crossing.UNDERWAY)
+    view.note(START, "INFO", note)
+    del added, amended, note
+    assert [one() for one in kept] == [None] * 3
     assert not view.close()
     assert "the recording is incomplete" in str(view.failure)
 
 
 def test_a_view_that_is_far_behind_gives_up(tmp_path: Path, rows: NDArray[Any]) -> None:
     """Instead of taking ever more memory, or holding up the wire."""
-    view = WireView(tmp_path / "r.rrd", robot_plan(), "wire", START)
-    with view._changed, patch("evedrop.wire.view._MOST_ROWS", 5000):  # the thread stands still
-        for _ in range(10):
-            view.add(rows)
-        assert len(view._waiting) <= 5000 // len(rows) + 2
+    looking, going_on = threading.Event(), threading.Event()
+
+    def clocks() -> tuple[float, float]:
+        if threading.current_thread() is not threading.main_thread():
+            looking.set()
+            assert going_on.wait(LIMIT)
+        return START, 77.0
+
+    view = WireView(tmp_path / "r.rrd", robot_plan(), "wire", START, None, clocks, most_rows=5000)
+    assert looking.wait(LIMIT)  # the thread stands still
+    blocks = [rows.copy() for _ in range(10)]
+    kept = [weakref.ref(block) for block in blocks]
+    while blocks:
+        view.add(blocks.pop())
+    assert 0 < sum(one() is not None for one in kept) <= 5000 // len(rows) + 2
     assert "did not keep up" in str(view.failure)
+    going_on.set()
     view.close()
 
 

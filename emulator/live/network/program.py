@@ -67,7 +67,7 @@ class ProgramStates:
             raise BriefError(
                 f"process.zenoh: the sensor {what} {where} ({error}); start the router there first, or give another endpoint"
             ) from error
-        self._subscriber = self._session.declare_subscriber(entry.key, self._hear)
+        self._subscriber = self._session.declare_subscriber(entry.key, self.hear)
 
     def __enter__(self) -> Self:
         return self
@@ -77,7 +77,7 @@ class ProgramStates:
     ) -> None:
         self._session.close()
 
-    def _hear(self, sample: zenoh.Sample) -> None:
+    def hear(self, sample: zenoh.Sample) -> None:
         """Keep a message; called on a thread of Zenoh's. Deletions, and messages of another key, are not states."""
         if sample.kind != zenoh.SampleKind.PUT or str(sample.key_expr) != self._entry.key:
             return

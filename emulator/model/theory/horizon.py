@@ -12,15 +12,17 @@ from evedrop.model.theory.covariances import NOBODY, ExpectedCovariance
 UNIT_ROUNDOFF = 2.0**-53
 TOLERANCE = 0.01
 _NO_NOISE = 1e-12  # relative to the largest eigenvalue of a singular Q: eigenvalues below it are rounding
-_EACH = 2**17  # numbers in the covariances of slots that are checked one by one; later slots are bisected
+_EACH = 2**17  # numbers
 _AT_LEAST = 1024
 
 
-def horizon(process: Process, slots: int) -> int | None:
+def horizon(process: Process, slots: int, checked: int = _EACH) -> int | None:
     """Largest k within float64's reach, if it is below slots−1; None if the whole run is within it.
 
     The last k such that up to it 2⁻⁵³ √λ_max(Σ_k) ≤ 0.01 √λ_min(Q). Each of the first thousands of slots is checked; after
     them Σ_k is assumed to grow from slot to slot, because it has outgrown its beginning.
+
+    checked: how many numbers the covariances of the slots may have that are checked one by one; later slots are bisected.
 
     Source: docs/mathematics.md, horizon.
     """
@@ -28,8 +30,8 @@ def horizon(process: Process, slots: int) -> int | None:
     least = noise[noise > _NO_NOISE * noise[-1]][0] if process.singular_noise and noise[-1] > 0.0 else noise[0]
     limit = (TOLERANCE / UNIT_ROUNDOFF) ** 2 * float(least)
     states = ExpectedCovariance(process, NOBODY)
-    count = min(slots, max(_AT_LEAST, _EACH // process.n**2))
-    ahead = max(2, _EACH // (16 * process.n**2))
+    count = min(slots, max(_AT_LEAST, checked // process.n**2))
+    ahead = max(2, checked // (16 * process.n**2))
     sigma = process.initial_covariance[None]
     for first in range(0, count, ahead):
         sigma = states.next(min(ahead, count - first))
