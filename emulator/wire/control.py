@@ -20,10 +20,11 @@ import zenoh
 from evedrop.errors import MalformedMessage, ScenarioError
 from evedrop.live.network.access import Grant, access_control
 from evedrop.live.network.control_file import Control, remove_control
-from evedrop.live.network.operator import Answer, Request, read_request
+from evedrop.live.network.operator import Answer
 from evedrop.live.network.router_users import users_file
 from evedrop.live.protocol.envelope import enclosed, payload_of
 from evedrop.live.protocol.keys import RunKeys, ZenohConfig
+from evedrop.live.protocol.requests import LinkRequest, OperatorRequest, StatusRequest, read_request
 from evedrop.live.protocol.wire_status import WireLinkStatus, WireStatus
 from evedrop.names import OBSERVER, OPERATOR
 from evedrop.output import warn
@@ -105,10 +106,10 @@ class WireControl:
                 answer = Answer(refused=(f"the wire failed to do so: {error!r}",))
             query.reply(self._key, enclosed(self._key, answer.pack()))
 
-    def _carry_out(self, request: Request) -> Answer:
-        if request.do == "status":
+    def _carry_out(self, request: OperatorRequest) -> Answer:
+        if isinstance(request, StatusRequest):
             return Answer(status=self._status())
-        if request.do != "link" or request.event is None:
+        if not isinstance(request, LinkRequest):
             why = "programs that know nothing of a wire do not wait for it"
             return Answer(
                 refused=(f"a wire cannot be held: {why}; `evedrop link` cuts a link, `evedrop partition` two sides",)

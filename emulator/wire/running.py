@@ -23,7 +23,8 @@ import zenoh
 
 from evedrop.errors import EvedropError, RunError, UsageError
 from evedrop.live.network.control_file import no_run, read_control
-from evedrop.live.network.operator import Answer, Request, ask
+from evedrop.live.network.operator import Answer, ask
+from evedrop.live.protocol.requests import LinkRequest, OperatorRequest, StatusRequest
 from evedrop.live.protocol.wire_status import WireStatus
 from evedrop.results.folder import claimed, default_folder, write_private
 from evedrop.results.wire_summary import WIRE_SUMMARY_FILE, WireSummary
@@ -165,7 +166,7 @@ class RunningWire:
 
     def status(self) -> WireStatus:
         """The state of the wire now. Raises UsageError if it does not run."""
-        found = self._ask(Request("status")).status
+        found = self._ask(StatusRequest()).status
         if not isinstance(found, WireStatus):
             raise UsageError(f"{self.folder} is the folder of a run; expected that of a wire")
         return found
@@ -208,10 +209,10 @@ class RunningWire:
 
     def _steer(self, event: Mapping[str, Any]) -> None:
         """Let an event begin now. Raises UsageError if the wire refuses it, or does not run."""
-        if refused := self._ask(Request("link", event=event)).refused:
+        if refused := self._ask(LinkRequest(event)).refused:
             raise UsageError(f"{'; '.join(refused)}; nothing was changed")
 
-    def _ask(self, request: Request) -> Answer:
+    def _ask(self, request: OperatorRequest) -> Answer:
         """The wire's answer. Raises UsageError if it does not run."""
         control = read_control(self.folder)
         try:

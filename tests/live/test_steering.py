@@ -7,10 +7,11 @@ from typing import Any
 
 import pytest
 
-from evedrop.live.network.operator import Answer, Request, read_answer
+from evedrop.live.network.operator import Answer, read_answer
 from evedrop.live.observer.operator_orders import Order
 from evedrop.live.observer.steering import Steering
 from evedrop.live.protocol.commands import ControlCommand, Go, Hold, LinkChange
+from evedrop.live.protocol.requests import REQUESTS
 from evedrop.loading import checked
 from evedrop.model.slot.link import Change
 from evedrop.news import Held, News
@@ -78,7 +79,7 @@ class Run:
     def asks(self, do: str, reported: int = 0, **fields: Any) -> Asked:
         """An operator asks for something after this number of slots was reported."""
         asked = Asked()
-        self.steering.take_order(Order(Request(do, **fields), asked), reported)  # type: ignore[arg-type]
+        self.steering.take_order(Order(REQUESTS[do](**fields), asked), reported)  # type: ignore[arg-type]
         return asked
 
     def holds(self, k: int) -> list[Sent]:
@@ -309,11 +310,11 @@ def test_a_step_beyond_the_end_ends_with_the_run() -> None:
     assert stepped.answers == [Answer(SLOTS, f"slots 90 to {SLOTS - 1} passed; the run is over")]
 
 
-@pytest.mark.parametrize("do", ["pause", "link", "step"])
-def test_what_comes_after_the_last_slot_is_refused(do: str) -> None:
+@pytest.mark.parametrize(("do", "fields"), [("pause", {}), ("link", {"event": SET}), ("step", {"slots": 2})])
+def test_what_comes_after_the_last_slot_is_refused(do: str, fields: dict[str, Any]) -> None:
     """The sensor has sent all slots and does not hold again: the operator is told, and nothing has changed."""
     run = Run()
-    asked = run.asks(do, reported=SLOTS - 3, event=SET, slots=2)
+    asked = run.asks(do, reported=SLOTS - 3, **fields)
     run.steering.answer_open_orders(SLOTS, complete=True)
     assert asked.answers[0].refused == ("the run ended first; nothing was done",)
     assert (run.events, run.kept) == ([], [])

@@ -12,9 +12,10 @@ import zenoh
 
 from evedrop.cli.main import main
 from evedrop.live.network.control_file import read_control
-from evedrop.live.network.operator import Request, ask
+from evedrop.live.network.operator import ask
 from evedrop.live.protocol.envelope import enclosed
 from evedrop.live.protocol.keys import RunKeys
+from evedrop.live.protocol.requests import OperatorRequest
 from evedrop.names import OBSERVER
 from evedrop.wire.conductor import WireConductor
 from evedrop.wire.control import WireControl
@@ -72,6 +73,12 @@ def test_a_wire_is_steered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert said("status").startswith("2 evedrop: no run is going on in")
 
 
+class NoEvent(OperatorRequest):
+    """A change without an event."""
+
+    do = "link"
+
+
 def test_what_cannot_be_done_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Every mistake has a line, exit status 2, and nothing is changed; commands without the password get no answer."""
 
@@ -87,7 +94,7 @@ def test_what_cannot_be_done_is_refused(tmp_path: Path, capsys: pytest.CaptureFi
         assert "are not partitioned" in refused("heal", "robot", "base")
         assert "rabot" in refused("partition", "rabot", "base")
         control = read_control(tmp_path)
-        answer = ask(control, Request("link"), 10.0)
+        answer = ask(control, NoEvent(), 10.0)
         assert answer is not None
         assert answer.refused
         key = RunKeys(control.run).control(OBSERVER)

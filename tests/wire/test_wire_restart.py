@@ -8,7 +8,8 @@ import signal
 from pathlib import Path
 
 from evedrop.live.network.control_file import read_control
-from evedrop.live.network.operator import Request, ask
+from evedrop.live.network.operator import ask
+from evedrop.live.protocol.requests import StatusRequest
 from evedrop.live.protocol.wire_status import WireStatus
 from evedrop.wire.fates import KeyFates
 from evedrop.wire.file import load_wire
@@ -37,7 +38,7 @@ def carrying(evedrop: Evedrop, path: Path, numbers: range, arrived: list[int]) -
     wire = evedrop.started("wire", str(path))
     control = wire.folder / "control.json"
     wait_until(lambda: control.exists() or wire.process.poll() is not None, "a wire that can be asked")
-    answer = ask(read_control(wire.folder), Request("status"), 30.0)
+    answer = ask(read_control(wire.folder), StatusRequest(), 30.0)
     assert answer is not None
     assert isinstance(answer.status, WireStatus)
     sides = answer.status.sides

@@ -18,60 +18,71 @@ from evedrop.errors import BriefError, UsageError
 
 if TYPE_CHECKING:
     from evedrop.live.network.control_file import Control
-    from evedrop.live.network.operator import Answer, Request
+    from evedrop.live.network.operator import Answer
+    from evedrop.live.protocol.requests import OperatorRequest
 
 _PATIENCE = 60.0  # seconds; a hold may wait for a process that the scenario has restarted
 _AWAY_SECONDS = 5.0  # for which a run may have no observer at its router
 _AGAIN_SECONDS = 0.2
-_REPEATABLE = frozenset({"pause", "resume", "status"})
 _STEP_PATIENCE = 30 * 86_400.0  # a step takes as long as its slots do
 
 
 def link(options: argparse.Namespace) -> int:
     """Change, cut or heal a link."""
+    from evedrop.live.protocol.requests import LinkRequest
+
     event = _event(options.name, options.changes)
-    return _ask(options.run, "link", f"link {options.name}", event=event)
+    return _ask(options.run, LinkRequest(event), f"link {options.name}")
 
 
 def partition(options: argparse.Namespace) -> int:
     """Let nothing pass between two sides of a wire."""
+    from evedrop.live.protocol.requests import LinkRequest
+
     event = {"partition": [options.one, options.other]}
-    return _ask(options.run, "link", f"partition {options.one} {options.other}", event=event)
+    return _ask(options.run, LinkRequest(event), f"partition {options.one} {options.other}")
 
 
 def heal(options: argparse.Namespace) -> int:
     """End the partition of two sides of a wire."""
+    from evedrop.live.protocol.requests import LinkRequest
+
     event = {"join": [options.one, options.other]}
-    return _ask(options.run, "link", f"heal {options.one} {options.other}", event=event)
+    return _ask(options.run, LinkRequest(event), f"heal {options.one} {options.other}")
 
 
 def pause(options: argparse.Namespace) -> int:
     """Hold the run before its next slot."""
-    return _ask(options.run, "pause", "pause")
+    from evedrop.live.protocol.requests import PauseRequest
+
+    return _ask(options.run, PauseRequest(), "pause")
 
 
 def resume(options: argparse.Namespace) -> int:
     """Let a held run continue."""
-    return _ask(options.run, "resume", "resume")
+    from evedrop.live.protocol.requests import ResumeRequest
+
+    return _ask(options.run, ResumeRequest(), "resume")
 
 
 def step(options: argparse.Namespace) -> int:
     """Let the run continue for some slots, and hold it again."""
+    from evedrop.live.protocol.requests import StepRequest
     from evedrop.streams import MOST_SLOTS
 
     if not 1 <= options.slots <= MOST_SLOTS:
         raise UsageError(f"step {options.slots}: expected 1 or more slots, and {MOST_SLOTS} at most")
-    return _ask(options.run, "step", f"step {options.slots}", _STEP_PATIENCE, slots=options.slots)
+    return _ask(options.run, StepRequest(options.slots), f"step {options.slots}", _STEP_PATIENCE)
 
 
 def status(options: argparse.Namespace) -> int:
     """Print the run's status."""
     from evedrop.live.network.control_file import read_controls
-    from evedrop.live.network.operator import Request
+    from evedrop.live.protocol.requests import StatusRequest
     from evedrop.live.protocol.status import RunStatus, status_of_shards
 
     answers = [
-        _answer(options.run, control, Request("status"), "status", _PATIENCE).status
+        _answer(options.run, control, StatusRequest(), "status", _PATIENCE).status
         for control in read_controls(options.run)
     ]
     of_runs = [answer for answer in answers if isinstance(answer, RunStatus)]
@@ -81,16 +92,15 @@ def status(options: argparse.Namespace) -> int:
     return 0
 
 
-def _ask(run: Path, do: str, what: str, patience: float = _PATIENCE, **fields: Any) -> int:
+def _ask(run: Path, request: OperatorRequest, what: str, patience: float = _PATIENCE) -> int:
     from evedrop.live.network.control_file import read_controls
-    from evedrop.live.network.operator import Request
 
     control = read_controls(run)[0]  # in a run in shards, any of them refuses
-    print(_answer(run, control, Request(do, **fields), what, patience).said)
+    print(_answer(run, control, request, what, patience).said)
     return 0
 
 
-def _answer(run: Path, control: Control, request: Request, what: str, patience: float) -> Answer:
+def _answer(run: Path, control: Control, request: OperatorRequest, what: str, patience: float) -> Answer:
     """The answer of the observer of a run or a shard. Raises UsageError if it does not answer, or refuses."""
     import zenoh
 
@@ -108,7 +118,7 @@ def _answer(run: Path, control: Control, request: Request, what: str, patience: 
     try:
         found = ask(control, request, patience)
         # An observer that has lost its connection is back in a moment; these requests may be carried out twice.
-        while found is None and request.do in _REPEATABLE and time.monotonic() - began < _AWAY_SECONDS:
+        while found is None and request.repeatable and time.monotonic() - began < _AWAY_SECONDS:
             read_controls(run)  # raises UsageError when the run is over
             time.sleep(_AGAIN_SECONDS)
             found = ask(control, request, patience)

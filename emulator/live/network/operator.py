@@ -1,4 +1,4 @@
-"""The operator's requests to a run in progress, and the answers: a Zenoh query to the observer.
+"""How the operator asks a run in progress, and the answers: a Zenoh query to the observer.
 
 Source: docs/protocol.md, request and answer.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import zenoh
 
@@ -18,43 +17,12 @@ from evedrop.live.network.session import client_config
 from evedrop.live.protocol.codec import Reader, pack
 from evedrop.live.protocol.envelope import enclosed, payload_of
 from evedrop.live.protocol.keys import RunKeys
+from evedrop.live.protocol.requests import OperatorRequest
 from evedrop.live.protocol.status import RunStatus
 from evedrop.live.protocol.wire_status import WireStatus
 from evedrop.names import OBSERVER
 
-DOES = ("link", "pause", "resume", "step", "status")
-"""The possible requests."""
 _STATUSES: Mapping[str, type[RunStatus | WireStatus]] = {"status": RunStatus, "wire": WireStatus}
-
-
-@dataclass(frozen=True)
-class Request:
-    """One request of the operator."""
-
-    do: str
-    """One of `DOES`."""
-    event: Mapping[str, Any] | None = None
-    """For `link`: the entries of an [[event]] of a scenario or a wire, except its time; on a wire also
-    `heal` and `join`, which end a cut and a partition."""
-    slots: int | None = None
-    """For `step`."""
-
-    def pack(self) -> bytes:
-        """Encode it as a message."""
-        optional = {"event": self.event, "slots": self.slots}
-        return pack({"do": self.do, **{name: value for name, value in optional.items() if value is not None}})
-
-
-def read_request(key: str, payload: bytes) -> Request:
-    """Decode a request. Raises MalformedMessage if the message is not a request."""
-    message = Reader(key, payload)
-    do = message.text("do")
-    if do not in DOES:
-        raise message.malformed(f"do = {do!r}", f"one of {', '.join(DOES)}")
-    event = message.map("event") if do == "link" else None
-    if event is not None and not all(isinstance(name, str) for name in event):
-        raise message.malformed(f"event = {event!r:.60}", "a map event with strings as keys")
-    return Request(do, event, message.integer("slots", 1) if do == "step" else None)
 
 
 @dataclass(frozen=True)
@@ -95,7 +63,7 @@ def read_answer(key: str, payload: bytes) -> Answer:
     return Answer(message.integer("k"), message.text("said"))
 
 
-def ask(control: Control, request: Request, patience: float) -> Answer | None:
+def ask(control: Control, request: OperatorRequest, patience: float) -> Answer | None:
     """Ask the observer of a run; None if it does not answer within `patience` seconds, because the run is over or ends.
 
     Raises zenoh.ZError if the router is not there or refuses the operator.

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, final
 from evedrop.errors import EvedropError, Interrupted, MalformedMessage, NoAnswer, RunError
 from evedrop.live.network.control_file import Control, remove_control
 from evedrop.live.network.declared import Question
-from evedrop.live.network.operator import Answer, read_request
+from evedrop.live.network.operator import Answer
 from evedrop.live.network.resending import GapDetector
 from evedrop.live.network.session import Session
 from evedrop.live.observer.conductor import Conductor, Stop
@@ -32,6 +32,7 @@ from evedrop.live.protocol.brief_parts import ObserverPart
 from evedrop.live.protocol.codec import Reader, is_refusal, read_refusal
 from evedrop.live.protocol.commands import Where
 from evedrop.live.protocol.news import RunOver
+from evedrop.live.protocol.requests import StatusRequest, read_request
 from evedrop.live.protocol.status import RunStatus
 from evedrop.live.protocol.telemetry import is_held, is_leaving, read_leaving
 from evedrop.live.protocol.whereabouts import is_whereabouts, read_whereabouts
@@ -215,7 +216,7 @@ class ObservedRun:
         except MalformedMessage as error:
             question.answer(Answer(refused=(str(error),)).pack())
             return
-        if order.request.do == "status":
+        if isinstance(order.request, StatusRequest):
             order.tell(self._status(conductor))
         elif self._brief.part.shard:
             order.refuse("this run is in shards, which cannot be steered; run it with --set shards=1 to steer it")

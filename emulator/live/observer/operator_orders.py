@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import final
 
 from evedrop.live.network.declared import Question
-from evedrop.live.network.operator import Answer, Request
+from evedrop.live.network.operator import Answer
+from evedrop.live.protocol.requests import OperatorRequest
 from evedrop.live.protocol.status import RunStatus
 
 
@@ -15,7 +16,7 @@ from evedrop.live.protocol.status import RunStatus
 class Order:
     """A request with the Zenoh question that brought it, to be answered once."""
 
-    request: Request
+    request: OperatorRequest
     _question: Question
 
     def done(self, slot: int, said: str) -> None:

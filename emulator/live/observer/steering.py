@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable
-from typing import final
+from collections.abc import Callable, Mapping
+from typing import Any, final
 
 from evedrop.errors import RunError, ScenarioError
 from evedrop.live.network.session import READY_SECONDS
@@ -19,6 +19,7 @@ from evedrop.live.observer.conductor import Conductor
 from evedrop.live.observer.operator_orders import OperatorStep, Order
 from evedrop.live.protocol.commands import Go, Hold, LinkChange
 from evedrop.live.protocol.news import ProcessRequest
+from evedrop.live.protocol.requests import LinkRequest, PauseRequest, ResumeRequest, StepRequest
 from evedrop.loading.file import with_event
 from evedrop.model.slot.link import Change
 from evedrop.names import ROUTER, SENSOR, ProcessAction
@@ -93,7 +94,7 @@ class Steering:
 
         reported: all slots below it are joined.
         """
-        if order.request.do == "resume" and self.at is None and not self._orders:
+        if isinstance(order.request, ResumeRequest) and self.at is None and not self._orders:
             self._forget_step(reported, "the run was resumed")
             order.done(reported, "the run is not paused")
             return
@@ -178,34 +179,33 @@ class Steering:
 
     def _obey(self, k: int, order: Order) -> None:
         """Carry out a request of the operator before slot k."""
-        match order.request.do:
-            case "link":
-                self._change(k, order)
-            case "pause":
+        match order.request:
+            case LinkRequest(event):
+                self._change(k, order, event)
+            case PauseRequest():
                 said = f"held already, before slot {k}" if self.paused else f"held before slot {k}"
                 if not self.paused:
                     self._pause(k, "pause the run")
                 self._forget_step(k, "the run was paused")
                 order.done(k, said)
-            case "resume":
+            case ResumeRequest():
                 if self.paused:
                     self._note(k, "resume the run", "operator")
                 self.paused = False
                 self._forget_step(k, "the run was resumed")
                 order.done(k, f"the run goes on with slot {k}")
-            case "step" if self._step is not None:
+            case StepRequest() if self._step is not None:
                 order.refuse(
                     f"another step is under way, to slot {self._step.until - 1}; wait for its end, or pause first"
                 )
-            case "step":
-                slots = order.request.slots or 1
+            case StepRequest(slots):
                 self._note(k, f"step {slots} slots" if slots > 1 else "step 1 slot", "operator")
                 self._step, self.paused = OperatorStep(order, k, k + slots), False
 
-    def _change(self, k: int, order: Order) -> None:
+    def _change(self, k: int, order: Order, event: Mapping[str, Any]) -> None:
         """Add an event at slot k to the scenario, and send the router the changes of its links from then on."""
         try:
-            changed = with_event(self._scenario, order.request.event or {}, k)
+            changed = with_event(self._scenario, event, k)
         except ScenarioError as error:
             order.refuse(*error.mistakes)
             return

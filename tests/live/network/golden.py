@@ -16,6 +16,7 @@ from evedrop.live.network import operator
 from evedrop.live.protocol import closed_loop as loop_wire
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import commands, envelope, packets, telemetry
+from evedrop.live.protocol.requests import REQUESTS, read_request
 from evedrop.live.protocol.status import RunStatus
 from evedrop.live.protocol.whereabouts import Whereabouts, read_whereabouts
 from evedrop.model.digest import Blocks
@@ -297,10 +298,15 @@ def decode_acknowledgement(shape: dict[str, Any], value: dict[str, Any], raw: by
     return {"k": value["k"], "gamma": gamma.astype(int).tolist()}
 
 
+def encode_request(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
+    """As the operator makes it."""
+    return REQUESTS[value["do"]](**{name: found for name, found in value.items() if name != "do"}).pack()
+
+
 def decode_request(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the observer reads it."""
-    request = operator.read_request(KEY, raw)
-    return {name: found for name in ("do", "event", "slots") if (found := getattr(request, name)) is not None}
+    request = read_request(KEY, raw)
+    return {"do": request.do, **vars(request)}
 
 
 def encode_answer(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
@@ -334,7 +340,7 @@ CODECS: dict[str, tuple[Encode, Decode]] = {
     "barrier": (lambda _shape, value: packets.barrier(value["k"]), decode_barrier),
     "held": (lambda _shape, value: telemetry.held(value["k"]), decode_held),
     "leaving": (encode_leaving, decode_leaving),
-    "request": (lambda _shape, value: operator.Request(**value).pack(), decode_request),
+    "request": (encode_request, decode_request),
     "answer": (encode_answer, decode_answer),
     "truth": (encode_truth, decode_truth),
     "report": (encode_report, decode_report),

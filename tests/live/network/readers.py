@@ -13,6 +13,7 @@ from evedrop.live.protocol import closed_loop as loop_wire
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import commands, packets, telemetry, whereabouts
 from evedrop.live.protocol.codec import Reader
+from evedrop.live.protocol.requests import StepRequest, read_request
 from evedrop.live.protocol.status import LinkStatus, RunStatus
 from evedrop.model.digest import Blocks
 from evedrop.model.links.link import REASONS
@@ -53,7 +54,7 @@ READERS: Mapping[str, tuple[str, Callable[[bytes], Any]]] = {
     "go": _commanded("sensor", ("eve", "observer")),
     "change": _commanded("router", ("eve", "legitimate")),
     "again": _commanded("router", ("eve", "legitimate")),
-    "request": ("evedrop/r1/control/observer", lambda raw: operator.read_request("evedrop/r1/control/observer", raw)),
+    "request": ("evedrop/r1/control/observer", lambda raw: read_request("evedrop/r1/control/observer", raw)),
     "answer": ("evedrop/r1/control/observer", lambda raw: operator.read_answer("evedrop/r1/control/observer", raw)),
     "status": ("evedrop/r1/control/observer", lambda raw: operator.read_answer("evedrop/r1/control/observer", raw)),
     "truth": _on("telemetry/sensor", lambda m: telemetry.read_truth(m, K, EXTENT)),
@@ -97,7 +98,7 @@ EXAMPLES: Mapping[str, bytes] = {
     "go": commands.Go(K, ("eve",), 9).pack(),
     "change": commands.LinkChange("eve", (Change(4, cut=True), Change(9, {"loss": {}}))).pack(),
     "again": commands.Again(1, K, {"eve": (Change(4, cut=True),)}).pack(),
-    "request": operator.Request("step", slots=3).pack(),
+    "request": StepRequest(3).pack(),
     "answer": operator.Answer(3, "done").pack(),
     "status": operator.Answer(status=RunStatus(
         K, SLOTS, 9.0, "held", {"eve": True}, {"eve": LinkStatus.of(4, 2)}, [RunEvent(2, "cut eve", "scenario")])).pack(),

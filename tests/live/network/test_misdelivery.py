@@ -17,7 +17,7 @@ from evedrop.errors import MalformedMessage
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.network.control_file import Control
 from evedrop.live.network.declared import InboxClosedError, Question
-from evedrop.live.network.operator import Answer, Request, ask
+from evedrop.live.network.operator import Answer, ask
 from evedrop.live.network.router_users import users_file
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import AnyBrief
@@ -25,6 +25,7 @@ from evedrop.live.protocol.codec import Reader, progress
 from evedrop.live.protocol.commands import End, Start
 from evedrop.live.protocol.envelope import enclosed, head_of, named_in
 from evedrop.live.protocol.keys import RunKeys
+from evedrop.live.protocol.requests import StatusRequest
 from evedrop.ports import free_port
 from tests.live.network.bench import LIMIT_SECONDS, is_matched, scenario_of, until
 from tests.proxy import Cable, cable
@@ -149,9 +150,9 @@ def test_an_answer_that_names_another_key_is_none(stage: Stage) -> None:
     entry = Control(stage.eve.run, stage.eve.router, "operator", "password")
     for message in (*foreign(stage.keys, key), enclosed(stage.keys.control("eve"), Answer(3, "no").pack())):
         answers.put(message)
-        assert ask(entry, Request("status"), 2.0) is None
+        assert ask(entry, StatusRequest(), 2.0) is None
     answers.put(enclosed(key, Answer(7, "yes").pack()))
-    assert ask(entry, Request("status"), LIMIT_SECONDS) == Answer(7, "yes")
+    assert ask(entry, StatusRequest(), LIMIT_SECONDS) == Answer(7, "yes")
 
 
 def test_a_malformed_message_of_its_own_key_is_an_error(stage: Stage) -> None:

@@ -13,14 +13,13 @@ from typing import Any
 import pytest
 import zenoh
 
-from evedrop.errors import MalformedMessage
 from evedrop.live.network.control_file import Control
-from evedrop.live.network.operator import Answer, Request, ask, read_request
+from evedrop.live.network.operator import Answer, ask
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.brief_parts import ObserverPart
-from evedrop.live.protocol.codec import pack
 from evedrop.live.protocol.envelope import enclosed, payload_of
 from evedrop.live.protocol.keys import RunKeys
+from evedrop.live.protocol.requests import PauseRequest, StatusRequest, StepRequest
 from tests.builders import part_of
 from tests.live.network.bench import Bench, Ear, bench_of, connect, scenario_of, until
 
@@ -61,7 +60,7 @@ def answering(stage: Bench) -> Iterator[list[bytes]]:
         query.drop()
 
     queryable = stage.sessions["observer"].declare_queryable(key, answer)
-    until(lambda: ask(control(stage), Request("status"), PATIENCE), "an observer that answers")
+    until(lambda: ask(control(stage), StatusRequest(), PATIENCE), "an observer that answers")
     asked.clear()
     yield asked
     queryable.undeclare()
@@ -75,7 +74,7 @@ def attempts(stage: Bench) -> list[str]:
 
 def replies(session: zenoh.Session, key: str) -> list[bytes]:
     """What a question at a key brings, but for what a session says of itself."""
-    question = enclosed(key, Request("pause").pack())
+    question = enclosed(key, PauseRequest().pack())
     found = [reply.ok for reply in session.get(key, payload=question, timeout=PATIENCE) if reply.ok]
     answers = [(str(one.key_expr), one.payload.to_bytes()) for one in found]
     return [payload_of(key, message) or message for key, message in answers if not key.startswith("@/")]
@@ -84,8 +83,8 @@ def replies(session: zenoh.Session, key: str) -> list[bytes]:
 def test_the_operator_is_answered(stage: Bench) -> None:
     """Its question reaches the observer as it was put, and the answer comes back."""
     with answering(stage) as asked:
-        assert ask(control(stage), Request("step", slots=3), PATIENCE) == Answer(7, "yes")
-        assert asked == [Request("step", slots=3).pack()]
+        assert ask(control(stage), StepRequest(3), PATIENCE) == Answer(7, "yes")
+        assert asked == [StepRequest(3).pack()]
 
 
 @pytest.mark.parametrize("who", OTHERS)
@@ -94,8 +93,8 @@ def test_nobody_else_may_ask(who: str, stage: Bench) -> None:
     with answering(stage) as asked, connect(stage.briefs[who]) as session:
         for key in attempts(stage):
             assert replies(session, key) == [], key
-        assert ask(control(stage), Request("status"), PATIENCE) == Answer(7, "yes")
-        assert asked == [Request("status").pack()]
+        assert ask(control(stage), StatusRequest(), PATIENCE) == Answer(7, "yes")
+        assert asked == [StatusRequest().pack()]
 
 
 @pytest.mark.parametrize("mode", ["peer", "router"])
@@ -105,8 +104,8 @@ def test_an_eavesdropper_may_not_ask_in_any_mode(mode: str, stage: Bench) -> Non
     with answering(stage) as asked, connect(stage.briefs["eve"], **changes) as session:
         for key in attempts(stage):
             assert replies(session, key) == [], key
-        assert ask(control(stage), Request("status"), PATIENCE) == Answer(7, "yes")
-        assert asked == [Request("status").pack()]
+        assert ask(control(stage), StatusRequest(), PATIENCE) == Answer(7, "yes")
+        assert asked == [StatusRequest().pack()]
 
 
 @pytest.mark.parametrize("wrong", [{"password": "guessed"}, {"password": ""}, {"user": "trudy"}, {"user": "eve"}])
@@ -114,7 +113,7 @@ def test_a_stranger_gets_no_session(wrong: dict[str, str], stage: Bench) -> None
     """Without the operator's password nothing can be asked."""
     with answering(stage) as asked:
         with pytest.raises(zenoh.ZError):
-            ask(control(stage, **wrong), Request("pause"), PATIENCE)
+            ask(control(stage, **wrong), PauseRequest(), PATIENCE)
         assert asked == []
 
 
@@ -129,9 +128,9 @@ def test_nobody_else_may_answer(stage: Bench) -> None:
             # Denied, but answered in its turn: what was declared before has been dealt with.
             assert ask_nothing(session, stage) == []
         with answering(stage) as asked:
-            assert ask(control(stage), Request("status"), PATIENCE) == Answer(7, "yes")
+            assert ask(control(stage), StatusRequest(), PATIENCE) == Answer(7, "yes")
             assert len(asked) == 1
-        assert ask(control(stage), Request("status"), PATIENCE) is None
+        assert ask(control(stage), StatusRequest(), PATIENCE) is None
     finally:
         for session in sessions:
             session.close()
@@ -182,14 +181,3 @@ def test_of_another_run_nothing_can_be_asked(stage: Bench) -> None:
     with answering(stage) as asked, connect(operator(stage)) as session:
         assert replies(session, RunKeys("another").control("observer")) == []
         assert asked == []
-
-
-@pytest.mark.parametrize(
-    "payload",
-    [b"\xc1", b"", pack({}), pack({"do": "end"}), pack({"do": "step"}), pack({"do": "step", "slots": 0}),
-     pack({"do": "link", "event": 3}), pack({"do": "link"}), pack({"do": "link", "event": {1: 2}})],
-)  # fmt: skip
-def test_what_is_no_request_is_malformed(payload: bytes) -> None:
-    """The error says where it came from and what was expected."""
-    with pytest.raises(MalformedMessage, match=r"malformed message on operator.*expected"):
-        read_request("operator", payload)

@@ -1,0 +1,20 @@
+"""The operator's requests, as the observer reads them. docs/protocol.md has their bytes."""
+
+from __future__ import annotations
+
+import pytest
+
+from evedrop.errors import MalformedMessage
+from evedrop.live.protocol.codec import pack
+from evedrop.live.protocol.requests import read_request
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [b"\xc1", b"", pack({}), pack({"do": "end"}), pack({"do": "step"}), pack({"do": "step", "slots": 0}),
+     pack({"do": "link", "event": 3}), pack({"do": "link"}), pack({"do": "link", "event": {1: 2}})],
+)  # fmt: skip
+def test_what_is_no_request_is_malformed(payload: bytes) -> None:
+    """The error says where it came from and what was expected."""
+    with pytest.raises(MalformedMessage, match=r"malformed message on operator.*expected"):
+        read_request("operator", payload)
