@@ -81,12 +81,7 @@ class WireHistory:
         return [(round(at - self.began, 3), line) for at, line in self.said]
 
     def begin(self, plan: WirePlan, now: float) -> None:
-        """Begin the next start. Raises UsageError if an earlier one had another seed, and OSError if the disk is full."""
-        if self._seed not in {None, plan.seed}:
-            raise UsageError(
-                f"the wire of {self.folder.parent} had the seed {self._seed}, and this one has {plan.seed}: its fates would not "
-                "go on; give the same seed, or another folder"
-            )
+        """Begin the next start, which has the seed of the earlier ones. Raises OSError if the disk is full."""
         links = {link.name: dict(link.settings) for link in plan.links}
         self._write({"start": self.start + 1, "time": now, "seed": plan.seed, "links": links})
 
@@ -124,6 +119,14 @@ class WireHistory:
                     mistakes.append(("corrupt", f"is {as_toml(corrupt)}; expected a probability"))
                 for name, what in mistakes:
                     raise UsageError(f"{self.folder / _FILE} has settings of the link {link} in which {name} {what}")
+
+    def expect_seed(self, plan: WirePlan) -> None:
+        """Raise UsageError if an earlier start had another seed."""
+        if self._seed not in {None, plan.seed}:
+            raise UsageError(
+                f"the wire of {self.folder.parent} had the seed {self._seed}, and this one has {plan.seed}: its fates would not "
+                "go on; give the same seed, or another folder"
+            )
 
     def _write(self, entry: Mapping[str, Any]) -> None:
         line = json.dumps(entry).encode() + b"\n"

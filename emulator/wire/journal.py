@@ -99,7 +99,7 @@ class WireJournal:
         self._next = 0  # the part whose rows are handed over now
         self._amended: deque[tuple[Records, Crossing]] = deque()
         self._number = itertools.count()
-        self._began, self._stopped = time.monotonic(), math.inf
+        self._stopped = math.inf
         self._amended_late: deque[tuple[int, Crossing]] = deque()
         self._convert_after = 0.0
         try:
@@ -122,11 +122,13 @@ class WireJournal:
     def _begin(self, plan: WirePlan) -> None:
         self._history = WireHistory.read(self._folder)
         self._history.expect_laws()
+        self._history.expect_seed(plan)  # before the recovery: a start that is refused changes nothing
         self.recovered = recover(self._folder, self._history)
         """The number of records that an earlier start left behind, because it was killed or the disk was full."""
         self.counts: dict[Numbered, int] = dict(self._history.counts)
         """(link, key, kind of stream) → the number of its next message, as of the records handed to the listeners."""
         self._history.begin(plan, time.time())
+        self._began = time.monotonic()  # after the recovery, which is no part of this start
         self._words = JournalWords(self._place, self.start, self._miss)
         self._alive = os.open(self._place / "alive", os.O_WRONLY | os.O_CREAT, 0o600)
         self._beat()

@@ -93,7 +93,8 @@ class JournalOnDisk:
                     zenoh.KeyExpr(key)
                 except zenoh.ZError as error:
                     raise UsageError(
-                        f"the journal in {self._folder} is damaged: {as_toml(key)} is not a key; remove it, or give another --out"
+                        f"the journal in {self._folder} is damaged: {as_toml(key)} is not a key; remove the journal, or give "
+                        "another folder"
                     ) from error
                 self._codes[key] = len(self._keys)
                 self._keys.append(key)

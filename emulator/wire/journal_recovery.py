@@ -23,23 +23,30 @@ from evedrop.wire.journal_reader import UNFINISHED, damaged, last_beat, parquet_
 def locked(folder: Path) -> int:
     """The descriptor of a folder that this process alone may use until it closes it. Raises UsageError if another one does."""
     descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
+    if not _takes_lock(descriptor, fcntl.LOCK_EX):
         os.close(descriptor)
-        raise UsageError(f"another wire writes to {folder.parent}; end it, or give another folder") from error
-    except OSError:  # a file system without locks
-        pass
+        raise UsageError(f"another wire writes to {folder.parent}; end it, or give another folder")
     return descriptor
 
 
 def is_in_use(folder: Path) -> bool:
-    """Whether another process uses a folder, as `locked` says."""
+    """Whether a wire uses a folder, as `locked` says; False on a file system without locks."""
+    descriptor = os.open(folder, os.O_RDONLY)
     try:
-        os.close(locked(folder))
-    except UsageError:
-        return True
-    return False
+        return not _takes_lock(descriptor, fcntl.LOCK_SH)  # shared: two readers at once do not see each other
+    finally:
+        os.close(descriptor)
+
+
+def _takes_lock(descriptor: int, kind: int) -> bool:
+    """Lock a folder; False if another process has a lock that excludes this one. True on a file system without locks."""
+    try:
+        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        pass
+    return True
 
 
 def recover(journal: Path, history: WireHistory) -> int:

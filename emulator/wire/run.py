@@ -85,6 +85,9 @@ def _begin_results(out: Path, plan: WirePlan) -> None:
     """Write wire.toml, the complete file of the wire, and remove the summary of an earlier start."""
     try:
         (out / WIRE_SUMMARY_FILE).unlink(missing_ok=True)
+    except OSError as error:
+        warn(f"the summary of an earlier start cannot be removed ({error}); the wire goes on")
+    try:
         write_private(out / WIRE_FILE, resolved_wire(plan))
     except OSError as error:
         warn(f"wire.toml cannot be written ({error}); the wire goes on")

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
+import os
 import shutil
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,11 +16,14 @@ import pytest
 from evedrop.cli.main import main
 from evedrop.errors import UsageError
 from evedrop.results.wire_folder import WIRE_FILE
+from evedrop.wire import journal as journal_module
 from evedrop.wire.crossing import Crossing, Kind
 from evedrop.wire.file import resolved_wire
+from evedrop.wire.history import WireHistory
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_on_disk import summary_of_wire
-from evedrop.wire.run import run_wire
+from evedrop.wire.journal_recovery import is_in_use, recover
+from evedrop.wire.run import _begin_results, run_wire
 from tests.pages import checked
 from tests.wire.wire_at_work import LOSSY, both_ways
 
@@ -121,3 +127,75 @@ def test_a_wire_does_not_go_on_after_a_delay_that_no_link_has(folders: dict[str,
         file.write(json.dumps({"change": "robot-base", "time": time.time(), "settings": settings, "since": []}) + "\n")
     with pytest.raises(UsageError, match=r"history\.jsonl has settings of the link robot-base in which delay\."):
         WireJournal(folders["killed"], both_ways(LOSSY))
+
+
+def test_a_start_that_is_refused_leaves_a_killed_wire_as_it_was(folders: dict[str, Path]) -> None:
+    """A start with another seed ends nothing: the wire was killed before, and it was killed afterwards."""
+    killed = folders["killed"]
+    history = killed / "journal" / "history.jsonl"
+    before = history.read_bytes()
+    with pytest.raises(UsageError, match="give the same seed, or another folder"):
+        WireJournal(killed, replace(both_ways(LOSSY), seed=99))
+    assert history.read_bytes() == before
+    assert summary_of_wire(killed).state == "killed"
+
+
+def test_the_time_of_a_start_does_not_include_the_recovery_before_it(
+    folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A long recovery, during which the clock goes on by 1000 s."""
+    late = [0.0]
+    monotonic = time.monotonic
+
+    def slowly(journal: Path, history: WireHistory) -> int:
+        late[0] += 1000.0
+        return recover(journal, history)
+
+    monkeypatch.setattr(journal_module, "recover", slowly)
+    monkeypatch.setattr(time, "monotonic", lambda: monotonic() + late[0])
+    with WireJournal(folders["killed"], both_ways(LOSSY)) as journal:
+        assert late == [1000.0]
+        assert 0.0 <= journal.seconds < 500.0
+
+
+def test_two_readers_at_once_do_not_take_each_other_for_a_wire(folders: dict[str, Path]) -> None:
+    """Another reader holds its lock on the folder of the killed wire; the one that runs is in use all the same."""
+    reader = os.open(folders["killed"] / "journal", os.O_RDONLY)
+    try:
+        fcntl.flock(reader, fcntl.LOCK_SH)
+        assert not is_in_use(folders["killed"] / "journal")
+    finally:
+        os.close(reader)
+    assert is_in_use(folders["running"] / "journal")
+
+
+@pytest.mark.parametrize(
+    ("file", "says"),
+    [
+        ("summary.json", "the summary of an earlier start cannot be removed ("),
+        ("wire.toml", "wire.toml cannot be written ("),
+    ],
+)
+def test_a_file_that_cannot_be_replaced_is_named(
+    file: str, says: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The wire goes on, and the other file is as it should be."""
+    _begin_results(tmp_path, both_ways(LOSSY))
+    (tmp_path / "summary.json").write_text("{}")
+    (tmp_path / file).unlink()
+    (tmp_path / file).mkdir()
+    _begin_results(tmp_path, both_ways(LOSSY))
+    told = capfd.readouterr().err
+    assert says in told
+    assert told.count("the wire goes on") == 1
+    assert (tmp_path / "wire.toml").is_file() == (file != "wire.toml")
+    assert (tmp_path / "summary.json").exists() == (file == "summary.json")
+
+
+def test_a_key_that_is_none_names_the_journal(folders: dict[str, Path]) -> None:
+    """What to remove, in words that are true in Python as well."""
+    words = folders["killed"] / "journal" / "unfinished" / "002.words"
+    assert b"scan" in words.read_bytes()
+    words.write_bytes(words.read_bytes().replace(b"scan", b"//an"))
+    with pytest.raises(UsageError, match="is not a key; remove the journal, or give another folder"):
+        summary_of_wire(folders["killed"])
