@@ -14,10 +14,9 @@ from evedrop.hints import near
 from evedrop.model.checks import as_toml
 from evedrop.scenario.table import Found, Table, expected
 from evedrop.scenario.words import listed
+from evedrop.wire.figures import WIRE_FIGURES
 from evedrop.wire.units import in_seconds
 
-WIRE_FIGURES = ("delivery", "latency", "gap_messages", "gap_seconds")
-"""What can be expected of a link, as in docs/wire.md."""
 _BOUNDS = ("below", "above")
 
 
@@ -65,13 +64,17 @@ class WireExpectTable(Table):
         found = []
         if not set(given) & set(_BOUNDS):
             found.append(("below", "is missing, and so is above; add one of them, or both"))
-        if str(table["figure"]).endswith(".latency") == ("quantile" not in given):
+        figure = WIRE_FIGURES.get(str(table["figure"]).rpartition(".")[2])
+        if (figure is not None and figure.has_quantile) == ("quantile" not in given):
+            names = [one.name for one in WIRE_FIGURES.values() if one.has_quantile]
             said = (
-                "is missing; a latency needs one"
+                f"is missing; a {listed(names)} needs one"
                 if "quantile" not in given
-                else "is set, but only a latency has quantiles"
+                else f"is set, but only a {listed(names)} has quantiles"
             )
-            found.append(("quantile", f"{said}; expected quantile = 0.99 with LINK.latency"))
+            found.append(
+                ("quantile", f"{said}; expected quantile = 0.99 with {listed([f'LINK.{one}' for one in names])}")
+            )
         return found
 
     @property

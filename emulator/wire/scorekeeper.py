@@ -30,6 +30,7 @@ from evedrop.results.wire_summary import (
 from evedrop.score.summary import Judged
 from evedrop.wire.crossing import UNLINKED, Crossing, Kind
 from evedrop.wire.expect import WireExpectTable
+from evedrop.wire.figures import WIRE_FIGURES
 from evedrop.wire.journal import AmendmentListener, Listener
 from evedrop.wire.journal_part import REASONS, Records
 from evedrop.wire.law import bounds, expected
@@ -181,18 +182,8 @@ class WireScorekeeper:
     def _judged(self, table: WireExpectTable, link: WireLinkSummary) -> Judged:
         if table.link is not None:
             return Judged(table.text, link.within_bounds, link.rate, table.wanted)
-        figure = str(table.figure).rpartition(".")[2]
-        found: float | None
-        match figure:
-            case "delivery":
-                found = link.delivered / link.heard if link.heard else None
-            case "latency":
-                tally = self._links[self._plan.named(table.subject).number]
-                found = tally.delay_quantile(table.quantile or 0.5)
-            case "gap_messages":
-                found = link.gap_messages if link.heard else None
-            case _:
-                found = link.gap_seconds if link.heard else None
+        figure = WIRE_FIGURES[str(table.figure).rpartition(".")[2]]
+        found = figure.value(link, self._links[self._plan.named(table.subject).number], table.quantile)
         return Judged(table.text, None if found is None else table.holds(found), found, table.wanted)
 
     def _of_link(self, link: WireLink, tally: LinkTally) -> WireLinkSummary:

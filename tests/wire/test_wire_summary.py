@@ -15,15 +15,17 @@ from evedrop.errors import ScenarioError, UsageError
 from evedrop.report.wire import wire_failures, wire_sentences, wire_table
 from evedrop.report.writing import write_report
 from evedrop.results.wire_folder import WIRE_FILE
-from evedrop.results.wire_summary import WireSummary
+from evedrop.results.wire_summary import WireLinkSummary, WireSummary
 from evedrop.wire.closing import closing_lines
 from evedrop.wire.crossing import AGAIN, UNLINKED, Crossing, Kind
 from evedrop.wire.expect import WireExpectTable
 from evedrop.wire.fates import KeyFates
+from evedrop.wire.figures import WIRE_FIGURES
 from evedrop.wire.file import resolved_wire, wire_of
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.plan import Side, WirePlan
 from evedrop.wire.scorekeeper import WireScorekeeper
+from evedrop.wire.tallies import LinkTally
 from tests.pages import checked
 from tests.wire.wire_links import LOSSES
 from tests.wire.wire_plans import wire_plan
@@ -370,3 +372,27 @@ def test_the_exit_status_tells_of_an_incomplete_journal_and_of_unaccounted_messa
     journal.recorded += 1
     assert keeper.finish(tmp_path) == 3
     assert "unaccounted for: 1 message; this is a fault of Evedrop" in wire_failures(keeper.summary())
+
+
+def test_a_figure_of_a_link_is_one_line_of_the_registry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A wire file may expect something of a figure that is only in the registry, and its own method gives the value."""
+
+    class Bytes:
+        name = "bytes"
+        has_quantile = False
+
+        def value(self, link: WireLinkSummary, tally: LinkTally, quantile: float | None) -> float | None:
+            assert (tally.heard, quantile) == (link.heard, None)
+            return link.bytes
+
+    monkeypatch.setitem(WIRE_FIGURES, "bytes", Bytes())
+    found, _ = run(tmp_path, expecting('[[expect]]\nfigure = "scan.bytes"\nabove = 0.5\n'), messages=30)
+    (judged,) = found["expectations"]
+    assert (judged["held"], judged["found"]) == (True, found["links"]["scan"]["bytes"])
+
+
+def test_the_page_lists_every_figure_of_a_link() -> None:
+    """In the section about expectations."""
+    page = (Path(__file__).parents[2] / "docs" / "wire.md").read_text(encoding="utf-8")
+    section = page.partition("## Expectations")[2].partition("\n## ")[0]
+    assert [name for name in WIRE_FIGURES if name not in section] == []
