@@ -59,7 +59,7 @@ def steps(trials: int, slots: int, rounds: int) -> None:
 
 def packets(scenario: Scenario, batch: Batch) -> list[Reception]:
     """What arrives at an eavesdropper in every slot."""
-    keys, process = StreamKeys.of(scenario), scenario.process.process
+    keys, process = StreamKeys.from_scenario(scenario), scenario.process.process
     scheme = scheme_of(process, scenario.encoding.spec)
     encoder = scheme.encoder(keys.secret(scheme.secret_streams), batch)
     trajectory = Trajectory(process, keys.process, batch)
@@ -74,7 +74,7 @@ def packets(scenario: Scenario, batch: Batch) -> list[Reception]:
 
 def read(scenario: Scenario, strategy: str, batch: Batch, heard: list[Reception]) -> float:
     """Microseconds of the processor a slot."""
-    keys = StreamKeys.of(scenario).eavesdropper(strategy, strategy, {})
+    keys = StreamKeys.from_scenario(scenario).eavesdropper(strategy, strategy, {})
     receiver = STRATEGIES[strategy](Knowledge(scenario.process.process, scenario.encoding.mu_d, {}, keys), batch)
     belief, started = receiver.prior(), time.process_time()
     for k, packet in enumerate(heard):

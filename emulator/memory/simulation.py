@@ -71,7 +71,7 @@ class Simulation:
         self._mode = mode
         self._batch = Batch(scenario.slots, len(trials), trials.start, lineage)
         self._process = scenario.process.process
-        self._keys = StreamKeys.of(scenario)
+        self._keys = StreamKeys.from_scenario(scenario)
         if scenario.modules is not None:
             look_in(scenario.modules)
         self._scheme = scheme_of(self._process, scenario.encoding.spec)

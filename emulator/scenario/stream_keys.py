@@ -42,7 +42,7 @@ class StreamKeys:
     """The wire whose random numbers some links draw; None if each draws its own."""
 
     @classmethod
-    def of(cls, scenario: Scenario) -> StreamKeys:
+    def from_scenario(cls, scenario: Scenario) -> StreamKeys:
         """The keys of a scenario: from its seed, and the secret's from a file if it names one. Raises as `secret_in`."""
         root = root_of_seed(scenario.seed)
         if scenario.secret_file is None:

@@ -91,7 +91,7 @@ def test_over_ssh_it_is_the_same_run(evedrop: Evedrop, server: Sshd) -> None:
     assert digests_of(evedrop.folder / "run") == digests_of(evedrop.folder / "memory")
     logs = {log.stem for log in (evedrop.folder / "run" / "logs").iterdir()}
     assert logs == {"router", "sensor", "legitimate", "smart", "naive", "observer"}
-    secret = [key.hex() for key in StreamKeys.of(load("restart")).secret(("schedule", "noise")).values()]
+    secret = [key.hex() for key in StreamKeys.from_scenario(load("restart")).secret(("schedule", "noise")).values()]
     received = {host: (evedrop.folder / f"{host}.received").read_text() for host in PLACES}
     assert all(key in received["alpha"] and key not in received["beta"] for key in secret)
     assert "schedule" in received["alpha"]

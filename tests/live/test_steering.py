@@ -39,7 +39,7 @@ class Asked:
 
 
 @dataclass
-class Told:
+class RecordingConductor:
     """A conductor that keeps the messages that it would send, and the processes that are present."""
 
     absent: set[str] = field(default_factory=set)
@@ -64,7 +64,7 @@ class Run:
     """A steered run in a test's hands."""
 
     def __init__(self, *events: dict[str, Any], paused: bool = False) -> None:
-        self.conductor = Told()
+        self.conductor = RecordingConductor()
         self.kept: list[Scenario] = []
         self.news: list[News] = []
         scenario = checked({**TABLES, "event": list(events)}, "test")

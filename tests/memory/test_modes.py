@@ -140,7 +140,7 @@ def test_which_streams_are_drawn(mode: Mode, monkeypatch: pytest.MonkeyPatch) ->
         of = scenario(MARGINAL, 40, **receivers)
         drawn.clear()
         played(of, mode, 10)
-        keys = StreamKeys.of(of)
+        keys = StreamKeys.from_scenario(of)
         secret = keys.secret(("schedule", "noise"))
         assert secret["schedule"] in drawn
         assert all(keys.link(name, of.schedule(name))[f"link/{name}"] in drawn for name in of.receivers)

@@ -60,7 +60,7 @@ def scenario_of(process: dict[str, list[list[float]]], slots: int, first_trial: 
 def test_same_deliveries_same_bits(process: dict[str, list[list[float]]], slots: int, first_trial: int) -> None:
     """Fed with the deliveries of a run, it has our digest, and reports what we report."""
     scenario = scenario_of(process, slots, first_trial)
-    keys, batch = StreamKeys.of(scenario), Batch(slots, 9, first_trial)
+    keys, batch = StreamKeys.from_scenario(scenario), Batch(slots, 9, first_trial)
     made = briefs_of(scenario, "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False))
     peer = Estimator(json.loads(made["legitimate"].text))
     model = scenario.process.process

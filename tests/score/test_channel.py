@@ -59,7 +59,7 @@ def tally_of(one: Scenario, name: str) -> Tally:
     """What a run would have counted."""
     schedule = one.schedule(name)
     batch, accountant = Batch(one.slots, one.trials), Accountant(schedule.window, one.trials)
-    fates = Link(schedule, name, StreamKeys.of(one).link(name, schedule), batch).fates(range(one.slots))
+    fates = Link(schedule, name, StreamKeys.from_scenario(one).link(name, schedule), batch).fates(range(one.slots))
     account = accountant.account(range(one.slots), fates)
     tally = Tally(one.slots, one.trials, done=one.slots, offered=one.slots * one.trials)
     tally.account(account.delivered, (account.delivered).astype(np.uint8), account.lost)

@@ -118,7 +118,7 @@ def briefs_of(
     if isinstance(endpoints, str):
         endpoints = endpoints_at(endpoints)
     endpoints.check(scenario.relayed)
-    keys = StreamKeys.of(scenario)
+    keys = StreamKeys.from_scenario(scenario)
     steered = () if scenario.controller is None else (CONTROLLER,)
     users = {
         name: secrets.token_urlsafe(24) for name in (ROUTER, SENSOR, *scenario.receivers, *steered, OBSERVER, OPERATOR)

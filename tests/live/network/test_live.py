@@ -270,7 +270,7 @@ def test_the_attack_left_no_trace_in_the_run(evidence: Evidence, tmp_path: Path)
 
 def secrets_of(scenario: Scenario) -> dict[str, bytes]:
     """Every piece of key material of a scenario, by name."""
-    keys = StreamKeys.of(scenario)
+    keys = StreamKeys.from_scenario(scenario)
     found = {"seed's root": keys.seed_root, "secret's root": keys.secret_root, "process": keys.process}
     found |= keys.links({name: scenario.schedule(name) for name in scenario.receivers})
     found |= {f"coin/{name}": stream_key(keys.seed_root, f"coin/{name}") for name in scenario.eavesdroppers}

@@ -156,7 +156,8 @@ def test_a_secret_file_replaces_the_seed_where_it_must(tmp_path: Path) -> None:
     for name, brief in plain.items():
         for stream, key in brief.keys.items():
             assert (own[name].keys[stream] == key) == (stream not in {"schedule", "noise"})
-    assert StreamKeys.of(scenario_of(secret_file=str(secret))).seed_root == StreamKeys.of(scenario_of()).seed_root
+    keys = [StreamKeys.from_scenario(one) for one in (scenario_of(secret_file=str(secret)), scenario_of())]
+    assert keys[0].seed_root == keys[1].seed_root
 
 
 def test_passwords_and_run_are_made_afresh() -> None:
