@@ -12,7 +12,7 @@ from tests.packages import install
 from tests.view.read_back import rows
 
 COMMAND = """
-from evedrop.command import Command
+from evedrop.extend import Command
 
 def greet(options):
     print("hello")
@@ -82,16 +82,22 @@ def test_a_package_with_one_of_each_runs(evedrop: Evedrop, environment: dict[str
     assert live["peers"]["smart"]["largest_error"] == memory["peers"]["smart"]["largest_error"] > 0.0
     assert [one["held"] for one in live["expectations"]] == [True]
     assert [one["event"] for one in live["events"]] == ["dim legitimate", "legitimate is bright again"]
+    page = (evedrop.folder / "live" / "report.html").read_text(encoding="utf-8")
+    told = {"flipped", "chaser", "shifts", "steady", "smart.largest_error above 0: held", "<td>dim legitimate</td>"}
+    assert {one for one in told if one in page} == told
     assert len(rows(evedrop.folder / "live" / "recording.rrd", "ratio/smart", "Scalars:scalars")) == 60
     assert "say hello" in evedrop.process("--help", env=environment).out
 
 
 def test_studies_and_checks_take_them_too(evedrop: Evedrop, environment: dict[str, str]) -> None:
     """`check` with its options for classes, `compare` and `sweep`, by their short names."""
-    for kind, name in (("scheme", "flipped"), ("link", "shifts"), ("delay", "steady")):
+    for kind, name in (("scheme", "flipped"), ("eavesdropper", "chaser"), ("link", "shifts"), ("delay", "steady")):
         done = evedrop.process("check", f"--{kind}", name, env=environment)
         assert done.status == 0, done.out
     (evedrop.folder / "each.toml").write_text(SCENARIO)
+    done = evedrop.process("design", "each.toml", env=environment)
+    assert done.status == 2
+    assert "flipped" in done.err
     small = ("--slots", "40", "--trials", "4")
     who = ("--schemes", "flipped,plain", "--adversaries", "chaser,naive")
     done = evedrop.process("compare", "each.toml", *small, *who, "--out", "compared", env=environment)

@@ -80,6 +80,13 @@ class Parser(argparse.ArgumentParser):
             named["type"] = _choice(named["choices"])
         return super().add_argument(*given, **named)
 
+    def options(self) -> set[str]:
+        """The options of this parser and of all its commands, as a user types them."""
+        return set(self._own_options()).union(*(one.options() for one in self._commands.values()))
+
+    def _own_options(self) -> list[str]:
+        return [*getattr(self, "_option_string_actions", ())]
+
     def format_help(self) -> str:
         """For a parser with sections, the commands under their titles; otherwise as argparse writes it."""
         if not self.sections:
@@ -101,7 +108,7 @@ class Parser(argparse.ArgumentParser):
         if unknown:
             parser: Parser = getattr(options, "parser", self)
             word = unknown[0]
-            known = [name for name in getattr(parser, "_option_string_actions", ()) if name.startswith("--")]
+            known = [name for name in parser._own_options() if name.startswith("--")]
             what = "option" if word.startswith("-") else "argument"
             parser.error(f"unknown {what} {word}{near(word.partition('=')[0], known)}")
         return options

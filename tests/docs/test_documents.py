@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import re
 import shlex
 from pathlib import Path
@@ -56,21 +55,12 @@ _PIP = {"--force-reinstall"}
 
 def test_every_option_that_the_code_names_is_one() -> None:
     """A message that advises an option names one that a command has."""
-    known = options(cli.parser_of()) | _PIP
+    known = cli.parser_of().options() | _PIP
     sources = [path.relative_to(DOCS.parent).as_posix() for path in sorted((DOCS.parent / "emulator").rglob("*.py"))]
     assert set(sources) > OTHER_OPTIONS
     for source in set(sources) - OTHER_OPTIONS:
         text = (DOCS.parent / source).read_text(encoding="utf-8")
         assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", text)) <= known, source
-
-
-def options(parser: argparse.ArgumentParser) -> set[str]:
-    """The options of a parser and of all its commands."""
-    found = {option for action in parser._actions for option in action.option_strings}
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            found = found.union(*(options(one) for one in action.choices.values()))
-    return found
 
 
 def test_every_scheme_has_a_page_or_shares_one() -> None:

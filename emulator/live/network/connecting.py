@@ -110,9 +110,13 @@ def _reason(error: OSError | zenoh.ZError) -> object:
 
 
 def connected(
-    address: RouterAddress, patience: float, meanwhile: Callable[[], None] = lambda: None, clock: Clock = SYSTEM_CLOCK
+    address: RouterAddress,
+    patience: float,
+    meanwhile: Callable[[], None] = lambda: None,
+    clock: Clock = SYSTEM_CLOCK,
+    opened: Callable[[zenoh.Config], zenoh.Session] = zenoh.open,
 ) -> zenoh.Session:
-    """Open a session with the router; `meanwhile` is called before each attempt.
+    """Open a session with the router; `meanwhile` is called before each attempt, `opened` opens it.
 
     Raises BriefError for an error that waiting cannot mend, RunError if no router has answered after `patience` seconds.
     """
@@ -125,7 +129,7 @@ def connected(
         tried = clock.monotonic()
         try:
             _knock(endpoint, address)
-            return zenoh.open(zenoh.Config.from_json5(json.dumps(address.config)))
+            return opened(zenoh.Config.from_json5(json.dumps(address.config)))
         except (OSError, zenoh.ZError) as error:
             failures.add_attempt(error, clock.monotonic() - tried)
             why = _reason(error)

@@ -165,8 +165,12 @@ class Session:
         listen: str | None = None,
         meanwhile: Callable[[], None] = lambda: None,
         clock: Clock = SYSTEM_CLOCK,
+        opened: Callable[[zenoh.Config], zenoh.Session] = zenoh.open,
     ) -> None:
-        """config, listen: a router's configuration, and its address; meanwhile: called while waiting for the router."""
+        """config, listen: a router's configuration, and its address; meanwhile: called while waiting for the router.
+
+        opened: opens a session with the router, the first one and those after a lost connection.
+        """
         zenoh.init_log_from_env_or(_LOGGED)
         if brief.ends_with_stdin:
             when_launcher_is_gone(lambda: os._exit(3))
@@ -185,8 +189,8 @@ class Session:
         if config is None or listen is None:
             address = _once(router_address_of(brief))
             once = zenoh.Config.from_json5(json.dumps(address.config))
-            first = connected(address, self.patience, meanwhile, clock)
-            self.connection = Connection(first, lambda: self._waiting.attempt(lambda: zenoh.open(once)), self._changed)
+            first = connected(address, self.patience, meanwhile, clock, opened)
+            self.connection = Connection(first, lambda: self._waiting.attempt(lambda: opened(once)), self._changed)
         else:
             self.connection = Connection(_listening(listen, brief.identity, config), None)
         self._outlets: dict[str, Outlet] = {}

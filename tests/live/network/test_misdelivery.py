@@ -240,17 +240,15 @@ def test_an_inbox_that_is_closed_says_so(stage: Stage) -> None:
     assert [str(error) for error in caught] == [stage.keys.downlink("eve")]
 
 
-def test_zenoh_reconnects_no_session(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_zenoh_reconnects_no_session(stage: Stage) -> None:
     """Neither the first session of a process nor a later one: what keys mean would be confused before it is replaced."""
     seen: list[dict[str, Any]] = []
-    honest = zenoh.open
 
     def opened(config: zenoh.Config) -> zenoh.Session:
         seen.append(json.loads(config.get_json("connect/retry")))
-        return honest(config)
+        return zenoh.open(config)
 
-    monkeypatch.setattr(zenoh, "open", opened)
-    with Session(stage.eve) as session:
+    with Session(stage.eve, opened=opened) as session:
         stage.cable.flap()
         until(lambda: session.connection.openings > 1, "another session")
     assert len(seen) > 1
