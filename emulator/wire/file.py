@@ -85,7 +85,7 @@ def resolved_wire(plan: WirePlan) -> str:
             "side": {name: _side_table(side) for name, side in plan.sides.items()},
             "link": [_link_table(link) for link in plan.links],
             "event": [_event_table(event) for event in plan.events],
-            "expect": [dict(one) for one in plan.expectations],
+            "expect": [one.model_dump(exclude_none=True) for one in plan.expectations],
         }
     )
 
@@ -115,7 +115,7 @@ def _plan(file: WireFile) -> WirePlan:
         query_seconds=file.query_seconds,
         held_messages=file.held_messages,
         held_bytes=file.held_bytes,
-        expectations=tuple(one.model_dump(exclude_none=True) for one in file.expect),
+        expectations=tuple(file.expect),
     )
 
 

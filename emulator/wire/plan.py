@@ -12,6 +12,8 @@ from typing import Any
 
 import zenoh
 
+from evedrop.wire.expect import WireExpectTable
+
 _HISTORY = "/@adv/"
 """What follows the key of an advanced publisher in the keys of its history."""
 
@@ -117,7 +119,7 @@ class WirePlan:
     """The most messages that wait for their delay to be over, on all links together."""
     held_bytes: int = 2**30
     """Their most bytes."""
-    expectations: tuple[Mapping[str, Any], ...] = ()
+    expectations: tuple[WireExpectTable, ...] = ()
 
     def link_of(self, source: str, target: str, key: zenoh.KeyExpr, *, query: bool = False) -> WireLink | None:
         """The first link that takes the messages of a key from one side to another; None if no link does.

@@ -161,8 +161,7 @@ class WireScorekeeper:
 
     def judged(self, links: Mapping[str, WireLinkSummary]) -> list[Judged]:
         """The expectations of the wire, and whether they held."""
-        tables = [WireExpectTable.model_validate(table) for table in self._plan.expectations]
-        return [self._judged(table, links[table.subject]) for table in tables]
+        return [self._judged(table, links[table.subject]) for table in self._plan.expectations]
 
     def finish(self, out: Path) -> int:
         """Write summary.json of a wire whose journal is closed; returns the exit status.
