@@ -130,11 +130,13 @@ class Viewer:
         return self._process.pid
 
     @classmethod
-    def start(cls, mode: str, logs: Path, recording: Path, complete: bool = False) -> Viewer | None:
+    def start(
+        cls, mode: str, logs: Path, recording: Path, complete: bool = False, options: Sequence[str] = _WINDOW
+    ) -> Viewer | None:
         """Start a viewer and wait until it is ready; None for "off". Its output goes to viewer.log in the folder `logs`.
 
         mode: "native", "web", "off", or "auto". recording: the file to show, from its beginning on and as it grows; it need not
-        exist yet. complete: whether the file no longer grows.
+        exist yet. complete: whether the file no longer grows. options: those that a window is started with.
 
         Raises UsageError if it cannot be started.
         """
@@ -146,7 +148,7 @@ class Viewer:
         followed = Followed(recording, complete)
         if mode == "web":
             return _repeatedly(lambda: cls._page(followed, HOST, HOST, free_port(), free_port(), logs))
-        return _repeatedly(lambda: cls._window(followed, free_port(), logs))
+        return _repeatedly(lambda: cls._window(followed, free_port(), logs, options))
 
     @classmethod
     def serve(cls, web_address: WebAddress, logs: Path, recording: Path, complete: bool = False) -> Viewer:
@@ -182,10 +184,10 @@ class Viewer:
         return cls(process, followed, [served, page], f"http://{seen}:{port}/?url={data}&{_DARK}")
 
     @classmethod
-    def _window(cls, followed: Followed, port: int, logs: Path) -> Viewer:
+    def _window(cls, followed: Followed, port: int, logs: Path, options: Sequence[str]) -> Viewer:
         from evedrop.view.growing_recording import feed  # noqa: PLC0415 - only with a view
 
-        arguments = ["--port", str(port), *_WINDOW, "-"]
+        arguments = ["--port", str(port), *options, "-"]
         process = spawn(port, arguments, logs, stdin=subprocess.PIPE, apart=not _screen_is_remote())
         assert process.stdin is not None  # noqa: S101 - it is a pipe
         feed(followed, process.stdin)

@@ -203,15 +203,14 @@ def test_those_who_only_connect_keep_nobody_out_for_long(viewer: Viewer, tmp_pat
 
 @pytest.fixture
 def headless(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A window that needs no screen."""
-    monkeypatch.setattr("evedrop.view.viewer._WINDOW", ("--headless",))
+    """A screen for a window, which needs none."""
     monkeypatch.setenv("DISPLAY", ":0")
 
 
 def window(logs: Path, recording: Path) -> Viewer:
     """A window that shows a recording. Skips the test where nothing can draw one."""
     try:
-        started = Viewer.start("native", logs, recording)
+        started = Viewer.start("native", logs, recording, options=("--headless",))
     except UsageError as error:
         if "graphics adapter" not in str(error) and "render context" not in str(error):
             raise
