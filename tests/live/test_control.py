@@ -166,7 +166,7 @@ def test_a_paused_run_stands_still(steered: Start, evedrop: Evedrop) -> None:
     assert [(one["slot"] - at, one["event"], one["by"]) for one in summary["events"]] == [
         (-at, "pause the run", "operator"),
         (-at, "step 300 slots", "operator"),
-        (0, "pause the run", "operator"),
+        *([(0, "pause the run", "operator")] if at < 300 else []),  # the step may be over before the operator says so
         (0, "link smart: quality = 0.5", "operator"),
         (0, "step 4 slots", "operator"),
         (4, "resume the run", "operator"),
