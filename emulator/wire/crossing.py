@@ -5,9 +5,12 @@ Source: docs/wire.md, the journal.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evedrop.model.links.link import Fate
 
@@ -79,3 +82,15 @@ RECORD = np.dtype(
     ]
 )
 """A row of the journal while the wire runs, 48 bytes; codes of keys and sources are in another file."""
+
+
+def next_numbers(block: NDArray[Any]) -> Iterator[tuple[int, int, Kind, int]]:
+    """The codes of link and key, the kind, and the number after the last message, for each stream of a block of `RECORD`s."""
+    rows = block[(block["n"] >= 0) & (block["link"] != UNLINKED)]
+    link, key, kind = (rows[name].astype(np.uint64) for name in ("link", "key", "kind"))
+    streams = link << np.uint64(40) | key << np.uint64(8) | kind & np.uint64(0x7F)
+    found, places = np.unique(streams, return_inverse=True)
+    numbers = np.zeros(len(found), np.int64)
+    np.maximum.at(numbers, places, rows["n"] + 1)
+    for stream, n in zip(found.tolist(), numbers.tolist(), strict=True):
+        yield stream >> 40, stream >> 8 & 0xFFFF_FFFF, Kind(stream & 0xFF), n

@@ -29,7 +29,7 @@ from evedrop.model.slot.link import Change
 from evedrop.output import warn
 from evedrop.results.folder import make_private
 from evedrop.results.wire_summary import JournalState
-from evedrop.wire.crossing import RECORD, UNLINKED, Crossing, Kind
+from evedrop.wire.crossing import RECORD, Crossing, next_numbers
 from evedrop.wire.history import Numbered, WireHistory, highest
 from evedrop.wire.journal_part import (
     STORED,
@@ -342,15 +342,8 @@ class WireJournal:
 
     def _count(self, block: Records) -> None:
         """Raise `counts` to the numbers in a block."""
-        rows = block[(block["n"] >= 0) & (block["link"] != UNLINKED)]
-        link, key, kind = (rows[name].astype(np.uint64) for name in ("link", "key", "kind"))
-        streams = link << np.uint64(40) | key << np.uint64(8) | kind & np.uint64(0x7F)
-        found, places = np.unique(streams, return_inverse=True)
-        numbers = np.zeros(len(found), np.int64)
-        np.maximum.at(numbers, places, rows["n"] + 1)
-        for stream, n in zip(found.tolist(), numbers.tolist(), strict=True):
-            name = (self.links[stream >> 40], self.key_of(stream >> 8 & _LARGEST), Kind(stream & 0xFF).stream)
-            highest(self.counts, name, n)
+        for link, key, kind, n in next_numbers(block):
+            highest(self.counts, (self.links[link], self.key_of(key), kind.stream), n)
 
     def _convert(self, at: int) -> None:
         """Make the Parquet file of a part, and forget the part.

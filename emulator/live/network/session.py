@@ -260,11 +260,7 @@ class Session:
         return self._outlets[key]
 
     def kept(
-        self,
-        key: str,
-        span: int | None = None,
-        head: Callable[[int, int, int], bytes] | None = None,
-        back: int = 0,
+        self, key: str, span: int | None = None, head: Callable[[int, int, int], bytes] | None = None, back: int = 0
     ) -> ReplayBuffer:
         """A publisher for one exact key, whose messages are sent again after a lost connection; as in `ReplayBuffer`."""
         kept = ReplayBuffer(self.outlet(key), span, head, back)

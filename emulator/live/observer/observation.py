@@ -66,11 +66,7 @@ class ObservedRun:
     """The observer's work on one run."""
 
     def __init__(
-        self,
-        brief: Brief[ObserverPart],
-        scenario: Scenario,
-        confirmations: SimpleQueue[bytes],
-        by_hand: bool = False,
+        self, brief: Brief[ObserverPart], scenario: Scenario, confirmations: SimpleQueue[bytes], by_hand: bool = False
     ) -> None:
         """by_hand: whether the processes were started by hand, so that there is no launcher to end them."""
         self._place = Path(brief.part.results)
