@@ -107,7 +107,7 @@ def wire_faults(summary: WireSummary) -> Iterator[str]:
 
 
 def _unfinished(summary: WireSummary) -> str:
-    """What to say of a wire that has not ended; empty for one that has."""
+    """The sentence about a wire that has not ended; empty if it has ended."""
     return {"running": "the wire still runs", "killed": "the wire was killed"}.get(summary.state, "")
 
 

@@ -128,7 +128,7 @@ class WireJournal:
         self.counts: dict[Numbered, int] = dict(self._history.counts)
         """(link, key, kind of stream) → the number of its next message, as of the records handed to the listeners."""
         self._history.begin(plan, time.time())
-        self._began = time.monotonic()  # after the recovery, which is no part of this start
+        self._began = time.monotonic()  # the recovery of an earlier start does not count
         self._words = JournalWords(self._place, self.start, self._miss)
         self._alive = os.open(self._place / "alive", os.O_WRONLY | os.O_CREAT, 0o600)
         self._beat()

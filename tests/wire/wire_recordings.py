@@ -1,0 +1,29 @@
+"""The messages of a wire that tests of its view show, and what a recording of them contains."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rerun.chunk import RrdReader
+
+from evedrop.view.column import ELAPSED
+
+RATES = {"scan": 100.0, "command": 20.0, "listener": 100.0}
+SECONDS = 12.0
+CUT = (6.0, 8.0)
+
+
+def shown(rrd: Path, entity: str, component: str) -> list[tuple[float, Any]]:
+    """The component's values of one entity, with their times in seconds, in order of time."""
+    found = []
+    for chunk in RrdReader(rrd).stream().filter(content=f"/{entity}", is_static=False):
+        columns = chunk.to_record_batch().to_pydict()
+        times = [one.total_seconds() for one in columns[ELAPSED]]
+        found += list(zip(times, columns[component], strict=True))
+    return sorted(found, key=lambda one: one[0])
+
+
+def texts(rrd: Path) -> list[tuple[float, str]]:
+    """The lines of the events."""
+    return [(round(seconds, 6), text[0]) for seconds, text in shown(rrd, "events", "TextLog:text")]
