@@ -39,7 +39,7 @@ bench: $(READY)
 
 # Also the tests with random examples, with more examples than in `make test`.
 test-long: $(READY)
-	$(BIN)/python -m pytest --hypothesis-profile=full -m "long or hypothesis"
+	$(BIN)/python -m pytest -n 2 --hypothesis-profile=full -m "long or hypothesis"
 
 # Every notebook of docs/notebooks from top to bottom, in a kernel.
 notebooks: $(NOTEBOOKS_READY)

@@ -9,6 +9,7 @@ import importlib.metadata
 import platform
 import threading
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Protocol, final
 
@@ -16,6 +17,7 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
+from evedrop.errors import UsageError
 from evedrop.model.slot.link import Change
 from evedrop.output import warn
 from evedrop.results.folder import replace_private
@@ -221,9 +223,18 @@ class WireScorekeeper:
         )
 
     def _law(self, link: WireLink, key: int, kind: int, tally: StreamTally) -> tuple[float, float]:
-        """How many of a stream's messages its models should have let through, and the variance of this number."""
+        """How many of a stream's messages its models should have let through, and the variance of this number.
+
+        Raises UsageError if a message has two fates, which only a journal on disk that was changed can say.
+        """
         changes = self._journal.changes_of(link.name, self._journal.key_of(key), Kind(kind).stream)
         ranges = [range(*numbers) for numbers in sorted(tally.ranges)]
+        for before, after in pairwise(ranges):
+            if after.start < before.stop:
+                raise UsageError(
+                    f"the journal has two fates for message {after.start} of {self._journal.key_of(key)!r} on the link "
+                    f"{link.name!r}; a file of it was changed, so give the results folder as the wire wrote it"
+                )
         mean, variance = expected(link.settings, changes, ranges)
         if not tally.scattered:
             return mean, variance

@@ -227,6 +227,17 @@ def test_figures_from_the_disk_are_those_of_the_wire(tmp_path: Path) -> None:
     assert (found.start, found.heard, found.links["scan"].delivered) == (2, 1, 1)
 
 
+def test_a_journal_with_two_fates_of_a_message_is_refused(tmp_path: Path) -> None:
+    """Its models cannot be compared with it: where the fates of a chain of losses overlapped, this ended in a singular matrix."""
+    plan = wire_plan()
+    with WireJournal(tmp_path, plan) as journal:
+        for n in (4, 5, 4, 6):
+            journal.record(1e9, n, -1, 0.0, journal.key_code("scan/0"), 0, 64, 0, Kind.PUT, Crossing.LOST)
+        journal.flush()
+        with pytest.raises(UsageError, match="two fates for message 4 of 'scan/0' on the link 'scan'"):
+            scorekeeper_on_disk(tmp_path, plan).summary()
+
+
 def test_the_page_shows_the_example_and_every_method() -> None:
     """As it is executed, and all that a wire has."""
     docs = Path(__file__).parents[2] / "docs"
