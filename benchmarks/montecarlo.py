@@ -95,7 +95,7 @@ def study(slots: int) -> float:
     """Seconds of the paper's study with some number of slots."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "microgrid.toml"
-        file.write_text(MICROGRID)
+        file.write_text(MICROGRID, encoding="utf-8")
         grid = {"encoding.state_probability": [round(0.1 * i, 1) for i in range(1, 10)]}
         plan = Plan(Mode.COVARIANCE_ONLY, workers=2)
         out = Path(folder) / "out"

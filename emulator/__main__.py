@@ -19,16 +19,13 @@ def program() -> NoReturn:
     heed_signals()
 
     from evedrop.cli.main import is_role, main  # noqa: PLC0415 - the handlers come first
-    from evedrop.output import let_go  # noqa: PLC0415 - the same
 
     status = main()
     if is_role(sys.argv[1:]):
         # Threads of the process may still be in Zenoh; an interpreter that exits meanwhile aborts (Python 3.11).
-        let_go()
         os._exit(status)
     for number in heeded():  # the command is over: ignore signals while the interpreter exits
         signal.signal(number, signal.SIG_IGN)
-    let_go()
     sys.exit(status)
 
 

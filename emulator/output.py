@@ -1,17 +1,32 @@
-"""The output of a command, whose terminal may be gone, or may be a pipe without a reader."""
+"""The output of a command: a reader that has left, a full disk and a narrow encoding end no work, and leave no file unwritten.
+
+A command writes to `sys.stdout` and `sys.stderr` as if that could not fail. What cannot be written is lost; what the encoding
+lacks is spelled in ASCII.
+"""
 
 from __future__ import annotations
 
+import codecs
 import contextlib
+import io
+import json
 import os
+import re
 import sys
-from collections.abc import Callable, Iterator
-from typing import Any, TextIO, TypeVar, final
+from collections.abc import Iterator
+from typing import Any, TextIO, cast, final
 
-T = TypeVar("T")
-
-OUTPUT = "standard output"
-"""The file name in errors of standard output."""
+_SPELLED = "evedrop.spelled"
+"""The name of the error handler that spells characters in ASCII."""
+_SPELLINGS = {
+    "−": "-", "–": "-", "—": "-", "·": "-", "─": "-", "…": "...", "±": "+/-", "×": "x", "÷": "/", "≥": ">=", "≤": "<=",
+    "≈": "~", "√": "sqrt ", "∞": "inf", "°": " deg ", "‰": " per mille", "€": "EUR", "′": "'", "’": "'", "‘": "'", "“": '"',
+    "”": '"', "„": '"', "µ": "mu", "\N{COMBINING CIRCUMFLEX ACCENT}": "_hat", "\N{COMBINING TILDE}": "_tilde",
+    "\N{COMBINING MACRON}": "_bar",
+}  # fmt: skip
+_GREEK = re.compile("GREEK (SMALL|CAPITAL) LETTER (?:FINAL )?([A-Z]+)$")
+_MARKS = {"<super>": "^", "<sub>": "_"}
+"""The beginning of a character's decomposition → the mark of an exponent, of an index."""
 
 
 def say(text: str) -> None:
@@ -25,67 +40,111 @@ def warn(text: str) -> None:
     say(f"warning: {text}")
 
 
-@contextlib.contextmanager
-def named_output() -> Iterator[None]:
-    """Mark errors of standard output with its name, so that other errors are not taken for them."""
-    if sys.stdout is None:
-        yield
-    else:
-        with contextlib.redirect_stdout(_Named(sys.stdout, OUTPUT)):
-            yield
+def print_json(value: object) -> None:
+    """Print a value as one line of JSON, whose content does not depend on the encoding of standard output."""
+    encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
+    text = json.dumps(value, ensure_ascii=codecs.lookup(encoding).name != "utf-8")
+    sys.stdout.write(f"{text}\n")
 
 
 @final
-class _Named:
-    """A stream whose errors carry a file name."""
+class Output:
+    """A text stream that never fails: after the first error, what is written to it is lost."""
 
-    def __init__(self, stream: TextIO, name: str) -> None:
+    def __init__(self, stream: TextIO) -> None:
         self._stream = stream
-        self._name = name
+        self._terminal = stream.isatty()
+        self.failed: OSError | None = None
+        """The first error, unless the reader or the terminal is gone, which is what its user wanted."""
+        self._over = False
 
     def write(self, text: str) -> int:
-        return self._tried(lambda: self._stream.write(text))
+        """Write text, if that is possible; returns its length."""
+        if not self._over:
+            try:
+                self._stream.write(text)
+            except OSError as error:
+                self._end(error)
+        return len(text)
 
     def flush(self) -> None:
-        self._tried(self._stream.flush)
+        """Write what is buffered, if that is possible."""
+        if not self._over:
+            try:
+                self._stream.flush()
+            except OSError as error:
+                self._end(error)
+
+    def _end(self, error: OSError) -> None:
+        self._over = True
+        if not (self._terminal or isinstance(error, ConnectionError)):
+            self.failed = error
+        # The interpreter flushes the buffer again when it exits.
+        with contextlib.suppress(OSError, ValueError):
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, self._stream.fileno())
+            os.close(nowhere)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
-    def _tried(self, act: Callable[[], T]) -> T:
-        try:
-            return act()
-        except OSError as error:
-            error.filename = self._name
-            raise
+
+@contextlib.contextmanager
+def standard_streams() -> Iterator[Output]:
+    """Replace standard output and standard error by streams that never fail; gives standard output.
+
+    A stream that the shell has closed is replaced by one that goes nowhere.
+    """
+    codecs.register_error(_SPELLED, _spelled)
+    with contextlib.ExitStack() as stack:
+        out, err = (stack.enter_context(_unfailing(one)) for one in (sys.stdout, sys.stderr))
+        stack.enter_context(contextlib.redirect_stderr(cast(TextIO, err)))
+        stack.enter_context(contextlib.redirect_stdout(cast(TextIO, out)))
+        yield out
 
 
-def finish() -> None:
-    """Flush standard output; ignores errors, because another error is being reported."""
-    _flush(sys.stdout)
+@contextlib.contextmanager
+def _unfailing(stream: TextIO | None) -> Iterator[Output]:
+    """An output to a stream, which is flushed in the end."""
+    with contextlib.ExitStack() as stack:
+        if stream is None:
+            stream = stack.enter_context(open(os.devnull, "w", encoding="utf-8"))
+        if isinstance(stream, io.TextIOWrapper):
+            stack.callback(_set_errors, stream, stream.errors)
+            _set_errors(stream, _SPELLED)
+        output = Output(stream)
+        stack.callback(output.flush)
+        yield output
 
 
-def let_go() -> None:
-    """Flush both streams for the last time; if one fails, the interpreter would otherwise exit with a status of its own."""
-    for stream in (sys.stdout, sys.stderr):
-        _flush(stream)
+def _set_errors(stream: io.TextIOWrapper, errors: str | None) -> None:
+    with contextlib.suppress(OSError, ValueError):  # it flushes first
+        stream.reconfigure(errors=errors)
 
 
-def silence() -> None:
-    """Discard further standard output, including the flush when the interpreter exits."""
-    _discard(sys.stdout)
+def _spelled(error: UnicodeError) -> tuple[str, int]:
+    """Replace characters that an encoding lacks; an error handler, see `codecs.register_error`."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    parts: list[str] = []
+    before = ""
+    for character in error.object[error.start : error.end]:
+        mark, text = _spelling(character)
+        parts += [text] if mark == before else [mark, text]
+        before = mark
+    return "".join(parts), error.end
 
 
-def _flush(stream: TextIO | None) -> None:
-    """Flush a stream; discards the text if its reader is gone."""
-    try:
-        if stream is not None:
-            stream.flush()
-    except (OSError, ValueError):
-        _discard(stream)
+def _spelling(character: str) -> tuple[str, str]:
+    """A mark, ^ for an exponent and _ for an index, and a character in ASCII: by its name if Greek, otherwise by its number."""
+    import unicodedata  # noqa: PLC0415 - few commands need it
 
-
-def _discard(stream: TextIO | None) -> None:
-    with contextlib.suppress(OSError, ValueError):
-        if stream is not None:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+    if character in _SPELLINGS:
+        return "", _SPELLINGS[character]
+    if found := _GREEK.match(unicodedata.name(character, "")):
+        return "", found[2].capitalize() if found[1] == "CAPITAL" else found[2].lower()
+    how, *numbers = unicodedata.decomposition(character).split() or [""]
+    if how in _MARKS and len(numbers) == 1:
+        base = chr(int(numbers[0], 16))
+        return _MARKS[how], base if base.isascii() else _spelling(base)[1]
+    return "", character.encode("ascii", "backslashreplace").decode()

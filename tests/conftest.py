@@ -243,10 +243,7 @@ class Evedrop:
             tempfile.TemporaryFile("w+", encoding="utf-8", dir=self.folder) as err,
         ):
             with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-                try:
-                    status = cli.main(arguments)
-                except SystemExit as left:  # argparse has said what it expected
-                    status = int(left.code or 0)
+                status = cli.main(arguments)
             texts = []
             for file in (out, err):
                 file.seek(0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import shlex
 import sys
 from pathlib import Path
@@ -11,7 +10,7 @@ from pathlib import Path
 from evedrop.cli.report import print_summary
 from evedrop.errors import UsageError
 from evedrop.loading import load
-from evedrop.output import silence
+from evedrop.output import print_json, say
 from evedrop.results.writer import load_results
 
 
@@ -22,7 +21,7 @@ def print_results(folder: Path, as_json: bool = False) -> None:
     """
     results = load_results(folder)
     if as_json:
-        sys.stdout.write(json.dumps(results.summary, ensure_ascii=False) + "\n")
+        print_json(results.summary)
         return
     summary = results.typed_summary
     print_summary(summary, str(folder), None if summary.mode == "live" else replay_command(folder))
@@ -49,22 +48,17 @@ def print_report_line(folder: Path) -> None:
 
 
 def print_ending(folder: Path, status: int, how: str) -> None:
-    """Print the output of `evedrop run` at its end: the closing report, and the reason for a failure; never fails itself.
+    """Print the output of `evedrop run` at its end: the closing report, and the reason for a failure.
 
     status: the exit status of the run; how: why it failed.
     """
-    try:
+    with contextlib.suppress(UsageError):
         print_results(folder)
         report_page(folder)
-        sys.stdout.flush()
-    except UsageError:
-        pass
-    except OSError:
-        silence()  # discard the rest of the buffer, or a later flush would fail
+    sys.stdout.flush()
     if status not in {0, 1}:
-        with contextlib.suppress(OSError):
-            sys.stderr.write(f"evedrop: {how}\n")
-            sys.stderr.flush()
+        say(how)
+        sys.stderr.flush()
 
 
 def replay_command(folder: Path) -> str | None:

@@ -14,7 +14,7 @@ from evedrop.cli.commands import GROUP, MODULES, ROLES
 from evedrop.cli.parser import Parser
 from evedrop.errors import EvedropError, Interrupted, RunError, UsageError
 from evedrop.files import shown
-from evedrop.output import OUTPUT, finish, named_output, say, silence, warn
+from evedrop.output import say, standard_streams, warn
 
 if TYPE_CHECKING:
     from evedrop.command import Command
@@ -30,33 +30,38 @@ def is_role(arguments: Sequence[str]) -> bool:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns its exit status."""
-    given = sys.argv[1:] if arguments is None else list(arguments)
+    """Run the command line; returns its exit status, which output that cannot be written makes 2 only if it would be 0."""
+    with standard_streams() as output:
+        status = _status(sys.argv[1:] if arguments is None else list(arguments))
+        output.flush()
+        if output.failed is not None and status in {0, 1}:  # otherwise an error has been reported
+            say(f"standard output: {output.failed.strerror}; free some space, or check its permissions")
+            return status or UsageError.exit_status
+        return status
+
+
+def _status(given: list[str]) -> int:
+    """Run the command line, and report its errors."""
     if "_ARGCOMPLETE" in os.environ:  # a shell asks for completions
         import argcomplete
 
         argcomplete.autocomplete(parser_of())
-    options = parser_of(given[0] if given else "").parse_whole(given)
+    try:
+        options = parser_of(given[0] if given else "").parse_whole(given)
+    except SystemExit as left:  # argparse has printed the help, or said what it expected
+        return int(left.code or 0)
     command: Callable[[argparse.Namespace], int] = options.command
     try:
         _check_names(options)
-        with named_output():
-            status = command(options)
-            if sys.stdout is not None:  # a shell may have closed it
-                sys.stdout.flush()
-        return status
+        return command(options)
     except EvedropError as error:
-        finish()
+        sys.stdout.flush()
         say(str(error))
         return error.exit_status
     except KeyboardInterrupt:
-        finish()
         return Interrupted.exit_status
     except OSError as error:
-        if error.filename == OUTPUT:
-            silence()
-        if isinstance(error, BrokenPipeError) and error.filename == OUTPUT:
-            return 0
+        sys.stdout.flush()
         if error.filename is None:
             say(f"{error}; free system resources and try again")
             return RunError.exit_status

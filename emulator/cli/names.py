@@ -22,7 +22,7 @@ def name_lines(described: Mapping[str, str], width: int, columns: int) -> Iterat
 
 def print_names(described: Mapping[str, str]) -> None:
     """Print names with their descriptions; one in a line if standard output is not a terminal."""
-    on_terminal = sys.stdout is not None and sys.stdout.isatty()
+    on_terminal = sys.stdout.isatty()
     columns = shutil.get_terminal_size().columns if on_terminal else sys.maxsize
     for line in name_lines(described, max(map(len, described)) + 2, columns):
         print(line)

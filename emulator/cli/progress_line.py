@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import sys
-from contextlib import suppress
-from io import StringIO
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self, TextIO, cast, final
+from typing import Self, final
 
 from rich.console import Console
 from rich.progress import (
@@ -29,29 +27,6 @@ _BAR_WIDTH = 120  # the least width of a terminal, in columns, that has room for
 _WHOLE_WIDTH = 70  # the least width that has room for more than what is done and the time left
 
 
-class _Unfailing:
-    """A stream that ignores write errors: the terminal may be closed while the run is being ended in order."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-
-    def write(self, text: str) -> int:
-        with suppress(OSError):
-            return self._stream.write(text)
-        return len(text)
-
-    def flush(self) -> None:
-        with suppress(OSError):
-            self._stream.flush()
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
-
-
-def _unfailing(stream: TextIO | None) -> TextIO:
-    return cast(TextIO, _Unfailing(StringIO() if stream is None else stream))  # a shell may have closed it
-
-
 @final
 class _TimeLeft(TimeRemainingColumn):
     """The time left; nothing while the total is unknown."""
@@ -69,7 +44,7 @@ class ProgressLine:
     """
 
     def __init__(self, total: int | None, unit: str, quiet: bool = False) -> None:
-        self.console = Console(file=_unfailing(sys.stderr), highlight=False, markup=False)
+        self.console = Console(file=sys.stderr, highlight=False, markup=False)
         self._quiet = quiet
         self._total = total
         self.moved: Path | None = None

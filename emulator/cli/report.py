@@ -85,10 +85,6 @@ def left_out_line(left_out: Mapping[str, str], why: str) -> str:
 
 
 class _Console(Console):
-    def on_broken_pipe(self) -> None:
-        """Re-raise: a closed pipe is not a failure of the program, and main.py handles it."""
-        raise  # noqa: PLE0704 - rich calls this where it has caught the error
-
     def print(self, *objects: Any, **named: Any) -> None:
         """Show a table that is wider than the terminal row by row."""
         super().print(*(fitted(one, self) if isinstance(one, Table) else one for one in objects), **named)
@@ -100,5 +96,5 @@ def terminal() -> Console:
         highlight=False,
         markup=False,
         soft_wrap=True,
-        width=None if sys.stdout is not None and sys.stdout.isatty() else 140,
+        width=None if sys.stdout.isatty() else 140,
     )

@@ -61,7 +61,7 @@ class _Crew:
             [sys.executable, "-P", "-c", _WORK, task],
             stdin=subprocess.PIPE,  # closes when this process is gone
             stdout=subprocess.PIPE,
-            text=True,
+            encoding="ascii",  # JSON
             start_new_session=True,
         )
         with process:

@@ -122,7 +122,7 @@ def opened(rrd: Path, size: tuple[int, int], moment: float | None = None) -> Ite
             viewer.settle()
             yield viewer
         except (RuntimeError, ConnectionError) as error:
-            log = (logs / "viewer.log").read_text(errors="replace")
+            log = (logs / "viewer.log").read_text("utf-8", "replace")
             raise UsageError(_without_driver(log) or f"the headless viewer failed: {error}; its log:\n{log}") from error
         finally:
             end(process)

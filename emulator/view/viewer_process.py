@@ -37,7 +37,7 @@ def apart():
     if ctypes.CDLL(None).unshare(0x10000000 | 0x40000000):  # CLONE_NEWUSER, CLONE_NEWNET
         raise OSError
     for name, text in (("setgroups", "deny"), ("uid_map", f"{user} {user} 1"), ("gid_map", f"{group} {group} 1")):
-        with open(f"/proc/self/{name}", "w") as file:
+        with open(f"/proc/self/{name}", "w", encoding="ascii") as file:
             file.write(text)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
         flags = struct.unpack("16sh14x", fcntl.ioctl(any_socket, 0x8913, struct.pack("16sh14x", b"lo", 0)))[1]
@@ -152,7 +152,9 @@ def _listens(process: subprocess.Popen[bytes], port: int, patience: float) -> bo
 
 def _is_there(process: subprocess.Popen[bytes], port: int) -> bool:
     if is_apart(process):
-        lines = [line.split() for line in Path(f"/proc/{process.pid}/net/tcp").read_text().splitlines()[1:]]
+        lines = [
+            line.split() for line in Path(f"/proc/{process.pid}/net/tcp").read_text(encoding="ascii").splitlines()[1:]
+        ]
         return any(local.endswith(f":{port:04X}") and state == "0A" for _, local, _, state, *_ in lines)
     with socket.socket() as probe:
         probe.settimeout(1.0)

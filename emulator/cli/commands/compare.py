@@ -8,6 +8,7 @@ from pathlib import Path
 from evedrop.cli.options import changes_of, entries, output, scenario, workers
 from evedrop.command import Command
 from evedrop.errors import UsageError
+from evedrop.output import print_json
 
 
 def compare(options: argparse.Namespace) -> int:
@@ -19,6 +20,7 @@ def compare(options: argparse.Namespace) -> int:
     from evedrop.loading import value_of
     from evedrop.memory.montecarlo import Plan
     from evedrop.results.folder import results_folder
+    from evedrop.results.summary_file import plain
 
     changes = changes_of(options)
     parameters = {}
@@ -44,7 +46,7 @@ def compare(options: argparse.Namespace) -> int:
             **{"trials": 200, **changes},
         )
     if options.json:
-        print(found.as_json(indent=None))
+        print_json(plain(found.as_dict()))
     else:
         print_comparison(found, str(folder))
     report_page(folder, options.json)

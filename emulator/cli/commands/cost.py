@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from evedrop.cli.in_memory import studied
 from evedrop.cli.options import as_json, entries, scenario
 from evedrop.command import Command
+from evedrop.output import print_json
 
 if TYPE_CHECKING:
     from evedrop.studies.secrecy_cost import MeanEstimate, SecrecyCost
@@ -21,7 +21,7 @@ def cost(options: argparse.Namespace) -> int:
 
     _, found = studied(options, secrecy_cost)
     if options.json:
-        print(json.dumps(asdict(found)))
+        print_json(asdict(found))
     else:
         _print(found)
     return 0

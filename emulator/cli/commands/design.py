@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 from evedrop.cli.options import as_json, changes, changes_of, scenario
 from evedrop.command import Command
 from evedrop.errors import UsageError
+from evedrop.output import print_json
 
 
 def design(options: argparse.Namespace) -> int:
@@ -66,7 +66,7 @@ def _given(options: argparse.Namespace, kind: str | None) -> dict[str, Any]:
 
 def _show(options: argparse.Namespace, found: _Printable, show: Callable[[], None]) -> int:
     if options.json:
-        print(json.dumps(found.as_dict(), ensure_ascii=False))
+        print_json(found.as_dict())
     else:
         show()
     return 0

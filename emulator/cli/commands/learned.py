@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from evedrop.cli.in_memory import studied
 from evedrop.cli.options import as_json, entries, scenario
 from evedrop.command import Command
+from evedrop.output import print_json
 
 if TYPE_CHECKING:
     from evedrop.studies.learning_curve import LearningRow
@@ -23,7 +23,7 @@ def learned(options: argparse.Namespace) -> int:
 
     scenario, rows = studied(options, learning_curve)
     if options.json:
-        print(json.dumps([asdict(row) for row in rows]))
+        print_json([asdict(row) for row in rows])
     else:
         _print(rows, scenario.trials)
     return 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from evedrop.cli.options import argument, as_json
 from evedrop.command import Command
 from evedrop.errors import UsageError
+from evedrop.output import print_json
 
 if TYPE_CHECKING:
     from evedrop.recordings.message_recording import MessageRecording
@@ -26,7 +26,10 @@ def fit_link(options: argparse.Namespace) -> int:
         told, lines = _journal(options)
     else:
         told, lines = _table(options)
-    print(json.dumps(told, ensure_ascii=False) if options.json else "\n".join(lines))
+    if options.json:
+        print_json(told)
+    else:
+        print("\n".join(lines))
     return 0
 
 

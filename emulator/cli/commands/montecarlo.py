@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 
 from evedrop.cli.in_memory import MEMORY, plan_of
 from evedrop.cli.options import loaded, over_wire, print_so_far, scenario
@@ -25,8 +24,7 @@ def montecarlo(options: argparse.Namespace) -> int:
             try:
                 status = simulate(scenario, folder, line.tell, plan)
             except Interrupted:
-                with contextlib.suppress(OSError):  # the reader of the output may have got the same Ctrl-C
-                    print_so_far(line.moved or folder, options.json)
+                print_so_far(line.moved or folder, options.json)
                 raise
         print_so_far(line.moved or folder, options.json)
     return status

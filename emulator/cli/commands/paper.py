@@ -14,6 +14,7 @@ from evedrop.cli.names import print_names
 from evedrop.cli.options import as_json
 from evedrop.command import Command
 from evedrop.errors import UsageError
+from evedrop.output import print_json
 
 if TYPE_CHECKING:
     from evedrop.literature.reproduction import Reproduction
@@ -34,7 +35,7 @@ def paper(options: argparse.Namespace) -> int:
     if options.out is not None:
         _write(found, options.out)
     if options.json:
-        print(json.dumps(found.as_dict(), ensure_ascii=False))
+        print_json(found.as_dict())
     else:
         _print(found)
     return 1 if found.differing else 0
@@ -48,7 +49,7 @@ def _list(as_json: bool) -> None:
             name: {"title": one.title, "authors": one.authors, "published": one.published}
             for name, one in PAPERS.items()
         }
-        print(json.dumps(papers, ensure_ascii=False))
+        print_json(papers)
         return
     print_names({name: f"{one.authors}: {one.title}. {one.published}" for name, one in PAPERS.items()})
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 
 from evedrop.cli.options import argument, as_json
 from evedrop.command import Command
 from evedrop.errors import UsageError
+from evedrop.output import print_json
 
 
 def fit(options: argparse.Namespace) -> int:
@@ -17,7 +17,7 @@ def fit(options: argparse.Namespace) -> int:
     names = None if options.states is None else [name.strip() for name in options.states.split(",")]
     found = fit_process(options.file, names, _numbers(options.reference))
     if options.json:
-        print(json.dumps(found.as_dict(), ensure_ascii=False))
+        print_json(found.as_dict())
     else:
         print("\n".join([*(f"# {line}" for line in found.remarks), "", found.toml]))
     return 0

@@ -64,8 +64,7 @@ def _run(options: argparse.Namespace) -> Ended:
                     hosts=hosts,
                 )
             except (RunError, Interrupted):
-                with contextlib.suppress(OSError):  # the reader of the output may have got the same Ctrl-C
-                    print_so_far(line.moved or folder, options.json)
+                print_so_far(line.moved or folder, options.json)
                 raise
         print_so_far(ended.folder, options.json)
     return ended
@@ -104,7 +103,7 @@ def _hosts_of(options: argparse.Namespace, scenario: Scenario) -> HostsPlan | No
 
 def _keep_open(viewer: Viewer) -> None:
     """Keep the view open until it is closed or Ctrl-C, if started from a terminal; otherwise end it with the command."""
-    if sys.stdin.isatty() and sys.stderr.isatty() and viewer.alive():
+    if sys.stdin is not None and sys.stdin.isatty() and sys.stderr.isatty() and viewer.alive():
         where = f" at {viewer.address}" if viewer.address else ""
         print(f"the view stays open{where}; Ctrl-C ends it", file=sys.stderr)
         hold(viewer)

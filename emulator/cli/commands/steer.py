@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from evedrop.cli.options import as_json
 from evedrop.command import Command
 from evedrop.errors import BriefError, UsageError
+from evedrop.output import print_json
 
 if TYPE_CHECKING:
     from evedrop.live.network.control_file import Control
@@ -88,7 +89,10 @@ def status(options: argparse.Namespace) -> int:
     of_runs = [answer for answer in answers if isinstance(answer, RunStatus)]
     of_wires = [answer for answer in answers if answer is not None and not isinstance(answer, RunStatus)]
     found = of_wires[0] if of_wires else status_of_shards(of_runs)
-    print(json.dumps(asdict(found), ensure_ascii=False) if options.json else "\n".join(found.lines))
+    if options.json:
+        print_json(asdict(found))
+    else:
+        print("\n".join(found.lines))
     return 0
 
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 from evedrop.cli.in_memory import MEMORY, plan_of
 from evedrop.cli.options import changes_of, scenario
 from evedrop.command import Command
+from evedrop.output import print_json
 
 
 def sweep(options: argparse.Namespace) -> int:
@@ -28,7 +28,7 @@ def sweep(options: argparse.Namespace) -> int:
     ):
         table = sweep_over(options.scenario, changes_of(options), grid, folder, line.tell, plan)
     if options.json:
-        print(json.dumps(table.to_pylist(), ensure_ascii=False))
+        print_json(table.to_pylist())
     else:
         print_sweep(table, tuple(grid), str(folder))
     report_page(folder, options.json)

@@ -148,7 +148,10 @@ class Children:
 
     def _refuse(self, name: str, error: ValueError) -> None:
         """Write into a process's log that the launcher cannot read its news."""
-        with contextlib.suppress(OSError), (self._folder.now / "logs" / f"{name}.log").open("a") as log:
+        with (
+            contextlib.suppress(OSError),
+            (self._folder.now / "logs" / f"{name}.log").open("a", encoding="utf-8") as log,
+        ):
             log.write(f"{_COMPLAINT}the launcher refused malformed news: {error}\n")
 
     def restart_router(self, ended: Exit) -> bool:
@@ -321,7 +324,7 @@ class Children:
     def _log(self, name: str) -> list[str]:
         """The lines of a log, without Zenoh's lines about messages that arrive while its session closes."""
         try:
-            text = _COLOUR.sub("", (self._folder.now / "logs" / f"{name}.log").read_text(errors="replace"))
+            text = _COLOUR.sub("", (self._folder.now / "logs" / f"{name}.log").read_text("utf-8", "replace"))
         except OSError as error:
             return [f"(cannot be read: {error.strerror})"]
         return [line for line in text.splitlines() if _ZENOH_CLOSES not in line]

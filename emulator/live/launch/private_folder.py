@@ -53,7 +53,7 @@ def _locked(folder: Path) -> Iterator[None]:
     """Make the folder, and hold the lock in it."""
     try:
         folder.mkdir(mode=0o700)
-        lock = (folder / f"{_LOCK}.new").open("w")
+        lock = (folder / f"{_LOCK}.new").open("wb")
     except OSError as error:
         raise _unmade(error) from error
     with lock:
@@ -96,6 +96,6 @@ def _sweep(where: Path) -> None:
         with contextlib.suppress(OSError):
             if folder.is_symlink() or folder.stat().st_uid != os.getuid():
                 continue
-            with (folder / _LOCK).open("r+") as lock:
+            with (folder / _LOCK).open("rb+") as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 shutil.rmtree(folder, ignore_errors=True)

@@ -18,7 +18,7 @@ def users_file(users: Mapping[str, str]) -> Iterator[Path]:
     handle, name = tempfile.mkstemp(prefix="evedrop-users-")
     path = Path(name)
     try:
-        with os.fdopen(handle, "w") as file:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
             file.writelines(f"{user}:{password}\n" for user, password in users.items())
         yield path
     finally:

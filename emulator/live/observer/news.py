@@ -11,10 +11,11 @@ import sys
 import threading
 from contextlib import suppress
 from types import TracebackType
-from typing import Self, TextIO, final
+from typing import Self, TextIO, cast, final
 
 from evedrop.live.protocol.news import Alive
 from evedrop.news import News
+from evedrop.output import Output
 
 _BEAT_SECONDS = 1.0
 _LINE = threading.Lock()  # one line at a time
@@ -35,7 +36,7 @@ def set_news_apart(launched: bool) -> None:
     if launched:
         _TO.append(apart)
     else:
-        sys.stdout = apart
+        sys.stdout = cast(TextIO, Output(apart))
 
 
 def tell(news: News) -> None:
