@@ -58,12 +58,15 @@ class ScenarioError(UsageError):
 
 
 class TraceError(UsageError):
-    """An unusable recording of a link: `entry` says which entry must change, `file` or `column`; `what` says why."""
+    """An unusable recording of a link: `entry` says which entry must change, `file` or `column`; `what` says why.
 
-    def __init__(self, path: str, entry: str, what: str) -> None:
+    The message itself is for the command line: `typed` is `what` with options in place of entries, where the two differ.
+    """
+
+    def __init__(self, path: str, entry: str, what: str, typed: str | None = None) -> None:
         self.entry = entry
         self.what = what
-        super().__init__(f"{path}: {what}")
+        super().__init__(f"{path}: {what if typed is None else typed}")
 
 
 class DisturbanceError(UsageError):

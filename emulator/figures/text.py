@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 
 _SMALL_NUMBER, _LARGE_NUMBER, _LEAST_PLACE = 0.01, 1e5, -4  # beyond them estimates have exponents
+_ROUNDING = 1e-12  # a standard error below this part of the estimate comes from the rounding of equal trials
+_MOST_DIGITS = 8  # significant digits of an estimate
 
 
 def figure_text(value: float | None, how: str = ".4g") -> str:
@@ -18,11 +20,16 @@ def finite_text(value: float, how: str = ".4g") -> str:
 
 
 def estimate(value: float | None, error: float | None, how: str = ".4g") -> str:
-    """An estimate with its standard error, to the place of that error's first digit: 0.0123 ± 0.0004. how: without an error."""
-    if value is None or not error or not math.isfinite(value):
+    """An estimate with its standard error, to the place of that error's first digit: 0.0123 ± 0.0004. how: without an error.
+
+    An error of the size of rounding, which trials with equal outcomes have, counts as none.
+    """
+    if value is None or not error or not math.isfinite(value) or error <= _ROUNDING * abs(value):
         return figure_text(value, how)
-    place = math.floor(math.log10(float(f"{error:.0e}")))
-    if abs(value) < _LARGE_NUMBER and (place >= _LEAST_PLACE or abs(value) >= _SMALL_NUMBER):
+    place = int(f"{error:.0e}".partition("e")[2])
+    if value and math.floor(math.log10(abs(value))) - place >= _MOST_DIGITS:
+        return f"{value:.{_MOST_DIGITS}g} ± {_scientific(error, 0)}"
+    if max(abs(value), error) < _LARGE_NUMBER and (place >= _LEAST_PLACE or abs(value) >= _SMALL_NUMBER):
         places = max(0, -place)
         return f"{value:.{places}f} ± {error:.{places}f}"
     digits = max(0, math.floor(math.log10(abs(value))) - place) if value else 0

@@ -15,14 +15,13 @@ from evedrop.fitting.candidate import Candidate, delay_candidates, wilson
 from evedrop.fitting.run_lengths import RunLaw, lengths_of, p_value
 from evedrop.model.checks import toml_of
 from evedrop.model.process import Floats
-from evedrop.recordings.link_recording import LinkRecording, Outcomes
+from evedrop.recordings.link_recording import DELAY, LinkRecording, Outcomes
 
 FEWEST = 100
 """The fewest outcomes from which a model can be estimated."""
 FEWEST_DELAYS = 10
 """The fewest delays from which a model can be estimated."""
 _LEVEL = 0.01
-DELAY = "delay"
 
 
 @dataclass(frozen=True)
@@ -109,20 +108,19 @@ class Fit:
         }
 
 
-def fit(path: Path, column: str | None = None, delay_column: str | None = None) -> Fit:
+def fit(path: Path, column: str | None = None, delay_column: str | None = None, lost: str | None = None) -> Fit:
     """Find the models that may have produced a recording.
 
-    column: that of the outcomes, in a file with several; delay_column: that of delays in slots, by default `delay` if present.
+    column: that of the outcomes, in a file with several, by default `received`; delay_column: that of delays in slots, by default
+    `delay` if present; lost: in place of column, one whose ones are losses.
 
     Raises TraceError if the file is not a recording, or if nothing can be estimated from it.
     """
     recording = LinkRecording(path)
     names = recording.columns()
-    if column is None and len(names) == 2 and DELAY in names:
-        column = next(name for name in names if name != DELAY)
-    outcomes = recording.outcomes(column)
+    outcomes = recording.outcomes(column, lost)
     _check(str(path), outcomes)
-    wanted = delay_column or (DELAY if DELAY in names and column != DELAY else None)
+    wanted = delay_column or (DELAY if DELAY in names and DELAY not in {column, lost} else None)
     delays = np.empty(0) if wanted is None else recording.delays(wanted)
     delays = delays[~np.isnan(delays)]
     if wanted is not None and len(delays) < FEWEST_DELAYS:

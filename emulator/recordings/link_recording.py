@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import csv
 import math
+import re
+import shlex
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, NoReturn, final
 
@@ -30,6 +32,11 @@ _LIMIT = Limit.of_rows(MOST_OUTCOMES)
 _MOST_BYTES = 2**28  # decompressed, of a row group of a Parquet file, whose column is in memory at once
 _LONGEST_VALUE = 100  # characters of a text found where a number should be
 _MOST_NAMES = 20  # columns that a message lists
+_LOOKED_AT = 1000  # values of a column from which a message judges whether it has outcomes
+_OUTCOMES = {"0": 0, "1": 1, "false": 0, "true": 1}
+_NAMES_OF_LOSSES = {"lost", "loss", "losses", "dropped", "erased", "missing"}
+RECEIVED, DELAY = "received", "delay"
+"""The columns that are read from a file of several, unless another one is named."""
 
 
 @final
@@ -46,13 +53,21 @@ class LinkRecording:
         except Unreadable as error:
             self._unreadable(error)
 
-    def outcomes(self, column: str | None = None) -> Outcomes:
-        """The outcome of each packet. Raises TraceError, also for values other than 0 and 1 and for more than ten million."""
+    def outcomes(self, column: str | None = None, lost: str | None = None) -> Outcomes:
+        """The outcome of each packet. column: where 1 is delivered; lost: instead, the column where 1 is lost.
+
+        Raises TraceError, also for values other than 0 and 1 and for more than ten million, and if the only column is named as
+        one of losses and neither argument says what its ones mean.
+        """
+        if column is not None and lost is not None:
+            self._no("lost", "is given together with column; expected one of them", "--lost: leave out --column")
+        one, zero = ("delivered", "lost") if lost is None else ("lost", "delivered")
         found = bytearray()
-        for place, value in self._values(column):
-            if value not in {"0", "1"}:
-                self._no("file", f"{place} is {_shown(value)}; expected 0 (lost) or 1 (delivered)")
-            found.append(value == "1")
+        for place, value in self._values(self._column_of_outcomes() if column is lost is None else column or lost):
+            outcome = _OUTCOMES.get(value.lower())
+            if outcome is None:
+                self._no("file", f"{place} is {_shown(value)}; expected 0 ({zero}) or 1 ({one})")
+            found.append(outcome if lost is None else 1 - outcome)
             if len(found) > MOST_OUTCOMES:
                 self._no(
                     "file", f"has more than {MOST_OUTCOMES} outcomes; expected at most that many, such as a part of it"
@@ -64,7 +79,7 @@ class LinkRecording:
     def delays(self, column: str | None = None) -> NDArray[np.float64]:
         """The delay of each packet in slots, (packets,); NaN for empty values. Raises TraceError as `outcomes` does."""
         found = []
-        for place, value in self._values(column):
+        for place, value in self._values(self._column_of_delays() if column is None else column):
             found.append(self._delay(place, value))
             if len(found) > MOST_DELAYS:
                 self._no(
@@ -90,6 +105,53 @@ class LinkRecording:
                 return list(_parquet(self._path).schema_arrow.names)
             first = next(_rows(lines_of(self._path, _LIMIT)), (0, []))[1]
             return [] if all(map(_is_number, first)) else first
+
+    def _column_of_outcomes(self) -> str | None:
+        """The column to read if none is named; None for the only one of a file without names."""
+        names = self.columns()
+        if not names or RECEIVED in names:
+            return RECEIVED if names else None
+        others = [name for name in names if name != DELAY] if len(names) == 2 else names
+        if len(others) != 1 or _names_losses(others[0]):
+            self._ask_for_column(names, others)
+        return others[0]
+
+    def _ask_for_column(self, names: Sequence[str], others: Sequence[str]) -> NoReturn:
+        """Raise TraceError with a proposal: a column that has outcomes, and both of its meanings if its name is one of losses."""
+        typed = f"has {_some(names)}"
+        has = f"is missing; {self._path.name} {typed}"
+        able = others if len(others) == 1 else [name for name in names[:_MOST_NAMES] if self._may_be_outcomes(name)]
+        proposed = min(able, key=_names_losses, default=None)
+        if proposed is None:
+            none = "none of these has only 0 (lost) and 1 (delivered)"
+            self._no(
+                "column",
+                f"{has}, and {none}; expected a column that has",
+                f"{typed}, and {none}; expected one that has",
+            )
+        entry, option = _shown(proposed), shlex.quote(proposed)
+        if _names_losses(proposed):
+            self._no(
+                "column",
+                f"{has}; expected lost = {entry} if 1 means lost there, or column = {entry} if 1 means delivered",
+                f"{typed}; expected --lost {option} if 1 means lost there, or --column {option} if 1 means delivered",
+            )
+        self._no("column", f"{has}; expected column = {entry}", f"{typed}; expected --column {option}")
+
+    def _column_of_delays(self) -> str | None:
+        """The column to read if none is named; None for the only one of a file."""
+        names = self.columns()
+        if len(names) > 1 and DELAY not in names:
+            self._no("column", f"is missing; {self._path.name} has {_some(names)}; expected the column of delays")
+        return DELAY if len(names) > 1 else None
+
+    def _may_be_outcomes(self, column: str) -> bool:
+        """Whether a column begins with outcomes."""
+        try:
+            values = [value.lower() for _, value in islice(self._values(column), _LOOKED_AT)]
+        except TraceError:
+            return False
+        return bool(values) and all(value in _OUTCOMES for value in values)
 
     @property
     def _is_parquet(self) -> bool:
@@ -157,20 +219,14 @@ class LinkRecording:
                 self._no("column", f"{_shown(column)} is not a column of {self._path.name}; {there}")
             return names.index(column)
         if len(names) != 1:
-            if not any(names):
-                self._no(
-                    "file", f"has {len(names)} columns without names; expected one column, or a line of names first"
-                )
-            self._no(
-                "column", f"is missing; {self._path.name} has {_some(names)}; expected column = {_shown(names[0])}"
-            )
+            self._no("file", f"has {len(names)} columns without names; expected one column, or a line of names first")
         return 0
 
     def _unreadable(self, error: Exception) -> NoReturn:
-        self._no("file", f"cannot be read ({why_of(error)}); {_EXPECTED}", error)
+        self._no("file", f"cannot be read ({why_of(error)}); {_EXPECTED}", cause=error)
 
-    def _no(self, entry: str, what: str, cause: Exception | None = None) -> NoReturn:
-        raise TraceError(str(self._path), entry, what) from cause
+    def _no(self, entry: str, what: str, typed: str | None = None, cause: Exception | None = None) -> NoReturn:
+        raise TraceError(str(self._path), entry, what, typed) from cause
 
 
 def _rows(file: Iterable[str]) -> Iterator[tuple[int, list[str]]]:
@@ -217,6 +273,11 @@ def _as_text(value: Any) -> str:
     if isinstance(value, (bool, float)) and value in {0, 1}:
         return str(int(value))
     return str(value)
+
+
+def _names_losses(name: str) -> bool:
+    """Whether ones in a column of this name are more likely losses than deliveries: lost, packet_loss."""
+    return not _NAMES_OF_LOSSES.isdisjoint(re.split(r"[^a-z]+", name.lower()))
 
 
 def _is_number(cell: str) -> bool:

@@ -112,7 +112,7 @@ def recordings_located(tables: Mapping[str, Any], folder: Path) -> None:
 
 
 def read_recordings(tables: Mapping[str, Any]) -> list[str]:
-    """Replace `file` and `column` of every trace with the recorded contents, in place. Returns the mistakes, with their paths."""
+    """Replace the file and column of every trace with the recorded contents, in place. Returns the mistakes, with their paths."""
     mistakes = []
     delays = 0
     slots = tables.get("slots")
@@ -160,15 +160,17 @@ def _parameter_of(entry: str | int, table: Mapping[str, Any]) -> str | None:
 def _replace(trace: dict[str, Any], entry: str, of_delays: bool) -> list[tuple[str, str]]:
     """Put a recording's outcomes, or its delays, into an entry; returns the mistakes, (entry, description) each."""
     file, column = trace.pop("file", None), trace.pop("column", None)
+    lost = None if of_delays else trace.pop("lost", None)
+    names = (("file", file), ("column", column), ("lost", lost))
     if entry in trace:
-        extra = "file" if file is not None else "column" if column is not None else None
+        extra = next((name for name, value in names if value is not None), None)
         return [(extra, f"is given together with {entry}; expected one of them")] if extra else []
     trace[entry] = [0.0] if of_delays else _STAND_IN
     if file is None:
         return [("file", 'is missing; expected file = "walk.csv"')]
     wrong = [
         (name, f"is {as_toml(value)}; expected a string")
-        for name, value in (("file", file), ("column", column))
+        for name, value in names
         if value is not None and not isinstance(value, str)
     ]
     if wrong:
@@ -181,7 +183,7 @@ def _replace(trace: dict[str, Any], entry: str, of_delays: bool) -> list[tuple[s
             if not trace[entry]:
                 return [("file", f"{file} has no delays; expected one for at least one packet")]
         else:
-            trace[entry] = (recording.outcomes(column) + ord("0")).tobytes().decode()
+            trace[entry] = (recording.outcomes(column, lost) + ord("0")).tobytes().decode()
     except TraceError as error:
         return [(error.entry, f"{file} {error.what}" if error.entry == "file" else error.what)]
     return []

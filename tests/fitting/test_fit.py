@@ -252,7 +252,14 @@ def test_delays_beside_outcomes(tmp_path: Path) -> None:
         ("1\n" * 1000, "has 1000 outcomes, all delivered: the quality is at least 0.9962 with 95 % confidence"),
         ("0\n" * 1000, "has 1000 outcomes, all lost: the quality is at most 0.003827 with 95 % confidence"),
         ("1\nx\n" * 1000, 'line 2 is "x"; expected 0 (lost) or 1 (delivered)'),
-        ("a,b\n" + "1,0\n" * 200, 'is missing; walk.csv has a, b; expected column = "a"'),
+        ("a,b\n" + "1,0\n" * 200, "has a, b; expected --column a"),
+        ("t,received_ok\n" + "2.5,1\n3.5,0\n" * 200, "has t, received_ok; expected --column received_ok"),
+        ("t,x\n" + "2.5,7\n" * 200, "none of these has only 0 (lost) and 1 (delivered); expected one that has"),
+        (
+            "lost\n" + "0\n1\n" * 200,
+            "has lost; expected --lost lost if 1 means lost there, or --column lost if 1 means del",
+        ),
+        ("packet_loss,delay\n" + "0,1\n1,\n" * 200, "expected --lost packet_loss if 1 means lost there, or --column p"),
         ("received,delay\n" + "1,\n0,\n" * 100 + "1,2\n" * 5, "delay has 5 delays; expected 10 or more"),
         (None, "cannot be read (No such file or directory)"),
     ],
@@ -298,3 +305,13 @@ def test_a_directory_is_no_recording(tmp_path: Path) -> None:
     """Said as what it is."""
     with pytest.raises(TraceError, match="it is a folder"):
         fit(tmp_path)
+
+
+def test_ones_are_losses_only_if_told(evedrop: Evedrop) -> None:
+    """A column named lost is read as the command line says; --lost and --column of it are each other's opposites."""
+    (evedrop.folder / "walk.csv").write_text("t,lost\n" + "".join(f"{t}.5,{int(t % 10 == 0)}\n" for t in range(200)))
+    told = {option: evedrop("links", "fit", "walk.csv", option, "lost", "--json") for option in ("--lost", "--column")}
+    assert {option: json.loads(done.out)["lost"] for option, done in told.items()} == {"--lost": 20, "--column": 180}
+    both = evedrop("links", "fit", "walk.csv", "--lost", "lost", "--column", "lost")
+    assert (both.status, both.out) == (2, "")
+    assert "--lost: leave out --column" in both.err

@@ -41,6 +41,8 @@ def write(folder: Path, name: str, text: str | bytes) -> Path:
         ("received\n1\n1\n0\n1\n", None),
         ("\ufeff\nreceived\n1\n1\n0\n1\n\n", "received"),
         ("k,received,rssi\n0,1,-60\n1, 1 ,-61\n2,0,\n3,1,-70\n", "received"),
+        ("t,received\n0.5,1\n1.5,1\n2.5,0\n3.5,1\n", None),
+        ("ok\nTrue\ntrue\nFalse\nTRUE\n", None),
     ],
 )
 def test_a_csv_file_is_read(tmp_path: Path, text: str, column: str | None) -> None:
@@ -76,6 +78,22 @@ def test_delays_are_read(tmp_path: Path) -> None:
         ("walk.csv", "a,b\n1,0\n1\n", "a", "file", "line 3 has 1 columns; expected 2, as the first line has"),
         ("walk.csv", "a,b\n1,0\n", "c", "column", '"c" is not a column of walk.csv; there are a, b'),
         ("walk.csv", "a,b\n1,0\n", None, "column", 'is missing; walk.csv has a, b; expected column = "a"'),
+        ("walk.csv", "t,ok\n0.5,1\n", None, "column", 'is missing; walk.csv has t, ok; expected column = "ok"'),
+        (
+            "walk.csv",
+            "t,lost,ok\n0.5,1,1\n",
+            None,
+            "column",
+            'is missing; walk.csv has t, lost, ok; expected column = "ok"',
+        ),
+        (
+            "walk.csv",
+            "lost\n1\n",
+            None,
+            "column",
+            'walk.csv has lost; expected lost = "lost" if 1 means lost there, or column',
+        ),
+        ("walk.csv", "a,b\n7,x\n", None, "column", "walk.csv has a, b, and none of these has only 0 (lost) and 1 (del"),
         ("walk.csv", "1\n0\n", "a", "column", '"a" is not a column of walk.csv; there are no names'),
         ("walk.csv", "1,0\n0,1\n", None, "file", "has 2 columns without names; expected one column, or a line of"),
         ("walk.csv", b"\xff\xfe1", None, "file", "cannot be read (it is not text in UTF-8"),

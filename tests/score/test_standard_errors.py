@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from rich.console import Console
 
 from evedrop.api import montecarlo, run
@@ -207,6 +209,30 @@ def test_a_summary_of_an_older_version_can_be_read(recorded: Results) -> None:
 def test_an_estimate_has_the_digits_of_its_error(value: float | None, error: float | None, text: str) -> None:
     """A digit of the error, and the estimate to its place; small and large ones with exponents."""
     assert estimate(value, error) == text
+
+
+@given(
+    st.floats(-1e300, 1e300),
+    st.floats(0.0, allow_infinity=False) | st.floats(1e-17, 1e-5),
+    st.booleans(),
+)
+def test_an_estimate_is_never_wide(value: float, error: float, relative: bool) -> None:
+    """However small or large its error is, a table keeps its shape, and the figure has its significant digits."""
+    error = error * abs(value) if relative else error
+    text = estimate(value, error)
+    shown, _, after = text.partition(" ± ")
+    assert len(shown) <= 16
+    assert len(after) <= 8
+    assert float(shown) == pytest.approx(value, abs=max(error, 5e-4 * abs(value) if not after else 5e-8 * abs(value)))
+
+
+def test_trials_with_equal_losses_have_no_error_of_rounding(tmp_path: Path) -> None:
+    """A trace from its beginning is the same in every trial: the table shows its fraction without an error of 1e-17."""
+    outcomes = "1" * 106 + "0" * 19
+    loss: dict[str, Any] = {"legitimate.link": {"loss": {"model": "trace", "outcomes": outcomes}}}
+    done = montecarlo("eavesdroppers", slots=125, trials=30, out=tmp_path / "x", plan=ALONE, expect=[], **loss)
+    errors = done.summary["peers"]["legitimate"]["standard_errors"]
+    assert estimate(0.848, errors["received_fraction"]) == estimate(0.848, 1.1e-17) == "0.848"
 
 
 def test_a_standard_error_needs_finite_trials() -> None:

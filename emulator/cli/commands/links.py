@@ -37,8 +37,8 @@ def _table(options: argparse.Namespace) -> tuple[dict[str, Any], Sequence[str]]:
     """The fit of a table of outcomes."""
     from evedrop.fitting.fit import fit, lines
 
-    _refuse_others(options, "a table of outcomes", ("column", "delay_column"))
-    found = fit(options.trace, options.column, options.delay_column)
+    _refuse_others(options, "a table of outcomes", ("column", "lost", "delay_column"))
+    found = fit(options.trace, options.column, options.delay_column, options.lost)
     return found.as_dict(), lines(found)
 
 
@@ -74,6 +74,7 @@ def _messages(recording: MessageRecording, options: argparse.Namespace) -> tuple
 
 _ONLY = {
     "column": "a table of outcomes",
+    "lost": "a table of outcomes",
     "delay_column": "a table of outcomes",
     "topic": "an MCAP recording",
     "period": "an MCAP recording",
@@ -99,7 +100,12 @@ def _refuse_others(options: argparse.Namespace, what: str, names: Sequence[str])
 
 
 def _fits(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--column", metavar="C", help="the column of outcomes, if the file has several columns")
+    parser.add_argument(
+        "--column",
+        metavar="C",
+        help="the column of outcomes, in which 1 means delivered; default received, or the only one",
+    )
+    parser.add_argument("--lost", metavar="C", help="in place of --column: the column in which 1 means lost")
     parser.add_argument(
         "--delay-column",
         metavar="C",
