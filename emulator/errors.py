@@ -148,8 +148,13 @@ class Interrupted(EvedropError):
 
     exit_status = 130
 
-    def __init__(self, said: str = "interrupted; the results so far are in the results folder") -> None:
+    def __init__(self, said: str = "interrupted") -> None:
         super().__init__(said)
+
+    @classmethod
+    def with_results(cls, folder: object) -> Interrupted:
+        """The same, where a folder holds the results so far."""
+        return cls(f"interrupted; the results so far are in {folder}")
 
 
 class NoAnswer(Exception):

@@ -46,6 +46,18 @@ def raise_on_signals() -> Iterator[None]:
 
 
 @contextmanager
+def leave_after(act: Callable[[], object]) -> Iterator[None]:
+    """Make Ctrl-C, SIGTERM and SIGHUP call `act` and exit at once while the block runs."""
+
+    def interrupt() -> None:
+        act()
+        os._exit(INTERRUPTED)
+
+    with _handled(interrupt):
+        yield
+
+
+@contextmanager
 def held_back() -> Iterator[None]:
     """Delay signals to processes that are started in the block until they have handlers.
 

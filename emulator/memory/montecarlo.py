@@ -114,13 +114,14 @@ def simulate(scenario: Scenario, folder: Path, tell: Tell, plan: Plan = Plan()) 
             if not merger.trials:
                 shutil.rmtree(held.now)
                 raise failure or Interrupted("interrupted before any trials were done; nothing was kept")
-            write_summary(held.now, summary)
-            if held.now != folder:
-                tell(FolderMoved(str(held.now)))
+            kept = held.now
+            write_summary(kept, summary)
+            if kept != folder:
+                tell(FolderMoved(str(kept)))
     if failure is not None:
         raise failure
     if not merger.complete or (plan.rare and stop.is_set()):
-        raise Interrupted
+        raise Interrupted.with_results(kept)
     if summary.ended != how:  # a figure failed
         raise RunError(summary.ended)
     return 1 if summary.failed_expectations else 0

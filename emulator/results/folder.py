@@ -20,6 +20,7 @@ from typing import final
 
 from evedrop.errors import UsageError
 from evedrop.files import shown
+from evedrop.signals import leave_after
 
 
 def default_folder(scenario: str | Path) -> Path:
@@ -51,12 +52,17 @@ def results_folder(out: str | Path | None, scenario: str | Path) -> Iterator[Pat
         yield Path(out)
         return
     folder = claimed(default_folder(scenario))
-    try:
-        yield folder
-    finally:
+
+    def remove_empty() -> None:
         with contextlib.suppress(OSError):
-            folder.rmdir()  # succeeds only if the folder is empty
+            folder.rmdir()
             folder.parent.rmdir()
+
+    try:
+        with leave_after(remove_empty):
+            yield folder
+    finally:
+        remove_empty()
 
 
 def _unusable(folder: Path, why: str) -> UsageError:

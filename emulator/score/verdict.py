@@ -117,6 +117,7 @@ class SignTest:
 SignTestOf = Callable[[Floats], SignTest]
 """Tests a quantity, from its samples (R,)."""
 _NOTHING = SignTest(1.0, 1.0)
+_PROMISED_SLOTS = 10_000  # for which theory is computed at least
 
 
 def sign_of_mean(samples: Floats) -> SignTest:
@@ -207,7 +208,8 @@ def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tall
     # A limit too large to be computed neither promises nor denies anything.
     perfect_by_theory = perfect_by_theory if known and not math.isnan(user_bound + theirs.limit) else None
     complete = user.done == user.slots
-    slots = user.slots if complete else max(user.done, 2)
+    # What theory promises does not depend on how soon a run was interrupted, but must not take long then.
+    slots = user.slots if complete else min(user.slots, max(user.done, _PROMISED_SLOTS))
     bounded_user = math.isfinite(user_bound) or not user_theory.has_limit
     holds_from = _holds_from(user_theory, theirs, slots)
     always = bounded_user and slots > 1 and holds_from == 1

@@ -19,7 +19,6 @@ from evedrop.signals import stop_on_signals
 from evedrop.studies.scenario_tests import Finding, Manner, Outcome, carry_out
 
 _LOOK_SECONDS = 0.1
-_INTERRUPTED = "interrupted; the results so far are in the results folders"
 _WORK = "from evedrop.studies.scenario_test_jobs import work; work()"
 
 
@@ -29,7 +28,7 @@ def results(scenarios: Sequence[str], manner: Manner, jobs: int) -> Iterator[Fin
         with stop_on_signals() as stop:
             for scenario in scenarios:
                 if stop.is_set():
-                    raise Interrupted(_INTERRUPTED)
+                    raise Interrupted.with_results(manner.folder)
                 yield carry_out(scenario, manner)
         return
     crew = _Crew(replace(manner, workers=1))
@@ -39,7 +38,7 @@ def results(scenarios: Sequence[str], manner: Manner, jobs: int) -> Iterator[Fin
             for one in waiting:
                 while not wait([one], _LOOK_SECONDS).done:
                     if stop.is_set():
-                        raise Interrupted(_INTERRUPTED)
+                        raise Interrupted.with_results(manner.folder)
                 yield one.result()
         finally:
             crew.end(waiting)

@@ -54,6 +54,11 @@ class Manner:
     workers: int | None = None
     """Worker processes of a test in memory; None: as in `Plan`."""
 
+    @property
+    def folder(self) -> Path:
+        """The folder for all results folders."""
+        return Path("runs") if self.out is None else self.out
+
 
 @dataclass(frozen=True)
 class Finding:

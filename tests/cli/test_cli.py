@@ -346,7 +346,7 @@ def test_an_interrupt_stays_one_for_every_reader(evedrop: Evedrop, reader: str) 
         live.process.terminate()
         done = live.end()
     assert done.status == 130
-    assert done.err == "evedrop: interrupted; the results so far are in the results folder\n"
+    assert done.err == "evedrop: interrupted; the results so far are in run\n"
 
 
 def test_a_title_is_text(evedrop: Evedrop) -> None:

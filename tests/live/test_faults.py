@@ -141,9 +141,11 @@ def test_an_interrupted_run_leaves_results_and_no_process(evedrop: Evedrop, when
     live.process.send_signal(number)
     done = live.end()
     assert done.status == 130
-    assert done.err.splitlines() == ["evedrop: interrupted; the results so far are in the results folder"]
+    assert done.err.splitlines() == ["evedrop: interrupted; the results so far are in run"]
     live.nothing_left()
     assert live.results.summary["ended"] == "interrupted"
+    again = evedrop("montecarlo", "run", "--slots", "20", "--trials", "1", "--out", "again")
+    assert (again.status, again.err) == (0, "")
     slots = tables_whole(live)
     if when == "running":
         assert slots > 0

@@ -119,6 +119,28 @@ def test_a_signal_ends_a_command_in_order(evedrop: Evedrop, command: str, moment
     interrupted(live, done)
 
 
+@pytest.mark.parametrize("command", ["run", "shards", "montecarlo"])
+def test_a_command_that_is_killed_in_its_first_moments_can_be_repeated(evedrop: Evedrop, command: str) -> None:
+    """The scenario is in the folder before any process is started and any trial is computed."""
+    live = evedrop.started(*COMMANDS[command])
+    began = live.children if command != "montecarlo" else live.done
+    wait_until(lambda: began() or live.process.poll() is not None, "a beginning")
+    live.process.kill()
+    live.process.wait()
+    again = evedrop("montecarlo", "run", "--slots", "20", "--trials", "2", "--out", "again")
+    assert (again.status, again.err) == (0, "")
+
+
+def test_a_folder_that_is_still_empty_is_removed(evedrop: Evedrop) -> None:
+    """A command that is interrupted while it still checks its scenarios leaves nothing."""
+    live = evedrop.begun(*COMMANDS["sweep"])
+    runs = evedrop.folder / "runs"
+    wait_until(lambda: [*runs.glob("*")] or live.process.poll() is not None, "a folder")
+    live.process.send_signal(signal.SIGINT)
+    assert live.end().status == 130
+    assert not runs.exists()
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
 @pytest.mark.parametrize("command", ["short run", "montecarlo", "sweep"])

@@ -12,13 +12,18 @@ import pytest
 from evedrop.api import montecarlo
 from evedrop.errors import UsageError
 from evedrop.figures import FIGURES, figure
-from evedrop.memory.montecarlo import Plan
+from evedrop.loading import load
+from evedrop.memory.montecarlo import Merger, Plan
 from evedrop.memory.simulation import Mode
+from evedrop.memory.trials import tasks_of
+from evedrop.memory.workers import in_this_process
 from evedrop.news import ConnectionOutage
 from evedrop.results.reading import Results
 from evedrop.results.summary_file import summary_text, write_summary
 from evedrop.results.writer import load_results
+from evedrop.score.scorekeeper import Ending, summary_of
 from evedrop.score.summary import Summary
+from evedrop.score.totals import Totals
 
 
 @pytest.mark.parametrize(
@@ -100,3 +105,19 @@ def test_infinite_numbers_are_numbers(results: Results) -> None:
     changed: Any = copy.deepcopy(dict(results.summary))
     changed["peers"]["smart"]["mean_squared_error"] = "inf"
     assert Summary.read(changed).peers["smart"].figure("mean_squared_error") == float("inf")
+
+
+@pytest.mark.parametrize("name", ["bursts", "late"])
+def test_theory_promises_the_same_however_soon_a_run_is_interrupted(name: str) -> None:
+    """Even before its first slot, where theory promises secrecy only from some slot on."""
+    scenario = load(name, {"trials": 2, "slots": 500, "event": [], "expect": []})
+    whole = Merger(scenario, Mode.EXACT)
+    for result in in_this_process(tasks_of(scenario, Mode.EXACT, 1), lambda _: None, lambda: False):
+        whole.add_batch(result)
+    ending = Ending(0.0, "interrupted")
+    nothing = summary_of(scenario, Totals.nothing(scenario, 2), dict.fromkeys(scenario.digested), ending)
+    for eavesdropper, verdict in whole.summary(Ending(1.0)).secrecy.items():
+        early = nothing.secrecy[eavesdropper]
+        assert early.sentence.endswith(verdict.sentence.rpartition("; ")[2])
+        assert early.relative_from == verdict.relative_from
+        assert early.relative_by_theory == verdict.relative_by_theory

@@ -24,6 +24,7 @@ from evedrop.live.network.control_file import remove_control
 from evedrop.names import OBSERVER
 from evedrop.news import FolderMoved, RunEnded, Tell, ViewOpened
 from evedrop.results.folder import HeldFolder, make_private, new_folder
+from evedrop.results.resolved_scenario import write_resolved
 from evedrop.scenario import Scenario
 from evedrop.signals import AFTERTHOUGHT_SECONDS
 from evedrop.view.viewer import Viewer
@@ -65,6 +66,9 @@ def launch_one(
         make_private(folder / "logs")
         viewer = None
         try:
+            # At once, so that a run that is interrupted or killed in its first moments can be run again.
+            with contextlib.suppress(OSError):  # the observer writes it, too, and reports why it cannot
+                write_resolved(folder, scenario)
             task = ObserverTask(folder.absolute(), view != "off", shard, paused)
             briefs = briefs_of(scenario, endpoints, task, patience=patience)
             observer = briefs.pop(OBSERVER)
@@ -87,31 +91,29 @@ def launch_one(
             elif isinstance(error, EvedropError):
                 with contextlib.suppress(OSError):
                     _note(held.now, scenario, "interrupted" if isinstance(error, Interrupted) else str(error))
+            if isinstance(error, Interrupted):
+                raise Interrupted.with_results(_now(held)) from None
             raise
         finally:
-            now = _now(held, tell)
+            now = _now(held)
+            remove_control(now)
+            if now != held.first:
+                tell(FolderMoved(str(now)))
     return Ended(status, viewer, now)
 
 
-def _now(held: HeldFolder, tell: Tell) -> Path:
-    """The results folder at the end of a run; removes the control file, and tells the user if the folder was renamed."""
+def _now(held: HeldFolder) -> Path:
+    """The results folder, which may have been renamed; its first name if it was removed."""
     try:
-        now = held.now
+        return held.now
     except FileNotFoundError:
         return held.first
-    remove_control(now)
-    if now != held.first:
-        tell(FolderMoved(str(now)))
-    return now
 
 
 def _forget(folder: Path) -> None:
     """Remove the folder of a run that was not started, so that the next run can use it."""
     with contextlib.suppress(OSError):
-        for log in (folder / "logs").iterdir():
-            log.unlink()
-        (folder / "logs").rmdir()
-        folder.rmdir()
+        shutil.rmtree(folder)
 
 
 def _note(folder: Path, scenario: Scenario, how: str) -> None:

@@ -8,6 +8,7 @@ Source: docs/scale.md.
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import threading
 import time
@@ -23,6 +24,7 @@ from evedrop.live.launch.shard import SHARDS_FOLDER, Shard, shards_of
 from evedrop.live.launch.starter import Starter
 from evedrop.news import ConnectionOutage, FolderMoved, News, RunEnded, RunProgress, Started, Tell
 from evedrop.results.folder import HeldFolder, new_folder
+from evedrop.results.resolved_scenario import write_resolved
 from evedrop.scenario import Scenario
 from evedrop.view.viewer import Viewer
 
@@ -130,6 +132,8 @@ def launch_shards(
     """
     endpoints = _endpoints(scenario)
     held = HeldFolder(new_folder(folder))
+    with contextlib.suppress(OSError):  # it is written again when the shards are merged, and an error reported then
+        write_resolved(folder, scenario)
     shards = shards_of(scenario, folder)
     progress, state = OneProgress(shards, tell), _ShardsState()
     first, *others = [(shard, at, progress.of(shard)) for shard, at in zip(shards, endpoints, strict=True)]
@@ -195,5 +199,5 @@ def _made_one(
     if fault is not None:
         raise RunError(how)
     if state.failures:
-        raise state.failures[0][1]
+        raise Interrupted.with_results(folder)
     return 1 if summary.failed_expectations else 0
