@@ -13,6 +13,7 @@ RUN if ls /wheels/*.whl >/dev/null 2>&1; then index=--no-index; fi; \
     /build/bin/pip download --quiet --disable-pip-version-check --no-cache-dir $index --find-links /wheels \
       --require-hashes --no-deps --requirement /wheels/constraints.txt --dest /packages
 COPY pyproject.toml hatch_build.py README.md LICENSE /source/
+COPY docs /source/docs
 COPY emulator /source/emulator
 COPY peers /source/peers
 COPY scenarios /source/scenarios

@@ -7,7 +7,6 @@ Processor seconds where two things are compared, in turns, so that a busy machin
 
 from __future__ import annotations
 
-import os
 import statistics
 import sys
 import tempfile
@@ -18,6 +17,7 @@ from evedrop import compare
 from evedrop.expected.expectations import expectations_of
 from evedrop.loading import load
 from evedrop.memory.montecarlo import Plan
+from evedrop.memory.workers import usable_cores
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.process import Trajectory
@@ -35,7 +35,7 @@ BURSTS = {"legitimate.link": {"loss": {"model": "gilbert-elliott", "p": 0.05, "r
 
 def whole(trials: int, slots: int) -> None:
     """Wall seconds of all schemes against all adversaries."""
-    workers = len(os.sched_getaffinity(0))
+    workers = usable_cores()
     with tempfile.TemporaryDirectory() as folder:
         started = time.monotonic()
         found = compare(MARGINAL, trials=trials, slots=slots, out=Path(folder) / "run", plan=Plan(workers=workers))

@@ -6,7 +6,6 @@ Trials run in fixed blocks of 500 and are merged in trial order: the results are
 from __future__ import annotations
 
 import contextlib
-import os
 import shutil
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping
@@ -22,7 +21,7 @@ from evedrop.memory.packet_counts import PacketCounts
 from evedrop.memory.simulation import Mode
 from evedrop.memory.splitting import rare_estimates, work_of
 from evedrop.memory.trials import BatchResult, Task, tasks_of
-from evedrop.memory.workers import REACH_SECONDS, connected, in_processes, in_this_process, on_cluster
+from evedrop.memory.workers import REACH_SECONDS, connected, in_processes, in_this_process, on_cluster, usable_cores
 from evedrop.model.digest import RunDigest, block_starts
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.outcomes import eavesdropper_outcomes
@@ -70,7 +69,7 @@ class Plan:
         if self.workers is not None:
             return self.workers
         work = scenario.trials * scenario.slots * len(scenario.receivers)
-        return len(os.sched_getaffinity(0)) if work > _WORTH_A_PROCESS else 1
+        return usable_cores() if work > _WORTH_A_PROCESS else 1
 
 
 def simulate(scenario: Scenario, folder: Path, tell: Tell, plan: Plan = Plan()) -> int:

@@ -6,6 +6,7 @@ A worker process has a pipe of its own and shares no lock with other processes, 
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import subprocess
 import sys
@@ -30,6 +31,13 @@ REACH_SECONDS = 5.0
 
 Tell = Callable[[int], None]
 Stopped = Callable[[], bool]
+
+
+def usable_cores() -> int:
+    """The number of cores that this process may use; all of the machine's where the system cannot say, as on macOS."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def in_this_process(tasks: list[Task], tell: Tell, stopped: Stopped) -> Iterator[BatchResult]:
@@ -197,7 +205,7 @@ def connected(scheduler: str | None, patience: float = REACH_SECONDS) -> Iterato
         from distributed import Client  # noqa: PLC0415 - an optional extra
         from distributed.comm.core import connect  # noqa: PLC0415 - the same
     except ImportError as error:
-        raise UsageError("a scheduler needs Dask: pip install 'evedrop[cluster]'") from error
+        raise UsageError("a scheduler needs Dask: pip install '.[cluster]' in the checkout") from error
 
     async def reach() -> None:  # a client without a scheduler may hang, and prints useless messages
         reached = connect(scheduler, timeout=patience)  # type: ignore[no-untyped-call]

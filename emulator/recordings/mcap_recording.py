@@ -141,7 +141,7 @@ class _Reader:
             from mcap.stream_reader import StreamReader  # noqa: PLC0415 - an optional extra
         except ImportError as error:
             raise TraceError(
-                str(self._path), "file", "is an MCAP recording; expected pip install 'evedrop[mcap]' first"
+                str(self._path), "file", "is an MCAP recording; expected pip install '.[mcap]' in the checkout first"
             ) from error
         channels: dict[tuple[int, int], _Channel] = {}
         for number, path in enumerate(self._files()):

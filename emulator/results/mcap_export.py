@@ -60,7 +60,7 @@ def export_mcap(
     try:
         from mcap.writer import Writer  # noqa: PLC0415 - an optional extra
     except ImportError as error:
-        raise UsageError("an MCAP file needs pip install 'evedrop[mcap]' first") from error
+        raise UsageError("an MCAP file needs pip install '.[mcap]' in the checkout first") from error
     scenario = load(results.folder / "scenario.toml", beyond_horizon=True)
     with whole_file(path) as temporary, temporary.open("wb") as file:
         writer = Writer(file)

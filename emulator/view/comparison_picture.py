@@ -45,9 +45,18 @@ _LEAST_WIDTH = 9.0
 
 
 def draw(path: Path, found: Comparison) -> None:
-    """Draw a comparison as `path`.png and `path`.pdf."""
-    with panels(path, 1, *_size(found)) as (axes,):
+    """Draw a comparison as `path`.png and `path`.pdf. The PNG file names its rows and columns in its metadata."""
+    with panels(path, 1, *_size(found), shown(found)) as (axes,):
         _draw_on(axes, found)
+
+
+def shown(found: Comparison) -> dict[str, str]:
+    """What the picture of a comparison shows, by keyword, as its PNG file says it: so that a kept picture can be checked."""
+    return {
+        "Rows": ",".join(found.schemes),
+        "Columns": ",".join(found.adversaries),
+        "Size": f"{found.slots} slots, {found.trials} trials, seed {found.seed}",
+    }
 
 
 def comparison_figure(found: Comparison) -> ShownFigure:

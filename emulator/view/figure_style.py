@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,13 +52,17 @@ def drawing(width: float, height: float) -> Iterator[ShownFigure]:
 
 
 @contextmanager
-def panels(path: Path, columns: int, width: float, height: float) -> Iterator[list[Axes]]:
+def panels(
+    path: Path, columns: int, width: float, height: float, shows: Mapping[str, str] | None = None
+) -> Iterator[list[Axes]]:
     """Axes to draw on, side by side; width and height in inches. Saved as `path`.png and `path`.pdf at the end.
+
+    shows: what the picture shows, by keyword; the PNG file keeps it as text, which any reader of PNG metadata can read.
 
     Uses no windowing toolkit, and leaves no global state changed.
     """
     with drawing(width, height) as figure:
         axes = figure.subplots(1, columns, squeeze=False)
         yield list(axes[0])
-        figure.savefig(path.with_suffix(".png"), dpi=180)
+        figure.savefig(path.with_suffix(".png"), dpi=180, metadata=dict(shows or {}))
         figure.savefig(path.with_suffix(".pdf"), metadata={"CreationDate": None})

@@ -160,8 +160,8 @@ def ffmpeg() -> str:
         return str(imageio_ffmpeg.get_ffmpeg_exe())
     except (ImportError, RuntimeError) as error:
         raise UsageError(
-            "an MP4 needs ffmpeg, which the package imageio-ffmpeg brings: pip install 'evedrop[video]', or give --video a "
-            "name that ends in .gif"
+            "an MP4 needs ffmpeg, which the package imageio-ffmpeg brings: pip install '.[video]' in the checkout, or give "
+            "--video a name that ends in .gif"
         ) from error
 
 

@@ -73,10 +73,10 @@ def test_without_the_solver_one_line_says_what_to_install(
     monkeypatch.setattr(mpc, "find_spec", lambda _: None)
     assert cli.main(["check", "microgrid-mpc"]) == 2
     told = capsys.readouterr().err
-    assert told.count("evedrop[microgrid]") == 1
+    assert told.count("'.[microgrid]'") == 1
     assert "microgrid-mpc: 1 mistake" in told
     assert (
-        "controller.strategy: is mpc, whose solver is not installed; expected pip install 'evedrop[microgrid]' first"
+        "controller.strategy: is mpc, whose solver is not installed; expected pip install '.[microgrid]' in the checkout first"
         in told
     )
     assert cli.main(["check", "microgrid"]) == 0

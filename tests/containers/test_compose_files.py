@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,16 @@ def test_the_base_image_is_pinned_by_a_digest() -> None:
     stages = [line.split()[1] for line in lines if line.startswith("FROM ")]
     assert stages == ["${EVEDROP_BASE:-${PINNED}}"] * 2
     assert "python:" not in (ROOT / "docker-compose.yml").read_text(), "the Dockerfile alone names it"
+
+
+def test_the_image_is_built_from_all_that_the_package_contains() -> None:
+    """The Dockerfile copies every folder of the wheel, the pages of `evedrop docs` too, and .dockerignore lets them through."""
+    with (ROOT / "pyproject.toml").open("rb") as file:
+        folders = tomllib.load(file)["tool"]["hatch"]["build"]["targets"]["wheel"]["only-include"]
+    assert "docs" in folders
+    copied = re.findall(r"^COPY (\S+) /source/\1$", (ROOT / "Dockerfile").read_text(), re.MULTILINE)
+    let_through = (ROOT / ".dockerignore").read_text().splitlines()
+    assert [one for one in folders if one not in copied or f"!{one}" not in let_through] == []
 
 
 def test_the_shipped_services_are_those_that_the_command_writes(evedrop: Evedrop) -> None:

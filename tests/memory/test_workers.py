@@ -15,9 +15,10 @@ from hypothesis import strategies as st
 
 from evedrop.errors import RunError
 from evedrop.loading import load
+from evedrop.memory.montecarlo import Plan
 from evedrop.memory.simulation import Mode
 from evedrop.memory.trials import BLOCK_TRIALS, tasks_of
-from evedrop.memory.workers import in_processes
+from evedrop.memory.workers import in_processes, usable_cores
 from evedrop.results.writer import load_results
 from tests.conftest import Done, Evedrop, Live, wait_until, with_mark
 
@@ -185,3 +186,14 @@ def test_an_interrupted_sweep_keeps_finished_points(evedrop: Evedrop) -> None:
     assert set(table["slots"].to_pylist()) == {20}
     assert table.num_rows == 4
     assert (live.folder / "sweep.png").is_file()
+
+
+def test_the_cores_are_counted_where_the_system_cannot_say_which_may_be_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without `sched_getaffinity`, as on macOS, a large study gets all cores; without any count, one worker."""
+    large = load("eavesdroppers", {"slots": SLOTS, "trials": 1000})
+    assert Plan().workers_for(large) == usable_cores() == len(os.sched_getaffinity(0))
+    monkeypatch.delattr(os, "sched_getaffinity")
+    monkeypatch.setattr(os, "cpu_count", lambda: 7)
+    assert Plan().workers_for(large) == 7
+    monkeypatch.setattr(os, "cpu_count", lambda: None)
+    assert Plan().workers_for(large) == 1

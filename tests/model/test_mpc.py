@@ -166,7 +166,7 @@ def test_without_the_solver_it_says_what_to_install(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(mpc, "find_spec", lambda _: None)
     ((entry, what),) = Mpc.objections(assigned())
     assert entry == "strategy"
-    assert "pip install 'evedrop[microgrid]'" in what
+    assert "pip install '.[microgrid]' in the checkout" in what
 
 
 def test_the_strategy_is_registered_with_defaults() -> None:

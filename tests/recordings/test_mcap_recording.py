@@ -278,5 +278,5 @@ def test_without_the_library_the_message_says_what_to_install(tmp_path: Path, mo
     """The extra, by its name."""
     path = write(tmp_path / "bag.mcap", [Recorded("/scan", heard(lossy(BURSTS, 300)))])
     monkeypatch.setitem(sys.modules, "mcap.stream_reader", None)
-    with pytest.raises(TraceError, match=r"expected pip install 'evedrop\[mcap\]' first"):
+    with pytest.raises(TraceError, match=r"expected pip install '\.\[mcap\]' in the checkout first"):
         mcap_recording(path)

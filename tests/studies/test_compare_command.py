@@ -6,6 +6,7 @@ import json
 from typing import Any
 
 import pytest
+from PIL import Image
 
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.loading import load
@@ -161,6 +162,13 @@ def test_the_command_prints_a_table_and_writes_its_folder(evedrop: Evedrop) -> N
         "innovation",
     ]
     assert (folder / "compare.png").stat().st_size > 20_000
+    with Image.open(folder / "compare.png") as picture:
+        said = {name: picture.info[name] for name in ("Rows", "Columns", "Size")}
+    assert said == {
+        "Rows": "innovation,acknowledged",
+        "Columns": "smart,reference,blocks-critical",
+        "Size": "41 slots, 30 trials, seed 11",
+    }
 
 
 def test_json_is_strict_and_has_what_is_documented(evedrop: Evedrop) -> None:

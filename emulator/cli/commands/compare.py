@@ -58,8 +58,8 @@ def _names(listed: str | None) -> list[str] | None:
 
 
 def _compares(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--schemes", metavar="A,B", help="default all")
-    parser.add_argument("--adversaries", metavar="X,Y", help="default all")
+    parser.add_argument("--schemes", metavar="A,B", help="default all that the process allows")
+    parser.add_argument("--adversaries", metavar="X,Y", help="default all but learners, which take long")
     parser.add_argument(
         "--with",
         dest="parameters",
@@ -74,7 +74,7 @@ COMMANDS = (
     Command(
         "compare",
         compare,
-        "compare every scheme with every eavesdropper, in memory",
+        "compare schemes, each against all adversaries, in memory",
         (scenario, entries, output, _compares, workers),
         section="study",
         example="compare vehicle --trials 100",

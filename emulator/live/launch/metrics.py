@@ -175,7 +175,7 @@ def metrics_served(address: MetricsAddress, metrics: RunMetrics, patience: float
     try:
         from prometheus_client import CollectorRegistry, MetricsHandler  # noqa: PLC0415 - an optional extra
     except ImportError as error:
-        raise UsageError("--metrics needs pip install 'evedrop[metrics]' first") from error
+        raise UsageError("--metrics needs pip install '.[metrics]' in the checkout first") from error
     registry = CollectorRegistry()
     registry.register(metrics)
     handler = type("ScrapeHandler", (_Scrape, MetricsHandler.factory(registry)), {"timeout": patience})

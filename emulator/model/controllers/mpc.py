@@ -84,7 +84,10 @@ class Mpc(Controller):
         """A missing or broken solver, and inputs without weight, for which no best inputs exist."""
         if find_spec("osqp") is None:
             return [
-                ("strategy", "is mpc, whose solver is not installed; expected pip install 'evedrop[microgrid]' first")
+                (
+                    "strategy",
+                    "is mpc, whose solver is not installed; expected pip install '.[microgrid]' in the checkout first",
+                )
             ]
         why = _broken()
         if why is not None:
