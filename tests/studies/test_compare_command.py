@@ -163,8 +163,8 @@ def test_the_command_prints_a_table_and_writes_its_folder(evedrop: Evedrop) -> N
     ]
     assert (folder / "compare.png").stat().st_size > 20_000
     with Image.open(folder / "compare.png") as picture:
-        said = {name: picture.info[name] for name in ("Rows", "Columns", "Size")}
-    assert said == {
+        kept = {name: picture.info[name] for name in ("Rows", "Columns", "Size")}
+    assert kept == {
         "Rows": "innovation,acknowledged",
         "Columns": "smart,reference,blocks-critical",
         "Size": "41 slots, 30 trials, seed 11",
