@@ -88,11 +88,15 @@ def limited_program() -> NoReturn:
 
 
 def program_with_path() -> NoReturn:
-    """In the place of `program`, in a fork: with the modules of PYTHONPATH, and a `sitecustomize` among them."""
+    """In the place of `program`, in a fork: with the modules of PYTHONPATH, and a `sitecustomize` among them.
+
+    Debian and Ubuntu ship a `sitecustomize` that this process has imported long ago; the one in PYTHONPATH comes before it.
+    """
     folders = [one for one in os.environ.get("PYTHONPATH", "").split(os.pathsep) if one and one not in sys.path]
     if folders:
         sys.path[:0] = folders
         importlib.invalidate_caches()
+        sys.modules.pop("sitecustomize", None)
         with suppress(ModuleNotFoundError):
             importlib.import_module("sitecustomize")
     limited_program()
