@@ -15,6 +15,17 @@ from numpy.typing import NDArray
 from evedrop.kernels.choice import EXTENSION
 from evedrop.kernels.elementary import Floats
 from evedrop.kernels.reference import Codes, Flags, Words
+from evedrop.kernels.shapes import (
+    expect,
+    expect_bytes,
+    expect_counters,
+    expect_histograms,
+    expect_mixture,
+    expect_records,
+    expect_runs,
+    expect_wide,
+    expect_words,
+)
 
 _module = importlib.import_module(EXTENSION)
 _lib, _buffer, _NULL = _module.lib, _module.ffi.from_buffer, _module.ffi.NULL
@@ -23,34 +34,28 @@ _lib, _buffer, _NULL = _module.lib, _module.ffi.from_buffer, _module.ffi.NULL
 def _doubles(array: Any, shape: tuple[int, ...]) -> Any:
     """A pointer to an array's numbers, which keeps them alive."""
     ordered = np.ascontiguousarray(array, np.float64)
-    if ordered.shape != shape:
-        raise ValueError(f"an array of shape {ordered.shape}; expected {shape}")
+    expect(ordered, shape)
     return _buffer("double[]", ordered)
 
 
 def _bytes(array: Any, shape: tuple[int, ...]) -> Any:
     """The same for codes or flags."""
     ordered = np.ascontiguousarray(array)
-    if ordered.shape != shape or ordered.itemsize != 1:
-        raise ValueError(f"{ordered.dtype} of shape {ordered.shape}; expected codes or flags of shape {shape}")
+    expect_bytes(ordered, shape)
     return _buffer("uint8_t[]", ordered)
 
 
 def _words(words: Words, width: int) -> Any:
     """The same for words (c, R, m), m ≥ width."""
     ordered = np.ascontiguousarray(words, np.uint64)
-    if ordered.ndim != 3 or ordered.shape[2] < width:
-        raise ValueError(f"words of shape {ordered.shape}; expected at least {width} for each slot and trial")
+    expect_words(ordered, width)
     return _buffer("uint64_t[]", ordered)
 
 
 def fill_counters(counters: NDArray[np.uint64], slot: int, first: int) -> None:
     """As `reference.fill_counters`."""
-    slots, count, two = counters.shape
-    if two != 2 or counters.dtype.itemsize != 8:
-        raise ValueError(
-            f"counters of shape {counters.shape} and type {counters.dtype}; expected pairs of 64-bit words"
-        )
+    expect_counters(counters)
+    slots, count, _ = counters.shape
     out = _buffer("uint64_t[]", counters.view(np.uint64), require_writable=True)
     _lib.kernels_counters(slots, count, slot, first, out)
 
@@ -159,12 +164,9 @@ def _follow(A: Floats, Q: Floats, sizes: tuple[int, int, int], initial: bool, *a
 
 def records(marks: Flags, a: Floats, P: Floats | None, out: Codes, first: int = 0) -> None:
     """As `reference.records`."""
-    (slots, trials), (count, places, size), width = marks.shape, out.shape, a.shape[1]
+    expect_records(marks, a, P, out, first)
+    (slots, trials), count, width = marks.shape, len(out), a.shape[1]
     n = 0 if P is None else P.shape[1]
-    if out.dtype != np.uint8 or (places, size) != (slots, 1 + 8 * (width + n * (n + 1) // 2)):
-        raise ValueError(f"records {out.dtype} of shape {out.shape} for {slots} slots, {width} numbers and {n} states")
-    if not 0 <= first <= trials - count:
-        raise ValueError(f"{count} of {trials} trials from {first} on")
     _lib.kernels_records(
         slots,
         trials,
@@ -206,8 +208,7 @@ def count_codes(codes: Codes, kinds: int) -> NDArray[np.uint32]:
 def count_bursts(codes: Codes, lost: int, run: NDArray[np.int64], most: int) -> NDArray[np.uint32]:
     """As `reference.count_bursts`."""
     slots, trials = codes.shape
-    if run.shape != (trials,) or run.dtype != np.int64:
-        raise ValueError(f"runs of shape {run.shape} and type {run.dtype}; expected int64 of shape {(trials,)}")
+    expect_runs(run, trials)
     counts = np.zeros(most + 1, np.uint32)
     _lib.kernels_bursts(
         slots,
@@ -223,10 +224,9 @@ def count_bursts(codes: Codes, lost: int, run: NDArray[np.int64], most: int) -> 
 
 def add_to_histograms(counts: NDArray[np.uint32], values: Floats, shift: int, base: int) -> None:
     """As `reference.add_to_histograms`."""
+    expect_histograms(counts)
     rows, bins = counts.shape
-    if counts.dtype != np.uint32:
-        raise ValueError(f"counts of type {counts.dtype}; expected uint32")
-    trials = values.shape[1]
+    _, trials = values.shape
     out = _buffer("uint32_t[]", counts, require_writable=True)
     _lib.kernels_histogram(rows, trials, _doubles(values, (rows, trials)), shift, base, bins, out)
 
@@ -251,9 +251,8 @@ def gather(flags: Flags, x: Floats) -> Floats:
 
 def triangular_factors(M: Floats) -> Floats:
     """As `reference.triangular_factors`."""
+    expect_wide(M)
     count, n, m = M.shape
-    if m < n:
-        raise ValueError(f"matrices of shape {(n, m)}; expected at least as many columns as rows")
     work = np.array(M, np.float64, order="C")
     _check_factor(_lib.kernels_triangularise(count, n, m, _buffer("double[]", work)), n)
     return work[:, :, :n]
@@ -288,12 +287,11 @@ def follow_mixture(
     initial: bool = False,
 ) -> tuple[Floats, Floats, Codes, Floats, Floats, Floats, Floats]:
     """As `reference.follow_mixture`."""
+    expect_mixture(A, G, leaks, rounding, before, gamma, z, capacity)
     (slots, n, trials), places, below = z.shape, len(before[0]), len(A) * (len(A) - 1) // 2
     if not slots:
         weight, mean, lower, diagonal = before
         return z.copy(), np.empty((0, n, n, trials)), np.empty((0, trials), np.uint8), weight, mean, lower, diagonal
-    if places > capacity:
-        raise ValueError(f"a mixture with {places} places; expected at most {capacity}")
     x_hat, P, action = np.empty(z.shape), np.empty((slots, n, n, trials)), np.empty((slots, trials), np.uint8)
     rows = [(), (n,), (below,), (n,)]
     after = [np.empty((*row, capacity, trials)) for row in rows]

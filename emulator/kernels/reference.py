@@ -1,7 +1,7 @@
 """The kernels in numpy: what they must compute, to the bit, and the fallback where no C compiler worked.
 
 Each function has a twin of the same name in `compiled.py`. Trials are the last axis, and slots the first; everything is
-elementwise over slots and trials, in a fixed order of operations.
+elementwise over slots and trials, in a fixed order of operations. Arguments of other shapes are refused with ValueError.
 
 Source: docs/mathematics.md, model and eavesdroppers.
 """
@@ -15,6 +15,18 @@ from evedrop.kernels import elementary, mixtures, posterior
 from evedrop.kernels.elementary import Floats
 from evedrop.kernels.factored import Factor
 from evedrop.kernels.leak import Leak
+from evedrop.kernels.shapes import (
+    expect,
+    expect_all,
+    expect_bytes,
+    expect_counters,
+    expect_histograms,
+    expect_mixture,
+    expect_records,
+    expect_runs,
+    expect_wide,
+    expect_words,
+)
 
 Words = NDArray[np.uint64]
 Codes = NDArray[np.uint8]
@@ -25,6 +37,7 @@ _STATE, _INNOVATION = 1, 2  # `Action` of evedrop.model.receiver
 
 def fill_counters(counters: NDArray[np.uint64], slot: int, first: int) -> None:
     """Fill AES counters (c, m, 2), big-endian: slot, slot + 1, … and in each of them the blocks first … first + m − 1."""
+    expect_counters(counters)
     slots, count, _ = counters.shape
     big = counters.view(">u8")
     big[:, :, 0] = np.arange(slot, slot + slots, dtype=np.uint64)[:, None]
@@ -47,10 +60,15 @@ def normals(words: Words, width: int) -> Floats:
 
 
 def _ordered(words: Words, width: int) -> Words:
+    expect_words(words, width)
     return np.ascontiguousarray(words[:, :, :width].transpose(0, 2, 1))
 
 
-product = elementary.product
+def product(M: Floats, x: Floats) -> Floats:
+    """M x of every slot and trial: M (c, m, n), x (c, n, R) → (c, m, R)."""
+    slots, _, n = M.shape
+    expect(x, (slots, n, x.shape[-1]))
+    return elementary.product(M, x)
 
 
 def carry(A: Floats, P: Floats) -> Floats:
@@ -66,6 +84,8 @@ def carry(A: Floats, P: Floats) -> Floats:
 
 def advance(A: Floats, noise: Floats, before: Floats) -> tuple[Floats, Floats]:
     """Predictions A x_{k−1} and states x_k = A x_{k−1} + noise, (c, n, R) each, from noise (c, n, R) and x before (n, R)."""
+    _, n, trials = noise.shape
+    expect_all((A, (n, n)), (before, (n, trials)))
     predicted, x = np.empty_like(noise), np.empty_like(noise)
     for row, one in enumerate(noise):
         predicted[row] = product(A[None], before[None])[0]
@@ -75,6 +95,9 @@ def advance(A: Floats, noise: Floats, before: Floats) -> tuple[Floats, Floats]:
 
 def encode(nu: Flags, x: Floats, predicted: Floats, chi: Floats) -> Floats:
     """(x − predicted) + χ where ν (c, R), x elsewhere; (c, n, R) each."""
+    slots, _, trials = x.shape
+    expect_bytes(nu, (slots, trials))
+    expect_all((predicted, x.shape), (chi, x.shape))
     return np.where(nu[:, None, :], (x - predicted) + chi, x)
 
 
@@ -92,6 +115,9 @@ def follow(
     action (c, R); z (c, n, R): packets, read where they are used; χ (c, n, R): for a decoder, subtracted from innovations.
     initial: the first slot is slot 0, which is not predicted. The table in `evedrop.model.update` says what is computed.
     """
+    slots, n, trials = z.shape
+    expect_all((A, (n, n)), (before[0], (n, trials)), (z if chi is None else chi, z.shape))
+    expect_bytes(action, (slots, trials))
     x_hat = np.empty(z.shape)
     last = before[0]
     for row, codes in enumerate(action):
@@ -105,6 +131,9 @@ def follow(
 @np.errstate(over="ignore", invalid="ignore")  # as in C: an unstable receiver's covariance may exceed double precision
 def follow_covariance(A: Floats, Q: Floats, P: Floats, action: Codes, initial: bool = False) -> Floats:
     """The believed covariances (c, n, n, R) of `follow`, from P (n, n, R) and actions (c, R)."""
+    (slots, trials), n = action.shape, len(A)
+    expect_all((A, (n, n)), (Q, (n, n)), (P, (n, n, trials)))
+    expect_bytes(action, (slots, trials))
     found = np.empty((len(action), *P.shape))
     for row, codes in enumerate(action):
         if not (initial and row == 0):
@@ -120,6 +149,7 @@ def records(marks: Flags, a: Floats, P: Floats | None, out: Codes, first: int = 
     marks (c, R), a (c, m, R); P (c, n, n, R), whose upper triangle is taken, row by row, or None. out: that of the trials from
     `first` on, (trials, c, 1 + 8 (m + n (n + 1) / 2)).
     """
+    expect_records(marks, a, P, out, first)
     some = slice(first, first + len(out))
     columns = [a[:, i, some] for i in range(a.shape[1])]
     if P is not None:
@@ -133,6 +163,8 @@ def records(marks: Flags, a: Floats, P: Floats | None, out: Codes, first: int = 
 
 def squared_errors(x: Floats, x_hat: Floats) -> Floats:
     """|x − x̂|² of every slot and trial, (c, R), from (c, n, R)."""
+    slots, n, trials = x.shape
+    expect(x_hat, (slots, n, trials))
     error = x - x_hat
     error *= error
     squared: Floats = error[:, 0].copy()
@@ -143,6 +175,8 @@ def squared_errors(x: Floats, x_hat: Floats) -> Floats:
 
 def traces(P: Floats) -> Floats:
     """Tr P of every slot and trial: P (c, n, n, R) → (c, R)."""
+    slots, n, _, trials = P.shape
+    expect(P, (slots, n, n, trials))
     trace: Floats = P[:, 0, 0].copy()
     for i in range(1, P.shape[1]):
         trace += P[:, i, i]
@@ -151,6 +185,8 @@ def traces(P: Floats) -> Floats:
 
 def count_codes(codes: Codes, kinds: int) -> NDArray[np.uint32]:
     """How often each code below `kinds` occurs in each slot, (c, kinds), from codes (c, R)."""
+    slots, trials = codes.shape
+    expect_bytes(codes, (slots, trials))
     return np.stack([(codes == code).sum(axis=1, dtype=np.uint32) for code in range(kinds)], axis=1)
 
 
@@ -159,6 +195,9 @@ def count_bursts(codes: Codes, lost: int, run: NDArray[np.int64], most: int) -> 
 
     run (R,): the length of each trial's current run, which is brought up to date.
     """
+    slots, trials = codes.shape
+    expect_bytes(codes, (slots, trials))
+    expect_runs(run, trials)
     counts = np.zeros(most, np.uint32)
     for row in codes:
         going = row == lost
@@ -170,7 +209,10 @@ def count_bursts(codes: Codes, lost: int, run: NDArray[np.int64], most: int) -> 
 
 def add_to_histograms(counts: NDArray[np.uint32], values: Floats, shift: int, base: int) -> None:
     """Add each of values (c, R) to a bin of its row of counts (c, bins): its bits shifted right, less base, within the bins."""
+    expect_histograms(counts)
     rows, bins = counts.shape
+    _, trials = values.shape
+    expect(values, (rows, trials))
     found = (np.ascontiguousarray(values).view(np.int64) >> shift) - base
     np.clip(found, 0, bins - 1, out=found)
     found += bins * np.arange(rows)[:, None]
@@ -182,7 +224,10 @@ def scatter(flags: Flags, packed: Floats, n: int) -> Floats:
 
     flags (c, R); packed (m,): for each slot n rows of as many numbers as it has flags.
     """
-    z = np.zeros((len(flags), n, flags.shape[1]))
+    slots, trials = flags.shape
+    expect_bytes(flags, (slots, trials))
+    expect(packed, (n * int(np.count_nonzero(flags)),))
+    z = np.zeros((slots, n, trials))
     at = 0
     for row, some in zip(z, flags, strict=True):
         count = n * int(np.count_nonzero(some))
@@ -193,6 +238,8 @@ def scatter(flags: Flags, packed: Floats, n: int) -> Floats:
 
 def gather(flags: Flags, x: Floats) -> Floats:
     """The columns of x (n, R) where the flags (R,) are set, (n, count)."""
+    _, trials = x.shape
+    expect_bytes(flags, (trials,))
     some: Floats = np.compress(flags, x, axis=1)
     return some
 
@@ -202,6 +249,7 @@ def triangular_factors(M: Floats) -> Floats:
 
     Raises ZeroDivisionError where the square of an entry is too small for a double.
     """
+    expect_wide(M)
     count, n, _ = M.shape
     return np.array([elementary.triangular_factor(one.tolist()) for one in M]).reshape(count, n, n)
 
@@ -211,6 +259,8 @@ def carried_factors(A: Floats, G: Floats, carried: Floats, count: int) -> Floats
 
     Raises ZeroDivisionError as `triangular_factors` does.
     """
+    n = len(A)
+    expect_all((A, (n, n)), (G, (n, n)), (carried, (n, n)))
     found = np.empty((count, *carried.shape))
     for row in range(count):
         carried = found[row] = product(A[None], triangular_factors(np.concatenate([carried, G], axis=1)[None]))[0]
@@ -236,6 +286,7 @@ def follow_mixture(
     z (c, n, R): packets, read where they are received.
     initial: the first slot is slot 0, in which a packet is the state.
     """
+    expect_mixture(A, G, leaks, rounding, before, gamma, z, capacity)
     model = posterior.Weighing(A, Factor.of_triangular(G.tolist()), state_probability, capacity)
     mixture, (slots, n, trials) = mixtures.Mixture(*before), z.shape
     x_hat, P, action = np.empty(z.shape), np.empty((slots, n, n, trials)), np.empty((slots, trials), np.uint8)

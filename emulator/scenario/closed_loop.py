@@ -5,15 +5,12 @@ Source: docs/scenario.md, process, plant and controller.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
-import numpy as np
-
-from evedrop.kernels.elementary import semidefinite_factor
 from evedrop.model.controllers import CONTROLLERS
 from evedrop.model.schemes import SCHEMES
 from evedrop.names import LEGITIMATE
-from evedrop.scenario.plant import ControllerTable, PlantTable, assignment_of, limit_mistakes, plant_of
+from evedrop.scenario.plant import ControllerTable, PlantTable, assignment_of, limit_mistakes, noise_mistakes, plant_of
 from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.valid import ValidTables
 from evedrop.scenario.words import listed
@@ -75,10 +72,10 @@ def _plant_and_process(plant: PlantTable, process: ProcessTable) -> Iterator[str
     for name, rows in matrices.items():
         if rows is None:
             continue
-        if len(rows) != n:
+        if name == "noise":
+            yield from noise_mistakes(plant, n)
+        elif len(rows) != n:
             yield f"plant.{name}: has {len(rows)} rows; expected {n}, one for each state"
-        elif name == "noise":
-            yield from _noise_mistakes(rows, n)
     inside = {"process.reference": process.around}
     if plant.start is not None and len(plant.start) != n:
         yield f"plant.start: has {len(plant.start)} entries; expected {n}, one for each state"
@@ -87,20 +84,6 @@ def _plant_and_process(plant: PlantTable, process: ProcessTable) -> Iterator[str
     limits = {"state_lower": plant.state_lower, "state_upper": plant.state_upper}
     for name, what in limit_mistakes(limits, "state", n, "one for each state", inside):
         yield f"{name}: {what}" if name.startswith("process.") else f"plant.{name}: {what}"
-
-
-def _noise_mistakes(rows: Sequence[Sequence[float]], n: int) -> Iterator[str]:
-    if any(len(row) != n for row in rows):
-        yield f"plant.noise: has a row that is not of {n} numbers; expected {n} × {n}, as A is"
-        return
-    noise = np.array(rows, np.float64)
-    if not np.array_equal(noise, noise.T):
-        yield "plant.noise: is not symmetric; expected a covariance, such as 1e-6 times the identity, or 0"
-        return
-    try:
-        semidefinite_factor(noise)
-    except ValueError:
-        yield "plant.noise: has an eigenvalue below 0; expected a covariance, such as 1e-6 times the identity, or 0"
 
 
 def _rows(plant: PlantTable, slots: int | None) -> Iterator[str]:

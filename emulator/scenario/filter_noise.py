@@ -16,7 +16,7 @@ from evedrop.kernels.elementary import semidefinite_factor
 from evedrop.model.local_filter import MOST_STATES, FilterStep, settled
 from evedrop.model.plant import Plant
 from evedrop.model.process import MARGINAL, Floats, Process
-from evedrop.scenario.plant import PlantTable, plant_of
+from evedrop.scenario.plant import PlantTable, noise_mistakes, plant_of
 from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.valid import ValidTables
 
@@ -78,7 +78,7 @@ def _settled_from(process: Mapping[str, Any], plant: PlantTable) -> FilterStep:
 def settled_of(process: ProcessTable, plant: PlantTable) -> FilterStep:
     """The steady state of the sensor's filter. Raises ValueError if there is no filter, or if it has no steady state."""
     n = len(process.A)
-    if plant.output_matrix is None or measured_mistakes(plant, n):
+    if plant.output_matrix is None or measured_mistakes(plant, n) or noise_mistakes(plant, n):
         raise ValueError("no filter")
     known = Process(np.array(process.A), np.eye(n), np.array(process.initial_covariance))
     described = plant_of(plant, process.around)
@@ -140,7 +140,7 @@ def filter_mistakes(tables: ValidTables) -> Iterator[str]:
         try:
             settled_of(process, plant)
         except ValueError:
-            if not wrong:
+            if not wrong and not noise_mistakes(plant, len(process.A)):
                 yield from _why_unsettled(process, plant)
         if encoding is not None and scheme is not None and scheme.decides_initial_state():
             decides = f"the scheme {encoding.scheme} decides x_0 itself"

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, ConfigDict, Field
 
+from evedrop.kernels.elementary import semidefinite_factor
 from evedrop.model.controllers import CONTROLLERS, Assignment
 from evedrop.model.plant import Plant
 from evedrop.model.process import MOST_STATES, Floats, Process
@@ -163,6 +164,24 @@ class ControllerTable(Table):
     def parameters(self) -> dict[str, Any]:
         """The strategy's parameters, with defaults for those that are left out."""
         return {**CONTROLLERS[self.strategy].optional, **(self.model_extra or {})}
+
+
+def noise_mistakes(table: PlantTable, n: int) -> list[str]:
+    """Mistakes in `noise`, for n states."""
+    if table.noise is None:
+        return []
+    if len(table.noise) != n:
+        return [f"plant.noise: has {len(table.noise)} rows; expected {n}, one for each state"]
+    if any(len(row) != n for row in table.noise):
+        return [f"plant.noise: has a row that is not of {n} numbers; expected {n} × {n}, as A is"]
+    noise = np.array(table.noise, np.float64)
+    if not np.array_equal(noise, noise.T):
+        return ["plant.noise: is not symmetric; expected a covariance, such as 1e-6 times the identity, or 0"]
+    try:
+        semidefinite_factor(noise)
+    except ValueError:
+        return ["plant.noise: has an eigenvalue below 0; expected a covariance, such as 1e-6 times the identity, or 0"]
+    return []
 
 
 def plant_of(table: PlantTable, reference: Sequence[float]) -> Plant:

@@ -55,13 +55,13 @@ def _scenario_words() -> tuple[str, ...]:
     return words_of([tomllib.loads(one.decode()) for one in _scenarios()])
 
 
-def read_scenario(data: bytes, folder: Path) -> None:
-    """As `evedrop check` does."""
+def read_scenario(data: bytes, folder: Path) -> list[str]:
+    """As `evedrop check` does; returns its warnings."""
     if _names_code(data):
-        return
+        return []
     path = folder / "scenario.toml"
     path.write_bytes(data)
-    warnings_of(load(path))
+    return warnings_of(load(path))
 
 
 def read_change(data: bytes, folder: Path) -> None:

@@ -142,6 +142,13 @@ def test_a_mistake_says_where_what_and_what_instead(case: str) -> None:
     assert any(line.startswith(sentence) for line in mistakes(**changes)), mistakes(**changes)
 
 
+@pytest.mark.parametrize("noise", [[[-1.0, 0.1]], [[1.0], [1.0]], [[-1.0, 0.0], [0.0, 1.0]], [[1.0, 0.5], [0.0, 1.0]]])
+def test_a_plants_noise_that_is_no_covariance_is_the_only_mistake(noise: list[list[float]]) -> None:
+    """No filter is computed with it, so nothing is said of the filter's measurements."""
+    (line,) = mistakes(plant__noise=noise)
+    assert line.startswith("plant.noise: ")
+
+
 REGULAR: dict[str, Any] = {
     "process__Q": [[2.5e-5 + 1e-9, 5e-4], [5e-4, 1e-2 + 1e-9]],
     "process__singular_noise": None,
