@@ -26,7 +26,7 @@ def test_a_tests_sitecustomize_is_imported_where_the_distribution_has_one(tmp_pa
         folder.mkdir()
         (folder / "sitecustomize.py").write_text(f"print({folder.name!r})\n")
     environment = {**os.environ, "PYTHONPATH": f"{distribution}{os.pathsep}{ROOT}"}
-    command = [sys.executable, "-c", FORKED, distribution, own]
+    command = [sys.executable, "-c", FORKED, str(distribution), str(own)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split("\n") == ["distribution", "own", "the command", ""]
