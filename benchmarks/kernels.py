@@ -30,7 +30,7 @@ from table import Row, judged, load, run_alone
 from evedrop.kernels.choice import KERNELS
 from evedrop.loading import checked
 from evedrop.memory.simulation import Mode, Simulation
-from evedrop.memory.trials import Task, carry_out
+from evedrop.memory.trials import TrialsTask, carry_out
 from evedrop.names import KERNELS_VARIABLE
 from evedrop.scenario import Scenario
 
@@ -88,7 +88,9 @@ def simulated(scenario: Scenario) -> None:
 
 def scored(scenario: Scenario) -> None:
     """The same, and what `evedrop montecarlo` keeps of them."""
-    carry_out(Task(scenario.model_dump(mode="json"), Mode.EXACT, 0, scenario.trials), lambda _: None, lambda: False)
+    carry_out(
+        TrialsTask(scenario.model_dump(mode="json"), 0, scenario.trials, Mode.EXACT), lambda _: None, lambda: False
+    )
 
 
 def measured(quick: bool) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """Evedrop: a network emulator for secrecy in remote state estimation.
 
-    from evedrop import Scenario, run, preloaded, montecarlo, sweep, compare, design, load_results, wire
+    from evedrop import Scenario, run, preloaded, montecarlo, sweep, compare, cost, learned, design, load_results, wire
 
 These names are loaded when they are used: a peer imports this package, too, and needs none of them.
 """
@@ -12,17 +12,21 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from evedrop.api import compare, design, load_results, montecarlo, run, sweep
+    from evedrop.api import compare, cost, design, learned, load_results, montecarlo, run, sweep
     from evedrop.live.launch.preloading import preloaded
     from evedrop.loading import Scenario
     from evedrop.wire.running import wire  # the package `wire`, which can be called: see there
 
-__all__ = ["Scenario", "compare", "design", "load_results", "montecarlo", "preloaded", "run", "sweep", "wire"]
+__all__ = [
+    "Scenario", "compare", "cost", "design", "learned", "load_results", "montecarlo", "preloaded", "run", "sweep", "wire",
+]  # fmt: skip
 
 _HOMES = {
     "Scenario": "evedrop.loading",
     "compare": "evedrop.api",
+    "cost": "evedrop.api",
     "design": "evedrop.api",
+    "learned": "evedrop.api",
     "load_results": "evedrop.api",
     "montecarlo": "evedrop.api",
     "preloaded": "evedrop.live.launch.preloading",

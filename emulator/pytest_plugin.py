@@ -36,6 +36,19 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         metavar="DIR",
         help="folder for the results, a folder for each scenario; default runs/",
     )
+    group.addoption(
+        "--evedrop-scheduler",
+        metavar="ADDRESS",
+        help="with --evedrop-in-memory: let the workers of this Dask scheduler compute the trials, tcp://HOST:PORT",
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Refuse a scheduler for live runs."""
+    if config.option.evedrop_scheduler is not None and not config.option.evedrop_in_memory:
+        raise pytest.UsageError(
+            "--evedrop-scheduler computes trials in memory; add --evedrop-in-memory, or leave it out"
+        )
 
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
@@ -84,7 +97,12 @@ class ScenarioItem(pytest.Item):
 
         self._imports_once()
         options = self.config.option
-        manner = Manner(options.evedrop_in_memory, options.evedrop_trials, options.evedrop_out)
+        manner = Manner(
+            options.evedrop_in_memory,
+            options.evedrop_trials,
+            options.evedrop_out,
+            scheduler=options.evedrop_scheduler,
+        )
         try:
             tested = carry_out(str(self.path), manner)
         except Interrupted:

@@ -5,17 +5,19 @@ Source: docs/python.md.
 
 from evedrop.api.designs import design, design_budget, design_policy, design_schedule
 from evedrop.api.results import ComparisonResults, RunResults, SweepResults, load_results
-from evedrop.api.running import compare, montecarlo, run, sweep
+from evedrop.api.running import compare, cost, learned, montecarlo, run, sweep
 
 __all__ = [
     "ComparisonResults",
     "RunResults",
     "SweepResults",
     "compare",
+    "cost",
     "design",
     "design_budget",
     "design_policy",
     "design_schedule",
+    "learned",
     "load_results",
     "montecarlo",
     "run",

@@ -28,10 +28,14 @@ def scenario_of(scenario: str | Path | Scenario, changes: Mapping[str, Any], bey
     return prepared(scenario, dotted(changes), beyond_horizon=beyond_horizon)
 
 
-def plan_of(plan: Plan | None, workers: int | None) -> Plan:
-    """The plan of a call. Raises UsageError if workers is not positive."""
+def plan_of(plan: Plan | None, workers: int | None, scheduler: str | None) -> Plan:
+    """The plan of a call, whose own workers and scheduler give way to these. Raises UsageError as `Plan` does."""
     found = plan or Plan()
-    return found if workers is None else replace(found, workers=workers)
+    return replace(
+        found,
+        workers=found.workers if workers is None else workers,
+        scheduler=found.scheduler if scheduler is None else scheduler,
+    )
 
 
 @final

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from evedrop.api.given import place_for, plan_of, scenario_of
 from evedrop.api.notebook import progress
@@ -17,6 +17,10 @@ from evedrop.memory.simulation import Mode
 from evedrop.news import Tell
 from evedrop.scenario import Scenario
 from evedrop.scenario.words import dotted
+
+if TYPE_CHECKING:
+    from evedrop.studies.learning_curve import LearningRow
+    from evedrop.studies.secrecy_cost import SecrecyCost
 
 
 def run(
@@ -62,6 +66,7 @@ def montecarlo(
     out: str | Path | None = None,
     overwrite: bool = False,
     workers: int | None = None,
+    scheduler: str | None = None,
     plan: Plan | None = None,
     tell: Tell | None = None,
     **changes: Any,
@@ -69,11 +74,12 @@ def montecarlo(
     """Run the trials of a scenario in memory; in the exact mode, the default, to the same bits as a live run.
 
     Arguments and errors as for `run`; trials: how many, from `first_trial` on; workers: processes, by default chosen for this
-    machine and the amount of work; plan: the mode.
+    machine and the amount of work; scheduler: the address of a Dask scheduler, such as "tcp://127.0.0.1:8786", whose workers
+    then compute the trials; plan: the mode.
     """
     from evedrop.memory.montecarlo import simulate  # noqa: PLC0415 - a live run does not need it
 
-    plan = plan_of(plan, workers)
+    plan = plan_of(plan, workers, scheduler)
     made = scenario_of(scenario, {**changes, "trials": trials}, plan.mode is not Mode.EXACT)
     with place_for(out, overwrite) as place, progress(tell, made.trials * made.slots) as told:
         simulate(made, place.folder, told, plan)
@@ -90,6 +96,7 @@ def sweep(
     out: str | Path | None = None,
     overwrite: bool = False,
     workers: int | None = None,
+    scheduler: str | None = None,
     plan: Plan | None = None,
     tell: Tell | None = None,
     **changes: Any,
@@ -112,7 +119,7 @@ def sweep(
     if not values or math.prod(map(len, values.values())) > MOST_POINTS:
         raise UsageError(f"over: expected 1 to {MOST_POINTS} points, such as {{'slots': [100, 200]}}")
     with place_for(out, overwrite) as place, progress(tell, 0) as told:
-        table = sweep_over(scenario, given, values, place.folder, told, plan_of(plan, workers))
+        table = sweep_over(scenario, given, values, place.folder, told, plan_of(plan, workers, scheduler))
         results = SweepResults(place.folder, table, tuple(values))
         place.keep_for(results)
         return results
@@ -128,6 +135,7 @@ def compare(
     out: str | Path | None = None,
     overwrite: bool = False,
     workers: int | None = None,
+    scheduler: str | None = None,
     plan: Plan | None = None,
     tell: Tell | None = None,
     **changes: Any,
@@ -152,10 +160,58 @@ def compare(
     made = scenario_of(scenario, given)
     matchups = matchups_of(made, chosen.get("schemes"), chosen.get("adversaries"), parameters)
     with place_for(out, overwrite) as place, progress(tell, 0) as told:
-        found = compare_all(matchups, place.folder, told, plan_of(plan, workers))
+        found = compare_all(matchups, place.folder, told, plan_of(plan, workers, scheduler))
         results = ComparisonResults.of(found, place.folder)
         place.keep_for(results)
         return results
+
+
+def cost(
+    scenario: str | Path | Scenario,
+    *,
+    trials: int = 100,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    tell: Tell | None = None,
+    **changes: Any,
+) -> SecrecyCost:
+    """The energy that secrecy costs an application: the scenario's scheme against `plain`, trial by trial.
+
+    Arguments as for `montecarlo`. Source: docs/microgrid.md, what does secrecy cost in energy.
+
+    Raises ScenarioError with every mistake of the scenario, UsageError without an application that has a power, RunError if a
+    worker fails, Interrupted on Ctrl-C.
+    """
+    from evedrop.memory.montecarlo import teller  # noqa: PLC0415 - a live run does not need it
+    from evedrop.studies.secrecy_cost import secrecy_cost  # noqa: PLC0415 - no other call needs it
+
+    made = scenario_of(scenario, {**changes, "trials": trials})
+    with progress(tell, total := made.trials * made.slots) as told:
+        return secrecy_cost(made, teller(told, total), plan_of(None, workers, scheduler))
+
+
+def learned(
+    scenario: str | Path | Scenario,
+    *,
+    trials: int = 100,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    tell: Tell | None = None,
+    **changes: Any,
+) -> list[LearningRow]:
+    """What eavesdroppers that learn know of the process after 8, 16, 32, … slots, and how that affects their error.
+
+    Arguments as for `montecarlo`. Source: docs/learning.md.
+
+    Raises ScenarioError with every mistake of the scenario, UsageError if no eavesdropper learns, RunError if a worker fails,
+    Interrupted on Ctrl-C.
+    """
+    from evedrop.memory.montecarlo import teller  # noqa: PLC0415 - a live run does not need it
+    from evedrop.studies.learning_curve import learning_curve  # noqa: PLC0415 - no other call needs it
+
+    made = scenario_of(scenario, {**changes, "trials": trials})
+    with progress(tell, total := made.trials * made.slots) as told:
+        return learning_curve(made, teller(told, total), plan_of(None, workers, scheduler))
 
 
 def _named(

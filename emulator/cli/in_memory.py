@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable
 from typing import TYPE_CHECKING, TypeVar
 
-from evedrop.cli.options import entries, loaded, output, workers
+from evedrop.cli.options import entries, loaded, output
 
 if TYPE_CHECKING:
     from evedrop.memory.montecarlo import Plan
@@ -15,10 +15,22 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
+def crew(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say where trials are computed."""
+    what = "number of worker processes; does not affect the results"
+    parser.add_argument("--workers", type=int, metavar="N", help=what)
+    scheduler(parser)
+
+
+def scheduler(parser: argparse.ArgumentParser) -> None:
+    """Add `--scheduler`, the address of a Dask scheduler."""
+    what = "let the workers of this Dask scheduler compute the trials, tcp://HOST:PORT (docs/montecarlo.md)"
+    parser.add_argument("--scheduler", metavar="ADDRESS", help=what)
+
+
 def memory(parser: argparse.ArgumentParser) -> None:
     """Add the options that say how trials are computed."""
-    workers(parser)
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="use a Dask cluster, tcp://HOST:PORT")
+    crew(parser)
     mode = parser.add_mutually_exclusive_group()
     mode.add_argument(
         "--covariance-only",
@@ -37,7 +49,9 @@ def memory(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(mode="exact")
 
 
-def studied(options: argparse.Namespace, study: Callable[[Scenario, Callable[[int], None]], T]) -> tuple[Scenario, T]:
+def studied(
+    options: argparse.Namespace, study: Callable[[Scenario, Callable[[int], None], Plan], T]
+) -> tuple[Scenario, T]:
     """Run a study of a command's scenario, with 100 trials by default, and show its progress.
 
     Returns the scenario and what the study found.
@@ -46,18 +60,20 @@ def studied(options: argparse.Namespace, study: Callable[[Scenario, Callable[[in
     from evedrop.memory.montecarlo import teller
 
     options.trials = 100 if options.trials is None else options.trials
+    plan = plan_of(options)
     scenario = loaded(options)
     total = scenario.trials * scenario.slots
     with ProgressLine(total, "trial-slots", options.json) as line:
-        return scenario, study(scenario, teller(line.tell, total))
+        return scenario, study(scenario, teller(line.tell, total), plan)
 
 
 MEMORY = (entries, output, memory)
 
 
 def plan_of(options: argparse.Namespace) -> Plan:
-    """The plan, how trials are computed, from the options of `memory`."""
+    """The plan, how and where trials are computed, from the options of `memory` or `crew`."""
     from evedrop.memory.montecarlo import Plan
     from evedrop.memory.simulation import Mode
 
-    return Plan(Mode(options.mode), options.workers, options.scheduler, rare=getattr(options, "rare", False))
+    mode = Mode(getattr(options, "mode", Mode.EXACT))
+    return Plan(mode, options.workers, options.scheduler, rare=getattr(options, "rare", False))

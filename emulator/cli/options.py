@@ -82,12 +82,6 @@ def as_json(parser: argparse.ArgumentParser, what: str = "print JSON") -> None:
     parser.add_argument("--json", action="store_true", help=what)
 
 
-def workers(parser: argparse.ArgumentParser) -> None:
-    """Add `--workers`, the number of processes that compute trials in memory."""
-    what = "number of worker processes; does not affect the results"
-    parser.add_argument("--workers", type=int, metavar="N", help=what)
-
-
 def served(parser: argparse.ArgumentParser) -> None:
     """Add `--serve`, the address where a run is shown to browsers."""
     parser.add_argument(

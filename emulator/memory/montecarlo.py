@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import shutil
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
@@ -17,11 +17,13 @@ import numpy as np
 
 from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.expected.expectations import expected_traces_of
+from evedrop.memory.cluster import REACH_SECONDS
 from evedrop.memory.packet_counts import PacketCounts
+from evedrop.memory.sharing import Crew, crew_of
 from evedrop.memory.simulation import Mode
 from evedrop.memory.splitting import rare_estimates, work_of
-from evedrop.memory.trials import BatchResult, Task, tasks_of
-from evedrop.memory.workers import REACH_SECONDS, connected, in_processes, in_this_process, on_cluster, usable_cores
+from evedrop.memory.trials import BatchResult, tasks_of
+from evedrop.memory.workers import usable_cores
 from evedrop.model.digest import RunDigest, block_starts
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.outcomes import eavesdropper_outcomes
@@ -60,9 +62,14 @@ class Plan:
     """Whether to estimate means that rare events carry by splitting, too."""
 
     def __post_init__(self) -> None:
-        """Raise UsageError if the number of workers is not positive."""
+        """Raise UsageError if the number of workers is not positive, or the address of the scheduler is not a text."""
         if self.workers is not None and self.workers < 1:
             raise UsageError(f"workers={self.workers}: expected 1 or more")
+        if self.scheduler is not None and not isinstance(self.scheduler, str):
+            raise UsageError(
+                f"scheduler={self.scheduler!r:.60}: expected the address of a Dask scheduler, such as "
+                '"tcp://127.0.0.1:8786"; that of a LocalCluster is its scheduler_address'
+            )
 
     def workers_for(self, scenario: Scenario) -> int:
         """The number of workers."""
@@ -70,6 +77,12 @@ class Plan:
             return self.workers
         work = scenario.trials * scenario.slots * len(scenario.receivers)
         return usable_cores() if work > _WORTH_A_PROCESS else 1
+
+    @contextlib.contextmanager
+    def crew(self, scenarios: Iterable[Scenario]) -> Iterator[Crew]:
+        """Where the trials of these scenarios are carried out. Raises UsageError if the scheduler does not answer."""
+        with crew_of(max(map(self.workers_for, scenarios)), self.scheduler, self.patience) as crew:
+            yield crew
 
 
 def simulate(scenario: Scenario, folder: Path, tell: Tell, plan: Plan = Plan()) -> int:
@@ -79,7 +92,6 @@ def simulate(scenario: Scenario, folder: Path, tell: Tell, plan: Plan = Plan()) 
     the results so far in the folder.
     """
     check_mode(scenario, plan.mode)
-    workers = plan.workers_for(scenario)
     started = time.monotonic()
     failure: RunError | None = None
     merger = Merger(scenario, plan.mode)
@@ -87,13 +99,13 @@ def simulate(scenario: Scenario, folder: Path, tell: Tell, plan: Plan = Plan()) 
     def ending(how: str) -> Ending:
         return Ending(time.monotonic() - started, how, replay_of(folder, scenario, plan.mode.value))
 
-    with stop_on_signals() as stop, connected(plan.scheduler, plan.patience) as client:
-        tasks, told = tasks_of(scenario, plan.mode, workers), teller(tell, scenario.trials * scenario.slots)
+    with stop_on_signals() as stop, plan.crew([scenario]) as crew:
+        tasks, told = tasks_of(scenario, plan.mode, crew.workers), teller(tell, scenario.trials * scenario.slots)
         with contextlib.closing(HeldFolder(new_folder(folder))) as held, disk_errors(folder):
             write_resolved(folder, scenario)
             with (
                 ResultsWriter.of(folder, scenario) as writer,
-                contextlib.closing(results_of(tasks, workers, client, told, stop.is_set)) as results,
+                contextlib.closing(crew.results(tasks, told, stop.is_set)) as results,
             ):
                 try:
                     for result in results:
@@ -205,18 +217,6 @@ def _check_scheme(scenario: Scenario, mode: Mode) -> None:
                 f"--{mode.value} follows events, not packets, and {receiver} (strategy {table.strategy}) reads the "
                 f"packets of the scheme {name}; leave --{mode.value} out, or remove {receiver} from the scenario"
             )
-
-
-def results_of(
-    tasks: list[Task], workers: int, client: Any, tell: Callable[[int], None], stopped: Callable[[], bool]
-) -> Generator[BatchResult]:
-    """Carry out the tasks on the cluster of a client, or by workers here; yields the results in task order."""
-    if client is not None:
-        yield from on_cluster(tasks, client, tell, stopped)
-    elif workers == 1 or len(tasks) == 1:
-        yield from in_this_process(tasks, tell, stopped)
-    else:
-        yield from in_processes(tasks, min(workers, len(tasks)), tell, stopped)
 
 
 def teller(tell: Tell, total: int) -> Callable[[int], None]:

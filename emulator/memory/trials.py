@@ -6,10 +6,10 @@ on the distribution of the work.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any
+from typing import final
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from evedrop.figures.figure import ScoredSlots
 from evedrop.memory.chunk import Chunk
 from evedrop.memory.packet_counts import PacketCounts
 from evedrop.memory.simulation import Mode, Simulation
+from evedrop.memory.tasks import Stopped, Task, Tell
 from evedrop.model.digest import Digests
 from evedrop.model.process import Floats
 from evedrop.model.slot.account import Account, Accountant
@@ -30,17 +31,6 @@ from evedrop.score.totals import Totals
 
 BLOCK_TRIALS = 500
 _SIDE_BY_SIDE = 4  # blocks: spreads the overhead of numpy calls over more trials, and the state still fits the cache
-
-
-@dataclass(frozen=True)
-class Task:
-    """Some consecutive blocks of trials of a scenario."""
-
-    scenario: dict[str, Any]
-    """The scenario, from `Scenario.model_dump`."""
-    mode: Mode
-    start: int
-    stop: int
 
 
 @dataclass(frozen=True)
@@ -67,8 +57,25 @@ class BatchResult:
     recorded: list[Slots] = field(default_factory=list)
     """The recorded trials of the task, in parts."""
 
+    @property
+    def complete(self) -> bool:
+        """Whether every trial has every slot."""
+        return all(tally.done == tally.slots for block in self.blocks for tally in block.totals.tallies.values())
 
-def tasks_of(scenario: Scenario, mode: Mode, workers: int) -> list[Task]:
+
+@final
+@dataclass(frozen=True)
+class TrialsTask(Task[BatchResult]):
+    """Some consecutive blocks of trials, of which all figures are kept."""
+
+    mode: Mode
+
+    def carry_out(self, tell: Tell, stopped: Stopped) -> BatchResult:
+        """Simulate the trials."""
+        return carry_out(self, tell, stopped)
+
+
+def tasks_of(scenario: Scenario, mode: Mode, workers: int) -> list[TrialsTask]:
     """Split the trials, in order, into parts of nearly equal size, the same number for each worker."""
     blocks = -(-scenario.trials // BLOCK_TRIALS)
     rounds = -(-blocks // (workers * _SIDE_BY_SIDE))
@@ -76,10 +83,10 @@ def tasks_of(scenario: Scenario, mode: Mode, workers: int) -> list[Task]:
     first, end = scenario.first_trial, scenario.first_trial + scenario.trials
     bounds = [min(first - BLOCK_TRIALS * (-blocks * i // count), end) for i in range(count + 1)]
     tables = scenario.model_dump(mode="json")
-    return [Task(tables, mode, start, stop) for start, stop in pairwise(bounds)]
+    return [TrialsTask(tables, start, stop, mode) for start, stop in pairwise(bounds)]
 
 
-def carry_out(task: Task, tell: Callable[[int], None], stopped: Callable[[], bool]) -> BatchResult:
+def carry_out(task: TrialsTask, tell: Tell, stopped: Stopped) -> BatchResult:
     """Simulate a task. `tell` gets the trial-slots done since its last call; the simulation ends early once `stopped`."""
     scenario = Scenario.read(task.scenario)
     names, slots = scenario.receivers, scenario.slots
@@ -127,7 +134,7 @@ def carry_out(task: Task, tell: Callable[[int], None], stopped: Callable[[], boo
 
 
 def _empty_block(
-    scenario: Scenario, task: Task, start: int, expected: Mapping[str, Floats]
+    scenario: Scenario, task: TrialsTask, start: int, expected: Mapping[str, Floats]
 ) -> tuple[TrialBlock, Scorekeeper]:
     """A block that begins with this trial, and the keeper of its score; expected: receiver → its expected traces, (slots,)."""
     names = scenario.receivers

@@ -1,4 +1,4 @@
-"""Carries out tasks: in this process, in worker processes on this machine, or on a Dask cluster. Results come in task order.
+"""Carries out tasks on this machine: in this process or in worker processes.
 
 A worker process has a pipe of its own and shares no lock with other processes, so that killing one cannot hang the others.
 """
@@ -12,25 +12,20 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from multiprocessing import connection
 from multiprocessing.connection import Connection, Pipe
 from typing import Any, final
 
 from evedrop.environment import SINGLE_THREADED, own_environment
-from evedrop.errors import EvedropError, RunError, UsageError
+from evedrop.errors import EvedropError, RunError
 from evedrop.interrupts import SIGNALS
-from evedrop.memory.trials import BatchResult, Task, carry_out
+from evedrop.memory.tasks import R, Result, Stopped, Task, Tell
 from evedrop.model.registry import place_of
 from evedrop.scenario.dry_run import foreign
 
 _LOOK_SECONDS = 0.1
 _LAST_SECONDS = 10.0  # after a stop, for the current chunk of slots
-REACH_SECONDS = 5.0
-"""For a Dask scheduler to answer."""
-
-Tell = Callable[[int], None]
-Stopped = Callable[[], bool]
 
 
 def usable_cores() -> int:
@@ -40,13 +35,13 @@ def usable_cores() -> int:
     return os.cpu_count() or 1
 
 
-def in_this_process(tasks: list[Task], tell: Tell, stopped: Stopped) -> Iterator[BatchResult]:
+def in_this_process(tasks: Sequence[Task[R]], tell: Tell, stopped: Stopped) -> Iterator[R]:
     """Carry out the tasks in this process, one after the other."""
     for task in tasks:
         if stopped():
             return
         try:
-            result = carry_out(task, tell, stopped)
+            result = task.carry_out(tell, stopped)
         except EvedropError:
             raise
         except Exception as error:
@@ -60,11 +55,14 @@ def in_this_process(tasks: list[Task], tell: Tell, stopped: Stopped) -> Iterator
         yield result
 
 
-def in_processes(tasks: list[Task], workers: int, tell: Tell, stopped: Stopped) -> Iterator[BatchResult]:
-    """Carry out the tasks in worker processes. Raises RunError if one dies."""
+def in_processes(tasks: Sequence[Task[R]], workers: int, tell: Tell, stopped: Stopped) -> Iterator[tuple[int, R]]:
+    """Carry out the tasks in worker processes; yields the number of a task and its result as they come.
+
+    After a stop, the partial results of the current tasks come last. Raises RunError if a process dies.
+    """
     crew = [_Worker() for _ in range(workers)]
     try:
-        yield from _in_order(_results(tasks, crew, tell, stopped))
+        yield from _results(tasks, crew, tell, stopped)
     finally:
         for worker in crew:
             worker.end()
@@ -98,7 +96,7 @@ class _Worker:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             theirs.close()
 
-    def send_task(self, number: int, task: Task) -> None:
+    def send_task(self, number: int, task: Task[Any]) -> None:
         self.number = number
         with contextlib.suppress(OSError):  # the worker died; the next read of its pipe reports it
             self.pipe.send(task)
@@ -113,8 +111,7 @@ class _Worker:
         self.pipe.close()
 
 
-def _results(tasks: list[Task], crew: list[_Worker], tell: Tell, stopped: Stopped) -> Iterator[tuple[int, BatchResult]]:
-    """The results as they come, with their numbers; after a stop, the partial results of the current tasks."""
+def _results(tasks: Sequence[Task[R]], crew: list[_Worker], tell: Tell, stopped: Stopped) -> Iterator[tuple[int, R]]:
     waiting = iter(enumerate(tasks))
     for worker, (number, task) in zip(crew, waiting, strict=False):
         worker.send_task(number, task)
@@ -141,9 +138,10 @@ def _results(tasks: list[Task], crew: list[_Worker], tell: Tell, stopped: Stoppe
                 worker.send_task(*following)
 
 
-def _received(worker: _Worker) -> int | str | BatchResult:
+def _received(worker: _Worker) -> Any:
+    """A count of trial-slots done, the reason for a failure, or the result of a task."""
     try:
-        news: int | str | BatchResult = worker.pipe.recv()
+        news = worker.pipe.recv()
     except (EOFError, OSError) as error:
         with contextlib.suppress(subprocess.TimeoutExpired):
             worker.process.wait(_LAST_SECONDS)
@@ -151,17 +149,6 @@ def _received(worker: _Worker) -> int | str | BatchResult:
         how = f"was ended by signal {-code}" if code is not None and code < 0 else f"ended with status {code}"
         raise RunError(f"a worker process {how}; was it killed, or out of memory? try fewer workers") from error
     return news
-
-
-def _in_order(results: Iterator[tuple[int, BatchResult]]) -> Iterator[BatchResult]:
-    """Results in the order of their numbers; those after a missing one are left out."""
-    held: dict[int, BatchResult] = {}
-    due = 0
-    for number, result in results:
-        held[number] = result
-        while due in held:
-            yield held.pop(due)
-            due += 1
 
 
 def work(descriptor: int) -> None:
@@ -179,81 +166,12 @@ def work(descriptor: int) -> None:
             pipe.send(_outcome(pipe.recv(), pipe.send, stop.is_set))
 
 
-def _outcome(task: Task, tell: Tell, stopped: Stopped) -> BatchResult | str:
+def _outcome(task: Task[Result], tell: Tell, stopped: Stopped) -> Result | str:
     try:
-        return carry_out(task, tell, stopped)
+        return task.carry_out(tell, stopped)
     except OSError:
         raise
     except EvedropError as error:
         return str(error)
     except Exception as error:
         return f"trials {task.start} to {task.stop - 1}: {place_of(error)}"
-
-
-@contextlib.contextmanager
-def connected(scheduler: str | None, patience: float = REACH_SECONDS) -> Iterator[Any]:
-    """A client of the Dask scheduler at an address, which answers within `patience` seconds; None without an address.
-
-    Raises UsageError if it cannot be reached or the extra `cluster` is not installed.
-    """
-    if scheduler is None:
-        yield None
-        return
-    import asyncio  # noqa: PLC0415 - a tenth of a worker's import time, and no worker needs it
-
-    try:
-        from distributed import Client  # noqa: PLC0415 - an optional extra
-        from distributed.comm.core import connect  # noqa: PLC0415 - the same
-    except ImportError as error:
-        raise UsageError("a scheduler needs Dask: pip install '.[cluster]' in the checkout") from error
-
-    async def reach() -> None:  # a client without a scheduler may hang, and prints useless messages
-        reached = connect(scheduler, timeout=patience)  # type: ignore[no-untyped-call]
-        comm = await asyncio.wait_for(reached, patience)
-        await comm.close()
-
-    try:
-        asyncio.run(reach())
-        client = Client(scheduler, timeout=patience, set_as_default=False)  # type: ignore[no-untyped-call]
-    except (OSError, ValueError, TimeoutError) as error:
-        raise UsageError(
-            f"the scheduler {scheduler}: no Dask scheduler answers there within {patience:g} s; start one with "
-            "`dask scheduler`, and give its address, such as tcp://127.0.0.1:8786"
-        ) from error
-    with contextlib.closing(client):
-        yield client
-
-
-def on_cluster(tasks: list[Task], client: Any, tell: Tell, stopped: Stopped) -> Iterator[BatchResult]:
-    """Carry out the tasks by the workers of a Dask cluster, which must have this version of evedrop installed.
-
-    Raises RunError if a worker fails or the cluster is gone. After a stop, the current tasks are cancelled.
-    """
-    futures = [client.submit(_on_worker, task, pure=False) for task in tasks]
-    try:
-        for task, future in zip(tasks, futures, strict=True):
-            while not future.done():
-                if stopped():
-                    return
-                time.sleep(_LOOK_SECONDS)
-            yield _result(future)
-            tell((task.stop - task.start) * int(task.scenario["slots"]))
-    finally:
-        client.cancel(futures)
-
-
-def _result(future: Any) -> BatchResult:
-    try:
-        result: BatchResult = future.result()
-    except RunError as error:
-        raise RunError(f"a worker failed: {error}") from error
-    except Exception as error:
-        raise RunError(
-            f"a worker of the cluster failed: {type(error).__name__}: {str(error).splitlines()[:1]}; "
-            "install this version of evedrop on every worker, and look at the worker's log"
-        ) from error
-    return result
-
-
-def _on_worker(task: Task) -> BatchResult:
-    return carry_out(task, lambda _: None, lambda: False)

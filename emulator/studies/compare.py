@@ -22,11 +22,10 @@ from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.expected.expectations import Expectation, expectations_of
 from evedrop.figures.errors import MeanSquaredError
 from evedrop.figures.standard_error import standard_error, z_of
-from evedrop.memory.montecarlo import Merger, Plan, disk_errors, results_of, teller
+from evedrop.memory.montecarlo import Merger, Plan, disk_errors, teller
 from evedrop.memory.packet_counts import PacketCounts
 from evedrop.memory.simulation import Mode
 from evedrop.memory.trials import BatchResult, tasks_of
-from evedrop.memory.workers import connected
 from evedrop.model.schemes import scheme_of
 from evedrop.names import LEGITIMATE
 from evedrop.news import Tell
@@ -58,17 +57,16 @@ def compare_all(matchups: Matchups, folder: Path, tell: Tell, plan: Plan) -> Com
             f"a comparison follows packets, which the mode {plan.mode.value} does not have; leave the mode out"
         )
     groups = matchups.groups
-    workers = max(plan.workers_for(group.scenario) for group in groups)
     tasks = [tasks_of(group.scenario, plan.mode, 1) for group in groups]
     told = teller(tell, sum(group.scenario.trials * group.scenario.slots for group in groups))
     played: list[tuple[Group, Merger]] = []
     failure: RunError | None = None
-    with stop_on_signals() as stop, connected(plan.scheduler, plan.patience) as client:
+    with stop_on_signals() as stop, plan.crew(group.scenario for group in groups) as crew:
         new_folder(folder)
         everything = list(itertools.chain(*tasks))
         with (
             disk_errors(folder),
-            contextlib.closing(results_of(everything, workers, client, told, stop.is_set)) as results,
+            contextlib.closing(crew.results(everything, told, stop.is_set)) as results,
         ):
             written, took = time.monotonic(), 0.0
             try:

@@ -7,18 +7,22 @@ Source: docs/learning.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import final
 
 import numpy as np
 
 from evedrop.errors import UsageError
 from evedrop.figures.standard_error import ratio_error, standard_error
+from evedrop.memory.montecarlo import Plan
 from evedrop.memory.simulation import Simulation
+from evedrop.memory.tasks import Stopped, Task, Tell
 from evedrop.model.process import Floats
 from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
+from evedrop.studies.parts import all_results, parts_of
 
 _SIDE_BY_SIDE = 100  # trials
 _FIRST = 8  # slots before the first row
@@ -62,23 +66,30 @@ class LearningRow:
 
 
 def learning_curve(
-    scenario: Scenario, tell: Callable[[int], None], side_by_side: int = _SIDE_BY_SIDE
+    scenario: Scenario, tell: Tell, plan: Plan | None = None, side_by_side: int = _SIDE_BY_SIDE
 ) -> list[LearningRow]:
-    """A row for every power of two from 8 slots on, and for the whole run; tell gets the trial-slots done since its last call.
+    """A row for every power of two from 8 slots on, and for the whole run.
 
-    side_by_side: trials that are simulated at once.
+    plan: where the trials are carried out, by default here; side_by_side: trials that are simulated at once.
 
-    Raises UsageError for a scenario in which no eavesdropper learns.
+    Raises UsageError for a scenario in which no eavesdropper learns, RunError if a worker fails, Interrupted on Ctrl-C.
     """
+    windows = _windows(scenario)
+    first = Simulation(scenario, range(scenario.first_trial, scenario.first_trial + 1), stops=[1])
+    next(first.chunks())
+    if not first.learned():
+        raise UsageError(f"{scenario.title}: no eavesdropper learns; try the scenario learning")
+    parts = all_results(parts_of(_LearningTask, scenario, side_by_side), plan or Plan(), tell)
+    return [_row(window, [part.windows[i] for part in parts]) for i, window in enumerate(windows)]
+
+
+def _windows(scenario: Scenario) -> list[tuple[int, int]]:
+    """The slots of each row, first and stop."""
     stops = [_FIRST]
     while 2 * stops[-1] < scenario.slots:
         stops.append(2 * stops[-1])
     stops = [*(stop for stop in stops if stop < scenario.slots), scenario.slots]
-    windows = [*pairwise([0, *stops])]
-    end = scenario.first_trial + scenario.trials
-    bounds = [*range(scenario.first_trial, end, side_by_side), end]
-    parts = [_measured(scenario, range(*pair), windows, tell) for pair in pairwise(bounds)]
-    return [_row(window, [part[i] for part in parts]) for i, window in enumerate(windows)]
+    return [*pairwise([0, *stops])]
 
 
 @dataclass(frozen=True)
@@ -91,9 +102,31 @@ class _Measured:
     """Receiver → mean squared error."""
 
 
+@dataclass(frozen=True)
+class _Part:
+    """All windows of some trials."""
+
+    windows: list[_Measured]
+    complete: bool
+
+
+@final
+@dataclass(frozen=True)
+class _LearningTask(Task[_Part]):
+    """Some trials that are simulated at once."""
+
+    def carry_out(self, tell: Tell, stopped: Stopped) -> _Part:
+        """Simulate the trials. Raises UsageError if no eavesdropper learns."""
+        scenario = Scenario.read(self.scenario)
+        windows = _windows(scenario)
+        found = _measured(scenario, range(self.start, self.stop), windows, tell, stopped)
+        return _Part(found, len(found) == len(windows))
+
+
 def _measured(
-    scenario: Scenario, trials: range, windows: list[tuple[int, int]], tell: Callable[[int], None]
+    scenario: Scenario, trials: range, windows: list[tuple[int, int]], tell: Tell, stopped: Stopped
 ) -> list[_Measured]:
+    """The windows of these trials, fewer after a stop."""
     simulation = Simulation(scenario, trials, stops=[stop for _, stop in windows])
     process = scenario.process.process
     truth = {"A": process.A, "Q": process.Q, "mu_d": np.array(scenario.encoding.mu_d)}
@@ -106,16 +139,15 @@ def _measured(
             sums[name] = _added(one.error, sums.get(name, np.zeros(len(trials))))
         first, stop = windows[len(found)]
         if chunk.first + count == stop:
-            learned = simulation.learned()
-            if not learned:
-                raise UsageError(f"{scenario.title}: no eavesdropper learns; try the scenario learning")
             off = {
                 name: {key: _relative(values, truth[key]) for key, values in one.items()}
-                for name, one in learned.items()
+                for name, one in simulation.learned().items()
             }
             found.append(_Measured(off, {name: total / (stop - first) for name, total in sums.items()}))
             sums = {}
         tell(count * len(trials))
+        if stopped():
+            break
     return found
 
 

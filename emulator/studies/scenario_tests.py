@@ -53,6 +53,8 @@ class Manner:
     """The folder for all results folders; None: runs/."""
     workers: int | None = None
     """Worker processes of a test in memory; None: as in `Plan`."""
+    scheduler: str | None = None
+    """Address of a Dask scheduler, for tests in memory."""
 
     @property
     def folder(self) -> Path:
@@ -133,7 +135,7 @@ def carry_out(scenario: str, manner: Manner) -> Finding:
 def _run(scenario: Scenario, folder: Path, manner: Manner) -> Path:
     """Run a scenario into a folder; returns the results folder."""
     if manner.in_memory:
-        simulate(scenario, folder, silent, Plan(workers=manner.workers))
+        simulate(scenario, folder, silent, Plan(workers=manner.workers, scheduler=manner.scheduler))
         return folder
     return launch(scenario, folder, "off", None, silent).folder
 

@@ -9,21 +9,23 @@ Source: docs/microgrid.md, what does secrecy cost in energy.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from itertools import pairwise
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
 from evedrop.errors import UsageError
 from evedrop.loading import checked
+from evedrop.memory.montecarlo import Plan
 from evedrop.memory.simulation import Simulation
+from evedrop.memory.tasks import Stopped, Task, Tell
 from evedrop.model.process import Floats
 from evedrop.scenario import Scenario
 from evedrop.scenario.application import APPLICATIONS, applications_in
 from evedrop.scenario.controlled import controlled_plant
 from evedrop.score.energy import Meter, energy
+from evedrop.studies.parts import all_results, parts_of
 
 _SIDE_BY_SIDE = 50  # trials
 MEASURES = ("net", "total", "summed")
@@ -62,22 +64,25 @@ class SecrecyCost:
     """`scheme_from_plain`, `scheme_from_truth`, `plain_from_truth` → measure → the difference, as a share."""
 
 
-def secrecy_cost(scenario: Scenario, tell: Callable[[int], None], side_by_side: int = _SIDE_BY_SIDE) -> SecrecyCost:
-    """Compare a scenario's scheme with `plain`; tell gets the trial-slots done since its last call.
+def secrecy_cost(
+    scenario: Scenario, tell: Tell, plan: Plan | None = None, side_by_side: int = _SIDE_BY_SIDE
+) -> SecrecyCost:
+    """Compare a scenario's scheme with `plain`.
 
-    side_by_side: trials that are simulated at once.
+    plan: where the trials are carried out, by default here; side_by_side: trials that are simulated at once.
 
-    Raises UsageError for a scenario without an application that has a power, or with fewer than two trials.
+    Raises UsageError for a scenario without an application that has a power, or with fewer than two trials; RunError if a
+    worker fails, Interrupted on Ctrl-C.
     """
     loop = controlled_plant(scenario)
     if loop is None or not any(APPLICATIONS[name].has_power for name in scenario.applications):
         raise UsageError(f"{scenario.title}: {_lacking()}")
     if scenario.trials < 2:
         raise UsageError(f"--trials {scenario.trials}: expected 2 or more, so that there is a standard error")
-    end = scenario.first_trial + scenario.trials
-    bounds = [*range(scenario.first_trial, end, side_by_side), end]
-    parts = [_meters_of(scenario, range(*pair), tell) for pair in pairwise(bounds)]
-    plain, truth, plain_truth = (Meter.of_all(list(meters)) for meters in zip(*parts, strict=True))
+    parts = all_results(parts_of(_CostTask, scenario, side_by_side), plan or Plan(), tell)
+    plain, truth, plain_truth = (
+        Meter.of_all(list(meters)) for meters in zip(*(one.meters for one in parts), strict=True)
+    )
     more = {
         "net_energy": plain.bought - plain.sold - (plain.other_bought - plain.other_sold),
         "total_energy": plain.bought + plain.sold - (plain.other_bought + plain.other_sold),
@@ -94,8 +99,26 @@ def secrecy_cost(scenario: Scenario, tell: Callable[[int], None], side_by_side: 
     )
 
 
-def _meters_of(scenario: Scenario, trials: range, tell: Callable[[int], None]) -> tuple[Meter, Meter, Meter]:
-    """For some trials, the power of scheme and plain, of scheme and truth, and of plain and truth."""
+@dataclass(frozen=True)
+class _Part:
+    """Some trials."""
+
+    meters: tuple[Meter, Meter, Meter]
+    """The power of scheme and plain, of scheme and truth, and of plain and truth."""
+    complete: bool
+
+
+@final
+@dataclass(frozen=True)
+class _CostTask(Task[_Part]):
+    """Some trials that are simulated at once, each with both schemes."""
+
+    def carry_out(self, tell: Tell, stopped: Stopped) -> _Part:
+        """Simulate the trials."""
+        return _part_of(Scenario.read(self.scenario), range(self.start, self.stop), tell, stopped)
+
+
+def _part_of(scenario: Scenario, trials: range, tell: Tell, stopped: Stopped) -> _Part:
     found = [Meter.zero(len(trials)) for _ in range(3)]
     tables: dict[str, Any] = scenario.model_dump(mode="json", exclude_none=True)
     alone = {**tables, "eavesdroppers": {}, "expect": []}  # eavesdroppers change nothing
@@ -106,7 +129,9 @@ def _meters_of(scenario: Scenario, trials: range, tell: Callable[[int], None]) -
         pairs = ((power, other), (power, truth), (other, other_truth))
         found = [meter.then(*pair) for meter, pair in zip(found, pairs, strict=True)]
         tell(power.size)
-    return found[0], found[1], found[2]
+        if stopped():
+            return _Part((found[0], found[1], found[2]), complete=False)
+    return _Part((found[0], found[1], found[2]), complete=True)
 
 
 def _powers(scenario: Scenario, trials: range) -> Iterator[tuple[Floats, Floats]]:

@@ -20,9 +20,8 @@ import pyarrow.parquet as pq
 from evedrop.errors import Interrupted, RunError, ScenarioError, UsageError
 from evedrop.figures import all_figures, error_column, estimated_figures, z_column
 from evedrop.loading import prepared, value_of
-from evedrop.memory.montecarlo import Merger, Plan, check_mode, disk_errors, results_of, teller
+from evedrop.memory.montecarlo import Merger, Plan, check_mode, disk_errors, teller
 from evedrop.memory.trials import BatchResult, tasks_of
-from evedrop.memory.workers import connected
 from evedrop.news import Tell
 from evedrop.results.folder import new_folder, private_pictures, private_replacement, write_private
 from evedrop.scenario import Scenario
@@ -94,16 +93,15 @@ def sweep_over(
     before any point is run; Interrupted, or RunError if a worker fails, with the points done so far in the folder.
     """
     scenarios = _checked(source, changes, grid, plan)
-    workers = max(plan.workers_for(scenario) for _, scenario in scenarios)
     total = sum(scenario.trials * scenario.slots for _, scenario in scenarios)
-    each = workers if len(scenarios) < 4 * workers else 1  # if there are many points, do not split them
-    tasks = [tasks_of(scenario, plan.mode, each) for _, scenario in scenarios]
     rows: list[dict[str, Any]] = []
     failure: RunError | None = None
     done = 0
     description = {"scenario": _title(source), "changes": dict(changes), "over": dict(grid), "mode": plan.mode.value}
-    with stop_on_signals() as stop, connected(plan.scheduler, plan.patience) as client:
+    with stop_on_signals() as stop, plan.crew(scenario for _, scenario in scenarios) as crew:
         new_folder(folder)
+        each = crew.workers if len(scenarios) < 4 * crew.workers else 1  # if there are many points, do not split them
+        tasks = [tasks_of(scenario, plan.mode, each) for _, scenario in scenarios]
         told = teller(tell, total)
         everything = list(itertools.chain(*tasks))
         with disk_errors(folder):
@@ -111,7 +109,7 @@ def sweep_over(
             write_private(folder / "sweep.json", text + "\n")
             if isinstance(source, Scenario):  # there is no other file from which the sweep could be repeated
                 write_private(folder / "scenario.toml", source.to_toml())
-            with contextlib.closing(results_of(everything, workers, client, told, stop.is_set)) as results:
+            with contextlib.closing(crew.results(everything, told, stop.is_set)) as results:
                 written = time.monotonic()
                 try:
                     for (point, scenario), its_tasks in zip(scenarios, tasks, strict=True):

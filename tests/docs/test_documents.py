@@ -43,6 +43,7 @@ def test_every_command_of_the_documents_is_one(page: str) -> None:
 OTHER_OPTIONS = {
     "emulator/applications/microgrid/day.py",  # a program of its own
     "emulator/live/launch/compose.py",  # those of docker compose
+    "emulator/memory/cluster.py",  # those of dask worker
     "emulator/pytest_plugin.py",
     "emulator/report/page.py",  # names in its style sheet
     "emulator/view/headless.py",  # the viewer's

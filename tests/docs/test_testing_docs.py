@@ -47,7 +47,7 @@ def test_the_ci_jobs_test_and_keep_the_report() -> None:
         assert kept == [str(options.junit), f"{options.out}/"]
 
 
-@pytest.mark.parametrize("option", ["--evedrop-in-memory", "--evedrop-trials", "--evedrop-out"])
+@pytest.mark.parametrize("option", ["--evedrop-in-memory", "--evedrop-trials", "--evedrop-out", "--evedrop-scheduler"])
 def test_every_option_of_the_plugin_is_on_the_page(option: str) -> None:
     """In its table, and in the plugin."""
     assert f"| `{option}" in PAGE

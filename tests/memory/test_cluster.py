@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import importlib.metadata
+import json
 import os
+import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any, cast
 
 import pyarrow.parquet as pq
 import pytest
 
-from evedrop.api import montecarlo
+from evedrop.api import compare, cost, learned, montecarlo, sweep
 from evedrop.errors import UsageError
+from evedrop.loading import shipped
 from evedrop.memory.montecarlo import Plan
 from evedrop.ports import free_port
 from evedrop.results.writer import load_results
-from tests.conftest import Evedrop, wait_until
+from tests.conftest import Evedrop, Live, wait_until
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -35,41 +40,85 @@ def answers(port: int) -> bool:
     return True
 
 
-@pytest.fixture(scope="module")
-def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """The address of a scheduler with two workers."""
-    folder = tmp_path_factory.mktemp("dask")
-    port = free_port()
-    address = f"tcp://127.0.0.1:{port}"
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), "DASK_TEMPORARY_DIRECTORY": str(folder)}
-    command = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--no-dashboard"]
-    worker = [
-        sys.executable,
-        "-m",
-        "distributed.cli.dask_worker",
-        address,
-        "--host",
-        "127.0.0.1",
-        "--no-dashboard",
-        "--no-nanny",
-    ]
-    processes = []
-    log = (folder / "log").open("wb")
-    try:
-        for one in ([*command, "--port", str(port)], *([[*worker, "--nworkers", "1", "--nthreads", "1"]] * 2)):
-            processes.append(subprocess.Popen(one, env=environment, cwd=folder, stdout=log, stderr=log))
-            wait_until(lambda: answers(port), "a scheduler that listens")
-        wait_until(lambda: (folder / "log").read_text().count("Registered to:") >= 2, "two workers at the scheduler")
-        yield address
-    finally:
-        for process in reversed(processes):
+class Dask:
+    """A Dask scheduler of this machine, and its workers."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._log = folder / "log"
+        self._processes: list[subprocess.Popen[bytes]] = []
+        port = free_port()
+        self.address = f"tcp://127.0.0.1:{port}"
+        self._start("scheduler", "--port", str(port))
+        wait_until(lambda: answers(port), "a scheduler that listens")
+
+    def _start(self, program: str, *options: str, path: Sequence[Path] = ()) -> None:
+        paths = os.pathsep.join(map(str, (*path, Path(__file__).parents[2])))
+        with self._log.open("ab") as log:
+            started = subprocess.Popen(
+                [
+                    sys.executable,
+                    "-m",
+                    f"distributed.cli.dask_{program}",
+                    "--host",
+                    "127.0.0.1",
+                    "--no-dashboard",
+                    *options,
+                ],
+                env={**os.environ, "PYTHONPATH": paths, "DASK_TEMPORARY_DIRECTORY": str(self._folder)},
+                cwd=self._folder,
+                stdout=log,
+                stderr=log,
+            )
+        self._processes.append(started)
+
+    def add_worker(self, *path: Path) -> None:
+        """Start a worker, which finds packages in these folders first, and wait until the scheduler knows it."""
+        before = self._workers()
+        self._start("worker", self.address, "--no-nanny", "--nworkers", "1", "--nthreads", "1", path=path)
+        wait_until(lambda: self._workers() > before, "a worker at the scheduler")
+
+    def _workers(self) -> int:
+        return self._log.read_text().count("Registered to:")
+
+    def end(self) -> None:
+        """End all processes."""
+        for process in reversed(self._processes):
             process.terminate()
             try:
                 process.wait(10)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
-        log.close()
+
+
+def first_line(live: Live) -> str:
+    """The first line of a command on standard error, as soon as it is there."""
+    assert isinstance(live.process, subprocess.Popen)
+    assert live.process.stderr is not None
+    return str(live.process.stderr.readline())
+
+
+@pytest.fixture
+def lonely(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Dask]:
+    """A scheduler without workers."""
+    dask = Dask(tmp_path_factory.mktemp("lonely"))
+    try:
+        yield dask
+    finally:
+        dask.end()
+
+
+@pytest.fixture(scope="module")
+def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The address of a scheduler with two workers."""
+    dask = Dask(tmp_path_factory.mktemp("dask"))
+    try:
+        dask.add_worker()
+        dask.add_worker()
+        yield dask.address
+    finally:
+        dask.end()
 
 
 def test_a_study_on_the_cluster_is_the_local_one(evedrop: Evedrop, scheduler: str) -> None:
@@ -112,6 +161,135 @@ def test_a_sweep_on_the_cluster_is_the_local_one(evedrop: Evedrop, scheduler: st
     ours, theirs = (pq.read_table(evedrop.folder / name / "sweep.parquet") for name in ("here", "there"))
     assert ours.num_rows == 4 * 4
     assert ours.equals(theirs)
+
+
+def test_a_comparison_on_the_cluster_is_the_local_one(evedrop: Evedrop, scheduler: str) -> None:
+    """The same compare.json, byte for byte."""
+    base = ("compare", "acknowledged", "--slots", "40", "--trials", "30", "--schemes", "acknowledged,innovation")
+    here, there = evedrop(*base, "--out", "here"), evedrop.process(*base, "--out", "there", "--scheduler", scheduler)
+    assert (here.status, there.status, there.err) == (0, 0, "")
+    ours, theirs = ((evedrop.folder / name / "compare.json").read_text() for name in ("here", "there"))
+    assert ours == theirs
+    assert len(json.loads(ours)["schemes"]) == 2
+
+
+@pytest.mark.parametrize(
+    "study",
+    [
+        ("cost", "microgrid", "--trials", "51", "--slots", "60"),
+        ("learned", "learning", "--trials", "101", "--slots", "12", "--set", "expect=[]"),
+    ],
+    ids=["cost", "learned"],
+)
+def test_a_table_on_the_cluster_is_the_local_one(evedrop: Evedrop, scheduler: str, study: tuple[str, ...]) -> None:
+    """The same JSON from two tasks, and from two processes of this machine."""
+    here, there = evedrop(*study, "--json"), evedrop.process(*study, "--json", "--scheduler", scheduler)
+    assert (here.status, there.status, there.err) == (0, 0, "")
+    assert json.loads(here.out) == json.loads(there.out)
+    assert here.out == evedrop(*study, "--json", "--workers", "2").out
+
+
+def test_a_test_in_memory_on_the_cluster_is_the_local_one(evedrop: Evedrop, scheduler: str) -> None:
+    """Both pass, with the same digests; live, a scheduler is refused."""
+    base = ("test", "bursts", "--in-memory", "--trials", "600", "--out")
+    here, there = evedrop(*base, "here"), evedrop.process(*base, "there", "--scheduler", scheduler)
+    assert (here.status, there.status) == (0, 0)
+    ours, theirs = (load_results(evedrop.folder / name / "bursts") for name in ("here", "there"))
+    assert ours.digests.num_rows > 0
+    assert ours.digests.equals(theirs.digests)
+    live = evedrop("test", "bursts", "--scheduler", scheduler)
+    assert (live.status, live.err) == (
+        2,
+        "evedrop: --scheduler computes trials in memory; add --in-memory, or leave it out\n",
+    )
+
+
+def test_pytest_computes_in_memory_on_the_cluster(evedrop: Evedrop, scheduler: str) -> None:
+    """A scenario passes as a test of pytest; live, a scheduler is refused."""
+    (evedrop.folder / "mine.toml").write_text(shipped()["bursts"].read_text(encoding="utf-8"), encoding="utf-8")
+    (evedrop.folder / "pyproject.toml").write_text("[project]\n", encoding="utf-8")
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-p",
+        "evedrop.pytest_plugin",
+        "mine.toml",
+        "--evedrop-scheduler",
+        scheduler,
+    ]
+    environment = {**evedrop.environment, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
+    done, live = (
+        subprocess.run(
+            [*command, *more], cwd=evedrop.folder, env=environment, capture_output=True, text=True, check=False
+        )
+        for more in (("--evedrop-in-memory", "--evedrop-trials", "20"), ())
+    )
+    assert done.returncode == 0
+    assert "1 passed" in done.stdout
+    assert live.returncode == pytest.ExitCode.USAGE_ERROR
+    assert "--evedrop-scheduler computes trials in memory; add --evedrop-in-memory, or leave it out" in live.stderr
+
+
+def test_python_takes_a_scheduler_by_its_address(scheduler: str) -> None:
+    """Every function that simulates in memory gives what it gives here."""
+    small: dict[str, Any] = {"slots": 20, "trials": 30}
+    results = [montecarlo("eavesdroppers", scheduler=where, **small) for where in (None, scheduler)]
+    assert results[0].digests == results[1].digests
+    over = {"encoding.state_probability": [0.3, 0.6]}
+    tables = [sweep("eavesdroppers", over, scheduler=where, **small).table for where in (None, scheduler)]
+    assert tables[0] == tables[1]
+    two = {"schemes": ["plain", "innovation"], "adversaries": ["smart"], **small}
+    assert compare("vehicle", scheduler=scheduler, **two).table == compare("vehicle", **two).table
+    short: dict[str, Any] = {"slots": 12, "trials": 3, "expect": []}
+    day: dict[str, Any] = {"slots": 130, "trials": 3}
+    assert cost("microgrid", scheduler=scheduler, **day) == cost("microgrid", **day)
+    assert learned("learning", scheduler=scheduler, **short) == learned("learning", **short)
+
+
+def test_a_scheduler_that_is_no_address_is_refused() -> None:
+    """A cluster in place of its address: the message has the attribute to give."""
+    with pytest.raises(UsageError, match=r"expected the address .* a LocalCluster is its scheduler_address"):
+        montecarlo("eavesdroppers", slots=9, trials=5, scheduler=cast(str, object()))
+
+
+def test_a_scheduler_without_workers_is_said_and_its_first_worker_begins(evedrop: Evedrop, lonely: Dask) -> None:
+    """One line that has the command which starts a worker, and once there is one, the study runs to its end."""
+    study = ("montecarlo", "eavesdroppers", "--slots", "9", "--trials", "5")
+    live = evedrop.started(*study, "--scheduler", lonely.address, interpreter=True)
+    line = first_line(live)
+    assert line.startswith(f"evedrop: the scheduler {lonely.address} has no workers; waiting for one: start it with ")
+    assert f"`dask worker {lonely.address} --nthreads 1`" in line
+    lonely.add_worker()
+    done = live.end()
+    assert (done.status, done.err) == (0, "")
+
+
+def test_waiting_for_workers_ends_upon_ctrl_c(evedrop: Evedrop, lonely: Dask) -> None:
+    """Status 130, and no folder."""
+    study = ("montecarlo", "eavesdroppers", "--slots", "9", "--trials", "5")
+    live = evedrop.started(*study, "--scheduler", lonely.address, interpreter=True)
+    assert "has no workers" in first_line(live)
+    live.process.send_signal(signal.SIGINT)
+    assert live.end().status == 130
+    assert not live.folder.exists()
+
+
+def test_a_worker_of_another_version_is_said(evedrop: Evedrop, lonely: Dask, tmp_path: Path) -> None:
+    """The worker's address, its version, ours, and what to do; nothing is kept."""
+    folder = tmp_path / "other" / "evedrop-0.0.1.dist-info"
+    folder.mkdir(parents=True)
+    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: evedrop\nVersion: 0.0.1\n")
+    lonely.add_worker(tmp_path / "other")
+    done = evedrop(
+        "montecarlo", "eavesdroppers", "--slots", "9", "--trials", "5", "--scheduler", lonely.address, "--out", "run"
+    )
+    assert done.status == 3
+    (line,) = done.err.splitlines()
+    assert line.startswith("evedrop: the worker tcp://127.0.0.1:")
+    ours = importlib.metadata.version("evedrop")
+    assert f"has evedrop 0.0.1; expected evedrop {ours}, as here: install this version there" in line
+    assert not (evedrop.folder / "run").exists()
 
 
 def test_a_folder_that_is_not_empty_is_refused_there_too(evedrop: Evedrop, scheduler: str) -> None:

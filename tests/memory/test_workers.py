@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -123,17 +124,15 @@ def test_a_worker_is_given_no_tokens(evedrop: Evedrop, monkeypatch: pytest.Monke
 def test_what_was_merged_before_a_fault_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A fault after the first batch: the tables have its trials, the summary says how the study ended."""
     from evedrop.api import montecarlo
-    from evedrop.memory import montecarlo as module
+    from evedrop.memory import sharing
 
     def failing(tasks: list[Any], *_: object) -> object:
-        from evedrop.memory.trials import carry_out
-
-        yield carry_out(tasks[0], lambda _: None, lambda: False)
+        yield 0, tasks[0].carry_out(lambda _: None, lambda: False)
         raise RunError("a worker process died")
 
-    monkeypatch.setattr(module, "in_processes", failing)
+    monkeypatch.setattr(sharing, "in_processes", failing)
     with pytest.raises(RunError, match="died"):
-        montecarlo("eavesdroppers", trials=1100, slots=20, out=tmp_path / "run", plan=module.Plan(workers=2))
+        montecarlo("eavesdroppers", trials=1100, slots=20, out=tmp_path / "run", plan=Plan(workers=2))
     results = load_results(tmp_path / "run")
     assert results.summary["ended"] == "a worker process died"
     assert set(results.slots["trials"].to_pylist()) == {1000}
@@ -157,7 +156,7 @@ def test_a_failing_worker_says_what_failed(monkeypatch: pytest.MonkeyPatch) -> N
     """An error inside a worker comes back as one line with its kind."""
     scenario = load("eavesdroppers", {"slots": 10, "trials": 1500})
     tasks = tasks_of(scenario, Mode.EXACT, 2)
-    broken = [type(task)({**task.scenario, "slots": "many"}, task.mode, task.start, task.stop) for task in tasks]
+    broken = [replace(task, scenario={**task.scenario, "slots": "many"}) for task in tasks]
     results = in_processes(broken, 2, lambda _: None, lambda: False)
     with pytest.raises(RunError, match=r"^a worker failed: trials \d+ to \d+: ValidationError: [^\n]*slots[^\n]*$"):
         next(results)

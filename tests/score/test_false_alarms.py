@@ -10,7 +10,7 @@ from scipy.stats import binom, binomtest
 
 from evedrop.loading import checked
 from evedrop.memory.simulation import Mode
-from evedrop.memory.trials import Task, carry_out
+from evedrop.memory.trials import TrialsTask, carry_out
 from evedrop.model.process import Floats
 from evedrop.score.sums import WINDOWS, merged, window_means
 from evedrop.score.verdict import ERROR_RATE, SignTestOf, Verdict, relative_verdict, sign_of_mean, sign_of_median
@@ -43,7 +43,7 @@ def differences(studies: int) -> Floats:
     )
     parts = []
     for start in range(0, scenario.trials, 2000):
-        task = Task(scenario.model_dump(mode="json"), Mode.EXACT, start, min(start + 2000, scenario.trials))
+        task = TrialsTask(scenario.model_dump(mode="json"), start, min(start + 2000, scenario.trials), Mode.EXACT)
         tallies = [block.totals.tallies for block in carry_out(task, lambda _: None, lambda: False).blocks]
         user, other = (merged([one[name] for one in tallies]) for name in ("legitimate", "alike"))
         parts.append(window_means(other) - window_means(user))

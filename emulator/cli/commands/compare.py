@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from evedrop.cli.options import changes_of, entries, output, scenario, workers
+from evedrop.cli.in_memory import crew, plan_of
+from evedrop.cli.options import changes_of, entries, output, scenario
 from evedrop.command import Command
 from evedrop.errors import UsageError
 from evedrop.output import print_json
@@ -18,7 +19,6 @@ def compare(options: argparse.Namespace) -> int:
     from evedrop.cli.comparison_report import print_comparison
     from evedrop.cli.progress_line import ProgressLine
     from evedrop.loading import value_of
-    from evedrop.memory.montecarlo import Plan
     from evedrop.results.folder import results_folder
     from evedrop.results.summary_file import plain
 
@@ -41,7 +41,7 @@ def compare(options: argparse.Namespace) -> int:
             adversaries=_names(options.adversaries),
             parameters=parameters,
             out=folder,
-            plan=Plan(workers=options.workers),
+            plan=plan_of(options),
             tell=line.tell,
             **{"trials": 200, **changes},
         )
@@ -75,7 +75,7 @@ COMMANDS = (
         "compare",
         compare,
         "compare schemes, each against all adversaries, in memory",
-        (scenario, entries, output, _compares, workers),
+        (scenario, entries, output, _compares, crew),
         section="study",
         example="compare vehicle --trials 100",
         page="compare",

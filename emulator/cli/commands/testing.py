@@ -7,6 +7,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
+from evedrop.cli.in_memory import scheduler
 from evedrop.command import Command
 from evedrop.errors import UsageError
 
@@ -19,10 +20,13 @@ def test(options: argparse.Namespace) -> int:
 
     if options.jobs < 1:
         raise UsageError(f"--jobs {options.jobs}: expected 1 or more")
+    if options.scheduler is not None and not options.in_memory:
+        raise UsageError("--scheduler computes trials in memory; add --in-memory, or leave it out")
     scenarios = scenarios_of(options.places)
+    manner = Manner(options.in_memory, options.trials, options.out, scheduler=options.scheduler)
     started, tested = time.time(), list[Finding]()
     try:
-        for one in results(scenarios, Manner(options.in_memory, options.trials, options.out), options.jobs):
+        for one in results(scenarios, manner, options.jobs):
             tested.append(one)
             print(f"{one.outcome.word:<9}{one.seconds:7.1f} s  {one.scenario}", flush=True)
             for line in one.lines:
@@ -60,7 +64,7 @@ COMMANDS = (
         "test",
         test,
         "run scenarios as tests, with a report for CI",
-        (_places, _tests),
+        (_places, _tests, scheduler),
         section="run",
         example="test scenarios/ --junit report.xml",
         page="testing",
