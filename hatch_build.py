@@ -33,7 +33,8 @@ class KernelsHook(BuildHookInterface):
             raise ValueError(f"{_REQUIRED} is {required!r}; expected 1 or 0, or leave it out")
         folder = Path(self.root) / (_ROOM if version == "editable" else "build/kernels")
         folder.mkdir(parents=True, exist_ok=True)
-        for old in folder.glob("_compiled.*"):
+        # Only this Python's own: environments of several Pythons may share a checkout.
+        for old in folder.glob(f"_compiled.{sys.implementation.cache_tag}-*"):
             old.unlink()
         try:
             built = _binding(Path(self.root)).compile_kernels(folder)

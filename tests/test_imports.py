@@ -123,7 +123,7 @@ def test_launcher_and_memory_load_neither_zenoh_nor_rerun(
 
 
 STARTS = {
-    "evedrop.live.launch.launcher": {"numpy", "xxhash", "pydantic", "cryptography"},
+    "evedrop.live.launch.launcher": {"numpy", "xxhash", "pydantic", "cryptography", "tomli_w"},
     "evedrop.live.observer.observer": {
         "numpy",
         "xxhash",

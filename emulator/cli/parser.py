@@ -41,14 +41,29 @@ class _Help(argparse.RawDescriptionHelpFormatter):
         prefix: str | None = None,
     ) -> None:
         """The usage without optional arguments, which are listed below it."""
-        if prefix is None:
+        if usage is None and prefix is None:
             options = argparse.Action([], "options", metavar="[options]")
-            actions = [options, *(one for one in actions if one.required or not one.option_strings)]
-        super().add_usage(usage, actions, groups if prefix is not None else [], prefix)
+            usage = _usage(self._prog, [options, *(one for one in actions if one.required or not one.option_strings)])
+        super().add_usage(usage, actions, groups, prefix)
 
     def add_text(self, text: str | None) -> None:
         """A description, or an example after it, whose lines are indented."""
         super().add_text(text and "\n".join(map(_broken, text.splitlines())))
+
+
+def _usage(prog: str, actions: Iterable[argparse.Action]) -> str:
+    """A usage in lines that fit, the same with every Python: argparse breaks its own elsewhere since 3.13."""
+    whole = argparse.HelpFormatter(prog, width=10**6)
+    whole.add_usage(None, actions, [])
+    head, words = f"usage: {prog} ", whole.format_help().strip()
+    rest = textwrap.wrap(
+        words.removeprefix(head).replace(" ...", "\0..."),
+        _columns() - len(head),
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    indented = f"\n{' ' * len(head)}".join(rest).replace("\0", " ")
+    return f"{prog} {indented}".replace("%", "%%")
 
 
 def _broken(line: str) -> str:

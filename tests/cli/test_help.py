@@ -67,6 +67,16 @@ def test_help_fits_a_narrow_terminal(columns: int, monkeypatch: pytest.MonkeyPat
         assert max(map(len, parser.format_help().splitlines())) <= columns, parser.prog
 
 
+def test_a_usage_is_broken_the_same_with_every_python(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At spaces, with the sign of repetition beside its word."""
+    monkeypatch.setenv("COLUMNS", "42")
+    (link,) = (one for one in commands() if one.name == "link")
+    usage = parsed(link).parser.format_help().partition("\n\n")[0]
+    indent = " " * len("usage: evedrop link ")
+    expected = ["usage: evedrop link [options] RUN NAME", f"{indent}KEY=VALUE", f"{indent}[KEY=VALUE ...]"]
+    assert usage.splitlines() == expected
+
+
 def test_an_example_that_is_broken_stays_the_same_command(monkeypatch: pytest.MonkeyPatch) -> None:
     """A shell reads its lines as one."""
     monkeypatch.setenv("COLUMNS", "40")

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import runpy
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -93,3 +95,21 @@ def test_zigs_compiler_takes_the_place_of_a_missing_one(monkeypatch: pytest.Monk
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setattr("importlib.util.find_spec", lambda _: object())
     assert binding.compiler_environment()["CC"].endswith(" -m ziglang cc")
+
+
+def test_a_build_replaces_only_the_kernels_of_its_own_python(tmp_path: Path) -> None:
+    """Environments of several Pythons may share a checkout; a build that fails leaves no old kernels of its own."""
+    room = tmp_path / "emulator" / "kernels"
+    room.mkdir(parents=True)
+    (room / "binding.py").write_text("def compile_kernels(folder):\n    raise RuntimeError('no compiler')\n")
+    own, other = (
+        f"_compiled.{sys.implementation.cache_tag}-x86_64-linux-gnu.so",
+        "_compiled.cpython-39-x86_64-linux-gnu.so",
+    )
+    for name in (own, other):
+        (room / name).touch()
+    hook = runpy.run_path(str(Path(__file__).parents[2] / "hatch_build.py"))["KernelsHook"]
+    said = Mock()
+    hook(str(tmp_path), {}, None, None, str(tmp_path), "wheel", said).initialize("editable", {})
+    assert [path.name for path in room.glob("_compiled.*")] == [other]
+    assert "no compiler" in said.display_warning.call_args.args[0]

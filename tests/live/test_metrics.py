@@ -174,7 +174,7 @@ def test_a_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     """The message names the extra that installs it."""
     monkeypatch.setitem(sys.modules, "prometheus_client", None)
     with (
-        pytest.raises(UsageError, match=r"evedrop\[metrics\]"),
+        pytest.raises(UsageError, match=r"'\.\[metrics\]'"),
         metrics_served(ANY_PORT, RunMetrics(load("vehicle"), tmp_path, silent)),
     ):
         pytest.fail("served")
