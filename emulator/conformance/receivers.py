@@ -11,6 +11,7 @@ import numpy as np
 from evedrop.conformance.packets import expect_belief, row_of
 from evedrop.conformance.problems import QUALITY, Problem
 from evedrop.conformance.rules import Broken, Row, calling, expect_array, expect_same
+from evedrop.kernels.elementary import sum_in_order
 from evedrop.model import update
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Belief, Receiver, Reception
@@ -124,9 +125,9 @@ def expect_expected(problem: Problem, outcomes_at: OutcomesAt, errors: Sequence[
     """Raise Broken if the mean squared errors (R,) of every slot contradict the outcomes beyond chance."""
     outcomes = outcomes_at(QUALITY)
     parts = (outcomes.predicted, outcomes.decoded, outcomes.leaked, outcomes.state, outcomes.misled)
-    if abs(sum(parts) - 1.0) > 1e-9 or min(parts) < 0.0:
+    if abs(sum_in_order(parts) - 1.0) > 1e-9 or min(parts) < 0.0:
         raise Broken(
-            f"outcomes sum to {sum(parts):.6g}, the least is {min(parts):.3g}; expected probabilities that sum to 1"
+            f"outcomes sum to {sum_in_order(parts):.6g}, the least is {min(parts):.3g}; expected probabilities that sum to 1"
         )
     expected = ExpectedCovariance(problem.process, outcomes).next_traces(len(errors))
     for k, error in enumerate(errors):

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from evedrop.kernels.elementary import sum_in_order
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags
 
@@ -63,8 +64,8 @@ class RunLaw:
         stay, at = (self.transitions * self.chance).tolist(), self._opening.tolist()
         found = []
         for _ in range(most + 1):
-            found.append(sum(at))
-            at = [sum(a * row[j] for a, row in zip(at, stay, strict=True)) for j in range(len(at))]
+            found.append(sum_in_order(at))
+            at = [sum_in_order(a * row[j] for a, row in zip(at, stay, strict=True)) for j in range(len(at))]
         return np.array(found)
 
 

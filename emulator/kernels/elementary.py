@@ -7,7 +7,7 @@ uses these functions instead. All functions work elementwise, so a trial gives t
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,14 @@ _LN2_HIGH = 6.93147180369123816490e-01
 _LN2_LOW = 1.90821492927058770002e-10
 _LOG_ODD = (6.666666666666735130e-01, 2.857142874366239149e-01, 1.818357216161805012e-01, 1.479819860511658591e-01)
 _LOG_EVEN = (3.999999999940941908e-01, 2.222219843214978396e-01, 1.531383769920937332e-01)
+
+
+def sum_in_order(numbers: Iterable[float]) -> float:
+    """The sum of numbers, added one after the other: the same bits with every Python, whose `sum` compensates since 3.12."""
+    found = 0.0
+    for number in numbers:
+        found += number
+    return found
 
 
 def product(M: Floats, x: Floats) -> Floats:

@@ -7,6 +7,7 @@ from typing import final
 
 import numpy as np
 
+from evedrop.kernels.elementary import sum_in_order
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags
 from evedrop.streams import Ahead, Batch, BlockReader
@@ -32,7 +33,7 @@ def mean_of(mu_d: StateProbability) -> float:
     if not isinstance(mu_d, tuple):
         return mu_d
     later = mu_d[1:] or mu_d
-    return sum(later) / len(later)
+    return sum_in_order(later) / len(later)
 
 
 def equal_slots(mu_d: StateProbability, slots: range) -> list[range]:

@@ -14,7 +14,7 @@ from typing import NamedTuple, final
 
 import numpy as np
 
-from evedrop.kernels.elementary import Floats, cholesky, inverse, triangular_factor
+from evedrop.kernels.elementary import Floats, cholesky, inverse, sum_in_order, triangular_factor
 from evedrop.kernels.reference import carry
 from evedrop.model.noise_law import NoiseLaw
 from evedrop.model.process import Process, product
@@ -197,7 +197,7 @@ def _reached(process: Process, scale: _Vector) -> _Basis:
 def _remainder(A: list[_Vector], v: _Vector, basis: list[tuple[int, _Vector]]) -> _Vector | None:
     """A v without its part in the span of the basis; None if nothing else is left. Raises ValueError if that is in doubt."""
     rest = [math.fsum(a * value for a, value in zip(row, v, strict=True)) for row in A]
-    size = [sum(abs(a * value) for a, value in zip(row, v, strict=True)) for row in A]
+    size = [sum_in_order(abs(a * value) for a, value in zip(row, v, strict=True)) for row in A]
     for pivot, known in basis:
         factor = rest[pivot] / known[pivot]
         size = [s + abs(factor * value) for s, value in zip(size, known, strict=True)]

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from evedrop.figures.links import LinkAccount
+from evedrop.kernels.elementary import sum_in_order
 from evedrop.model.delays import delay_of
 from evedrop.model.links import loss_of
 from evedrop.model.links.link import Chain, LossModel
@@ -53,8 +54,12 @@ def link_summary_of(scenario: Scenario, receiver: str, tally: Tally) -> LinkSumm
         return found
     rate = 1.0 - tally.lost.get("lost", 0) / met
     slots = sum(len(piece) for piece, _ in pieces)
-    expected = sum(float(loss.quality_at(part).sum()) for piece, loss in pieces for part in parts_of(piece)) / slots
-    variance = sum(loss.rate_variance(piece) * len(piece) ** 2 for piece, loss in pieces) / slots**2 / tally.trials
+    expected = (
+        sum_in_order(float(loss.quality_at(part).sum()) for piece, loss in pieces for part in parts_of(piece)) / slots
+    )
+    variance = (
+        sum_in_order(loss.rate_variance(piece) * len(piece) ** 2 for piece, loss in pieces) / slots**2 / tally.trials
+    )
     variance *= slots * tally.trials / met if tally.unsent else 1.0
     low, high = interval(rate, expected, variance)
     within = low - _ROUNDING <= expected <= high + _ROUNDING

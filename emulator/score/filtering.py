@@ -12,6 +12,7 @@ from typing import final
 import numpy as np
 
 from evedrop.figures.standard_error import standard_error, z_of
+from evedrop.kernels.elementary import sum_in_order
 from evedrop.model.local_filter import LocalFilter, Steps
 from evedrop.model.process import Floats
 from evedrop.names import SENSOR
@@ -91,7 +92,7 @@ class FilterTally:
         while len(traces) < self.slots and not steps.settled:
             last = float(np.trace(steps.next().covariance))
             traces.append(last)
-        mean = (sum(traces) + (self.slots - len(traces)) * last) / max(1, self.slots)
+        mean = (sum_in_order(traces) + (self.slots - len(traces)) * last) / max(1, self.slots)
         errors = {name: value / max(1, self.count) for name, value in self.sums.items()}
         own = errors.pop(SENSOR, None)
         mean_trace = mean if self.slots else None

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from evedrop.kernels.elementary import sum_in_order
 from evedrop.model.links import loss_of
 from evedrop.model.links.link import Chain, LossModel, count_variance
 from evedrop.model.process import Floats
@@ -49,7 +50,7 @@ def expected(settings: Mapping[str, Any], changes: Iterable[Change], ranges: Ite
     for _, group in groupby(_parts(settings, changes, ranges), key=lambda part: part.loss):
         parts = list(group)
         loss = loss_of(parts[0].spec)
-        mean += sum(part.passes * _delivered(loss, part.slots) for part in parts)
+        mean += sum_in_order(part.passes * _delivered(loss, part.slots) for part in parts)
         variance += _variance(loss, parts)
     return mean, variance
 
@@ -81,7 +82,7 @@ def _delivered(loss: LossModel, slots: range) -> float:
     if loss.chain is not None:
         return len(slots) * loss.quality
     pieces = (slots[i : i + _AT_ONCE] for i in range(0, len(slots), _AT_ONCE))
-    return sum(float(loss.quality_at(piece).sum()) for piece in pieces)
+    return sum_in_order(float(loss.quality_at(piece).sum()) for piece in pieces)
 
 
 def _variance(loss: LossModel, parts: Sequence[_Part]) -> float:
@@ -92,7 +93,7 @@ def _variance(loss: LossModel, parts: Sequence[_Part]) -> float:
         + part.passes * (1.0 - part.passes) * _delivered(loss, part.slots)
         for part in parts
     ]
-    return sum(each) if loss.memoryless else sum(map(math.sqrt, each)) ** 2
+    return sum_in_order(each) if loss.memoryless else sum_in_order(map(math.sqrt, each)) ** 2
 
 
 def _variance_of_chain(chain: Chain, parts: Sequence[_Part]) -> float:

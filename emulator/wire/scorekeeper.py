@@ -18,6 +18,7 @@ import zenoh
 from numpy.typing import NDArray
 
 from evedrop.errors import UsageError
+from evedrop.kernels.elementary import sum_in_order
 from evedrop.model.slot.link import Change
 from evedrop.output import warn
 from evedrop.results.folder import replace_private
@@ -193,7 +194,7 @@ class WireScorekeeper:
         rate = model = between = within = None
         if tried:
             laws = [self._law(link, *stream, one) for stream, one in tally.streams.items() if one.tried]
-            mean, variance = (sum(law[i] for law in laws) for i in (0, 1))
+            mean, variance = (sum_in_order(law[i] for law in laws) for i in (0, 1))
             low, high = bounds(mean, variance, tried)
             rate, model, between, within = (
                 passed / tried,

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import final
 
 from evedrop.errors import Interrupted, RunError, UsageError
+from evedrop.kernels.elementary import sum_in_order
 from evedrop.live.launch.ports import RouterEndpoints, loopback_endpoints
 from evedrop.live.launch.process_set import Ended, launch_one
 from evedrop.live.launch.shard import SHARDS_FOLDER, Shard, shards_of
@@ -76,9 +77,10 @@ class OneProgress:
     def _all(self) -> RunProgress:
         """The slowest shard's progress and rate, with the errors over all trials."""
         slowest = min(self._latest.values(), key=lambda one: one.done)
-        total = sum(self._trials.values())
+        trials = sum(self._trials.values())
         errors = {
-            name: sum(self._trials[number] * one.squared_errors[name] for number, one in self._latest.items()) / total
+            name: sum_in_order(self._trials[number] * one.squared_errors[name] for number, one in self._latest.items())
+            / trials
             for name in slowest.squared_errors
         }
         return replace(slowest, squared_errors=errors)

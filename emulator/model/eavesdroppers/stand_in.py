@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Self, final
 
 from evedrop.errors import NoAnswer, NotRegistered
+from evedrop.kernels.elementary import sum_in_order
 from evedrop.model.answers import Answers
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, PacketTaker
 from evedrop.model.theory.covariances import Outcomes, OutcomesAt
@@ -119,7 +120,7 @@ class _Elsewhere(Eavesdropper):
                 raise _wrong("outcomes()", found, f"the probabilities {', '.join(names)}")
             if not all(_is_probability(value) for value in found.values()):
                 raise _wrong("outcomes()", found, "probabilities")
-            if abs(sum(found[name] for name in _SHARES) - 1.0) > _ROUNDING:
+            if abs(sum_in_order(found[name] for name in _SHARES) - 1.0) > _ROUNDING:
                 raise _wrong("outcomes()", found, f"{', '.join(_SHARES)} that sum to 1")
             return Outcomes(**found)
 

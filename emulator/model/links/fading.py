@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 
+from evedrop.kernels.elementary import sum_in_order
 from evedrop.model.process import Floats
 
 _AT_ONCE = 1 << 20  # numbers
@@ -59,7 +60,7 @@ def count_variance(needed: Floats, first: int, outer: int, inner: int, deviation
     padded[lead : lead + len(needed)] = needed
     parts = np.sort(padded.reshape(blocks, outer // inner, inner), axis=2)
     step = max(1, _AT_ONCE // outer)
-    return sum(_variance_of(parts[i : i + step], deviation) for i in range(0, blocks, step))
+    return sum_in_order(_variance_of(parts[i : i + step], deviation) for i in range(0, blocks, step))
 
 
 def _variance_of(parts: Floats, deviation: float) -> float:

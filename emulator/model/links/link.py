@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from evedrop.kernels.elementary import sum_in_order
 from evedrop.model.links.way import Way
 from evedrop.model.parts_of_runs import parts_of
 from evedrop.model.process import Floats
@@ -107,7 +108,7 @@ class LossModel(ABC):
         if chain is not None:
             return count_variance(chain.transitions, chain.law, chain.quality, count) / count**2
         qualities = (self.quality_at(part) for part in parts_of(slots))
-        return sum(float((quality * (1.0 - quality)).sum()) for quality in qualities) / count**2
+        return sum_in_order(float((quality * (1.0 - quality)).sum()) for quality in qualities) / count**2
 
     @property
     def memoryless(self) -> bool:

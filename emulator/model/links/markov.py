@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from functools import reduce
-from operator import add
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evedrop.kernels.elementary import sum_in_order
 from evedrop.model.checks import as_toml, is_probability
 from evedrop.model.links.link import Chain, LossModel, fates_of
 from evedrop.model.process import Floats
@@ -144,8 +143,8 @@ def _matrix_mistakes(rows: Any) -> list[str]:
     for i, row in enumerate(rows):
         if not all(is_probability(value) for value in row):
             found.append(f"row {i} is {as_toml(row)}; expected numbers from 0 to 1")
-        elif abs(sum(row) - 1.0) > _SUM:
-            found.append(f"row {i} sums to {sum(row):.6g}; expected 1")
+        elif abs(sum_in_order(row) - 1.0) > _SUM:
+            found.append(f"row {i} sums to {sum_in_order(row):.6g}; expected 1")
     if not found and not _common(rows):
         found.append("has several recurrent classes; expected a state that can be reached from all others")
     return found
@@ -172,7 +171,7 @@ def stationary(transitions: Floats) -> Floats:
     kept = count
     while kept > 1:
         last = kept - 1
-        leaves = _in_order(rows[last][:last])
+        leaves = sum_in_order(rows[last][:last])
         if leaves == 0.0:
             break
         for i in range(last):
@@ -183,11 +182,6 @@ def stationary(transitions: Floats) -> Floats:
     weights = [0.0] * count
     weights[kept - 1] = 1.0
     for state in range(kept, count):
-        weights[state] = _in_order(weights[i] * rows[i][state] for i in range(state))
-    total = _in_order(weights)
+        weights[state] = sum_in_order(weights[i] * rows[i][state] for i in range(state))
+    total = sum_in_order(weights)
     return np.array([weight / total for weight in weights])
-
-
-def _in_order(values: Iterable[float]) -> float:
-    """The sum, added in order: Python's own `sum` rounds differently from 3.12 on."""
-    return reduce(add, values, 0.0)

@@ -16,6 +16,7 @@ from typing import final
 
 import numpy as np
 
+from evedrop.kernels.elementary import sum_in_order
 from evedrop.model.parts_of_runs import SLOTS_AT_ONCE, parts_of
 from evedrop.model.process import Floats, Process
 from evedrop.model.theory.covariances import (
@@ -107,7 +108,7 @@ def streaks(process: Process, outcomes: Outcomes, slots: int) -> Streaks | None:
 
 def total_of(next_traces: Callable[[int], Floats], slots: int) -> float:
     """Σ_k tr E P_k over slots 0 … slots−1; next_traces: returns tr E P_k of as many next slots as it is asked for."""
-    return sum(float(next_traces(len(part)).sum()) for part in parts_of(range(slots)))
+    return sum_in_order(float(next_traces(len(part)).sum()) for part in parts_of(range(slots)))
 
 
 def _begun(process: Process, outcomes: Outcomes, slots: int, last: int) -> tuple[Floats, Floats | None]:
