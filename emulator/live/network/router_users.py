@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -14,15 +13,15 @@ _FAREWELL_SECONDS = 10.0
 
 @contextmanager
 def users_file(users: Mapping[str, str]) -> Iterator[Path]:
-    """The file of users and passwords that Zenoh reads once, when the session opens; afterwards it is deleted."""
-    handle, name = tempfile.mkstemp(prefix="evedrop-users-")
-    path = Path(name)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.writelines(f"{user}:{password}\n" for user, password in users.items())
-        yield path
-    finally:
-        path.unlink(missing_ok=True)
+    """The file of users and passwords that Zenoh reads once, when the session opens.
+
+    It has no name in any folder, so nothing of it is left however the process ends: the path is that of an open file.
+    """
+    with tempfile.TemporaryFile("w", encoding="utf-8") as file:
+        file.writelines(f"{user}:{password}\n" for user, password in users.items())
+        file.flush()
+        file.seek(0)  # where a path of an open file shares its position
+        yield Path(f"/dev/fd/{file.fileno()}")
 
 
 def until_all_left(present: Mapping[str, bool], linked: Callable[[], bool] = lambda: False) -> None:
