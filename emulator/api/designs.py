@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from evedrop.api.given import scenario_of
+from evedrop.api.measuring import measuring_command
 from evedrop.errors import UsageError
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.schemes import SCHEMES
@@ -23,7 +24,8 @@ from evedrop.scenario.words import listed
 if TYPE_CHECKING:
     from evedrop.expected.energy_budget import BudgetDesign
     from evedrop.expected.policies import PolicyDesign
-    from evedrop.model.theory.design import Adversary, Design
+    from evedrop.model.theory.adversary import Adversary
+    from evedrop.model.theory.design import Design
     from evedrop.model.theory.schedules import ScheduleDesign
 
 _LONGEST_SCHEDULE = 100  # designed in a minute
@@ -31,36 +33,54 @@ _TWENTIETHS = tuple(float(i) / 20 for i in range(21))
 
 
 def design(
-    scenario: str | Path | Scenario, *, max_trace: float | None = None, changes: Mapping[str, Any] | None = None
+    scenario: str | Path | Scenario,
+    *,
+    max_trace: float | None = None,
+    min_ratio: float | None = None,
+    changes: Mapping[str, Any] | None = None,
 ) -> Design:
     """The admissible μ_d for a scenario's process and links, and the cost and secrecy of each choice.
 
-    max_trace: Ω, for which the least μ_d that keeps the limiting trace below it is computed, too; changes: entries by dotted
-    key.
+    max_trace: Ω, for which the least μ_d that keeps the limiting trace below it is computed, too; min_ratio: how many times
+    larger than the legitimate error every eavesdropper's is to be, for which the cheapest μ_d is chosen, one that keeps Ω if both
+    are given; changes: entries by dotted key.
 
     Raises ScenarioError with every mistake of the scenario, UsageError if the scheme does not send states and innovations, if
-    the losses of a link are not independent and alike in all slots, or if Ω is infinite or no μ_d keeps the trace below it.
+    the losses of a link are not independent and alike in all slots, or if Ω is infinite, or no μ_d keeps the trace below it or
+    has the ratio. The error names a command that measures what cannot be designed.
     """
     from evedrop.model.theory.design import design as design_of  # noqa: PLC0415 - a run does not need it
 
     made = scenario_of(scenario, changes or {}, beyond_horizon=True)
+    measured = measuring_command(scenario, changes or {}, made)
     if not SCHEMES[made.encoding.scheme].sends_states_and_innovations:
-        raise UsageError(_not_for(made.encoding.scheme))
+        raise UsageError(_not_for(made.encoding.scheme, measured))
     if max_trace == math.inf:
         raise UsageError("an infinite largest trace is kept by every admissible μ_d; give a finite one")
+    if min_ratio is not None and not 0.0 < min_ratio < math.inf:
+        raise UsageError(f"a least ratio of {min_ratio:g}: expected a finite number above 0, such as 10")
     if made.encoding.state_probabilities is not None:
         raise UsageError(
             "the design of μ_d is for one μ_d in all slots, whose limits it compares, and encoding.state_probability is a list; "
-            "change it, as by encoding.state_probability=0.6, or design a schedule, which is another list"
+            "change it, as by encoding.state_probability=0.6, or design a schedule, which is another list; "
+            f"{measured} measures this one"
         )
-    mu, adversaries, left_out = _adversaries(made)
-    found = design_of(made.process.process, mu, made.encoding.mu_d, adversaries, made.slots, max_trace)
-    return replace(found, left_out=left_out)
+    mu, adversaries, left_out = _adversaries(made, measured)
+    if min_ratio is not None and not adversaries:
+        raise UsageError(
+            "a least ratio is for eavesdroppers whose error has a closed form, and the scenario has none; add one, such as "
+            f'eavesdroppers.genie={{strategy = "genie", link = {{quality = 0.9}}}}, or measure those it has: {measured}'
+        )
+    found = design_of(made.process.process, mu, made.encoding.mu_d, adversaries, made.slots, max_trace, min_ratio)
+    return replace(found, left_out=left_out, measuring=measured)
 
 
-def _adversaries(made: Scenario) -> tuple[float, list[Adversary], dict[str, str]]:
-    """μ, the eavesdroppers whose error has a closed form, and the strategies of the others. Raises UsageError for other links."""
-    from evedrop.model.theory.design import Adversary  # noqa: PLC0415 - a run does not need it
+def _adversaries(made: Scenario, measured: str) -> tuple[float, list[Adversary], dict[str, str]]:
+    """μ, the eavesdroppers whose error has a closed form, and the strategies of the others. Raises UsageError for other links.
+
+    measured: the command that measures what cannot be designed.
+    """
+    from evedrop.model.theory.adversary import Adversary  # noqa: PLC0415 - a run does not need it
 
     quality = {}
     for name in made.receivers:
@@ -70,7 +90,8 @@ def _adversaries(made: Scenario) -> tuple[float, list[Adversary], dict[str, str]
             raise UsageError(
                 "the design of μ_d is for independent losses that stay the same, without late packets and outages, and "
                 f"the link of {name} is different; give it only a quality, such as "
-                f"{'' if name == LEGITIMATE else 'eavesdroppers.'}{name}.link={{quality = 0.9}}"
+                f"{'' if name == LEGITIMATE else 'eavesdroppers.'}{name}.link={{quality = 0.9}}, or measure the "
+                f"scenario as it is: {measured}"
             )
         quality[name] = float(alike.quality[0])
     adversaries, left_out = [], {}
@@ -103,8 +124,9 @@ def design_schedule(
     from evedrop.model.theory.schedules import ScheduleDesign, best_schedule  # noqa: PLC0415 - a run does not need it
 
     made = scenario_of(scenario, changes or {}, beyond_horizon=True)
+    measured = measuring_command(scenario, changes or {}, made)
     if not SCHEMES[made.encoding.scheme].sends_states_and_innovations:
-        raise UsageError(_not_for(made.encoding.scheme))
+        raise UsageError(_not_for(made.encoding.scheme, measured))
     if not 2 <= slots <= _LONGEST_SCHEDULE:
         raise UsageError(
             f"a schedule of {slots} slot{'' if slots == 1 else 's'}: "
@@ -120,13 +142,13 @@ def design_schedule(
         raise UsageError(
             "a schedule needs a bound on the legitimate trace or a weight for it: give a largest trace, or a weight"
         )
-    mu, adversaries, left_out = _adversaries(made)
+    mu, adversaries, left_out = _adversaries(made, measured)
     bound, process = math.inf if max_trace is None else max_trace, made.process.process
     found = {one.name: best_schedule(process, mu, one.outcomes, slots, bound, weight, block) for one in adversaries}
     if not found:
         raise UsageError(
             "a schedule is designed against eavesdroppers whose error has a closed form, and the scenario has none; add one, "
-            'such as eavesdroppers.genie={strategy = "genie", link = {quality = 0.9}}'
+            f'such as eavesdroppers.genie={{strategy = "genie", link = {{quality = 0.9}}}}, or measure those it has: {measured}'
         )
     return ScheduleDesign(found, left_out)
 
@@ -167,17 +189,19 @@ def design_budget(
     return budget_of(scenario_of(scenario, changes or {}, beyond_horizon=True), budget)
 
 
-def _not_for(scheme: str) -> str:
-    """The reason why a scheme cannot be designed, and an alternative."""
+def _not_for(scheme: str, measured: str) -> str:
+    """The reason why a scheme cannot be designed, and two ways out; measured: the command that measures it."""
     designed = [name for name in SCHEMES if SCHEMES[name].sends_states_and_innovations]
     why = f"the design of μ_d is for the scheme {listed(designed)}"
     instead = 'give encoding={scheme = "innovation", state_probability = 0.6} to design that on this process'
     if SCHEMES.foreign(scheme):
-        return f"{why}; no closed form is known for {scheme}; {instead}, or study it by evedrop sweep"
-    if SCHEMES[scheme].needs_acknowledgements:
+        why = f"{why}; no closed form is known for {scheme}"
+    elif SCHEMES[scheme].needs_acknowledgements:
+        why = f"{why}, and this scenario has {scheme}"
         instead = (
             f"evedrop compare SCENARIO --schemes {scheme},innovation --out DIR measures both on this process, and writes "
             "DIR/scenarios/innovation.toml, which can be designed"
         )
-        return f"{why}, and this scenario has {scheme}; {instead}"
-    return f"{why}, and this scenario has {scheme}; {instead}, or measure {scheme} by evedrop compare"
+    else:
+        why = f"{why}, and this scenario has {scheme}"
+    return f"{why}; {instead}, or measure {scheme}: {measured}"

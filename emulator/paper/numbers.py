@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from evedrop.model.process import Floats
+from evedrop.model.theory.adversary import Adversary, adversary_bound
 from evedrop.model.theory.covariances import Outcomes, expected_traces, stability_bound
-from evedrop.model.theory.design import Adversary, Against, adversary_bound
+from evedrop.model.theory.design import Against
 from evedrop.paper import numerical
 
 _INTERCHANGED = "the paper gives the other eavesdropper's value: the figures for 0.95 and 0.99 are interchanged"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from typing import Any
 
 import pytest
@@ -31,7 +32,7 @@ def test_the_numerical_illustration(evedrop: Evedrop) -> None:
     found = designed(evedrop, "numerical")
     assert list(found) == ["rho", "legitimate", "eavesdroppers"]
     assert set(found["legitimate"]) == {"bound", "trace"}
-    keys = {"bound", "perfect", "relative", "best_difference", "best_ratio", "trace"}
+    keys = {"bound", "perfect", "relative", "best_difference", "best_ratio", "ratio", "largest_ratio", "trace"}
     assert {frozenset(one) for one in found["eavesdroppers"].values()} == {frozenset(keys)}
     assert found["rho"] == pytest.approx(1.387799, abs=1e-6)
     assert found["legitimate"]["bound"] == pytest.approx(LOW, abs=1e-6)
@@ -153,9 +154,9 @@ def test_who_has_no_closed_form_is_left_out_and_said(evedrop: Evedrop) -> None:
     assert found["legitimate"]["trace"] < genie["trace"] < equal["trace"]
     assert found["eavesdroppers"]["deaf"]["bound"] is None
     (line,) = [line for line in evedrop("design", "numerical", *extra).out.splitlines() if "left out" in line]
-    assert line == (
+    assert line.startswith(
         "left out: clever (bayesian): no closed form of its error is known; a guarantee against a genie holds against every "
-        "eavesdropper"
+        "eavesdropper, and this measures it: evedrop sweep numerical --set "
     )
 
 
@@ -201,3 +202,66 @@ def test_figures_that_cannot_be_written_are_refused(evedrop: Evedrop) -> None:
     done = evedrop("figures", "file")
     assert (done.status, done.out) == (2, "")
     assert done.err.splitlines()[-1].startswith("evedrop: file cannot be written (")
+
+
+def test_the_choice_of_a_ratio(evedrop: Evedrop) -> None:
+    """`--min-ratio R`: in words, as JSON, and the line it prints gives a scenario that has the ratio."""
+    found = designed(evedrop, "numerical", "--min-ratio", "2")
+    choice = found["choice"]
+    assert min(ratio for ratio in choice["ratios"].values() if ratio is not None) == pytest.approx(2.0, rel=1e-9)
+    assert choice["cost"] > 1.0
+    again = designed(evedrop, "numerical", *changes(encoding__state_probability=choice["mu_d"]))
+    ratios = {name: one["ratio"] for name, one in again["eavesdroppers"].items()}
+    assert ratios == {name: value and pytest.approx(value) for name, value in choice["ratios"].items()}
+    done = evedrop("design", "numerical", "--min-ratio", "2")
+    assert f"state_probability = {choice['mu_d']!r}" in done.out.splitlines()
+    assert "J_e/J ≥ 2 against every eavesdropper" in done.out
+    assert "…  " not in done.out  # no column is cut
+
+
+def test_a_ratio_that_is_impossible_is_refused(evedrop: Evedrop) -> None:
+    """With the largest there is, where it is, and its price."""
+    done = evedrop("design", "numerical", "--min-ratio", "10")
+    assert (done.status, done.out) == (2, "")
+    (line,) = done.err.splitlines()
+    assert line.startswith("evedrop: no μ_d gives 10× against every eavesdropper; the most is 2.488× at μ_d = 0.6445")
+    assert "2.91 times that of sending all states" in line
+
+
+@pytest.mark.parametrize("wanted", ["0", "-1", "inf", "nan"])
+def test_a_ratio_that_is_no_ratio_is_refused(evedrop: Evedrop, wanted: str) -> None:
+    """In one line that says what is expected."""
+    done = evedrop("design", "numerical", "--min-ratio", wanted)
+    assert (done.status, done.out) == (2, "")
+    assert "expected a finite number above 0, such as 10" in done.err
+
+
+@pytest.mark.parametrize(
+    ("scenario", "entries"),
+    [
+        ("numerical", {"legitimate__link": '{loss = {model = "gilbert-elliott", p = 0.01, r = 0.3}}'}),
+        ("numerical", {"eavesdroppers": '{clever = {strategy = "bayesian", link = {quality = 0.9}}}'}),
+        ("twin-track", {}),
+        ("noise", {}),
+        ("acknowledged", {}),
+        ("numerical", {"slots": 4, "encoding__state_probability": [1.0, 0.5, 0.5, 0.5]}),
+        (
+            "numerical",
+            {
+                "title": '"it\'s  a \\"title\\""',
+                "eavesdroppers__clever": '{strategy = "bayesian", link = {quality = 0.9}}',
+            },
+        ),
+    ],
+    ids=["bursts", "bayesian", "twin-track", "noise", "acknowledged", "list", "left out"],
+)
+def test_what_is_refused_can_be_measured(evedrop: Evedrop, scenario: str, entries: dict[str, Any]) -> None:
+    """The refusal, or the line about who is left out, ends in a command that works as printed."""
+    done = evedrop(
+        "design", scenario, *([] if scenario != "numerical" else ["--min-ratio", "1.5"]), *changes(**entries)
+    )
+    said = done.err.splitlines()[-1] if done.err else done.out.splitlines()[-1]
+    command = said[said.rindex("evedrop ") :].removesuffix(" measures this one")
+    words = shlex.split(command)
+    assert words[1] in {"sweep", "montecarlo"}
+    assert evedrop(*words[1:], "--trials", "2", "--slots", "4", "--set", "expect=[]", "--out", "measured").status == 0

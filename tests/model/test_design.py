@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 
 from evedrop.errors import UsageError
 from evedrop.model.process import Process
+from evedrop.model.theory.adversary import Adversary, adversary_bound
 from evedrop.model.theory.covariances import Outcomes, limit_trace, stability_bound
 from evedrop.model.theory.design import (
-    Adversary,
-    adversary_bound,
     best_difference,
     best_ratio,
     design,
@@ -241,7 +240,16 @@ def test_dictionary_is_strict_json() -> None:
     assert set(data["legitimate"]) == {"bound", "trace"}
     assert data["legitimate"]["trace"] is None
     for against in data["eavesdroppers"].values():
-        assert set(against) == {"bound", "perfect", "relative", "best_difference", "best_ratio", "trace"}
+        assert set(against) == {
+            "bound",
+            "perfect",
+            "relative",
+            "best_difference",
+            "best_ratio",
+            "ratio",
+            "largest_ratio",
+            "trace",
+        }
     assert data["eavesdroppers"]["smart"]["perfect"] == pytest.approx([LOW, 0.565630], abs=1e-6)
     asked = design(UNSTABLE, 0.9, 0.6, [], slots=80, max_trace=0.01).as_dict()
     assert asked["legitimate"]["minimum"] == pytest.approx(0.540427, abs=1e-6)

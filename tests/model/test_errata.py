@@ -5,6 +5,7 @@ import pytest
 
 from evedrop.model.process import Floats, Process, Trajectory, mistakes_of
 from evedrop.model.schemes.innovation import Innovation
+from evedrop.model.theory.adversary import Adversary
 from evedrop.model.theory.covariances import (
     Outcomes,
     expected_covariances,
@@ -12,7 +13,7 @@ from evedrop.model.theory.covariances import (
     limit_trace,
     state_covariances,
 )
-from evedrop.model.theory.design import Adversary, best_difference, design, relative_secrecy
+from evedrop.model.theory.design import best_difference, design, relative_secrecy
 from evedrop.paper import microgrid
 from evedrop.streams import Batch
 from tests.builders import stream_keys

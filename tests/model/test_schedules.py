@@ -9,8 +9,8 @@ import pytest
 
 from evedrop.errors import UsageError
 from evedrop.model.process import Process
+from evedrop.model.theory.adversary import Adversary
 from evedrop.model.theory.covariances import Outcomes, expected_traces, misled_covariances
-from evedrop.model.theory.design import Adversary
 from evedrop.model.theory.schedules import BestSchedule, ScheduleDesign, ScheduleProblem, SlotRecursion, best_schedule
 from tests.builders import DRIFTING, UNSTABLE
 from tests.model.slot_loop import STABLE

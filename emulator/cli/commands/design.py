@@ -37,7 +37,7 @@ def design(options: argparse.Namespace) -> int:
 
 
 _OPTIONS: Mapping[str | None, Mapping[str, str]] = {
-    None: {"max_trace": "max_trace"},
+    None: {"max_trace": "max_trace", "min_ratio": "min_ratio"},
     "--policy": {"weight": "weights", "price": "prices", "states": "states"},
     "--schedule": {"max_trace": "max_trace", "weight": "weight", "block": "block"},
     "--budget": {},
@@ -78,6 +78,12 @@ def _designs(parser: argparse.ArgumentParser) -> None:
         type=float,
         metavar="Ω",
         help="find the least μ_d whose limiting trace stays below Ω; with --schedule: the trace stays within Ω in every slot",
+    )
+    parser.add_argument(
+        "--min-ratio",
+        type=float,
+        metavar="R",
+        help="find the cheapest μ_d at which every eavesdropper's error is at least R times the user's in the limit",
     )
     kind = parser.add_mutually_exclusive_group()
     kind.add_argument(

@@ -16,40 +16,14 @@ import numpy as np
 from evedrop.errors import UsageError
 from evedrop.model.process import Process
 from evedrop.model.receiver import Flags
+from evedrop.model.theory.adversary import ATTAINED, Adversary, adversary_bound, points_between, traces_of
 from evedrop.model.theory.covariances import Outcomes, expected_traces, limit_trace, stability_bound
+from evedrop.model.theory.ratio import Choice, LargestRatio, cheapest, largest_ratio, ratio_of
 
 Interval = tuple[float, float]
 
 _EQUAL = 1e-12  # relative difference below which two traces count as equal
 _XTOL = 1e-13
-_NEAREST = 1e-9  # smallest distance to a pole, relative to the interval, at which differences are computed
-_ATTAINED = 1e-5  # a maximum nearer than this to the open end of the interval is not a maximum
-
-
-@dataclass(frozen=True)
-class Adversary:
-    """An eavesdropper as the design needs to know it."""
-
-    name: str
-    mu_e: float
-    """Quality of its link."""
-    use_state: float
-    """P(b = 1 given ν = 0)."""
-    use_innovation: float
-    """P(b = 1 given ν = 1)."""
-    reads_leak: bool = False
-    """Whether it uses the leak of innovations: the genie, with the probabilities of smart."""
-
-    @classmethod
-    def with_outcomes(cls, name: str, mu_e: float, half: Outcomes) -> Adversary:
-        """From its outcomes behind a lossless link at μ_d = 1/2."""
-        return cls(name, mu_e, 2.0 * half.state, 2.0 * half.misled, half.leaked > 0.0)
-
-    def outcomes(self, mu_d: float) -> Outcomes:
-        """Its outcomes in a slot."""
-        if self.reads_leak:
-            return Outcomes.genie(self.mu_e, mu_d)
-        return Outcomes.eavesdropper(self.mu_e, mu_d, self.use_state, self.use_innovation)
 
 
 @dataclass(frozen=True)
@@ -65,7 +39,11 @@ class Against:
     best_difference: float | None
     """μ_d* that maximises J_r = J_e − J; None if there is no maximum: J_r is unbounded, or nowhere positive."""
     best_ratio: float | None
-    """μ_d that maximises J_r / J; None if there is no maximum."""
+    """μ_d that maximises J_r / J, and so J_e / J; None if there is no maximum."""
+    ratio: float
+    """J_e / J at the scenario's own μ_d; inf if only its error is unbounded, nan if both are."""
+    largest: LargestRatio | None
+    """The largest J_e / J over the admissible μ_d; None if no μ_d is admissible."""
     trace: float
     """J_e at the scenario's own μ_d."""
     difference: float
@@ -85,6 +63,8 @@ class Against:
             "relative": [list(interval) for interval in self.relative],
             "best_difference": self.best_difference,
             "best_ratio": self.best_ratio,
+            "ratio": _finite(self.ratio),
+            "largest_ratio": None if self.largest is None else self.largest.as_dict(),
             "trace": _finite(self.trace),
         }
 
@@ -109,8 +89,12 @@ class Design:
     plain_trace: float
     """J(1): the error over the same link if every packet is the state."""
     eavesdroppers: dict[str, Against]
+    choice: Choice | None = None
+    """The cheapest μ_d with the ratio asked for; None if none was."""
     left_out: dict[str, str] = field(default_factory=dict)
     """Eavesdropper → strategy, for those whose error has no closed form, which cannot be designed for."""
+    measuring: str = ""
+    """The command that measures their errors at several μ_d; empty if there is no scenario."""
 
     @property
     def cost(self) -> float:
@@ -136,11 +120,11 @@ class Design:
         who = ", ".join(f"{name} ({strategy})" for name, strategy in self.left_out.items())
         return (
             f"left out: {who}: no closed form of its error is known; a guarantee against a genie holds against every "
-            "eavesdropper"
+            f"eavesdropper{f', and this measures it: {self.measuring}' if self.measuring else ''}"
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """The JSON of `evedrop design`; inf is null, and `minimum` and `left_out` are present only if they have values."""
+        """The JSON of `evedrop design`; inf is null; `minimum`, `choice` and `left_out` are present only if they have values."""
         legitimate: dict[str, Any] = {"bound": _finite(self.bound), "trace": _finite(self.trace)}
         if self.minimum is not None:
             legitimate["minimum"] = self.minimum
@@ -149,6 +133,8 @@ class Design:
             "legitimate": legitimate,
             "eavesdroppers": {name: against.as_dict() for name, against in self.eavesdroppers.items()},
         }
+        if self.choice is not None:
+            found["choice"] = self.choice.as_dict()
         return {**found, "left_out": self.left_out} if self.left_out else found
 
 
@@ -159,10 +145,13 @@ def design(
     eavesdroppers: Sequence[Adversary],
     slots: int,
     max_trace: float | None = None,
+    min_ratio: float | None = None,
 ) -> Design:
     """Compute everything that the choice of μ_d depends on. `slots` is the run's length, `max_trace` is Ω.
 
-    Raises UsageError if no μ_d can keep Ω.
+    min_ratio: the least J_e / J against every eavesdropper, for which the cheapest μ_d is chosen.
+
+    Raises UsageError if no μ_d can keep Ω, or has the ratio, or does both.
 
     Source: docs/mathematics.md, design.
     """
@@ -182,36 +171,27 @@ def design(
             relative=relative_secrecy(process, mu, adversary),
             best_difference=best_difference(process, mu, adversary),
             best_ratio=best_ratio(process, mu, adversary),
+            ratio=ratio_of(trace, its_trace),
+            largest=largest_ratio(process, mu, [adversary]),
             trace=its_trace,
             difference=math.nan if math.isinf(trace) and math.isinf(its_trace) else its_trace - trace,
             violated=violated,
             relative_from=held_from if held_from < slots else None,
         )
 
+    minimum = None if max_trace is None else least_state_probability(process, mu, max_trace)
     return Design(
         rho=process.spectral_radius,
         mu=mu,
         mu_d=mu_d,
         bound=bound,
         admissible=(bound, 1.0) if bound < 1.0 else None,
-        minimum=None if max_trace is None else least_state_probability(process, mu, max_trace),
+        minimum=minimum,
         trace=trace,
         plain_trace=limit_trace(process, Outcomes.plain(mu)),
         eavesdroppers={adversary.name: against(adversary) for adversary in eavesdroppers},
+        choice=None if min_ratio is None else cheapest(process, mu, eavesdroppers, min_ratio, minimum, max_trace),
     )
-
-
-def adversary_bound(process: Process, adversary: Adversary) -> float:
-    """Infimum of the μ_d at which an eavesdropper's error is bounded; inf if there is none.
-
-    The error of an eavesdropper that may be misled is bounded at most at μ_d = 1, where nothing misleads.
-
-    Source: docs/mathematics.md, design.
-    """
-    bound = stability_bound(process, adversary.mu_e * adversary.use_state)
-    if math.isinf(limit_trace(process, adversary.outcomes(0.5))) and adversary.outcomes(0.5).misled:
-        return 1.0 if bound < 1.0 else math.inf
-    return bound
 
 
 def perfect_secrecy(process: Process, mu: float, adversary: Adversary) -> Interval | None:
@@ -238,10 +218,10 @@ def relative_secrecy(process: Process, mu: float, adversary: Adversary) -> tuple
         return ()
 
     def advantage(mu_d: float) -> float:
-        return _advantage(*_traces(process, mu, adversary, mu_d))
+        return _advantage(*traces_of(process, mu, adversary, mu_d))
 
     poles = sorted({low, min(max(low, adversary_bound(process, adversary)), 1.0)})
-    points = np.concatenate([_between(a, b) for a, b in zip(poles, [*poles[1:], 1.0], strict=True) if a < b])
+    points = np.concatenate([points_between(a, b) for a, b in zip(poles, [*poles[1:], 1.0], strict=True) if a < b])
     signs = [np.sign(advantage(point)) for point in points]
     edges = [low]
     for (a, before), (b, after) in pairwise(zip(points, signs, strict=True)):
@@ -307,10 +287,10 @@ def _argmax(process: Process, mu: float, adversary: Adversary, gain: Callable[[f
         return None
 
     def loss(mu_d: float) -> float:
-        return -gain(*_traces(process, mu, adversary, mu_d))
+        return -gain(*traces_of(process, mu, adversary, mu_d))
 
-    points = _between(low, 1.0)
-    points = points[points - low > 0.1 * _ATTAINED * (1.0 - low)]
+    points = points_between(low, 1.0)
+    points = points[points - low > 0.1 * ATTAINED * (1.0 - low)]
     losses = np.array([loss(point) for point in points])
     lowest = int(np.argmin(losses))
     if not np.all(np.isfinite(losses)) or losses[lowest] >= 0.0 or lowest in (0, len(points) - 1):
@@ -319,12 +299,7 @@ def _argmax(process: Process, mu: float, adversary: Adversary, gain: Callable[[f
         loss, bounds=(points[lowest - 1], points[lowest + 1]), method="bounded", options={"xatol": 1e-10}
     )
     mu_d = float(found.x)
-    return mu_d if mu_d - low > _ATTAINED * (1.0 - low) else None
-
-
-def _traces(process: Process, mu: float, adversary: Adversary, mu_d: float) -> tuple[float, float]:
-    ours = limit_trace(process, Outcomes.legitimate(mu, mu_d))
-    return ours, limit_trace(process, adversary.outcomes(mu_d))
+    return mu_d if mu_d - low > ATTAINED * (1.0 - low) else None
 
 
 def _advantage(ours: float, theirs: float) -> float:
@@ -335,13 +310,6 @@ def _advantage(ours: float, theirs: float) -> float:
         return 1.0
     relative = (theirs - ours) / (theirs + ours) if theirs + ours else 0.0
     return relative if abs(relative) > _EQUAL else 0.0
-
-
-def _between(low: float, high: float) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """Points of (low, high], dense near low, where there may be a pole."""
-    steps = np.concatenate([np.geomspace(_NEAREST, 0.02, 60), np.linspace(0.02, 1.0, 99)[1:]])
-    points: np.ndarray[tuple[int], np.dtype[np.float64]] = low + steps * (high - low)
-    return points
 
 
 def _stretches(flags: Flags) -> tuple[tuple[int, int], ...]:

@@ -1,0 +1,93 @@
+"""The μ_d at which every eavesdropper is so many times worse, against a grid of errors by another recursion."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import numpy as np
+import pytest
+
+from evedrop.errors import UsageError
+from evedrop.model.process import Process
+from evedrop.model.theory.adversary import Adversary
+from evedrop.model.theory.ratio import cheapest, large_enough, largest_ratio
+from tests.builders import MICROGRID, UNSTABLE
+
+SMART = Adversary("smart", 0.95, 1.0, 0.0)
+DULL = Adversary("dull", 0.85, 1.0, 0.0)
+GENIE = Adversary("genie", 0.9, 1.0, 0.0, reads_leak=True)
+NAIVE = Adversary("naive", 0.9, 1.0, 1.0)
+
+
+def limit(process: Process, hears: float, kept: float, steps: int = 40_000) -> float:
+    """The trace of P = hears·0 + (1 − hears)(A P Aᵀ + Q), where innovations that count add `kept`; by plain iteration."""
+    A, Q = np.asarray(process.A), np.asarray(process.Q)
+    P = np.zeros_like(Q)
+    for _ in range(steps):
+        P, last = (1.0 - hears) * (A @ P @ A.T + Q) - kept * Q, P
+        if np.abs(P - last).max() <= 1e-15 * np.abs(P).max():
+            break
+        if np.trace(P) > 1e12:
+            return math.inf
+    return float(np.trace(P))
+
+
+def ratio(process: Process, mu: float, mu_e: float, mu_d: float) -> float:
+    """J_e / J of a smart eavesdropper: a state resets, and the user alone also gets the innovation of a slot that is heard."""
+    user = limit(process, mu * mu_d, mu * (1.0 - mu_d))
+    smart = limit(process, mu_e * mu_d, 0.0)
+    return smart / user
+
+
+@pytest.mark.parametrize("mu_e", [0.95, 0.9, 0.85])
+def test_the_cheapest_is_the_largest_of_the_grid(mu_e: float) -> None:
+    """No μ_d of a grid above it has the ratio, it has it, and all in the intervals do; a large enough one at every place."""
+    one = Adversary("smart", mu_e, 1.0, 0.0)
+    for wanted in (1.5, 2.0, 2.4):
+        found = cheapest(UNSTABLE, 0.9, [one], wanted)
+        inside = [any(low < mu_d < high for low, high in found.intervals) for mu_d in np.linspace(0.56, 0.999, 90)]
+        truly = [ratio(UNSTABLE, 0.9, mu_e, mu_d) >= wanted for mu_d in np.linspace(0.56, 0.999, 90)]
+        assert inside == truly
+        there = ratio(UNSTABLE, 0.9, mu_e, found.mu_d)
+        assert found.ratios["smart"] == pytest.approx(there, rel=1e-6)
+        assert there == pytest.approx(wanted, rel=1e-6) or (there > wanted and found.mu_d == 1.0)
+        plain = limit(UNSTABLE, 0.9, 0.0)
+        assert found.cost == pytest.approx(limit(UNSTABLE, 0.9 * found.mu_d, 0.9 * (1 - found.mu_d)) / plain, rel=1e-6)
+
+
+def test_the_largest_ratio_is_that_of_a_grid() -> None:
+    """Over the admissible μ_d, where it is attained; the refusal says how large it is, and where."""
+    found = largest_ratio(UNSTABLE, 0.9, [SMART])
+    assert found is not None
+    grid = np.linspace(0.56, 0.999, 400)
+    ratios = [ratio(UNSTABLE, 0.9, 0.95, mu_d) for mu_d in grid]
+    assert found.ratio == pytest.approx(max(ratios), rel=1e-4)
+    assert found.ratio >= max(ratios) * (1 - 1e-9)
+    assert found.mu_d == pytest.approx(grid[int(np.argmax(ratios))], abs=2e-3)
+    with pytest.raises(UsageError, match=re.escape(f"the most is {found.ratio:.4g}× at μ_d = {found.mu_d:.4g}")):
+        cheapest(UNSTABLE, 0.9, [SMART], 1.01 * found.ratio)
+
+
+def test_several_eavesdroppers_need_the_ratio_all() -> None:
+    """The intervals are those in which each of them has it."""
+    each = [large_enough(UNSTABLE, 0.9, [one], 2.0) for one in (SMART, DULL, GENIE, NAIVE)]
+    every = large_enough(UNSTABLE, 0.9, [SMART, DULL, GENIE, NAIVE], 2.0)
+    for mu_d in np.linspace(0.5343, 0.9997, 211):
+        in_all = all(any(low < mu_d < high for low, high in one) for one in each)
+        assert any(low < mu_d < high for low, high in every) == in_all
+
+
+def test_a_largest_trace_bounds_the_choice() -> None:
+    """Both options at once: the cheapest μ_d with the ratio, or a refusal that says which trace the ratio needs."""
+    free = cheapest(UNSTABLE, 0.9, [SMART], 2.0)
+    assert cheapest(UNSTABLE, 0.9, [SMART], 2.0, 0.6, 1.0).mu_d == free.mu_d
+    with pytest.raises(UsageError, match=f"2× needs a legitimate trace of {free.trace:.4g}"):
+        cheapest(UNSTABLE, 0.9, [SMART], 2.0, free.mu_d + 0.01, 0.9 * free.trace)
+
+
+def test_a_marginal_process_has_the_closed_form() -> None:
+    """A = I: J = (1−μ) tr Q/(μ μ_d) and J_e = (1−μ_e μ_d) tr Q/(μ_e μ_d), so the ratio R is at μ_d = (1 − R(1−μ))/μ."""
+    found = cheapest(MICROGRID, 0.6, [Adversary("smart", 0.6, 1.0, 0.0)], 1.8)
+    assert found.mu_d == pytest.approx((1.0 - 1.8 * 0.4) / 0.6, rel=1e-9)
+    assert found.cost == pytest.approx(1.0 / found.mu_d, rel=1e-9)
