@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import itertools
+import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import differential_evolution
 
 from evedrop.errors import UsageError
 from evedrop.model.process import Process
@@ -100,20 +103,76 @@ def test_the_program_finds_the_best_of_the_grid(
     assert max(found.grid.user) <= max_trace * (1 + 1e-9)
 
 
-@pytest.mark.parametrize(
-    ("eavesdropper", "share"), [("smart", 1.0), ("genie", 1.0), ("naive", 0.99), ("suspicious", 0.99)]
-)
+@pytest.mark.parametrize("eavesdropper", EAVESDROPPERS)
 @pytest.mark.parametrize(("process", "max_trace"), [(SETTLED, 0.0015), (UNSTABLE, 0.5), (STABLE, 0.05)])
-def test_the_best_schedule_is_as_good_as_brute_force(
-    process: Process, max_trace: float, eavesdropper: str, share: float
-) -> None:
-    """No schedule on a fine mesh of all does better; against misled eavesdroppers none by more than a hundredth."""
+def test_the_best_schedule_is_as_good_as_brute_force(process: Process, max_trace: float, eavesdropper: str) -> None:
+    """No schedule on a fine mesh of all does better."""
     problem = problem_of(process, eavesdropper, 4, max_trace)
     found = best_schedule(process, MU, EAVESDROPPERS[eavesdropper].outcomes, 4, max_trace).best
-    assert found.value >= share * problem.sums(mesh_of(4, 41)).max() * (1 - 1e-12)
+    assert found.value >= problem.sums(mesh_of(4, 41)).max() * (1 - 1e-6)
     assert max(found.user) <= max_trace * (1 + 1e-9)
     assert found.mu_d[0] == 1.0
     assert found.value == pytest.approx(sum(found.eavesdropper))
+
+
+_NOISE = np.array([[1e-2, 2e-3], [2e-3, 5e-3]])
+DOUBLE = Process(np.array([[1.0, 0.1], [0.0, 1.0]]), _NOISE, _NOISE)
+
+
+def evolved(problem: ScheduleProblem) -> float:
+    """The largest sum that differential evolution finds, which knows nothing of the problem but its sums."""
+    free = replace(problem, max_trace=math.inf)
+
+    def loss(columns: np.ndarray) -> np.ndarray:
+        mu_d = np.column_stack([np.ones(columns.shape[1]), columns.T])
+        excess = np.maximum(problem.user.traces(mu_d) / problem.max_trace - 1.0, 0.0).sum(axis=1)
+        return -free.sums(mu_d) * (1.0 - (excess > 1e-9)) + 1e3 * excess
+
+    found = differential_evolution(
+        loss,
+        [(0.0, 1.0)] * (problem.slots - 1),
+        maxiter=400,
+        popsize=12,
+        tol=1e-10,
+        seed=7,
+        vectorized=True,
+        updating="deferred",
+        polish=False,
+    )
+    return -float(found.fun)
+
+
+@pytest.mark.parametrize(
+    ("process", "max_trace", "mu", "mu_e"),
+    [
+        (DOUBLE, 0.012, 0.85, 0.95),
+        (DOUBLE, 0.03, 0.7, 0.9),
+        (SETTLED, 0.002, 0.9, 0.85),
+        (UNSTABLE, 0.5, 0.9, 0.95),
+        (STABLE, 0.07, 0.8, 0.8),
+        (Process(np.array([[1.05]]), np.eye(1), np.eye(1)), 1.5, 0.8, 0.9),
+    ],
+    ids=["double", "double, loose", "settled", "unstable", "stable", "scalar"],
+)
+@pytest.mark.parametrize("eavesdropper", ["naive", "suspicious"])
+def test_an_independent_solver_finds_nothing_better(
+    process: Process, max_trace: float, mu: float, mu_e: float, eavesdropper: str
+) -> None:
+    """Against misled eavesdroppers, whose sum has many local maxima, over seven slots."""
+    one = replace(EAVESDROPPERS[eavesdropper], mu_e=mu_e)
+    user = SlotRecursion(process, lambda mu_d: Outcomes.legitimate(mu, mu_d), 7)
+    problem = ScheduleProblem(user, SlotRecursion(process, one.outcomes, 7), 7, max_trace, 0.0)
+    found = best_schedule(process, mu, one.outcomes, 7, max_trace).best
+    assert found.value >= evolved(problem) * (1 - 1e-5)
+    assert max(found.user) <= max_trace * (1 + 1e-9)
+
+
+def test_a_single_packet_with_the_state_may_be_best() -> None:
+    """A maximum far from every schedule that changes of one or two μ_d lead to: 2.6 % above what they find."""
+    naive = Adversary("naive", 0.95, 1.0, 1.0)
+    found = best_schedule(DOUBLE, 0.85, naive.outcomes, 7, 0.012).best
+    assert found.value >= 0.61173
+    assert found.mu_d[3] == pytest.approx(0.814, abs=1e-3)
 
 
 def test_changes_of_two_neighbours_find_what_changes_of_one_do_not() -> None:
@@ -137,11 +196,14 @@ def test_no_change_of_one_slot_improves_it(eavesdropper: str) -> None:
         assert problem.sums(tried).max() <= found.value * (1 + 1e-4)
 
 
-def test_the_user_is_kept_at_the_bound() -> None:
-    """Against smart: no states until the user's error reaches Ω, then just enough; twice as good as the best constant μ_d."""
+def test_it_is_better_to_recover_than_to_be_kept_at_the_bound() -> None:
+    """Against smart, in a long run: no states until the user's error reaches Ω, then a state, and again none."""
     found = best_schedule(SETTLED, MU, EAVESDROPPERS["smart"].outcomes, 16, 0.005, levels=5, capacity=50)
     assert found.best.mu_d[1:5] == (0.0,) * 4
-    assert np.allclose(found.best.user[6:], 0.005)
+    kept = np.array([[1.0, 0.0, 0.0, 0.0, 0.0, 0.1720277, *[0.547] * 10]])
+    problem = problem_of(SETTLED, "smart", 16, 0.005)
+    assert found.best.value > 1.035 * float(problem.sums(kept)[0]) > 0.0
+    assert found.best.mu_d[6:9] == (1.0, 0.0, 0.0)
     assert found.best.value > 1.7 * found.constant.value
     assert len(set(found.constant.mu_d[1:])) == 1
     assert max(found.constant.user) <= 0.005 * (1 + 1e-9)
@@ -163,7 +225,7 @@ def test_blocks_share_their_probability() -> None:
     mu_d = thirds.best.mu_d
     assert [mu_d[k] for k in (2, 3, 5, 6, 8, 9, 11)] == [mu_d[k] for k in (1, 1, 4, 4, 7, 7, 10)]
     assert len(set(mu_d[1:])) > 1
-    assert whole.best.value == pytest.approx(whole.constant.value, rel=1e-9)
+    assert whole.best.value == pytest.approx(whole.constant.value, rel=1e-6)
     assert whole.best.value <= thirds.best.value <= found(1).best.value
 
 

@@ -22,6 +22,8 @@ _ROUNDING = 1e-12
 _POINTS, _REFINEMENTS = 33, 8  # the least feasible μ_d of a block is found to 33⁻⁸
 _MESH, _ZOOM, _NARROW = 17, 4.0, 1e-3
 _PAIR_GAIN = 1e-6
+_ASCENDED = 6  # of the schedules found, the best are improved
+_DIGIT = 1e-7  # to which a schedule is given
 _GAIN = 1e-10  # an improvement of the sum below which the ascent ends, relative
 
 
@@ -90,6 +92,10 @@ class ScheduleProblem:
         ours, theirs = self.user.traces(mu_d), self.eavesdropper.traces(mu_d)
         total = ((1.0 - self.weight) * theirs - self.weight * ours).sum(axis=1)
         return np.where((ours <= self.max_trace * (1.0 + _ROUNDING)).all(axis=1), total, -np.inf)
+
+    def sum_of(self, mu_d: Floats) -> float:
+        """The sum of one schedule, (N,)."""
+        return float(self.sums(mu_d[None])[0])
 
 
 @dataclass(frozen=True)
@@ -166,8 +172,10 @@ def best_schedule(
     eavesdropper_at: μ_d → its outcomes; block: slots, from slot 1 on, that share a μ_d; levels: the number of μ_d in the grid;
     capacity: the most candidates that are kept from slot to slot.
 
-    First the best schedule of the grid, by a dynamic program; then each block's μ_d is set to its best real value, in turn,
-    until nothing improves. Raises UsageError if not even sending every state keeps Ω.
+    First the best schedule of the grid, by a dynamic program; then sequential quadratic programs from it and from others; then
+    each block's μ_d is set to its best real value, in turn, until nothing improves.
+
+    Raises UsageError if not even sending every state keeps Ω.
 
     Source: docs/mathematics.md, schedules of μ_d.
     """
@@ -185,17 +193,21 @@ def best_schedule(
     blocks = [slice(*one) for one in pairwise(edges)]
     grid, exact = _best_of_grid(process, problem, blocks, np.linspace(0.0, 1.0, levels), capacity)
     constant = _ascended(problem, np.ones(slots), [slice(1, slots)])
-    starts = (grid, constant, _lowest(problem, blocks))
-    best = max(
-        (_ascended(problem, start, blocks) for start in starts), key=lambda one: float(problem.sums(one[None])[0])
-    )
+    starts = [grid, constant, _lowest(problem, blocks)]
+    from evedrop.model.theory.schedule_climb import climbed, patterns  # noqa: PLC0415 - it needs the problem
+
+    found = [climbed(problem, start, blocks) for start in (*starts, *patterns(slots, blocks))]
+    starts += sorted(found, key=problem.sum_of, reverse=True)[:_ASCENDED]
+    best = max((_ascended(problem, start, blocks) for start in starts), key=problem.sum_of)
     best = _improved_by_pairs(problem, best, blocks)
+    # Upwards, where the user's error is smaller: digits beyond these depend on the machine.
+    best = np.minimum(np.ceil(best / _DIGIT) * _DIGIT, 1.0).round(7)
     return BestSchedule(_described(problem, best), _described(problem, constant), _described(problem, grid), exact)
 
 
 def _described(problem: ScheduleProblem, mu_d: Floats) -> MeanSchedule:
     ours, theirs = problem.user.traces(mu_d[None])[0], problem.eavesdropper.traces(mu_d[None])[0]
-    value = float(problem.sums(mu_d[None])[0])
+    value = problem.sum_of(mu_d)
     return MeanSchedule(tuple(mu_d.tolist()), tuple(ours.tolist()), tuple(theirs.tolist()), value)
 
 
@@ -270,7 +282,7 @@ def _ascended(problem: ScheduleProblem, mu_d: Floats, blocks: list[slice]) -> Fl
     The user's error falls with each μ_d, so those of a block that keep Ω are all from the least one on.
     """
     mu_d = mu_d.copy()
-    best = float(problem.sums(mu_d[None])[0])
+    best = problem.sum_of(mu_d)
     while True:
         before = best
         for one in blocks:
@@ -288,7 +300,7 @@ def _improved_by_pairs(problem: ScheduleProblem, mu_d: Floats, blocks: list[slic
     """A schedule, (N,), that no change of two neighbouring blocks improves by more than 1e-6, as far as a mesh shows."""
     mu_d = mu_d.copy()
     while True:
-        before = best = float(problem.sums(mu_d[None])[0])
+        before = best = problem.sum_of(mu_d)
         for one, other in pairwise(blocks):
             middle, width = np.full(2, 0.5), 0.5
             while width > _NARROW:
@@ -302,7 +314,7 @@ def _improved_by_pairs(problem: ScheduleProblem, mu_d: Floats, blocks: list[slic
                 if sums[found] > best:
                     best, mu_d = float(sums[found]), tried[found]
         mu_d = _ascended(problem, mu_d, blocks)
-        if float(problem.sums(mu_d[None])[0]) - before <= _PAIR_GAIN * abs(before):
+        if problem.sum_of(mu_d) - before <= _PAIR_GAIN * abs(before):
             return mu_d
 
 
