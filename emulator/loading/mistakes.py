@@ -148,8 +148,15 @@ def _horizon_mistakes(process: Process, slots: int) -> list[str]:
     last = horizon(process, slots)
     if last is None:
         return []
+    rounded = "float64 rounds off more than 1 % of the process noise inside a state this large"
+    change = "a smaller initial_covariance or a larger Q"
+    if last < 0:
+        return [
+            f"process: cannot be followed in any slot, because {rounded} as the initial one. Ways out: {change}; "
+            "initial variances up to 8e27 times those of Q can be followed"
+        ]
     return [
         f"slots: is {slots}; this process (spectral radius {process.spectral_radius:.4g}) can be followed up to slot "
-        f"{last}: beyond it float64 rounds off more than 1 % of the process noise inside a state this large. Ways out: "
-        f"slots = {last + 1} or fewer; a smaller initial_covariance or a larger Q; an A with a smaller spectral radius"
+        f"{last}: beyond it {rounded}. Ways out: slots = {last + 1}{' or fewer' if last else ''}; {change}; an A with a "
+        "smaller spectral radius"
     ]
