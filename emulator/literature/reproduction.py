@@ -20,7 +20,9 @@ class NumberVerdict(StrEnum):
     """What the comparison of one number says."""
 
     AGREES = "agrees"
-    """The difference is within the tolerance."""
+    """The paper prints the number, and the difference is within the tolerance."""
+    FORMULA = "formula"
+    """The paper prints no number: ours, by simulation, is within the tolerance of our own evaluation of its formula."""
     ERRATUM = "erratum"
     """The difference is larger, and the reason says why the paper is wrong."""
     NOT_PUBLIC = "not public"
@@ -47,7 +49,15 @@ class PublishedNumber:
     """What was allowed, such as "2 %"; empty if nothing was compared."""
     verdict: NumberVerdict
     reason: str = ""
-    """A sentence, for every verdict but `agrees` and `differs`."""
+    """A sentence, for every verdict but `agrees`, `formula` and `differs`."""
+    printed: bool = True
+    """Whether the paper prints `theirs`; otherwise it is our own evaluation of the paper's formula."""
+
+    @property
+    def compares_print(self) -> bool:
+        """Whether a number that the paper prints was compared with ours."""
+        decided = {NumberVerdict.AGREES, NumberVerdict.ERRATUM, NumberVerdict.DIFFERS}
+        return self.printed and self.theirs is not None and self.verdict in decided
 
     @classmethod
     def compared(
@@ -63,12 +73,15 @@ class PublishedNumber:
         errors: float | None = None,
         their_error: float = 0.0,
         erratum: str = "",
+        printed: bool = True,
     ) -> Self:
         """Compare two numbers. They agree if they differ by no more than any of the tolerances given.
 
         relative: as a share of theirs; absolute: in units of the number; errors: in standard errors of the difference.
         their_error: the standard error of theirs, 0 if it is exact. erratum: the reason, where a larger difference is known to be
-        the paper's mistake. Raises ValueError if no tolerance is given.
+        the paper's mistake. printed: False if theirs is our evaluation of the paper's formula.
+
+        Raises ValueError if no tolerance is given.
         """
         words, bounds = [], []
         if relative is not None:
@@ -83,21 +96,25 @@ class PublishedNumber:
         if not bounds:
             raise ValueError(f"{where}, {what}: no tolerance; expected relative, absolute or errors")
         agrees = abs(ours - theirs) <= max(bounds)
+        same = NumberVerdict.AGREES if printed else NumberVerdict.FORMULA
         otherwise = NumberVerdict.ERRATUM if erratum else NumberVerdict.DIFFERS
         return cls(
             where, what, theirs, ours, standard_error, " or ".join(words),
-            NumberVerdict.AGREES if agrees else otherwise, "" if agrees else erratum,
+            same if agrees else otherwise, "" if agrees else erratum, printed,
         )  # fmt: skip
 
     @classmethod
     def stated(
         cls, where: str, what: str, theirs: Value, ours: Value, verdict: NumberVerdict, reason: str = "",
-        standard_error: float | None = None,
+        standard_error: float | None = None, *, printed: bool = True,
     ) -> Self:  # fmt: skip
-        """A row whose verdict no tolerance decides. Raises ValueError for a verdict without the reason that it needs."""
-        if not reason and verdict is not NumberVerdict.AGREES:
+        """A row whose verdict no tolerance decides; printed: as for `compared`.
+
+        Raises ValueError for a verdict without the reason that it needs.
+        """
+        if not reason and verdict not in {NumberVerdict.AGREES, NumberVerdict.FORMULA}:
             raise ValueError(f"{where}, {what}: the verdict {verdict} needs a reason")
-        return cls(where, what, theirs, ours, standard_error, "", verdict, reason)
+        return cls(where, what, theirs, ours, standard_error, "", verdict, reason, printed)
 
     @property
     def their_text(self) -> str:
@@ -145,10 +162,25 @@ class Reproduction:
         found = {str(one): sum(row.verdict is one for row in self.rows) for one in NumberVerdict}
         return {name: count for name, count in found.items() if count}
 
+    @property
+    def printed_compared(self) -> int:
+        """How many numbers that the paper prints were compared with ours."""
+        return sum(row.compares_print for row in self.rows)
+
+    @property
+    def scope(self) -> str:
+        """How many of the paper's own numbers were compared, as a sentence."""
+        count = self.printed_compared
+        if not count:
+            return "No number that the paper prints was compared: none was available."
+        return (
+            f"{count} number{' that the paper prints was' if count == 1 else 's that the paper prints were'} compared."
+        )
+
     def as_dict(self) -> dict[str, Any]:
         """The content of `NAME.json`."""
         rows = [{key: _strict(value) for key, value in asdict(row).items()} for row in self.rows]
-        return {**asdict(self), "rows": rows, "counts": self.counts}
+        return {**asdict(self), "rows": rows, "counts": self.counts, "printed_compared": self.printed_compared}
 
     def as_markdown(self) -> str:
         """The content of `NAME.md`: the table, with reasons."""
@@ -156,6 +188,8 @@ class Reproduction:
             f"# {self.title}",
             "",
             f"{self.authors}. {self.published}.",
+            "",
+            self.scope,
             "",
             "| where | what | theirs | ours | tolerance | verdict |",
             "|---|---|---|---|---|---|",

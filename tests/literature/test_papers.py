@@ -25,7 +25,9 @@ def judged(found: Reproduction) -> None:
     for row in found.rows:
         assert row.where, row
         assert row.what, row
-        if row.verdict is NumberVerdict.AGREES:
+        assert row.verdict is not NumberVerdict.AGREES or row.printed, row
+        assert row.verdict is not NumberVerdict.FORMULA or not row.printed, row
+        if row.verdict in {NumberVerdict.AGREES, NumberVerdict.FORMULA}:
             assert row.reason == "", row
             assert row.tolerance or not isinstance(row.theirs, float), row
         else:
@@ -99,13 +101,26 @@ def test_a_paper_is_printed_and_written(evedrop: Evedrop, tmp_path: Path) -> Non
     assert "numerical illustration" in done.err
     assert "1.3878 exact" in done.out
     assert "erratum [1]" in done.out
-    assert "agrees: 5, erratum: 7, not comparable: 2" in done.out
+    said = "12 numbers that the paper prints were compared."
+    assert f"agrees: 5, erratum: 7, not comparable: 2. {said}" in done.out
     written = json.loads((folder / "kennedy2022.json").read_text(encoding="utf-8"))
     assert len(written["rows"]) == 14
     assert written["counts"] == {"agrees": 5, "erratum": 7, "not comparable": 2}
     markdown = (folder / "kennedy2022.md").read_text(encoding="utf-8")
+    assert written["printed_compared"] == 12
+    assert said in markdown
     assert markdown.count("\n| numerical illustration | ") == 10
     assert json.loads(evedrop("paper", "kennedy2022", "--json").out) == written
+
+
+def test_a_paper_of_which_no_number_is_known_agrees_with_nothing() -> None:
+    """Our simulations of its formulas have a verdict of their own, and the count of its own numbers is 0."""
+    found = reproduce("naha2021", quick=True)
+    assert found.printed_compared == 0
+    assert found.scope == "No number that the paper prints was compared: none was available."
+    assert set(found.counts) == {"formula", "not public", "not comparable"}
+    assert {row["printed"] for row in found.as_dict()["rows"] if row["verdict"] == "formula"} == {False}
+    assert reproduce("crimson2023", quick=True).printed_compared == 1
 
 
 @final

@@ -98,7 +98,7 @@ def _print(found: Reproduction) -> None:
     console.print(table)
     for reason, number in reasons.items():
         console.print(f"[{number}] {reason}")
-    console.print(", ".join(f"{verdict}: {count}" for verdict, count in found.counts.items()))
+    console.print(f"{', '.join(f'{verdict}: {count}' for verdict, count in found.counts.items())}. {found.scope}")
     if found.quick:
         console.print("these are quick estimates: without --quick the standard errors are smaller")
 
