@@ -11,7 +11,7 @@ import pytest
 from evedrop.api import design_schedule
 from evedrop.loading import load
 from evedrop.model.theory.covariances import Outcomes
-from evedrop.model.theory.schedules import SlotRecursion
+from evedrop.model.theory.schedule_problem import SlotRecursion
 from tests.builders import UNSTABLE
 from tests.conftest import Evedrop
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,8 @@ from evedrop.errors import UsageError
 from evedrop.model.process import Process
 from evedrop.model.theory.adversary import Adversary
 from evedrop.model.theory.covariances import Outcomes, expected_traces, misled_covariances
-from evedrop.model.theory.schedules import BestSchedule, ScheduleDesign, ScheduleProblem, SlotRecursion, best_schedule
+from evedrop.model.theory.schedule_problem import ScheduleProblem, SlotRecursion
+from evedrop.model.theory.schedules import BestSchedule, ScheduleDesign, best_schedule
 from tests.builders import DRIFTING, UNSTABLE
 from tests.model.slot_loop import STABLE
 
@@ -126,9 +128,11 @@ def evolved(problem: ScheduleProblem) -> float:
     def loss(columns: np.ndarray) -> np.ndarray:
         mu_d = np.column_stack([np.ones(columns.shape[1]), columns.T])
         excess = np.maximum(problem.user.traces(mu_d) / problem.max_trace - 1.0, 0.0).sum(axis=1)
-        return -free.sums(mu_d) * (1.0 - (excess > 1e-9)) + 1e3 * excess
+        losses: np.ndarray = -free.sums(mu_d) * (1.0 - (excess > 1e-9)) + 1e3 * excess
+        return losses
 
-    found = differential_evolution(
+    solve: Any = differential_evolution
+    found = solve(
         loss,
         [(0.0, 1.0)] * (problem.slots - 1),
         maxiter=400,

@@ -20,7 +20,7 @@ from evedrop.model.receiver import Belief, Reception
 from evedrop.model.schedule import Schedule, equal_slots, in_slot, in_slots, mean_of
 from evedrop.model.schemes.innovation import Innovation
 from evedrop.model.slot.link_law import LinkLaw
-from evedrop.model.theory.schedules import SlotRecursion
+from evedrop.model.theory.schedule_problem import SlotRecursion
 from evedrop.streams import Batch
 from tests.builders import MARGINAL, UNSTABLE, stream_keys
 

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from evedrop.model.process import Floats
-from evedrop.model.theory.schedules import ScheduleProblem, SlotRecursion
+from evedrop.model.theory.schedule_problem import ScheduleProblem, SlotRecursion
 
 _MOST_PATTERNS, _PATTERN_SLOTS = 24, 240  # starts of each kind: as many as a long schedule leaves time for
 _POINTS, _REFINEMENTS = 33, 8
@@ -69,7 +70,7 @@ def climbed(problem: ScheduleProblem, start: Floats, blocks: list[slice]) -> Flo
         found: Floats = (problem.weight * ours - (1.0 - problem.weight) * theirs).sum(axis=0) / scale
         return found
 
-    constraint = {
+    constraint: Any = {
         "type": "ineq",
         "fun": lambda of: 1.0 - problem.user.traces(schedule(of)[None])[0, 1:] / bound,
         "jac": lambda of: -derivatives(problem.user, of)[1:] / bound,

@@ -8,94 +8,22 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.errors import UsageError
 from evedrop.model.process import Floats, Process
-from evedrop.model.theory.covariances import Outcomes, OutcomesAt, misled_covariances
-from evedrop.model.theory.leak import RemainingCovariances
+from evedrop.model.theory.covariances import Outcomes, OutcomesAt
+from evedrop.model.theory.schedule_climb import climbed, patterns
+from evedrop.model.theory.schedule_problem import ROUNDING, ScheduleProblem, SlotRecursion
 
-_ROUNDING = 1e-12
 _POINTS, _REFINEMENTS = 33, 8  # the least feasible μ_d of a block is found to 33⁻⁸
 _MESH, _ZOOM, _NARROW = 17, 4.0, 1e-3
 _PAIR_GAIN = 1e-6
 _ASCENDED = 6  # of the schedules found, the best are improved
 _DIGIT = 1e-7  # to which a schedule is given
 _GAIN = 1e-10  # an improvement of the sum below which the ascent ends, relative
-
-
-@final
-class SlotRecursion:
-    """E P_k of one receiver for many schedules at once, slot by slot: its map of a slot is affine in μ_d(k).
-
-    E_0 = p_0 Σ0, E_k = kept · A E_{k−1} Aᵀ + p_d Q + p_i f_k + p_l M_k, with probabilities that are affine in μ_d(k).
-
-    Source: docs/mathematics.md, schedules of μ_d.
-    """
-
-    def __init__(self, process: Process, outcomes_at: OutcomesAt, slots: int) -> None:
-        never, always = outcomes_at(0.0), outcomes_at(1.0)
-        self._A, self._Q = process.A, process.Q
-        self._base = _probabilities(never)
-        self._slope = _probabilities(always) - self._base
-        self.initial: Floats = always.initial * process.initial_covariance
-        """E P_0, (n, n): the first packet is always the state."""
-        self._misled = misled_covariances(process, slots)
-        remaining = RemainingCovariances(process) if never.leaked else None
-        self._remaining = np.zeros_like(self._misled)
-        if remaining is not None:
-            for k in range(1, slots):
-                self._remaining[k] = remaining.next()
-
-    def next(self, k: int, E: Floats, mu_d: Floats) -> Floats:
-        """E P_k, (S, n, n), from E P_{k−1}, (S, n, n), with μ_d(k), (S,)."""
-        kept, predicted, misled, leaked = (self._base[:, None] + self._slope[:, None] * mu_d)[:, :, None, None]
-        found: Floats = (
-            kept * (self._A @ E @ self._A.T)
-            + predicted * self._Q
-            + misled * self._misled[k]
-            + leaked * self._remaining[k]
-        )
-        return found
-
-    def traces(self, mu_d: Floats) -> Floats:
-        """Trace of E P_k for k = 0 … N−1 of schedules, (S, N) → (S, N); μ_d(0) is taken as 1."""
-        found = np.empty(mu_d.shape)
-        E = np.broadcast_to(self.initial, (len(mu_d), *self.initial.shape))
-        found[:, 0] = np.trace(self.initial)
-        for k in range(1, mu_d.shape[1]):
-            E = self.next(k, E, mu_d[:, k])
-            found[:, k] = np.trace(E, axis1=1, axis2=2)
-        return found
-
-
-def _probabilities(outcomes: Outcomes) -> Floats:
-    return np.array([outcomes.kept, outcomes.predicted, outcomes.misled, outcomes.leaked])
-
-
-@dataclass(frozen=True)
-class ScheduleProblem:
-    """What a schedule is to reach: the largest Σ_k (1 − weight) tr E Pᵉ_k − weight tr E P_k with tr E P_k ≤ Ω in each slot."""
-
-    user: SlotRecursion
-    eavesdropper: SlotRecursion
-    slots: int
-    max_trace: float
-    """Ω; inf for no bound."""
-    weight: float
-
-    def sums(self, mu_d: Floats) -> Floats:
-        """The sum of each schedule, (S, N) → (S,); −inf for those that violate Ω."""
-        ours, theirs = self.user.traces(mu_d), self.eavesdropper.traces(mu_d)
-        total = ((1.0 - self.weight) * theirs - self.weight * ours).sum(axis=1)
-        return np.where((ours <= self.max_trace * (1.0 + _ROUNDING)).all(axis=1), total, -np.inf)
-
-    def sum_of(self, mu_d: Floats) -> float:
-        """The sum of one schedule, (N,)."""
-        return float(self.sums(mu_d[None])[0])
 
 
 @dataclass(frozen=True)
@@ -194,8 +122,6 @@ def best_schedule(
     grid, exact = _best_of_grid(process, problem, blocks, np.linspace(0.0, 1.0, levels), capacity)
     constant = _ascended(problem, np.ones(slots), [slice(1, slots)])
     starts = [grid, constant, _lowest(problem, blocks)]
-    from evedrop.model.theory.schedule_climb import climbed, patterns  # noqa: PLC0415 - it needs the problem
-
     found = [climbed(problem, start, blocks) for start in (*starts, *patterns(slots, blocks))]
     starts += sorted(found, key=problem.sum_of, reverse=True)[:_ASCENDED]
     best = max((_ascended(problem, start, blocks) for start in starts), key=problem.sum_of)
@@ -230,7 +156,7 @@ def _best_of_grid(
             E, F = problem.user.next(k, E, mu_d[:, k]), problem.eavesdropper.next(k, F, mu_d[:, k])
             ours = np.trace(E, axis1=1, axis2=2)
             value = value + (1.0 - problem.weight) * np.trace(F, axis1=1, axis2=2) - problem.weight * ours
-            kept = ours <= problem.max_trace * (1.0 + _ROUNDING)
+            kept = ours <= problem.max_trace * (1.0 + ROUNDING)
             mu_d, E, F, value = mu_d[kept], E[kept], F[kept], value[kept]
         later = _later_traces(process, np.stack([E, F]), problem.slots - one.stop)
         best = _undominated(np.column_stack([-later[0], later[1], value]))
@@ -262,7 +188,7 @@ def _undominated(scores: Floats) -> NDArray[np.int64]:
     kept = np.empty((len(order), scores.shape[1]))
     found: list[int] = []
     for row in order.tolist():
-        if not (kept[: len(found)] >= scores[row] - _ROUNDING).all(axis=1).any():
+        if not (kept[: len(found)] >= scores[row] - ROUNDING).all(axis=1).any():
             kept[len(found)] = scores[row]
             found.append(row)
     return np.array(found, np.int64)
