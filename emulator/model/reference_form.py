@@ -5,7 +5,6 @@ Source: docs/mathematics.md, acknowledged references.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import final
@@ -17,7 +16,7 @@ from evedrop.model.reference_code import ReferenceCode
 from evedrop.model.reference_floor import reference_floor
 from evedrop.model.theory.closed_form import ClosedForm, ReceiverConditions
 from evedrop.model.theory.closed_forms import reference_covariances, reference_limit
-from evedrop.model.theory.covariances import NOBODY, limit_trace
+from evedrop.model.theory.covariances import NOBODY, Outcomes, has_infinite_variance, limit_trace
 
 
 @final
@@ -66,5 +65,10 @@ class ReferenceForm(ClosedForm):
 
     @property
     def infinite_variance(self) -> bool:
-        """Whether the variance over trials has no bound."""
-        return math.isinf(self.limit)
+        """Whether the variance over trials has no bound: only where no packet is acknowledged that the reader did not hear.
+
+        After such a packet nothing ends the growth of its error, in any trial.
+
+        Source: docs/mathematics.md, heavy tails.
+        """
+        return self.acknowledged[1] == 0.0 and has_infinite_variance(self.process, Outcomes.plain(self.received))

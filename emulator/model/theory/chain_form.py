@@ -5,8 +5,7 @@ Source: docs/mathematics.md, schedules by holding time and quantised packets.
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import final
 
@@ -47,4 +46,4 @@ class ChainForm(ClosedForm):
     @cached_property
     def infinite_variance(self) -> bool:
         """Whether the variance over trials has no bound: not if only the steps of a quantiser grow."""
-        return math.isinf(self.limit if self.quantisation is None else replace(self, quantisation=None).limit)
+        return self.chain.has_infinite_variance(self.process)

@@ -155,6 +155,21 @@ class SensorChain:
         total: Floats = solution.reshape(states, n, n).sum(axis=0)
         return total
 
+    def has_infinite_variance(self, process: Process) -> bool:
+        """Whether E (tr P_k)² outgrows (E tr P_k)², so that a sample mean proves nothing.
+
+        With ν the spectral radius of `carried` on the states that occur, the second moment grows as ν ρ⁴. Where ν = 1 the error
+        is not reset any more, and grows alike in all trials.
+
+        Source: docs/mathematics.md, heavy tails.
+        """
+        occurs = self.start > 0.0
+        for _ in occurs:
+            occurs = occurs | (occurs @ (self.reset + self.carried) > 0.0)
+        kept = float(np.abs(np.linalg.eigvals(self.carried[np.ix_(occurs, occurs)])).max())
+        rho = radius(process)
+        return rho > 1.0 and kept < 1.0 - 1e-12 and kept * rho**4 >= 1.0 - 1e-12
+
     @property
     def law(self) -> Floats:
         """Stationary law of the state, (S,)."""
