@@ -24,8 +24,10 @@ def estimate(value: float | None, error: float | None, how: str = ".4g") -> str:
 
     An error of the size of rounding, which trials with equal outcomes have, counts as none.
     """
-    if value is None or not error or not math.isfinite(value) or error <= _ROUNDING * abs(value):
+    if value is None or not error or not math.isfinite(value) or math.isnan(error) or error <= _ROUNDING * abs(value):
         return figure_text(value, how)
+    if math.isinf(error):
+        return f"{figure_text(value, how)} ± ∞"
     place = int(f"{error:.0e}".partition("e")[2])
     if value and math.floor(math.log10(abs(value))) - place >= _MOST_DIGITS:
         return f"{value:.{_MOST_DIGITS}g} ± {_scientific(error, 0)}"

@@ -17,7 +17,7 @@ def sweep_table(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> TextT
     """A row for each point and receiver; rows: those of sweep.parquet, keys: the entries that the sweep changed."""
     figures = columns("sweep_column")
     compared = [z_column(name) for name in all_figures() if rows and z_column(name) in rows[0]]
-    heads = [*keys, "peer", *(column.heading for column in figures), "z", "relative secrecy"]
+    heads = [*keys, "peer", *(column.heading for column in figures), "z", "ratio", "relative secrecy"]
     table = TextTable([TextColumn(head, head not in {"peer", "relative secrecy"}) for head in heads])
     for row in rows:
         table.add(
@@ -28,6 +28,7 @@ def sweep_table(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> TextT
                 for column, names in figures.items()
             ),
             figure_text(shown_figure(row, compared), "+.1f"),
+            estimate(row.get("ratio"), row.get("ratio_standard_error"), ".3g"),
             row["relative_secrecy"] or "–",
         )
     return table

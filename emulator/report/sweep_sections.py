@@ -143,7 +143,10 @@ class SweepFigures(Section[SweepSource]):
     @classmethod
     def nodes(cls, of: SweepSource) -> Iterator[Node]:
         """The table that the terminal shows."""
-        caption = "A row for each point and receiver: means ± standard errors; z: by how many of them the error is above theory"
+        caption = (
+            "A row for each point and receiver: means ± standard errors; z: by how many of them the error is above theory; "
+            "ratio: an eavesdropper's error over the legitimate one, in the second half of the run"
+        )
         yield html_table(sweep_table(of.rows, tuple(of.grid)), caption)
 
 

@@ -203,6 +203,8 @@ def test_a_summary_of_an_older_version_can_be_read(recorded: Results) -> None:
         (0.25, None, "0.25"),
         (0.25, 0.0, "0.25"),
         (math.inf, 1.0, "inf"),
+        (2.0, math.inf, "2 ± ∞"),
+        (2.0, math.nan, "2"),
         (None, None, "–"),
     ],
 )

@@ -9,6 +9,7 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -18,8 +19,10 @@ from hypothesis import strategies as st
 from evedrop.api import montecarlo
 from evedrop.errors import UsageError
 from evedrop.figures import expectable_figures
+from evedrop.loading import load
 from evedrop.memory.montecarlo import Plan
-from evedrop.memory.simulation import Mode
+from evedrop.memory.simulation import Mode, Simulation
+from evedrop.report.sweep import sweep_table
 from evedrop.report.writing import write_report
 from evedrop.studies.sweep import grid_of, sweep_over
 from tests.conftest import Evedrop
@@ -237,3 +240,26 @@ def test_the_command_prints_what_it_wrote(evedrop: Evedrop) -> None:
     assert (done.status, done.err) == (0, "")
     for words in ("encoding.state_probability", "legitimate", "smart", "other/sweep.parquet"):
         assert words in done.out
+
+
+def test_the_ratio_is_that_of_the_second_half_of_each_trial(tmp_path: Path) -> None:
+    """Against errors of every slot: after the transient, with a standard error for the two together; none for the user."""
+    changes = {"trials": 40, "slots": 121, "expect": []}
+    grid = {"encoding.state_probability": [0.3, 0.7]}
+    table = sweep_over("eavesdroppers", changes, grid, tmp_path / "sweep", lambda _: None, Plan(workers=1))
+    for row in table.to_pylist():
+        if row["peer"] == "legitimate":
+            assert (row["ratio"], row["ratio_standard_error"], row["ratio_from"]) == (None, None, None)
+            continue
+        made = load("eavesdroppers", {**changes, "encoding.state_probability": row["encoding.state_probability"]})
+        errors = {
+            name: np.concatenate([one.receivers[name].error for one in Simulation(made, range(40)).chunks()])[61:]
+            for name in ("legitimate", row["peer"])
+        }
+        theirs, ours = errors[row["peer"]].sum(axis=0), errors["legitimate"].sum(axis=0)
+        assert row["ratio_from"] == 61
+        assert row["ratio"] == pytest.approx(theirs.sum() / ours.sum(), rel=1e-9)
+        left_out = (theirs.sum() - theirs) / (ours.sum() - ours)
+        jackknife = np.sqrt(39 / 40 * ((left_out - left_out.mean()) ** 2).sum())
+        assert row["ratio_standard_error"] == pytest.approx(jackknife, rel=0.25)
+    assert "ratio" in [column.heading for column in sweep_table(table.to_pylist(), tuple(grid)).columns]
