@@ -8,14 +8,14 @@ READY := $(VENV)/.ready
 DOCS_READY := $(VENV)/.docs-ready
 NOTEBOOKS_READY := $(VENV)/.notebooks-ready
 
-.PHONY: demo test test-wheel test-pictures notebooks bench coverage test-long test-hosts test-compose test-faults docs lint lint-types lint-rest setup clean
+.PHONY: demo test test-wheel test-pictures notebooks bench coverage test-long test-hosts test-compose test-fresh test-faults docs lint lint-types lint-rest setup clean
 
 demo: $(READY)
 	$(BIN)/evedrop demo
 
 # What needs more than processors and a disk has a target of its own, below: packages to install, a driver that draws, root.
 test: $(READY)
-	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder -m "not (long or hosts or containers or notebooks or wheel or pictures)"
+	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder -m "not (long or hosts or containers or fresh or notebooks or wheel or pictures)"
 
 # The wheel, built and installed into environments of its own.
 test-wheel: $(READY)
@@ -53,6 +53,12 @@ test-hosts: $(READY)
 # As root: docker-compose.yml brought up by a Docker daemon of its own. Where that cannot be, it says so and fails nothing.
 test-compose: $(READY)
 	$(BIN)/python -m pytest -m containers tests/containers
+
+# As root: README's two commands on bare Debian 12 and 13, each without a compiler and with one. Where that cannot be, it says so
+# and fails nothing. FRESH=debian13 is that one alone; `in-turn` is another one with every commit.
+FRESH ?= all
+test-fresh: $(READY)
+	$(BIN)/python -m pytest -s -m fresh --machine=$(FRESH) tests/fresh
 
 # Disturbs live runs at random, by number: the same SEED is the same case. SEED alone repeats that one case, and COUNT is how
 # many from SEED on. As root a small disk can be filled as well.

@@ -10,12 +10,12 @@ from pathlib import Path
 from tests.privileged import BANNER
 
 ROOT = Path(__file__).parents[1]
-FOLDERS = ("tests/containers", "tests/hosts")
+FOLDERS = ("tests/containers", "tests/fresh", "tests/hosts")
 
 
 def test_what_cannot_be_tested_is_said_loudly(tmp_path: Path) -> None:
     """The reason is that the user is not root or, for root, that the commands and apt-get are missing."""
-    command = (sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-m", "hosts or containers", *FOLDERS)
+    command = (sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-m", "hosts or containers or fresh", *FOLDERS)
     where = {"PATH": str(tmp_path), "PYTHONPATH": str(ROOT)}
     done = subprocess.run(command, cwd=ROOT, env={**os.environ, **where}, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout

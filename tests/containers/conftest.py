@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.containers.base import base
 from tests.containers.machine import BASE, PACKAGES, Docker, checkout, take_away_leftovers
 from tests.containers.project import Project, projects
+from tests.debian import base, mirror, own_release, python_version
 from tests.folders import temporary_folder
 from tests.privileged import CannotRun, prepare, run, skip
 
@@ -57,7 +57,7 @@ def _image(daemon: Docker, folder: Path, times: dict[str, float]) -> None:
         text=True,
     )
     try:
-        daemon("import", str(base(folder)), BASE)
+        daemon("import", str(_debian(folder)), BASE)
         said, _ = fetching.communicate(timeout=_FETCH_SECONDS)
     except subprocess.TimeoutExpired as error:
         raise CannotRun(
@@ -72,6 +72,16 @@ def _image(daemon: Docker, folder: Path, times: dict[str, float]) -> None:
     environment = {**os.environ, "DOCKER_HOST": daemon.address, "EVEDROP_BASE": BASE, "DOCKER_BUILDKIT": "0"}
     run("docker-compose", "build", cwd=copy, env=environment)
     times["image"] = time.monotonic() - begun
+
+
+def _debian(folder: Path) -> Path:
+    """Debian of this machine's release, with its Python, as a tar. Raises CannotRun if that Python is not ours."""
+    tar = base(folder, mirror(own_release()), own_release(), ("python3", "python3-venv"))
+    # pip fetches packages for the Python it runs in.
+    ours = f"{sys.version_info[0]}.{sys.version_info[1]}"
+    if (version := python_version(tar)) != ours:
+        raise CannotRun(f"Debian's Python is {version}, and the one that runs the tests is {ours}")
+    return tar
 
 
 @pytest.fixture

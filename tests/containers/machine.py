@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, final
 
 from tests.conftest import wait_until
-from tests.containers.base import ROOT
+from tests.debian import ROOT
 from tests.folders import remove
 from tests.privileged import CannotRun, run
 

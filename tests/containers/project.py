@@ -14,8 +14,8 @@ from typing import Any
 
 from evedrop.results.writer import Results, load_results
 from tests.conftest import wait_until
-from tests.containers.base import ROOT
 from tests.containers.machine import Docker
+from tests.debian import ROOT
 from tests.privileged import run
 
 ROLES = ("router", "sensor", "legitimate", "suspicious", "smart", "observer")

@@ -16,7 +16,7 @@ from evedrop.errors import UsageError
 from evedrop.live.launch.compose import write_compose
 from evedrop.loading import load
 from tests.conftest import Evedrop
-from tests.containers.base import ROOT
+from tests.debian import ROOT
 
 
 def test_the_base_image_is_pinned_by_a_digest() -> None:

@@ -14,7 +14,7 @@ from typing import final
 import pytest
 
 from tests.conftest import wait_until
-from tests.containers.base import ROOT, bootstrap
+from tests.debian import ROOT, bootstrap
 from tests.folders import mounted_below, remove
 from tests.privileged import CannotRun, prepare, run, skip
 
@@ -31,7 +31,7 @@ wait
 MAKES = """
 import sys
 from pathlib import Path
-from tests.containers.base import bootstrap
+from tests.debian import bootstrap
 folder = Path(sys.argv[1])
 bootstrap(folder, "http://mirror.invalid", "bookworm", folder / "base.tar")
 """
@@ -141,6 +141,22 @@ def test_a_debootstrap_that_fails_is_no_failure_of_ours(
     (tmp_path / "bin" / "debootstrap").write_text("#!/bin/sh\necho 'E: no such mirror' >&2\nexit 1\n")
     (tmp_path / "temporary").mkdir()
     with pytest.raises(CannotRun, match="E: no such mirror"):
+        bootstrap(tmp_path / "temporary", "http://mirror.invalid", "bookworm", tmp_path / "base.tar")
+
+
+def test_apts_proxies_are_for_debootstrap_too(making: Making, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are in a configuration of its own; a variable of the environment outranks them."""
+    programs = {
+        "apt-config": "echo \"http_proxy='http://a b.invalid:1'\"; echo \"https_proxy='http://apt.invalid:2'\"",
+        "debootstrap": 'echo "<$http_proxy> <$https_proxy>" >&2; exit 1',
+    }
+    for name, script in programs.items():
+        (tmp_path / "bin" / name).write_text(f"#!/bin/sh\n{script}\n")
+        (tmp_path / "bin" / name).chmod(0o755)
+    monkeypatch.delenv("http_proxy", raising=False)
+    monkeypatch.setenv("https_proxy", "http://ours.invalid:3")
+    (tmp_path / "temporary").mkdir()
+    with pytest.raises(CannotRun, match=r"<http://a b\.invalid:1> <http://ours\.invalid:3>"):
         bootstrap(tmp_path / "temporary", "http://mirror.invalid", "bookworm", tmp_path / "base.tar")
 
 
