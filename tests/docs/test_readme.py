@@ -58,7 +58,15 @@ def test_every_command_is_one() -> None:
         assert cli.parser_of(words[1]).parse_args(words[1:]).command is not None
 
 
-@pytest.mark.parametrize("link", sorted(set(re.findall(r"\]\((docs/[^)]+)\)", README))))
+@pytest.mark.parametrize("link", sorted(set(re.findall(r"\]\(((?!https?:)[^)]+)\)", README))))
 def test_links_lead_somewhere(link: str) -> None:
-    """Every document and picture that the README links to is there."""
+    """Every document, picture and test that the README links to is there."""
     assert (ROOT / link.partition("#")[0]).is_file()
+
+
+def test_every_guarantee_names_its_tests() -> None:
+    """Each item of the list links to a test, or to a file of tests, that holds it."""
+    _, _, guarantees = README.partition("## Guarantees\n")
+    items = re.split(r"^- ", guarantees, flags=re.MULTILINE)[1:]
+    assert len(items) == 6
+    assert all(re.search(r"\[tests\]\(tests/[\w/]+\.py\)", item) for item in items)
