@@ -140,7 +140,7 @@ def compare(
     tell: Tell | None = None,
     **changes: Any,
 ) -> ComparisonResults:
-    """Compare every scheme against every adversary, on a scenario's process and links.
+    """Compare schemes against adversaries, on a scenario's process and links.
 
     schemes, adversaries: names or classes, by default all; parameters: of schemes other than the scenario's own, such as
     `{"innovation.state_probability": 0.7}`; all else as for `montecarlo`. Source: docs/compare.md.

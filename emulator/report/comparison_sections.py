@@ -53,7 +53,7 @@ class ComparisonSource:
 
 @final
 class MatrixSection(Section[ComparisonSource]):
-    """The verdict on every scheme against every adversary."""
+    """The verdict on each scheme against each adversary."""
 
     title = "Verdicts"
 

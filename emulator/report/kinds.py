@@ -36,7 +36,7 @@ def comparison_page(folder: Path) -> Page:
     source = ComparisonSource.read(folder)
     about = comparison_heading(source.found)
     return Page(
-        "Every scheme against every adversary", about, source.outcome, None, parts_of(COMPARISON_SECTIONS, source)
+        "Schemes against adversaries", about, source.outcome, None, parts_of(COMPARISON_SECTIONS, source)
     )
 
 

@@ -1,4 +1,4 @@
-"""Compares every scheme against every adversary, on one process and its links: the secrecy of each scheme, and its cost.
+"""Compares schemes against adversaries, on one process and its links: the secrecy of each scheme, and its cost.
 
 Each scheme is a Monte Carlo study of its own, with another for every attack on acknowledgements; all of them have the same
 trials, and an adversary has the same losses in each.

@@ -8,6 +8,7 @@ import pytest
 
 from evedrop.cli import main as cli
 from evedrop.loading import load, parse
+from evedrop.wire.file import example_wire
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -70,3 +71,14 @@ def test_every_guarantee_names_its_tests() -> None:
     items = re.split(r"^- ", guarantees, flags=re.MULTILINE)[1:]
     assert len(items) == 6
     assert all(re.search(r"\[tests\]\(tests/[\w/]+\.py\)", item) for item in items)
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/wire.md"])
+def test_a_run_over_a_wire_works_as_printed(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the example of a wire, as the line above it writes it; in memory, where it is quick."""
+    (line,) = re.findall(r"^\$? ?evedrop (run .*--wire robot\.toml .*)$", (ROOT / page).read_text("utf-8"), re.MULTILINE)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "robot.toml").write_text(example_wire(), encoding="utf-8")
+    command, *words = shlex.split(line)
+    assert command == "run"
+    assert cli.main(["montecarlo", *words, "--trials", "20", "--workers", "1"]) == 0

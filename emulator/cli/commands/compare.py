@@ -1,4 +1,4 @@
-"""`evedrop compare`: every scheme against every adversary."""
+"""`evedrop compare`: schemes against adversaries."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from evedrop.output import print_json
 
 
 def compare(options: argparse.Namespace) -> int:
-    """Compare every scheme against every adversary."""
+    """Compare schemes against adversaries."""
     from evedrop.api import compare as compare_all
     from evedrop.cli.closing_report import report_page
     from evedrop.cli.comparison_report import print_comparison
