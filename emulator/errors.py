@@ -4,7 +4,7 @@ EvedropError                    exit status
 ├── UsageError                  2   the command line or a file it names cannot be used
 │   ├── ScenarioError           2   the scenario has mistakes: all of them, listed
 │   ├── TraceError              2   a recording of a link cannot be read
-│   └── DisturbanceError        2   a table of disturbances cannot be read: all mistakes, listed
+│   └── DisturbanceError        2   a table of disturbances cannot be read: its mistakes, listed
 ├── BriefError                  2   a brief cannot be read or does not fit
 ├── RunError                    3   a process failed or a packet is unaccounted for
 │   ├── MalformedMessage        3   a message breaks the protocol: names sender, key and bytes
@@ -70,7 +70,7 @@ class TraceError(UsageError):
 
 
 class DisturbanceError(UsageError):
-    """An unusable table of disturbances: `mistakes` lists all mistakes, with their lines in the file."""
+    """An unusable table of disturbances: `mistakes` lists the mistakes, up to five of a kind, with their lines in the file."""
 
     def __init__(self, path: str, mistakes: list[str]) -> None:
         self.mistakes = mistakes

@@ -1,4 +1,4 @@
-"""Read and check a scenario file; all its mistakes are reported at once.
+"""Read and check a scenario file; its mistakes are reported together.
 
 Source: docs/scenario.md.
 """

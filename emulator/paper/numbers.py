@@ -42,7 +42,7 @@ def table(designs: dict[float, Against], day: Floats) -> str:
 def formulas() -> str:
     """The finite-k expectations at k = 1, as corrected and as printed, as a Markdown table.
 
-    Source: docs/errata.md, items 1 and 2.
+    Source: docs/errata.md (items 1 and 2).
     """
     process = numerical.process()
     carried = float(np.trace(process.A @ process.initial_covariance @ process.A.T))

@@ -1,4 +1,4 @@
-"""The base class of all tables of a scenario file: it checks each entry and all together, and reports every mistake at once."""
+"""The base class of all tables of a scenario file: it checks each entry and all together, and reports the mistakes together."""
 
 from __future__ import annotations
 

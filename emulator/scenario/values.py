@@ -1,6 +1,6 @@
 """Values that no entry of a scenario can have: too deep, too large, or with control characters. Found before any other check.
 
-Source: docs/scenario.md, what a scenario cannot have.
+Source: docs/scenario.md, the scenario file.
 """
 
 from __future__ import annotations

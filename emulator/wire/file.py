@@ -1,4 +1,4 @@
-"""Wire files: read, checked, and written again; all mistakes are reported at once.
+"""Wire files: read, checked, and written again; mistakes are reported together.
 
 Source: docs/wire.md, the file.
 """

@@ -209,7 +209,7 @@ def perfect_secrecy(process: Process, mu: float, adversary: Adversary) -> Interv
 def relative_secrecy(process: Process, mu: float, adversary: Adversary) -> tuple[Interval, ...]:
     """The intervals of μ_d on which J < J_e ≤ ∞ with J bounded.
 
-    Source: Theorem V.8 for μ_e ≤ μ; docs/mathematics.md, design, for any μ_e.
+    Source: Theorem V.8 for μ_e ≤ μ; docs/mathematics.md, design (for any μ_e).
     """
     from scipy.optimize import brentq  # noqa: PLC0415 - slow to import
 
