@@ -1,0 +1,68 @@
+"""The colours that pages name are those that the view gives to receivers, and what the page says of them is so."""
+
+from __future__ import annotations
+
+import colorsys
+import math
+import re
+from pathlib import Path
+
+import pytest
+
+from evedrop.loading import load
+from evedrop.score.track import FACTOR
+from evedrop.view.palette import KNOWLEDGE, RECEIVERS, Colour
+
+ROOT = Path(__file__).parents[2]
+HUES = {"red": (345, 380), "yellow": (35, 60), "green": (120, 165), "violet": (260, 290)}
+"""Name of a colour → its hues, in degrees; red goes on beyond 360."""
+
+
+def name_of(colour: Colour) -> str | None:
+    """What a page calls a colour; None if it is none of these."""
+    hue = 360.0 * colorsys.rgb_to_hsv(*(part / 255.0 for part in colour))[0]
+    return next((name for name, (low, high) in HUES.items() if low <= hue <= high or low <= hue + 360 <= high), None)
+
+
+def text(name: str) -> str:
+    """A file with single spaces."""
+    return re.sub(r"[\s#]+", " ", (ROOT / name).read_text(encoding="utf-8"))
+
+
+def test_the_readme_names_the_colours_of_the_vehicle_s_receivers() -> None:
+    """In the words below its picture."""
+    receivers = load("vehicle").receivers
+    assert receivers == ("legitimate", "naive", "suspicious", "smart")
+    said = re.findall(r"The legitimate estimator \((\w+)\).*?naive eavesdropper \((\w+)\)", text("README.md"))
+    more = re.findall(r"the suspicious one \((\w+)\).*?the smart one \((\w+)\)", text("README.md"))
+    assert [*said[0], *more[0]] == [name_of(colour) for colour in RECEIVERS[:4]]
+
+
+def test_the_page_of_the_view_names_the_first_colours() -> None:
+    """In the order of the scenario."""
+    first, second, *next_ones = [name_of(colour) for colour in RECEIVERS[:4]]
+    assert (
+        f"the legitimate estimator is {first}, the first eavesdropper {second}, the next ones {' and '.join(map(str, next_ones))}"
+        in text("docs/view.md")
+    )
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "scenarios").glob("*.toml")), ids=lambda path: path.name)
+def test_a_scenario_names_colours_that_there_are(path: Path) -> None:
+    """No receiver is teal."""
+    assert not re.search(r"\b(teal|cyan|orange|magenta|pink)\b", path.read_text(encoding="utf-8"))
+
+
+def test_a_colour_of_a_lane_is_not_a_receiver_s() -> None:
+    """They mean something else, as the page says, so they are others; some resemble each other."""
+    assert not set(KNOWLEDGE) & set(RECEIVERS)
+
+
+def test_how_often_a_right_covariance_is_called_wrong() -> None:
+    """P(χ² with one degree of freedom > 20): the number in the page, and how many slots there are to one such slot."""
+    probability = math.erfc(math.sqrt(FACTOR / 2.0))
+    page = text("docs/view.md")
+    assert f"{probability * 1e6:.1f} · 10⁻⁶" in page
+    assert "fewer than one in 100 000 slots" in page
+    assert probability < 1e-5
+    assert f"one of {round(1 / probability, -4):.0f}".replace("130000", "130 000") in page
