@@ -1,4 +1,4 @@
-"""The Python API: a function for each command that computes, with the same name and arguments.
+"""The Python API: functions for most commands that compute, with the same name; docs/python.md lists the commands without one.
 
 Source: docs/python.md.
 """

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import re
 import traceback
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+import evedrop
+from evedrop import api
+from evedrop.cli.commands import MODULES
 
 PAGE = (Path(__file__).parents[2] / "docs" / "python.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```(python|pycon)\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
@@ -26,3 +32,25 @@ def test_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         with pytest.raises(Exception, match="mistakes") as caught:
             exec(call, names)  # noqa: S102 - the same
         assert "".join(traceback.format_exception_only(caught.value)) == said
+
+
+def test_the_table_has_every_function() -> None:
+    """Those of `evedrop`, and those of `evedrop.api` that the page says are only there."""
+    named = re.findall(r"^\| `(\w+)\(", PAGE, re.MULTILINE)
+    functions = {name for name in evedrop.__all__ if name != "Scenario"}
+    further = {name for name in api.__all__ if inspect.isfunction(getattr(api, name))} - functions
+    assert sorted(named) == sorted(functions | further)
+    (said,) = re.findall(r"imported from `evedrop`; (.*?) from `evedrop\.api`", PAGE)
+    assert set(re.findall(r"`(\w+)`", said)) == further
+
+
+def test_the_commands_without_a_function_are_listed() -> None:
+    """Of those that run or compute something."""
+    commands = {
+        " ".join(filter(None, (command.group, command.name)))
+        for module in set(MODULES.values())
+        for command in importlib.import_module(f"evedrop.cli.commands.{module}").COMMANDS
+        if command.section in {"run", "study"}
+    }
+    (said,) = re.findall(r"have no\s+function: (.*?);", PAGE, re.DOTALL)
+    assert set(re.findall(r"`([\w ]+)`", said)) == {name for name in commands if name not in evedrop.__all__}
