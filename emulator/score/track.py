@@ -1,9 +1,9 @@
 """Whether a receiver follows the process in each slot, and the spans in which it does not.
 
 A receiver with Gaussian errors whose covariance P is right has a squared error above 20 tr P in fewer than one of 100 000 slots,
-whatever the number of states: of all Gaussian errors with this trace, one along a single direction is above most often (Székely and Bakirov 2003),
-and there 20 is exceeded with probability 7.7e-6. Errors up to 20 times those of one step's noise, tr Q, are those of a receiver
-that follows the process step by step.
+whatever the number of states: of all Gaussian errors with this trace, one along a single direction is above most often (Székely
+and Bakirov 2003), and there 20 is exceeded with probability 7.7e-6. Errors up to 20 times those of one step's noise, tr Q, are
+those of a receiver that follows the process step by step.
 
 Source: docs/view.md, who knows what; docs/results.md, lost track.
 """
