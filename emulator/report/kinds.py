@@ -35,9 +35,7 @@ def comparison_page(folder: Path) -> Page:
     """The report of a comparison."""
     source = ComparisonSource.read(folder)
     about = comparison_heading(source.found)
-    return Page(
-        "Schemes against adversaries", about, source.outcome, None, parts_of(COMPARISON_SECTIONS, source)
-    )
+    return Page("Schemes against adversaries", about, source.outcome, None, parts_of(COMPARISON_SECTIONS, source))
 
 
 def wire_page(source: WireSource) -> Page:

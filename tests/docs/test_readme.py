@@ -76,7 +76,9 @@ def test_every_guarantee_names_its_tests() -> None:
 @pytest.mark.parametrize("page", ["README.md", "docs/wire.md"])
 def test_a_run_over_a_wire_works_as_printed(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the example of a wire, as the line above it writes it; in memory, where it is quick."""
-    (line,) = re.findall(r"^\$? ?evedrop (run .*--wire robot\.toml .*)$", (ROOT / page).read_text("utf-8"), re.MULTILINE)
+    (line,) = re.findall(
+        r"^\$? ?evedrop (run .*--wire robot\.toml .*)$", (ROOT / page).read_text("utf-8"), re.MULTILINE
+    )
     monkeypatch.chdir(tmp_path)
     (tmp_path / "robot.toml").write_text(example_wire(), encoding="utf-8")
     command, *words = shlex.split(line)

@@ -26,4 +26,6 @@ def test_the_readme_says_so_too() -> None:
 def test_no_test_runs_a_node() -> None:
     """The day one does, these pages may say more."""
     tests = (path for path in (ROOT / "tests").rglob("*.py") if path != Path(__file__).resolve())
-    assert not [path for path in tests if re.search(r"^\s*(import|from) rclpy\b", path.read_text("utf-8"), re.MULTILINE)]
+    assert not [
+        path for path in tests if re.search(r"^\s*(import|from) rclpy\b", path.read_text("utf-8"), re.MULTILINE)
+    ]
