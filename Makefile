@@ -96,18 +96,18 @@ setup: $(READY)
 # all the same, and numpy does their work.
 $(READY): constraints.txt pyproject.toml hatch_build.py $(wildcard emulator/kernels/binding.py emulator/kernels/source/*)
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --require-hashes --no-deps --requirement constraints.txt
-	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	$(BIN)/python tools/install.py constraints.txt
+	$(BIN)/python tools/install.py --project .
 	touch $(READY)
 
 # Versions of the packages that build the site, each checked against its hash.
 $(DOCS_READY): $(READY) constraints-docs.txt
-	$(BIN)/python -m pip install --quiet --require-hashes --no-deps --requirement constraints-docs.txt
+	$(BIN)/python tools/install.py constraints-docs.txt
 	touch $(DOCS_READY)
 
 # Versions of the packages that run notebooks, each checked against its hash.
 $(NOTEBOOKS_READY): $(READY) constraints-notebooks.txt
-	$(BIN)/python -m pip install --quiet --require-hashes --no-deps --requirement constraints-notebooks.txt
+	$(BIN)/python tools/install.py constraints-notebooks.txt
 	touch $(NOTEBOOKS_READY)
 
 clean:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 
 import pytest
@@ -14,7 +15,7 @@ pytestmark = pytest.mark.fresh
 
 
 def test_a_newcomers_commands_succeed_on_a_bare_machine(machine: Machine, outcomes: dict[str, Outcome]) -> None:
-    """Both commands end with 0, and leave no process, and no file in /tmp and /dev/shm."""
+    """Both commands end with 0, and leave no process, and no file in /tmp and /dev/shm; setting up downloads what it says."""
 
     def write(line: str) -> None:
         # The machine's own banners are not this machine's.
@@ -26,4 +27,8 @@ def test_a_newcomers_commands_succeed_on_a_bare_machine(machine: Machine, outcom
             outcomes[machine.name] = outcome(machine, folder, write)
         except CannotRun as error:
             skip(error)
+    said = "\n".join(outcomes[machine.name].said)
+    sizes = [re.search(pattern, said) for pattern in (r"about (\d+) MB to download", r"(\d+) MB downloaded")]
+    announced, downloaded = (int(size[1]) if size else 0 for size in sizes)
+    assert announced == pytest.approx(downloaded, rel=0.15), "tools/install.py announces another size than it downloads"
     assert not (mistakes := outcomes[machine.name].mistakes(COMMANDS)), "\n".join(mistakes)
