@@ -3,37 +3,70 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Self, final
 
+from rich.cells import cell_len
 from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    ProgressColumn,
     SpinnerColumn,
     Task,
     TaskID,
-    TextColumn,
     TimeRemainingColumn,
 )
+from rich.table import Column
 from rich.text import Text
 
 from evedrop.kernels.choice import fallback_warning
 from evedrop.news import ConnectionOutage, FolderMoved, Held, News, RunEnded, RunProgress, Started, ViewOpened
 
-_BAR_WIDTH = 120  # the least width of a terminal, in columns, that has room for a bar
-_WHOLE_WIDTH = 70  # the least width that has room for more than what is done and the time left
+_BAR_FROM = 120  # the least width of a terminal, in columns, that has room for a bar
+_BAR_WIDTH = 24
+_SPINNER_WIDTH = 1
 
 
 @final
-class _TimeLeft(TimeRemainingColumn):
-    """The time left; nothing while the total is unknown."""
+class _Facts(ProgressColumn):
+    """What is done, how fast, the time left and the errors, in one line; what does not fit is left out, the errors first."""
+
+    def __init__(self, unit: str, room: Callable[[], int]) -> None:
+        """room: gives the columns that the text may have."""
+        super().__init__(Column(no_wrap=True))
+        self._unit = unit
+        self._room = room
+        self._done = MofNCompleteColumn()
+        self._left = TimeRemainingColumn(compact=True)
 
     def render(self, task: Task) -> Text:
-        time = super().render(task)
-        return time if task.total is None else time + " left"
+        room = self._room()
+        state = Text(f"{task.description} ")
+        done = self._done.render(task) + Text(f" {self._unit}")
+        rate = Text(f" · {task.fields['rate']}" if task.fields["rate"] else "")
+        # While a run is held, or no total is known, any time left would be a guess.
+        left = Text(" ") + self._left.render(task) + Text(" left") if rate and task.total is not None else Text()
+        shortened = ((state, done, rate, left), (done, rate, left), (done, left), (state, done), (done,))
+        line = next((fits for parts in shortened if (fits := Text.assemble(*parts)).cell_len <= room), done)
+        return line + _that_fit(task.fields["errors"], room - line.cell_len)
+
+
+def _that_fit(errors: Mapping[str, float], room: int) -> Text:
+    """The errors of the first receivers, as many as fit into this number of columns, and `…` if these are not all."""
+    text = ""  # which has room for the mark behind it
+    for i, (name, error) in enumerate(errors.items()):
+        longer = f"{text}  {name} {error:.2g}"
+        if cell_len(longer if i == len(errors) - 1 else longer + _MORE) > room:
+            return Text(text and text + _MORE)
+        text = longer
+    return Text(text)
+
+
+_MORE = "  …"
 
 
 @final
@@ -49,20 +82,17 @@ class ProgressLine:
         self._total = total
         self.moved: Path | None = None
         """The results folder, if it was renamed."""
-        whole = self.console.width >= _WHOLE_WIDTH
+        bar = self.console.width >= _BAR_FROM
+        around = _SPINNER_WIDTH + 1 + (_BAR_WIDTH + 1 if bar else 0)
         self._progress = Progress(
             SpinnerColumn(),
-            *([TextColumn("{task.description}")] if whole else []),
-            *([BarColumn(bar_width=24)] if self.console.width >= _BAR_WIDTH else []),
-            MofNCompleteColumn(),
-            TextColumn(f"{unit} · {{task.fields[rate]}}" if whole else unit),
-            _TimeLeft(compact=True),
-            *([TextColumn("{task.fields[errors]}")] if whole else []),
+            *([BarColumn(bar_width=_BAR_WIDTH)] if bar else []),
+            _Facts(unit, lambda: self.console.width - around),
             console=self.console,
             transient=True,
             disable=quiet or not self.console.is_terminal,
         )
-        self._task: TaskID = self._progress.add_task("starting", total=total, rate="", errors="")
+        self._task: TaskID = self._progress.add_task("starting", total=total, rate="", errors={})
 
     def __enter__(self) -> Self:
         if (warning := fallback_warning()) is not None:
@@ -91,7 +121,7 @@ class ProgressLine:
                     total=self._total if news.total is None else news.total,
                     completed=news.done,
                     rate=f"{news.rate:,.0f} {news.rate_unit}",
-                    errors="  ".join(f"{name} {error:.2g}" for name, error in news.squared_errors.items()),
+                    errors=news.squared_errors,
                 )
             case ViewOpened() if not self._quiet:
                 if news.address:

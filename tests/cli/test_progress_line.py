@@ -6,6 +6,8 @@ import io
 import sys
 
 import pytest
+from rich.cells import cell_len
+from rich.text import Text
 
 from evedrop.cli.progress_line import ProgressLine
 from evedrop.news import Held, RunProgress, Started
@@ -59,3 +61,53 @@ def test_a_narrow_terminal_shows_what_is_done_and_the_time_left(monkeypatch: pyt
     assert "left" in last
     assert "123,456" not in terminal.getvalue()
     assert "…" not in terminal.getvalue()
+
+
+ERRORS = {"legitimate": 0.0081, "naive": 3.2e2, "suspicious": 0.61, "smart": 0.0234}
+
+
+@pytest.mark.parametrize(
+    ("columns", "shown", "cut"),
+    [
+        (40, "2999/3000 slots 00:0", True),
+        (60, "running 2999/3000 slots · 43 slots/s 00:0", True),
+        (80, "running 2999/3000 slots · 43 slots/s 00:0", True),
+        (100, "running 2999/3000 slots · 43 slots/s 00:0", True),
+        (140, "running 2999/3000 slots · 43 slots/s 00:0", False),
+    ],
+)
+def test_the_errors_never_hide_how_far_a_run_is(
+    monkeypatch: pytest.MonkeyPatch, columns: int, shown: str, cut: bool
+) -> None:
+    """A terminal shows the slots, the rate and the time left on one line, and the errors of the receivers that still fit."""
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", str(columns))
+    monkeypatch.setenv("NO_COLOR", "1")
+    with ProgressLine(3000, "slots") as line:
+        line.tell(Started())
+        line.tell(RunProgress(10, 43.0, "slots/s", ERRORS))
+        line.tell(RunProgress(2999, 43.0, "slots/s", ERRORS))
+    written = Text.from_ansi(terminal.getvalue()).plain.splitlines()
+    assert all(cell_len(one) <= columns for one in written)
+    assert not any(one.strip() in {"left", "slots"} for one in written), "nothing goes on in a second line"
+    last = [one for one in written if "2999/3000" in one][-1]
+    assert shown in last
+    assert " left" in last
+    assert ("smart" not in last) is cut
+    assert ("legitimate 0.0081  …" in last) is (columns == 80), last
+
+
+def test_a_held_run_on_a_narrow_terminal_says_that_it_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At 40 columns too; and it guesses no time left."""
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "40")
+    with ProgressLine(400, "slots") as line:
+        line.tell(RunProgress(100, 43.0, "slots/s", ERRORS))
+        line.tell(Held(120))
+    last = [one for one in Text.from_ansi(terminal.getvalue()).plain.splitlines() if "held before" in one][-1]
+    assert "held before slot 120 120/400 slots" in last
+    assert "left" not in last
