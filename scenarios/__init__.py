@@ -32,7 +32,12 @@ def write_new(path: Path, origin: str | None = None) -> None:
     text = (_FOLDER / "_new.toml").read_text(encoding="utf-8") if origin is None else built_in_text(origin)
     try:
         with path.open("x", encoding="utf-8") as file:
-            file.write(text)
+            try:
+                file.write(text)
+                file.flush()
+            except BaseException:
+                path.unlink(missing_ok=True)
+                raise
     except FileExistsError as error:
         raise UsageError(f"{path} exists already; give another name") from error
     except OSError as error:

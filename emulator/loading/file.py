@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.files import Unreadable, is_folder, is_there, shown, text_of
 from evedrop.hints import near
-from evedrop.loading.line_numbers import with_line_numbers
+from evedrop.loading.line_numbers import given_twice, with_line_numbers
 from evedrop.loading.mistakes import mistakes_across
 from evedrop.model.registry import place_of
 from evedrop.plugins import named_in
@@ -42,6 +42,8 @@ MOST_BYTES = 2**28
 """The largest scenario file: room for the outcomes of millions of packets."""
 MOST_VALUES = 1_000_000
 """The most values in the lists of a scenario file: reading more would take too long."""
+_TWICE = ("Cannot overwrite", "Cannot declare", "Cannot mutate", "Cannot redefine")
+"""How Python's TOML reader begins to say that an entry is given twice."""
 _MOST_DOTS = 32
 # Python's TOML reader takes time that grows with the square of the number of a key's parts.
 _PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+"""
@@ -92,6 +94,8 @@ def parse(
     folder: where the files are that the text names; files that a change names are in the current folder.
     """
     tables = tables_in(text, source)
+    if not tables and not changes:
+        raise ScenarioError(source, ["has no entries; `evedrop new FILE` writes a scenario to start from"])
     located(tables, folder)
     with with_line_numbers(text, changes or ()):
         return checked(tables, source, changes, beyond_horizon=beyond_horizon, folder=folder)
@@ -121,10 +125,19 @@ def tables_in(text: str, source: str) -> dict[str, Any]:
     try:
         tables = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # numbers of thousands of digits, tables nested without end
-        raise ScenarioError(source, [f"not TOML: {error}"]) from error
+        raise ScenarioError(source, [_no_toml(text, error)]) from None
     if mistakes := list(unusable(tables)):
         raise ScenarioError(source, mistakes)
     return tables
+
+
+def _no_toml(text: str, error: Exception) -> str:
+    """Why a text is not TOML, in words that name an entry that is given twice."""
+    place = re.search(r"\(at line (\d+), column \d+\)", str(error))
+    twice = None
+    if place is not None and str(error).startswith(_TWICE):
+        twice = given_twice(text, int(place[1]))
+    return f"not TOML: {error if twice is None else twice}"
 
 
 def checked(
@@ -152,7 +165,7 @@ def checked(
         scenario = Scenario.read(tables)
     except ValidationError as error:
         mistakes = [*sentences(error, Scenario), *recordings, *_across(tables, beyond_horizon, None)]
-        raise ScenarioError(source, mistakes) from error
+        raise ScenarioError(source, mistakes) from None
     broken = dry_run(scenario)
     # A class that breaks in a dry run breaks again when it is asked about itself: report that only once.
     mistakes = recordings + broken + _across(tables, beyond_horizon, scenario, silent=bool(broken))
@@ -244,4 +257,4 @@ def with_event(scenario: Scenario, event: Mapping[str, Any], at: int) -> Scenari
         return checked(tables, "event", beyond_horizon=True)
     except ScenarioError as error:
         mistakes = [line.removeprefix(f"event.{number}.") for line in error.mistakes]
-        raise ScenarioError(error.source, mistakes) from error
+        raise ScenarioError(error.source, mistakes) from None

@@ -24,16 +24,28 @@ _TOKEN = re.compile(
 def lines_of_entries(text: str) -> dict[str, int]:
     """Dotted path → line, from 1, of each table and entry of a valid TOML text; inside a value there are no paths."""
     found: dict[str, int] = {}
-    counts: dict[str, int] = {}
-    table = ""
-    for line, statement in _statements(text):
-        if statement.startswith("["):
-            path = table = _with_places(_parts(statement), counts, many=statement.startswith("[["))
-        else:
-            named = ".".join(_parts(f"{statement} = 0"))
-            path = f"{table}.{named}" if table else named
+    for path, line in _paths(text):
         found.setdefault(path, line)
     return found
+
+
+def given_twice(text: str, line: int) -> str | None:
+    """The entry of this line that an earlier line gives too, in words; None if there is none.
+
+    text: valid TOML in front of this line, which may be the last of its entry.
+    """
+    try:
+        *earlier, (path, at) = _paths("\n".join(text.split("\n")[:line]))
+    except ValueError:  # no entry, or none that can be read
+        return None
+    lines = dict(reversed(earlier))  # the first line of each path
+    inside = next((one for one in lines if one.startswith(f"{path}.")), None)
+    around = max((one for one in lines if path.startswith(f"{one}.")), key=len, default=None)
+    first = path if path in lines else inside or around
+    if first is None:
+        return None
+    before = f"line {lines[first]}" if first == path else f"line {lines[first]}, as {first}"
+    return f"{path} in line {at} is given already in {before}; leave one of them out"
 
 
 @contextmanager
@@ -45,7 +57,7 @@ def with_line_numbers(text: str, changed: Iterable[str] = ()) -> Iterator[None]:
         lines = lines_of_entries(text)
         begins = tuple(f"{path}." for path in changed)
         numbered = error.numbered(lambda path: None if f"{path}.".startswith(begins) else line_of(path, lines))
-        raise numbered from error.__cause__
+        raise numbered from None
 
 
 def line_of(path: str, lines: Mapping[str, int]) -> int | None:
@@ -55,6 +67,19 @@ def line_of(path: str, lines: Mapping[str, int]) -> int | None:
             return lines[path]
         path = path.rpartition(".")[0]
     return None
+
+
+def _paths(text: str) -> Iterator[tuple[str, int]]:
+    """The dotted path of each table and entry, with its line."""
+    counts: dict[str, int] = {}
+    table = ""
+    for line, statement in _statements(text):
+        if statement.startswith("["):
+            path = table = _with_places(_parts(statement), counts, many=statement.startswith("[["))
+        else:
+            named = ".".join(_parts(f"{statement} = 0"))
+            path = f"{table}.{named}" if table else named
+        yield path, line
 
 
 def _statements(text: str) -> Iterator[tuple[int, str]]:

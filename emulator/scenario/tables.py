@@ -110,7 +110,7 @@ class Scenario(Table):
     slot_seconds: Annotated[float | None, Field(gt=0.0, le=1e6, strict=True, examples=[0.02])] = None
     secret_file: Annotated[str | None, Field(examples=["secret.bin"])] = None
     modules: Annotated[str | None, Field(strict=True, examples=["."])] = None
-    process: ProcessTable
+    process: Annotated[ProcessTable, Field(examples=[{"A": [[1.0]], "Q": [[0.001]], "initial_covariance": [[1.0]]}])]
     encoding: Annotated[EncodingTable, Field(examples=[{"scheme": "innovation", "state_probability": 0.6}])]
     legitimate: Annotated[LegitimateTable, Field(examples=[{"link": {"quality": 0.9}}])]
     eavesdroppers: Annotated[

@@ -66,7 +66,7 @@ def wire_of(
     try:
         file = WireFile.model_validate(made)
     except ValidationError as error:
-        raise ScenarioError(source, [*sentences(error, WireFile), *recordings, *mistakes_across(made)]) from error
+        raise ScenarioError(source, [*sentences(error, WireFile), *recordings, *mistakes_across(made)]) from None
     if mistakes := [*recordings, *mistakes_across(made)]:
         raise ScenarioError(source, mistakes)
     return _plan(file)

@@ -250,7 +250,13 @@ class WireFile(Table):
     """A wire file."""
 
     seed: Annotated[int, Field(ge=0, lt=2**256, strict=True, examples=[7])] = 0
-    side: Annotated[dict[Annotated[str, AfterValidator(_side_name)], SideTable], Field(min_length=2)]
+    side: Annotated[
+        dict[Annotated[str, AfterValidator(_side_name)], SideTable],
+        Field(
+            min_length=2,
+            examples=[{"robot": {"listen": "tcp/127.0.0.1:7448"}, "base": {}}],
+        ),
+    ]
     link: Annotated[list[WireLinkTable], Field(default_factory=list)]
     event: Annotated[list[WireEventTable], Field(default_factory=list)]
     expect: Annotated[list[WireExpectTable], Field(default_factory=list)]

@@ -75,7 +75,7 @@ def with_change(plan: WirePlan, table: Mapping[str, Any], time: float) -> tuple[
     try:
         checked = WireEventTable.model_validate(found)
     except ValidationError as error:
-        raise ScenarioError("event", [*sentences(error, WireEventTable), *mistakes]) from error
+        raise ScenarioError("event", [*sentences(error, WireEventTable), *mistakes]) from None
     if mistakes:
         raise ScenarioError("event", mistakes)
     event = wire_event(checked, now, {link.name: link.settings for link in plan.links})

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from evedrop.errors import ScenarioError
-from evedrop.loading import load, shipped
+from evedrop.loading import load, parse, shipped
 from evedrop.loading.line_numbers import line_of, lines_of_entries
 
 TEXT = '''# a comment with [brackets]
@@ -110,3 +110,29 @@ def test_a_mistake_names_its_line_and_a_changed_entry_none(tmp_path: Path) -> No
     told = {mistake.partition(":")[0]: mistake for mistake in found.value.mistakes}
     assert told["eavesdroppers.smart.strategy"].endswith(f" (line {line})")
     assert "(line" not in told["slots"]
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("[process]\nA = [[1]]\nA = [\n[2]]\n", "process.A in line 3 is given already in line 2"),
+        ("[a]\nb = 1\n[c]\n[a]\n", "a in line 4 is given already in line 1"),
+        ("a.b = 1\na = 2\n", "a in line 2 is given already in line 1, as a.b"),
+        ("[t]\na = 1\na.b = 2\n", "t.a.b in line 3 is given already in line 2, as t.a"),
+        ("[a]\nb = { c = 1 }\n[a.b]\nc = 2\n", "a.b in line 3 is given already in line 2"),
+        ("[[a]]\nb = 1\n[a]\nb = 2\n", "a.0 in line 3 is given already in line 1"),
+        ("a = { b = 1, b = 2 }\n", "'b'"),
+    ],
+)
+def test_an_entry_that_is_given_twice_is_named(text: str, told: str) -> None:
+    """With the lines of both, so that one of them can be left out."""
+    with pytest.raises(ScenarioError) as found:
+        parse(text, "mine.toml")
+    (mistake,) = found.value.mistakes
+    assert told in mistake
+
+
+def test_other_mistakes_of_toml_are_told_in_its_readers_words() -> None:
+    """They say the place."""
+    with pytest.raises(ScenarioError, match=r"not TOML: Expected '=' after a key.*line 2"):
+        parse("a = 1\na b = 2\n", "mine.toml")

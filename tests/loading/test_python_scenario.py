@@ -6,7 +6,8 @@ import importlib
 import pickle
 import re
 import sys
-from collections.abc import Iterator
+import traceback
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,14 @@ import pytest
 
 from evedrop import Scenario, montecarlo, sweep
 from evedrop.errors import ScenarioError, UsageError
-from evedrop.loading import load, shipped
+from evedrop.loading import load, parse, shipped, tables_in
+from evedrop.loading.file import with_event
 from evedrop.memory.montecarlo import Plan
 from evedrop.model.eavesdroppers.naive import Naive
 from evedrop.model.schemes.innovation import Innovation
 from evedrop.scenario.entries import ScenarioEntries
+from evedrop.wire.file import example_wire, wire_of
+from evedrop.wire.timeline import with_change
 from tests.builders import digests_of
 from tests.conformance.own_classes import BLOCK, PAGE
 from tests.scenario.good import GOOD, mistakes
@@ -114,6 +118,31 @@ def test_all_mistakes_of_a_new_scenario_are_told_at_once() -> None:
     said = caught.value.mistakes
     assert [line.partition(":")[0] for line in said] == ["slots", "process", "encoding", "legitimate", "slotz"]
     assert said[-1] == "slotz: is not an entry of this table; did you mean slots?"
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: Scenario({"slots": "x"}),
+        lambda: vehicle(slots=0),
+        lambda: vehicle().replace(slots=0),
+        lambda: Scenario.load("vehicle", {"slots": 0}),
+        lambda: montecarlo("vehicle", legitimate__link__quality=2),
+        lambda: parse("slots = 1\nslots = 2\n", "mine.toml"),
+        lambda: parse("slots = 0\n", "mine.toml"),
+        lambda: with_event(vehicle(), {"cut": "nobody"}, 3),
+        lambda: wire_of({"side": 3}),
+        lambda: with_change(wire_of(tables_in(example_wire(), "wire")), {"cut": 3}, 1.0),
+    ],
+)
+def test_a_refusal_shows_no_error_of_another_package(call: Callable[[], object]) -> None:
+    """The mistakes are told in our words; a traceback with pydantic's words before them, and its address, only hides them."""
+    with pytest.raises(ScenarioError) as refused:
+        call()
+    shown = "".join(traceback.format_exception(refused.value))
+    assert "pydantic" not in shown
+    assert "another exception" not in shown
+    assert "direct cause" not in shown
 
 
 @pytest.mark.parametrize(

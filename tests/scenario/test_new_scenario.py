@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from evedrop.errors import ScenarioError
 from evedrop.figures import FIGURES
+from evedrop.live.launch.hosts_file import HostsFile
+from evedrop.loading import parse
 from evedrop.model.acknowledgements import ATTACKS
 from evedrop.model.controllers import CONTROLLERS
 from evedrop.model.delays import DELAY_MODELS
@@ -20,6 +25,8 @@ from evedrop.model.schemes import SCHEMES
 from evedrop.scenario import Scenario
 from evedrop.scenario.application import APPLICATIONS
 from evedrop.scenario.events import EVENTS
+from evedrop.scenario.table import Table
+from evedrop.wire.tables import WireFile
 
 NEW = (Path(__file__).parents[2] / "scenarios" / "_new.toml").read_text(encoding="utf-8")
 WRITTEN_BY_EVEDROP = {"made_with"}
@@ -91,3 +98,44 @@ def test_an_entry_that_is_missing_is_noticed() -> None:
     """So that the tests above test something."""
     assert not has_entry(sections()["event"], "explode")
     assert not has_entry(sections()["network"], "seed"), "it belongs to other tables"
+
+
+def test_a_new_scenario_is_written_completely_or_not_at_all(tmp_path: Path) -> None:
+    """A disk that is full leaves no empty file, which would be in the way of the next attempt."""
+    path = tmp_path / "mine.toml"
+    code = f"""if True:
+        import resource
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
+        from evedrop.cli.main import main
+        raise SystemExit(main(["new", {str(path)!r}]))
+    """
+    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert "mine.toml cannot be written (File too large); give another place" in done.stderr
+    assert not path.exists()
+
+
+def test_a_scenario_without_entries_says_where_to_start(tmp_path: Path) -> None:
+    """An empty file gets one line, not the list of all that is missing."""
+    with pytest.raises(ScenarioError) as refused:
+        parse("# nothing\n", "mine.toml")
+    assert refused.value.mistakes == ["has no entries; `evedrop new FILE` writes a scenario to start from"]
+
+
+def tables(kind: type[Table]) -> Iterator[type[Table]]:
+    """The tables of a kind, and of the kinds made from it."""
+    for one in kind.__subclasses__():
+        yield one
+        yield from tables(one)
+
+
+def test_an_entry_that_is_required_has_an_example() -> None:
+    """So that no message about a missing entry only repeats its name, as "process: is missing; expected process" did."""
+    assert {WireFile, HostsFile, Scenario} <= {*tables(Table)}
+    bare = [
+        f"{table.__name__}.{name}"
+        for table in tables(Table)
+        for name, field in table.model_fields.items()
+        if table.__module__.startswith("evedrop.") and field.is_required() and not field.examples
+    ]
+    assert bare == []

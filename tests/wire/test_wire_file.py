@@ -211,9 +211,9 @@ def test_all_mistakes_at_once() -> None:
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("", "side: is missing; expected side"),
+        ("", 'side: is missing; expected side = { robot = { listen = "tcp/127.0.0.1:7448" }, base = {} }'),
         ("[side.robot]", "side: has fewer than 2 entries; expected at least that many"),
-        ("side = 3", "side: is 3; expected a table"),
+        ("side = 3", 'side: is 3; expected a table, such as { robot = { listen = "tcp/127.0.0.1:7448" }, base = {} }'),
         (f"{BASE}keys = 'a/**/**'", "link.0.keys: is \"a/**/**\", which Zenoh refuses (`**/**` must be "
          "replaced by `**` to reach canon-form); did you mean a/**?"),
         (BASE.replace('"base"', '"robot"'), 'link.0.to: is "robot", where the link begins; expected another side'),

@@ -162,7 +162,7 @@ def _observe(brief: Brief[ObserverPart], serve: str | None) -> int:
         return observe(brief, _report, serve)
     except ValidationError as error:
         lines = "; ".join(sentences(error, Scenario)[:_MOST_TOLD])
-        raise BriefError(f"part.scenario has mistakes: {lines}; {WRITE_AGAIN}") from error
+        raise BriefError(f"part.scenario has mistakes: {lines}; {WRITE_AGAIN}") from None
 
 
 def _report(folder: Path, status: int, how: str) -> None:

@@ -82,7 +82,7 @@ class HostsFile(Table):
     """The complete file."""
 
     ssh_config: Annotated[Line | None, Field(examples=["ssh_config"])] = None
-    router: RouterTable
+    router: Annotated[RouterTable, Field(examples=[{"listen": "tls/0.0.0.0:7447", "connect": "tls/alpha.lan:7447"}])]
     relay: RouterTable | None = None
     hosts: Annotated[
         dict[Annotated[str, AfterValidator(_host_name)], HostTable],
@@ -118,7 +118,7 @@ def load_hosts(path: Path, scenario: Scenario) -> HostsPlan:
         try:
             file = HostsFile.model_validate(tables)
         except ValidationError as error:
-            raise ScenarioError(source, sentences(error, HostsFile)) from error
+            raise ScenarioError(source, sentences(error, HostsFile)) from None
         mistakes = [*_of_processes(file, scenario)]
         endpoints = _endpoints(file, scenario, mistakes)
         if mistakes or endpoints is None:
