@@ -28,6 +28,8 @@ from evedrop.model.theory.rare_events import Streaks, streaks, total_of
 from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
 
+_ROUNDING = 1e-12  # of an error, relative to the state
+
 
 class ExpectedTraceStream(Protocol):
     """Expected traces, a number of slots at a time."""
@@ -148,6 +150,10 @@ class Expectation:
         for part in parts_of(range(slots)):
             found[part.start : part.stop] = np.einsum("i,kij,j->k", v, stream.next(len(part)), v)
         return found
+
+    def rounding(self, slots: int) -> float:
+        """A mean squared error over slots 0 … slots−1 below which it consists of rounding: 1e-24 of the state's own square."""
+        return _ROUNDING**2 * total_of(ExpectedCovariance(self.process, theory.NOBODY).next_traces, slots) / slots
 
     @property
     def growth(self) -> Growth | None:

@@ -1,11 +1,12 @@
-"""The standard error of a mean over trials, and its distance from theory in standard errors.
+"""The standard error of a mean over trials, and its distance from theory as a z-score.
 
-Source: docs/results.md, standard errors.
+Source: docs/results.md, standard errors; docs/mathematics.md, z-scores.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -35,8 +36,100 @@ def ratio_error(over: Floats, under: Floats) -> float | None:
     return standard_error((over - float(np.mean(over)) / mean * under) / mean)
 
 
-def z_of(found: float | None, expected: float | None, error: float | None) -> float | None:
-    """How many standard errors a figure is above its expectation by theory; None without theory or a standard error above 0."""
-    if found is None or expected is None or not error or not math.isfinite(found - expected):
+def z_of(of_trials: Floats | None, expected: float | None, rounding: float = 0.0) -> float | None:
+    """How far the mean of independent trials, (R,), is from its expectation by theory, as a standard normal number.
+
+    It is the distance in standard errors, corrected for what the trials show of their distribution: their skewness and their
+    kurtosis, without which a mean that a few trials carry is called improbable far too often.
+
+    rounding: trials whose mean and expectation are both below it consist of rounding errors only, and have none. None without
+    theory, for fewer than two trials, and for trials that are all equal or not finite.
+
+    Source: docs/mathematics.md, z-scores.
+    """
+    test = skewed_test(of_trials, expected) if expected is not None else None
+    if (
+        test is None
+        or of_trials is None
+        or expected is None
+        or max(abs(float(np.mean(of_trials))), abs(expected)) < rounding
+    ):
         return None
-    return (found - expected) / error
+    return test.z
+
+
+@dataclass(frozen=True)
+class MeanTest:
+    """A test on the mean of independent trials."""
+
+    statistic: float
+    """The distance of the mean from the number it is compared with, in standard errors."""
+    freedom: float
+    """Degrees of freedom of Student's t that this statistic follows."""
+
+    @property
+    def above(self) -> float:
+        """The p-value of the hypothesis that the mean is at most the number: small where it is above."""
+        return _student(self.freedom, -self.statistic)
+
+    @property
+    def below(self) -> float:
+        """The p-value of the hypothesis that the mean is at least the number: small where it is below."""
+        return _student(self.freedom, self.statistic)
+
+    @property
+    def z(self) -> float:
+        """The same as a standard normal number."""
+        from scipy.special import ndtri  # noqa: PLC0415 - 0.2 s that only a closing report needs
+
+        tail = max(min(self.above, self.below), _LEAST_TAIL)
+        return math.copysign(float(ndtri(tail)), self.statistic)
+
+
+def student_test(of_trials: Floats | None, number: float) -> MeanTest | None:
+    """Compare the mean of independent trials, (R,), with a number by Student's t.
+
+    None for fewer than two trials, for trials that are all equal, and for numbers that are not finite.
+    """
+    error = standard_error(of_trials)
+    if of_trials is None or not error:
+        return None
+    t = (float(np.mean(of_trials)) - number) / error
+    return MeanTest(t, len(of_trials) - 1.0) if math.isfinite(t) else None
+
+
+def skewed_test(of_trials: Floats | None, number: float) -> MeanTest | None:
+    """The same for trials whose distribution may be skewed and heavy-tailed, by Hall's transformation of t.
+
+    Source: docs/mathematics.md, z-scores.
+    """
+    test = student_test(of_trials, number)
+    if of_trials is None or test is None:
+        return None
+    t = test.statistic
+    count, a = len(of_trials), mean_skewness(of_trials)
+    kurtosis = float(np.mean(_standardised(of_trials) ** 4))
+    # Hall's transformation: t + a t²/3 + a² t³/27 + a/6, which grows with t.
+    statistic = t + a * t * t / 3.0 + a * a * t**3 / 27.0 + a / 6.0
+    return MeanTest(statistic, min(test.freedom, 2.0 * count / (max(kurtosis, 3.0) - 1.0)))
+
+
+def mean_skewness(of_trials: Floats) -> float:
+    """The skewness of the mean of independent trials, (R,), estimated from them; 0 for trials that are all equal."""
+    return float(np.mean(_standardised(of_trials) ** 3)) / math.sqrt(len(of_trials))
+
+
+def _standardised(of_trials: Floats) -> Floats:
+    """The distance of each trial from the mean in standard deviations, (R,)."""
+    mean, deviation = float(np.mean(of_trials)), float(np.std(of_trials))
+    return (of_trials - mean) / deviation if deviation > 0.0 else np.zeros(len(of_trials))
+
+
+def _student(freedom: float, t: float) -> float:
+    """The distribution function of Student's t."""
+    from scipy.special import stdtr  # noqa: PLC0415 - 0.2 s that only a closing report needs
+
+    return float(stdtr(freedom, t))
+
+
+_LEAST_TAIL = 1e-300

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 
-_SMALL_NUMBER, _LARGE_NUMBER, _LEAST_PLACE = 0.01, 1e5, -4  # beyond them estimates have exponents
+_SMALL_NUMBER, _LARGE_NUMBER, _LEAST_PLACE, _LAST_PLACE = 0.01, 1e5, -4, -6  # beyond them estimates have exponents
 _ROUNDING = 1e-12  # a standard error below this part of the estimate comes from the rounding of equal trials
 _MOST_DIGITS = 8  # significant digits of an estimate
+_LARGE_COUNT, _NEARLY_ALL = 1e7, 0.99
 
 
 def figure_text(value: float | None, how: str = ".4g") -> str:
@@ -17,6 +18,16 @@ def figure_text(value: float | None, how: str = ".4g") -> str:
 def finite_text(value: float, how: str = ".4g") -> str:
     """A number as text; ∞ for one that is not finite."""
     return format(value, how) if math.isfinite(value) else "∞"
+
+
+def count_text(number: float) -> str:
+    """A large number of trials as text: 12,345, or 1.2e12."""
+    return f"{number:,.0f}" if number < _LARGE_COUNT else _scientific(number, 1)
+
+
+def share_text(share: float) -> str:
+    """A share as a percentage of two digits; one that is nearly everything is more than 99 %."""
+    return f"{100 * share:.2g} %" if share < _NEARLY_ALL else "more than 99 %"
 
 
 def estimate(value: float | None, error: float | None, how: str = ".4g") -> str:
@@ -31,7 +42,9 @@ def estimate(value: float | None, error: float | None, how: str = ".4g") -> str:
     place = int(f"{error:.0e}".partition("e")[2])
     if value and math.floor(math.log10(abs(value))) - place >= _MOST_DIGITS:
         return f"{value:.{_MOST_DIGITS}g} ± {_scientific(error, 0)}"
-    if max(abs(value), error) < _LARGE_NUMBER and (place >= _LEAST_PLACE or abs(value) >= _SMALL_NUMBER):
+    if max(abs(value), error) < _LARGE_NUMBER and place >= (
+        _LEAST_PLACE if abs(value) < _SMALL_NUMBER else _LAST_PLACE
+    ):
         places = max(0, -place)
         return f"{value:.{places}f} ± {error:.{places}f}"
     digits = max(0, math.floor(math.log10(abs(value))) - place) if value else 0

@@ -79,7 +79,7 @@ class SplitMeans:
             "mean_error": self.errors.mean(axis=0).tolist(),
             "standard_error": (self.errors.std(axis=0, ddof=1) / np.sqrt(count)).tolist(),
         }
-        return RareEstimate(mean, error, z_of(mean, theory, error), *about, None, slots)
+        return RareEstimate(mean, error, z_of(found, theory), *about, None, slots)
 
 
 @final

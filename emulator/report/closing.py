@@ -9,12 +9,11 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 
 from evedrop.figures import columns, shown_figure, unloadable_figures
-from evedrop.figures.text import estimate, figure_text
+from evedrop.figures.text import count_text, estimate, figure_text, share_text
+from evedrop.model.theory.rare_events import RARE
 from evedrop.report.text_table import TextTable
 from evedrop.scenario.application import applications_in
 from evedrop.score.summary import RARE_SHARE, ControllerSummary, DirectionSummary, LinkSummary, PeerSummary, Summary
-
-_LARGE_COUNT = 1e7
 
 
 def amount(summary: Summary) -> str:
@@ -197,25 +196,22 @@ def _link_lines(links: Mapping[str, LinkSummary]) -> Iterator[str]:
 
 
 def _rare_lines(summary: Summary) -> Iterator[str]:
-    """A line for each receiver whose expected error is carried by events that may not occur in this many trials."""
+    """A line for each receiver whose expected error is carried by events that too few of the trials contain."""
     for name, peer in summary.peers.items():
         rare = peer.rare_events
         if rare is not None and rare.share > RARE_SHARE and summary.trials > 1:
-            enough = f"{_count(rare.trials)} trials" if math.isfinite(rare.trials) else "no number of trials"
+            split = peer.rare_estimate is not None
+            enough = f"{count_text(rare.trials)} trials" if math.isfinite(rare.trials) else "no number of trials"
             yield (
-                f"{name}: {100 * rare.share:.2g} % of its expected error is carried by {rare_events_words(summary.trials)}, so "
-                f"its mean and standard error are probably too small; {enough} would leave {100 * RARE_SHARE:.2g} %"
-                + ("; montecarlo --rare estimates it by splitting" if peer.rare_estimate is None else "")
+                f"{name}: {share_text(rare.share)} of its expected error is carried by {rare_events_words(summary.trials)}, so "
+                f"its mean over the trials is uncertain, probably too small{'' if split else ', and has no z'}; {enough} would "
+                f"leave {share_text(RARE_SHARE)}" + ("" if split else "; montecarlo --rare estimates it by splitting")
             )
 
 
 def rare_events_words(trials: int) -> str:
     """Events that are too rare for this number of trials."""
-    return f"events that occur less than once on average in {trials:,} trials"
-
-
-def _count(number: float) -> str:
-    return f"{number:,.0f}" if number < _LARGE_COUNT else f"{number:.1e}"
+    return f"events that are expected fewer than {RARE} times in {trials:,} trials"
 
 
 def application_lines(summary: Summary) -> Iterator[str]:

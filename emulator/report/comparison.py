@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from itertools import groupby
 from typing import TYPE_CHECKING
 
-from evedrop.figures.text import estimate, figure_text
+from evedrop.figures.text import estimate, figure_text, share_text
 from evedrop.report.closing import rare_events_words
 from evedrop.report.text_table import TextTable
 from evedrop.score.summary import RARE_SHARE
@@ -142,7 +142,7 @@ def _remarks(found: Comparison) -> Iterator[str]:
         name: max((_rare_share(cell.eavesdropper) for cell in one.cells.values()), default=0.0)
         for name, one in found.schemes.items()
     }
-    rare = [f"{name} up to {100 * share:.2g} %" for name, share in shares.items() if share > RARE_SHARE]
+    rare = [f"{name} up to {share_text(share)}" for name, share in shares.items() if share > RARE_SHARE]
     if rare:
         yield (
             f"{rare_events_words(found.trials)} carry a part of expected errors, whose means and standard errors are then "

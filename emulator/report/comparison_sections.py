@@ -102,9 +102,7 @@ class PairsSection(Section[ComparisonSource]):
     @classmethod
     def nodes(cls, of: ComparisonSource) -> Iterator[Node]:
         """The table that the terminal shows."""
-        yield html_table(
-            pairs_table(of.found), "Errors ± standard errors, with theory; z: by how many of them above theory"
-        )
+        yield html_table(pairs_table(of.found), "Errors ± standard errors, with theory; z: the z-score against theory")
 
 
 @final

@@ -77,7 +77,7 @@ class FiguresSection(Section[RunSource]):
         """The tables of the closing report."""
         yield html_table(
             closing.receivers_table(of.summary),
-            "Means over slots and trials ± standard errors. z: by how many standard errors the error is above theory.",
+            "Means over slots and trials ± standard errors. z: the z-score of the error against theory.",
         )
         if of.summary.directions:
             yield html_table(

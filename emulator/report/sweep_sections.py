@@ -144,7 +144,7 @@ class SweepFigures(Section[SweepSource]):
     def nodes(cls, of: SweepSource) -> Iterator[Node]:
         """The table that the terminal shows."""
         caption = (
-            "A row for each point and receiver: means ± standard errors; z: by how many of them the error is above theory; "
+            "A row for each point and receiver: means ± standard errors; z: the z-score of the error against theory; "
             "ratio: an eavesdropper's error over the legitimate one, in the second half of the run"
         )
         yield html_table(sweep_table(of.rows, tuple(of.grid)), caption)

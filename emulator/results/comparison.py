@@ -96,12 +96,16 @@ class Cell:
 
     @property
     def ratio(self) -> float | None:
-        """Eavesdropper's over legitimate error; of medians if either variance is infinite. None if the pair is not defined."""
-        if self.legitimate is None or self.eavesdropper is None:
+        """Eavesdropper's over legitimate error in the second half of the run. None if the pair is not defined.
+
+        Of medians over all slots if either variance is infinite.
+        """
+        if self.legitimate is None or self.eavesdropper is None or self.secrecy is None:
             return None
         one, two = self.legitimate, self.eavesdropper
-        medians = one.infinite_variance or two.infinite_variance
-        user, other = (each.quantiles["0.5"] if medians else each.mean for each in (one, two))
+        if not (one.infinite_variance or two.infinite_variance):
+            return self.secrecy.ratio
+        user, other = (each.quantiles["0.5"] for each in (one, two))
         return other / user if user else math.inf
 
     @property

@@ -41,28 +41,32 @@ def _comparison(found: Mapping[str, Any]) -> Comparison:
         int(found["seed"]),
         int(found["first_trial"]),
         tuple(found["adversaries"]),
-        {name: _scheme(name, one, int(found["trials"])) for name, one in found["schemes"].items()},
+        {
+            name: _scheme(name, one, (int(found["slots"]), int(found["trials"])))
+            for name, one in found["schemes"].items()
+        },
         {name: tuple(why) for name, why in found["left_out"].items()},
     )
 
 
-def _scheme(name: str, found: Mapping[str, Any], trials: int) -> SchemeResult:
+def _scheme(name: str, found: Mapping[str, Any], size: tuple[int, int]) -> SchemeResult:
     needs = {key: value for key, value in found["needs"].items() if key != "packet_bits"}
     return SchemeResult(
         name,
         found["parameters"],
         TypeAdapter(Needs).validate_python(needs),
         _error(found["legitimate"]),
-        {adversary: _cell(name, adversary, one, trials) for adversary, one in found["against"].items()},
+        {adversary: _cell(name, adversary, one, size) for adversary, one in found["against"].items()},
         None if found["leak"] is None else TypeAdapter(PacketLeak).validate_python(found["leak"]),
     )
 
 
-def _cell(scheme: str, adversary: str, found: Mapping[str, Any], trials: int) -> Cell:
+def _cell(scheme: str, adversary: str, found: Mapping[str, Any], size: tuple[int, int]) -> Cell:
     if "verdict" not in found:
         return Cell(Match(scheme, adversary, not_defined=found["not_defined"]))
     match = Match(scheme, adversary, found["reads_as"], found["attack"], betrayed=bool(found["betrayed"]))
     said = TypeAdapter(SecrecySummary).validate_python(found["secrecy"])
+    first = found["secrecy"]["ratio_from"]  # results of an older version have none, and are refused
     secrecy = Secrecy(
         match.receiver,
         Verdict(said.relative),
@@ -71,11 +75,12 @@ def _cell(scheme: str, adversary: str, found: Mapping[str, Any], trials: int) ->
         said.relative_from,
         "",
         said.perfect_by_theory,
-        math.nan if found["ratio"] is None else float(found["ratio"]),
-        trials,
+        math.inf if said.ratio is None else said.ratio,
+        size[1],
         said.judged_by,
-        ratio_error=found["ratio_standard_error"],
+        ratio_error=said.ratio_standard_error,
         leak=said.leak,
+        ratio_slots=None if first is None else (first, size[0] - 1),
     )
     return Cell(match, _error(found["legitimate"]), _error(found["eavesdropper"]), secrecy)
 

@@ -12,9 +12,10 @@ from dataclasses import replace
 import numpy as np
 
 from evedrop.expected.expectations import Expectation
-from evedrop.figures.standard_error import standard_error, z_of
+from evedrop.figures.standard_error import standard_error
 from evedrop.names import LEGITIMATE
-from evedrop.score.summary import DirectionSummary
+from evedrop.score.rare_events import rare_events_of, z_of_error
+from evedrop.score.summary import DirectionSummary, RareEvents
 from evedrop.score.sums import DirectionErrors, Tally, window_means
 from evedrop.score.verdict import Verdict, perfect_verdict, relative_verdict, sign_of_mean, sign_of_median
 
@@ -29,7 +30,7 @@ def directions_of(
         for name, errors in tally.directions.items():
             if not errors.done:
                 continue
-            one = _measured(errors, expected[receiver])
+            one = _measured(errors, expected[receiver], rare_events_of(expected[receiver], tally))
             if receiver != LEGITIMATE:
                 pair = (expected[LEGITIMATE], expected[receiver])
                 one = _judged(one, found[LEGITIMATE][name], (user.directions[name], errors), pair)
@@ -37,16 +38,15 @@ def directions_of(
     return found
 
 
-def _measured(errors: DirectionErrors, expected: Expectation) -> DirectionSummary:
-    """The error, and what theory knows of it."""
+def _measured(errors: DirectionErrors, expected: Expectation, rare: RareEvents | None) -> DirectionSummary:
+    """The error, and what theory knows of it; rare: the receiver's rare events."""
     means = errors.window_errors.sum(axis=0) / errors.done
     mean, series = float(np.mean(means)), None if expected.of_model else expected.along(errors.v, errors.done)
     scatter = None if expected.infinite_variance else standard_error(means)
     theory = None if series is None else float(np.mean(series))
     growth = None if expected.of_model else expected.growth
-    return DirectionSummary(
-        mean, scatter, theory, z_of(mean, theory, scatter), None if growth is None else growth.along(errors.v)
-    )
+    z = z_of_error(means, theory, expected, errors.done, rare)
+    return DirectionSummary(mean, scatter, theory, z, None if growth is None else growth.along(errors.v))
 
 
 def _judged(

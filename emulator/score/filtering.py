@@ -98,6 +98,7 @@ class FilterTally:
         mean_trace = mean if self.slots else None
         alike = all(self.slots * len(one) == self.count for one in self.of_trials.values())
         spread = {name: standard_error(one / self.slots) if alike else None for name, one in self.of_trials.items()}
-        error = spread.pop(SENSOR, None)
+        error, own_of_trials = spread.pop(SENSOR, None), self.of_trials.get(SENSOR)
+        z = z_of(own_of_trials / self.slots, mean_trace) if alike and self.slots and own_of_trials is not None else None
         of_mean = {"mean_squared_error": error, "mean_true_squared_errors": spread}
-        return FilterSummary(mean_trace, own, errors, of_mean, z_of(own, mean_trace, error))
+        return FilterSummary(mean_trace, own, errors, of_mean, z)

@@ -85,7 +85,7 @@ class LeakTally:
         total = float(self._expected[0])
         expected = None if math.isnan(total) else total / self.slots
         clear = float(np.mean(self._clear)) / self.slots
-        return LeakSummary(clear, bits, error, expected, z_of(bits, expected, error))
+        return LeakSummary(clear, bits, error, expected, z_of(means, expected))
 
 
 def leak_is_known(scenario: Scenario, receiver: str) -> bool:

@@ -15,7 +15,6 @@ import numpy as np
 from evedrop.expected.expectations import Expectation, ExpectedTraceStream, expectations_of
 from evedrop.figures import figures_of
 from evedrop.figures.figure import COVARIANCE_ONLY, ScoredSlots
-from evedrop.figures.standard_error import z_of
 from evedrop.model.digest import Digests, RunDigest, block_starts
 from evedrop.model.process import Floats
 from evedrop.names import CONTROLLER, LEGITIMATE
@@ -28,8 +27,9 @@ from evedrop.score.expectations_held import Evidence
 from evedrop.score.filtering import true_errors
 from evedrop.score.histogram import LEVELS
 from evedrop.score.leak import HeardBitsStream
+from evedrop.score.rare_events import rare_events_of, z_of_error
 from evedrop.score.slots import Slots
-from evedrop.score.summary import RARE_SHARE, PeerSummary, RareEvents, Summary, Surprising, Verification
+from evedrop.score.summary import PeerSummary, Summary, Surprising, Verification
 from evedrop.score.sums import SlotSums, Tally, slot_sums, squared_errors, trial_means
 from evedrop.score.totals import Totals
 from evedrop.score.verdict import Secrecy, secrecy
@@ -204,19 +204,15 @@ def _peer(name: str, tally: Tally, expected: Expectation, digest: str | None, mo
             meaningless = found is None or (one.of_error and infinite_variance)
             errors[figure] = None if meaningless else tally.standard_error(figure)
     known, comparable = {**figures, **of_mode}, not expected.of_model or mode == COVARIANCE_ONLY
+    rare = rare_events_of(expected, tally) if comparable else None
     z = {
-        figure: z_of(known[figure], known[one.expected], errors[figure]) if comparable else None
+        figure: z_of_error(tally.of_trials(figure), known[one.expected], expected, tally.done, rare)
+        if comparable and known[figure] is not None
+        else None
         for figure, one in figures_of(name).items()
         if one.expected is not None and figure in errors
     }
-    rare = rare_events_of(expected, tally) if comparable else None
     return PeerSummary(figures, _quantiles(tally), infinite_variance, digest, of_mode, errors, z, rare)
-
-
-def rare_events_of(expected: Expectation, tally: Tally) -> RareEvents | None:
-    """The rare events of a receiver over the slots so far; None if they are unknown."""
-    streaks = expected.streaks(tally.done) if tally.alike else None
-    return None if streaks is None else RareEvents(streaks.share(tally.trials), streaks.trials_for(RARE_SHARE))
 
 
 def _quantiles(tally: Tally) -> dict[str, float] | None:

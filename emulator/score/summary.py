@@ -29,8 +29,8 @@ Found = float | int | str | None
 
 StandardErrors = Mapping[str, float | Mapping[str, float | None] | None]
 """Figure → its standard error, None if it has none; for figures by name, such as those of receivers, a further mapping."""
-RARE_SHARE = 0.01
-"""The share of an expected error that rare events may carry without being reported."""
+RARE_SHARE = 0.1
+"""The share of an expected error that rare events may carry without being reported; beyond it, a mean error has no z-score."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class RareEvents:
     """The events that carry a receiver's expected error, but that too few trials meet."""
 
     share: float
-    """The share of the expected error that comes from events that are expected less than once in all trials."""
+    """The share of the expected error that comes from events that are expected fewer than 20 times in all trials."""
     trials: float
     """The number of trials for which this share would be RARE_SHARE."""
 
@@ -51,7 +51,7 @@ class RareEstimate:
     """None: not to be trusted, for the reason in `doubt`."""
     standard_error: float | None
     z: float | None
-    """How many standard errors it is above its expectation by theory; None if that is unknown."""
+    """Its z-score against its expectation by theory; None if that is unknown."""
     populations: int
     trials: int
     """The trials of each population."""
@@ -78,7 +78,7 @@ class PeerSummary(BuiltInFigures):
     standard_errors: Mapping[str, float | None] = field(default_factory=dict)
     """Name of a figure → its standard error, for figures that are estimated; None if it has none."""
     z: Mapping[str, float | None] = field(default_factory=dict)
-    """Name of a figure that theory expects → how many standard errors it is above its expectation; None if that is unknown."""
+    """Name of a figure that theory expects → its z-score; None if that is unknown, or rare events carry too much of it."""
     rare_events: RareEvents | None = None
     """None: unknown."""
     rare_estimate: RareEstimate | None = None
@@ -147,7 +147,7 @@ class LeakSummary:
     expected_bits: float | None
     """Theory: `bits` over the same slots; None if theory does not cover the link."""
     z: float | None
-    """How many standard errors `bits` is above `expected_bits`."""
+    """The z-score of `bits` against `expected_bits`."""
 
     @property
     def text(self) -> str:
@@ -167,6 +167,11 @@ class SecrecySummary:
     perfect_by_theory: bool | None
     judged_by: str
     sentence: str
+    ratio: float | None = None
+    """Mean error over the slots from `ratio_from` on, eavesdropper's over legitimate; None if it is not finite."""
+    ratio_standard_error: float | None = None
+    ratio_from: int | None = None
+    """The first slot of the second half of the run, so that the start does not count."""
     leak: LeakSummary | None = None
     """None: unknown, or not measured in this mode."""
 
@@ -182,7 +187,7 @@ class DirectionSummary:
     expected: float | None
     """Theory: the same over the same slots; None if it is unknown."""
     z: float | None
-    """How many standard errors `mean_squared_error` is above `expected`."""
+    """The z-score of `mean_squared_error` against `expected`; None as in `PeerSummary`."""
     unbounded: bool | None
     """Theory: whether the error grows without bound; None if it is unknown."""
     relative: str | None = None
@@ -231,7 +236,7 @@ class FilterSummary:
     mean_true_squared_errors: Mapping[str, float]
     standard_errors: StandardErrors = field(default_factory=dict)
     z: float | None = None
-    """How many standard errors `mean_squared_error` is above its expectation, `mean_trace_covariance`."""
+    """The z-score of `mean_squared_error` against its expectation, `mean_trace_covariance`."""
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,16 @@ from enum import StrEnum
 
 import numpy as np
 
-from evedrop.expected.expectations import Expectation
-from evedrop.figures.standard_error import ratio_error
-from evedrop.figures.text import estimate
+from evedrop.expected.expectations import Expectation, ExpectedTraceStream
+from evedrop.figures.standard_error import ratio_error, skewed_test, student_test
+from evedrop.figures.text import count_text, estimate
 from evedrop.model.parts_of_runs import parts_of
 from evedrop.model.process import Floats
-from evedrop.score.summary import LeakSummary, SecrecySummary
-from evedrop.score.sums import WINDOWS, Tally, trial_means, window_bounds, window_means
+from evedrop.model.theory.covariances import NOBODY, ExpectedCovariance
+from evedrop.names import LEGITIMATE
+from evedrop.score.rare_events import rare_events_of
+from evedrop.score.summary import RARE_SHARE, LeakSummary, SecrecySummary
+from evedrop.score.sums import WINDOWS, Tally, window_bounds, window_means, window_of
 
 ERROR_RATE = 0.01
 """Of a verdict: how often `held`, or `failed`, may be said in error."""
@@ -49,7 +52,7 @@ class Secrecy:
     perfect_by_theory: bool | None
     """J bounded and J_e not; None where theory makes no statement."""
     ratio: float
-    """Mean error, eavesdropper's over legitimate; NaN before the first slot."""
+    """Mean error over the slots from `ratio_from` on, eavesdropper's over legitimate; NaN before the first slot."""
     trials: int
     judged_by: str
     """`mean` over trials, or `median` where an error has infinite variance, so that a mean is not meaningful."""
@@ -61,6 +64,10 @@ class Secrecy:
     """The leak of its packets; None where that is unknown."""
     has_bound: bool = True
     """Whether a bound of the legitimate error is known, against which the run was tested."""
+    ratio_slots: tuple[int, int] | None = None
+    """The first and the last slot over which the ratio is taken; None before the first slot."""
+    missing: str = ""
+    """What the trials lack for a verdict, as the end of a sentence; empty where more of them would simply scatter less."""
 
     @property
     def summary(self) -> SecrecySummary:
@@ -73,6 +80,9 @@ class Secrecy:
             perfect_by_theory=self.perfect_by_theory,
             judged_by=self.judged_by,
             sentence=self.sentence,
+            ratio=self.ratio if math.isfinite(self.ratio) else None,
+            ratio_standard_error=self.ratio_error,
+            ratio_from=None if self.ratio_slots is None else self.ratio_slots[0],
             leak=self.leak,
         )
 
@@ -88,11 +98,12 @@ class Secrecy:
         if math.isnan(self.ratio):
             return f"{self.eavesdropper}: nothing was measured; {promise}"
         times = "∞" if math.isinf(self.ratio) else estimate(self.ratio, self.ratio_error, ".3g")
+        over = "" if self.ratio_slots is None else " in slots {} to {}".format(*self.ratio_slots)
         where = f" in slots {self.windows}" if self.windows else ""
         run = {
             Verdict.HELD: "relative secrecy held in every window of this run",
             Verdict.FAILED: f"relative secrecy failed in this run{where}",
-            Verdict.UNDECIDED: f"{self.trials} trials are too few to decide{where}"
+            Verdict.UNDECIDED: f"{self.trials:,} trials are too few to decide{where}{self.missing}"
             if self.trials > 1
             else "one trial is not enough for a verdict (try --trials 200)",
         }[self.relative]
@@ -101,7 +112,7 @@ class Secrecy:
             run = f"perfect secrecy held in this run: its error grew while the legitimate one {legitimate}"
         if self.judged_by == "median" and self.trials > 1:
             run += " (judged by medians, because the variance is infinite)"
-        return f"{self.eavesdropper}: {times} × the legitimate error; {run}; {promise}"
+        return f"{self.eavesdropper}: {times} × the legitimate error{over}; {run}; {promise}"
 
 
 @dataclass(frozen=True)
@@ -121,15 +132,18 @@ _PROMISED_SLOTS = 10_000  # for which theory is computed at least
 
 
 def sign_of_mean(samples: Floats) -> SignTest:
-    """Tests on the mean of samples (R,), by Student's t."""
-    from scipy.special import stdtr  # noqa: PLC0415 - 0.2 s that only a verdict needs
+    """Tests on the mean of samples (R,), by Student's t and by the same corrected for skewness: the larger p-value counts.
 
-    count, mean = len(samples), float(np.mean(samples))
-    if count < 2 or mean == 0.0:
+    Source: docs/mathematics.md, verdicts.
+    """
+    tests = student_test(samples, 0.0), skewed_test(samples, 0.0)
+    known = [test for test in tests if test is not None]
+    if known:
+        return SignTest(max(test.above for test in known), max(test.below for test in known))
+    mean = float(np.mean(samples))
+    if len(samples) < 2 or mean == 0.0 or not math.isfinite(mean):
         return _NOTHING
-    error = float(np.std(samples, ddof=1)) / math.sqrt(count)
-    t = mean / error if error else math.copysign(math.inf, mean)
-    return SignTest(float(stdtr(count - 1, -t)), float(stdtr(count - 1, t)))
+    return SignTest(0.0, 1.0) if mean > 0.0 else SignTest(1.0, 0.0)  # all equal
 
 
 def sign_of_median(samples: Floats) -> SignTest:
@@ -154,15 +168,22 @@ def rejected(p_values: Mapping[int, float]) -> list[int]:
     return sorted(found)
 
 
-def relative_verdict(difference: Floats, test: SignTestOf, slots: int) -> tuple[Verdict, str]:
+def relative_verdict(
+    difference: Floats, test: SignTestOf, slots: int, least: Floats | None = None, most: Floats | None = None
+) -> tuple[Verdict, str]:
     """The verdict on relative secrecy, and the slots in which it failed or is undecided, empty if in all.
 
     difference: the eavesdropper's mean error less the legitimate one, by window and trial, (WINDOWS, R). One window fails the
     claim, so the windows share the error rate. All windows must support it, so that each may have the whole rate.
+
+    least, most: the same difference from the largest mean that the legitimate error may have, and that the eavesdropper's may
+    have: `held` must hold of the first of them as well, and `failed` of the second. None: these are the means of the trials.
     """
-    tests = {w: test(row) for w, row in enumerate(difference) if not np.isnan(row).any()}
-    failed = rejected({window: one.below for window, one in tests.items()})
-    doubtful = [window for window, one in tests.items() if one.above > ERROR_RATE]
+    least, most = (difference if each is None else each for each in (least, most))
+    known = [w for w, row in enumerate(difference) if not np.isnan(row).any()]
+    tests = {w: test(difference[w]) for w in known}
+    failed = rejected({w: max(tests[w].below, test(most[w]).below) for w in known})
+    doubtful = [w for w in known if max(tests[w].above, test(least[w]).above) > ERROR_RATE]
     if failed:
         return Verdict.FAILED, _slots_of(failed, slots)
     if doubtful or not tests:
@@ -216,18 +237,24 @@ def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tall
     user_means, other_means = window_means(user), window_means(other)
     heavy = user_theory.infinite_variance or other_theory.infinite_variance
     test = sign_of_median if heavy else sign_of_mean
-    relative, windows = Verdict.UNDECIDED, ""
+    relative, windows, missing = Verdict.UNDECIDED, "", ""
     if complete:
-        relative, windows = relative_verdict(other_means - user_means, test, slots)
+        difference = other_means - user_means
+        relative, windows = relative_verdict(difference, test, slots)
+        if not heavy and relative is not Verdict.UNDECIDED:
+            least = other_means - largest_means(user_theory, user_means, slots)
+            most = largest_means(other_theory, other_means, slots) - user_means
+            plain, (relative, windows) = relative, relative_verdict(difference, test, slots, least, most)
+            if relative is Verdict.UNDECIDED:
+                in_doubt = (LEGITIMATE, user, user_theory) if plain is Verdict.HELD else (name, other, other_theory)
+                missing = _missing(*in_doubt)
     if not user_theory.has_limit:
         perfect = Verdict.UNDECIDED
     elif perfect_by_theory is False:
         perfect = Verdict.FAILED
     else:
         perfect = perfect_verdict(other_means, user_means, user_bound, test) if complete else Verdict.UNDECIDED
-    ratio = other.error / user.error if user.error else math.inf if user.done else math.nan
-    scattered = not heavy and user.alike and other.alike
-    scatter = ratio_error(trial_means(other), trial_means(user)) if scattered else None
+    ratio, scatter, ratio_slots = ratio_of(user, other, user_theory.rounding(user.done) if user.done else 0.0)
     return Secrecy(
         name,
         relative,
@@ -240,10 +267,79 @@ def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tall
         user.trials,
         "median" if heavy else "mean",
         unknown=_unknown(other_theory),
-        ratio_error=scatter,
+        ratio_error=None if heavy else scatter,
         leak=None if other.leak is None else other.leak.summary,
         has_bound=math.isfinite(user_bound),
+        ratio_slots=ratio_slots,
+        missing=missing,
     )
+
+
+def ratio_of(user: Tally, other: Tally, rounding: float) -> tuple[float, float | None, tuple[int, int] | None]:
+    """The ratio of two mean errors, the eavesdropper's over the legitimate one, its standard error, and its slots.
+
+    rounding: a smaller legitimate error is only rounding, and the ratio infinite.
+
+    Over the second half of the run, so that the start, in which few packets decide, does not count; over all slots of a run
+    that was cut short or is not longer than its first half. NaN without slots.
+    """
+    if not user.done:
+        return math.nan, None, None
+    first = int(window_bounds(user.slots)[WINDOWS // 2])
+    if user.done == other.done == user.slots and first < user.slots:
+        theirs, ours = (one.window_errors[WINDOWS // 2 : WINDOWS].sum(axis=0) for one in (other, user))
+    else:
+        first, (theirs, ours) = 0, (one.window_errors.sum(axis=0) for one in (other, user))
+    over, under = float(np.mean(theirs)), float(np.mean(ours))
+    alike = user.alike and other.alike
+    slots = (first, user.done - 1)
+    if under <= rounding * (slots[1] + 1 - first) or not under:
+        return math.inf, None, slots
+    return over / under, ratio_error(theirs, ours) if alike else None, slots
+
+
+def largest_means(theory: Expectation, means: Floats, slots: int) -> Floats:
+    """What a receiver's mean errors by window may be, given those of the trials, (WINDOWS, R): (WINDOWS, 1).
+
+    Theory's expectation where it is known. Where theory only knows a model of what moves the states, the mean of the trials and
+    what rare events carry of the model's expectation. Otherwise what an event that none of R trials met may add to their mean:
+    it has a probability of at most 4.6/R, or one of them would have met it in 99 of 100 studies, and then the error is at most
+    that of a receiver without packets, or that of the heaviest trial.
+
+    Source: docs/mathematics.md, verdicts.
+    """
+    trials = means.shape[1]
+    if theory.known:
+        expected = _window_averages(theory.stream(), slots)
+        if not theory.of_model:
+            return expected
+        streaks = theory.streaks(slots)
+        rare = 1.0 if streaks is None else streaks.share(trials)
+        return np.asarray(means.mean(axis=1, keepdims=True) + rare * expected)
+    deaf = _window_averages(ExpectedCovariance(theory.process, NOBODY), slots)
+    heaviest = np.maximum(deaf, means.max(axis=1, keepdims=True))
+    return np.asarray(means.mean(axis=1, keepdims=True) - math.log(ERROR_RATE) / trials * heaviest)
+
+
+def _window_averages(stream: ExpectedTraceStream, slots: int) -> Floats:
+    """The mean of expected traces over the slots of each window, (WINDOWS, 1); NaN for windows without slots."""
+    sums = np.zeros(WINDOWS + 1)
+    for part in parts_of(range(slots)):
+        np.add.at(sums, window_of(np.arange(part.start, part.stop), slots), stream.next_traces(len(part)))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        averages: Floats = (sums[:WINDOWS] / np.diff(window_bounds(slots)))[:, None]
+    return averages
+
+
+def _missing(name: str, tally: Tally, theory: Expectation) -> str:
+    """What the trials lack for a verdict that they would otherwise support, as the end of a sentence."""
+    if not theory.known:
+        return f": no closed form bounds the error of {name} in events that none of them met"
+    rare = rare_events_of(theory, tally)
+    ways = "montecarlo --rare estimates its mean"
+    if rare is not None and rare.share > RARE_SHARE and math.isfinite(rare.trials):
+        ways = f"{count_text(rare.trials)} trials would contain them, and {ways}"
+    return f": theory expects a larger error of {name}, which rare events carry; {ways}"
 
 
 def _unknown(theory: Expectation) -> str:

@@ -21,7 +21,7 @@ import numpy as np
 from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.expected.expectations import Expectation, expectations_of
 from evedrop.figures.errors import MeanSquaredError
-from evedrop.figures.standard_error import standard_error, z_of
+from evedrop.figures.standard_error import standard_error
 from evedrop.memory.montecarlo import Merger, Plan, disk_errors, teller
 from evedrop.memory.packet_counts import PacketCounts
 from evedrop.memory.simulation import Mode
@@ -35,7 +35,8 @@ from evedrop.results.resolved_scenario import input_texts, resolved
 from evedrop.scenario import Scenario
 from evedrop.score.histogram import LEVELS
 from evedrop.score.leak import revealed_by_packets
-from evedrop.score.scorekeeper import rare_events_of, verdicts
+from evedrop.score.rare_events import rare_events_of, z_of_error
+from evedrop.score.scorekeeper import verdicts
 from evedrop.score.sums import Tally, trial_means
 from evedrop.signals import stop_on_signals
 from evedrop.studies.matchups import Group, Matchups
@@ -176,14 +177,16 @@ def _measured(scenario: Scenario, receiver: str, tally: Tally, expected: Expecta
     heavy = expected.infinite_variance
     error = None if heavy else standard_error(means)
     mean, theory = MeanSquaredError.of_totals(tally), _theory(scenario, receiver, expected)
+    rare = None if expected.of_model else rare_events_of(expected, tally)
+    exact = None if theory is None or theory.bound or expected.of_model else theory.mean
     return SimulatedError(
         mean,
         error,
         {f"{level:g}": float(np.quantile(means, level)) for level in LEVELS},
         heavy,
         theory,
-        None if theory is None or theory.bound or expected.of_model else z_of(mean, theory.mean, error),
-        None if expected.of_model else rare_events_of(expected, tally),
+        z_of_error(means, exact, expected, tally.done, rare),
+        rare,
     )
 
 

@@ -14,25 +14,20 @@ from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from evedrop.errors import Interrupted, RunError, ScenarioError, UsageError
 from evedrop.figures import all_figures, error_column, estimated_figures, z_column
-from evedrop.figures.standard_error import ratio_error
 from evedrop.loading import prepared, value_of
 from evedrop.memory.montecarlo import Merger, Plan, check_mode, disk_errors, teller
 from evedrop.memory.trials import BatchResult, tasks_of
-from evedrop.names import LEGITIMATE
 from evedrop.news import Tell
 from evedrop.results.folder import new_folder, private_pictures, private_replacement, write_private
 from evedrop.scenario import Scenario
 from evedrop.scenario.application import APPLICATIONS
 from evedrop.score.scorekeeper import Ending
 from evedrop.score.summary import Summary
-from evedrop.score.sums import WINDOWS, window_bounds
-from evedrop.score.totals import Totals
 from evedrop.signals import stop_on_signals
 
 Grid = Mapping[str, Sequence[Any]]
@@ -40,7 +35,6 @@ Point = Mapping[str, Any]
 
 MOST_POINTS = 10_000
 """The most combinations of values."""
-_NO_ERROR = 1e-12  # a legitimate error is rounding if it is smaller, relative to the eavesdropper's
 _WRITE_SECONDS = 3.0  # from one table of the points so far to the next
 _RANGE = re.compile(r"[^\[\]{}\"',]*:[^\[\]{}\"',]*")  # a colon, and no character of a list or string
 _WHOLE = re.compile(r"[+-]?\d+")
@@ -119,10 +113,10 @@ def sweep_over(
                 written = time.monotonic()
                 try:
                     for (point, scenario), its_tasks in zip(scenarios, tasks, strict=True):
-                        measured = _measured(scenario, plan, itertools.islice(results, len(its_tasks)))
-                        if measured is None:
+                        summary = _summary(scenario, plan, itertools.islice(results, len(its_tasks)))
+                        if summary is None:
                             break
-                        rows += _rows(point, scenario, *measured)
+                        rows += _rows(point, scenario, summary)
                         done += 1
                         if time.monotonic() - written > _WRITE_SECONDS:
                             _write_table(folder, rows)
@@ -158,8 +152,8 @@ def _draw(folder: Path, table: pa.Table, grid: Grid, applications: Iterable[str]
         APPLICATIONS[name].draw_sweep(private_pictures(folder / name), table, next(iter(grid)))
 
 
-def _measured(scenario: Scenario, plan: Plan, results: Iterator[BatchResult]) -> tuple[Summary, Totals] | None:
-    """The summary of a point, and its totals; None if it was interrupted."""
+def _summary(scenario: Scenario, plan: Plan, results: Iterator[BatchResult]) -> Summary | None:
+    """The summary of a point; None if it was interrupted."""
     started = time.monotonic()
     merger = Merger(scenario, plan.mode)
     for result in results:
@@ -170,7 +164,7 @@ def _measured(scenario: Scenario, plan: Plan, results: Iterator[BatchResult]) ->
     summary = merger.summary(ending)
     if summary.ended != ending.how:  # a figure failed
         raise RunError(summary.ended)
-    return summary, merger.totals
+    return summary
 
 
 def _checked(
@@ -197,22 +191,7 @@ def _title(source: str | Path | Scenario) -> str:
     return source.title if isinstance(source, Scenario) else str(source)
 
 
-def _ratio(scenario: Scenario, summary: Summary, totals: Totals, name: str) -> dict[str, float | None]:
-    """The columns of an eavesdropper's error over the legitimate one in the second half of the run, after the transient."""
-    first = int(window_bounds(scenario.slots)[WINDOWS // 2])
-    found: dict[str, float | None] = {"ratio": None, "ratio_standard_error": None, "ratio_from": None}
-    if name not in scenario.eavesdroppers or first >= scenario.slots:
-        return found
-    theirs, ours = (totals.tallies[one].window_errors[WINDOWS // 2 : WINDOWS].sum(axis=0) for one in (name, LEGITIMATE))
-    over, under = float(np.mean(theirs)), float(np.mean(ours))
-    if not math.isfinite(over) or under <= _NO_ERROR * over:
-        return {**found, "ratio_from": first}
-    heavy = summary.peers[name].infinite_variance or summary.peers[LEGITIMATE].infinite_variance
-    scatter = None if heavy else ratio_error(theirs, ours)
-    return {"ratio": over / under, "ratio_standard_error": scatter, "ratio_from": first}
-
-
-def _rows(point: Point, scenario: Scenario, summary: Summary, totals: Totals) -> Iterator[dict[str, Any]]:
+def _rows(point: Point, scenario: Scenario, summary: Summary) -> Iterator[dict[str, Any]]:
     """A row for each peer: the point, the figures, the verdict."""
     for name, peer in summary.peers.items():
         verdict = summary.secrecy.get(name)
@@ -233,7 +212,9 @@ def _rows(point: Point, scenario: Scenario, summary: Summary, totals: Totals) ->
                 for application, entry in summary.applications.items()
                 for column, value in APPLICATIONS[application].sweep_columns(entry, name).items()
             },
-            **_ratio(scenario, summary, totals, name),
+            "ratio": None if verdict is None else verdict.ratio,
+            "ratio_standard_error": None if verdict is None else verdict.ratio_standard_error,
+            "ratio_from": None if verdict is None else verdict.ratio_from,
             "relative_secrecy": None if verdict is None else verdict.relative,
             "perfect_secrecy": None if verdict is None else verdict.perfect,
             "digest": peer.digest,

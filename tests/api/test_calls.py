@@ -177,7 +177,7 @@ def test_a_table_in_a_notebook_has_the_cautions_of_the_terminal(results: RunResu
     html = RunResults(results.folder, changed)._repr_html_()
     assert f"{results.folder}: a process died" in html
     assert (
-        "smart: 50 % of its expected error is carried by events that occur less than once on average in 4 trials"
+        "smart: 50 % of its expected error is carried by events that are expected fewer than 20 times in 4 trials"
         in html
     )
 

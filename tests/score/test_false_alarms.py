@@ -87,4 +87,4 @@ def test_held_is_said_in_error_no_more_often_than_promised(studies: int) -> None
     samples[:, 1:] += 1.0
     found = counted([relative_verdict(one, sign_of_mean, SLOTS)[0] for one in samples])
     assert 0 < found[Verdict.HELD] <= most(studies)
-    assert found[Verdict.FAILED] == 0
+    assert found[Verdict.FAILED] <= binom.ppf(1.0 - SURE, studies, ERROR_RATE / WINDOWS)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from evedrop.api import compare, montecarlo
+from evedrop.figures.standard_error import z_of
 from evedrop.loading import load
 from evedrop.memory.montecarlo import Plan
 from evedrop.memory.simulation import Mode
@@ -42,7 +43,7 @@ def test_the_bits_of_a_run_are_those_of_its_innovations(tmp_path: Path) -> None:
     assert leak["clear_fraction"] == pytest.approx(clear / 40 / 120, rel=1e-12)
     mu_e, mu_d = scenario.quality["smart"], scenario.encoding.mu_d
     assert leak["expected_bits"] == pytest.approx(mu_e * (1.0 - mu_d) * bits.mean(), rel=1e-12)
-    assert leak["z"] == pytest.approx((leak["bits"] - leak["expected_bits"]) / leak["standard_error"])
+    assert leak["z"] == pytest.approx(z_of(total / 120, leak["expected_bits"]), rel=1e-6)
     assert abs(leak["z"]) < 4.5
 
 

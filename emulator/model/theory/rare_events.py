@@ -29,6 +29,8 @@ from evedrop.model.theory.covariances import (
 
 LARGEST_RUN = 2**22
 """The most numbers, slots × n², in the covariances of a run for which the streaks of a misled receiver are computed."""
+RARE = 20
+"""Events that are expected less often than this in all trials are rare: their number, and with it a mean, is too uncertain."""
 REST = 1e-9
 """The share of the expectation that is left out, in the longest streaks."""
 
@@ -46,10 +48,10 @@ class Streaks:
     """Σ_k tr E P_k."""
 
     def share(self, trials: int) -> float:
-        """The share of the expectation in slots that fewer than one streak of all trials is expected to reach, 0 … 1."""
+        """The share of the expectation in slots that fewer than RARE streaks of all trials are expected to reach, 0 … 1."""
         if self.total == 0.0:
             return 0.0
-        met = float(self.carried[self.number * trials >= 1.0].sum()) / self.total
+        met = float(self.carried[self.number * trials >= RARE].sum()) / self.total
         return 1.0 - met if met < 1.0 - REST else 0.0
 
     def trials_for(self, share: float) -> float:
@@ -60,7 +62,7 @@ class Streaks:
         met = np.cumsum(self.carried.reshape(-1)[order])
         last = int(np.searchsorted(met, (1.0 - share) * self.total))
         number = float(self.number.reshape(-1)[order[min(last, len(order) - 1)]])
-        return max(1.0, float(np.ceil(1.0 / number))) if number > 0.0 else math.inf
+        return max(1.0, float(np.ceil(RARE / number))) if number > 0.0 else math.inf
 
 
 @np.errstate(over="ignore", invalid="ignore")
