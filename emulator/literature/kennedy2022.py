@@ -21,6 +21,7 @@ class Kennedy2022(Paper):
     title = "Innovation-Based Remote State Estimation Secrecy with no Acknowledgments"
     authors = "J. M. Kennedy, J. J. Ford, D. E. Quevedo, F. Dressler"
     published = "arXiv 2212.08234, 2022"
+    text_read = True
 
     def rows(self, quick: bool, progress: Progress) -> Iterator[PublishedNumber]:  # noqa: ARG002 - there is nothing to shorten
         """The numbers of the numerical illustration and of the microgrid; `evedrop figures` draws their figures."""

@@ -164,7 +164,7 @@ def _by_quantiles(one: _Published, runs: Floats) -> Iterator[PublishedNumber]:
         )
         verdict = NumberVerdict.NOT_COMPARABLE
         if name == "user":
-            verdict = NumberVerdict.ERRATUM
+            verdict = NumberVerdict.PROGRAM
             reason += "; they chose the policy so that this error is 2, but its mean settles nowhere"
         what = f"{name}, unstable A, {one.policy}, μ_e = {mu_e}"
         yield PublishedNumber.stated("solve_optim.py", what, theirs, math.inf, verdict, reason)

@@ -22,6 +22,8 @@ class Paper(ABC):
     authors: ClassVar[str]
     published: ClassVar[str]
     """Where and when, and where its code is if it is public."""
+    text_read: ClassVar[bool] = False
+    """Whether we have read the text of the paper; without it, no number of it has the verdict `erratum`."""
 
     @abstractmethod
     def rows(self, quick: bool, progress: Progress) -> Iterable[PublishedNumber]:

@@ -20,11 +20,13 @@ class NumberVerdict(StrEnum):
     """What the comparison of one number says."""
 
     AGREES = "agrees"
-    """The paper prints the number, and the difference is within the tolerance."""
+    """The number is published, and the difference is within the tolerance."""
     FORMULA = "formula"
-    """The paper prints no number: ours, by simulation, is within the tolerance of our own evaluation of its formula."""
+    """No number is published: ours, by simulation, is within the tolerance of our own evaluation of its formula."""
     ERRATUM = "erratum"
-    """The difference is larger, and the reason says why the paper is wrong."""
+    """The difference is larger, and the reason says why the paper, whose text we have read, is wrong."""
+    PROGRAM = "program differs"
+    """The number is that of a published program whose paper we have not read; the reason says why ours is another."""
     NOT_PUBLIC = "not public"
     """The data needed to compute or to compare the number is not published."""
     NOT_COMPARABLE = "not comparable"
@@ -51,12 +53,12 @@ class PublishedNumber:
     reason: str = ""
     """A sentence, for every verdict but `agrees`, `formula` and `differs`."""
     printed: bool = True
-    """Whether the paper prints `theirs`; otherwise it is our own evaluation of the paper's formula."""
+    """Whether `theirs` is published, in the paper, its slides or its program; otherwise it is our evaluation of a formula."""
 
     @property
     def compares_print(self) -> bool:
-        """Whether a number that the paper prints was compared with ours."""
-        decided = {NumberVerdict.AGREES, NumberVerdict.ERRATUM, NumberVerdict.DIFFERS}
+        """Whether a published number was compared with ours."""
+        decided = {NumberVerdict.AGREES, NumberVerdict.ERRATUM, NumberVerdict.PROGRAM, NumberVerdict.DIFFERS}
         return self.printed and self.theirs is not None and self.verdict in decided
 
     @classmethod
@@ -164,18 +166,16 @@ class Reproduction:
 
     @property
     def printed_compared(self) -> int:
-        """How many numbers that the paper prints were compared with ours."""
+        """How many published numbers were compared with ours."""
         return sum(row.compares_print for row in self.rows)
 
     @property
     def scope(self) -> str:
-        """How many of the paper's own numbers were compared, as a sentence."""
+        """How many published numbers were compared, as a sentence."""
         count = self.printed_compared
         if not count:
-            return "No number that the paper prints was compared: none was available."
-        return (
-            f"{count} number{' that the paper prints was' if count == 1 else 's that the paper prints were'} compared."
-        )
+            return "No published number was compared: none was available."
+        return f"{count} published {'number was' if count == 1 else 'numbers were'} compared."
 
     def as_dict(self) -> dict[str, Any]:
         """The content of `NAME.json`."""

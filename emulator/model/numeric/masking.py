@@ -1,4 +1,4 @@
-"""A one-time pad for numbers: a masked number looks like a random number of its range, whatever its value is.
+"""Pads for numbers: with ideal pads a masked number is a random number of its range, whatever its value is.
 
 Source: docs/mathematics.md, masking.
 """

@@ -70,7 +70,7 @@ class DitheredQuantiser:
 
 @final
 class LevelPad:
-    """A one-time pad for levels: a masked level is uniform, whatever the level is."""
+    """Pads for levels: with ideal pads a masked level is uniform, whatever the level is."""
 
     def __init__(self, n: int, bits: int, key: bytes, batch: Batch) -> None:
         self._most = 2**bits - 1

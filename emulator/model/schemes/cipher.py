@@ -1,4 +1,4 @@
-"""Stream cipher: every packet is the state under a one-time pad that only sensor and estimator can draw."""
+"""Stream cipher: every packet is the state under a pad that only sensor and estimator can draw, which the model takes as ideal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Partial encryption: some states of every state packet under a one-time pad, the others and all innovations in clear."""
+"""Partial encryption: some states of every state packet under a pad, as by `cipher`, the others and all innovations in clear."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from evedrop.model.theory.quantisation import QuantisationError
 def twin_track_bound(process: Process, slots: int) -> Floats:
     """½ tr A^k Σ0 A^kᵀ for k = 0 … slots−1, (slots,): a lower bound on the squared error of any eavesdropper of twin tracks.
 
-    Holds for μ_e = 1 and unlimited means, without knowledge of coin and starts. inf once it overflows.
+    Holds for μ_e = 1, without knowledge of coin and starts, which the model takes as ideal random numbers. inf once it overflows.
 
     Source: docs/mathematics.md, twin track.
     """
