@@ -1,4 +1,4 @@
-"""Stream cipher: every packet is the state under a pad that only sensor and estimator can draw, which the model takes as ideal."""
+"""Stream cipher: every packet is the state under a pad that only sensor and estimator can draw; the model takes it for ideal."""
 
 from __future__ import annotations
 
