@@ -64,6 +64,14 @@ def test_every_option_that_the_code_names_is_one() -> None:
         assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", text)) <= known, source
 
 
+@pytest.mark.parametrize("page", PAGES)
+def test_a_page_that_names_a_file_of_the_program_says_where_it_is(page: str) -> None:
+    """In the repository: in an installed package the folder has another name."""
+    text = " ".join((DOCS / page).read_text(encoding="utf-8").split())
+    if re.search(r"`emulator/", text):
+        assert re.search(r"\b(clone of the repository|of the repository|the checkout)\b", text)
+
+
 def test_every_scheme_has_a_page_or_shares_one() -> None:
     """The index links each name to its page, and that page is about it."""
     index = (DOCS / "schemes.md").read_text(encoding="utf-8")

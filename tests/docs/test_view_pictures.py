@@ -87,3 +87,12 @@ def test_the_picture_of_a_day_is_what_its_command_draws(tmp_path: Path) -> None:
     assert difference(drawn(words, run, tmp_path / "same.png"), DOCS / "microgrid_view.png") < TOLERANCE
     noon = drawn([*words, "--slot", "43200"], run, tmp_path / "noon.png")
     assert difference(noon, DOCS / "microgrid_view.png") > 2 * TOLERANCE
+
+
+def test_a_picture_is_described_alike_wherever_it_is_shown() -> None:
+    """The words for those who do not see it."""
+    pages = [ROOT / "README.md", *DOCS.rglob("*.md")]
+    said = {
+        text for page in pages for text in re.findall(r"!\[([^]]+)\]\([\w/.]*live_view\.png\)", page.read_text("utf-8"))
+    }
+    assert len(said) == 1
