@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -122,7 +123,7 @@ def spawn(
 
 
 def end(process: subprocess.Popen[bytes]) -> None:
-    """Terminate a viewer, kill it if it does not end, and wait for it."""
+    """Terminate a viewer, kill it if it does not end, wait for it, and remove the temporary folder that it leaves."""
     if process.poll() is None:
         process.terminate()
         try:
@@ -130,6 +131,9 @@ def end(process: subprocess.Popen[bytes]) -> None:
         except subprocess.TimeoutExpired:
             process.kill()
     process.wait()
+    # A viewer that draws makes this folder when it starts, and a terminated one does not remove it.
+    for folder in Path(tempfile.gettempdir()).glob(f"rerun-data-{process.pid}-*"):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def executable() -> Path:

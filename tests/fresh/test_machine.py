@@ -100,7 +100,7 @@ def test_a_machine_is_bare_and_what_stays_there_is_told(user: str) -> None:
     """It has nothing of this environment, no power over this machine, and its own /dev/shm and /tmp; what stays is named."""
     name = next(name for name, one in MACHINES.items() if one.user == user and "gcc" not in one.packages)
     look = "env; pwd; ls -A /dev/shm /tmp; command -v gcc cc; mount -t tmpfs tmpfs /mnt; git log -1"
-    leave = "sleep 1000 & touch /tmp/mine /dev/shm/ours /tmp/pytest-of-nobody; sleep 0.1"
+    leave = "sleep 1000 & touch /tmp/mine /dev/shm/ours /dev/shm/12.zenoh /tmp/pytest-of-nobody; sleep 0.1"
     with temporary_folder("evedrop-fresh-") as folder:
         try:
             seen = outcome(MACHINES[name], folder, print, (look, leave, "exit 3"))
