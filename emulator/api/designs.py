@@ -6,7 +6,7 @@ Source: docs/design.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +19,7 @@ from evedrop.model.schemes import SCHEMES
 from evedrop.model.slot.link_law import law_of
 from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
+from evedrop.scenario.arguments import number_argument, refuse_unless
 from evedrop.scenario.words import listed
 
 if TYPE_CHECKING:
@@ -55,6 +56,7 @@ def design(
     measured = measuring_command(scenario, changes or {}, made)
     if not SCHEMES[made.encoding.scheme].sends_states_and_innovations:
         raise UsageError(_not_for(made.encoding.scheme, measured))
+    _refuse_texts(max_trace=max_trace, min_ratio=min_ratio)
     if max_trace == math.inf:
         raise UsageError("an infinite largest trace is kept by every admissible μ_d; give a finite one")
     if min_ratio is not None and not 0.0 < min_ratio < math.inf:
@@ -127,6 +129,8 @@ def design_schedule(
     measured = measuring_command(scenario, changes or {}, made)
     if not SCHEMES[made.encoding.scheme].sends_states_and_innovations:
         raise UsageError(_not_for(made.encoding.scheme, measured))
+    _refuse_texts(max_trace=max_trace, weight=weight)
+    _refuse_texts(whole=True, slots=slots, block=block)
     if not 2 <= slots <= _LONGEST_SCHEDULE:
         raise UsageError(
             f"a schedule of {slots} slot{'' if slots == 1 else 's'}: "
@@ -171,6 +175,13 @@ def design_policy(
     """
     from evedrop.expected.policies import policies_of  # noqa: PLC0415 - a run does not need it
 
+    for name, several in (("weights", weights), ("prices", prices)):
+        refuse_unless(
+            isinstance(several, Iterable) and not isinstance(several, str), name, several, "a list of numbers"
+        )
+        for value in several:
+            number_argument(name, value)
+    number_argument("states", states, whole=True)
     return policies_of(scenario_of(scenario, changes or {}, beyond_horizon=True), weights, prices, states)
 
 
@@ -186,7 +197,15 @@ def design_budget(
     """
     from evedrop.expected.energy_budget import budget_of  # noqa: PLC0415 - a run does not need it
 
+    number_argument("budget", budget)
     return budget_of(scenario_of(scenario, changes or {}, beyond_horizon=True), budget)
+
+
+def _refuse_texts(whole: bool = False, **numbers: object) -> None:
+    """Raise UsageError for an argument that is not a number, or not a whole one if it must be; None is none."""
+    for name, value in numbers.items():
+        if value is not None:
+            number_argument(name, value, whole)
 
 
 def _not_for(scheme: str, measured: str) -> str:

@@ -17,6 +17,7 @@ from evedrop.loading import prepared
 from evedrop.memory.montecarlo import Plan
 from evedrop.results.growing_tables import goes_on
 from evedrop.scenario import Scenario
+from evedrop.scenario.arguments import CHANGES, path_argument, refuse_unless, table_argument
 from evedrop.scenario.words import dotted
 
 _OF_RESULTS = ("summary.json", "unfinished", "shards", "sweep.json", "compare.json")
@@ -25,11 +26,12 @@ _OF_RESULTS = ("summary.json", "unfinished", "shards", "sweep.json", "compare.js
 
 def scenario_of(scenario: str | Path | Scenario, changes: Mapping[str, Any], beyond_horizon: bool = False) -> Scenario:
     """The scenario of a call, with its changes. Raises ScenarioError with every mistake."""
-    return prepared(scenario, dotted(changes), beyond_horizon=beyond_horizon)
+    return prepared(scenario, dotted(table_argument("changes", changes, CHANGES)), beyond_horizon=beyond_horizon)
 
 
 def plan_of(plan: Plan | None, workers: int | None, scheduler: str | None) -> Plan:
     """The plan of a call, whose own workers and scheduler give way to these. Raises UsageError as `Plan` does."""
+    refuse_unless(plan is None or isinstance(plan, Plan), "plan", plan, 'a Plan, such as Plan(mode="covariance-only")')
     found = plan or Plan()
     return replace(
         found,
@@ -73,6 +75,8 @@ def place_for(out: str | Path | None, overwrite: bool) -> Iterator[ResultsPlace]
     if out is None:
         place = ResultsPlace(Path(tempfile.mkdtemp(prefix="evedrop-")), temporary=True)
     else:
+        path_argument("out", out, "the name of a folder, or None for a temporary one")
+        refuse_unless(isinstance(overwrite, bool), "overwrite", overwrite, "True or False")
         place = ResultsPlace(Path(out), temporary=False)
         _clear(place.folder, overwrite)
     try:

@@ -12,6 +12,7 @@ from evedrop.news import News, RunProgress, Tell, silent
 from evedrop.report.markup import element, fragment, paragraphs, printable
 from evedrop.report.tables import html_table
 from evedrop.report.text_table import TextTable
+from evedrop.scenario.arguments import refuse_unless
 
 _TELL_SECONDS = 0.2
 
@@ -28,6 +29,7 @@ def progress(tell: Tell | None, total: int) -> Iterator[Tell]:
 
     total: the progress at the end, unless the news gives it. The bar vanishes at the end.
     """
+    refuse_unless(tell is None or callable(tell), "tell", tell, "a function that takes an item of news")
     if tell is not None or not in_notebook():
         yield tell or silent
         return

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,7 @@ from evedrop.memory.montecarlo import Plan
 from evedrop.memory.simulation import Mode
 from evedrop.news import Tell
 from evedrop.scenario import Scenario
+from evedrop.scenario.arguments import refuse_unless, table_argument
 from evedrop.scenario.words import dotted
 
 if TYPE_CHECKING:
@@ -50,6 +51,9 @@ def run(
     from evedrop.live.launch.launcher import launch  # noqa: PLC0415 - Monte Carlo does not need it
 
     made = scenario_of(scenario, changes)
+    refuse_unless(
+        listen is None or isinstance(listen, str), "listen", listen, "an endpoint such as tcp/127.0.0.1:17460"
+    )
     with place_for(out, overwrite) as place, progress(tell, made.slots) as told:
         ended = launch(made, place.folder, view, listen, told)
         if ended.viewer is not None:
@@ -112,7 +116,9 @@ def sweep(
     from evedrop.studies.sweep import MOST_POINTS, sweep_over  # noqa: PLC0415 - no other call needs it
 
     given = {**dotted(changes), "trials": trials}
-    values = _named(dotted(over), "over", scenario, given)
+    wanted = 'a dict of lists by dotted key, such as {"encoding.state_probability": [0.2, 0.4]}'
+    refuse_unless(over is not None, "over", over, wanted)
+    values = _named(dotted(table_argument("over", over, wanted)), "over", scenario, given)
     for key, found in values.items():
         if not isinstance(found, list) or not found:
             raise UsageError(f"over: {key} is {found!r}; expected a list of values, such as [0.2, 0.4]")
@@ -156,6 +162,10 @@ def compare(
     from evedrop.studies.matchups import matchups_of  # noqa: PLC0415 - the same
 
     given = {**dotted(changes), "trials": trials}
+    for name, names in (("schemes", schemes), ("adversaries", adversaries)):
+        fits = names is None or (isinstance(names, Iterable) and not isinstance(names, str))
+        refuse_unless(fits, name, names, "a list of names or classes")
+    table_argument("parameters", parameters, 'a dict such as {"innovation.state_probability": 0.7}')
     chosen = _named({"schemes": schemes, "adversaries": adversaries}, "compare", scenario, given)
     made = scenario_of(scenario, given)
     matchups = matchups_of(made, chosen.get("schemes"), chosen.get("adversaries"), parameters)

@@ -12,6 +12,7 @@ from typing import Any
 from evedrop.errors import ScenarioError
 from evedrop.loading.file import checked, load, located
 from evedrop.loading.python_values import plain_tables
+from evedrop.scenario.arguments import path_argument
 from evedrop.scenario.tables import Builders, Scenario
 from evedrop.scenario.values import unusable
 
@@ -38,9 +39,15 @@ def loaded(source: str | Path, changes: Mapping[str, Any]) -> Scenario:
 
 
 def prepared(scenario: str | Path | Scenario, changes: Mapping[str, Any], *, beyond_horizon: bool = False) -> Scenario:
-    """The scenario that a call is about, with changes by dotted key, checked as `load` does; beyond_horizon: as there."""
+    """The scenario that a call is about, with changes by dotted key, checked as `load` does; beyond_horizon: as there.
+
+    Raises ScenarioError with every mistake, UsageError for what is neither a Scenario nor the name of one.
+    """
     if isinstance(scenario, Scenario):
         return changed(scenario, changes, beyond_horizon=beyond_horizon)
+    path_argument(
+        "scenario", scenario, "a built-in name, a file, or a Scenario, which Scenario(entries) makes of a dict"
+    )
     return load(scenario, plain_tables(changes, str(scenario)), beyond_horizon=beyond_horizon)
 
 

@@ -33,7 +33,9 @@ from evedrop.results.folder import HeldFolder, new_folder
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.writer import ResultsWriter, write_summary
 from evedrop.scenario import Scenario
+from evedrop.scenario.arguments import number_argument, refuse_unless
 from evedrop.scenario.input_files import states_of
+from evedrop.scenario.words import listed
 from evedrop.score.expectations_held import replay_of
 from evedrop.score.histogram import SlotHistograms
 from evedrop.score.scorekeeper import Ending, events_of, summary_of
@@ -52,6 +54,7 @@ class Plan:
     """How to simulate: the mode, and the workers."""
 
     mode: Mode = Mode.EXACT
+    """Or its name, such as "covariance-only"."""
     workers: int | None = None
     """None: chosen for this machine and the amount of work."""
     scheduler: str | None = None
@@ -62,9 +65,13 @@ class Plan:
     """Whether to estimate means that rare events carry by splitting, too."""
 
     def __post_init__(self) -> None:
-        """Raise UsageError if the number of workers is not positive, or the address of the scheduler is not a text."""
-        if self.workers is not None and self.workers < 1:
-            raise UsageError(f"workers={self.workers}: expected 1 or more")
+        """Raise UsageError for an unknown mode, a number of workers below 1, and an address that is not a text."""
+        modes = [mode.value for mode in Mode]
+        refuse_unless(self.mode in modes, "mode", self.mode, listed(modes))
+        object.__setattr__(self, "mode", Mode(self.mode))  # which may have been given by its name
+        if self.workers is not None:
+            number_argument("workers", self.workers, whole=True)
+            refuse_unless(self.workers >= 1, "workers", self.workers, "1 or more")
         if self.scheduler is not None and not isinstance(self.scheduler, str):
             raise UsageError(
                 f"scheduler={self.scheduler!r:.60}: expected the address of a Dask scheduler, such as "

@@ -22,6 +22,7 @@ from evedrop.news import RunEvent
 from evedrop.results.growing_tables import batches_of, figures_path, goes_on, is_unfinished, last_round, schema_of
 from evedrop.results.summary_file import plain
 from evedrop.results.tables import DIGESTS, JOURNAL, NULLABLE, SLOTS, inputs_schema_in, trials_schema
+from evedrop.scenario.arguments import path_argument
 from evedrop.score.summary import Summary
 from evedrop.streams import MOST_SLOTS
 
@@ -160,6 +161,7 @@ def load_results(folder: str | Path) -> Results:
 
     Raises UsageError naming the missing or broken file if it is not a results folder.
     """
+    path_argument("folder", folder, "the results folder of a run")
     place = Path(folder)
     path = place / "summary.json"
     if not path.exists() and (place / "shards").is_dir():

@@ -33,6 +33,7 @@ from evedrop.names import CONTROLLER, LEGITIMATE
 from evedrop.plugins import elsewhere, look_in, trusted_in
 from evedrop.scenario.acknowledgements import AcknowledgementsTable
 from evedrop.scenario.application import APPLICATIONS, applications_in, unloadable_in
+from evedrop.scenario.arguments import CHANGES, table_argument
 from evedrop.scenario.encoding import EncodingTable
 from evedrop.scenario.entries import ScenarioEntries
 from evedrop.scenario.events.table import AnyEvent, event_table
@@ -49,6 +50,7 @@ from evedrop.scenario.wire_table import WireTable
 from evedrop.scenario.words import as_toml, dotted
 from evedrop.streams import MOST_SLOTS
 
+_LOADS = 'Scenario.load("vehicle") reads a built-in scenario, a file or a results folder'
 _Energy = Annotated[float, Field(strict=True, ge=0.0, le=1e12)]
 
 
@@ -142,7 +144,8 @@ class Scenario(Table):
 
         Raises ScenarioError with every mistake: its key, what was found, what was expected.
         """
-        self.__setstate__(_builders().build({**(entries or {}), **others}).__getstate__())
+        given = table_argument("entries", entries, f"a dict of entries; {_LOADS}")
+        self.__setstate__(_builders().build({**given, **others}).__getstate__())
 
     # Pydantic calls a model's own constructor for every table that it validates, unless the constructor has this mark.
     __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
@@ -156,11 +159,11 @@ class Scenario(Table):
 
         Raises ScenarioError with every mistake, UsageError if there is no such scenario.
         """
-        return _builders().load(source, {**(changes or {}), **dotted(others)})
+        return _builders().load(source, {**table_argument("changes", changes, CHANGES), **dotted(others)})
 
     def replace(self, changes: Mapping[str, Any] | None = None, /, **others: Any) -> Scenario:
         """The same scenario with changes, given as for `load`; None removes an entry. Raises ScenarioError with every mistake."""
-        return _builders().change(self, {**(changes or {}), **dotted(others)})
+        return _builders().change(self, {**table_argument("changes", changes, CHANGES), **dotted(others)})
 
     def to_toml(self) -> str:
         """The scenario as the text of a file; loading the file gives an equal scenario, which gives equal digests."""

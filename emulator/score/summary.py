@@ -14,6 +14,8 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from evedrop.entries import plain
+from evedrop.errors import UnknownName
+from evedrop.figures import FIGURES
 from evedrop.figures.links import LinkAccount
 from evedrop.figures.text import estimate
 from evedrop.news import ConnectionOutage, RunEvent
@@ -90,7 +92,9 @@ class PeerSummary(BuiltInFigures):
         return {**self.figures, **self.mode_figures}
 
     def figure(self, name: str) -> float | None:
-        """A figure by its name; None if it has no value, or if there is no such figure."""
+        """A figure by its name; None if this receiver has no value of it. Raises UnknownName if there is no such figure."""
+        if name not in self.all_figures and name not in FIGURES.names:
+            raise UnknownName("figure", name, self.all_figures)
         return self.all_figures.get(name)
 
     def as_dict(self) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from evedrop.loading.process_noise import process_noise
 from evedrop.model.packet_words import NOTHING, SILENT
 from evedrop.model.process import Floats
 from evedrop.results.reading import Results
+from evedrop.scenario.arguments import refuse_unless
 from evedrop.view.error_floor import error_floor, floor_words
 from evedrop.view.figure_style import drawing
 from evedrop.view.lanes import EAVESDROPPER
@@ -50,6 +51,7 @@ def run_figure(results: Results, wanted: Sequence[str], slots: range | None, tri
     for name in names:
         if name not in _HEIGHTS:
             raise UsageError(f"plot: there is no panel {name!r}; expected {', '.join(_HEIGHTS)}")
+    refuse_unless(slots is None or isinstance(slots, range), "slots", slots, "a range of slots, such as range(0, 50)")
     rows = results.slots
     last = pc.max(rows["slot"]).as_py()
     if slots is not None and (not slots or slots.step != 1 or not 0 <= slots[0] <= slots[-1] <= last):
