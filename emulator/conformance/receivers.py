@@ -121,8 +121,13 @@ def _name(action: int) -> str:
     return Action(action).name if int(action) in set(Action) else str(int(action))
 
 
-def expect_expected(problem: Problem, outcomes_at: OutcomesAt, errors: Sequence[Floats]) -> None:
-    """Raise Broken if the mean squared errors (R,) of every slot contradict the outcomes beyond chance."""
+def expect_expected(
+    problem: Problem,
+    outcomes_at: OutcomesAt,
+    errors: Sequence[Floats],
+    remedy: str = "correct them, or return None: no closed form",
+) -> None:
+    """Raise Broken if the mean squared errors (R,) of every slot contradict the outcomes beyond chance; remedy: what to do."""
     outcomes = outcomes_at(QUALITY)
     parts = (outcomes.predicted, outcomes.decoded, outcomes.leaked, outcomes.state, outcomes.misled)
     if abs(sum_in_order(parts) - 1.0) > 1e-9 or min(parts) < 0.0:
@@ -134,6 +139,5 @@ def expect_expected(problem: Problem, outcomes_at: OutcomesAt, errors: Sequence[
         chance = SIGMAS * float(error.std()) / float(np.sqrt(len(error))) + _SLACK * float(expected[k]) + 1e-9
         if abs(float(error.mean()) - float(expected[k])) > chance:
             raise Broken(
-                f"slot {k}: the mean squared error is {error.mean():.4g}, and outcomes say {expected[k]:.4g}; correct them, "
-                "or return None: no closed form"
+                f"slot {k}: the mean squared error is {error.mean():.4g}, and outcomes say {expected[k]:.4g}; {remedy}"
             )

@@ -130,10 +130,13 @@ class Registry(Mapping[str, type[T]], Generic[T]):
             raise NotRegistered(name, f"{said}, which is not a {self.base.__name__}; expected {wanted}")
         lacking = sorted(getattr(found, "__abstractmethods__", ()))
         if lacking:
+            # The class that its author inherited from describes more than the base of all of this kind.
+            ours = next((one for one in found.__mro__ if one.__module__.startswith("evedrop.")), self.base)
+            these, them = ("these methods", "them") if len(lacking) > 1 else ("this method", "it")
             raise NotRegistered(
                 name,
-                f"{said}, which lacks {', '.join(lacking)}; expected a class with "
-                f"{'these methods' if len(lacking) > 1 else 'this method'}, as {self.base.__name__} describes them",
+                f"{said}, which lacks {', '.join(lacking)}; expected a class with {these}, as "
+                f"evedrop.extend.{ours.__name__} describes {them}",
             )
         parameters = getattr(found, "parameters", {})
         if not isinstance(parameters, Mapping) or not all(isinstance(one, str) for one in parameters):

@@ -101,7 +101,7 @@ class Boastful(Naive):
     ("kind", "rule", "said"),
     [
         (Forgetful, "a slot asked for again", "Belief.memory"),
-        (Boastful, "what it says to theory", "outcomes say"),
+        (Boastful, "what it says to theory", "correct use_probabilities, which must be the same in every slot"),
     ],
 )
 def test_an_eavesdropper_that_breaks_a_rule_is_told_which(kind: Any, rule: str, said: str) -> None:

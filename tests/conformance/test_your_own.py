@@ -26,6 +26,7 @@ def test_the_tutorial_has_short_classes_and_a_scenario() -> None:
     modules = {
         "flipped.py",
         "tracker.py",
+        "thirds.py",
         "shifts.py",
         "platooning.py",
         "ratio.py",

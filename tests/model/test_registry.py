@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from evedrop.errors import NoAnswer, NotRegistered
+from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, PacketTaker
 from evedrop.model.links import LOSS_MODELS
 from evedrop.model.links.bernoulli import Bernoulli
 from evedrop.model.links.link import LossModel
@@ -101,8 +102,9 @@ REFUSED = {
     "gone": ", which an installed package says is registered:Gone, and the module registered (",
     "registered:number": ", which is not a LossModel; expected a class that inherits from evedrop.extend.LossModel",
     "pathlib:Path": ", which is not a LossModel; expected a class that inherits from evedrop.extend.LossModel",
-    "registered:Half": ", which lacks fates; expected a class with this method, as LossModel describes them",
-    "registered:None_": ", which lacks fates, quality; expected a class with these methods, as LossModel describes them",
+    "registered:Half": ", which lacks fates; expected a class with this method, as evedrop.extend.LossModel describes it",
+    "registered:None_": ", which lacks fates, quality; expected a class with these methods, as evedrop.extend.LossModel "
+    "describes them",
     "registered:Table": ", whose parameters are not a table; expected the entries it takes, each with an example",
     "registered:Numbered": ", whose parameters are not a table; expected the entries it takes, each with an example",
     "registered:Taken": ", one of whose parameters is called model, as an entry of every loss model is",
@@ -191,3 +193,16 @@ def test_the_place_of_an_error_is_the_line_of_its_author() -> None:
     assert place_of(ValueError()) == "ValueError"
     nameless = SyntaxError("bad")
     assert place_of(nameless) == "SyntaxError: bad"
+
+
+def test_a_class_that_lacks_methods_is_sent_to_the_class_it_inherits_from() -> None:
+    """PacketTaker describes `uses`; Eavesdropper, the base of all eavesdroppers, does not."""
+
+    class Bare(PacketTaker):
+        pass
+
+    strategies = Registry("strategy", Eavesdropper, GROUP, {})  # type: ignore[type-abstract]
+    with pytest.raises(
+        NotRegistered, match=r"lacks use_probabilities, uses; .* as evedrop.extend.PacketTaker describes them"
+    ):
+        strategies._checked("mine:Bare", Bare, "")
