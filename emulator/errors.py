@@ -31,6 +31,8 @@ class EvedropError(Exception):
     """Base class of all errors that this project raises on purpose."""
 
     exit_status = 3
+    resumable: str | None = None
+    """The folder of the study that the error ended, if the study can go on from there."""
 
 
 class UsageError(EvedropError):

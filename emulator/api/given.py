@@ -67,12 +67,20 @@ class ResultsPlace:
 
 
 @contextlib.contextmanager
-def place_for(out: str | Path | None, overwrite: bool) -> Iterator[ResultsPlace]:
+def place_for(out: str | Path | None, overwrite: bool, resume: bool = False) -> Iterator[ResultsPlace]:
     """Where to write: `out`, which must be new or empty unless `overwrite`, or a temporary folder without `out`.
+
+    resume: `out` may have an interrupted study, which goes on.
 
     Raises UsageError if `out` is in use and must not be overwritten, or is not a results folder.
     """
-    if out is None:
+    if resume and (out is None or overwrite):
+        raise UsageError(
+            "resume=True goes on with the study in a folder: give the folder as out, and leave overwrite out"
+        )
+    if resume and out is not None:
+        place = ResultsPlace(Path(out), temporary=False)
+    elif out is None:
         place = ResultsPlace(Path(tempfile.mkdtemp(prefix="evedrop-")), temporary=True)
     else:
         path_argument("out", out, "the name of a folder, or None for a temporary one")
@@ -83,6 +91,8 @@ def place_for(out: str | Path | None, overwrite: bool) -> Iterator[ResultsPlace]
         yield place
     except EvedropError as error:
         place.end(error)
+        if error.resumable is not None and not place.temporary:
+            error.add_note(f"The same call with out={error.resumable!r} and resume=True goes on where it stopped.")
         raise
     except BaseException:
         place.end()

@@ -69,6 +69,7 @@ def montecarlo(
     trials: int = 1000,
     out: str | Path | None = None,
     overwrite: bool = False,
+    resume: bool = False,
     workers: int | None = None,
     scheduler: str | None = None,
     plan: Plan | None = None,
@@ -77,7 +78,8 @@ def montecarlo(
 ) -> RunResults:
     """Run the trials of a scenario in memory; in the exact mode, the default, to the same bits as a live run.
 
-    Arguments and errors as for `run`; trials: how many, from `first_trial` on; workers: processes, by default chosen for this
+    Arguments and errors as for `run`; trials: how many, from `first_trial` on; resume: go on with the study in `out` if it was
+    interrupted, and begin it otherwise; workers: processes, by default chosen for this
     machine and the amount of work; scheduler: the address of a Dask scheduler, such as "tcp://127.0.0.1:8786", whose workers
     then compute the trials; plan: the mode.
     """
@@ -85,8 +87,8 @@ def montecarlo(
 
     plan = plan_of(plan, workers, scheduler)
     made = scenario_of(scenario, {**changes, "trials": trials}, plan.mode is not Mode.EXACT)
-    with place_for(out, overwrite) as place, progress(tell, made.trials * made.slots) as told:
-        simulate(made, place.folder, told, plan)
+    with place_for(out, overwrite, resume) as place, progress(tell, made.trials * made.slots) as told:
+        simulate(made, place.folder, told, plan, resume=resume)
         results = RunResults.read(place.folder)
         place.keep_for(results)
         return results
@@ -99,6 +101,7 @@ def sweep(
     trials: int = 1000,
     out: str | Path | None = None,
     overwrite: bool = False,
+    resume: bool = False,
     workers: int | None = None,
     scheduler: str | None = None,
     plan: Plan | None = None,
@@ -124,8 +127,10 @@ def sweep(
             raise UsageError(f"over: {key} is {found!r}; expected a list of values, such as [0.2, 0.4]")
     if not values or math.prod(map(len, values.values())) > MOST_POINTS:
         raise UsageError(f"over: expected 1 to {MOST_POINTS} points, such as {{'slots': [100, 200]}}")
-    with place_for(out, overwrite) as place, progress(tell, 0) as told:
-        table = sweep_over(scenario, given, values, place.folder, told, plan_of(plan, workers, scheduler))
+    with place_for(out, overwrite, resume) as place, progress(tell, 0) as told:
+        table = sweep_over(
+            scenario, given, values, place.folder, told, plan_of(plan, workers, scheduler), resume=resume
+        )
         results = SweepResults(place.folder, table, tuple(values))
         place.keep_for(results)
         return results
@@ -140,6 +145,7 @@ def compare(
     trials: int = 200,
     out: str | Path | None = None,
     overwrite: bool = False,
+    resume: bool = False,
     workers: int | None = None,
     scheduler: str | None = None,
     plan: Plan | None = None,
@@ -169,8 +175,8 @@ def compare(
     chosen = _named({"schemes": schemes, "adversaries": adversaries}, "compare", scenario, given)
     made = scenario_of(scenario, given)
     matchups = matchups_of(made, chosen.get("schemes"), chosen.get("adversaries"), parameters)
-    with place_for(out, overwrite) as place, progress(tell, 0) as told:
-        found = compare_all(matchups, place.folder, told, plan_of(plan, workers, scheduler))
+    with place_for(out, overwrite, resume) as place, progress(tell, 0) as told:
+        found = compare_all(matchups, place.folder, told, plan_of(plan, workers, scheduler), resume=resume)
         results = ComparisonResults.of(found, place.folder)
         place.keep_for(results)
         return results

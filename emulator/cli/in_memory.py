@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, TypeVar
 
 from evedrop.cli.options import entries, loaded, output
+from evedrop.errors import UsageError
 
 if TYPE_CHECKING:
     from evedrop.memory.montecarlo import Plan
@@ -26,6 +27,20 @@ def scheduler(parser: argparse.ArgumentParser) -> None:
     """Add `--scheduler`, the address of a Dask scheduler."""
     what = "let the workers of this Dask scheduler compute the trials, tcp://HOST:PORT (docs/montecarlo.md)"
     parser.add_argument("--scheduler", metavar="ADDRESS", help=what)
+
+
+def resuming(parser: argparse.ArgumentParser) -> None:
+    """Add `--resume`, to go on with a study that was interrupted."""
+    what = (
+        "go on with the interrupted study in the folder of --out; all but --workers and --scheduler must be as it was"
+    )
+    parser.add_argument("--resume", action="store_true", help=what)
+
+
+def check_resuming(options: argparse.Namespace) -> None:
+    """Raise UsageError for `--resume` without a folder."""
+    if options.resume and options.out is None:
+        raise UsageError("--resume goes on with the study in a folder: give the folder with --out DIR")
 
 
 def memory(parser: argparse.ArgumentParser) -> None:
@@ -67,7 +82,7 @@ def studied(
         return scenario, study(scenario, teller(line.tell, total), plan)
 
 
-MEMORY = (entries, output, memory)
+MEMORY = (entries, output, memory, resuming)
 
 
 def plan_of(options: argparse.Namespace) -> Plan:

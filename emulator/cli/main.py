@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
@@ -57,6 +58,8 @@ def _status(given: list[str]) -> int:
     except EvedropError as error:
         sys.stdout.flush()
         say(str(error))
+        if error.resumable is not None and hasattr(options, "resume"):
+            say(f"go on with: {_resuming(given, options, error.resumable)}")
         return error.exit_status
     except KeyboardInterrupt:
         return Interrupted.exit_status
@@ -67,6 +70,13 @@ def _status(given: list[str]) -> int:
             return RunError.exit_status
         say(f"{error.filename}: {error.strerror}; free some space, or check its permissions")
         return UsageError.exit_status
+
+
+def _resuming(given: Sequence[str], options: argparse.Namespace, folder: str) -> str:
+    """The command that goes on with the study that a command line began, in a folder."""
+    place = [] if str(options.out) == folder else ["--out", folder]
+    resume = [] if options.resume else ["--resume"]
+    return shlex.join(["evedrop", *given, *place, *resume])
 
 
 def _check_names(options: argparse.Namespace) -> None:

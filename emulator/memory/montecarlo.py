@@ -6,7 +6,6 @@ Trials run in fixed blocks of 500 and are merged in trial order: the results are
 from __future__ import annotations
 
 import contextlib
-import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -18,18 +17,19 @@ import numpy as np
 from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.expected.expectations import expected_traces_of
 from evedrop.memory.cluster import REACH_SECONDS
+from evedrop.memory.kept_tasks import kept_tasks, study_of
 from evedrop.memory.packet_counts import PacketCounts
 from evedrop.memory.sharing import Crew, crew_of
 from evedrop.memory.simulation import Mode
 from evedrop.memory.splitting import rare_estimates, work_of
-from evedrop.memory.trials import BatchResult, tasks_of
+from evedrop.memory.trials import BLOCK_TRIALS, BatchResult, tasks_of
 from evedrop.memory.workers import usable_cores
 from evedrop.model.digest import RunDigest, block_starts
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.outcomes import eavesdropper_outcomes
 from evedrop.model.schemes import scheme_of
 from evedrop.news import FolderMoved, RunProgress, Tell
-from evedrop.results.folder import HeldFolder, new_folder
+from evedrop.results.folder import HeldFolder, disk_errors
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.writer import ResultsWriter, write_summary
 from evedrop.scenario import Scenario
@@ -92,27 +92,29 @@ class Plan:
             yield crew
 
 
-def simulate(scenario: Scenario, folder: Path, tell: Tell, plan: Plan = Plan()) -> int:
+def simulate(scenario: Scenario, folder: Path, tell: Tell, plan: Plan = Plan(), *, resume: bool = False) -> int:
     """Run all trials of a scenario into a results folder; returns the exit status. `tell` gets progress as it is made.
+
+    resume: go on with the study in the folder, which was interrupted.
 
     Raises UsageError for an unusable folder, plan or scheduler; Interrupted on Ctrl-C and RunError if a worker fails, with
     the results so far in the folder.
     """
     check_mode(scenario, plan.mode)
-    started = time.monotonic()
+    study = study_of("montecarlo", {"mode": plan.mode.value, "rare": plan.rare}, [scenario])
     failure: RunError | None = None
     merger = Merger(scenario, plan.mode)
 
     def ending(how: str) -> Ending:
-        return Ending(time.monotonic() - started, how, replay_of(folder, scenario, plan.mode.value))
+        return Ending(kept.seconds, how, replay_of(folder, scenario, plan.mode.value))
 
-    with stop_on_signals() as stop, plan.crew([scenario]) as crew:
-        tasks, told = tasks_of(scenario, plan.mode, crew.workers), teller(tell, scenario.trials * scenario.slots)
-        with contextlib.closing(HeldFolder(new_folder(folder))) as held, disk_errors(folder):
+    with stop_on_signals() as stop, plan.crew([scenario]) as crew, kept_tasks(folder, study, resume) as kept:
+        tasks, told = tasks_of(scenario, plan.mode, crew.workers, kept), teller(tell, scenario.trials * scenario.slots)
+        with contextlib.closing(HeldFolder(folder)) as held, disk_errors(folder):
             write_resolved(folder, scenario)
             with (
                 ResultsWriter.of(folder, scenario) as writer,
-                contextlib.closing(crew.results(tasks, told, stop.is_set)) as results,
+                contextlib.closing(crew.results(tasks, told, stop.is_set, kept)) as results,
             ):
                 try:
                     for result in results:
@@ -130,30 +132,20 @@ def simulate(scenario: Scenario, folder: Path, tell: Tell, plan: Plan = Plan()) 
                         summary = summary.with_rare_estimates(estimates)
                     writer.settle(merger.at, summary)
             if not merger.trials:
-                shutil.rmtree(held.now)
-                raise failure or Interrupted("interrupted before any trials were done; nothing was kept")
-            kept = held.now
-            write_summary(kept, summary)
-            if kept != folder:
-                tell(FolderMoved(str(kept)))
-    if failure is not None:
-        raise failure
-    if not merger.complete or (plan.rare and stop.is_set()):
-        raise Interrupted.with_results(kept)
+                kept.remove_unless_any()
+                raise failure or kept.interrupted("any trials were done")
+            place = held.now
+            write_summary(place, summary)
+            if place != folder:
+                tell(FolderMoved(str(place)))
+        if failure is not None:
+            raise failure
+        if not merger.complete or (plan.rare and stop.is_set()):
+            raise Interrupted.with_results(place)
+        kept.forget()
     if summary.ended != how:  # a figure failed
         raise RunError(summary.ended)
     return 1 if summary.failed_expectations else 0
-
-
-@contextlib.contextmanager
-def disk_errors(folder: Path) -> Iterator[None]:
-    """Turn a full disk, or any other OSError when writing results, into a RunError."""
-    try:
-        yield
-    except OSError as error:
-        raise RunError(
-            f"{folder} cannot be written ({error.strerror or error}); free some space, or give another folder"
-        ) from error
 
 
 def check_mode(scenario: Scenario, mode: Mode) -> None:
@@ -288,10 +280,12 @@ class Merger:
                 else:
                     mine[name] = histograms
         if writer is not None and result.recorded:
-            slots = concatenated(result.recorded)
-            writer.input_rows(slots, result.start)
-            errors = {name: squared_errors(slots.x, one.x_hat) for name, one in slots.receivers.items()}
-            writer.trial_rows(slots, errors, result.start)
+            recorded = concatenated(result.recorded)
+            for start in range(0, recorded.trials, BLOCK_TRIALS):  # the order of rows does not depend on the tasks
+                slots = recorded.part(slice(start, start + BLOCK_TRIALS))
+                writer.input_rows(slots, result.start + start)
+                errors = {name: squared_errors(slots.x, one.x_hat) for name, one in slots.receivers.items()}
+                writer.trial_rows(slots, errors, result.start + start)
 
     def _add_digests(self, start: int, digests: Mapping[str, Mapping[int, Any]], writer: ResultsWriter | None) -> None:
         if writer is not None:

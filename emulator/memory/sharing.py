@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import final
 
 from evedrop.memory.cluster import REACH_SECONDS, Cluster, connected
+from evedrop.memory.kept_tasks import KeptTasks
 from evedrop.memory.tasks import R, Stopped, Task, Tell
 from evedrop.memory.workers import in_processes, in_this_process
 
@@ -21,17 +22,42 @@ class Crew:
     """Worker processes on this machine; 1: this process."""
     cluster: Cluster | None = None
 
-    def results(self, tasks: Sequence[Task[R]], tell: Tell, stopped: Stopped) -> Generator[R]:
+    def results(
+        self, tasks: Sequence[Task[R]], tell: Tell, stopped: Stopped, kept: KeptTasks | None = None
+    ) -> Generator[R]:
         """Carry out tasks; yields their results in task order.
 
-        tell: gets the trial-slots done since its last call. After a stop, the last results may be incomplete.
+        tell: gets the trial-slots done since its last call; kept: where complete results are kept as they come, and from where
+        those that it has are read. After a stop, the last results may be incomplete.
 
-        Raises RunError if a worker fails.
+        Raises RunError if a worker fails, OSError if a result cannot be kept.
         """
-        yield from _in_order(self._as_they_come(tasks, tell, stopped))
+        read = {number for number, task in enumerate(tasks) if kept is not None and kept.has(task)}
+        left = [number for number in range(len(tasks)) if number not in read]
+        held: dict[int, R] = {}
+        due = 0
+        with contextlib.closing(self._as_they_come([tasks[number] for number in left], tell, stopped)) as new:
+            while True:
+                while due in read or due in held:
+                    if due in held:
+                        yield held.pop(due)
+                    elif kept is not None and not stopped():
+                        yield kept.load(tasks[due])
+                        tell(tasks[due].work)
+                    else:
+                        return
+                    due += 1
+                if (following := next(new, None)) is None:
+                    return
+                number, result = left[following[0]], following[1]
+                held[number] = result
+                if kept is not None and result.complete and len(tasks) > 1:  # a study of one task is complete with it
+                    kept.keep(tasks[number], result)
 
-    def _as_they_come(self, tasks: Sequence[Task[R]], tell: Tell, stopped: Stopped) -> Iterator[tuple[int, R]]:
+    def _as_they_come(self, tasks: Sequence[Task[R]], tell: Tell, stopped: Stopped) -> Generator[tuple[int, R]]:
         """The results, with the numbers of their tasks."""
+        if not tasks:
+            return
         if self.cluster is not None:
             for number, result in self.cluster.results(tasks, stopped):
                 tell(tasks[number].work)
@@ -50,14 +76,3 @@ def crew_of(workers: int, scheduler: str | None = None, patience: float = REACH_
     """
     with connected(scheduler, patience) as cluster:
         yield Crew(workers, cluster)
-
-
-def _in_order(results: Iterator[tuple[int, R]]) -> Iterator[R]:
-    """Results in the order of their numbers; those after a missing one are left out."""
-    held: dict[int, R] = {}
-    due = 0
-    for number, result in results:
-        held[number] = result
-        while due in held:
-            yield held.pop(due)
-            due += 1

@@ -41,3 +41,7 @@ class Task(ABC, Generic[R]):
     @abstractmethod
     def carry_out(self, tell: Tell, stopped: Stopped) -> R:
         """Simulate the trials. The simulation ends early once `stopped`; the result is then not complete."""
+
+    @abstractmethod
+    def example(self) -> R:
+        """A result with an instance of every class that a result may have: kept results are read like it."""

@@ -6,7 +6,7 @@ on the distribution of the work.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import final
@@ -16,6 +16,7 @@ import numpy as np
 from evedrop.expected.expectations import KnownTraces, expected_traces_of
 from evedrop.figures.figure import ScoredSlots
 from evedrop.memory.chunk import Chunk
+from evedrop.memory.kept_tasks import KeptTasks
 from evedrop.memory.packet_counts import PacketCounts
 from evedrop.memory.simulation import Mode, Simulation
 from evedrop.memory.tasks import Stopped, Task, Tell
@@ -31,6 +32,10 @@ from evedrop.score.totals import Totals
 
 BLOCK_TRIALS = 500
 _SIDE_BY_SIDE = 4  # blocks: spreads the overhead of numpy calls over more trials, and the state still fits the cache
+
+_MOST_WORK = (
+    500_000_000  # trial-slots and receivers of a task of several blocks: about a minute, lost if it is interrupted
+)
 
 
 @dataclass(frozen=True)
@@ -74,16 +79,41 @@ class TrialsTask(Task[BatchResult]):
         """Simulate the trials."""
         return carry_out(self, tell, stopped)
 
+    def example(self) -> BatchResult:
+        """A result of one trial without slots, with recorded ones."""
+        scenario = Scenario.read(self.scenario)
+        expected = {name: np.zeros(scenario.slots) for name in scenario.receivers}
+        histograms = {name: SlotHistograms(1, 1.0) for name in scenario.receivers}
+        (block, _) = _empty_block(scenario, self, self.start, expected)
+        for tally in block.totals.tallies.values():
+            tally.watched.begin()
+        return BatchResult(self.start, [block], histograms, histograms, [Slots.example(scenario.receivers)])
 
-def tasks_of(scenario: Scenario, mode: Mode, workers: int) -> list[TrialsTask]:
-    """Split the trials, in order, into parts of nearly equal size, the same number for each worker."""
-    blocks = -(-scenario.trials // BLOCK_TRIALS)
-    rounds = -(-blocks // (workers * _SIDE_BY_SIDE))
-    count = min(blocks, rounds * workers)
-    first, end = scenario.first_trial, scenario.first_trial + scenario.trials
-    bounds = [min(first - BLOCK_TRIALS * (-blocks * i // count), end) for i in range(count + 1)]
+
+def tasks_of(scenario: Scenario, mode: Mode, workers: int, kept: KeptTasks | None = None) -> list[TrialsTask]:
+    """Split the trials, in order, into parts of nearly equal size, the same number for each worker.
+
+    kept: has the results of some tasks, which stay as they are; the trials between them are split.
+    """
     tables = scenario.model_dump(mode="json")
-    return [TrialsTask(tables, start, stop, mode) for start, stop in pairwise(bounds)]
+    end = scenario.first_trial + scenario.trials
+    done = [] if kept is None else kept.ranges(TrialsTask(tables, scenario.first_trial, end, mode))
+    work = BLOCK_TRIALS * scenario.slots * len(scenario.receivers)
+    side_by_side = max(1, min(_SIDE_BY_SIDE, _MOST_WORK // work))
+    bounds, at = list[tuple[int, int]](), scenario.first_trial
+    for one in (*done, range(end, end)):
+        if one.start >= at:  # no trial twice
+            bounds += [*_split(at, one.start, workers, side_by_side), *([(one.start, one.stop)] if one else [])]
+            at = one.stop
+    return [TrialsTask(tables, start, stop, mode) for start, stop in bounds]
+
+
+def _split(first: int, end: int, workers: int, side_by_side: int) -> Iterator[tuple[int, int]]:
+    """First trials and ends of the parts of some trials, each of whole blocks, at most `side_by_side`."""
+    blocks = -(-(end - first) // BLOCK_TRIALS)
+    rounds = -(-blocks // (workers * side_by_side))
+    if count := min(blocks, rounds * workers):
+        yield from pairwise(min(first - BLOCK_TRIALS * (-blocks * i // count), end) for i in range(count + 1))
 
 
 def carry_out(task: TrialsTask, tell: Tell, stopped: Stopped) -> BatchResult:

@@ -18,7 +18,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import final
 
-from evedrop.errors import UsageError
+from evedrop.errors import RunError, UsageError
 from evedrop.files import shown
 from evedrop.signals import leave_after
 
@@ -164,6 +164,17 @@ def private_replacement(path: Path) -> Iterator[Path]:
         with suppress(OSError):
             unfinished.unlink()
         raise
+
+
+@contextlib.contextmanager
+def disk_errors(folder: Path) -> Iterator[None]:
+    """Turn a full disk, or any other OSError when writing results, into a RunError."""
+    try:
+        yield
+    except OSError as error:
+        raise RunError(
+            f"{folder} cannot be written ({error.strerror or error}); free some space, or give another folder"
+        ) from error
 
 
 _F_GETPATH = 50  # of macOS; Python has no name for it before 3.9, and none on Linux

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import platform
 from pathlib import Path
+from typing import Any
 
 from evedrop.plugins import sources_of
 from evedrop.recordings.disturbance_file import table_text
@@ -50,9 +51,14 @@ def resolved(scenario: Scenario, taken: bool = False) -> str:
         tables["process"] |= {"state_file": STATES, **({"source": "file"} if taken else {})}
     if scenario.secret_file is not None:
         tables["secret_file"] = str(Path(scenario.secret_file).absolute())
-    tables["made_with"] = {
+    tables["made_with"] = made_with(tables)
+    return toml_text(tables)
+
+
+def made_with(tables: dict[str, Any]) -> dict[str, Any]:
+    """The versions of the software, and the SHA-256 of the modules of a scenario, given as its tables."""
+    return {
         "python": platform.python_version(),
         **{name: importlib.metadata.version(name) for name in ("evedrop", "numpy", "cryptography", "eclipse-zenoh")},
         **sources_of(tables),
     }
-    return toml_text(tables)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
@@ -97,6 +97,14 @@ class Slots:
     """None without a controller."""
     true: Floats | None = None
     """The true states, (c, n, R), for a sensor that filters; None where they equal x."""
+
+    @classmethod
+    def example(cls, receivers: Iterable[str]) -> Slots:
+        """Slots without numbers, with an instance of every class that slots may have."""
+        nothing: Any = np.zeros(0)
+        of_receiver = ReceiverSlots(nothing, nothing, nothing, nothing, nothing, {})
+        inputs = InputSlots(nothing, nothing, MonitoredSlots(nothing, nothing))
+        return cls(0, nothing, nothing, dict.fromkeys(receivers, of_receiver), inputs=inputs)
 
     @property
     def count(self) -> int:

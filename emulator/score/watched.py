@@ -34,6 +34,10 @@ class GuardedTally(FigureTally):
         """Why the figure is None, if it failed."""
         self._tally: FigureTally | None = None
 
+    def begin(self) -> None:
+        """Make the package's tally now, not with the first slot."""
+        self._asked(lambda: self._begun)
+
     def add(self, slots: ScoredSlots) -> None:
         """Add the next slots."""
         self._asked(lambda: self._begun.add(slots))
@@ -181,6 +185,12 @@ class Watched:
             stateless = slots.x is None and watch.what != IN_STEP and figure(watch.what).needs_states
             if start < stop and not stateless:
                 kept.add(slots if (start, stop) == (0, len(slots.error)) else slots.part(start, stop))
+
+    def begin(self) -> None:
+        """Make the tallies of packages' figures now, not with the first slot."""
+        for kept in self._kept.values():
+            if isinstance(kept, GuardedTally):
+                kept.begin()
 
     @property
     def failures(self) -> list[str]:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
-import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -22,7 +21,8 @@ from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.expected.expectations import Expectation, expectations_of
 from evedrop.figures.errors import MeanSquaredError
 from evedrop.figures.standard_error import standard_error
-from evedrop.memory.montecarlo import Merger, Plan, disk_errors, teller
+from evedrop.memory.kept_tasks import kept_tasks, study_of
+from evedrop.memory.montecarlo import Merger, Plan, teller
 from evedrop.memory.packet_counts import PacketCounts
 from evedrop.memory.simulation import Mode
 from evedrop.memory.trials import BatchResult, tasks_of
@@ -30,7 +30,13 @@ from evedrop.model.schemes import scheme_of
 from evedrop.names import LEGITIMATE
 from evedrop.news import Tell
 from evedrop.results.comparison import Cell, Comparison, Needs, PacketLeak, SchemeResult, SimulatedError, Theory
-from evedrop.results.folder import make_private, new_folder, private_pictures, replace_private, write_private
+from evedrop.results.folder import (
+    disk_errors,
+    make_private,
+    private_pictures,
+    replace_private,
+    write_private,
+)
 from evedrop.results.resolved_scenario import input_texts, resolved
 from evedrop.scenario import Scenario
 from evedrop.score.histogram import LEVELS
@@ -47,8 +53,10 @@ _WRITE_SECONDS, _WRITE_SHARE = (
 )  # from one compare.json to the next, and as a multiple of the time to write one
 
 
-def compare_all(matchups: Matchups, folder: Path, tell: Tell, plan: Plan) -> Comparison:
+def compare_all(matchups: Matchups, folder: Path, tell: Tell, plan: Plan, *, resume: bool = False) -> Comparison:
     """Simulate all matches into a results folder: compare.json, compare.png and .pdf, and the simulated scenarios.
+
+    resume: go on with the comparison in the folder, which was interrupted.
 
     Raises UsageError for an unusable folder or plan; Interrupted on Ctrl-C and RunError if a worker fails, with the completed
     schemes in the folder.
@@ -58,16 +66,21 @@ def compare_all(matchups: Matchups, folder: Path, tell: Tell, plan: Plan) -> Com
             f"a comparison follows packets, which the mode {plan.mode.value} does not have; leave the mode out"
         )
     groups = matchups.groups
-    tasks = [tasks_of(group.scenario, plan.mode, 1) for group in groups]
+    wanted = {"schemes": [*matchups.schemes], "adversaries": [*matchups.adversaries]}
+    study = study_of("compare", wanted, [group.scenario for group in groups])
     told = teller(tell, sum(group.scenario.trials * group.scenario.slots for group in groups))
     played: list[tuple[Group, Merger]] = []
     failure: RunError | None = None
-    with stop_on_signals() as stop, plan.crew(group.scenario for group in groups) as crew:
-        new_folder(folder)
+    with (
+        stop_on_signals() as stop,
+        plan.crew(group.scenario for group in groups) as crew,
+        kept_tasks(folder, study, resume) as kept,
+    ):
+        tasks = [tasks_of(group.scenario, plan.mode, 1, kept) for group in groups]
         everything = list(itertools.chain(*tasks))
         with (
             disk_errors(folder),
-            contextlib.closing(crew.results(everything, told, stop.is_set)) as results,
+            contextlib.closing(crew.results(everything, told, stop.is_set, kept)) as results,
         ):
             written, took = time.monotonic(), 0.0
             try:
@@ -85,13 +98,14 @@ def compare_all(matchups: Matchups, folder: Path, tell: Tell, plan: Plan) -> Com
                 failure = error
         found = _comparison(matchups, played)
         if not found.schemes:
-            shutil.rmtree(folder)
-            raise failure or Interrupted("interrupted before a scheme was done; nothing was kept")
+            kept.remove_unless_any()
+            raise failure or kept.interrupted("a scheme was done")
         _write(folder, found, played)
-    if failure is not None:
-        raise failure
-    if len(played) < len(groups):
-        raise Interrupted(f"interrupted; {len(found.schemes)} of {len(matchups.schemes)} schemes are in {folder}")
+        if failure is not None:
+            raise failure
+        if len(played) < len(groups):
+            raise Interrupted(f"interrupted; {len(found.schemes)} of {len(matchups.schemes)} schemes are in {folder}")
+        kept.forget()
     return found
 
 

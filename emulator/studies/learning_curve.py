@@ -122,6 +122,10 @@ class _LearningTask(Task[_Part]):
         found = _measured(scenario, range(self.start, self.stop), windows, tell, stopped)
         return _Part(found, len(found) == len(windows))
 
+    def example(self) -> _Part:
+        """A part with one window, of no receivers."""
+        return _Part([_Measured({}, {})], complete=True)
+
 
 def _measured(
     scenario: Scenario, trials: range, windows: list[tuple[int, int]], tell: Tell, stopped: Stopped

@@ -117,6 +117,10 @@ class _CostTask(Task[_Part]):
         """Simulate the trials."""
         return _part_of(Scenario.read(self.scenario), range(self.start, self.stop), tell, stopped)
 
+    def example(self) -> _Part:
+        """A part of one trial without slots."""
+        return _Part((Meter.zero(1), Meter.zero(1), Meter.zero(1)), complete=True)
+
 
 def _part_of(scenario: Scenario, trials: range, tell: Tell, stopped: Stopped) -> _Part:
     found = [Meter.zero(len(trials)) for _ in range(3)]

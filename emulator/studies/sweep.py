@@ -7,7 +7,6 @@ import itertools
 import json
 import math
 import re
-import shutil
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from decimal import Decimal, InvalidOperation
@@ -20,10 +19,11 @@ import pyarrow.parquet as pq
 from evedrop.errors import Interrupted, RunError, ScenarioError, UsageError
 from evedrop.figures import all_figures, error_column, estimated_figures, z_column
 from evedrop.loading import prepared, value_of
-from evedrop.memory.montecarlo import Merger, Plan, check_mode, disk_errors, teller
+from evedrop.memory.kept_tasks import kept_tasks, study_of
+from evedrop.memory.montecarlo import Merger, Plan, check_mode, teller
 from evedrop.memory.trials import BatchResult, tasks_of
 from evedrop.news import Tell
-from evedrop.results.folder import new_folder, private_pictures, private_replacement, write_private
+from evedrop.results.folder import disk_errors, private_pictures, private_replacement, write_private
 from evedrop.scenario import Scenario
 from evedrop.scenario.application import APPLICATIONS
 from evedrop.score.scorekeeper import Ending
@@ -86,8 +86,12 @@ def sweep_over(
     folder: Path,
     tell: Tell,
     plan: Plan,
+    *,
+    resume: bool = False,
 ) -> pa.Table:
     """Run every point of the grid into a folder: sweep.parquet, sweep.json and a plot.
+
+    resume: go on with the sweep in the folder, which was interrupted.
 
     Returns the table, with a row for each point and peer. Raises ScenarioError if the scenario of any point has mistakes,
     before any point is run; Interrupted, or RunError if a worker fails, with the points done so far in the folder.
@@ -98,18 +102,22 @@ def sweep_over(
     failure: RunError | None = None
     done = 0
     description = {"scenario": _title(source), "changes": dict(changes), "over": dict(grid), "mode": plan.mode.value}
-    with stop_on_signals() as stop, plan.crew(scenario for _, scenario in scenarios) as crew:
-        new_folder(folder)
+    text = json.dumps(description, indent=1, ensure_ascii=False, default=str)
+    study = study_of("sweep", json.loads(text) | {"mode": plan.mode.value}, [scenario for _, scenario in scenarios])
+    with (
+        stop_on_signals() as stop,
+        plan.crew(scenario for _, scenario in scenarios) as crew,
+        kept_tasks(folder, study, resume) as kept,
+    ):
         each = crew.workers if len(scenarios) < 4 * crew.workers else 1  # if there are many points, do not split them
-        tasks = [tasks_of(scenario, plan.mode, each) for _, scenario in scenarios]
+        tasks = [tasks_of(scenario, plan.mode, each, kept) for _, scenario in scenarios]
         told = teller(tell, total)
         everything = list(itertools.chain(*tasks))
         with disk_errors(folder):
-            text = json.dumps(description, indent=1, ensure_ascii=False, default=str)
             write_private(folder / "sweep.json", text + "\n")
             if isinstance(source, Scenario):  # there is no other file from which the sweep could be repeated
                 write_private(folder / "scenario.toml", source.to_toml())
-            with contextlib.closing(crew.results(everything, told, stop.is_set)) as results:
+            with contextlib.closing(crew.results(everything, told, stop.is_set, kept)) as results:
                 written = time.monotonic()
                 try:
                     for (point, scenario), its_tasks in zip(scenarios, tasks, strict=True):
@@ -124,15 +132,16 @@ def sweep_over(
                 except RunError as error:
                     failure = error
             if not rows:
-                shutil.rmtree(folder)
-                raise failure or Interrupted("interrupted before a point was done; nothing was kept")
+                kept.remove_unless_any()
+                raise failure or kept.interrupted("a point was done")
             table = _write_table(folder, rows)
             used = dict.fromkeys(name for _, scenario in scenarios for name in scenario.applications)
             _draw(folder, table, grid, used)
-    if failure is not None:
-        raise failure
-    if done < len(scenarios):
-        raise Interrupted(f"interrupted; {done} of {len(scenarios)} points were done, and are in {folder}")
+        if failure is not None:
+            raise failure
+        if done < len(scenarios):
+            raise Interrupted(f"interrupted; {done} of {len(scenarios)} points were done, and are in {folder}")
+        kept.forget()
     return table
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from evedrop.cli.in_memory import crew, plan_of
+from evedrop.cli.in_memory import check_resuming, crew, plan_of, resuming
 from evedrop.cli.options import changes_of, entries, output, scenario
 from evedrop.command import Command
 from evedrop.errors import UsageError
@@ -22,6 +22,7 @@ def compare(options: argparse.Namespace) -> int:
     from evedrop.results.folder import results_folder
     from evedrop.results.summary_file import plain
 
+    check_resuming(options)
     changes = changes_of(options)
     parameters = {}
     for text in options.parameters:
@@ -41,6 +42,7 @@ def compare(options: argparse.Namespace) -> int:
             adversaries=_names(options.adversaries),
             parameters=parameters,
             out=folder,
+            resume=options.resume,
             plan=plan_of(options),
             tell=line.tell,
             **{"trials": 200, **changes},
@@ -75,7 +77,7 @@ COMMANDS = (
         "compare",
         compare,
         "compare schemes, each against all adversaries, in memory",
-        (scenario, entries, output, _compares, crew),
+        (scenario, entries, output, _compares, crew, resuming),
         section="study",
         example="compare vehicle --trials 100",
         page="compare",

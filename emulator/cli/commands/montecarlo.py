@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from evedrop.cli.in_memory import MEMORY, plan_of
+from evedrop.cli.in_memory import MEMORY, check_resuming, plan_of
 from evedrop.cli.options import loaded, over_wire, print_so_far, scenario
 from evedrop.command import Command
 from evedrop.errors import Interrupted
@@ -16,13 +16,14 @@ def montecarlo(options: argparse.Namespace) -> int:
     from evedrop.memory.montecarlo import simulate
     from evedrop.results.folder import results_folder
 
+    check_resuming(options)
     options.trials = 1000 if options.trials is None else options.trials
     plan = plan_of(options)
     scenario = loaded(options, beyond_horizon=options.mode != "exact")
     with results_folder(options.out, options.scenario) as folder:
         with ProgressLine(scenario.trials * scenario.slots, "trial-slots", options.json) as line:
             try:
-                status = simulate(scenario, folder, line.tell, plan)
+                status = simulate(scenario, folder, line.tell, plan, resume=options.resume)
             except Interrupted:
                 print_so_far(line.moved or folder, options.json)
                 raise

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from evedrop.cli.in_memory import MEMORY, plan_of
+from evedrop.cli.in_memory import MEMORY, check_resuming, plan_of
 from evedrop.cli.options import changes_of, scenario
 from evedrop.command import Command
 from evedrop.output import print_json
@@ -19,6 +19,7 @@ def sweep(options: argparse.Namespace) -> int:
     from evedrop.results.folder import results_folder
     from evedrop.studies.sweep import grid_of, sweep_over
 
+    check_resuming(options)
     options.trials = 1000 if options.trials is None else options.trials
     grid = grid_of(options.over)
     plan = plan_of(options)
@@ -26,7 +27,7 @@ def sweep(options: argparse.Namespace) -> int:
         results_folder(options.out, f"{Path(options.scenario).stem}-sweep") as folder,
         ProgressLine(None, "trial-slots", options.json) as line,
     ):
-        table = sweep_over(options.scenario, changes_of(options), grid, folder, line.tell, plan)
+        table = sweep_over(options.scenario, changes_of(options), grid, folder, line.tell, plan, resume=options.resume)
     if options.json:
         print_json(table.to_pylist())
     else:

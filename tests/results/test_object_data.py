@@ -1,0 +1,117 @@
+"""Objects as data: what comes back is what was stored, and bytes decide values, never which code runs."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evedrop.errors import ScenarioError, UsageError
+from evedrop.loading import load, shipped
+from evedrop.memory.montecarlo import check_mode
+from evedrop.memory.simulation import Mode
+from evedrop.memory.trials import tasks_of
+from evedrop.results.object_data import NotData, packed, unpacked
+
+
+class Place(NamedTuple):
+    """A tuple of a class."""
+
+    x: int
+    y: float
+
+
+@dataclass(frozen=True)
+class Inner:
+    """An instance in an instance."""
+
+    values: Any = None
+
+
+@dataclass
+class Outer:
+    """Everything that a result may have."""
+
+    one: Any = 1
+    inner: Inner = field(default_factory=Inner)
+    table: dict[Any, Any] = field(default_factory=lambda: {Place(1, 2.0): Inner()})
+    parts: list[Inner] = field(default_factory=lambda: [Inner()])
+    act: Any = len
+
+
+def test_instances_come_back() -> None:
+    """Numbers to the bit, arrays with their kinds, tuples and names of classes, and functions of the example."""
+    array = np.array([[0.1, -0.0], [math.inf, math.nan]])
+    value = Outer((None, True, -(2**63), 1e-300, "μ", b"\0"), Inner(array), {Place(1, 2.0): Inner(Place(3, 4.0))})
+    value.parts = [Inner({"a", "b"}), Inner(np.float32(0.1)), Inner(np.zeros((0, 3), np.uint16))]
+    back: Outer = unpacked(packed(value), Outer())
+    assert (back.one, back.act) == (value.one, len)
+    assert back.inner.values.tobytes() == array.tobytes()
+    assert [type(name) for name in back.table] == [Place]
+    assert back.table[Place(1, 2.0)].values == (3, 4.0)
+    assert [type(one) for one in back.parts] == [Inner] * 3
+    assert back.parts[1].values.dtype == np.float32
+    assert (back.parts[2].values.shape, back.parts[2].values.dtype) == ((0, 3), np.uint16)
+    back.inner.values[0, 0] = 2.0  # an array of its own
+
+
+@pytest.mark.parametrize(
+    "value", [object, lambda: 1, np.array([object()], object), open], ids=["class", "function", "objects", "built-in"]
+)
+def test_what_is_not_data_is_refused(value: object) -> None:
+    """Classes, arrays of objects; a function is only a place that the example fills."""
+    try:
+        data = packed(value)
+    except NotData:
+        return
+    with pytest.raises(NotData, match="a function where the example has none"):
+        unpacked(data, None)
+
+
+def test_bytes_name_no_class() -> None:
+    """An instance where the example has a number is refused, and no bytes contain the name of a class."""
+    data = packed(Outer())
+    assert b"Outer" not in data
+    assert b"Inner" not in data
+    for like in (None, 1, [], {}, np.zeros(2)):
+        with pytest.raises(NotData, match="an instance where the example has none"):
+            unpacked(data, like)
+
+
+@given(st.binary(max_size=200), st.integers(0, 10_000))
+def test_any_bytes_are_read_or_refused(noise: bytes, place: int) -> None:
+    """Bytes that are damaged anywhere give a value or NotData, and no other error."""
+    data = bytearray(packed(Outer(np.arange(3), Inner([1.5]))))
+    data[place % len(data)] ^= 1 + place % 255
+    for one in (noise, bytes(data), bytes(data[: place % len(data)])):
+        with contextlib.suppress(NotData):
+            unpacked(one, Outer())
+
+
+SHORT = {"slots": 12, "trials": 503, "record_trials": 2}
+
+
+@pytest.mark.parametrize("name", [name for name in shipped() if name != "microgrid-mpc"])
+def test_every_shipped_scenario_s_results_are_data(name: str) -> None:
+    """What a task finds comes back the same, in every mode that the scenario allows."""
+    try:
+        scenario = load(name, SHORT, beyond_horizon=True)
+    except ScenarioError:  # its events or expectations need its own slots
+        scenario = load(name, {"trials": 2, "record_trials": 1}, beyond_horizon=True)
+    for mode in Mode:
+        try:
+            check_mode(scenario, mode)
+        except UsageError:
+            continue
+        (task,) = tasks_of(scenario, mode, 1)
+        result = task.carry_out(lambda _: None, lambda: False)
+        assert result.complete
+        data = packed(result)
+        back = unpacked(data, task.example())
+        assert packed(back) == data
