@@ -19,9 +19,11 @@ from evedrop.results.growing_tables import goes_on
 from evedrop.scenario import Scenario
 from evedrop.scenario.arguments import CHANGES, path_argument, refuse_unless, table_argument
 from evedrop.scenario.words import dotted
+from evedrop.studies.parts import StudyPlace
 
-_OF_RESULTS = ("summary.json", "unfinished", "shards", "sweep.json", "compare.json")
+_OF_RESULTS = ("summary.json", "unfinished", "shards", "sweep.json", "compare.json", "kept")
 """Files and folders that show that a folder is a results folder."""
+_NO_FOLDER = "resume=True goes on with the study in a folder: give the folder as out, and leave overwrite out"
 
 
 def scenario_of(scenario: str | Path | Scenario, changes: Mapping[str, Any], beyond_horizon: bool = False) -> Scenario:
@@ -75,9 +77,7 @@ def place_for(out: str | Path | None, overwrite: bool, resume: bool = False) -> 
     Raises UsageError if `out` is in use and must not be overwritten, or is not a results folder.
     """
     if resume and (out is None or overwrite):
-        raise UsageError(
-            "resume=True goes on with the study in a folder: give the folder as out, and leave overwrite out"
-        )
+        raise UsageError(_NO_FOLDER)
     if resume and out is not None:
         place = ResultsPlace(Path(out), temporary=False)
     elif out is None:
@@ -91,13 +91,30 @@ def place_for(out: str | Path | None, overwrite: bool, resume: bool = False) -> 
         yield place
     except EvedropError as error:
         place.end(error)
-        if error.resumable is not None and not place.temporary:
-            error.add_note(f"The same call with out={error.resumable!r} and resume=True goes on where it stopped.")
+        if not place.temporary:
+            _say_how_to_resume(error)
         raise
     except BaseException:
         place.end()
         raise
     place.end()
+
+
+@contextlib.contextmanager
+def place_in(out: str | Path | None, resume: bool) -> Iterator[StudyPlace | None]:
+    """The place of a study that writes a folder only if `out` says so. Raises UsageError for `resume` without a folder."""
+    if resume and out is None:
+        raise UsageError(_NO_FOLDER)
+    try:
+        yield None if out is None else StudyPlace(Path(out), resume)
+    except EvedropError as error:
+        _say_how_to_resume(error)
+        raise
+
+
+def _say_how_to_resume(error: EvedropError) -> None:
+    if error.resumable is not None:
+        error.add_note(f"The same call with out={error.resumable!r} and resume=True goes on where it stopped.")
 
 
 def _clear(folder: Path, overwrite: bool) -> None:

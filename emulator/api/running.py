@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from evedrop.api.given import place_for, plan_of, scenario_of
+from evedrop.api.given import place_for, place_in, plan_of, scenario_of
 from evedrop.api.notebook import progress
 from evedrop.api.results import ComparisonResults, RunResults, SweepResults
 from evedrop.errors import UsageError
@@ -186,6 +186,8 @@ def cost(
     scenario: str | Path | Scenario,
     *,
     trials: int = 100,
+    out: str | Path | None = None,
+    resume: bool = False,
     workers: int | None = None,
     scheduler: str | None = None,
     tell: Tell | None = None,
@@ -193,7 +195,8 @@ def cost(
 ) -> SecrecyCost:
     """The energy that secrecy costs an application: the scenario's scheme against `plain`, trial by trial.
 
-    Arguments as for `montecarlo`. Source: docs/microgrid.md, what does secrecy cost in energy.
+    Arguments as for `montecarlo`; out: by default no folder, otherwise one for cost.json, in which finished trials are kept for
+    `resume`. Source: docs/microgrid.md, what does secrecy cost in energy.
 
     Raises ScenarioError with every mistake of the scenario, UsageError without an application that has a power, RunError if a
     worker fails, Interrupted on Ctrl-C.
@@ -202,14 +205,16 @@ def cost(
     from evedrop.studies.secrecy_cost import secrecy_cost  # noqa: PLC0415 - no other call needs it
 
     made = scenario_of(scenario, {**changes, "trials": trials})
-    with progress(tell, total := made.trials * made.slots) as told:
-        return secrecy_cost(made, teller(told, total), plan_of(None, workers, scheduler))
+    with place_in(out, resume) as place, progress(tell, total := made.trials * made.slots) as told:
+        return secrecy_cost(made, teller(told, total), plan_of(None, workers, scheduler), place)
 
 
 def learned(
     scenario: str | Path | Scenario,
     *,
     trials: int = 100,
+    out: str | Path | None = None,
+    resume: bool = False,
     workers: int | None = None,
     scheduler: str | None = None,
     tell: Tell | None = None,
@@ -217,7 +222,8 @@ def learned(
 ) -> list[LearningRow]:
     """What eavesdroppers that learn know of the process after 8, 16, 32, … slots, and how that affects their error.
 
-    Arguments as for `montecarlo`. Source: docs/learning.md.
+    Arguments as for `montecarlo`; out: by default no folder, otherwise one for learned.json, in which finished trials are kept
+    for `resume`. Source: docs/learning.md.
 
     Raises ScenarioError with every mistake of the scenario, UsageError if no eavesdropper learns, RunError if a worker fails,
     Interrupted on Ctrl-C.
@@ -226,8 +232,8 @@ def learned(
     from evedrop.studies.learning_curve import learning_curve  # noqa: PLC0415 - no other call needs it
 
     made = scenario_of(scenario, {**changes, "trials": trials})
-    with progress(tell, total := made.trials * made.slots) as told:
-        return learning_curve(made, teller(told, total), plan_of(None, workers, scheduler))
+    with place_in(out, resume) as place, progress(tell, total := made.trials * made.slots) as told:
+        return learning_curve(made, teller(told, total), plan_of(None, workers, scheduler), place)
 
 
 def _named(

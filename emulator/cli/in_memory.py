@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from evedrop.cli.options import entries, loaded, output
@@ -12,6 +13,7 @@ from evedrop.errors import UsageError
 if TYPE_CHECKING:
     from evedrop.memory.montecarlo import Plan
     from evedrop.scenario import Scenario
+    from evedrop.studies.parts import StudyPlace
 
 T = TypeVar("T")
 
@@ -43,6 +45,13 @@ def check_resuming(options: argparse.Namespace) -> None:
         raise UsageError("--resume goes on with the study in a folder: give the folder with --out DIR")
 
 
+def keeping(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a study that needs no results folder: one that keeps finished trials, and `--resume`."""
+    what = "write the result there, new or empty, and keep finished trials for --resume until it is complete"
+    parser.add_argument("--out", type=Path, metavar="DIR", help=what)
+    resuming(parser)
+
+
 def memory(parser: argparse.ArgumentParser) -> None:
     """Add the options that say how trials are computed."""
     crew(parser)
@@ -65,7 +74,7 @@ def memory(parser: argparse.ArgumentParser) -> None:
 
 
 def studied(
-    options: argparse.Namespace, study: Callable[[Scenario, Callable[[int], None], Plan], T]
+    options: argparse.Namespace, study: Callable[[Scenario, Callable[[int], None], Plan, StudyPlace | None], T]
 ) -> tuple[Scenario, T]:
     """Run a study of a command's scenario, with 100 trials by default, and show its progress.
 
@@ -73,13 +82,16 @@ def studied(
     """
     from evedrop.cli.progress_line import ProgressLine
     from evedrop.memory.montecarlo import teller
+    from evedrop.studies.parts import StudyPlace
 
+    check_resuming(options)
     options.trials = 100 if options.trials is None else options.trials
     plan = plan_of(options)
     scenario = loaded(options)
     total = scenario.trials * scenario.slots
     with ProgressLine(total, "trial-slots", options.json) as line:
-        return scenario, study(scenario, teller(line.tell, total), plan)
+        place = None if options.out is None else StudyPlace(options.out, options.resume)
+        return scenario, study(scenario, teller(line.tell, total), plan, place)
 
 
 MEMORY = (entries, output, memory, resuming)

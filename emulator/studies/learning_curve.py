@@ -8,7 +8,7 @@ Source: docs/learning.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import final
 
@@ -22,7 +22,7 @@ from evedrop.memory.tasks import Stopped, Task, Tell
 from evedrop.model.process import Floats
 from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
-from evedrop.studies.parts import all_results, parts_of
+from evedrop.studies.parts import StudyPlace, all_results, parts_of, write_found
 
 _SIDE_BY_SIDE = 100  # trials
 _FIRST = 8  # slots before the first row
@@ -66,11 +66,16 @@ class LearningRow:
 
 
 def learning_curve(
-    scenario: Scenario, tell: Tell, plan: Plan | None = None, side_by_side: int = _SIDE_BY_SIDE
+    scenario: Scenario,
+    tell: Tell,
+    plan: Plan | None = None,
+    place: StudyPlace | None = None,
+    side_by_side: int = _SIDE_BY_SIDE,
 ) -> list[LearningRow]:
     """A row for every power of two from 8 slots on, and for the whole run.
 
-    plan: where the trials are carried out, by default here; side_by_side: trials that are simulated at once.
+    plan: where the trials are carried out, by default here; place: the folder for learned.json; side_by_side: trials that are
+    simulated at once.
 
     Raises UsageError for a scenario in which no eavesdropper learns, RunError if a worker fails, Interrupted on Ctrl-C.
     """
@@ -79,8 +84,11 @@ def learning_curve(
     next(first.chunks())
     if not first.learned():
         raise UsageError(f"{scenario.title}: no eavesdropper learns; try the scenario learning")
-    parts = all_results(parts_of(_LearningTask, scenario, side_by_side), plan or Plan(), tell)
-    return [_row(window, [part.windows[i] for part in parts]) for i, window in enumerate(windows)]
+    tasks = parts_of(_LearningTask, scenario, side_by_side)
+    with all_results(tasks, plan or Plan(), tell, "learned", place) as parts:
+        rows = [_row(window, [part.windows[i] for part in parts]) for i, window in enumerate(windows)]
+        write_found(place, "learned.json", [asdict(row) for row in rows])
+    return rows
 
 
 def _windows(scenario: Scenario) -> list[tuple[int, int]]:

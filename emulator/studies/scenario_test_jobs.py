@@ -28,7 +28,7 @@ def results(scenarios: Sequence[str], manner: Manner, jobs: int) -> Iterator[Fin
         with stop_on_signals() as stop:
             for scenario in scenarios:
                 if stop.is_set():
-                    raise Interrupted.with_results(manner.folder)
+                    raise _interrupted(manner)
                 yield carry_out(scenario, manner)
         return
     crew = _Crew(replace(manner, workers=1))
@@ -38,10 +38,16 @@ def results(scenarios: Sequence[str], manner: Manner, jobs: int) -> Iterator[Fin
             for one in waiting:
                 while not wait([one], _LOOK_SECONDS).done:
                     if stop.is_set():
-                        raise Interrupted.with_results(manner.folder)
+                        raise _interrupted(manner)
                 yield one.result()
         finally:
             crew.end(waiting)
+
+
+def _interrupted(manner: Manner) -> Interrupted:
+    error = Interrupted.with_results(manner.folder)
+    error.resumable = manner.resumable
+    return error
 
 
 @final

@@ -5,6 +5,8 @@ Source: docs/testing.md.
 
 from __future__ import annotations
 
+import contextlib
+import glob
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -13,13 +15,15 @@ from pathlib import Path
 from typing import Any
 
 from evedrop.discovery import scenarios_in
-from evedrop.errors import RunError, ScenarioError, UsageError
+from evedrop.errors import Interrupted, RunError, ScenarioError, UsageError
 from evedrop.live.launch.launcher import launch
 from evedrop.loading import load, shipped
+from evedrop.memory.kept_tasks import KEPT
 from evedrop.memory.montecarlo import Plan, simulate
 from evedrop.news import silent
 from evedrop.report.writing import has_results, try_report
 from evedrop.results.folder import claimed, default_folder
+from evedrop.results.resolved_scenario import resolved
 from evedrop.results.writer import load_results
 from evedrop.scenario import Scenario
 from evedrop.score.summary import Judged
@@ -55,6 +59,13 @@ class Manner:
     """Worker processes of a test in memory; None: as in `Plan`."""
     scheduler: str | None = None
     """Address of a Dask scheduler, for tests in memory."""
+    resume: bool = False
+    """Whether to go on with tests in memory that were interrupted: those that ended keep their results."""
+
+    @property
+    def resumable(self) -> str | None:
+        """The folder from which interrupted tests can be resumed; None for live ones, and without a folder of their own."""
+        return str(self.out) if self.in_memory and self.out is not None else None
 
     @property
     def folder(self) -> Path:
@@ -115,13 +126,17 @@ def carry_out(scenario: str, manner: Manner) -> Finding:
 
     try:
         made = load(scenario, changes)
-        folder = claimed(default_folder(scenario) if manner.out is None else manner.out / Path(scenario).stem)
+        folder = _folder_for(scenario, made, manner)
     except ScenarioError as error:
         return ended(Outcome.MISTAKES, error.mistakes)
     except UsageError as error:
         return ended(Outcome.MISTAKES, [str(error)])
     try:
-        folder = _run(made, folder, manner)
+        if not _has_ended(folder):
+            folder = _run(made, folder, manner)
+    except Interrupted as error:
+        error.resumable = manner.resumable
+        raise
     except UsageError as error:
         return ended(Outcome.MISTAKES, [str(error)], seed=made.seed)
     except RunError as error:
@@ -132,10 +147,30 @@ def carry_out(scenario: str, manner: Manner) -> Finding:
     return ended(Outcome.FAILED if reasons else Outcome.PASSED, reasons, **kept)
 
 
+def _folder_for(scenario: str, made: Scenario, manner: Manner) -> Path:
+    """The results folder of a scenario: a new one, or when tests are resumed the one that already has this very scenario."""
+    if manner.out is None:
+        return claimed(default_folder(scenario))
+    wanted = manner.out / Path(scenario).stem
+    if manner.resume:
+        text = resolved(made)
+        for folder in (wanted, *sorted(manner.out.glob(f"{glob.escape(wanted.name)}-*"))):
+            with contextlib.suppress(OSError, ValueError):
+                if (folder / "scenario.toml").read_text(encoding="utf-8") == text:
+                    return folder
+    return claimed(wanted)
+
+
+def _has_ended(folder: Path) -> bool:
+    """Whether a folder has the results of a study that is complete."""
+    return has_results(folder) and not (folder / KEPT).exists()
+
+
 def _run(scenario: Scenario, folder: Path, manner: Manner) -> Path:
     """Run a scenario into a folder; returns the results folder."""
     if manner.in_memory:
-        simulate(scenario, folder, silent, Plan(workers=manner.workers, scheduler=manner.scheduler))
+        plan = Plan(workers=manner.workers, scheduler=manner.scheduler)
+        simulate(scenario, folder, silent, plan, resume=manner.resume)
         return folder
     return launch(scenario, folder, "off", None, silent).folder
 

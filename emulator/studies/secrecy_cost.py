@@ -9,8 +9,8 @@ Source: docs/microgrid.md, what does secrecy cost in energy.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any, final
 
 import numpy as np
@@ -22,10 +22,10 @@ from evedrop.memory.simulation import Simulation
 from evedrop.memory.tasks import Stopped, Task, Tell
 from evedrop.model.process import Floats
 from evedrop.scenario import Scenario
-from evedrop.scenario.application import APPLICATIONS, applications_in
+from evedrop.scenario.application import APPLICATIONS, ControlledPlant, applications_in
 from evedrop.scenario.controlled import controlled_plant
 from evedrop.score.energy import Meter, energy
-from evedrop.studies.parts import all_results, parts_of
+from evedrop.studies.parts import StudyPlace, all_results, parts_of, write_found
 
 _SIDE_BY_SIDE = 50  # trials
 MEASURES = ("net", "total", "summed")
@@ -65,11 +65,16 @@ class SecrecyCost:
 
 
 def secrecy_cost(
-    scenario: Scenario, tell: Tell, plan: Plan | None = None, side_by_side: int = _SIDE_BY_SIDE
+    scenario: Scenario,
+    tell: Tell,
+    plan: Plan | None = None,
+    place: StudyPlace | None = None,
+    side_by_side: int = _SIDE_BY_SIDE,
 ) -> SecrecyCost:
     """Compare a scenario's scheme with `plain`.
 
-    plan: where the trials are carried out, by default here; side_by_side: trials that are simulated at once.
+    plan: where the trials are carried out, by default here; place: the folder for cost.json; side_by_side: trials that are
+    simulated at once.
 
     Raises UsageError for a scenario without an application that has a power, or with fewer than two trials; RunError if a
     worker fails, Interrupted on Ctrl-C.
@@ -79,7 +84,15 @@ def secrecy_cost(
         raise UsageError(f"{scenario.title}: {_lacking()}")
     if scenario.trials < 2:
         raise UsageError(f"--trials {scenario.trials}: expected 2 or more, so that there is a standard error")
-    parts = all_results(parts_of(_CostTask, scenario, side_by_side), plan or Plan(), tell)
+    tasks = parts_of(_CostTask, scenario, side_by_side)
+    with all_results(tasks, plan or Plan(), tell, "cost", place) as parts:
+        found = _combined(scenario, loop, parts)
+        write_found(place, "cost.json", asdict(found))
+    return found
+
+
+def _combined(scenario: Scenario, loop: ControlledPlant, parts: Sequence[_Part]) -> SecrecyCost:
+    """The cost from the power of all trials."""
     plain, truth, plain_truth = (
         Meter.of_all(list(meters)) for meters in zip(*(one.meters for one in parts), strict=True)
     )

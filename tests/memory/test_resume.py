@@ -35,13 +35,13 @@ STUDY = (
 _TIMES = re.compile(r'"(wall_seconds|slots_per_second)": [^,\n]*|[0-9,]+ trial-slots/s|<td>[0-9.]+ s</td>')
 
 
-def files(folder: Path) -> dict[str, bytes | str]:
-    """The files of a results folder; texts without times and without the folder's name."""
+def files(folder: Path, name: str = "") -> dict[str, bytes | str]:
+    """The files of a results folder; texts without times and without the folder's name, by default its last two parts."""
     found: dict[str, bytes | str] = {}
     for path in sorted(folder.rglob("*")):
         if path.suffix in {".json", ".html", ".toml"}:
             text = _TIMES.sub("", path.read_text())
-            found[str(path.relative_to(folder))] = text.replace(f"{folder.parent.name}/{folder.name}", "FOLDER")
+            found[str(path.relative_to(folder))] = text.replace(name or f"{folder.parent.name}/{folder.name}", "FOLDER")
         elif path.is_file():
             found[str(path.relative_to(folder))] = path.read_bytes()
     return found
@@ -65,7 +65,7 @@ def interrupted_after(monkeypatch: pytest.MonkeyPatch, tasks: int) -> None:
             assert stops[-1].wait(60)
 
     monkeypatch.setattr(KeptTasks, "keep", then)
-    for module in ("memory.montecarlo", "studies.sweep", "studies.compare"):
+    for module in ("memory.montecarlo", "studies.sweep", "studies.compare", "studies.parts"):
         monkeypatch.setattr(f"evedrop.{module}.stop_on_signals", told)
 
 
@@ -264,13 +264,15 @@ STUDIES = {
         *("compare", "eavesdroppers", "--schemes", "plain,innovation,withholding", "--adversaries", "naive,smart"),
         *("--trials", "60", "--slots", "20", "--workers", "1", "--set", "expect=[]"),
     ),
+    "learned": (*("learned", "learning", "--trials", "220", "--slots", "8", "--workers", "1", "--set", "expect=[]"),),
+    "cost": ("cost", "microgrid", "--trials", "120", "--slots", "4", "--workers", "1", "--set", "expect=[]"),
 }
 
 
 @pytest.mark.parametrize("tasks", [1, 2])
 @pytest.mark.parametrize("name", STUDIES)
 def test_other_studies_go_on_too(name: str, tasks: int, evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A sweep and a comparison, interrupted after one and after two tasks; pictures are the same too."""
+    """Interrupted after one and after two tasks; tables and pictures are the same too."""
     study = STUDIES[name]
     assert evedrop(*study, "--out", "whole/run").status == 0
     with monkeypatch.context() as patched:
@@ -303,3 +305,27 @@ def test_another_sweep_or_comparison_is_refused(
         assert evedrop(*STUDIES[name], "--out", "cut/run").status == 130
     done = evedrop(*STUDIES[name], *more, "--out", "cut/run", "--resume")
     assert (done.status, "has another study: " in done.err, what in done.err) == (2, True, True), done.err
+
+
+def test_tests_go_on_too(evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two scenarios that are tested in memory, one has ended when the other is interrupted: it is not run again."""
+    text = evedrop("show", "eavesdroppers").out.replace("slots = 5000", "slots = 30")
+    for name in ("first", "second"):
+        (evedrop.folder / f"{name}.toml").write_text(text.replace("seed = 11", f"seed = {len(name)}"))
+    manner = ("--in-memory", "--trials", "4700")
+    both = ("test", "first.toml", "second.toml", *manner)
+    whole = evedrop(*both, "--out", "whole/run")
+    evedrop("test", "first.toml", *manner, "--out", "cut/run")
+    with monkeypatch.context() as patched:
+        interrupted_after(patched, 1)
+        done = evedrop("test", "second.toml", *manner, "--out", "cut/run")
+    assert done.status == 130
+    assert "go on with: evedrop test second.toml --in-memory --trials 4700 --out cut/run --resume" in done.err
+    before = (evedrop.folder / "cut/run/first/summary.json").read_bytes()
+    assert evedrop(*both, "--out", "cut/run", "--resume").status == whole.status
+    assert (evedrop.folder / "cut/run/first/summary.json").read_bytes() == before
+    for name in ("first", "second"):
+        ours, theirs = (files(evedrop.folder / place / "run" / name, f"{place}/run") for place in ("cut", "whole"))
+        assert ours == theirs
+    refused = evedrop("test", "first.toml", "--out", "cut/run", "--resume")
+    assert (refused.status, "add --in-memory" in refused.err) == (2, True)

@@ -79,7 +79,8 @@ def test_bytes_name_no_class() -> None:
     data = packed(Outer())
     assert b"Outer" not in data
     assert b"Inner" not in data
-    for like in (None, 1, [], {}, np.zeros(2)):
+    others: tuple[object, ...] = (None, 1, [], {}, np.zeros(2))
+    for like in others:
         with pytest.raises(NotData, match="an instance where the example has none"):
             unpacked(data, like)
 

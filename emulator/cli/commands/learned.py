@@ -6,7 +6,7 @@ import argparse
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
-from evedrop.cli.in_memory import crew, studied
+from evedrop.cli.in_memory import crew, keeping, studied
 from evedrop.cli.options import as_json, entries, scenario
 from evedrop.command import Command
 from evedrop.output import print_json
@@ -77,7 +77,7 @@ COMMANDS = (
         "learned",
         learned,
         "show what eavesdroppers that learn the process know, slot by slot",
-        (scenario, entries, as_json, crew),
+        (scenario, entries, as_json, keeping, crew),
         section="study",
         example="learned learning --trials 20",
         page="learning",

@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from evedrop.cli.in_memory import scheduler
+from evedrop.cli.in_memory import check_resuming, resuming, scheduler
 from evedrop.command import Command
 from evedrop.errors import UsageError
 
@@ -22,8 +22,11 @@ def test(options: argparse.Namespace) -> int:
         raise UsageError(f"--jobs {options.jobs}: expected 1 or more")
     if options.scheduler is not None and not options.in_memory:
         raise UsageError("--scheduler computes trials in memory; add --in-memory, or leave it out")
+    if options.resume and not options.in_memory:
+        raise UsageError("--resume goes on with tests in memory; add --in-memory, or leave it out")
+    check_resuming(options)
     scenarios = scenarios_of(options.places)
-    manner = Manner(options.in_memory, options.trials, options.out, scheduler=options.scheduler)
+    manner = Manner(options.in_memory, options.trials, options.out, scheduler=options.scheduler, resume=options.resume)
     started, tested = time.time(), list[Finding]()
     try:
         for one in results(scenarios, manner, options.jobs):
@@ -64,7 +67,7 @@ COMMANDS = (
         "test",
         test,
         "run scenarios as tests, with a report for CI",
-        (_places, _tests, scheduler),
+        (_places, _tests, resuming, scheduler),
         section="run",
         example="test scenarios/ --junit report.xml",
         page="testing",
