@@ -108,5 +108,5 @@ def test_a_mean_would_mislead_where_medians_do_not() -> None:
     random = np.random.default_rng(10)
     samples = random.pareto(1.1, (TRIES, 200))
     mean, median = 1.0 / 0.1, 2.0 ** (1 / 1.1) - 1.0
-    assert misses(sign_of_mean, samples, mean)[1] > 0.3
+    assert misses(sign_of_mean, samples, mean)[1] > 0.2
     assert max(misses(sign_of_median, samples, median)) <= HIGHEST
