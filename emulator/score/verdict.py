@@ -18,6 +18,7 @@ from evedrop.figures.text import count_text, estimate
 from evedrop.model.parts_of_runs import parts_of
 from evedrop.model.process import Floats
 from evedrop.model.theory.covariances import NOBODY, ExpectedCovariance
+from evedrop.model.theory.rare_events import RARE
 from evedrop.names import LEGITIMATE
 from evedrop.score.rare_events import rare_events_of
 from evedrop.score.summary import RARE_SHARE, LeakSummary, SecrecySummary
@@ -303,8 +304,8 @@ def largest_means(theory: Expectation, means: Floats, slots: int) -> Floats:
 
     Theory's expectation where it is known. Where theory only knows a model of what moves the states, the mean of the trials and
     what rare events carry of the model's expectation. Otherwise what an event that none of R trials met may add to their mean:
-    it has a probability of at most 4.6/R, or one of them would have met it in 99 of 100 studies, and then the error is at most
-    that of a receiver without packets, or that of the heaviest trial.
+    it has a probability of at most 4.6/R, or one of them would have met it in 99 of 100 studies. The error is then taken to be
+    that of the heaviest trial, or, where too few trials lose the first packet, that of a receiver without packets.
 
     Source: docs/mathematics.md, verdicts.
     """
@@ -316,8 +317,10 @@ def largest_means(theory: Expectation, means: Floats, slots: int) -> Floats:
         streaks = theory.streaks(slots)
         rare = 1.0 if streaks is None else streaks.share(trials)
         return np.asarray(means.mean(axis=1, keepdims=True) + rare * expected)
-    deaf = _window_averages(ExpectedCovariance(theory.process, NOBODY), slots)
-    heaviest = np.maximum(deaf, means.max(axis=1, keepdims=True))
+    heaviest = means.max(axis=1, keepdims=True)
+    lost = math.nan if theory.law is None else 1.0 - float(theory.law.rates(range(1))[0])
+    if math.isnan(lost) or 0.0 < lost * trials < RARE:
+        heaviest = np.maximum(heaviest, _window_averages(ExpectedCovariance(theory.process, NOBODY), slots))
     return np.asarray(means.mean(axis=1, keepdims=True) - math.log(ERROR_RATE) / trials * heaviest)
 
 

@@ -90,9 +90,11 @@ def test_live_and_memory_are_the_same_bits(name: str, batch: str, twins: Callabl
                     )
             elif figure != "digest":
                 assert found == (same[figure] if same[figure] is None else pytest.approx(same[figure], rel=apart))
-    for name, verdict in live.summary["secrecy"].items():
-        ratios = {key: pytest.approx(verdict[key], rel=1e-9) for key in ("ratio", "ratio_standard_error") if verdict[key]}
-        assert memory.summary["secrecy"][name] == {**verdict, **ratios}
+    for eavesdropper, verdict in live.summary["secrecy"].items():
+        ratios = {
+            key: pytest.approx(verdict[key], rel=1e-9) for key in ("ratio", "ratio_standard_error") if verdict[key]
+        }
+        assert memory.summary["secrecy"][eavesdropper] == {**verdict, **ratios}
     assert live.summary["directions"] == memory.summary["directions"]
     assert live.summary.get("integrity", {}).get("digest") == memory.summary.get("integrity", {}).get("digest")
 
