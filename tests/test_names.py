@@ -55,3 +55,12 @@ def test_classes_say_that_they_are_final_by_the_decorator() -> None:
     for path, text in (texts() | tests).items():
         for node in classes_of(text) if re.search("Final[.;]", text) else []:
             assert not said.search(ast.get_docstring(node) or ""), f"{path}: {node.name}"
+
+
+def test_no_two_test_files_have_the_same_name() -> None:
+    """Pytest imports test files by their names alone, and collects only the first of two."""
+    folders = defaultdict(list)
+    for folder in ("tests", "docs/examples"):
+        for path in (ROOT / folder).rglob("test_*.py"):
+            folders[path.name].append(str(path.parent))
+    assert {name: where for name, where in folders.items() if len(where) > 1} == {}

@@ -118,7 +118,7 @@ class Outcome:
         """All that is not as README promises, in words."""
         found = [f"`{command}` did not end" for command in commands if command not in self.ended]
         found += [f"`{command}` ended with {status}" for command, (status, _) in self.ended.items() if status]
-        found += [line for line in self.said if re.match(r"(FAILED|ERROR) \S+::", line)]
+        found += [line for line in self.said if re.match(r"(FAILED|ERROR) \S+\.py\b", line)]
         return found + [f"left behind: {what}" for what in self.left]
 
 

@@ -45,7 +45,13 @@ def test_all_that_went_wrong_is_named() -> None:
     outcomes = Outcome(
         ended={"make demo": (0, 3), "make test": (2, 5)},
         left=("x.zenoh",),
-        said=("FAILED tests/a.py::test_b - assert 0", "FAILED to be kind", "ERROR tests/c.py::test_d", "1 failed"),
+        said=(
+            "FAILED tests/a.py::test_b - assert 0",
+            "FAILED to be kind",
+            "ERROR tests/c.py::test_d",
+            "ERROR tests/e.py",
+            "1 failed",
+        ),
         used_kilobytes=1,
     )
     assert outcomes.mistakes(("make demo", "make test", "make more")) == [
@@ -53,6 +59,7 @@ def test_all_that_went_wrong_is_named() -> None:
         "`make test` ended with 2",
         "FAILED tests/a.py::test_b - assert 0",
         "ERROR tests/c.py::test_d",
+        "ERROR tests/e.py",
         "left behind: x.zenoh",
     ]
 
