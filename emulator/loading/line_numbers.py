@@ -10,11 +10,12 @@ from typing import Any
 
 from evedrop.errors import ScenarioError
 
-# All that a bracket, an equals sign or the end of a line may mean in a valid text; strings and comments hide others.
+# All that a bracket, an equals sign or the end of a line may mean in a valid text; strings and comments hide others. No group is
+# repeated possessively: the `re` of Python 3.11.2, which is Debian 12's, does not match such a repetition.
 _TOKEN = re.compile(
     r"""
-    (?P<string> \"""(?: [^"\\]++ | \\. | "{1,2}(?!") )*+"{3,5} | '''.*?'{3,5}
-              | "(?: [^"\\]++ | \\. )*+" | '[^']*+' )
+    (?P<string> \"""(?: [^"\\]++ | \\. | "{1,2}(?!") )*"{3,5} | '''.*?'{3,5}
+              | "(?: [^"\\]++ | \\. )*" | '[^']*+' )
     | (?P<opens> [\[{] ) | (?P<closes> [\]}] ) | (?P<equals> = ) | (?P<end> (?:\#[^\n]*+)?\n )
     """,
     re.DOTALL | re.VERBOSE,

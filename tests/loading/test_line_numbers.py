@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -136,3 +137,11 @@ def test_other_mistakes_of_toml_are_told_in_its_readers_words() -> None:
     """They say the place."""
     with pytest.raises(ScenarioError, match=r"not TOML: Expected '=' after a key.*line 2"):
         parse("a = 1\na b = 2\n", "mine.toml")
+
+
+def test_no_pattern_repeats_a_group_possessively() -> None:
+    """`(…)*+` is wrong in the `re` of Python 3.11.2, which Debian 12 has, and right in later ones."""
+    root = Path(__file__).parents[2]
+    sources = [path for folder in ("emulator", "peers", "tools") for path in (root / folder).rglob("*.py")]
+    assert len(sources) > 200
+    assert [path for path in sources if re.search(r"\)(?:[*+?]|\{[\d,]+\})\+", path.read_text("utf-8"))] == []
