@@ -29,6 +29,7 @@ from evedrop.names import LEGITIMATE
 from evedrop.scenario import Scenario
 
 _ROUNDING = 1e-12  # of an error, relative to the state
+_SMALL = 1e-15  # of a squared error, relative to those of the first slots: above it none is rounding
 
 
 class ExpectedTraceStream(Protocol):
@@ -151,9 +152,13 @@ class Expectation:
             found[part.start : part.stop] = np.einsum("i,kij,j->k", v, stream.next(len(part)), v)
         return found
 
-    def rounding(self, slots: int) -> float:
-        """A mean squared error over slots 0 … slots−1 below which it consists of rounding: 1e-24 of the state's own square."""
-        return _ROUNDING**2 * total_of(ExpectedCovariance(self.process, theory.NOBODY).next_traces, slots) / slots
+    def is_rounding(self, error: float, slots: int) -> bool:
+        """Whether a mean squared error over slots 0 … slots−1 is only rounding: below 1e-24 of the state's own square."""
+        process = self.process
+        if error > _SMALL * float(np.trace(process.initial_covariance) + np.trace(process.Q)):
+            return False  # the horizon of runs keeps the state from growing so far
+        own = total_of(ExpectedCovariance(process, theory.NOBODY).next_traces, slots) / slots
+        return error < _ROUNDING**2 * own
 
     @property
     def growth(self) -> Growth | None:

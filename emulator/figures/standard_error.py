@@ -36,26 +36,18 @@ def ratio_error(over: Floats, under: Floats) -> float | None:
     return standard_error((over - float(np.mean(over)) / mean * under) / mean)
 
 
-def z_of(of_trials: Floats | None, expected: float | None, rounding: float = 0.0) -> float | None:
+def z_of(of_trials: Floats | None, expected: float | None) -> float | None:
     """How far the mean of independent trials, (R,), is from its expectation by theory, as a standard normal number.
 
     It is the distance in standard errors, corrected for what the trials show of their distribution: their skewness and their
     kurtosis, without which a mean that a few trials carry is called improbable far too often.
 
-    rounding: trials whose mean and expectation are both below it consist of rounding errors only, and have none. None without
-    theory, for fewer than two trials, and for trials that are all equal or not finite.
+    None without theory, for fewer than two trials, and for trials that are all equal or not finite.
 
     Source: docs/mathematics.md, z-scores.
     """
-    test = skewed_test(of_trials, expected) if expected is not None else None
-    if (
-        test is None
-        or of_trials is None
-        or expected is None
-        or max(abs(float(np.mean(of_trials))), abs(expected)) < rounding
-    ):
-        return None
-    return test.z
+    test = None if expected is None else skewed_test(of_trials, expected)
+    return None if test is None else test.z
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ Source: docs/mathematics.md, rare events and z-scores.
 
 from __future__ import annotations
 
-import math
+import numpy as np
 
 from evedrop.expected.expectations import Expectation
 from evedrop.figures.standard_error import mean_skewness, z_of
@@ -35,4 +35,6 @@ def z_of_error(
         return None
     if rare is None and of_trials is not None and abs(mean_skewness(of_trials)) > _LARGEST_SKEWNESS:
         return None
-    return z_of(of_trials, theory, expected.rounding(slots) if slots else math.inf)
+    if of_trials is None or not slots or expected.is_rounding(max(theory, float(np.mean(of_trials))), slots):
+        return None
+    return z_of(of_trials, theory)

@@ -255,7 +255,7 @@ def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tall
         perfect = Verdict.FAILED
     else:
         perfect = perfect_verdict(other_means, user_means, user_bound, test) if complete else Verdict.UNDECIDED
-    ratio, scatter, ratio_slots = ratio_of(user, other, user_theory.rounding(user.done) if user.done else 0.0)
+    ratio, scatter, ratio_slots = ratio_of((user, user_theory), other)
     return Secrecy(
         name,
         relative,
@@ -276,14 +276,13 @@ def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tall
     )
 
 
-def ratio_of(user: Tally, other: Tally, rounding: float) -> tuple[float, float | None, tuple[int, int] | None]:
+def ratio_of(legitimate: tuple[Tally, Expectation], other: Tally) -> tuple[float, float | None, tuple[int, int] | None]:
     """The ratio of two mean errors, the eavesdropper's over the legitimate one, its standard error, and its slots.
 
-    rounding: a smaller legitimate error is only rounding, and the ratio infinite.
-
     Over the second half of the run, so that the start, in which few packets decide, does not count; over all slots of a run
-    that was cut short or is not longer than its first half. NaN without slots.
+    that was cut short or is not longer than its first half. inf if the legitimate error is only rounding; NaN without slots.
     """
+    user, theory = legitimate
     if not user.done:
         return math.nan, None, None
     first = int(window_bounds(user.slots)[WINDOWS // 2])
@@ -294,7 +293,7 @@ def ratio_of(user: Tally, other: Tally, rounding: float) -> tuple[float, float |
     over, under = float(np.mean(theirs)), float(np.mean(ours))
     alike = user.alike and other.alike
     slots = (first, user.done - 1)
-    if under <= rounding * (slots[1] + 1 - first) or not under:
+    if not under or theory.is_rounding(under / (slots[1] + 1 - first), user.done):
         return math.inf, None, slots
     return over / under, ratio_error(theirs, ours) if alike else None, slots
 

@@ -137,6 +137,17 @@ def test_one_trial_has_no_standard_error() -> None:
         assert set(peer.standard_errors.values()) | set(peer.z.values()) == {None}
 
 
+def test_rounding_has_no_z() -> None:
+    """Over a perfect link the legitimate error is only rounding, however far that is above 0; the ratio is infinite."""
+    changes = {"legitimate.link.quality": 1.0, "slots": 100, "trials": 50, "expect": []}
+    summary = summary_of_study(load("eavesdroppers", changes))
+    user = summary.peers["legitimate"]
+    assert 0.0 < user.figures["mean_squared_error"] < 1e-25  # type: ignore[operator]
+    assert user.z == {"mean_squared_error": None}
+    assert summary.secrecy["naive"].ratio is None
+    assert summary.secrecy["naive"].sentence.startswith("naive: ∞ × the legitimate error in slots 51 to 99;")
+
+
 def test_infinite_variance_leaves_only_counts_a_standard_error() -> None:
     """The error and the believed covariance have none, and no z."""
     peer = summary_of_study(load("numerical", {"trials": 20, "expect": []})).peers["smart"]
@@ -260,7 +271,7 @@ def test_a_standard_error_needs_finite_trials() -> None:
     assert standard_error(np.array([1.0, 3.0])) == 1.0
     some = np.array([1.0, 3.0])
     assert z_of(np.ones(4), 2.0) is z_of(some, None) is z_of(None, 2.0) is z_of(some, math.inf) is None
-    assert z_of(np.array([1.0, math.inf]), 2.0) is z_of(some, 2.0, rounding=4.0) is None
+    assert z_of(np.array([1.0, math.inf]), 2.0) is None
     assert z_of(some, 2.0) == pytest.approx(0.0, abs=1e-12)
 
 
