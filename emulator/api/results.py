@@ -15,6 +15,7 @@ from evedrop.api.notebook import table_text
 from evedrop.figures import shown_figure
 from evedrop.figures.text import figure_text
 from evedrop.report import closing
+from evedrop.report.comparison import pairs_table, schemes_table
 from evedrop.report.sweep import sweep_table
 from evedrop.report.text_table import TextTable
 from evedrop.results.by_name import ByName
@@ -36,7 +37,30 @@ class _InFolder(Protocol):
 
 
 class ReportedResults:
-    """Results in a folder, which can be shown on one page."""
+    """Results in a folder, which can be shown on one page and whose tables can be written for other programs."""
+
+    def to_csv(self, path: str | Path) -> list[Path]:
+        """Write the tables that the command prints as CSV, with every number at full precision, and return the files' paths.
+
+        The first table goes to `path`, a second one to NAME-2.csv. Source: docs/results.md, tables in other programs.
+
+        Raises UsageError if a file cannot be written.
+        """
+        from evedrop.report.table_files import write_csv  # noqa: PLC0415 - no other method needs it
+
+        return write_csv(self._tables(), Path(path))
+
+    def to_latex(self, path: str | Path) -> Path:
+        """Write the tables that the command prints as LaTeX, and return the file's path; it needs no package.
+
+        Raises UsageError if the file cannot be written.
+        """
+        from evedrop.report.table_files import write_latex  # noqa: PLC0415 - no other method needs it
+
+        return write_latex(self._tables(), Path(path))
+
+    def _tables(self) -> list[TextTable]:
+        raise NotImplementedError
 
     def report(self: _InFolder) -> Path:
         """Write report.html into the folder, and return its path. Source: docs/results.md, report.html.
@@ -119,6 +143,13 @@ class RunResults(Results, ReportedResults):
         remark = "" if self.remark is None else "; incomplete"
         return f"<RunResults of {self._typed.scenario!r}: {self._facts}; mean error: {', '.join(errors)}{remark}>"
 
+    def _tables(self) -> list[TextTable]:
+        directions = self._typed.directions
+        return [
+            closing.receivers_table(self._typed),
+            *([closing.directions_table(directions)] if directions else []),
+        ]
+
     def _repr_html_(self) -> str:
         title = f"{self._typed.scenario} · {self._facts}"
         return table_text(title, closing.receivers_table(self._typed), self._notes())
@@ -150,6 +181,9 @@ class SweepResults(ReportedResults):
     @property
     def _facts(self) -> str:
         return f"{', '.join(self.keys)}: {self.points} point{'' if self.points == 1 else 's'}"
+
+    def _tables(self) -> list[TextTable]:
+        return [sweep_table(self.table.to_pylist(), self.keys)]
 
     def _repr_html_(self) -> str:
         more = self.table.num_rows - _MOST_ROWS
@@ -183,6 +217,9 @@ class ComparisonResults(Comparison, ReportedResults):
 
     def __repr__(self) -> str:
         return f"<ComparisonResults of {self.title!r}: {self._facts}>"
+
+    def _tables(self) -> list[TextTable]:
+        return [schemes_table(self), pairs_table(self)]
 
     def _repr_html_(self) -> str:
         numbers = ["largest legitimate error", "error of the closest adversary"]

@@ -8,7 +8,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from evedrop.cli.report import left_out_line, terminal
-from evedrop.figures.text import finite_text
+from evedrop.figures.text import figure_text, finite_text
 
 if TYPE_CHECKING:
     from evedrop.expected.energy_budget import BudgetDesign
@@ -29,9 +29,9 @@ def print_budget(design: BudgetDesign) -> None:
     for one in sorted({round(each.threshold, 9): each for each in (*design.others, design.best)}.items()):
         figures = one[1]
         shown.add_row(
-            f"{figures.threshold:.6g}",
-            f"{figures.encrypted_fraction:.4f}",
-            f"{figures.energy:.6g}",
+            figure_text(figures.threshold, ".6g"),
+            figure_text(figures.encrypted_fraction, ".4f"),
+            figure_text(figures.energy, ".6g"),
             *(finite_text(figures.eavesdroppers[name]) for name in names),
             "the budget's" if figures is design.best else "",
         )

@@ -10,7 +10,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from evedrop.cli.report import terminal
-from evedrop.figures.text import finite_text
+from evedrop.figures.text import figure_text, finite_text
 
 if TYPE_CHECKING:
     from evedrop.model.theory.design import Design
@@ -59,7 +59,7 @@ def print_design(design: Design) -> None:
             "none"
             if not against.relative
             else " ∪ ".join(f"({low:.5f}, {high:.5f})" for low, high in against.relative),
-            "–" if against.best_difference is None else f"{against.best_difference:.5f}",
+            figure_text(against.best_difference, ".5f"),
             "–" if against.largest is None else _largest(against.largest),
             finite_text(against.trace, ".6g"),
             "–" if math.isnan(against.ratio) else finite_text(against.ratio),
@@ -72,7 +72,7 @@ def print_design(design: Design) -> None:
 
 def _largest(largest: LargestRatio) -> str:
     """The largest ratio, and its μ_d."""
-    return f"{finite_text(largest.ratio)} {'at' if largest.attained else '→'} {_shown(largest.mu_d)}"
+    return finite_text(largest.ratio) + f" {'at' if largest.attained else '→'} {_shown(largest.mu_d)}"
 
 
 def _shown(mu_d: float) -> str:

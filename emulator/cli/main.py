@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from evedrop.cli.commands import GROUP, MODULES, ROLES
 from evedrop.cli.parser import Parser
+from evedrop.cli.tables import written_tables
 from evedrop.errors import EvedropError, Interrupted, RunError, UsageError
 from evedrop.files import shown
 from evedrop.output import say, standard_streams, warn
@@ -54,7 +55,8 @@ def _status(given: list[str]) -> int:
     command: Callable[[argparse.Namespace], int] = options.command
     try:
         _check_names(options)
-        return command(options)
+        with written_tables(options):
+            return command(options)
     except EvedropError as error:
         sys.stdout.flush()
         say(str(error))

@@ -9,7 +9,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from evedrop.cli.report import left_out_line, terminal
-from evedrop.figures.text import finite_text
+from evedrop.figures.text import figure_text, finite_text
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -62,7 +62,7 @@ def _policies(front: Front, states: int) -> Table:
         low, high = point.weights
         shown.add_row(
             f"{low:g}" if low == high else f"{low:g} … {high:g}",
-            f"{point.price:g}",
+            figure_text(point.price, "g"),
             *_figures(point.figures),
             str(point.scheduled),
             _by_holding_time(point.thresholds, states),
@@ -79,4 +79,4 @@ def _by_holding_time(thresholds: Sequence[int], states: int) -> str:
 
 
 def _figures(figures: PolicyFigures) -> tuple[str, ...]:
-    return (*map(finite_text, (figures.user, figures.eavesdropper)), f"{figures.transmissions:.4f}")
+    return (*map(finite_text, (figures.user, figures.eavesdropper)), figure_text(figures.transmissions, ".4f"))

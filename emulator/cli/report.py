@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from evedrop.cli.narrow import fitted
+from evedrop.cli.tables import TAKEN, text_table
 from evedrop.report import closing
 from evedrop.report.sweep import sweep_table
 from evedrop.report.text_table import TextTable
@@ -52,7 +53,7 @@ def print_summary(summary: Summary, folder: str, replay: str | None = None) -> N
     console = terminal()
     if summary.ended != "complete":
         console.print(f"{summary.ended.splitlines()[0]}; the results so far:")
-    console.print(closing_table(summary, console.width))
+    console.print(closing_table(summary, console.width), whole=closing.receivers_table(summary))
     for line in (*closing.remarks(summary), *closing.verdicts(summary)):
         console.print(line)
     if summary.directions:
@@ -85,12 +86,15 @@ def left_out_line(left_out: Mapping[str, str], why: str) -> str:
 
 
 class _Console(Console):
-    def print(self, *objects: Any, **named: Any) -> None:
-        """Show a table that is wider than the terminal row by row."""
+    def print(self, *objects: Any, whole: TextTable | None = None, **named: Any) -> None:
+        """Show a table that is wider than the terminal row by row. whole: the table for files, if another one is shown."""
+        taken = TAKEN.get()
+        if taken is not None:
+            taken += [whole or text_table(one) for one in objects if isinstance(one, Table)]
         super().print(*(fitted(one, self) if isinstance(one, Table) else one for one in objects), **named)
 
 
-def terminal() -> Console:
+def terminal() -> _Console:
     """A console on standard output; 140 columns wide if that is not a terminal."""
     return _Console(
         highlight=False,

@@ -8,6 +8,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from evedrop.cli.report import left_out_line, terminal
+from evedrop.figures.text import figure_text
 from evedrop.model.checks import toml_of
 
 if TYPE_CHECKING:
@@ -46,5 +47,5 @@ def _slots(schedule: MeanSchedule) -> Table:
         shown.add_column(head, justify="right", no_wrap=True)
     for k, row in enumerate(zip(schedule.mu_d, schedule.user, schedule.eavesdropper, strict=True)):
         mu_d, ours, theirs = row
-        shown.add_row(str(k), f"{mu_d:.6g}", f"{ours:.4g}", f"{theirs:.4g}")
+        shown.add_row(str(k), figure_text(mu_d, ".6g"), figure_text(ours), figure_text(theirs))
     return shown

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import math
 
+from evedrop.figures.shown_number import ShownNumber
+
 _SMALL_NUMBER, _LARGE_NUMBER, _LEAST_PLACE, _LAST_PLACE = 0.01, 1e5, -4, -6  # beyond them estimates have exponents
 _ROUNDING = 1e-12  # a standard error below this part of the estimate comes from the rounding of equal trials
 _MOST_DIGITS = 8  # significant digits of an estimate
 _LARGE_COUNT, _NEARLY_ALL = 1e7, 0.99
 
 
-def figure_text(value: float | None, how: str = ".4g") -> str:
+def figure_text(value: float | None, how: str = ".4g") -> ShownNumber:
     """A figure of the summary as text; a dash for None."""
-    return "–" if value is None else format(value, how)
+    return ShownNumber("–" if value is None else format(value, how), value)
 
 
-def finite_text(value: float, how: str = ".4g") -> str:
+def finite_text(value: float, how: str = ".4g") -> ShownNumber:
     """A number as text; ∞ for one that is not finite."""
-    return format(value, how) if math.isfinite(value) else "∞"
+    return ShownNumber(format(value, how) if math.isfinite(value) else "∞", value)
 
 
 def count_text(number: float) -> str:
@@ -30,11 +32,15 @@ def share_text(share: float) -> str:
     return f"{100 * share:.2g} %" if share < _NEARLY_ALL else "more than 99 %"
 
 
-def estimate(value: float | None, error: float | None, how: str = ".4g") -> str:
+def estimate(value: float | None, error: float | None, how: str = ".4g") -> ShownNumber:
     """An estimate with its standard error, to the place of that error's first digit: 0.0123 ± 0.0004. how: without an error.
 
     An error of the size of rounding, which trials with equal outcomes have, counts as none.
     """
+    return ShownNumber(_estimate(value, error, how), value, error)
+
+
+def _estimate(value: float | None, error: float | None, how: str) -> str:
     if value is None or not error or not math.isfinite(value) or math.isnan(error) or error <= _ROUNDING * abs(value):
         return figure_text(value, how)
     if math.isinf(error):

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Any, Self, TypeAlias
 
+from evedrop.figures.shown_number import ShownNumber
 from evedrop.figures.text import estimate
 
 Value: TypeAlias = float | str | None
@@ -128,7 +129,7 @@ class PublishedNumber:
         """Our value with its standard error, or "exact", as text."""
         if not isinstance(self.ours, float):
             return _text(self.ours)
-        return f"{_text(self.ours)} exact" if self.standard_error is None else estimate(self.ours, self.standard_error)
+        return _text(self.ours) + " exact" if self.standard_error is None else estimate(self.ours, self.standard_error)
 
 
 def _strict(value: Any) -> Any:
@@ -139,7 +140,7 @@ def _strict(value: Any) -> Any:
 def _text(value: Value) -> str:
     if value is None:
         return "–"
-    return value if isinstance(value, str) else f"{value:.6g}".replace("inf", "∞")
+    return value if isinstance(value, str) else ShownNumber(f"{value:.6g}".replace("inf", "∞"), value)
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from itertools import groupby
 from typing import TYPE_CHECKING
 
+from evedrop.figures.shown_number import ShownNumber
 from evedrop.figures.text import estimate, figure_text, share_text
 from evedrop.report.closing import rare_events_words
 from evedrop.report.text_table import TextTable
@@ -52,14 +53,14 @@ def schemes_table(found: Comparison) -> TextTable:
             simulated(one.legitimate),
             theory(one.legitimate),
             "yes" if needs.acknowledgements else "–",
-            f"{needs.sent_fraction:.3g}",
-            f"{needs.bits_per_slot:.4g}",
+            figure_text(needs.sent_fraction, ".3g"),
+            figure_text(needs.bits_per_slot),
             estimate(needs.energy_per_slot, needs.standard_errors["energy_per_slot"] or None, ".3g"),
             f"{needs.secret_bits_per_slot}{once}" if needs.secret_bits_per_slot else "–",
             *(
                 ("–", "–")
                 if one.leak is None
-                else (f"{one.leak.clear_fraction:.3g}", figure_text(one.leak.bits, ".3g"))
+                else (figure_text(one.leak.clear_fraction, ".3g"), figure_text(one.leak.bits, ".3g"))
             ),
             *(("–", "–") if cell is None else (cell.match.adversary, verdict(cell))),
         )
@@ -93,13 +94,16 @@ def pairs_table(found: Comparison) -> TextTable:
 def simulated(of: SimulatedError) -> str:
     """The mean over trials with its standard error, or the median if the variance is infinite."""
     if of.infinite_variance:
-        return f"{of.typical:.3g} med"
+        return figure_text(of.typical, ".3g") + " med"
     return estimate(of.mean, of.standard_error, ".3g")
 
 
 def theory(of: SimulatedError) -> str:
     """The mean that theory expects over the same slots; with ≥ if it is only a bound."""
-    return "–" if of.theory is None else f"{'≥ ' if of.theory.bound else ''}{of.theory.mean:.3g}"
+    if of.theory is None:
+        return figure_text(None)
+    mean = of.theory.mean
+    return ShownNumber(f"≥ {mean:.3g}", mean, after="at least") if of.theory.bound else figure_text(mean, ".3g")
 
 
 def verdict(cell: Cell) -> str:

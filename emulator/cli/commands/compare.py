@@ -7,6 +7,7 @@ from pathlib import Path
 
 from evedrop.cli.in_memory import check_resuming, crew, plan_of, resuming
 from evedrop.cli.options import changes_of, entries, output, scenario
+from evedrop.cli.tables import tables
 from evedrop.command import Command
 from evedrop.errors import UsageError
 from evedrop.output import print_json
@@ -77,7 +78,7 @@ COMMANDS = (
         "compare",
         compare,
         "compare schemes, each against all adversaries, in memory",
-        (scenario, entries, output, _compares, crew, resuming),
+        (scenario, entries, output, _compares, crew, resuming, tables),
         section="study",
         example="compare vehicle --trials 100",
         page="compare",

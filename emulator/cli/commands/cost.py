@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING
 
 from evedrop.cli.in_memory import crew, keeping, studied
 from evedrop.cli.options import as_json, entries, scenario
+from evedrop.cli.tables import tables
 from evedrop.command import Command
+from evedrop.figures.shown_number import ShownNumber
+from evedrop.figures.text import figure_text
 from evedrop.output import print_json
 
 if TYPE_CHECKING:
@@ -53,8 +56,9 @@ def _print(found: SecrecyCost) -> None:
 
 
 def _cells(one: MeanEstimate, scale: float, unit: str) -> tuple[str, str, str]:
-    mean, error, low, high = (f"{scale * value:.3g}" for value in (one.mean, one.standard_error, one.low, one.high))
-    return f"{mean}{unit}", f"{float(error):.2g}", f"{low} to {high}{unit}"
+    mean, low, high = (figure_text(scale * value, ".3g") for value in (one.mean, one.low, one.high))
+    error = ShownNumber(f"{float(f'{scale * one.standard_error:.3g}'):.2g}", scale * one.standard_error)
+    return mean + unit, error, f"{low} to {high}{unit}"
 
 
 COMMANDS = (
@@ -62,7 +66,7 @@ COMMANDS = (
         "cost",
         cost,
         "compute the energy that secrecy costs a house",
-        (scenario, entries, as_json, keeping, crew),
+        (scenario, entries, as_json, keeping, crew, tables),
         section="study",
         example="cost microgrid",
         page="microgrid",

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 from evedrop.cli.options import as_json, changes, changes_of, scenario
+from evedrop.cli.tables import tables
 from evedrop.command import Command
 from evedrop.errors import UsageError
 from evedrop.output import print_json
@@ -113,7 +114,7 @@ COMMANDS = (
         "design",
         design,
         "choose μ_d, or when to send or encrypt, for a scenario",
-        (scenario, changes, _designs, as_json),
+        (scenario, changes, _designs, as_json, tables),
         section="study",
         example="design numerical",
         page="design",

@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING
 
 from evedrop.cli.in_memory import crew, keeping, studied
 from evedrop.cli.options import as_json, entries, scenario
+from evedrop.cli.tables import tables
 from evedrop.command import Command
+from evedrop.figures.shown_number import ShownNumber
+from evedrop.figures.text import figure_text
 from evedrop.output import print_json
 
 if TYPE_CHECKING:
@@ -45,7 +48,10 @@ def _print(rows: list[LearningRow], trials: int) -> None:
         table.add_column(heading, justify="right")
     for row in rows:
         for learner, values in row.parameters.items():
-            cells = (f"{one.median:.3g} ({_with_error(one.mean, one.standard_error)})" for one in values.values())
+            cells = (
+                figure_text(one.median, ".3g") + f" ({_with_error(one.mean, one.standard_error)})"
+                for one in values.values()
+            )
             table.add_row(str(row.stop), learner, *cells)
     console.print(table)
     console.print("mean |x − x̂|² of the slots between, ± standard error, and the learner's over it")
@@ -61,15 +67,17 @@ def _print(rows: list[LearningRow], trials: int) -> None:
     for row in rows:
         for name, error in row.errors.items():
             ratios = (one.get(name) for one in row.ratios.values())
-            cells = ("" if one is None else _with_error(one.ratio, one.standard_error) for one in ratios)
+            cells = (
+                ShownNumber("", None) if one is None else _with_error(one.ratio, one.standard_error) for one in ratios
+            )
             table.add_row(str(row.first), str(row.stop), name, _with_error(error, row.standard_errors[name]), *cells)
     console.print(table)
 
 
-def _with_error(value: float, error: float | None) -> str:
+def _with_error(value: float, error: float | None) -> ShownNumber:
     if error is None:
-        return f"{value:.3g}"
-    return f"{value:.3g} ± {error if error > _ROUNDING * abs(value) else 0.0:.1g}"
+        return figure_text(value, ".3g")
+    return ShownNumber(f"{value:.3g} ± {error if error > _ROUNDING * abs(value) else 0.0:.1g}", value, error)
 
 
 COMMANDS = (
@@ -77,7 +85,7 @@ COMMANDS = (
         "learned",
         learned,
         "show what eavesdroppers that learn the process know, slot by slot",
-        (scenario, entries, as_json, keeping, crew),
+        (scenario, entries, as_json, keeping, crew, tables),
         section="study",
         example="learned learning --trials 20",
         page="learning",

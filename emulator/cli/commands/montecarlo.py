@@ -6,6 +6,7 @@ import argparse
 
 from evedrop.cli.in_memory import MEMORY, check_resuming, plan_of
 from evedrop.cli.options import loaded, over_wire, print_so_far, scenario
+from evedrop.cli.tables import tables
 from evedrop.command import Command
 from evedrop.errors import Interrupted
 
@@ -44,7 +45,7 @@ COMMANDS = (
         "montecarlo",
         montecarlo,
         "simulate the trials of a scenario in memory (1000 unless told otherwise)",
-        (scenario, over_wire, *MEMORY, _rare),
+        (scenario, over_wire, *MEMORY, _rare, tables),
         section="run",
         example="montecarlo vehicle --trials 200",
         page="montecarlo",

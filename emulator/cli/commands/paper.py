@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from evedrop.cli.names import print_names
 from evedrop.cli.options import as_json
+from evedrop.cli.tables import tables
 from evedrop.command import Command
 from evedrop.errors import UsageError
 from evedrop.output import print_json
@@ -114,7 +115,7 @@ COMMANDS = (
         "paper",
         paper,
         "compare the numbers of a published paper with ours",
-        (_papers, as_json),
+        (_papers, as_json, tables),
         section="study",
         example="paper luecke2022",
         page="papers",

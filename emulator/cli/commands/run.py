@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from evedrop.cli.holding import hold
 from evedrop.cli.options import entries, loaded, output, over_wire, print_so_far, scenario
+from evedrop.cli.tables import tables
 from evedrop.command import Command
 from evedrop.errors import Interrupted, RunError, UsageError
 
@@ -133,7 +134,7 @@ def _over_ssh(parser: argparse.ArgumentParser) -> None:
     )
 
 
-_LIVE = (entries, output, _live)
+_LIVE = (entries, output, _live, tables)
 
 
 COMMANDS = (

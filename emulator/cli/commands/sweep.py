@@ -7,6 +7,7 @@ from pathlib import Path
 
 from evedrop.cli.in_memory import MEMORY, check_resuming, plan_of
 from evedrop.cli.options import changes_of, scenario
+from evedrop.cli.tables import tables
 from evedrop.command import Command
 from evedrop.output import print_json
 
@@ -51,7 +52,7 @@ COMMANDS = (
         "sweep",
         sweep,
         "simulate a scenario in memory over a grid of values",
-        (scenario, _over, *MEMORY),
+        (scenario, _over, *MEMORY, tables),
         section="study",
         example="sweep numerical --over encoding.state_probability=0.6,0.7,0.8",
         page="montecarlo",

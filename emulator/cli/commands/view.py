@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from evedrop.cli.holding import hold
 from evedrop.cli.options import argument, number_type, served
+from evedrop.cli.tables import tables
 from evedrop.command import Command
 from evedrop.errors import UsageError
 
@@ -247,7 +248,7 @@ COMMANDS = (
         "view",
         view,
         "open a finished run or wire, draw it, or print its report again",
-        (argument("run", "RUN"), _shown, served),
+        (argument("run", "RUN"), _shown, served, tables),
         section="inspect",
         example="view runs/vehicle --picture vehicle.png",
         page="view",

@@ -1,0 +1,206 @@
+"""Every table that a command prints can be written as CSV and as LaTeX."""
+
+from __future__ import annotations
+
+import ast
+import csv
+import itertools
+import re
+import shlex
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+import evedrop.cli
+from evedrop.api import montecarlo, sweep
+from evedrop.cli.commands import MODULES, ROLES
+from evedrop.cli.tables import tables
+from evedrop.figures.text import estimate, figure_text, finite_text
+from evedrop.report.table_files import csv_text, latex_escaped, latex_text
+from evedrop.report.text_table import TextTable
+from tests.conftest import Evedrop
+
+CLI = Path(evedrop.cli.__file__).parent
+OF_OTHERS = {"demo", "run"}
+"""Live commands, which print the closing report as `montecarlo` does."""
+COMMANDS = {
+    "montecarlo": "montecarlo eavesdroppers --trials 4 --slots 30 --set expect=[]",
+    "sweep": "sweep eavesdroppers --over encoding.state_probability=0.3,0.6 --trials 4 --slots 30 --set expect=[]",
+    "compare": "compare eavesdroppers --schemes plain,innovation --adversaries smart --trials 4 --slots 20 --set expect=[]",
+    "design": "design eavesdroppers",
+    "cost": "cost microgrid --trials 3 --slots 130 --set expect=[]",
+    "learned": "learned learning --trials 4 --slots 9 --set expect=[]",
+    "paper": "paper luecke2022 --quick",
+    "view": "view run --table",
+}
+
+
+@cache
+def functions(module: str) -> tuple[dict[str, set[str]], dict[str, str]]:
+    """The functions of a module of the command line with the names in them, and imported name → module."""
+    tree = ast.parse((CLI / Path(*module.split(".")).with_suffix(".py")).read_text(encoding="utf-8"))
+    inner = {
+        node.name: {used.id for used in ast.walk(node) if isinstance(used, ast.Name)}
+        for node in tree.body
+        if isinstance(node, ast.FunctionDef)
+    }
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module is not None]
+    ours = {
+        name.name: node.module.removeprefix("evedrop.cli.")
+        for node in imports
+        for name in node.names
+        if node.module is not None and node.module.startswith("evedrop.cli.")
+    }
+    return inner, ours
+
+
+def prints_tables(module: str, name: str) -> bool:
+    """Whether a function of the command line, or one that it names, makes a console for tables."""
+    seen: set[tuple[str, str]] = set()
+    waiting = [(module, name)]
+    while waiting:
+        place = waiting.pop()
+        if place[1] == "terminal":
+            return True
+        if place not in seen:
+            seen.add(place)
+            inner, ours = functions(place[0])
+            for used in inner.get(place[1], ()):
+                waiting += [(place[0], used)] if used in inner else [(ours[used], used)] if used in ours else []
+    return False
+
+
+def test_every_command_that_prints_a_table_writes_it() -> None:
+    """By the source of all commands: one that makes a console for tables takes --csv and --latex, and no other one does.
+
+    Processes of a run take a brief and nothing else; the observer among them prints the report, which `view --table` does again.
+    """
+    commands = [
+        (module, command)
+        for module in dict.fromkeys(MODULES.values())
+        for command in import_module(f"evedrop.cli.commands.{module}").COMMANDS
+    ]
+    printing = {one.name for module, one in commands if prints_tables(f"commands.{module}", one.run.__name__)}
+    assert {one.name for _, one in commands if tables in one.options} == printing - {*ROLES}
+    assert printing - {*ROLES} == COMMANDS.keys() | OF_OTHERS
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_tables_are_written(name: str, evedrop: Evedrop) -> None:
+    """The rows on the terminal are in the file, numbers can be read, and LaTeX has nothing that it would stumble over."""
+    if name == "view":
+        assert evedrop(*shlex.split(COMMANDS["montecarlo"]), "--out", "run").status == 0
+    done = evedrop(*shlex.split(COMMANDS[name]), "--csv", "a.csv", "--latex", "a.tex")
+    assert done.status in {0, 1}, done.err
+    files = sorted(evedrop.folder.glob("a*.csv"))
+    assert files
+    for file in files:
+        heads, *rows = csv.reader(file.read_text(encoding="utf-8").splitlines())
+        assert rows
+        assert len(set(heads)) == len(heads)
+        assert {len(row) for row in rows} == {len(heads)}
+        assert not [cell for row in rows for cell in row if "±" in cell and cell[:1].isdigit() and "(" not in cell]
+    text = (evedrop.folder / "a.tex").read_text(encoding="utf-8")
+    assert text.count(r"\begin{tabular}") == text.count(r"\end{tabular}") == len(files)
+    body = "".join(line for line in text.splitlines(keepends=True) if not line.startswith("%"))
+    assert body.isascii(), {one for one in body if not one.isascii()}
+    for line in body.splitlines():
+        plain = re.sub(r"\\[$_%&#{}]", "", line)
+        assert plain.count("$") % 2 == 0, line
+        assert plain.count("{") == plain.count("}"), line
+        assert not re.search(r"[#%]|(?<!\\)_(?![{])", re.sub(r"\$[^$]*\$", "", plain)), line
+
+
+def test_numbers_are_at_full_precision(evedrop: Evedrop) -> None:
+    """The CSV of a sweep has the very numbers of sweep.parquet, and their standard errors in columns of their own."""
+    assert evedrop(*shlex.split(COMMANDS["sweep"]), "--out", "swept", "--csv", "a.csv").status == 0
+    rows = list(csv.DictReader((evedrop.folder / "a.csv").read_text(encoding="utf-8").splitlines()))
+    table = pq.read_table(evedrop.folder / "swept" / "sweep.parquet").to_pylist()
+    assert len(rows) == len(table)
+    for row, exact in zip(rows, table, strict=True):
+        assert row["peer"] == exact["peer"]
+        assert float(row["mean error"]) == exact["mean_squared_error"]
+        assert float(row["mean error standard error"]) == exact["mean_squared_error_standard_error"]
+
+
+def by_hand() -> TextTable:
+    """A table with everything that may be in one."""
+    table = TextTable.headed(["receiver"], ["mean |x − x̂|²", "μ_d", "z"], ["digest"], "The title")
+    table.add("a_b & c", estimate(0.0123456789, 0.0004) + "*", finite_text(float("inf")), figure_text(None), "–")
+    table.add("", estimate(2.5e-7, None), figure_text(0.1), figure_text(-1.25, "+.2f"), "50 % {x}")
+    return table
+
+
+def test_csv_is_as_written_by_hand() -> None:
+    """The whole text."""
+    assert csv_text(by_hand()) == (
+        "receiver,mean |x − x̂|²,mean |x − x̂|² standard error,mean |x − x̂|² unit,μ_d,z,digest\n"
+        "a_b & c,0.0123456789,0.0004,*,inf,,\n"
+        "a_b & c,2.5e-07,,,0.1,-1.25,50 % {x}\n"
+    )
+
+
+def test_latex_is_as_written_by_hand() -> None:
+    """The whole text."""
+    assert latex_text(by_hand()) == (
+        "% The title\n"
+        "\\begin{tabular}{lrrrl}\n"
+        "\\hline\n"
+        "receiver & mean $|$x $-$ $\\hat{x}|^{2}$ & $\\mu$\\_d & z & digest \\\\\n"
+        "\\hline\n"
+        "a\\_b \\& c & 0.0123 $\\pm$ 0.0004* & $\\infty$ & -- & -- \\\\\n"
+        " & 2.5e-07 & 0.1 & -1.25 & 50 \\% \\{x\\} \\\\\n"
+        "\\hline\n"
+        "\\end{tabular}\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "latex"),
+    [
+        ("λ₁", r"$\lambda_{1}$"),
+        ("10⁻³", "10$^{-3}$"),
+        ("Ω ≥ ε", r"$\Omega$ $\geq$ $\epsilon$"),
+        ("x̄ á", r"$\bar{x}$ á"),
+        (r"C:\~^", r"C:\textbackslash{}\textasciitilde{}\textasciicircum{}"),
+        ("(0.1, 1] ∪ $5 #1", r"(0.1, 1] $\cup$ \$5 \#1"),
+        ("Ο ο Α", "$O$ $o$ $A$"),
+    ],
+)
+def test_text_is_escaped(text: str, latex: str) -> None:
+    """Greek letters, indices, accents, and LaTeX's own characters."""
+    assert latex_escaped(text) == latex
+
+
+def test_a_narrow_terminal_changes_no_file(evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a narrow terminal leaves out is in the file."""
+    words = shlex.split(COMMANDS["montecarlo"])
+    texts = []
+    for columns in ("200", "40"):
+        monkeypatch.setattr("evedrop.cli.report.sys.stdout.isatty", lambda: True, raising=False)
+        monkeypatch.setenv("COLUMNS", columns)
+        assert evedrop(*words, "--csv", f"{columns}.csv").status == 0
+        texts.append((evedrop.folder / f"{columns}.csv").read_text())
+    assert texts[0] == texts[1]
+
+
+def test_misuse_is_refused(evedrop: Evedrop) -> None:
+    """Together with --json there is no table; a file that cannot be written is named."""
+    done = evedrop("design", "eavesdroppers", "--json", "--csv", "a.csv")
+    assert (done.status, "leave --json or these out" in done.err) == (2, True), done.err
+    done = evedrop("design", "eavesdroppers", "--latex", "no/a.tex")
+    assert (done.status, "no/a.tex cannot be written" in done.err) == (2, True), done.err
+
+
+def test_python_writes_them_too(tmp_path: Path) -> None:
+    """`to_csv` and `to_latex` of results."""
+    run = montecarlo("eavesdroppers", trials=4, slots=20, expect=[])
+    swept = sweep("eavesdroppers", {"slots": [10, 20]}, trials=4, expect=[])
+    for i, one in enumerate((run, swept)):
+        (path,) = one.to_csv(tmp_path / f"{i}.csv")
+        rows = list(itertools.islice(csv.reader(path.read_text(encoding="utf-8").splitlines()), 3))
+        assert len(rows) == 3
+        assert r"\begin{tabular}" in one.to_latex(tmp_path / f"{i}.tex").read_text()
