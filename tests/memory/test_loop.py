@@ -14,6 +14,7 @@ import tomli_w
 
 from evedrop.api import run
 from evedrop.errors import UsageError
+from evedrop.figures.standard_error import z_of
 from evedrop.loading import checked, load
 from evedrop.memory.montecarlo import Plan, simulate
 from evedrop.memory.simulation import Mode
@@ -179,7 +180,7 @@ def test_errors_against_the_true_state_are_given_beside_those_of_the_transmitted
 
 
 def test_errors_against_the_true_state_have_standard_errors(tmp_path: Path) -> None:
-    """Those of runs of one trial each, which have none; z is the filter's distance from its covariance."""
+    """Those of runs of one trial each, which have none; z compares the filter's errors with its covariance."""
     found = in_memory(tmp_path / "run", **MEASURED).summary["filter"]
     alone = [
         in_memory(tmp_path / str(trial), trials=1, record_trials=1, first_trial=trial, **MEASURED).summary["filter"]
@@ -191,8 +192,7 @@ def test_errors_against_the_true_state_have_standard_errors(tmp_path: Path) -> N
     for name, error in errors["mean_true_squared_errors"].items():
         values = np.array([one["mean_true_squared_errors"][name] for one in alone])
         assert error == pytest.approx(values.std(ddof=1) / 6**0.5, rel=1e-9)
-    distance = found["mean_squared_error"] - found["mean_trace_covariance"]
-    assert found["z"] == pytest.approx(distance / errors["mean_squared_error"])
+    assert found["z"] == pytest.approx(z_of(own, found["mean_trace_covariance"]), rel=1e-6)
     assert alone[0]["z"] is alone[0]["standard_errors"]["mean_squared_error"] is None
 
 
