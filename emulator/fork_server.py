@@ -23,6 +23,7 @@ from typing import NoReturn
 from setproctitle import setproctitle
 
 from evedrop.interrupts import SIGNALS, heed_signals
+from evedrop.live.network.launcher_watch import continue_when_launcher_dies
 
 _MOST_BYTES = 1 << 17
 _FILES = 3
@@ -35,6 +36,7 @@ def serve(channel: socket.socket, modules: Sequence[str], further: Sequence[Serv
 
     further: servers that import these modules and more.
     """
+    continue_when_launcher_dies()  # the parent of a further server is the one before it, which ends with the launcher
     for name in modules:
         with suppress(Exception):  # the process that needs it will say why it cannot be imported
             import_module(name)
@@ -52,6 +54,7 @@ def serve(channel: socket.socket, modules: Sequence[str], further: Sequence[Serv
     signal.set_wakeup_fd(woken, warn_on_full_buffer=False)
     try:
         while True:
+            # Without a limit: the launcher's end closes the channel, and a suspended server is then continued.
             ready, _, _ = select.select([channel.fileno(), ended], [], [])
             if ended in ready:
                 os.read(ended, 512)

@@ -51,8 +51,9 @@ class Forked:
         """End it."""
         os.kill(self._pid, 9)
 
-    def wait(self) -> int:
-        """Wait for its end."""
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait for its end: it has been killed."""
+        del timeout
         return os.waitstatus_to_exitcode(os.waitpid(self._pid, 0)[1])
 
 

@@ -89,7 +89,7 @@ def test_a_solver_is_loaded_only_when_a_controller_is_made(loaded: dict[str, set
     assert not packages(names) & {"osqp", "scipy"}
 
 
-MATHEMATICS = {f"evedrop.{room}" for room in ("model", "streams", "kernels", "names", "errors", "hints")}
+MATHEMATICS = {f"evedrop.{room}" for room in ("model", "streams", "kernels", "names", "errors", "hints", "processes")}
 """What the model may import."""
 
 

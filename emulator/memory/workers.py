@@ -22,6 +22,7 @@ from evedrop.errors import EvedropError, RunError
 from evedrop.interrupts import SIGNALS
 from evedrop.memory.tasks import R, Result, Stopped, Task, Tell
 from evedrop.model.registry import place_of
+from evedrop.processes import kill
 from evedrop.scenario.dry_run import foreign
 
 _LOOK_SECONDS = 0.1
@@ -106,8 +107,7 @@ class _Worker:
         self.process.terminate()
 
     def end(self) -> None:
-        self.process.kill()
-        self.process.wait()
+        kill(self.process)
         self.pipe.close()
 
 

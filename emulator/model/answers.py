@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any, final
 
 from evedrop.errors import NoAnswer, NotRegistered
+from evedrop.processes import kill
 
 _MOST_BYTES = 2**20  # in one answer
 _MODULE = "evedrop.conformance.answering"
@@ -156,8 +157,7 @@ class _Child:
 
     def end(self) -> None:
         """End the process."""
-        self._process.kill()
-        self._process.wait()
+        kill(self._process)
         for pipe in filter(None, (self._process.stdin, self._process.stdout)):
             pipe.close()
 

@@ -20,6 +20,7 @@ from typing import IO
 
 from evedrop.environment import viewer_environment
 from evedrop.errors import UsageError
+from evedrop.processes import kill, wait_for
 from evedrop.results.folder import make_private, private_opener
 
 HOST = "127.0.0.1"
@@ -126,11 +127,7 @@ def end(process: subprocess.Popen[bytes]) -> None:
     """Terminate a viewer, kill it if it does not end, wait for it, and remove the temporary folder that it leaves."""
     if process.poll() is None:
         process.terminate()
-        try:
-            process.wait(_STOP_SECONDS)
-        except subprocess.TimeoutExpired:
-            process.kill()
-    process.wait()
+    kill(*wait_for([process], _STOP_SECONDS))
     # A viewer that draws makes this folder when it starts, and a terminated one does not remove it.
     for folder in Path(tempfile.gettempdir()).glob(f"rerun-data-{process.pid}-*"):
         shutil.rmtree(folder, ignore_errors=True)

@@ -27,6 +27,7 @@ from evedrop.live.network.control_file import no_run, read_control
 from evedrop.live.network.operator import Answer, ask
 from evedrop.live.protocol.requests import LinkRequest, OperatorRequest, StatusRequest
 from evedrop.live.protocol.wire_status import WireStatus
+from evedrop.processes import kill, wait_for
 from evedrop.results.folder import claimed, default_folder, write_private
 from evedrop.results.wire_summary import WIRE_SUMMARY_FILE, WireSummary
 from evedrop.scenario.words import listed
@@ -236,13 +237,9 @@ class RunningWire:
             return 0
         if process.poll() is None:
             process.send_signal(number)
-        try:
-            status = process.wait(_PATIENCE)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            status = process.wait()
+        kill(*wait_for([process], _PATIENCE))
         self._listener.join(_PATIENCE)
-        return status
+        return -signal.SIGKILL if process.returncode is None else process.returncode
 
     def _failure(self, status: int) -> EvedropError:
         """The error for a process that failed, in its own words."""

@@ -58,15 +58,14 @@ def temporary(evedrop: Evedrop, host: str) -> Path:
     return folder
 
 
-def hosts(evedrop: Evedrop, server: Sshd, command: str = OURS, port: int | None = None) -> Path:
-    """A file of two hosts, both of which are this one; all that each receives is kept in its folder."""
+def hosts(evedrop: Evedrop, server: Sshd, command: str = OURS, port: int | None = None, direct: bool = False) -> Path:
+    """A file of two hosts, both of which are this one; all that each receives is kept in its folder, unless `direct`."""
     text = [f'ssh_config = "{server.config}"', "[router]", f'listen = "tls/127.0.0.1:{free_port()}"']
     for host, processes in PLACES.items():
         script = evedrop.folder / f"{host}.sh"
         received = shlex.quote(str(evedrop.folder / f"{host}.received"))
-        script.write_text(
-            f'export TMPDIR={shlex.quote(str(temporary(evedrop, host)))}\ntee {received} | {command} "$@"\n'
-        )
+        runs = f"exec {command}" if direct else f"tee {received} | {command}"
+        script.write_text(f'export TMPDIR={shlex.quote(str(temporary(evedrop, host)))}\n{runs} "$@"\n')
         text += [f"[hosts.{host}]", 'address = "127.0.0.1"', f"processes = {json.dumps(processes)}"]
         text += [f'command = ["sh", {json.dumps(str(script))}]', f"port = {port or server.port}"]
     path = evedrop.folder / "hosts.toml"
@@ -101,9 +100,9 @@ def test_over_ssh_it_is_the_same_run(evedrop: Evedrop, server: Sshd) -> None:
         assert {order.brief.process for order in orders if isinstance(order, StartProcess)} == set(PLACES[host])
 
 
-def running(evedrop: Evedrop, server: Sshd) -> Live:
-    """A run in progress that does not end by itself."""
-    words = ("--set", "event=[]", "--set", "expect=[]", "--hosts", str(hosts(evedrop, server)))
+def running(evedrop: Evedrop, server: Sshd, direct: bool = False) -> Live:
+    """A run in progress that does not end by itself; direct: as for `hosts`."""
+    words = ("--set", "event=[]", "--set", "expect=[]", "--hosts", str(hosts(evedrop, server, direct=direct)))
     live = evedrop.live("restart", *ENDLESS, *words)
     live.running()
     return live
@@ -115,6 +114,22 @@ def test_ctrl_c_ends_everything_on_all_hosts(evedrop: Evedrop, server: Sshd) -> 
     live.process.send_signal(signal.SIGINT)
     assert live.end().status == 130
     nothing_left(evedrop)
+    assert live.results.slots.num_rows > 0
+
+
+def test_ctrl_c_ends_a_run_whose_host_program_is_suspended(evedrop: Evedrop, server: Sshd) -> None:
+    """It reports no end; once the connection is closed, the system continues it, and it ends its processes."""
+    live = running(evedrop, server, direct=True)
+    programs = [
+        pid for pid, command in with_mark(str(temporary(evedrop, "beta"))).items() if command.split()[-1] == "host"
+    ]
+    for program in programs:
+        os.kill(program, signal.SIGSTOP)
+    live.process.send_signal(signal.SIGINT)
+    done = live.end()
+    assert done.status == 130, done.err
+    nothing_left(evedrop)
+    assert programs
     assert live.results.slots.num_rows > 0
 
 

@@ -17,7 +17,7 @@ from evedrop.environment import own_environment
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.launch.ports import loopback_endpoints
 from evedrop.live.launch.preloading import fork_servers, process_starter
-from evedrop.live.launch.starter import StartedProcess, Starter, start_process
+from evedrop.live.launch.starter import FORK_SERVER_LOST, StartedProcess, Starter, start_process
 from evedrop.names import KERNELS_VARIABLE
 from tests.conftest import LIMIT, wait_until
 from tests.live.network.bench import scenario_of
@@ -136,7 +136,7 @@ def test_without_its_server_a_process_is_ended(own_bench: Bench, tmp_path: Path)
     with process_starter() as starter:
         router = own_bench.start()
         os.kill(parent_of(router.pid), signal.SIGKILL)
-        assert router.wait(LIMIT) == -signal.SIGKILL
+        assert router.wait(LIMIT) == FORK_SERVER_LOST
         with own_bench.log.open("wb") as log, pytest.raises(OSError, match="fork server"):
             starter("router", tmp_path / "no.json", log, {})
     wait_until(lambda: not is_kept(starter), "other servers")

@@ -18,6 +18,7 @@ from evedrop.errors import RunError
 from evedrop.interrupts import INTERRUPTED
 from evedrop.live.launch.starter import (
     CONNECTION_LOST,
+    FORK_SERVER_LOST,
     GRACE_SECONDS,
     StartedProcess,
     Starter,
@@ -30,12 +31,13 @@ from evedrop.live.protocol.keys import writer_of
 from evedrop.live.protocol.news import Alive, Finishing, ProcessRequest, RunOver, read_news
 from evedrop.names import OBSERVER, RELAY, ROUTER, SENSOR, ProcessAction
 from evedrop.news import News, RunEnded, Started, Tell
+from evedrop.processes import wait_for
 from evedrop.results.folder import HeldFolder, private_opener
-from evedrop.signals import held_back
 
 ROUTER_RESTARTS = 3  # how often routers that were ended by a signal are restarted in a run
 SILENCE_SECONDS = 30.0  # after which the launcher gives up on a silent observer, which sends a heartbeat every second
 _BEGIN_SECONDS = 30.0  # for a living observer to begin to write its results
+_FINISH_SECONDS = 600.0  # for it to write them: 10⁶ slots take some seconds
 _GONE_SECONDS = 5.0  # for a process that has left the network to end, and to say why in its log
 _LOG_LINES = 12
 _COMPLAINT = "evedrop: "
@@ -69,6 +71,8 @@ class Exit:
             return "was interrupted by a signal"
         if self.status == CONNECTION_LOST:
             return "was lost with its host"
+        if self.status == FORK_SERVER_LOST:
+            return "was ended with its fork server"
         return f"ended with status {self.status}" if self.status else "left before the run ended"
 
 
@@ -122,12 +126,11 @@ class Children:
         try:
             path = brief.write(self._private)
             log_file = self._folder.now / "logs" / f"{brief.process}.log"
-            with open(log_file, "ab" if again else "wb", opener=private_opener) as log, held_back():
+            with open(log_file, "ab" if again else "wb", opener=private_opener) as log:
                 process = self._starter(brief.role, path, log, environment)
         except OSError as error:
-            raise RunError(
-                f"{brief.process} cannot be started ({error}); free system resources and run again"
-            ) from error
+            why = error.strerror or str(error)
+            raise RunError(f"{brief.process} cannot be started ({why}); free system resources and run again") from error
         before = self._processes.get(brief.process)
         if before is not None and before.stdin is not None:
             before.stdin.close()
@@ -142,7 +145,7 @@ class Children:
                         self._news.put(read_news(line))
                     except ValueError as error:
                         self._refuse(name, error)
-        status = process.wait()
+        status = process.wait()  # without a limit: nobody waits for this thread
         if process.pid not in self._killed:
             self._news.put(Exit(name, status))
 
@@ -165,7 +168,7 @@ class Children:
         return True
 
     def act(self, request: ProcessRequest) -> None:
-        """Carry out the observer's request on a process, and confirm it.
+        """Carry out the observer's request on a process, and confirm it as soon as it is carried out.
 
         Raises RunError if a process cannot be restarted.
         """
@@ -173,14 +176,23 @@ class Children:
         if request.do == ProcessAction.END:
             self._killed.add(process.pid)
             process.kill()
-            process.wait()
-            if process.stdin is not None:
-                process.stdin.close()
-        elif request.do == ProcessAction.START:
+            threading.Thread(target=self._confirm_end, args=(process, request), daemon=True).start()
+            return
+        if request.do == ProcessAction.START:
             self.start(replace(self._briefs[name], first=request.first), again=True)
         else:
             with contextlib.suppress(ProcessLookupError):
                 process.send_signal(signal.SIGSTOP if request.do == ProcessAction.STOP else signal.SIGCONT)
+        self._confirm(request)
+
+    def _confirm_end(self, process: StartedProcess, request: ProcessRequest) -> None:
+        """Confirm that a process has ended, whenever its fork server or its host says so."""
+        process.wait()  # without a limit: nobody waits for this thread
+        if process.stdin is not None:
+            process.stdin.close()
+        self._confirm(request)
+
+    def _confirm(self, request: ProcessRequest) -> None:
         observer = self._processes[OBSERVER].stdin
         if observer is not None:
             with contextlib.suppress(OSError):
@@ -211,12 +223,14 @@ class Children:
     def conclude(self, tell: Tell, patience: float = 0.0) -> RunEnded | None:
         """End the observer, at once or after `patience` seconds; returns its `RunEnded`, or None if it sent none.
 
-        Once it has begun to write the results, it may take any time, as long as it sends heartbeats.
+        Once it has begun to write the results, it may take `_FINISH_SECONDS`, as long as it sends heartbeats.
         """
         self.terminate(OBSERVER, patience)
         begun = time.monotonic()
         ending: RunEnded | None = None
-        while self.silent_seconds < SILENCE_SECONDS and (self._finishing or time.monotonic() - begun < _BEGIN_SECONDS):
+        while self.silent_seconds < SILENCE_SECONDS and (
+            time.monotonic() - begun < (_FINISH_SECONDS if self._finishing else _BEGIN_SECONDS)
+        ):
             news = self.news(0.05)
             if isinstance(news, Exit):
                 if news.process == OBSERVER:
@@ -238,16 +252,16 @@ class Children:
 
     def wait_all(self) -> None:
         """Wait for all processes to leave by themselves, for `GRACE_SECONDS` at most."""
-        deadline = time.monotonic() + GRACE_SECONDS
-        for process in self._processes.values():
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(max(0.0, deadline - time.monotonic()))
+        wait_for(self._processes.values(), GRACE_SECONDS)
 
     def failure_report(self, first: Exit | None, ending: RunEnded | None) -> str:
         """The failure in words: the process at fault, and the last lines of its log and of the log that accuses it.
 
         first: the first process that ended too early, if any; ending: the end as the observer reported it, if it did.
         """
+        if orphans := [name for name, process in self._processes.items() if process.poll() == FORK_SERVER_LOST]:
+            theirs = ", ".join(orphans)
+            return f"the fork server of {theirs} ended or stopped responding (killed, suspended or out of memory); run again"
         suspects, accused = ([], []) if ending is None else (list(ending.suspects), list(ending.accused))
         why = ending.how if ending is not None and ending.status not in {0, 1, INTERRUPTED} else ""
         lost = None if first is None else self._lost_by_all(first.process, suspects)

@@ -35,9 +35,10 @@ from evedrop.live.launch.host_messages import (
 from evedrop.live.launch.preloading import preloaded_without_observer
 from evedrop.live.launch.private_folder import private_folder
 from evedrop.live.launch.starter import StartedProcess, Starter, end_all
+from evedrop.live.network.launcher_watch import continue_when_launcher_dies
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.brief_parts import ReceiverPart
-from evedrop.signals import held_back, raise_on_signals
+from evedrop.signals import raise_on_signals
 
 _LAST_LINES_SECONDS = 1.0  # for the last lines of a process that has ended, whose own children may hold its log open
 
@@ -46,6 +47,7 @@ def serve_launcher() -> None:
     """Carry out the launcher's orders until it closes standard input."""
     if sys.stdin is None or sys.stdin.isatty():
         raise UsageError("`evedrop host` is started by `evedrop run SCENARIO --hosts FILE`, over ssh; use that command")
+    continue_when_launcher_dies()  # if suspended, once the connection, whose process on this host is the parent, is closed
     os.umask(0o077)
     answers = os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)  # so that nothing else can write between the messages
@@ -123,8 +125,7 @@ class HostProcesses:
         try:
             with os.fdopen(write, "wb") as log:
                 path = brief.write(self._private)
-                with held_back():
-                    self._processes[number] = self._start(brief.role, path, log, environment)
+                self._processes[number] = self._start(brief.role, path, log, environment)
         except OSError as error:
             os.close(read)
             self.answer(LogText(number, f"evedrop: {brief.process} cannot be started ({error})\n"))
@@ -144,7 +145,7 @@ class HostProcesses:
         reader = threading.Thread(target=self._read, args=(number, log), daemon=True)
         reader.start()
         process = self._processes[number]
-        status = process.wait()
+        status = process.wait()  # without a limit: nobody waits for this thread
         if process.stdin is not None:
             process.stdin.close()
         reader.join(_LAST_LINES_SECONDS)

@@ -46,7 +46,7 @@ def launch(
     last two cases the results so far are in the folder and no process is left.
     """
     view = choose(view)
-    with stop_on_signals() as stop, process_starter() as start:
+    with stop_on_signals() as stop, process_starter(stop) as start:
         if hosts is not None:
             return _on_hosts(scenario, folder, view, tell, stop, start, hosts, paused)
         if scenario.shards == 1:

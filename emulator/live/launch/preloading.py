@@ -8,25 +8,35 @@ from __future__ import annotations
 import errno
 import json
 import os
+import select
 import signal
 import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from queue import SimpleQueue
-from typing import IO, Protocol, final
+from queue import Empty, SimpleQueue
+from typing import IO, final
 
 from evedrop.environment import SINGLE_THREADED, own_environment
-from evedrop.live.launch.starter import ReportedProcess, StartedProcess, Starter, start_process
+from evedrop.errors import Interrupted
+from evedrop.live.launch.starter import FORK_SERVER_LOST, ReportedProcess, StartedProcess, Starter, start_process
 from evedrop.names import OBSERVER
+from evedrop.processes import KillableProcess, kill
 from evedrop.signals import held_back
 
 _MOST_BYTES = 4096
-_GONE = (errno.ESRCH, "the fork server has ended")
+_LOOK_SECONDS = 0.25
+_REPORT_SECONDS = 5.0
+"""For a fork server to report the end of a process: a suspended one never does. Only the launcher's own time counts."""
+_START_SECONDS = 120.0
+"""For a fork server to make its imports and start a process."""
+_GONE = (errno.ESRCH, "its fork server has ended")
+_SILENT = (errno.ETIMEDOUT, f"its fork server did not respond within {_START_SECONDS:.0f} s")
 _EVERY_ROLE = (
     "evedrop.cli.commands.process",
     "evedrop.cli.main",
@@ -56,6 +66,16 @@ class Fork(ReportedProcess):
             os.close(self._handle)
         self._handle = None
 
+    @property
+    def over(self) -> bool:
+        """Whether it has ended, reported or not: the system says so."""
+        with self._lock:
+            if self._handle is None:
+                return True
+            system = select.poll()
+            system.register(self._handle, select.POLLIN)
+            return bool(system.poll(0))
+
     def send_signal(self, sig: int) -> None:
         """Send a signal to it, if it still runs."""
         with self._lock, suppress(ProcessLookupError):
@@ -63,17 +83,7 @@ class Fork(ReportedProcess):
                 signal.pidfd_send_signal(self._handle, sig)
 
 
-class ServerProcess(Protocol):
-    """The part of `subprocess.Popen` that `fork_servers` uses."""
-
-    def kill(self) -> None:
-        """End it."""
-
-    def wait(self) -> int:
-        """Wait for its end; returns its exit status."""
-
-
-def start_servers(channels: Sequence[socket.socket], modules: Sequence[Sequence[str]]) -> ServerProcess:
+def start_servers(channels: Sequence[socket.socket], modules: Sequence[Sequence[str]]) -> KillableProcess:
     """Start the first of some fork servers, each of which takes requests from its end of a channel. Raises OSError.
 
     modules: what each imports in addition to those before it. Each server after the first is forked from the one before.
@@ -95,10 +105,13 @@ def start_servers(channels: Sequence[socket.socket], modules: Sequence[Sequence[
 class ForkServer:
     """The launcher's side of a fork server for some roles: starts processes, and learns how they end.
 
+    A server that does not report the end of a process is given up: its processes are killed.
+
     channel: whose other end the server has.
     """
 
     def __init__(self, channel: socket.socket) -> None:
+        channel.settimeout(_LOOK_SECONDS)
         self._channel = channel
         self._forks: dict[int, Fork] = {}
         self._asking = threading.Lock()
@@ -114,20 +127,32 @@ class ForkServer:
 
     def close(self) -> None:
         """End the fork server, as soon as it has made its imports; its forks have ended before."""
-        self._channel.shutdown(socket.SHUT_RDWR)
-        self._follower.join()
+        self._give_up()
+        self._follower.join()  # it reads the end of the channel at once
         self._channel.close()
 
-    def start(self, role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:
-        """Start `evedrop ROLE BRIEF`, whose files only this user may read. Raises OSError."""
+    def _give_up(self) -> None:
+        """Close the channel: the server ends, if it is not suspended, and `_follow` ends its processes."""
+        with suppress(OSError):  # it is closed
+            self._channel.shutdown(socket.SHUT_RDWR)
+
+    def start(
+        self,
+        role: str,
+        brief: Path,
+        log: IO[bytes],
+        environment: Mapping[str, str],
+        stop: threading.Event | None = None,
+    ) -> StartedProcess:
+        """Start `evedrop ROLE BRIEF`, whose files only this user may read. Raises OSError, Interrupted once `stop` is set."""
         read_stdin, write_stdin = os.pipe()
         read_stdout, write_stdout = os.pipe() if role == OBSERVER else (None, None)
         stdin = os.fdopen(write_stdin, "wb")
         stdout = None if read_stdout is None else os.fdopen(read_stdout, "rb")
         files = (read_stdin, log.fileno() if write_stdout is None else write_stdout, log.fileno())
         try:
-            process = self.fork([role, str(brief)], files, environment, _folder(), 0o077)
-        except OSError:
+            process = self.fork([role, str(brief)], files, environment, _folder(), 0o077, stop)
+        except BaseException:
             stdin.close()
             if stdout is not None:
                 stdout.close()
@@ -146,40 +171,69 @@ class ForkServer:
         environment: Mapping[str, str],
         folder: str | None,
         umask: int,
+        stop: threading.Event | None = None,
     ) -> Fork:
-        """Run `evedrop WORDS` in a fork of the server, with these standard files, in this folder. Raises OSError."""
+        """Run `evedrop WORDS` in a fork of the server, with these standard files, in this folder.
+
+        Raises OSError if that is impossible or takes `_START_SECONDS`, Interrupted if `stop` is set before the process runs.
+        """
         request = {"words": [*words], "environment": dict(environment), "folder": folder, "umask": umask}
         with self._asking:
             try:
                 socket.send_fds(self._channel, [json.dumps(request).encode()], files)
-            except ConnectionError:
+            except (ConnectionError, TimeoutError):
                 raise OSError(*_GONE) from None
-            begun = self._begun.get()
+            begun = self._answer(stop)
         if isinstance(begun, OSError):
             raise begun
         return begun
 
+    def _answer(self, stop: threading.Event | None) -> Fork | OSError:
+        """The answer to a request. A server that does not answer in time is given up, for a late answer would confuse."""
+        deadline = time.monotonic() + _START_SECONDS
+        while time.monotonic() < deadline:
+            with suppress(Empty):
+                return self._begun.get(timeout=_LOOK_SECONDS)
+            if stop is not None and stop.is_set():
+                self._give_up()
+                raise Interrupted
+        self._give_up()
+        return OSError(*_SILENT)
+
     def _follow(self) -> None:
-        """Read the reports of the fork server until it ends, and end the processes that it leaves behind."""
-        while True:
+        """Read the reports of the fork server until it ends or is given up, and end the processes that it leaves behind."""
+        try:
+            while (report := self._next_report()) is not None:
+                self._take(*report)
+        finally:
+            for fork in self._forks.values():
+                fork.kill()
+                fork.ended(FORK_SERVER_LOST)
+            self._begun.put(OSError(*_GONE))
+
+    def _next_report(self) -> tuple[dict[str, int], list[int]] | None:
+        """The server's next report, and the files that came with it; None if it has ended, or hangs."""
+        unreported = 0.0
+        while unreported < _REPORT_SECONDS:
             try:
                 report, handles, _, _ = socket.recv_fds(self._channel, _MOST_BYTES, 1)
+            except TimeoutError:
+                # Not by the clock: this process may have been suspended, too.
+                unreported = unreported + _LOOK_SECONDS if any(fork.over for fork in self._forks.values()) else 0.0
             except OSError:
-                break
-            if not report:
-                break
-            found: dict[str, int] = json.loads(report)
-            if "error" in found:
-                self._begun.put(OSError(found["error"], os.strerror(found["error"])))
-            elif "status" in found:
-                self._forks.pop(found["pid"]).ended(found["status"])
+                return None
             else:
-                fork = self._forks[found["pid"]] = Fork(found["pid"], *handles)
-                self._begun.put(fork)
-        for fork in self._forks.values():
-            fork.kill()
-            fork.ended(-signal.SIGKILL)
-        self._begun.put(OSError(*_GONE))
+                return (json.loads(report), handles) if report else None
+        return None
+
+    def _take(self, report: dict[str, int], handles: list[int]) -> None:
+        if "error" in report:
+            self._begun.put(OSError(report["error"], os.strerror(report["error"])))
+        elif "status" in report:
+            self._forks.pop(report["pid"]).ended(report["status"])
+        else:
+            fork = self._forks[report["pid"]] = Fork(report["pid"], *handles)
+            self._begun.put(fork)
 
 
 @contextmanager
@@ -191,8 +245,7 @@ def fork_servers(*modules: Sequence[str]) -> Iterator[tuple[ForkServer, ...]]:
             for _, end in pairs:
                 theirs.enter_context(end)
             process = start_servers([end for _, end in pairs], modules)
-        stack.callback(process.wait)
-        stack.callback(process.kill)  # it may be in the middle of its imports
+        stack.callback(kill, process)  # it may be in the middle of its imports, or suspended
         servers = tuple(ForkServer(ours) for ours, _ in pairs)
         for server in servers:
             stack.callback(server.close)
@@ -201,14 +254,22 @@ def fork_servers(*modules: Sequence[str]) -> Iterator[tuple[ForkServer, ...]]:
 
 @final
 class PreloadedStarter:
-    """Starts an observer from the last of some fork servers, and all others, which need fewer modules, from the first."""
+    """Starts an observer from the last of some fork servers, and all others, which need fewer modules, from the first.
 
-    def __init__(self, servers: Sequence[ForkServer]) -> None:
-        self._observers, self._others = servers[-1], servers[0]
+    stop: once it is set, no fork server is waited for.
+    """
+
+    def __init__(self, servers: Sequence[ForkServer], stop: threading.Event | None = None) -> None:
+        self._servers, self._stop = servers, stop
+
+    def until(self, stop: threading.Event) -> PreloadedStarter:
+        """The same for a run that ends once this is set."""
+        return PreloadedStarter(self._servers, stop)
 
     def __call__(self, role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:
-        """Start `evedrop ROLE BRIEF`. Raises OSError."""
-        return (self._observers if role == OBSERVER else self._others).start(role, brief, log, environment)
+        """Start `evedrop ROLE BRIEF`. Raises OSError, and Interrupted if it is stopped before."""
+        server = self._servers[-1 if role == OBSERVER else 0]
+        return server.start(role, brief, log, environment, self._stop)
 
 
 @final
@@ -231,15 +292,17 @@ _kept: list[_Kept] = []
 
 
 @contextmanager
-def process_starter() -> Iterator[Starter]:
+def process_starter(stop: threading.Event | None = None) -> Iterator[Starter]:
     """The fastest way to start processes on this system, until the block ends. Raises OSError.
 
-    Outside a `preloaded` block, a summary's own imports are not made in advance, so that one run starts as early as it can.
+    stop: once it is set, the starter waits for nothing, and raises Interrupted. Outside a `preloaded` block, a summary's own
+    imports are not made in advance, so that one run starts as early as it can.
     """
-    if _kept and _kept[-1].usable:
-        yield _kept[-1].starter
-        return
-    with _kept_servers(OF_OTHERS, OF_OBSERVERS) as starter:
+    with ExitStack() as stack:
+        usable = bool(_kept) and _kept[-1].usable
+        starter = _kept[-1].starter if usable else stack.enter_context(_kept_servers(OF_OTHERS, OF_OBSERVERS))
+        if stop is not None and isinstance(starter, PreloadedStarter):
+            starter = starter.until(stop)
         yield starter
 
 

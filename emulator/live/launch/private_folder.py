@@ -19,6 +19,7 @@ from pathlib import Path
 
 from evedrop.environment import own_environment
 from evedrop.errors import UsageError
+from evedrop.processes import kill
 
 _PREFIX = "evedrop-"
 _LOCK = "lock"
@@ -86,8 +87,7 @@ def _dismiss(guard: subprocess.Popen[bytes]) -> None:
     try:
         guard.wait(_GUARD_SECONDS)
     except subprocess.TimeoutExpired:
-        guard.kill()
-        guard.wait()
+        kill(guard)
 
 
 def _sweep(where: Path) -> None:

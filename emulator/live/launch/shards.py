@@ -145,7 +145,7 @@ def launch_shards(
     # On this thread, not on another one: a viewer ends with the thread that started it.
     state.launched(*first, view, stop, starter)
     for thread in threads:
-        thread.join()
+        thread.join()  # without a limit: a run that is told to stop ends within one, and a signal reaches a thread that joins
     try:
         now = held.now
         if now != folder:

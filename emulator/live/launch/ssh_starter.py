@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
+import select
 import shlex
 import subprocess
 import tempfile
@@ -41,10 +42,12 @@ from evedrop.live.launch.hosts_file import HostsPlan, HostTable
 from evedrop.live.launch.starter import CONNECTION_LOST, ReportedProcess, StartedProcess, Starter
 from evedrop.live.protocol.brief import read_brief
 from evedrop.live.protocol.brief_parts import ImportingPart
+from evedrop.processes import kill, wait_for
 
 ANSWER_SECONDS = 60.0
 """How long a host may take to connect and to start Python."""
 _END_SECONDS = 8.0  # for a host to end its processes; they take three at most
+_SEND_SECONDS = 10.0  # for ssh to take some bytes; a suspended one takes none
 _LOOK_SECONDS = 0.05
 _MOST_SAID = 2**20
 _ALIVE_SECONDS = 3
@@ -165,11 +168,18 @@ class SshHost:
         return process
 
     def send(self, order: Order) -> None:
-        """Send an order; harmless if the connection is lost, which ends all processes there."""
+        """Send an order; harmless if the connection is lost, which ends all processes there. Ends an ssh that takes nothing."""
         assert self._ssh.stdin is not None  # noqa: S101 - it was started with a pipe
         with self._sending, contextlib.suppress(OSError, ValueError):
-            self._ssh.stdin.write(line_of(order))
-            self._ssh.stdin.flush()
+            handle, left = self._ssh.stdin.fileno(), line_of(order)
+            os.set_blocking(handle, False)
+            room = select.poll()
+            room.register(handle, select.POLLOUT)
+            while left:
+                if not room.poll(1000 * _SEND_SECONDS):
+                    self._ssh.kill()
+                    return
+                left = left[os.write(handle, left) :]
 
     def hang_up(self) -> None:
         """Close the connection: the processes there end. Does not wait."""
@@ -180,12 +190,8 @@ class SshHost:
     def close(self, deadline: float) -> None:
         """Wait until ssh has ended, and end it at the deadline."""
         self.hang_up()
-        try:
-            self._ssh.wait(max(0.0, deadline - time.monotonic()))
-        except subprocess.TimeoutExpired:
-            self._ssh.kill()
-            self._ssh.wait()
-        self._reader.join()
+        kill(*wait_for([self._ssh], deadline - time.monotonic()))
+        self._reader.join(_END_SECONDS)  # it reads the end of the connection at once, and may then wait for ssh as long
         self._said.close()
 
     def _follow(self) -> None:
@@ -217,8 +223,7 @@ class SshHost:
 
     def _lose(self) -> None:
         self.hang_up()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._ssh.wait(_END_SECONDS)
+        wait_for([self._ssh], _END_SECONDS)
         with self._guard:
             self._lost.set()
             left, self._processes = list(self._processes.values()), {}

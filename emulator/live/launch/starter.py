@@ -7,18 +7,20 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import IO, Protocol
 
 from evedrop.names import OBSERVER
-from evedrop.signals import SHOW_STACKS
+from evedrop.processes import kill, wait_for
+from evedrop.signals import SHOW_STACKS, held_back
 
 GRACE_SECONDS = 3.0  # for all processes to leave
 CONNECTION_LOST = 1000
 """The status of a process on another host if the connection with the host ended; no process ends with it."""
+FORK_SERVER_LOST = 1001
+"""The status of a process whose fork server ended or stopped responding; no process ends with it."""
 _STACKS_SECONDS = 0.3  # for a process that does not leave to write the stacks of its threads into its log
 
 
@@ -73,8 +75,10 @@ class ReportedProcess(ABC):
         """Send a signal to it, if it still runs."""
 
     def ended(self, status: int) -> None:
-        """Note that it ended with this status."""
+        """Note that it ended with this status; only the first report counts."""
         with self._lock:
+            if self._status is not None:
+                return
             self._close()
             self._status = status
         self._over.set()
@@ -107,33 +111,32 @@ class Starter(Protocol):
 
 def start_process(role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:
     """Start `evedrop ROLE BRIEF` in a session of its own."""
-    return subprocess.Popen(
-        [sys.executable, "-P", "-m", "evedrop", role, str(brief)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE if role == OBSERVER else log,
-        stderr=log,
-        start_new_session=True,
-        env=environment,
-        umask=0o077,
-    )
+    with held_back():
+        return subprocess.Popen(
+            [sys.executable, "-P", "-m", "evedrop", role, str(brief)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE if role == OBSERVER else log,
+            stderr=log,
+            start_new_session=True,
+            env=environment,
+            umask=0o077,
+        )
 
 
 def end_all(processes: Collection[StartedProcess]) -> None:
-    """Ask processes to end, and end those that still run after `GRACE_SECONDS`."""
+    """Ask processes to end, and kill those that still run after `GRACE_SECONDS`. Returns within seconds in any case.
+
+    A killed process whose end is never reported (its fork server or its host is suspended) ends with the connection to it.
+    """
     for process in processes:
         with contextlib.suppress(ProcessLookupError):
             process.send_signal(signal.SIGCONT)  # a paused process could not end
         if process.poll() is None:
             process.terminate()
-    deadline = time.monotonic() + GRACE_SECONDS
-    for process in processes:
-        try:
-            process.wait(max(0.0, deadline - time.monotonic()))
-        except subprocess.TimeoutExpired:
+    if hanging := wait_for(processes, GRACE_SECONDS):
+        for process in hanging:
             process.send_signal(SHOW_STACKS)
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(_STACKS_SECONDS)
-            process.kill()
-            process.wait()
+        kill(*wait_for(hanging, _STACKS_SECONDS))
+    for process in processes:
         if process.stdin is not None:
             process.stdin.close()

@@ -32,7 +32,7 @@ def when_launcher_is_gone(then: Callable[[], None], said: Callable[[bytes], None
 
 
 def continue_when_launcher_dies() -> None:
-    """Let the system continue this process if it is paused when its launcher dies: paused, it would not notice (Linux only)."""
+    """Let the system continue this process if it is paused when its parent dies: paused, it would not notice (Linux only)."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGCONT), 0, 0, 0)
 
