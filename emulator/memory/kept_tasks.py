@@ -3,7 +3,7 @@
 The folder `kept` in a results folder has `study.json`, which says exactly what is studied, and a file for each finished task.
 A file counts only if it is complete, undamaged, and of this study. All of it is data (`evedrop.results.object_data`).
 
-Source: docs/results.md, an interrupted study goes on.
+Source: docs/results.md, an interrupted study.
 """
 
 from __future__ import annotations

@@ -192,7 +192,7 @@ def test_a_sweep_knows_the_folder_of_the_classes_in_it(
         with pytest.raises(ScenarioError, match="of several folders"):
             sweep(scenario, over, **changes)
 
-    def stopped(_: object, given: dict[str, Any], values: dict[str, Any], *rest: object) -> None:
+    def stopped(_: object, given: dict[str, Any], values: dict[str, Any], *rest: object, **options: object) -> None:
         raise UsageError(f"{given['modules']} {values['encoding'][0]['scheme']}, {len(rest)} others")
 
     monkeypatch.setattr("evedrop.studies.sweep.sweep_over", stopped)
