@@ -9,7 +9,7 @@ from pathlib import Path
 
 from evedrop.cli.report import print_summary
 from evedrop.errors import UsageError
-from evedrop.loading import load
+from evedrop.loading.recorded import recorded
 from evedrop.output import print_json, say
 from evedrop.results.writer import load_results
 
@@ -64,11 +64,11 @@ def print_ending(folder: Path, status: int, how: str) -> None:
 def replay_command(folder: Path) -> str | None:
     """The command that runs one trial of a results folder's scenario live; None if it cannot be run live."""
     try:
-        scenario = load(folder)
+        scenario = recorded(folder, beyond_horizon=False).scenario
     except UsageError:  # float64 cannot represent the states of that many slots
         return None
-    recorded = " --record-trials 1" if scenario.record_trials > 1 else ""
-    recorded += " --set shards=1" if scenario.shards > 1 else ""
+    trials = " --record-trials 1" if scenario.record_trials > 1 else ""
+    trials += " --set shards=1" if scenario.shards > 1 else ""
     # A quantile over trials can be expected only of many trials.
     expected = " --set 'expect=[]'" if any(one.quantile is not None for one in scenario.expect) else ""
-    return f"evedrop run {shlex.quote(str(folder))} --pace 0.02{recorded}{expected}"
+    return f"evedrop run {shlex.quote(str(folder))} --pace 0.02{trials}{expected}"

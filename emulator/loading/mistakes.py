@@ -50,7 +50,7 @@ def mistakes_across(tables: ValidTables, beyond_horizon: bool) -> list[str]:
     """Mistakes across tables, as far as a faulty file can be checked."""
     found: list[str] = []
     if tables.process is not None and tables.slots is not None and not beyond_horizon:
-        found += _horizon_mistakes(tables.process.process, tables.slots)
+        found += horizon_mistakes(tables.process.process, tables.slots)
     trials = tables.trials
     if trials is not None and tables.record_trials is not None and tables.record_trials > trials:
         found.append(f"record_trials: is {tables.record_trials}; expected at most trials, which is {trials}")
@@ -143,7 +143,7 @@ def _application_objections(scenario: Scenario) -> list[str]:
     return [said for _, one, table in found if loop is not None for said in one.objections(loop, table)]
 
 
-def _horizon_mistakes(process: Process, slots: int) -> list[str]:
+def horizon_mistakes(process: Process, slots: int) -> list[str]:
     """A mistake if float64 cannot follow the process for that many slots (docs/mathematics.md, horizon)."""
     last = horizon(process, slots)
     if last is None:

@@ -10,6 +10,8 @@ import re
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Generic, TypeVar, final
@@ -21,6 +23,17 @@ T = TypeVar("T")
 
 _OWN = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 _NOT_IN_CHILDREN = "__main__"
+_NO_MODULES: ContextVar[bool] = ContextVar("no_modules", default=False)
+
+
+@contextmanager
+def no_modules() -> Iterator[None]:
+    """In the block no registry imports PACKAGE.MODULE:CLASS, or asks it anything: such a name raises NotRegistered."""
+    before = _NO_MODULES.set(True)
+    try:
+        yield
+    finally:
+        _NO_MODULES.reset(before)
 
 
 def is_own(name: object) -> bool:
@@ -114,6 +127,8 @@ class Registry(Mapping[str, type[T]], Generic[T]):
     def _target(self, name: str) -> tuple[str, str]:
         """The PACKAGE.MODULE:CLASS that a name stands for, and the beginning of messages about it."""
         if is_own(name):
+            if _NO_MODULES.get():
+                raise NotRegistered(name, ", and results are only looked at; expected a name without a module")
             return _importable(name, name, ""), ""
         targets = _entry_points(self.group, tuple(sys.path)).get(name, ())
         if not targets:

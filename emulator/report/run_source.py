@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from evedrop.errors import UsageError
 from evedrop.files import Unreadable, text_of
-from evedrop.loading.process_noise import process_noise
+from evedrop.loading.recorded import recorded_noise
 from evedrop.model.packet_words import NOTHING, SILENT
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes
@@ -103,7 +103,7 @@ class RunSource:
     @cached_property
     def noise(self) -> float:
         """The process noise tr Q; 0 if the scenario cannot be read."""
-        return process_noise(self.folder)
+        return recorded_noise(self.folder)
 
     def _by_receiver(self, table: pa.Table) -> dict[str, pa.Table]:
         found = {name: table.filter(pc.equal(table["peer"], name)) for name in self.summary.peers}

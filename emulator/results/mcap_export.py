@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 
 from evedrop.errors import UsageError
 from evedrop.files import Unreadable, opened, whole_file
-from evedrop.loading import load
+from evedrop.loading.recorded import recorded
 from evedrop.news import RunEvent
 from evedrop.results.growing_tables import batches_of
 from evedrop.results.reading import Results
@@ -61,7 +61,7 @@ def export_mcap(
         from mcap.writer import Writer  # noqa: PLC0415 - an optional extra
     except ImportError as error:
         raise UsageError("an MCAP file needs pip install '.[mcap]' in the checkout first") from error
-    scenario = load(results.folder / "scenario.toml", beyond_horizon=True)
+    scenario = recorded(results.folder).scenario
     with whole_file(path) as temporary, temporary.open("wb") as file:
         writer = Writer(file)
         writer.start(library="evedrop")

@@ -222,13 +222,19 @@ def _cut_short(folder: Path) -> dict[str, Any]:
 def _no_figures(folder: Path) -> dict[str, Any]:
     """The summary of a run that was killed before it wrote one. Raises UsageError if its scenario cannot be read."""
     # Only this case needs theory and the scenario to read results.
-    from evedrop.loading import load  # noqa: PLC0415
+    from evedrop.loading.recorded import recorded  # noqa: PLC0415
     from evedrop.score.scorekeeper import Ending, summary_of  # noqa: PLC0415
     from evedrop.score.totals import Totals  # noqa: PLC0415
 
-    scenario = load(folder, beyond_horizon=True)
+    found = recorded(folder)
+    if not found.complete:
+        raise UsageError(
+            f"{folder} has no figures yet, and theory needs its classes, which are not built in; looking at results imports "
+            "none: look again when the run has figures, or run the scenario again"
+        )
+    scenario = found.scenario
     nothing = Totals.nothing(scenario, scenario.trials)
-    found: dict[str, Any] = plain(
+    summary: dict[str, Any] = plain(
         summary_of(scenario, nothing, dict.fromkeys(scenario.digested), Ending(0.0, "slot 0")).as_dict()
     )
-    return found
+    return summary

@@ -34,7 +34,8 @@ def introduction(scene: Scene) -> list[Event]:
     about = [Event(0, "INFO", f"{scene.title}{trials}")]
     for shown in scene.receivers:
         kind = "scheme" if shown.role == "legitimate" else "strategy"
-        about.append(Event(0, "INFO", f"{shown.name}: {kind} {shown.strategy}, link quality {shown.quality:.4g}"))
+        quality = "with a loss model that is not built in" if shown.quality is None else f"quality {shown.quality:.4g}"
+        about.append(Event(0, "INFO", f"{shown.name}: {kind} {shown.strategy}, link {quality}"))
     return about
 
 

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from evedrop.errors import UsageError
-from evedrop.loading import load
+from evedrop.loading.recorded import recorded
 from evedrop.model.integrity.monitor import MonitoredSlots
 from evedrop.model.packet_words import ACTION_OF, INNOVATION, NOTHING
 from evedrop.model.process import Floats
@@ -30,7 +30,8 @@ def replay(folder: Path, path: Path | None = None) -> Path:
     Raises UsageError if the folder's tables cannot be read, or hold no recorded trial.
     """
     results = load_results(folder)
-    scenario = load(folder / "scenario.toml", beyond_horizon=True)
+    looked_at = recorded(folder)
+    scenario = looked_at.scenario
     path = folder / "recording.rrd" if path is None else path
     peers = {name: _peer(results, name) for name in scenario.receivers}
     x, nu, sent = _truth(results, scenario.receivers[0])
@@ -41,7 +42,9 @@ def replay(folder: Path, path: Path | None = None) -> Path:
     if showing is not None and len(inputs) != len(x):
         raise UsageError(f"{folder}: inputs.parquet does not have the slots of trials.parquet; run the scenario again")
     around = np.array(scenario.process.around)
-    recording = open_recording(scenario, folder.name, path)
+    recording = open_recording(
+        scenario, folder.name, path, words=looked_at.words, unknown_links=looked_at.unknown_links
+    )
     with closing(recording):
         for first in range(0, len(x), _CHUNK):
             rows = slice(first, min(first + _CHUNK, len(x)))

@@ -14,8 +14,7 @@ import pyarrow.compute as pc
 from matplotlib.patches import Patch
 
 from evedrop.errors import UsageError
-from evedrop.loading import load
-from evedrop.loading.process_noise import process_noise
+from evedrop.loading.recorded import recorded, recorded_noise
 from evedrop.model.packet_words import NOTHING, SILENT
 from evedrop.model.process import Floats
 from evedrop.results.reading import Results
@@ -57,7 +56,7 @@ def run_figure(results: Results, wanted: Sequence[str], slots: range | None, tri
     if slots is not None and (not slots or slots.step != 1 or not 0 <= slots[0] <= slots[-1] <= last):
         raise UsageError(f"plot: {slots} are not slots of the run; expected some such as range(0, {last + 1})")
     receivers = rows["peer"].unique().to_pylist()
-    noise = process_noise(results.folder)
+    noise = recorded_noise(results.folder)
     one = None if names == ["errors"] else _RecordedTrial(results, receivers, trial, slots)
     heights = [_HEIGHTS[name](len(receivers)) for name in names]
     with drawing(_WIDTH, sum(heights)) as figure:
@@ -118,11 +117,11 @@ class _RecordedTrial:
 
     def __init__(self, results: Results, receivers: list[str], trial: int | None, slots: range | None) -> None:
         rows = results.trials
-        recorded = rows["trial"].unique().to_pylist()
-        if trial is None and recorded:
-            trial = recorded[0]
-        if trial not in recorded:
-            said = f"recorded are {', '.join(map(str, recorded[:8]))}" if recorded else "the run has recorded none"
+        trials = rows["trial"].unique().to_pylist()
+        if trial is None and trials:
+            trial = trials[0]
+        if trial not in trials:
+            said = f"recorded are {', '.join(map(str, trials[:8]))}" if trials else "the run has recorded none"
             raise UsageError(f"plot: trial {trial} is not recorded; {said}, and 'errors' needs none")
         rows = rows.filter(pc.equal(rows["trial"], trial))
         last = int(pc.max(rows["slot"]).as_py())
@@ -130,7 +129,7 @@ class _RecordedTrial:
         rows = rows.filter(pc.is_in(rows["slot"], pa.array(self.slots, pa.int64())))
         self.rows = {name: rows.filter(pc.equal(rows["peer"], name)) for name in receivers}
         self.title = f"trial {trial}, slots {self.slots[0]} to {self.slots[-1]}"
-        process = load(results.folder, beyond_horizon=True).process
+        process = recorded(results.folder).scenario.process
         states = process.states or [f"x[{i}]" for i in range(len(process.A))]
         units = process.units or [""] * len(states)
         self.states = [f"{state} ({unit})" if unit else state for state, unit in zip(states, units, strict=True)]

@@ -28,8 +28,8 @@ class Shown:
     """"legitimate" or "eavesdropper"."""
     strategy: str
     """The scheme's name for the legitimate estimator, the strategy's for an eavesdropper."""
-    quality: float
-    """Probability that its link delivers a packet."""
+    quality: float | None
+    """Probability that its link delivers a packet; None if it is unknown, because the loss model is not built in."""
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,25 +26,39 @@ def showing_of(scenario: Scenario) -> Showing | None:
     return Showing.of(scenario)
 
 
-def open_recording(scenario: Scenario, run: str, path: Path, warn: Callable[[str], None] = warn) -> ViewRecording:
-    """Begin the run's recording on disk; run: its name; warn: as in ViewRecording."""
+def open_recording(
+    scenario: Scenario,
+    run: str,
+    path: Path,
+    warn: Callable[[str], None] = warn,
+    words: Mapping[str, str] | None = None,
+    unknown_links: Collection[str] = (),
+) -> ViewRecording:
+    """Begin the run's recording on disk.
+
+    run: its name; warn: as in ViewRecording; words: receiver → the name of its scheme or strategy, if not that of the scenario;
+    unknown_links: receivers whose link has a quality that is not that of the scenario, and unknown.
+    """
     from evedrop.view.glyphs import drawable  # noqa: PLC0415 - only with a view
     from evedrop.view.plant_slots import driven_scene  # noqa: PLC0415 - only with a view
     from evedrop.view.recording import ViewRecording  # noqa: PLC0415 - saves 0.3 s and 100 MB in a run without a view
     from evedrop.view.scene import Scene, Shown  # noqa: PLC0415 - the same
 
     quality = scenario.quality
-    strategies = {name: table.strategy for name, table in scenario.eavesdroppers.items()}
+    known = {
+        LEGITIMATE: scenario.encoding.scheme,
+        **{name: one.strategy for name, one in scenario.eavesdroppers.items()},
+    }
     receivers = [
         Shown(
             name,
             "legitimate" if name == LEGITIMATE else "eavesdropper",
-            strategies.get(name, scenario.encoding.scheme),
-            quality[name],
+            {**known, **(words or {})}[name],
+            None if name in unknown_links else quality[name],
         )
         for name in scenario.receivers
     ]
-    ways = {name: scenario.link(name).model.ways for name in scenario.receivers}
+    ways = {name: scenario.link(name).model.ways for name in scenario.receivers if name not in unknown_links}
     scene = Scene(
         title=drawable(scenario.title),
         run=run,

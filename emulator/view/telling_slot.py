@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import numpy as np
 import pyarrow.compute as pc
 
-from evedrop.loading import load
+from evedrop.loading.recorded import recorded
 from evedrop.model.process import Floats
 from evedrop.names import LEGITIMATE
 from evedrop.results.reading import Results
@@ -24,7 +24,8 @@ def telling_slot(results: Results) -> int | None:
 
     Raises UsageError if the folder's tables cannot be read.
     """
-    scenario = load(results.folder / "scenario.toml", beyond_horizon=True)
+    found = recorded(results.folder)
+    scenario = found.scenario
     if scenario.controller is not None:  # its panels show the whole run, up to the slot
         return None
     trials = results.trials
@@ -35,7 +36,7 @@ def telling_slot(results: Results) -> int | None:
     for name in scenario.receivers:
         rows = first.filter(pc.equal(first["peer"], name)).sort_by("slot")
         errors[name], traces[name] = rows["squared_error"].to_numpy(), rows["trace_covariance"].to_numpy()
-    return most_telling(errors, traces, float(np.trace(scenario.process.process.Q)))
+    return most_telling(errors, traces, found.noise)
 
 
 def most_telling(errors: Mapping[str, Floats], traces: Mapping[str, Floats], noise: float) -> int:

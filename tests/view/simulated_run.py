@@ -97,7 +97,7 @@ def simulate(
     peers = {}
     for s in shown:
         x_hat, P, action, error, spread, trace = (np.array(column) for column in zip(*seen[s.name], strict=True))
-        theory = expected(process, s, slots)
+        theory = expected(process, s, qualities[s.name], slots)
         peers[s.name] = PeerSlots(x_hat, P, action.astype(np.uint8), error, spread, trace, theory)
     scene = Scene(
         "Simulated", f"simulated-{seed}-{slots}", slots, trials, process.n, pace, shown, float(np.trace(process.Q))
@@ -105,9 +105,9 @@ def simulate(
     return Simulated(scene, SceneSlots(0, np.array(truth), np.array(nus), peers))
 
 
-def expected(process: Process, shown: Shown, slots: int) -> Floats:
-    """Trace of the actual mean error covariance, (slots,), by conditioning on what a slot may bring."""
-    A, Q, q, d = process.A, process.Q, shown.quality, STATE_PROBABILITY
+def expected(process: Process, shown: Shown, q: float, slots: int) -> Floats:
+    """Trace of the actual mean error covariance, (slots,), by conditioning on what a slot may bring; q: its link's quality."""
+    A, Q, d = process.A, process.Q, STATE_PROBABILITY
     use_state, misled = {"naive": (1.0, 1.0), "suspicious": (USE_STATE, USE_INNOVATION)}.get(shown.strategy, (1.0, 0.0))
     Sigma, M, traces = process.initial_covariance, (1 - q) * process.initial_covariance, []
     for k in range(slots):
