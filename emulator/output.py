@@ -1,7 +1,8 @@
 """The output of a command: a reader that has left, a full disk and a narrow encoding end no work, and leave no file unwritten.
 
 A command writes to `sys.stdout` and `sys.stderr` as if that could not fail. What cannot be written is lost; what the encoding
-lacks is spelled in ASCII.
+lacks is spelled in ASCII. Text may come from others: from the author of a class, of a results folder, of a message. So control
+characters, which could steer the terminal or reorder what it shows, are written escaped.
 """
 
 from __future__ import annotations
@@ -27,6 +28,21 @@ _SPELLINGS = {
 _GREEK = re.compile("GREEK (SMALL|CAPITAL) LETTER (?:FINAL )?([A-Z]+)$")
 _MARKS = {"<super>": "^", "<sub>": "_"}
 """The beginning of a character's decomposition → the mark of an exponent, of an index."""
+_BIDIRECTIONAL = "\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069"
+"""The characters that change the direction of text, as they stand in the brackets of a regular expression."""
+_STEERING = re.compile(f"[\0-\x08\x0b-\x1f\x7f-\x9f{_BIDIRECTIONAL}]")
+
+
+def escaped(text: str) -> str:
+    r"""Text with its control characters escaped, such as \x1b and \u202e; tabs and ends of lines stay.
+
+    These are C0, DEL, C1, and the characters that change the direction of text.
+    """
+    if text.isascii() and text.isprintable():
+        return text
+    return _STEERING.sub(
+        lambda found: rf"\x{ord(found[0]):02x}" if found[0] < "\xa0" else rf"\u{ord(found[0]):04x}", text
+    )
 
 
 def say(text: str) -> None:
@@ -44,12 +60,13 @@ def print_json(value: object) -> None:
     """Print a value as one line of JSON, whose content does not depend on the encoding of standard output."""
     encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
     text = json.dumps(value, ensure_ascii=codecs.lookup(encoding).name != "utf-8")
+    text = _STEERING.sub(lambda found: f"\\u{ord(found[0]):04x}", text)  # which JSON would leave as they are
     sys.stdout.write(f"{text}\n")
 
 
 @final
 class Output:
-    """A text stream that never fails: after the first error, what is written to it is lost."""
+    """A text stream that never fails, and escapes control characters; after the first error, what is written to it is lost."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -59,13 +76,22 @@ class Output:
         self._over = False
 
     def write(self, text: str) -> int:
-        """Write text, if that is possible; returns its length."""
+        """Write text with its control characters escaped, if that is possible; returns its length."""
+        self.write_styled(escaped(text))
+        return len(text)
+
+    def write_styled(self, text: str) -> None:
+        """Write text as it is, if that is possible."""
         if not self._over:
             try:
                 self._stream.write(text)
             except OSError as error:
                 self._end(error)
-        return len(text)
+
+    @property
+    def styled(self) -> Styled:
+        """The same stream for text that styles and moves the cursor on purpose."""
+        return Styled(self)
 
     def flush(self) -> None:
         """Write what is buffered, if that is possible."""
@@ -87,6 +113,22 @@ class Output:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
+
+
+@final
+class Styled:
+    """An `Output` without escaping, for a console that escapes the text of others by itself."""
+
+    def __init__(self, output: Output) -> None:
+        self._output = output
+
+    def write(self, text: str) -> int:
+        """Write text as it is, if that is possible; returns its length."""
+        self._output.write_styled(text)
+        return len(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._output, name)
 
 
 @contextlib.contextmanager

@@ -9,7 +9,6 @@ from types import TracebackType
 from typing import Self, final
 
 from rich.cells import cell_len
-from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -23,6 +22,7 @@ from rich.progress import (
 from rich.table import Column
 from rich.text import Text
 
+from evedrop.cli.console import StyledConsole
 from evedrop.kernels.choice import fallback_warning
 from evedrop.news import ConnectionOutage, FolderMoved, Held, News, RunEnded, RunProgress, Started, ViewOpened
 
@@ -77,7 +77,7 @@ class ProgressLine:
     """
 
     def __init__(self, total: int | None, unit: str, quiet: bool = False) -> None:
-        self.console = Console(file=sys.stderr, highlight=False, markup=False)
+        self.console = StyledConsole(sys.stderr, highlight=False, markup=False)
         self._quiet = quiet
         self._total = total
         self.moved: Path | None = None

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.table import Table
 
+from evedrop.cli.console import StyledConsole
 from evedrop.cli.narrow import fitted
 from evedrop.cli.tables import TAKEN, text_table
 from evedrop.report import closing
@@ -85,7 +85,7 @@ def left_out_line(left_out: Mapping[str, str], why: str) -> str:
     return f"left out: {who}: {why}"
 
 
-class _Console(Console):
+class _Console(StyledConsole):
     def print(self, *objects: Any, whole: TextTable | None = None, **named: Any) -> None:
         """Show a table that is wider than the terminal row by row. whole: the table for files, if another one is shown."""
         taken = TAKEN.get()
@@ -97,6 +97,7 @@ class _Console(Console):
 def terminal() -> _Console:
     """A console on standard output; 140 columns wide if that is not a terminal."""
     return _Console(
+        sys.stdout,
         highlight=False,
         markup=False,
         soft_wrap=True,

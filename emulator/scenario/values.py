@@ -9,6 +9,7 @@ import unicodedata
 from collections.abc import Iterator
 from typing import Any
 
+from evedrop.output import escaped
 from evedrop.scenario.words import as_toml
 
 _DEEPEST = 16  # levels of nested tables and lists; scenarios use about half as many
@@ -71,8 +72,9 @@ def _name_mistakes(path: tuple[str, ...], entries: list[tuple[Any, Any]]) -> Ite
 
 
 def _is_strange(character: str) -> bool:
-    """Whether a character moves the cursor, ends a string, or is half of a surrogate pair."""
-    return unicodedata.category(character) in ("Cc", "Cs") and character not in _PLAIN
+    """Whether a character moves the cursor, ends a string, changes the direction of text, or is half of a surrogate pair."""
+    strange = unicodedata.category(character) in ("Cc", "Cs") or escaped(character) != character
+    return strange and character not in _PLAIN
 
 
 def _dotted(path: tuple[str, ...]) -> str:

@@ -24,5 +24,5 @@ def closing_lines(summary: WireSummary) -> list[str]:
         table.add_column(column.heading, justify="right" if column.number else "left", no_wrap=True)
     for row in found.rows:
         table.add_row(*row)
-    Console(file=text, width=max(100, shutil.get_terminal_size().columns)).print(table)
+    Console(file=text, force_terminal=False, width=max(100, shutil.get_terminal_size().columns)).print(table)
     return [*(line.rstrip() for line in text.getvalue().splitlines()), *wire_sentences(summary)]
