@@ -12,7 +12,7 @@ from evedrop.output import warn
 from evedrop.report.kinds import page_of
 from evedrop.report.page import Page
 from evedrop.results.folder import replace_private
-from evedrop.results.reading import load_results
+from evedrop.results.reading import load_results, results_of_this_version
 
 REPORT = "report.html"
 """The file in a results folder."""
@@ -23,7 +23,8 @@ def write_report(folder: Path) -> Path:
 
     Raises UsageError if it is not a results folder, and OSError if the report cannot be written; an older one is then unchanged.
     """
-    return write_page(folder, page_of(folder))
+    with results_of_this_version(folder):
+        return write_page(folder, page_of(folder))
 
 
 def write_page(folder: Path, page: Page) -> Path:

@@ -6,7 +6,8 @@ Source: docs/results.md.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -154,6 +155,16 @@ def _differences(found: pa.Schema, wanted: pa.Schema) -> str:
 
 def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())
+
+
+@contextmanager
+def results_of_this_version(folder: Path) -> Iterator[None]:
+    """Turn an error about entries that no run of this version writes into UsageError: somebody may have changed the folder."""
+    try:
+        yield
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        why = f"{type(error).__name__}: {_one_line(error)}"
+        raise UsageError(f"{folder} has results that this version does not write ({why}); run it again") from error
 
 
 def load_results(folder: str | Path) -> Results:

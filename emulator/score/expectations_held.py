@@ -15,12 +15,10 @@ import numpy as np
 
 from evedrop.scenario import ExpectTable, Scenario, direction_figure, link_figure
 from evedrop.scenario.application import APPLICATIONS, Summary
-from evedrop.score.summary import DirectionSummary, Found, Judged, LinkSummary, PeerSummary
+from evedrop.score.summary import MODES, DirectionSummary, Found, Judged, LinkSummary, PeerSummary
 from evedrop.score.sums import Tally
 from evedrop.score.verdict import Secrecy, Verdict
 from evedrop.score.watched import watch_of
-
-_MODES = {"exact": "", "covariance-only": " --covariance-only", "error-coordinates": " --error-coordinates"}
 
 _THEORY = {True: "theory promises it", False: "theory denies it", None: "no theory covers these links"}
 _RUN = {Verdict.HELD.value: "the run shows it", Verdict.FAILED.value: "the run shows that it fails"}
@@ -36,7 +34,7 @@ def repeating(folder: Path, trials: int, mode: str) -> str:
     where = shlex.quote(str(folder.absolute()))
     if mode == "live":
         return f"evedrop run {where}"
-    return f"evedrop montecarlo {where} --trials {trials}{_MODES[mode]}"
+    return f"evedrop montecarlo {where} --trials {trials}{MODES[mode]}"
 
 
 @dataclass(frozen=True)

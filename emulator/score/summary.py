@@ -31,6 +31,13 @@ Found = float | int | str | None
 
 StandardErrors = Mapping[str, float | Mapping[str, float | None] | None]
 """Figure → its standard error, None if it has none; for figures by name, such as those of receivers, a further mapping."""
+MODES: Mapping[str, str] = {
+    "live": "",
+    "exact": "",
+    "covariance-only": " --covariance-only",
+    "error-coordinates": " --error-coordinates",
+}
+"""The mode of a run → the option of `evedrop montecarlo` that chooses it, after a space."""
 RARE_SHARE = 0.1
 """The share of an expected error that rare events may carry without being reported; beyond it, a mean error has no z-score."""
 
@@ -346,10 +353,21 @@ class Summary:
         own = {name: found[name] for name in known}
         others = {name: value for name, value in found.items() if name not in own}
         peers = {name: _peer_fields(peer) for name, peer in own["peers"].items()}
-        return _adapter().validate_python({**own, "peers": peers, _OPEN: others})
+        summary = _adapter().validate_python({**own, "peers": peers, _OPEN: others})
+        _expect_possible(summary)
+        return summary
 
 
 _OPEN = "applications"
+
+
+def _expect_possible(summary: Summary) -> None:
+    """Raise ValueError for a mode and counts that no run has."""
+    if summary.mode not in MODES:
+        raise ValueError(f"mode is {summary.mode!r}; expected {', '.join(MODES)}")
+    for name, count in {"slots": summary.slots, "trials": summary.trials}.items():
+        if count < 1:
+            raise ValueError(f"{name} is {count}; expected 1 or more")
 
 
 def _entry(value: Any) -> Any:

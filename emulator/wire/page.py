@@ -10,6 +10,7 @@ from pathlib import Path
 from evedrop.report.kinds import wire_page
 from evedrop.report.wire_sections import WireSource
 from evedrop.report.writing import write_page
+from evedrop.results.reading import results_of_this_version
 from evedrop.wire.journal_on_disk import summary_of_wire
 
 
@@ -18,4 +19,5 @@ def write_wire_report(folder: Path) -> Path:
 
     Raises UsageError if neither can be read, and OSError if the page cannot be written.
     """
-    return write_page(folder, wire_page(WireSource.of(folder, summary_of_wire(folder))))
+    with results_of_this_version(folder):
+        return write_page(folder, wire_page(WireSource.of(folder, summary_of_wire(folder))))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Mapping
 from dataclasses import replace
@@ -17,7 +19,7 @@ from evedrop.live.launch.host_messages import LogText, ProcessEnded, StartProces
 from evedrop.live.launch.host_program import HostProcesses
 from evedrop.live.launch.starter import StartedProcess
 from evedrop.live.protocol.brief import brief_from
-from tests.conftest import LIMIT, wait_until
+from tests.conftest import LIMIT, Evedrop, wait_until
 from tests.live.network.bench import brief_of_eve
 
 ORDER = StartProcess(7, brief_of_eve(), {})
@@ -106,6 +108,22 @@ def test_a_process_that_cannot_be_started_is_reported(folder: str, why: str, tmp
     assert why in log.written
     assert end == ProcessEnded(7, 1)
     host.end()
+
+
+MALFORMED = (b"no order", b'{"kind": "start"}', b"[" * 100_000, b'{"kind": "signal", "number": -1, "signal": 9}')
+
+
+@pytest.mark.parametrize("order", MALFORMED)
+def test_a_malformed_order_ends_the_program_with_a_sentence(evedrop: Evedrop, order: bytes) -> None:
+    """With the status of a run that failed, and without a traceback; nothing is left."""
+    words = [sys.executable, "-m", "evedrop", "host"]
+    done = subprocess.run(
+        words, input=order + b"\n", capture_output=True, env=evedrop.environment, timeout=LIMIT, check=False
+    )
+    assert done.returncode == 3
+    (line,) = done.stderr.decode().splitlines()
+    assert line.startswith("evedrop: the launcher gave an order that cannot be carried out (")
+    assert [*evedrop.temporary.iterdir()] == []
 
 
 @pytest.mark.parametrize("name", ["../eve", "/etc/eve"])

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import base64
 import json
+import math
+import shutil
 import stat
 import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
@@ -24,6 +27,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from evedrop import montecarlo
+from evedrop.errors import UsageError
 from evedrop.memory.montecarlo import Plan
 from evedrop.memory.simulation import Mode
 from evedrop.report import closing
@@ -35,6 +39,7 @@ from evedrop.report.strip import strip
 from evedrop.report.writing import REPORT, try_report, write_report
 from evedrop.results.writer import load_results
 from evedrop.score.track import LostSpan, Track, lost_spans, track_of
+from tests.conftest import Evedrop
 from tests.examples import examples
 from tests.pages import Checked, checked
 
@@ -266,3 +271,68 @@ def test_texts_are_escaped_wherever_they_stand() -> None:
     assert page.tags == {"p": 1, "i": 1}
     assert page.texts == ["<b>\ufffd", "&", texts[1]]
     assert page.attributes == [("p", "title", texts[2])]
+
+
+def with_other_values(found: Any, others: tuple[Any, ...]) -> Iterator[Any]:
+    """The contents of a JSON file with one value replaced, for every value (of lists: the first) and every other one."""
+    if isinstance(found, dict):
+        for name, inner in found.items():
+            yield {key: value for key, value in found.items() if key != name}
+            yield from ({**found, name: one} for one in (*others, *with_other_values(inner, others)))
+    elif isinstance(found, list) and found:
+        yield from ([one, *found[1:]] for one in (*others, *with_other_values(found[0], others)))
+
+
+OTHERS: tuple[Any, ...] = ("nonsense", None, -1, [], {}, math.inf)
+
+
+def test_a_changed_summary_is_refused_in_a_sentence(study: Path, tmp_path: Path) -> None:
+    """Or shown, whatever word or number in it is another one."""
+    folder = Path(shutil.copytree(study, tmp_path / "run"))
+    summary = json.loads((folder / "summary.json").read_text())
+    for name, word in (("mode", "nonsense"), ("trials", -1), ("slots", 0)):
+        (folder / "summary.json").write_text(json.dumps({**summary, name: word}))
+        with pytest.raises(UsageError, match=f"{name} is .*expected"):
+            write_report(folder)
+    top = {
+        name: summary[name] for name in ("mode", "slots", "trials", "secrecy", "expectations", "ended", "first_trial")
+    }
+    for changed in with_other_values(top, OTHERS):
+        (folder / "summary.json").write_text(
+            json.dumps({**{k: v for k, v in summary.items() if k not in top}, **changed})
+        )
+        with suppress(UsageError):
+            write_report(folder)
+
+
+def test_a_changed_entry_of_an_application_is_refused_in_a_sentence(evedrop: Evedrop) -> None:
+    """Also where the table is printed again."""
+    made = ("montecarlo", "replay-attack", "--slots", "300", "--trials", "2", "--set", "expect=[]", "--out", "run")
+    assert evedrop(*made).status == 0
+    path = evedrop.folder / "run" / "summary.json"
+    summary = json.loads(path.read_text())
+    path.write_text(
+        json.dumps({**summary, "integrity": {**summary["integrity"], "expected_watermark_cost": "nonsense"}})
+    )
+    for words in (("view", "run", "--table"), ("report", "run")):
+        done = evedrop(*words)
+        assert done.status == 2
+        assert "has results that this version does not write" in done.err
+
+
+@pytest.mark.parametrize(
+    ("words", "file"),
+    [
+        (("compare", "eavesdroppers", "--schemes", "plain", "--adversaries", "smart"), "compare.json"),
+        (("sweep", "eavesdroppers", "--over", "seed=1,2"), "sweep.json"),
+    ],
+)
+def test_a_changed_study_is_refused_in_a_sentence(evedrop: Evedrop, words: tuple[str, ...], file: str) -> None:
+    """The same of a comparison and of a sweep."""
+    assert evedrop(*words, "--slots", "12", "--trials", "2", "--out", "study").status == 0
+    path = evedrop.folder / "study" / file
+    for changed in with_other_values(json.loads(path.read_text()), OTHERS):
+        path.write_text(json.dumps(changed))
+        with suppress(UsageError):
+            write_report(path.parent)
+    assert evedrop("report", "study").status in {0, 2}

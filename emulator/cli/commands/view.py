@@ -37,8 +37,10 @@ def view(options: argparse.Namespace) -> int:
     _check_names(options)
     if options.table:
         from evedrop.cli.closing_report import print_report_line, print_results
+        from evedrop.results.reading import results_of_this_version
 
-        print_results(options.run)
+        with results_of_this_version(options.run):
+            print_results(options.run)
         print_report_line(options.run)
         return 0
     from evedrop.results.writer import load_results

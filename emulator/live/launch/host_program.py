@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, final
 
 from evedrop.environment import own_environment
-from evedrop.errors import UsageError
+from evedrop.errors import RunError, UsageError
 from evedrop.live.launch.host_messages import (
     Answer,
     Greeting,
@@ -44,7 +44,10 @@ _LAST_LINES_SECONDS = 1.0  # for the last lines of a process that has ended, who
 
 
 def serve_launcher() -> None:
-    """Carry out the launcher's orders until it closes standard input."""
+    """Carry out the launcher's orders until it closes standard input.
+
+    Raises UsageError if no launcher gives orders, RunError for one that is malformed; all processes are then ended.
+    """
     if sys.stdin is None or sys.stdin.isatty():
         raise UsageError("`evedrop host` is started by `evedrop run SCENARIO --hosts FILE`, over ssh; use that command")
     continue_when_launcher_dies()  # if suspended, once the connection, whose process on this host is the parent, is closed
@@ -56,9 +59,15 @@ def serve_launcher() -> None:
         try:
             host.answer(Greeting(own_version()))
             for line in sys.stdin.buffer:
-                order = order_in(line)
-                silence.heard(order)
-                host.obey(order)
+                try:
+                    order = order_in(line)
+                    silence.heard(order)
+                    host.obey(order)
+                except ValueError as error:
+                    raise RunError(
+                        f"the launcher gave an order that cannot be carried out ({error}); use the same version of Evedrop "
+                        "on all hosts"
+                    ) from error
         finally:
             host.end()
 
