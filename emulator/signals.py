@@ -58,6 +58,24 @@ def leave_after(act: Callable[[], object]) -> Iterator[None]:
 
 
 @contextmanager
+def told_when_suspended(tell: Callable[[], object]) -> Iterator[None]:
+    """Call `tell` before Ctrl-Z suspends this process while the block runs; has no effect outside the main thread."""
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGTSTP) != signal.SIG_DFL:
+        yield
+        return
+
+    def handler(_number: int, _frame: FrameType | None) -> None:
+        tell()
+        os.kill(os.getpid(), signal.SIGSTOP)
+
+    signal.signal(signal.SIGTSTP, handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTSTP, signal.SIG_DFL)
+
+
+@contextmanager
 def held_back() -> Iterator[None]:
     """Delay signals to processes that are started in the block until they have handlers.
 

@@ -16,6 +16,7 @@ from evedrop.cli.parser import Parser
 from evedrop.cli.tables import written_tables
 from evedrop.errors import EvedropError, Interrupted, RunError, UsageError
 from evedrop.files import shown
+from evedrop.lacks import lack_of
 from evedrop.output import say, standard_streams, warn
 
 if TYPE_CHECKING:
@@ -43,7 +44,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _status(given: list[str]) -> int:
-    """Run the command line, and report its errors."""
+    """Run the command line, and report its errors, and what the machine lacks."""
+    try:
+        return _status_of(given)
+    except Exception as error:
+        if (lack := lack_of(error)) is None:
+            raise
+    say(lack)  # after the error has been let go of, and the memory that it holds
+    return RunError.exit_status
+
+
+def _status_of(given: list[str]) -> int:
     if "_ARGCOMPLETE" in os.environ:  # a shell asks for completions
         import argcomplete
 
@@ -66,6 +77,8 @@ def _status(given: list[str]) -> int:
     except KeyboardInterrupt:
         return Interrupted.exit_status
     except OSError as error:
+        if lack_of(error) is not None:
+            raise
         sys.stdout.flush()
         if error.filename is None:
             say(f"{error}; free system resources and try again")

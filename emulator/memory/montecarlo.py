@@ -16,6 +16,7 @@ import numpy as np
 
 from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.expected.expectations import expected_traces_of
+from evedrop.lacks import preload_within_limit
 from evedrop.memory.cluster import REACH_SECONDS
 from evedrop.memory.kept_tasks import kept_tasks, study_of
 from evedrop.memory.packet_counts import PacketCounts
@@ -100,6 +101,7 @@ def simulate(scenario: Scenario, folder: Path, tell: Tell, plan: Plan = Plan(), 
     Raises UsageError for an unusable folder, plan or scheduler; Interrupted on Ctrl-C and RunError if a worker fails, with
     the results so far in the folder.
     """
+    preload_within_limit()
     check_mode(scenario, plan.mode)
     study = study_of("montecarlo", {"mode": plan.mode.value, "rare": plan.rare}, [scenario])
     failure: RunError | None = None

@@ -20,6 +20,7 @@ from typing import Any, final
 from evedrop.environment import SINGLE_THREADED, own_environment
 from evedrop.errors import EvedropError, RunError
 from evedrop.interrupts import SIGNALS
+from evedrop.lacks import lack_of
 from evedrop.memory.tasks import R, Result, Stopped, Task, Tell
 from evedrop.model.registry import place_of
 from evedrop.processes import kill
@@ -47,7 +48,7 @@ def in_this_process(tasks: Sequence[Task[R]], tell: Tell, stopped: Stopped) -> I
             raise
         except Exception as error:
             # A bug of this program keeps its traceback; an error in a class of the user's own names the class.
-            if isinstance(error, OSError) or not foreign(task.scenario):
+            if isinstance(error, OSError) or lack_of(error) is not None or not foreign(task.scenario):
                 raise
             raise RunError(
                 f"one of the trials {task.start} to {task.stop - 1} failed: {place_of(error)}; run `evedrop check` on the "
@@ -161,7 +162,8 @@ def work(descriptor: int) -> None:
     ):  # these reach the starting process, too, which tells the workers to stop
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
-    with contextlib.suppress(EOFError, OSError), Connection(descriptor) as pipe:
+    # Without memory for a message it ends, which the starting process reports.
+    with contextlib.suppress(EOFError, OSError, MemoryError), Connection(descriptor) as pipe:
         while True:
             pipe.send(_outcome(pipe.recv(), pipe.send, stop.is_set))
 
@@ -174,4 +176,6 @@ def _outcome(task: Task[Result], tell: Tell, stopped: Stopped) -> Result | str:
     except EvedropError as error:
         return str(error)
     except Exception as error:
+        if (lack := lack_of(error)) is not None:
+            return lack
         return f"trials {task.start} to {task.stop - 1}: {place_of(error)}"

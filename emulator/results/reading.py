@@ -224,7 +224,11 @@ def _cut_short(folder: Path) -> dict[str, Any]:
         summary = _read_summary(figures_path(folder))
     except UsageError:
         summary = _no_figures(folder)
-    ended = f"the run goes on, at {at}" if goes_on(folder) else f"cut short at {at}, because its run was killed"
+    ended = (
+        f"the run goes on, at {at}"
+        if goes_on(folder)
+        else f"cut short at {at}, because its run was killed or its disk was full"
+    )
     if summary["ended"] != at:
         ended += f" (the figures are as of {summary['ended']}; the tables have more)"
     return {**summary, "slots": found.slots, "ended": ended}

@@ -5,6 +5,7 @@ Source: docs/results.md, summary.json.
 
 from __future__ import annotations
 
+import errno
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -44,6 +45,11 @@ def unwritten(error: OSError) -> str:
     if isinstance(error, FileNotFoundError):
         return (
             f"the results cannot be written ({error}); leave the folder where it is while a run goes on, and run again"
+        )
+    if error.errno == errno.EIO:
+        return (
+            f"the results cannot be written ({error}); look at the disk, and run again on another one; whether the results so "
+            "far can be read depends on the disk"
         )
     return (
         f"the results cannot be written ({error}); free some room or look at the folder's rights, and run again; the results "

@@ -133,3 +133,19 @@ def test_an_end_that_no_fork_server_reports_is_seen(tmp_path: Path) -> None:
         assert time.monotonic() - began < SECONDS
         assert process.stdin is not None
         process.stdin.close()
+
+
+def test_ctrl_z_says_that_the_run_goes_on(evedrop: Evedrop) -> None:
+    """Only the launcher stops, and the message names the command that pauses the run."""
+    live = evedrop.live("eavesdroppers", *ENDLESS)
+    live.running()
+    live.process.send_signal(signal.SIGTSTP)
+    stat = Path(f"/proc/{live.process.pid}/stat")
+    wait_until(lambda: stat.read_text().rpartition(")")[2].split()[0] == "T", "a launcher that is suspended")
+    live.process.send_signal(signal.SIGCONT)
+    live.process.send_signal(signal.SIGINT)
+    done = live.end(SECONDS)
+    assert done.status == 130
+    assert "the processes of the run go on" in done.err.splitlines()[0]
+    assert "evedrop pause run" in done.err.splitlines()[0]
+    live.nothing_left()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -22,6 +23,7 @@ from hypothesis import strategies as st
 
 from evedrop.errors import UsageError
 from evedrop.results.growing_tables import UNFINISHED, goes_on, last_round
+from evedrop.results.summary_file import unwritten
 from evedrop.results.writer import Results, ResultsWriter, load_results
 from evedrop.score.sums import SlotSums
 from evedrop.view.replay import replay
@@ -68,7 +70,9 @@ def cut_short(live: Live) -> int:
     """Check that the folder of a live run that was killed opens, and says where it ends; how many slots it has."""
     results = live.results
     slots: int = results.summary["slots"]
-    assert str(results.summary["ended"]).startswith(f"cut short at slot {slots}, because its run was killed")
+    assert str(results.summary["ended"]).startswith(
+        f"cut short at slot {slots}, because its run was killed or its disk was full"
+    )
     receivers = len(results.summary["peers"])
     for table in (results.slots, results.trials, results.journal):
         assert table.num_rows == slots * receivers
@@ -87,7 +91,7 @@ def test_a_run_of_which_everything_was_killed_can_be_read(evedrop: Evedrop) -> N
     slots = cut_short(live)
     done = evedrop("view", "run", "--table")
     assert done.status == 0
-    assert done.out.startswith(f"cut short at slot {slots}, because its run was killed")
+    assert done.out.startswith(f"cut short at slot {slots}, because its run was killed or its disk was full")
     assert "legitimate" in done.out
     assert replay(live.folder, evedrop.folder / "again.rrd").stat().st_size > 10_000
     whole = evedrop("montecarlo", "eavesdroppers", "--trials", "1", "--slots", str(slots), "--out", "memory")
@@ -218,7 +222,10 @@ def test_a_killed_study_can_be_read(evedrop: Evedrop) -> None:
     results = live.results
     trials = results.summary["trials"]
     assert trials >= 500
-    assert f"cut short at {trials} of 100000 trials, because its run was killed" in results.summary["ended"]
+    assert (
+        f"cut short at {trials} of 100000 trials, because its run was killed or its disk was full"
+        in results.summary["ended"]
+    )
     assert set(results.slots["trials"].to_pylist()) == {trials}
     assert results.slots.num_rows == results.trials.num_rows == 4 * 400
     assert results.digests.num_rows == 4 * 2 * trials
@@ -292,3 +299,11 @@ def test_all_rows_are_on_disk_before_the_observer_waits_for_the_others_to_end(ev
     done = live.end()
     assert done.status == 3, done.err
     assert live.results.slots.num_rows == 4 * 60
+
+
+def test_a_broken_disk_is_not_called_full() -> None:
+    """After an input/output error nobody can know what is on the disk, and room does not help."""
+    said = unwritten(OSError(errno.EIO, "Input/output error"))
+    assert "free some room" not in said
+    assert "look at the disk" in said
+    assert "free some room" in unwritten(OSError(errno.ENOSPC, "No space left on device"))

@@ -5,6 +5,7 @@ It imports neither zenoh nor rerun. It alone decides how the run ended.
 
 from __future__ import annotations
 
+import shlex
 import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,8 +15,9 @@ from evedrop.live.launch.ports import loopback_endpoints
 from evedrop.live.launch.preloading import process_starter
 from evedrop.live.launch.process_set import Ended, launch_one
 from evedrop.news import Tell
+from evedrop.output import say
 from evedrop.scenario import Scenario
-from evedrop.signals import stop_on_signals
+from evedrop.signals import stop_on_signals, told_when_suspended
 from evedrop.view.viewer import choose
 
 if TYPE_CHECKING:
@@ -46,7 +48,12 @@ def launch(
     last two cases the results so far are in the folder and no process is left.
     """
     view = choose(view)
-    with stop_on_signals() as stop, process_starter(stop) as start:
+    pausing = f"; to pause it, type `evedrop pause {shlex.quote(str(folder))}`" if scenario.shards == 1 else ""
+
+    def suspended() -> None:
+        say(f"the processes of the run go on, and only this command stops{pausing}; `fg` continues the command")
+
+    with stop_on_signals() as stop, told_when_suspended(suspended), process_starter(stop) as start:
         if hosts is not None:
             return _on_hosts(scenario, folder, view, tell, stop, start, hosts, paused)
         if scenario.shards == 1:

@@ -17,6 +17,7 @@ from queue import SimpleQueue
 
 from evedrop.errors import EvedropError, Interrupted, NoAnswer, RunError
 from evedrop.interrupts import heeded
+from evedrop.lacks import lack_of, preload_within_limit
 from evedrop.live.network.launcher_watch import launcher_is_gone, when_launcher_is_gone
 from evedrop.live.network.session import Session
 from evedrop.live.observer.conductor import Stop
@@ -45,6 +46,7 @@ def observe(brief: Brief[ObserverPart], report: Report, serve: str | None = None
     stop, confirmations = Stop(launcher_is_gone if brief.ends_with_stdin else lambda: False), SimpleQueue[bytes]()
     for number in heeded():
         signal.signal(number, lambda *_: setattr(stop, "wanted", True))
+    preload_within_limit()
     by_hand = not brief.ends_with_stdin
     set_news_apart(launched=not by_hand)
     if not by_hand:
@@ -80,7 +82,10 @@ def observe(brief: Brief[ObserverPart], report: Report, serve: str | None = None
         )
     except Exception as error:  # a bug in the observer must not cost the results
         traceback.print_exc()
-        status, how = RunError.exit_status, f"the observer failed ({error!r}); please report its log"
+        status, how = (
+            RunError.exit_status,
+            lack_of(error) or f"the observer failed ({error!r}); please report its log",
+        )
     status = observation.finish(status, how, report)
     if viewer is not None:
         viewer.stop()

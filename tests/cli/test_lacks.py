@@ -1,0 +1,110 @@
+"""A machine that lacks memory, threads or processes: one sentence and exit status 3, of every command and in every process."""
+
+from __future__ import annotations
+
+import errno
+import os
+import resource
+import threading
+from pathlib import Path
+
+import pytest
+
+from evedrop.lacks import lack_of, preload_within_limit
+from evedrop.memory import montecarlo, workers
+from evedrop.memory.tasks import Result, Stopped, Task, Tell
+from tests.conftest import Evedrop
+
+LACKS = [
+    (MemoryError(), "there is not enough memory; "),
+    (OSError(errno.ENOMEM, "Cannot allocate memory"), "there is not enough memory; "),
+    (
+        BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable"),
+        "no further process or thread can be started; ",
+    ),
+    (RuntimeError("can't start new thread"), "no further process or thread can be started; "),
+    (
+        ImportError("Original error was: libx.so: failed to map segment from shared object"),
+        "there is not enough memory; ",
+    ),
+]
+STUDY = ("montecarlo", "eavesdroppers", "--trials", "2", "--slots", "5")
+
+
+@pytest.mark.parametrize(("error", "says"), LACKS, ids=lambda part: type(part).__name__)
+def test_a_study_without_resources_is_no_failed_expectation(
+    evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch, error: Exception, says: str
+) -> None:
+    """Status 1 would say that an expectation failed."""
+
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr(montecarlo, "teller", fail)
+    done = evedrop(*STUDY, "--out", "x")
+    assert (done.status, done.out) == (3, "")
+    assert done.err.startswith(f"evedrop: {says}")
+    assert done.err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "error", [RuntimeError("other"), ImportError("no module named x"), OSError(errno.ENOSPC, "No space"), ValueError()]
+)
+def test_other_errors_are_no_lack(error: Exception) -> None:
+    """A mistake in the program keeps its traceback."""
+    assert lack_of(error) is None
+
+
+def test_a_run_without_threads_ends_with_a_sentence(evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As under a container's limit of processes, which counts threads."""
+
+    def fail(*_: object) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading, "_start_new_thread", fail)
+    done = evedrop("run", "eavesdroppers", "--slots", "5", "--view", "off", "--out", "run")
+    assert done.status == 3
+    assert done.err.startswith("evedrop: no further process or thread can be started; ")
+
+
+class Hungry(Task[Result]):
+    """A task for which there is not enough memory."""
+
+    def carry_out(self, tell: Tell, stopped: Stopped) -> Result:
+        """Raises MemoryError."""
+        del tell, stopped
+        raise MemoryError
+
+    def example(self) -> Result:
+        """There is none."""
+        raise NotImplementedError
+
+
+def test_a_worker_without_memory_says_so() -> None:
+    """And not in which line of numpy it happened."""
+    task = Hungry({}, 0, 10)
+    assert str(workers._outcome(task, lambda _: None, lambda: False)).startswith("there is not enough memory; ")
+
+
+@pytest.mark.parametrize("megabytes", [150, 400, 500, 800])
+def test_a_command_with_little_memory_never_ends_with_status_1(evedrop: Evedrop, megabytes: int) -> None:
+    """Whatever fails first, our code or a library: it ends, and not with a failed expectation."""
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_AS, (megabytes * 10**6,) * 2)
+
+    done = evedrop.process(*STUDY, "--set", "expect=[]", "--workers", "1", "--out", "x", preexec_fn=limit)
+    assert done.status != 1, done.err
+    assert "Traceback" not in done.err
+
+
+def test_what_a_summary_needs_is_imported_while_there_is_room() -> None:
+    """Without room it fails at once; OpenBLAS would try for ever."""
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (used + 100_000_000, before[1]))
+    try:
+        with pytest.raises(MemoryError):
+            preload_within_limit()
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
