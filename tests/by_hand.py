@@ -81,7 +81,9 @@ class ByHand:
         for name in names or self.names:
             path = self.folder / "briefs" / f"{name}.json"
             with self.log(name).open("ab") as log:
-                self.processes[name] = self._started(read_brief(path).role, path, log)
+                process = self.processes[name] = self._started(read_brief(path).role, path, log)
+            if name != OBSERVER and process.stdout is not None:
+                process.stdout.close()  # a router that is started by hand tells nothing there
         if "observer" in (names or self.names):
             threading.Thread(target=self._listen, daemon=True).start()
 

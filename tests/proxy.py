@@ -1,4 +1,4 @@
-"""A cable that can be pulled: a TCP proxy that closes its connections, or goes silent without closing them, or flaps."""
+"""A cable that can be pulled: a proxy at a TCP port that closes its connections, or goes silent without it, or flaps."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ class Cable:
     whole: set while it passes everything on; closed connections stay closed, and none is accepted meanwhile.
     """
 
-    def __init__(self, port: int) -> None:
-        self._port = port
+    def __init__(self, to: int | str) -> None:
+        """to: a port of this machine, or the path of a Unix socket."""
+        self._to = to
         self._listener = socket.create_server(("127.0.0.1", 0))
         self._flows = threading.Event()
         self._flows.set()
@@ -37,9 +38,13 @@ class Cable:
         return f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
 
     @property
-    def port(self) -> int:
-        """Where it leads to."""
-        return self._port
+    def leads_somewhere(self) -> bool:
+        """Whether a program listens where it leads."""
+        try:
+            self._dial().close()
+        except OSError:
+            return False
+        return True
 
     @property
     def connections(self) -> int:
@@ -108,13 +113,24 @@ class Cable:
                 try:
                     if not self._accepts:
                         raise ConnectionRefusedError
-                    far = socket.create_connection(("127.0.0.1", self._port))
+                    far = self._dial()
                 except OSError:
                     near.close()
                     continue
                 self._ends += [near, far]
                 for here, there in ((near, far), (far, near)):
                     threading.Thread(target=self._carry, args=(here, there), daemon=True).start()
+
+    def _dial(self) -> socket.socket:
+        if isinstance(self._to, int):
+            return socket.create_connection(("127.0.0.1", self._to))
+        far = socket.socket(socket.AF_UNIX)
+        try:
+            far.connect(self._to)
+        except OSError:
+            far.close()
+            raise
+        return far
 
     def _carry(self, here: socket.socket, there: socket.socket) -> None:
         with suppress(OSError):

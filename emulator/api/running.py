@@ -38,8 +38,9 @@ def run(
 
     scenario: a built-in name, a file, or a `Scenario`; out: the results folder, new or empty, by default a temporary one that is
     removed with the results; overwrite: replace the results in `out`; view: auto, native, web or off; listen: the router's
-    loopback endpoint, tcp/127.0.0.1:PORT; tell: called with each item of news, by default a progress bar in a notebook; changes:
-    entries of the scenario by dotted key, with `__` for the dot, such as `slots=500` or `legitimate__link__quality=0.5`.
+    loopback endpoint, tls/127.0.0.1:PORT, by default a socket; tell: called with each item of news, by default a progress bar
+    in a notebook; changes: entries of the scenario by dotted key, with `__` for the dot, such as `slots=500` or
+    `legitimate__link__quality=0.5`.
 
     Raises ScenarioError with every mistake of the scenario, UsageError for an unusable folder or port, RunError if a
     process failed, Interrupted on Ctrl-C; after the last two the folder holds the results so far.
@@ -52,7 +53,7 @@ def run(
 
     made = scenario_of(scenario, changes)
     refuse_unless(
-        listen is None or isinstance(listen, str), "listen", listen, "an endpoint such as tcp/127.0.0.1:17460"
+        listen is None or isinstance(listen, str), "listen", listen, "an endpoint such as tls/127.0.0.1:17460"
     )
     with place_for(out, overwrite) as place, progress(tell, made.slots) as told:
         ended = launch(made, place.folder, view, listen, told)

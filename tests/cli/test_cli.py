@@ -124,7 +124,7 @@ def test_a_taken_port_is_refused(evedrop: Evedrop) -> None:
 )
 def test_an_endpoint_that_is_none_is_refused(evedrop: Evedrop, endpoint: str) -> None:
     """A port beyond those there are, every interface, another protocol, no address."""
-    refused(evedrop("run", "eavesdroppers", *QUICK, "--listen", endpoint, "--out", "x"), "give one such as tcp/127.")
+    refused(evedrop("run", "eavesdroppers", *QUICK, "--listen", endpoint, "--out", "x"), "give one such as tls/127.")
 
 
 def test_a_results_folder_must_be_new_or_empty(evedrop: Evedrop) -> None:

@@ -89,10 +89,12 @@ class Disturbed:
         router = str(told["router"])
         if told["role"] == "router" or told["process"] not in self._wired:
             return router
-        port = int(router.rpartition(":")[2])
+        protocol, _, place = router.partition("/")
         key = (int(told["first"]), str(told["process"]))
         if key not in self.cables:
-            self.cables[key] = Cable(port)
+            self.cables[key] = Cable(place if protocol == "unixsock-stream" else int(place.rpartition(":")[2]))
+        if protocol == "unixsock-stream":
+            return self.cables[key].endpoint
         return re.sub(r"\d+$", self.cables[key].endpoint.rpartition(":")[2], router)
 
     def _listen(self) -> None:

@@ -17,7 +17,8 @@ from evedrop.errors import Interrupted
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.launch.children import Children, Exit
 from evedrop.live.launch.process_set import follow_to_end
-from evedrop.live.protocol.news import read_news
+from evedrop.live.protocol.news import Listening, ProcessRequest, read_news
+from evedrop.names import ProcessAction
 from evedrop.news import ConnectionOutage, News, RunEnded, RunProgress, Started, silent
 from evedrop.results.folder import HeldFolder, new_folder
 from tests.conftest import wait_until
@@ -57,11 +58,16 @@ class Starting:
 
     lines: bytes = b""
     status: int = 0
+    pipes: dict[str, IO[bytes]] = field(default_factory=dict)
+    """Other processes that write something → what."""
+    begun: list[str] = field(default_factory=list)
     pids: Iterator[int] = field(default_factory=lambda: itertools.count(1))
 
     def __call__(self, role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> Ended:  # noqa: ARG002 - nothing is run
         """Start one."""
-        return Ended(next(self.pids), BytesIO(self.lines) if role == "observer" else None, None, self.status)
+        self.begun.append(brief.stem)
+        stdout = BytesIO(self.lines) if role == "observer" else self.pipes.get(brief.stem)
+        return Ended(next(self.pids), stdout, None, self.status)
 
 
 class Bench:
@@ -149,6 +155,28 @@ def test_the_sender_of_a_malformed_message_is_named(bench: Bench, key: str, send
     (bench.results / "logs" / "naive.log").write_text(f"evedrop: {said}\n")
     report = bench.children.failure_report(Exit("naive", 3), RunEnded(3, said))
     assert report.startswith(f"{sender} broke the protocol: malformed message on evedrop/r1/{key}"), report
+
+
+def test_a_process_starts_again_only_when_its_router_listens(bench: Bench) -> None:
+    """A router that has just been restarted has not said so: the request waits, and is carried out later."""
+    bench.starter.pipes = {"router": BytesIO()}
+    bench.children.start(bench.briefs["router"])
+    bench.children.start(bench.briefs["eve"])
+    bench.starter.lines = ProcessRequest(ProcessAction.START, "eve", 3, 1).line
+    bench.children.start(bench.briefs["observer"])
+    begun = len(bench.starter.begun)
+    for _ in range(10):
+        bench.children.news(0.01)
+    assert bench.starter.begun[begun:] == []
+    bench.starter.pipes = {"router": BytesIO(Listening("router").line)}
+    bench.children.start(bench.briefs["router"], again=True)
+
+    def started_again() -> bool:
+        bench.children.news(0.01)
+        return "eve" in bench.starter.begun[begun:]
+
+    wait_until(started_again, "the process to start again")
+    assert bench.starter.begun[begun:] == ["router", "eve"]
 
 
 PROGRESS = RunProgress(3, 2.5, "slots/s", {"eve": float("inf")})

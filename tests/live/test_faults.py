@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -299,7 +300,9 @@ def test_a_process_that_stays_stopped_ends_the_run(evedrop: Evedrop, name: str) 
     live.kill(name, signal.SIGSTOP)
     done = live.end()
     assert done.status == 3
-    assert done.err.startswith(f"evedrop: {name} stopped responding: hung, suspended or cut off")
+    # Zenoh only notices that a process is lost while it can send to it: a full socket leaves this to the observer.
+    said = r"( stopped responding: hung, suspended or cut off|: alive, and silent for \d+ s while the run waits)"
+    assert re.match(f"evedrop: {name}{said}", done.err), done.err
     live.nothing_left()
     tables_whole(live)
 

@@ -17,7 +17,7 @@ SLOW = """
 import time
 import evedrop.live.launch.children as children
 import evedrop.live.launch.process_set as process_set
-import evedrop.live.observer.news as heartbeat
+import evedrop.live.network.launcher_news as heartbeat
 import evedrop.results.writer as results
 
 def finish(folder, honest=results.finish):

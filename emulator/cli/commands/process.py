@@ -31,7 +31,7 @@ _MOST_TOLD = 5  # mistakes of a scenario in a brief, which is not written by han
 def brief(options: argparse.Namespace) -> int:
     """Write the briefs of a scenario's processes, or the files of their containers."""
     from evedrop.live.launch.briefs import write_briefs
-    from evedrop.live.launch.ports import endpoints_at
+    from evedrop.live.launch.ports import endpoints_at, warn_if_exposed
 
     if options.compose is not None:
         return _compose(options)
@@ -43,6 +43,7 @@ def brief(options: argparse.Namespace) -> int:
     endpoints = endpoints_at(options.listen, options.connect, options.relay, options.relay_connect, options.insecure)
     for path in write_briefs(scenario, endpoints, options.results, options.out, options.wait, paused=options.paused):
         print(path)
+    warn_if_exposed(endpoints)
     return 0
 
 
@@ -75,7 +76,7 @@ def process(options: argparse.Namespace) -> int:
     """Run one process of a run."""
     from evedrop.live.network.launcher_watch import continue_when_launcher_dies
     from evedrop.live.protocol.brief import read_brief
-    from evedrop.live.protocol.brief_parts import ImportingPart, ObserverPart
+    from evedrop.live.protocol.brief_parts import ImportingPart, ObserverPart, RoutingPart
     from evedrop.plugins import look_in
 
     os.umask(0o077)  # only this user may read its files
@@ -88,6 +89,10 @@ def process(options: argparse.Namespace) -> int:
     if brief.ends_with_stdin:  # started by a launcher, which writes another brief if it restarts the process
         options.brief.unlink(missing_ok=True)  # its keys should not stay on disk
         continue_when_launcher_dies()
+        if isinstance(brief.part, RoutingPart):
+            from evedrop.live.network.launcher_news import set_news_apart
+
+            set_news_apart(launched=True)  # before the modules of link classes print anything
     if isinstance(brief.part, ObserverPart) and getattr(options, "out", None) is not None:
         brief = replace(brief, part=replace(brief.part, results=str(options.out)))
     if isinstance(brief.part, ImportingPart) and brief.part.modules is not None:
@@ -109,7 +114,7 @@ def _play(brief: AnyBrief, serve: str | None) -> int:
 
         check_identity(brief.identity, brief.process)
     if has_part(brief, ObserverPart):
-        from evedrop.live.observer.news import Heartbeat
+        from evedrop.live.network.launcher_news import Heartbeat
 
         with Heartbeat() if brief.ends_with_stdin else contextlib.nullcontext():
             return _observe(brief, serve)
@@ -205,7 +210,7 @@ def _briefs(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--listen",
-        default="tcp/127.0.0.1:17447",
+        default="tls/127.0.0.1:17447",
         metavar="ENDPOINT",
         help="the endpoint where the router listens, such as tls/router.lan:7447",
     )

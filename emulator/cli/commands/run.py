@@ -115,7 +115,7 @@ def _keep_open(viewer: Viewer) -> None:
 def _live(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--view", choices=("auto", "native", "web", "off"), default="auto", help="default auto")
     parser.add_argument(
-        "--listen", metavar="ENDPOINT", help="the router's endpoint: tcp/127.0.0.1:PORT or tls/127.0.0.1:PORT"
+        "--listen", metavar="ENDPOINT", help="the router's endpoint, such as tls/127.0.0.1:PORT; by default no port"
     )
     parser.add_argument("--relay", metavar="ENDPOINT", help="the second router's endpoint, if the scenario has two")
     parser.add_argument(

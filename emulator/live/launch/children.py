@@ -28,7 +28,7 @@ from evedrop.live.launch.starter import (
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.brief_parts import ReceiverPart, RoutingPart
 from evedrop.live.protocol.keys import writer_of
-from evedrop.live.protocol.news import Alive, Finishing, ProcessRequest, RunOver, read_news
+from evedrop.live.protocol.news import Alive, Finishing, Listening, ProcessRequest, RunOver, read_news
 from evedrop.names import OBSERVER, RELAY, ROUTER, SENSOR, ProcessAction
 from evedrop.news import News, RunEnded, Started, Tell
 from evedrop.processes import wait_for
@@ -39,6 +39,7 @@ SILENCE_SECONDS = 30.0  # after which the launcher gives up on a silent observer
 _BEGIN_SECONDS = 30.0  # for a living observer to begin to write its results
 _FINISH_SECONDS = 600.0  # for it to write them: 10⁶ slots take some seconds
 _GONE_SECONDS = 5.0  # for a process that has left the network to end, and to say why in its log
+_AGAIN_SECONDS = 0.02  # until a request that cannot be carried out yet is looked at again
 _LOG_LINES = 12
 _COMPLAINT = "evedrop: "
 _HUBS = frozenset({ROUTER, RELAY, OBSERVER})
@@ -96,6 +97,8 @@ class Children:
         self.over = False
         """Whether the run is over, and all processes have been told to leave."""
         self._finishing = False
+        self._listening = set[str]()
+        """The routers that have said that they listen."""
         self._restarts = 0
         self._briefs: dict[str, AnyBrief] = {}
         self._killed: set[int] = set()
@@ -108,11 +111,13 @@ class Children:
         end_all(self._processes.values())
 
     def start(self, brief: AnyBrief, again: bool = False) -> None:
-        """Start the process of a brief, or restart it (`again`). Its output goes to its log, an observer's news to the launcher.
+        """Start the process of a brief, or restart it (`again`).
 
-        Raises RunError if the system cannot start it.
+        Its output goes to its log, the news of an observer or a router to the launcher. Raises
+        RunError if the system cannot start it.
         """
         self._briefs[brief.process] = brief
+        self._listening.discard(brief.process)
         if isinstance(brief.part, ReceiverPart) and brief.part.outages:
             state_file = str((self._private / f"{brief.process}.state").absolute())
             brief = replace(brief, part=replace(brief.part, state_file=state_file))
@@ -135,14 +140,22 @@ class Children:
         if before is not None and before.stdin is not None:
             before.stdin.close()
         self._processes[brief.process] = process
-        threading.Thread(target=self._follow, args=(brief.process, process), daemon=True).start()
+        try:
+            threading.Thread(target=self._follow, args=(brief.process, process), daemon=True).start()
+        except RuntimeError:  # no thread can be started: nobody will read what the process tells
+            if process.stdout is not None:
+                process.stdout.close()
+            raise
 
     def _follow(self, name: str, process: StartedProcess) -> None:
         if process.stdout is not None:
             with process.stdout as lines:
                 for line in lines:
                     try:
-                        self._news.put(read_news(line))
+                        news = read_news(line)
+                        if name != OBSERVER and news != Listening(name):
+                            raise ValueError("only the observer sends such news")
+                        self._news.put(news)
                     except ValueError as error:
                         self._refuse(name, error)
         status = process.wait()  # without a limit: nobody waits for this thread
@@ -156,6 +169,11 @@ class Children:
             (self._folder.now / "logs" / f"{name}.log").open("a", encoding="utf-8") as log,
         ):
             log.write(f"{_COMPLAINT}the launcher refused malformed news: {error}\n")
+
+    def listens(self, router: str) -> bool:
+        """Whether a router or relay has said that it listens; true for one that cannot say so, or is not there."""
+        process = self._processes.get(router)
+        return process is None or process.stdout is None or router in self._listening
 
     def restart_router(self, ended: Exit) -> bool:
         """Restart a router or relay if a signal ended it, a few times per run; returns whether it was restarted."""
@@ -200,7 +218,10 @@ class Children:
                 observer.flush()
 
     def news(self, seconds: float) -> News | Exit | None:
-        """The next news or exit that concerns the caller, or None; waits for `seconds` at most."""
+        """The next news or exit that concerns the caller, or None; waits for `seconds` at most.
+
+        A process that is to be started again waits, as the others did, until its router listens.
+        """
         try:
             news = self._news.get(timeout=seconds)
         except Empty:
@@ -212,13 +233,18 @@ class Children:
         match news:
             case Started():
                 self.started = True
+            case Listening(process):
+                self._listening.add(process)
+            case ProcessRequest(ProcessAction.START) if not all(self.listens(name) for name in (ROUTER, RELAY)):
+                self._news.put(news)
+                time.sleep(_AGAIN_SECONDS)
             case ProcessRequest():
                 self.act(news)
             case RunOver():
                 self.over = True
             case Finishing():
                 self._finishing = True
-        return None if isinstance(news, Alive | ProcessRequest | RunOver | Finishing) else news
+        return None if isinstance(news, Alive | Listening | ProcessRequest | RunOver | Finishing) else news
 
     def conclude(self, tell: Tell, patience: float = 0.0) -> RunEnded | None:
         """End the observer, at once or after `patience` seconds; returns its `RunEnded`, or None if it sent none.

@@ -140,6 +140,9 @@ class HostProcesses:
             self.answer(LogText(number, f"evedrop: {brief.process} cannot be started ({error})\n"))
             self.answer(ProcessEnded(number, 1))
             return
+        news = self._processes[number].stdout
+        if news is not None:
+            news.close()  # the launcher waits for no router on another host
         threading.Thread(target=self._follow, args=(number, read), daemon=True).start()
 
     def _kept_here(self, brief: AnyBrief) -> AnyBrief:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from evedrop.errors import UsageError
-from evedrop.live.launch.ports import loopback_endpoints
+from evedrop.live.launch.ports import loopback_endpoints, warn_if_exposed
 from evedrop.live.launch.preloading import process_starter
 from evedrop.live.launch.process_set import Ended, launch_one
 from evedrop.news import Tell
@@ -40,9 +40,9 @@ def launch(
 ) -> Ended:
     """Run a scenario live into a results folder; `tell` gets the observer's news as they come.
 
-    view: auto, native, web or off; listen, relay: the endpoints of router and relay, if there is one; free ports by default;
-    paused: whether the run is held before slot 0, until the operator lets it continue; hosts: the hosts of processes that are not
-    on this machine, and the endpoints of the routers then.
+    view: auto, native, web or off; listen, relay: the endpoints of router and relay, if there is one; by default no
+    port, or free ports for two routers; paused: whether the run is held before slot 0, until the operator lets it continue;
+    hosts: the hosts of processes that are not on this machine, and the endpoints of the routers then.
 
     Raises UsageError before any process is started, RunError if the run failed, Interrupted on Ctrl-C or SIGTERM; in the
     last two cases the results so far are in the folder and no process is left.
@@ -57,7 +57,10 @@ def launch(
         if hosts is not None:
             return _on_hosts(scenario, folder, view, tell, stop, start, hosts, paused)
         if scenario.shards == 1:
-            endpoints = loopback_endpoints(listen, relay, scenario.relayed)
+            endpoints = None
+            if listen is not None or relay is not None or scenario.relayed:
+                endpoints = loopback_endpoints(listen, relay, scenario.relayed)
+                warn_if_exposed(endpoints)
             return launch_one(scenario, folder, view, endpoints, tell, stop, start, paused=paused)
         from evedrop.live.launch.shards import launch_shards  # noqa: PLC0415 - not needed for one set of processes
 

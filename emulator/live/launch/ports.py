@@ -1,7 +1,8 @@
 """The endpoints of a run's routers, and the credentials at each of them.
 
-An endpoint is a free port on loopback, or the requested one if it is safe and available. Credentials are passwords,
-certificates, and the id by which two routers recognise each other.
+A run on one machine needs no port: its router listens at a Unix socket in the run's private folder. Two routers take free
+ports on loopback, with certificates. An endpoint that the user names is taken if it is safe and available. Credentials are
+passwords, certificates, and the id by which two routers recognise each other.
 """
 
 from __future__ import annotations
@@ -9,11 +10,13 @@ from __future__ import annotations
 import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from evedrop.errors import UsageError
-from evedrop.live.network.endpoint import Endpoint
+from evedrop.live.network.endpoint import AnyEndpoint, Endpoint, SocketEndpoint
 from evedrop.live.protocol.brief_parts import Identity
 from evedrop.names import RELAY, ROUTER, SENSOR
+from evedrop.output import warn
 from evedrop.ports import free_port
 
 _EXAMPLE = "give one such as tls/router.lan:7447"
@@ -23,8 +26,8 @@ _EXAMPLE = "give one such as tls/router.lan:7447"
 class RouterEndpoint:
     """The endpoint at which a router listens, and the one that the other processes connect to."""
 
-    listen: Endpoint
-    connect: Endpoint
+    listen: AnyEndpoint
+    connect: AnyEndpoint
 
     @property
     def secure(self) -> bool:
@@ -34,8 +37,8 @@ class RouterEndpoint:
     @property
     def names(self) -> tuple[str, ...]:
         """The host names and addresses by which the router is known."""
-        found = (self.connect.host, *(() if self.listen.everywhere else (self.listen.host,)))
-        return tuple(dict.fromkeys(found))
+        ports = (one for one in (self.connect, self.listen) if isinstance(one, Endpoint) and not one.everywhere)
+        return tuple(dict.fromkeys(one.host for one in ports))
 
 
 @dataclass(frozen=True)
@@ -126,20 +129,36 @@ def _endpoint(option: str, text: str) -> Endpoint:
         raise UsageError(f"{option} {error}; {_EXAMPLE}") from error
 
 
-def loopback_endpoints(listen: str | None, relay: str | None = None, relayed: bool = False) -> RouterEndpoints:
-    """The endpoints of a run whose processes are all on this host: the requested ones, or free ports.
+def socket_endpoints(folder: Path) -> RouterEndpoints:
+    """The endpoint of a run with one router, all on this host: a socket in a private folder."""
+    endpoint = SocketEndpoint(folder / ROUTER)
+    return RouterEndpoints(RouterEndpoint(endpoint, endpoint))
 
-    Two routers take certificates by default: without them, a router is recognised by its id alone, which is not a secret.
-    Raises UsageError unless they are on loopback and a router can listen there.
+
+def loopback_endpoints(listen: str | None, relay: str | None = None, relayed: bool = False) -> RouterEndpoints:
+    """The endpoints of a run at ports of this host: the requested ones, or free ports, with certificates.
+
+    Two routers need ports: without certificates, which only TLS has, a router is recognised by its id alone, which is not a
+    secret. Raises UsageError unless the endpoints are on loopback and a router can listen there.
     """
-    asked = next((one.partition("/")[0] for one in (listen, relay) if one is not None), "tls" if relayed else "tcp")
+    asked = next((one.partition("/")[0] for one in (listen, relay) if one is not None), "tls")
     router = _loopback_endpoint(listen, "--listen", asked)
     second = _loopback_endpoint(relay, "--relay", asked) if relayed or relay is not None else None
-    while relay is None and second is not None and second.listen.port == router.listen.port:
+    while relay is None and second is not None and str(second.listen) == str(router.listen):
         second = _loopback_endpoint(None, "--relay", asked)
     endpoints = RouterEndpoints(router, second)
     endpoints.check(relayed)
     return endpoints
+
+
+def warn_if_exposed(endpoints: RouterEndpoints) -> None:
+    """Warn of ports of this machine without certificates. Of those that other machines reach, `--insecure` speaks."""
+    for one in (endpoints.router, endpoints.relay):
+        if one is not None and isinstance(one.listen, Endpoint) and one.listen.loopback and not one.secure:
+            warn(
+                f"{one.listen} is not encrypted, and a user of this machine who listens there before the router does can pose "
+                f"as the router and read everything; give tls/{str(one.listen).partition('/')[2]}"
+            )
 
 
 def _loopback_endpoint(listen: str | None, option: str, protocol: str) -> RouterEndpoint:
@@ -148,17 +167,17 @@ def _loopback_endpoint(listen: str | None, option: str, protocol: str) -> Router
     try:
         endpoint = Endpoint.of(listen)
     except ValueError as error:
-        raise UsageError(f"{option} {error}; give one such as tcp/127.0.0.1:17460") from error
+        raise UsageError(f"{option} {error}; give one such as tls/127.0.0.1:17460") from error
     if not endpoint.loopback:
         raise UsageError(
-            f"{option} {listen} is not a loopback endpoint; give one such as tcp/127.0.0.1:17460, or start the processes by "
+            f"{option} {listen} is not a loopback endpoint; give one such as tls/127.0.0.1:17460, or start the processes by "
             "hand: evedrop brief"
         )
     found = router_endpoint(listen)
     try:
         endpoint.try_to_listen()
     except OSError as error:
-        raise UsageError(f"{option} {listen}: {error.strerror}; leave it out to use a free port") from error
+        raise UsageError(f"{option} {listen}: {error.strerror}; leave it out") from error
     return found
 
 

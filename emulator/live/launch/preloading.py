@@ -24,7 +24,14 @@ from typing import IO, final
 
 from evedrop.environment import SINGLE_THREADED, own_environment
 from evedrop.errors import Interrupted
-from evedrop.live.launch.starter import FORK_SERVER_LOST, ReportedProcess, StartedProcess, Starter, start_process
+from evedrop.live.launch.starter import (
+    FORK_SERVER_LOST,
+    TELLING,
+    ReportedProcess,
+    StartedProcess,
+    Starter,
+    start_process,
+)
 from evedrop.names import OBSERVER
 from evedrop.processes import KillableProcess, kill
 from evedrop.signals import held_back
@@ -146,7 +153,7 @@ class ForkServer:
     ) -> StartedProcess:
         """Start `evedrop ROLE BRIEF`, whose files only this user may read. Raises OSError, Interrupted once `stop` is set."""
         read_stdin, write_stdin = os.pipe()
-        read_stdout, write_stdout = os.pipe() if role == OBSERVER else (None, None)
+        read_stdout, write_stdout = os.pipe() if role in TELLING else (None, None)
         stdin = os.fdopen(write_stdin, "wb")
         stdout = None if read_stdout is None else os.fdopen(read_stdout, "rb")
         files = (read_stdin, log.fileno() if write_stdout is None else write_stdout, log.fileno())

@@ -19,10 +19,14 @@ from pathlib import Path
 
 from evedrop.environment import own_environment
 from evedrop.errors import UsageError
+from evedrop.live.network.endpoint import can_be_socket
+from evedrop.names import ROUTER
 from evedrop.processes import kill
 
 _PREFIX = "evedrop-"
 _LOCK = "lock"
+_SHORT = Path("/tmp")  # noqa: S108 - the folder in it is as private as one elsewhere
+"""Where sockets are if the paths in the folder for temporary files cannot be those of sockets."""
 _GUARD_SECONDS = 5.0
 # A process that is still starting may write into the folder while it is being removed, so try again.
 _GUARD = (
@@ -32,10 +36,13 @@ _GUARD = (
 
 
 @contextlib.contextmanager
-def private_folder() -> Iterator[Path]:
-    """A folder that only this user can read, removed after the block. Raises UsageError if it cannot be made."""
+def private_folder(where: Path | None = None) -> Iterator[Path]:
+    """A folder that only this user can read, removed after the block. Raises UsageError if it cannot be made.
+
+    where: the folder to make it in; the one for temporary files by default.
+    """
     try:
-        where = Path(tempfile.gettempdir()).absolute()
+        where = (where or Path(tempfile.gettempdir())).absolute()
         _sweep(where)
         folder = where / f"{_PREFIX}{secrets.token_hex(8)}"
         guard = _guard(folder)
@@ -47,6 +54,16 @@ def private_folder() -> Iterator[Path]:
     finally:
         shutil.rmtree(folder, ignore_errors=True)
         _dismiss(guard)
+
+
+@contextlib.contextmanager
+def socket_folder(private: Path) -> Iterator[Path]:
+    """The private folder of a run, or another one, if a path in it is too long for a socket. Raises UsageError."""
+    if can_be_socket(str(private / ROUTER)):
+        yield private
+        return
+    with private_folder(_SHORT) as folder:
+        yield folder
 
 
 @contextlib.contextmanager

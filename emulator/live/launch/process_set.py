@@ -10,6 +10,7 @@ import contextlib
 import shutil
 import threading
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,11 +18,11 @@ from evedrop.errors import EvedropError, Interrupted, RunError, UsageError
 from evedrop.interrupts import INTERRUPTED
 from evedrop.live.launch.briefs import LAUNCHED_PATIENCE, ObserverTask, briefs_of
 from evedrop.live.launch.children import SILENCE_SECONDS, Children, Exit
-from evedrop.live.launch.ports import RouterEndpoints
-from evedrop.live.launch.private_folder import private_folder
+from evedrop.live.launch.ports import RouterEndpoints, socket_endpoints
+from evedrop.live.launch.private_folder import private_folder, socket_folder
 from evedrop.live.launch.starter import Starter
 from evedrop.live.network.control_file import remove_control
-from evedrop.names import OBSERVER
+from evedrop.names import OBSERVER, RELAY, ROUTER
 from evedrop.news import FolderMoved, RunEnded, Tell, ViewOpened
 from evedrop.results.folder import HeldFolder, make_private, new_folder
 from evedrop.results.resolved_scenario import write_resolved
@@ -49,7 +50,7 @@ def launch_one(
     scenario: Scenario,
     folder: Path,
     view: str,
-    endpoints: RouterEndpoints,
+    endpoints: RouterEndpoints | None,
     tell: Tell,
     stop: threading.Event,
     starter: Starter,
@@ -60,9 +61,14 @@ def launch_one(
 ) -> Ended:
     """Run a scenario as `launch` does, in one set of processes, until `stop` is set.
 
+    endpoints: None for a socket in a private folder, which other users cannot enter.
     shard: whether other sets of processes carry further trials; patience: seconds for which processes wait for each other.
     """
-    with private_folder() as private, contextlib.closing(HeldFolder(new_folder(folder))) as held:
+    with (
+        private_folder() as private,
+        _endpoints(endpoints, private) as at,
+        contextlib.closing(HeldFolder(new_folder(folder))) as held,
+    ):
         make_private(folder / "logs")
         viewer = None
         try:
@@ -70,9 +76,13 @@ def launch_one(
             with contextlib.suppress(OSError):  # the observer writes it, too, and reports why it cannot
                 write_resolved(folder, scenario)
             task = ObserverTask(folder.absolute(), view != "off", shard, paused)
-            briefs = briefs_of(scenario, endpoints, task, patience=patience)
+            briefs = briefs_of(scenario, at, task, patience=patience)
             observer = briefs.pop(OBSERVER)
             with Children(held, private, scenario.controller is not None, starter) as children:
+                for name in (ROUTER, RELAY):
+                    if name in briefs:
+                        children.start(briefs.pop(name))
+                        _wait_until_listening(children, name, stop, patience)
                 for brief in briefs.values():
                     children.start(brief)
                 # The other processes start up at the same time as the viewer.
@@ -100,6 +110,35 @@ def launch_one(
             if now != held.first:
                 tell(FolderMoved(str(now)))
     return Ended(status, viewer, now)
+
+
+@contextlib.contextmanager
+def _endpoints(given: RouterEndpoints | None, private: Path) -> Iterator[RouterEndpoints]:
+    """The given endpoints, or a socket in a private folder."""
+    if given is not None:
+        yield given
+        return
+    with socket_folder(private) as folder:
+        yield socket_endpoints(folder)
+
+
+def _wait_until_listening(children: Children, router: str, stop: threading.Event, patience: float) -> None:
+    """Wait until a router says that it listens: a process that is started earlier might connect to another program there.
+
+    Raises RunError if the router ends, or is silent for `patience` seconds; Interrupted if stopped meanwhile.
+    """
+    deadline = time.monotonic() + patience
+    while not children.listens(router):
+        if stop.is_set():
+            raise Interrupted
+        news = children.news(_LOOK_SECONDS)
+        if isinstance(news, Exit) and not _meant_us_too(news, stop) and not children.restart_router(news):
+            raise RunError(children.failure_report(news, None))
+        if time.monotonic() > deadline:
+            raise RunError(
+                f"{router} did not listen within {patience:.0f} s of its start, so no other process was started; run again, and "
+                f"look at logs/{router}.log if it happens again"
+            )
 
 
 def _now(held: HeldFolder) -> Path:

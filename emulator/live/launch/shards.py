@@ -98,13 +98,13 @@ class _ShardsState:
     def launched(
         self,
         shard: Shard,
-        at: RouterEndpoints,
+        at: RouterEndpoints | None,
         tell: Tell,
         view: str,
         stop: threading.Event,
         starter: Starter,
     ) -> None:
-        """Run one shard to its end, its routers at these endpoints; if it ends early, all shards end."""
+        """Run one shard to its end, its routers at these endpoints, or at a socket; if it ends early, all shards end."""
         try:
             ended = launch_one(shard.scenario, shard.folder, view, at, tell, stop, starter, shard=True)
         except BaseException as error:
@@ -132,7 +132,7 @@ def launch_shards(
 
     The view shows the first shard, which has the recorded trials.
     """
-    endpoints = _endpoints(scenario)
+    endpoints = _endpoints(scenario.shards) if scenario.relayed else [None] * scenario.shards
     held = HeldFolder(new_folder(folder))
     with contextlib.suppress(OSError):  # it is written again when the shards are merged, and an error reported then
         write_resolved(folder, scenario)
@@ -164,13 +164,13 @@ def launch_shards(
         held.close()
 
 
-def _endpoints(scenario: Scenario) -> list[RouterEndpoints]:
-    """Router endpoints for all shards; free ports found one by one may coincide as long as no router listens on them."""
-    found: list[RouterEndpoints] = []
-    taken = set[int]()
-    while len(found) < scenario.shards:
-        endpoints = loopback_endpoints(None, None, scenario.relayed)
-        ports = {one.listen.port for one in (endpoints.router, endpoints.relay) if one is not None}
+def _endpoints(shards: int) -> list[RouterEndpoints | None]:
+    """The endpoints of two routers for each shard; free ports may coincide as long as no router listens on them."""
+    found: list[RouterEndpoints | None] = []
+    taken = set[str]()
+    while len(found) < shards:
+        endpoints = loopback_endpoints(None, None, relayed=True)
+        ports = {str(one.listen) for one in (endpoints.router, endpoints.relay) if one is not None}
         if not ports & taken:
             found.append(endpoints)
             taken |= ports

@@ -12,10 +12,12 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import IO, Protocol
 
-from evedrop.names import OBSERVER
+from evedrop.names import OBSERVER, RELAY, ROUTER
 from evedrop.processes import kill, wait_for
 from evedrop.signals import SHOW_STACKS, held_back
 
+TELLING = frozenset({OBSERVER, ROUTER, RELAY})
+"""The roles whose processes send the launcher news on their standard output."""
 GRACE_SECONDS = 3.0  # for all processes to leave
 CONNECTION_LOST = 1000
 """The status of a process on another host if the connection with the host ended; no process ends with it."""
@@ -37,7 +39,7 @@ class StartedProcess(Protocol):
 
     @property
     def stdout(self) -> IO[bytes] | None:
-        """An observer's news; None for others."""
+        """The news of an observer or a router; None for others, and for a process on another host."""
 
     def poll(self) -> int | None:
         """Its exit status; None while it runs."""
@@ -103,7 +105,7 @@ class ReportedProcess(ABC):
 
 
 class Starter(Protocol):
-    """Starts the process of a role with the file of its brief; an observer's news come on `stdout`."""
+    """Starts the process of a role with the file of its brief; the news of `TELLING` roles come on `stdout`."""
 
     def __call__(self, role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:
         """Start it. Raises OSError if the system cannot."""
@@ -115,7 +117,7 @@ def start_process(role: str, brief: Path, log: IO[bytes], environment: Mapping[s
         return subprocess.Popen(
             [sys.executable, "-P", "-m", "evedrop", role, str(brief)],
             stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE if role == OBSERVER else log,
+            stdout=subprocess.PIPE if role in TELLING else log,
             stderr=log,
             start_new_session=True,
             env=environment,

@@ -18,7 +18,7 @@ import zenoh
 
 from evedrop.errors import BriefError, RunError
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
-from evedrop.live.network.endpoint import Endpoint
+from evedrop.live.network.endpoint import AnyEndpoint, Endpoint, endpoint_in
 from evedrop.live.protocol.brief_parts import Identity
 from evedrop.live.protocol.keys import ZenohConfig
 
@@ -133,7 +133,7 @@ def connected(
         except (OSError, zenoh.ZError) as error:
             failures.add_attempt(error, clock.monotonic() - tried)
             why = _reason(error)
-            if failures.unknown_seconds > _UNKNOWN_HOST_SECONDS:
+            if failures.unknown_seconds > _UNKNOWN_HOST_SECONDS and isinstance(endpoint, Endpoint):
                 raise BriefError(
                     f"the router's host {endpoint.host} is not known here ({why}); write it into /etc/hosts, or write the "
                     "briefs again with --connect and a name or address that this host knows"
@@ -197,7 +197,7 @@ class Failures:
         )
 
 
-def cut_off(endpoint: Endpoint) -> bool:
+def cut_off(endpoint: AnyEndpoint) -> bool:
     """Whether it is the network that ends connections, not the program there: it ends those on which nothing is said, too.
 
     A program that hangs up on everybody does it at once.
@@ -206,7 +206,7 @@ def cut_off(endpoint: Endpoint) -> bool:
     for _ in range(3):
         began = time.monotonic()
         try:
-            link = socket.create_connection((endpoint.host, endpoint.port), _ATTEMPT_SECONDS)
+            link = endpoint.dial(_ATTEMPT_SECONDS)
         except OSError:
             return True
         with link:
@@ -222,10 +222,10 @@ def cut_off(endpoint: Endpoint) -> bool:
     return longest > _AT_ONCE_SECONDS
 
 
-def endpoint_of(router: str, identity: Identity | None) -> Endpoint:
+def endpoint_of(router: str, identity: Identity | None) -> AnyEndpoint:
     """The router's endpoint in a brief. Raises BriefError if it is malformed, or does not fit the brief's identity."""
     try:
-        endpoint = Endpoint.of(router)
+        endpoint = endpoint_in(router)
     except ValueError as error:
         raise BriefError(f"router: {error}; write the briefs again with `evedrop brief`") from error
     if endpoint.secure != (identity is not None):
@@ -234,17 +234,19 @@ def endpoint_of(router: str, identity: Identity | None) -> Endpoint:
     return endpoint
 
 
-def _knock(endpoint: Endpoint, address: RouterAddress) -> None:
+def _knock(endpoint: AnyEndpoint, address: RouterAddress) -> None:
     """Check that a program listens there and, by its certificate, is the router of this run.
 
     Raises OSError if none does, BriefError if the certificate cannot be trusted.
     """
+    if address.identity is None or not isinstance(endpoint, Endpoint):
+        endpoint.dial(_ATTEMPT_SECONDS).close()
+        return
     try:
-        with socket.create_connection((endpoint.host, endpoint.port), _ATTEMPT_SECONDS) as link:
-            if address.identity is not None:
-                trust = ssl.create_default_context(cadata=address.identity.authority)
-                # The router shows its certificate first; nothing more is needed here.
-                trust.wrap_socket(link, server_hostname=endpoint.host).close()
+        with endpoint.dial(_ATTEMPT_SECONDS) as link:
+            trust = ssl.create_default_context(cadata=address.identity.authority)
+            # The router shows its certificate first; nothing more is needed here.
+            trust.wrap_socket(link, server_hostname=endpoint.host).close()
     except ssl.SSLCertVerificationError as error:
         raise _mistrusted(endpoint, address, error) from error
 
@@ -279,7 +281,7 @@ def _maker_at(endpoint: Endpoint) -> str:
     anybody.check_hostname, anybody.verify_mode = False, ssl.CERT_NONE
     try:
         with (
-            socket.create_connection((endpoint.host, endpoint.port), _ATTEMPT_SECONDS) as link,
+            endpoint.dial(_ATTEMPT_SECONDS) as link,
             anybody.wrap_socket(link, server_hostname=endpoint.host) as shown,
         ):
             return maker_of(shown.getpeercert(binary_form=True) or b"")

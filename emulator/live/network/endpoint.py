@@ -1,19 +1,28 @@
-"""Zenoh endpoints, `tcp/HOST:PORT` or `tls/HOST:PORT`: a router listens there, and the other processes connect there."""
+"""Zenoh endpoints, where a router listens and the other processes connect.
+
+`unixsock-stream/PATH` is a Unix socket in a private folder of this machine; `tcp/HOST:PORT` and `tls/HOST:PORT` are ports.
+"""
 
 from __future__ import annotations
 
+import errno
 import ipaddress
+import os
 import re
 import socket
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 _FORM = re.compile(r"(tcp|tls)/(?:\[([0-9A-Fa-f:.]+)\]|([A-Za-z0-9_.-]+)):([0-9]{1,5})")
 _MOST_LABEL = 63
+_SOCKET = "unixsock-stream"
+_MOST_PATH_BYTES = 103  # Linux takes 107, macOS 103
+_SEPARATORS = frozenset("?#;")
 
 
 @dataclass(frozen=True)
 class Endpoint:
-    """The parts of an endpoint."""
+    """A port of a host."""
 
     protocol: str
     """`tcp`, unencrypted, or `tls`."""
@@ -23,7 +32,7 @@ class Endpoint:
 
     @classmethod
     def of(cls, text: str) -> Endpoint:
-        """Parse an endpoint. Raises ValueError if the text is not an endpoint."""
+        """Parse the endpoint of a port. Raises ValueError if the text is not one."""
         found = _FORM.fullmatch(text)
         if found is None:
             raise ValueError(f"{text} is not an endpoint")
@@ -78,3 +87,66 @@ class Endpoint:
         with socket.socket(family, kind, protocol) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(address)
+
+    def dial(self, seconds: float) -> socket.socket:
+        """Connect to the program that listens there, within this time. Raises OSError."""
+        return socket.create_connection((self.host, self.port), seconds)
+
+
+@dataclass(frozen=True)
+class SocketEndpoint:
+    """A Unix socket in a folder that no other user can enter: nobody else can listen there, or connect to it."""
+
+    path: Path
+
+    def __str__(self) -> str:
+        return f"{_SOCKET}/{self.path}"
+
+    @property
+    def secure(self) -> bool:
+        """Whether both ends show certificates: they do not, since the folder keeps other users out."""
+        return False
+
+    @property
+    def nearby(self) -> SocketEndpoint:
+        """The endpoint at which processes of the same machine reach a router that listens here."""
+        return self
+
+    def try_to_listen(self) -> None:
+        """Raise OSError unless the folder of the socket is this user's, and closed to all others.
+
+        Zenoh replaces the socket of a router that was killed.
+        """
+        folder = self.path.parent.stat()
+        if folder.st_uid != os.getuid() or folder.st_mode & 0o077:
+            raise PermissionError(errno.EPERM, "other users can enter its folder")
+
+    def dial(self, seconds: float) -> socket.socket:
+        """Connect to the program that listens there, within this time. Raises OSError."""
+        link = socket.socket(socket.AF_UNIX)
+        try:
+            link.settimeout(seconds)
+            link.connect(str(self.path))
+        except BaseException:
+            link.close()
+            raise
+        return link
+
+
+AnyEndpoint = Endpoint | SocketEndpoint
+
+
+def endpoint_in(text: str) -> AnyEndpoint:
+    """Parse an endpoint of either kind. Raises ValueError if the text is not an endpoint."""
+    protocol, _, path = text.partition("/")
+    if protocol != _SOCKET:
+        return Endpoint.of(text)
+    if not can_be_socket(path):
+        raise ValueError(f"{text} names no socket")
+    return SocketEndpoint(Path(path))
+
+
+def can_be_socket(path: str) -> bool:
+    """Whether a path can be that of a socket: absolute, short, and without characters that separate parts of an endpoint."""
+    plain = path.isprintable() and not set(path) & _SEPARATORS
+    return path.startswith("/") and plain and len(os.fsencode(path)) <= _MOST_PATH_BYTES

@@ -6,7 +6,7 @@ import json
 
 import zenoh
 
-from evedrop.live.network.endpoint import Endpoint
+from evedrop.live.network.endpoint import endpoint_in
 from evedrop.live.network.session import client_config
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.brief_parts import RelayPart, RoutingPart
@@ -27,7 +27,7 @@ def is_there(brief: AnyBrief) -> bool:
     if isinstance(brief.part, RoutingPart):
         # The router asks itself. It may listen on every address, which its certificate does not name.
         listens = brief.part.listen if isinstance(brief.part, RelayPart) else brief.router
-        config["connect"]["endpoints"] = [str(Endpoint.of(listens).nearby)]
+        config["connect"]["endpoints"] = [str(endpoint_in(listens).nearby)]
         config["transport"]["link"].get("tls", {})["verify_name_on_connect"] = False
     try:
         with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:

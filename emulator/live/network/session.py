@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import os
-import socket
 import sys
 import threading
 import time
@@ -24,14 +23,16 @@ from typing import Self, final
 
 import zenoh
 
-from evedrop.errors import BriefError, Gap, MalformedMessage, RunError
+from evedrop.errors import Gap, MalformedMessage, RunError
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
-from evedrop.live.network.connecting import Credentials, RouterAddress, Waiting, connected, endpoint_of
+from evedrop.live.network.connecting import Credentials, RouterAddress, Waiting, connected
 from evedrop.live.network.connection import Connection
 from evedrop.live.network.container_heartbeat import HeartbeatFile
 from evedrop.live.network.declared import Funnel, Inbox, Outlet, Question, Questions, Watch
+from evedrop.live.network.launcher_news import tell
 from evedrop.live.network.launcher_watch import when_launcher_is_gone
 from evedrop.live.network.lifeline import Lifeline
+from evedrop.live.network.listening import listening
 from evedrop.live.network.mailbox import allowance
 from evedrop.live.network.resending import ReplayBuffer
 from evedrop.live.protocol.brief import AnyBrief, Brief
@@ -41,6 +42,7 @@ from evedrop.live.protocol.commands import Abandon, Again, Bounds, ControlComman
 from evedrop.live.protocol.envelope import Dropped
 from evedrop.live.protocol.keys import RunKeys, ZenohConfig, reader_of
 from evedrop.live.protocol.message_limits import low_pass
+from evedrop.live.protocol.news import Listening
 from evedrop.live.protocol.whereabouts import Place
 from evedrop.names import OBSERVER, ROUTER
 
@@ -131,29 +133,6 @@ def router_config(brief: Brief[RoutingPart], users_file: str, access: ZenohConfi
     }
 
 
-def _listening(listen: str, identity: Identity | None, config: ZenohConfig) -> zenoh.Session:
-    """Open a router's session. Raises BriefError if it cannot listen at the address in its brief."""
-    endpoint = endpoint_of(listen, identity)
-    try:
-        endpoint.try_to_listen()
-        return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
-    except socket.gaierror as error:
-        raise BriefError(
-            f"the host of {listen} is not known here ({error.strerror}); write it into /etc/hosts, or write the "
-            f"briefs again with --listen {endpoint.protocol}/0.0.0.0:{endpoint.port} and --connect"
-        ) from error
-    except OSError as error:
-        other = f"--listen {endpoint.protocol}/HOST:PORT"
-        raise BriefError(
-            f"the router cannot listen at {listen} ({error.strerror}); end the program that does, or write the briefs "
-            f"again with another {other}, of the host that the router is started on"
-        ) from error
-    except zenoh.ZError as error:
-        raise BriefError(
-            f"the router cannot listen at {listen} ({error}); write the briefs again with another --listen"
-        ) from error
-
-
 @final
 class Session:
     """A process's session on the network; use it as a context manager, or its threads outlive the program."""
@@ -192,7 +171,9 @@ class Session:
             first = connected(address, self.patience, meanwhile, clock, opened)
             self.connection = Connection(first, lambda: self._waiting.attempt(lambda: opened(once)), self._changed)
         else:
-            self.connection = Connection(_listening(listen, brief.identity, config), None)
+            self.connection = Connection(listening(listen, brief.identity, config), None)
+            if brief.ends_with_stdin:
+                tell(Listening(brief.process))
         self._outlets: dict[str, Outlet] = {}
         self._kept: list[ReplayBuffer] = []
         self._commands: SimpleQueue[bytes] = SimpleQueue()

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, final
 from evedrop.errors import EvedropError, Interrupted, MalformedMessage, NoAnswer, RunError
 from evedrop.live.network.control_file import Control, remove_control
 from evedrop.live.network.declared import Question
+from evedrop.live.network.launcher_news import tell
 from evedrop.live.network.operator import Answer
 from evedrop.live.network.resending import GapDetector
 from evedrop.live.network.session import Session
 from evedrop.live.observer.conductor import Conductor, Stop
 from evedrop.live.observer.joiner import Joiner
-from evedrop.live.observer.news import tell
 from evedrop.live.observer.operator_orders import Order
 from evedrop.live.observer.recovery import Recovery
 from evedrop.live.observer.stall import Stall, patience_of

@@ -18,10 +18,10 @@ from queue import SimpleQueue
 from evedrop.errors import EvedropError, Interrupted, NoAnswer, RunError
 from evedrop.interrupts import heeded
 from evedrop.lacks import lack_of, preload_within_limit
+from evedrop.live.network.launcher_news import set_news_apart, tell
 from evedrop.live.network.launcher_watch import launcher_is_gone, when_launcher_is_gone
 from evedrop.live.network.session import Session
 from evedrop.live.observer.conductor import Stop
-from evedrop.live.observer.news import set_news_apart, tell
 from evedrop.live.observer.observation import ObservedRun, Report
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.brief_parts import ObserverPart

@@ -92,7 +92,7 @@ class Brief(Generic[P_co]):
     process: str = field(metadata=entry(text))
     role: str = field(metadata=entry(text))
     router: str = field(metadata=entry(text))
-    """Zenoh endpoint, such as tcp/127.0.0.1:17460."""
+    """Zenoh endpoint, such as unixsock-stream/PATH or tls/127.0.0.1:17460."""
     user: str = field(metadata=entry(text))
     password: str = field(repr=False, metadata=entry(text))
     slots: int = field(metadata=entry(whole(1, MOST_SLOTS)))

@@ -1,4 +1,4 @@
-"""The lines that an observer writes for its launcher: JSON objects with `event` and the entries of that kind of news.
+"""The lines that observer and routers write for their launcher: JSON objects with `event` and the entries of that kind of news.
 
 Kinds that only the launcher needs are defined here; it passes the others, which are in `evedrop.news`, on to be shown.
 """
@@ -25,6 +25,14 @@ class Alive(News):
     """The observer's heartbeat."""
 
     event = "alive"
+
+
+@dataclass(frozen=True)
+class Listening(News):
+    """From a router or relay, its only news: it listens, so the processes that connect to it may be started."""
+
+    event = "listening"
+    process: str = field(metadata=entry(text))
 
 
 @dataclass(frozen=True)
@@ -58,6 +66,7 @@ _KINDS: Mapping[str, type[News]] = {
     kind.event: kind
     for kind in (
         Alive,
+        Listening,
         Started,
         Held,
         ProcessRequest,
@@ -72,7 +81,7 @@ _KINDS: Mapping[str, type[News]] = {
 
 
 def read_news(line: bytes) -> News:
-    """Read a line of the observer. Raises ValueError if it is malformed."""
+    """Read a line of the observer or a router. Raises ValueError if it is malformed."""
     try:
         found = json.loads(line)
     except RecursionError as error:

@@ -334,4 +334,5 @@ def test_an_eavesdropper_is_told_no_truth(name: str, evidence: Evidence) -> None
     assert part["outages"] == []
     assert evidence.left_behind[name]["log"] == b""
     for other in {"legitimate", "eve", "mallory", "nadia"} - {name}:
-        assert other.encode() not in evidence.left_behind[name]["brief"]
+        # The path of the router's socket names Evedrop, whose name contains one of theirs.
+        assert other.encode() not in evidence.left_behind[name]["brief"].replace(b"evedrop", b"")

@@ -1,4 +1,4 @@
-"""Sends the observer's news, including its heartbeat, to the launcher.
+"""Sends news to the launcher: that a router listens, and the observer's news, including its heartbeat.
 
 The launcher gives up on an observer that is silent for half a minute. So the heartbeat has its own thread: it continues
 while the observer imports, computes or writes, however long that takes on a busy machine.
@@ -22,7 +22,7 @@ _LINE = threading.Lock()  # one line at a time
 
 
 _TO: list[TextIO] = []
-"""The stream for a launched observer's news; empty before `set_news_apart`, and if the observer was started by hand."""
+"""The stream for a launched process's news; empty before `set_news_apart`, and in a process that was started by hand."""
 
 
 def set_news_apart(launched: bool) -> None:
