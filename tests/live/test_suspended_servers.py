@@ -60,14 +60,23 @@ def test_a_run_whose_fork_servers_are_suspended_completes(evedrop: Evedrop) -> N
     assert live.results.summary["ended"] == "complete"
 
 
+def lives(pid: int) -> bool:
+    """Whether a process runs or is suspended."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in {"Z", "X"}
+    except OSError:
+        return False
+
+
 @pytest.mark.parametrize("which", WHICH)
 def test_a_suspended_fork_server_does_not_outlive_a_killed_launcher(evedrop: Evedrop, which: str) -> None:
     """The system continues it when its parent dies; it then finds its channel closed."""
     live = evedrop.live("eavesdroppers", *ENDLESS)
     live.running()
-    suspend(live, which)
+    servers = suspend(live, which)
     live.process.kill()
     live.process.wait(LIMIT)
+    wait_until(lambda: not any(lives(server) for server in servers), "no fork server left", SECONDS)
     wait_until(lambda: not live.left(), "no process left of the run", SECONDS)
     assert list(live.temporary.iterdir()) == []
 
