@@ -11,6 +11,7 @@ import pytest
 from evedrop.errors import UsageError
 from evedrop.model.process import Process
 from evedrop.model.theory.adversary import Adversary
+from evedrop.model.theory.design import design
 from evedrop.model.theory.ratio import cheapest, large_enough, largest_ratio
 from tests.builders import MICROGRID, UNSTABLE
 
@@ -91,3 +92,28 @@ def test_a_marginal_process_has_the_closed_form() -> None:
     found = cheapest(MICROGRID, 0.6, [Adversary("smart", 0.6, 1.0, 0.0)], 1.8)
     assert found.mu_d == pytest.approx((1.0 - 1.8 * 0.4) / 0.6, rel=1e-9)
     assert found.cost == pytest.approx(1.0 / found.mu_d, rel=1e-9)
+
+
+def test_without_an_admissible_probability_there_is_no_choice() -> None:
+    """A legitimate link so bad that even sending every state leaves the error unbounded."""
+    assert large_enough(UNSTABLE, 0.3, [SMART], 2.0) == ()
+    with pytest.raises(UsageError, match=r"no μ_d gives 2×: none is admissible, .*; improve the legitimate link"):
+        cheapest(UNSTABLE, 0.3, [SMART], 2.0)
+
+
+def test_a_refusal_names_what_each_eavesdropper_has() -> None:
+    """Where several cannot have the ratio at once, and where the largest trace leaves no μ_d at all."""
+    with pytest.raises(
+        UsageError, match=r"no μ_d gives 50× against every eavesdropper; the most is .* \(smart .*×, dull .*×\)"
+    ):
+        cheapest(UNSTABLE, 0.9, [SMART, DULL], 50.0)
+    with pytest.raises(UsageError, match=r"with a legitimate trace below 1e-09; ask for a larger trace"):
+        cheapest(UNSTABLE, 0.9, [SMART], 2.0, 1.0, 1e-9)
+
+
+def test_a_choice_as_json_has_null_for_infinity() -> None:
+    """A naive eavesdropper's error is unbounded; the design has the choice beside its other entries."""
+    found = cheapest(UNSTABLE, 0.9, [SMART, NAIVE], 2.0)
+    assert found.as_dict()["ratios"] == {"smart": pytest.approx(2.0, rel=1e-6), "naive": None}
+    assert found.as_dict()["intervals"] == [list(one) for one in found.intervals]
+    assert design(UNSTABLE, 0.9, 0.6, [SMART, NAIVE], slots=20, min_ratio=2.0).as_dict()["choice"] == found.as_dict()

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -224,9 +225,9 @@ def _ascended(problem: ScheduleProblem, mu_d: Floats, blocks: list[slice]) -> Fl
 
 def _improved_by_pairs(problem: ScheduleProblem, mu_d: Floats, blocks: list[slice]) -> Floats:
     """A schedule, (N,), that no change of two neighbouring blocks improves by more than 1e-6, as far as a mesh shows."""
-    mu_d = mu_d.copy()
-    while True:
-        before = best = problem.sum_of(mu_d)
+    before = -math.inf
+    while (best := problem.sum_of(mu_d)) - before > _PAIR_GAIN * abs(best):
+        before = best
         for one, other in pairwise(blocks):
             middle, width = np.full(2, 0.5), 0.5
             while width > _NARROW:
@@ -237,11 +238,9 @@ def _improved_by_pairs(problem: ScheduleProblem, mu_d: Floats, blocks: list[slic
                 sums = problem.sums(tried)
                 found = int(np.argmax(sums))
                 middle, width = np.array([first[found], second[found]]), width / _ZOOM
-                if sums[found] > best:
-                    best, mu_d = float(sums[found]), tried[found]
+                best, mu_d = max(((best, mu_d), (float(sums[found]), tried[found])), key=itemgetter(0))
         mu_d = _ascended(problem, mu_d, blocks)
-        if problem.sum_of(mu_d) - before <= _PAIR_GAIN * abs(before):
-            return mu_d
+    return mu_d
 
 
 def _least_feasible(problem: ScheduleProblem, mu_d: Floats, one: slice) -> float:
