@@ -24,7 +24,7 @@ from tests.conftest import Done, Evedrop, Live, wait_until
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 ENDLESS = ("--slots", "1000000")
-LINES = ("evedrop: interrupted", "evedrop: warning", "^C")
+LINES = ("evedrop: interrupted", "evedrop: go on with", "evedrop: warning", "^C")
 
 Moment = Callable[[Live], object]
 
