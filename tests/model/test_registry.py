@@ -14,7 +14,8 @@ from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, PacketTaker
 from evedrop.model.links import LOSS_MODELS
 from evedrop.model.links.bernoulli import Bernoulli
 from evedrop.model.links.link import LossModel
-from evedrop.model.registry import Registry, asked, is_own, place_of
+from evedrop.model.registry import Registry, asked, is_own, no_modules, place_of
+from evedrop.model.schemes import SCHEMES
 from tests.packages import install
 
 GROUP = "evedrop.tests.registry"
@@ -206,3 +207,14 @@ def test_a_class_that_lacks_methods_is_sent_to_the_class_it_inherits_from() -> N
         NotRegistered, match=r"lacks use_probabilities, uses; .* as evedrop.extend.PacketTaker describes them"
     ):
         strategies._checked("mine:Bare", Bare, "")
+
+
+def test_no_class_of_a_module_is_found_while_results_are_looked_at() -> None:
+    """Its module is not even looked for; built-in names are found, and afterwards the module is looked for again."""
+    with no_modules():
+        with pytest.raises(NotRegistered, match="results are only looked at"):
+            SCHEMES["nowhere:Scheme"]
+        assert SCHEMES["innovation"].__name__ == "Innovation"
+    with pytest.raises(NotRegistered) as refused:
+        SCHEMES["nowhere:Scheme"]
+    assert "only looked at" not in str(refused.value)
