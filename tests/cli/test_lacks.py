@@ -86,7 +86,7 @@ def test_a_worker_without_memory_says_so() -> None:
     assert str(workers._outcome(task, lambda _: None, lambda: False)).startswith("there is not enough memory; ")
 
 
-@pytest.mark.parametrize("megabytes", [150, 400, 500, 800])
+@pytest.mark.parametrize("megabytes", [400, 500, 800])
 def test_a_command_with_little_memory_never_ends_with_status_1(evedrop: Evedrop, megabytes: int) -> None:
     """Whatever fails first, our code or a library: it ends, and not with a failed expectation."""
 

@@ -55,7 +55,7 @@ def test_news_is_read_as_it_was_written(news: News) -> None:
     [
         (b"", "Expecting value"),
         (b"[" * 100_000, "it is nested too deeply"),
-        (b"[]", "it is not an object with an event of alive, started, held, "),
+        (b"[]", "it is not an object with an event of alive, listening, started, held, "),
         (b"{}", "it is not an object with an event of "),
         (b'{"event": 3}', "it is not an object with an event of "),
         (b'{"event": "dance"}', "it is not an object with an event of "),
