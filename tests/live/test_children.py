@@ -17,7 +17,7 @@ from evedrop.errors import Interrupted
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.launch.children import Children, Exit
 from evedrop.live.launch.process_set import follow_to_end
-from evedrop.live.protocol.news import Listening, ProcessRequest, read_news
+from evedrop.live.protocol.news import ProcessRequest, RouterListens, read_news
 from evedrop.names import ProcessAction
 from evedrop.news import ConnectionOutage, News, RunEnded, RunProgress, Started, silent
 from evedrop.results.folder import HeldFolder, new_folder
@@ -168,7 +168,7 @@ def test_a_process_starts_again_only_when_its_router_listens(bench: Bench) -> No
     for _ in range(10):
         bench.children.news(0.01)
     assert bench.starter.begun[begun:] == []
-    bench.starter.pipes = {"router": BytesIO(Listening("router").line)}
+    bench.starter.pipes = {"router": BytesIO(RouterListens("router").line)}
     bench.children.start(bench.briefs["router"], again=True)
 
     def started_again() -> bool:

@@ -25,7 +25,7 @@ from evedrop.live.launch.private_folder import private_folder, socket_folder
 from evedrop.live.launch.process_set import launch_one
 from evedrop.live.launch.starter import StartedProcess, Starter
 from evedrop.live.network.endpoint import Endpoint, SocketEndpoint, endpoint_in
-from evedrop.live.protocol.news import Listening
+from evedrop.live.protocol.news import RouterListens
 from evedrop.news import silent
 from evedrop.ports import free_port
 from evedrop.scenario import Scenario
@@ -239,9 +239,9 @@ TWO = "tls/127.0.0.1:1", None, "tls/127.0.0.1:2"
     [
         ({}, ["router"]),
         ({"router": b"noise\n"}, ["router"]),
-        ({"router": Listening("relay").line}, ["router"]),
+        ({"router": RouterListens("relay").line}, ["router"]),
         ({"router": b'{"event": "over"}\n'}, ["router"]),
-        ({"router": Listening("router").line}, ["router", "relay"]),
+        ({"router": RouterListens("router").line}, ["router", "relay"]),
     ],
 )
 def test_no_process_starts_before_the_routers_say_that_they_listen(
@@ -256,7 +256,7 @@ def test_no_process_starts_before_the_routers_say_that_they_listen(
 
 def test_the_processes_start_once_the_routers_listen(tmp_path: Path) -> None:
     """All of them, the observer last."""
-    routers = Routers({name: Listening(name).line for name in ("router", "relay")})
+    routers = Routers({name: RouterListens(name).line for name in ("router", "relay")})
     with pytest.raises(RunError):
         launch(tmp_path, routers, endpoints_at(*TWO), scenario=scenario_of(network={"routers": 2}))
     assert routers.started[:2] == ["router", "relay"]

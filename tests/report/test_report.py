@@ -290,7 +290,7 @@ def test_a_changed_summary_is_refused_in_a_sentence(study: Path, tmp_path: Path)
     """Or shown, whatever word or number in it is another one."""
     folder = Path(shutil.copytree(study, tmp_path / "run"))
     summary = json.loads((folder / "summary.json").read_text())
-    for name, word in (("mode", "nonsense"), ("trials", -1), ("slots", 0)):
+    for name, word in (("mode", "nonsense"), ("trials", -1), ("slots", -1)):
         (folder / "summary.json").write_text(json.dumps({**summary, name: word}))
         with pytest.raises(UsageError, match=f"{name} is .*expected"):
             write_report(folder)

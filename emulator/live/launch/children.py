@@ -28,7 +28,7 @@ from evedrop.live.launch.starter import (
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.brief_parts import ReceiverPart, RoutingPart
 from evedrop.live.protocol.keys import writer_of
-from evedrop.live.protocol.news import Alive, Finishing, Listening, ProcessRequest, RunOver, read_news
+from evedrop.live.protocol.news import Alive, Finishing, ProcessRequest, RouterListens, RunOver, read_news
 from evedrop.names import OBSERVER, RELAY, ROUTER, SENSOR, ProcessAction
 from evedrop.news import News, RunEnded, Started, Tell
 from evedrop.processes import wait_for
@@ -153,7 +153,7 @@ class Children:
                 for line in lines:
                     try:
                         news = read_news(line)
-                        if name != OBSERVER and news != Listening(name):
+                        if name != OBSERVER and news != RouterListens(name):
                             raise ValueError("only the observer sends such news")
                         self._news.put(news)
                     except ValueError as error:
@@ -233,7 +233,7 @@ class Children:
         match news:
             case Started():
                 self.started = True
-            case Listening(process):
+            case RouterListens(process):
                 self._listening.add(process)
             case ProcessRequest(ProcessAction.START) if not all(self.listens(name) for name in (ROUTER, RELAY)):
                 self._news.put(news)
@@ -244,7 +244,7 @@ class Children:
                 self.over = True
             case Finishing():
                 self._finishing = True
-        return None if isinstance(news, Alive | Listening | ProcessRequest | RunOver | Finishing) else news
+        return None if isinstance(news, Alive | RouterListens | ProcessRequest | RunOver | Finishing) else news
 
     def conclude(self, tell: Tell, patience: float = 0.0) -> RunEnded | None:
         """End the observer, at once or after `patience` seconds; returns its `RunEnded`, or None if it sent none.

@@ -42,7 +42,7 @@ from evedrop.live.protocol.commands import Abandon, Again, Bounds, ControlComman
 from evedrop.live.protocol.envelope import Dropped
 from evedrop.live.protocol.keys import RunKeys, ZenohConfig, reader_of
 from evedrop.live.protocol.message_limits import low_pass
-from evedrop.live.protocol.news import Listening
+from evedrop.live.protocol.news import RouterListens
 from evedrop.live.protocol.whereabouts import Place
 from evedrop.names import OBSERVER, ROUTER
 
@@ -173,7 +173,7 @@ class Session:
         else:
             self.connection = Connection(listening(listen, brief.identity, config), None)
             if brief.ends_with_stdin:
-                tell(Listening(brief.process))
+                tell(RouterListens(brief.process))
         self._outlets: dict[str, Outlet] = {}
         self._kept: list[ReplayBuffer] = []
         self._commands: SimpleQueue[bytes] = SimpleQueue()

@@ -28,7 +28,7 @@ class Alive(News):
 
 
 @dataclass(frozen=True)
-class Listening(News):
+class RouterListens(News):
     """From a router or relay, its only news: it listens, so the processes that connect to it may be started."""
 
     event = "listening"
@@ -66,7 +66,7 @@ _KINDS: Mapping[str, type[News]] = {
     kind.event: kind
     for kind in (
         Alive,
-        Listening,
+        RouterListens,
         Started,
         Held,
         ProcessRequest,
