@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import threading
 import time
 from collections.abc import Callable
@@ -111,3 +113,16 @@ def test_a_host_is_told_that_the_launcher_lives(connect: Connect, tmp_path: Path
     wait_until(lambda: len((tmp_path / "told").read_bytes().splitlines()) > 2, "three heartbeats")
     host.close(time.monotonic() + LIMIT)
     assert told(tmp_path)[:3] == [LauncherHeartbeat(600.0)] * 3
+
+
+def test_an_ssh_that_takes_nothing_is_ended(connect: Connect, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A suspended one would keep the launcher waiting for room in the pipe, deaf to Ctrl-C."""
+    monkeypatch.setattr("evedrop.live.launch.ssh_starter._SEND_SECONDS", 0.2)
+    host = connect(GREETING)
+    ready(host)
+    os.kill(host._ssh.pid, signal.SIGSTOP)
+    path = brief_of_eve(modules="/srv/" + "x" * 1_000_000).write(tmp_path)
+    with (tmp_path / "eve.log").open("wb") as file:
+        process = host.start(7, path, file, {})
+    assert process.wait(LIMIT) == CONNECTION_LOST
+    host.close(time.monotonic() + LIMIT)
