@@ -44,7 +44,7 @@ def connect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Connect:
         (tmp_path / "told").touch()
         (tmp_path / "said").write_text("".join(f"{line}\n" for line in said))
         script = tmp_path / "bin" / "ssh"
-        script.write_text(f"#!/bin/sh\ncat '{tmp_path}/said'\ncat >'{tmp_path}/told'\n")
+        script.write_text(f"#!/bin/sh\ncat '{tmp_path}/said'\nexec cat 3>&1 >'{tmp_path}/told'\n")
         script.chmod(0o700)
         return SshHost("beta", HostTable(address="beta.lan", processes=("smart",), **table), None, 30.0, beat_seconds)
 
