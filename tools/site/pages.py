@@ -26,6 +26,9 @@ _OF_THE_ROOT = {
 }
 """Pages outside docs/, and their names on the site."""
 
+_OF_THE_REPOSITORY = re.compile(r"\[([^\]\n]+)\]\(((?:tests/|CITATION\.cff)[^)#\n]*)\)")
+"""A link to a file of the repository that is no page of the site."""
+
 _ENTRY = re.compile(r"(^```.*?^```|`[^`\n]*`)|\]\[", re.DOTALL | re.MULTILINE)
 """The middle of M[i][j], which would be read as a link, outside of code."""
 
@@ -54,8 +57,15 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
         markdown = re.sub(rf"\]\((\.\./)?{re.escape(name)}(?=[)#])", f"]({there}", markdown)
     if page.file.src_uri in _OF_THE_ROOT.values():
         markdown = re.sub(r"\]\(docs/", "](", markdown)
+        markdown = _OF_THE_REPOSITORY.sub(_named, markdown)
     markdown = re.sub(r"^```golden .*$", "```text", markdown, flags=re.MULTILINE)
     return _ENTRY.sub(lambda found: found[1] or "]&#91;", markdown)
+
+
+def _named(link: re.Match[str]) -> str:
+    """The words of a link, with the path of the file that it leads to in the repository."""
+    words, path = link[1], link[2]
+    return words if path in words else f"{words} (`{path}`)"
 
 
 def on_page_content(page_html: str, **_: Any) -> str:
