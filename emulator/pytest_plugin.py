@@ -64,7 +64,7 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Col
 def evedrop_wire(tmp_path: Path) -> Iterator[Callable[..., RunningWire]]:
     """A function that opens a wire for this test: its arguments are those of `evedrop.wire`, its results in `tmp_path`.
 
-    The test fails if an expectation of a wire did not hold when the wire ended.
+    The test fails if an expectation of a wire failed.
     """
     from evedrop.wire.running import wire  # noqa: PLC0415 - needed only by tests that open a wire
 

@@ -13,7 +13,16 @@ from evedrop.figures.text import count_text, estimate, figure_text, share_text
 from evedrop.model.theory.rare_events import RARE
 from evedrop.report.text_table import TextTable
 from evedrop.scenario.application import applications_in
-from evedrop.score.summary import RARE_SHARE, ControllerSummary, DirectionSummary, LinkSummary, PeerSummary, Summary
+from evedrop.score.summary import (
+    RARE_SHARE,
+    ControllerSummary,
+    DirectionSummary,
+    Judged,
+    LinkSummary,
+    PeerSummary,
+    Summary,
+    failed,
+)
 
 
 def amount(summary: Summary) -> str:
@@ -35,23 +44,19 @@ def heading(summary: Summary) -> str:
 
 def outcome(summary: Summary) -> tuple[str, bool | None]:
     """The outcome of a run in a sentence, and whether it is good; None if there is nothing to judge."""
-    said, good = expectations_outcome([one.held for one in summary.expectations], "scenario")
+    said, good = expectations_outcome(summary.expectations, "scenario")
     if summary.ended != "complete":
         return f"{summary.ended.splitlines()[0]}; {said}", False
     return said[0].upper() + said[1:], good
 
 
-def expectations_outcome(held: Sequence[bool | None], of: str) -> tuple[str, bool | None]:
+def expectations_outcome(expectations: Sequence[Judged], of: str) -> tuple[str, bool | None]:
     """How many expectations held, and whether that is good; None without any. of: what gives them, such as "scenario"."""
-    failed, unknown = held.count(False), held.count(None)
-    said = f"all {len(held)} expectations held" if len(held) > 1 else "the expectation held"
-    if not held:
-        said = f"the {of} has no expectations"
-    elif failed:
-        said = f"{failed} of {len(held)} expectations FAILED"
-    elif unknown:
-        said = f"{unknown} of {len(held)} expectations could not be evaluated"
-    return said, None if not held else not failed and not unknown
+    if not expectations:
+        return f"the {of} has no expectations", None
+    if number := len(failed(expectations)):
+        return f"{number} of {len(expectations)} expectations FAILED", False
+    return f"all {len(expectations)} expectations held" if len(expectations) > 1 else "the expectation held", True
 
 
 def receivers_table(summary: Summary, wide: bool = True) -> TextTable:

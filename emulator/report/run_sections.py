@@ -26,7 +26,7 @@ from evedrop.view.palette import hexadecimal
 
 _MOST_SPANS = 12
 _MOST_TEXT = 40_000
-_MARKS = {True: "✓", False: "✕", None: "?"}
+_MARKS = {True: "✓", False: "✕"}
 
 
 def marked_sentences(expectations: Sequence[Judged]) -> Iterator[Node]:
@@ -34,7 +34,7 @@ def marked_sentences(expectations: Sequence[Judged]) -> Iterator[Node]:
     items = []
     for one in expectations:
         again = None if one.replay is None else element("pre", element("code", one.replay))
-        mark = element("span", _MARKS[one.held], aria_hidden="true", class_="mark")
+        mark = element("span", _MARKS[one.held is True], aria_hidden="true", class_="mark")
         items.append(element("li", mark, one.sentence, again))
     if items:
         yield element("ul", *items, class_="marked")

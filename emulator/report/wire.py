@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from evedrop.report.closing import expectations_outcome
 from evedrop.report.text_table import TextTable
 from evedrop.results.wire_summary import WireSummary
+from evedrop.score.summary import failed
 
 _MARKS = {True: "yes", False: "NO", None: "–"}
 
@@ -52,7 +53,7 @@ def reasons_table(summary: WireSummary) -> TextTable:
 
 def wire_outcome(summary: WireSummary) -> tuple[str, bool | None]:
     """The outcome of a wire in a sentence, and whether it is good; None if there is nothing to judge."""
-    said, good = expectations_outcome([one.held for one in summary.expectations], "wire")
+    said, good = expectations_outcome(summary.expectations, "wire")
     if summary.unaccounted:
         return f"unaccounted for: {_messages(summary.unaccounted)}; {said}", False
     if summary.journal.incomplete_since is not None:
@@ -72,7 +73,7 @@ def wire_sentences(summary: WireSummary) -> Iterator[str]:
         if dropped:
             yield f"{name}: the wire itself, or Zenoh, dropped {dropped}"
     yield from unlinked_sentence(summary)
-    yield from (one.sentence for one in summary.expectations if one.held is not False)
+    yield from (one.sentence for one in summary.expectations if one.held)
 
 
 def unlinked_sentence(summary: WireSummary) -> Iterator[str]:
@@ -84,7 +85,7 @@ def unlinked_sentence(summary: WireSummary) -> Iterator[str]:
 def wire_failures(summary: WireSummary) -> Iterator[str]:
     """What went wrong: faults of the wire, as below, and expectations that failed."""
     yield from wire_faults(summary)
-    yield from (one.sentence for one in summary.expectations if one.held is False)
+    yield from (one.sentence for one in failed(summary.expectations))
 
 
 def wire_faults(summary: WireSummary) -> Iterator[str]:

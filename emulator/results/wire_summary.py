@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from evedrop.errors import UsageError
 from evedrop.files import Unreadable, text_of
 from evedrop.results.summary_file import plain
-from evedrop.score.summary import Judged
+from evedrop.score.summary import Judged, failed
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
@@ -110,8 +110,8 @@ class WireSummary:
 
     @property
     def failed_expectations(self) -> int:
-        """The number of expectations that did not hold."""
-        return [one.held for one in self.expectations].count(False)
+        """The number of expectations that failed."""
+        return len(failed(self.expectations))
 
     def as_dict(self) -> dict[str, Any]:
         """The contents of summary.json."""

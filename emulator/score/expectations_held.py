@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from evedrop.model.links.link import REASONS
 from evedrop.scenario import ExpectTable, Scenario, direction_figure, link_figure
 from evedrop.scenario.application import APPLICATIONS, Summary
 from evedrop.score.summary import MODES, DirectionSummary, Found, Judged, LinkSummary, PeerSummary
@@ -76,13 +77,13 @@ class Evidence:
         return found, None if found is None else expect.holds(found)
 
     def _of_link(self, receiver: str, path: tuple[str, ...]) -> float | None:
-        """A figure of a link's account, or of its losses by reason."""
+        """A figure of a link's account, or of its losses by reason: 0 for a reason that did not occur."""
         entries: Mapping[str, object] = vars(self.links[receiver])
         *place, figure = path
         for part in place:
             inner = entries.get(part)
             entries = inner if isinstance(inner, Mapping) else {}
-        found = entries.get(figure)
+        found = entries.get(figure, 0 if place == ["lost_by"] and figure in REASONS else None)
         return found if isinstance(found, (int, float)) else None
 
     def _of_receiver(self, expect: ExpectTable, receiver: str, figure: str) -> float | None:

@@ -8,7 +8,7 @@ Source: docs/results.md, summary.json.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -269,27 +269,42 @@ class Judged:
 
     text: str
     held: bool | None
-    """None: the run does not tell."""
+    """None: it cannot be decided, and so it failed (see `failed`)."""
     found: Found
     wanted: str
     replay: str | None = None
     """The command that reproduces a failure; left out of the entry if None."""
+    why: str | None = None
+    """Why it cannot be decided; left out of the entry if None."""
 
     def as_dict(self) -> dict[str, Any]:
         """The entry of summary.json."""
-        return {name: value for name, value in asdict(self).items() if name != "replay" or value is not None}
+        return {name: value for name, value in asdict(self).items() if name not in _OPTIONAL or value is not None}
 
     @property
     def sentence(self) -> str:
         """The expectation as a sentence of the closing report."""
-        word = {True: "held", False: "FAILED", None: "not evaluated, the run has no value for it"}[self.held]
-        said = f"expected {self.text}: {word}"
+        words = {True: "held", False: "FAILED", None: f"FAILED, {self.why or 'the run has no value for it'}"}
+        said = f"expected {self.text}: {words[self.held]}"
         if self.found is None:
             return said + (", found none" if self.held is False else "")
         if isinstance(self.found, str) and self.found not in {"inf", "-inf", "nan"}:
             return f"{said}, found {self.found}"
         number = str(self.found) if isinstance(self.found, int) else f"{float(self.found):.6g}"
         return f"{said}, found {number}"
+
+
+_OPTIONAL = {"replay", "why"}
+
+
+def failed(expectations: Iterable[Judged]) -> list[Judged]:
+    """The expectations of a run or a wire that failed: they did not hold, or nothing could decide them.
+
+    Any of them makes the exit status 1 and fails a test.
+
+    Source: docs/scenario.md, expect.
+    """
+    return [one for one in expectations if one.held is not True]
 
 
 @dataclass(frozen=True)
@@ -324,8 +339,8 @@ class Summary:
 
     @property
     def failed_expectations(self) -> int:
-        """The number of expectations that did not hold."""
-        return [one.held for one in self.expectations].count(False)
+        """The number of expectations that failed."""
+        return len(failed(self.expectations))
 
     def with_rare_estimates(self, estimates: Mapping[str, RareEstimate]) -> Summary:
         """The same with the estimates of some receivers."""

@@ -26,7 +26,7 @@ from evedrop.results.folder import claimed, default_folder
 from evedrop.results.resolved_scenario import resolved
 from evedrop.results.writer import load_results
 from evedrop.scenario import Scenario
-from evedrop.score.summary import Judged
+from evedrop.score.summary import Judged, failed
 
 
 class Outcome(Enum):
@@ -34,7 +34,7 @@ class Outcome(Enum):
 
     PASSED = 0
     FAILED = 1
-    """An expectation did not hold, or the run could not decide it."""
+    """An expectation failed."""
     MISTAKES = 2
     """The scenario has mistakes, or nothing could be started."""
     BROKEN = 3
@@ -176,7 +176,6 @@ def _run(scenario: Scenario, folder: Path, manner: Manner) -> Path:
 
 
 def _reasons(expectations: Sequence[Judged]) -> Iterator[str]:
-    """A line for each expectation that did not hold or could not be decided: a test fails if it cannot decide."""
-    for one in expectations:
-        if one.held is not True:
-            yield one.sentence + (f"; see it again: {one.replay}" if one.replay is not None else "")
+    """A line for each expectation that failed."""
+    for one in failed(expectations):
+        yield one.sentence + (f"; see it again: {one.replay}" if one.replay is not None else "")

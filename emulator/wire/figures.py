@@ -21,7 +21,7 @@ class WireFigure(Protocol):
     """Whether its table has `quantile`."""
 
     def value(self, link: WireLinkSummary, tally: LinkTally, quantile: float | None) -> float | None:
-        """The figure so far; None if the link heard nothing that gives one. quantile: that of the table, if it has one."""
+        """The figure so far; None if no message gives one: its expectation failed. quantile: that of the table, if it has one."""
 
 
 @final
@@ -34,6 +34,18 @@ class Delivery:
     def value(self, link: WireLinkSummary, tally: LinkTally, quantile: float | None) -> float | None:  # noqa: ARG002
         """Delivered messages per message that was heard."""
         return link.delivered / link.heard if link.heard else None
+
+
+@final
+class Heard:
+    """The messages that the link took, which a silent link has too."""
+
+    name: ClassVar[str] = "heard"
+    has_quantile: ClassVar[bool] = False
+
+    def value(self, link: WireLinkSummary, tally: LinkTally, quantile: float | None) -> float | None:  # noqa: ARG002
+        """A number of messages."""
+        return link.heard
 
 
 @final
@@ -72,6 +84,6 @@ class GapSeconds:
         return link.gap_seconds if link.heard else None
 
 
-_ALL: tuple[WireFigure, ...] = (Delivery(), Latency(), GapMessages(), GapSeconds())
+_ALL: tuple[WireFigure, ...] = (Heard(), Delivery(), Latency(), GapMessages(), GapSeconds())
 WIRE_FIGURES: Mapping[str, WireFigure] = {figure.name: figure for figure in _ALL}
 """Name → the figure, in the order of docs/wire.md."""

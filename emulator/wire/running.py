@@ -31,6 +31,7 @@ from evedrop.processes import kill, wait_for
 from evedrop.results.folder import claimed, default_folder, write_private
 from evedrop.results.wire_summary import WIRE_SUMMARY_FILE, WireSummary
 from evedrop.scenario.words import listed
+from evedrop.score.summary import failed
 from evedrop.wire.file import load_wire, resolved_wire, wire_of
 from evedrop.wire.journal_on_disk import scorekeeper_on_disk
 from evedrop.wire.journal_reader import journal_tables
@@ -46,7 +47,7 @@ LONGEST_SECONDS = 3600.0
 
 
 class ExpectationFailed(EvedropError, AssertionError):
-    """An expectation of a wire that did not hold."""
+    """An expectation of a wire that failed."""
 
     exit_status = 1
 
@@ -65,7 +66,7 @@ def wire(
     itself. entries: with a file, changes by dotted key, with `__` for the dot, such as `seed=8` or `side__base__listen=[]`.
 
     Raises ScenarioError with every mistake of the wire. The `with` statement raises UsageError or RunError if the wire cannot
-    begin, and ExpectationFailed if one of its `[[expect]]` did not hold when it ended.
+    begin, and ExpectationFailed if one of its `[[expect]]` failed.
     """
     if isinstance(source, WirePlan):
         if entries:
@@ -128,8 +129,8 @@ class RunningWire:
         if error is not None or status == 0:
             return
         with suppress(UsageError):
-            if failed := [one.sentence for one in self.typed_summary().expectations if one.held is False]:
-                raise ExpectationFailed("\n".join(failed))
+            if failures := failed(self.typed_summary().expectations):
+                raise ExpectationFailed("\n".join(one.sentence for one in failures))
         raise self._failure(status)
 
     @property
@@ -191,16 +192,15 @@ class RunningWire:
         return scorekeeper_on_disk(self.folder, self.plan).summary()
 
     def expect(self, figure: str | None = None, **bounds: Any) -> None:
-        """Raise ExpectationFailed if an expectation does not hold so far.
+        """Raise ExpectationFailed if an expectation fails so far.
 
         The arguments are the entries of an `[[expect]]` of a wire file, such as `"scan.delivery", above=0.5`, or `link="scan"`.
         """
         table = {"figure": figure, **bounds} if figure is not None else bounds
         plan = wire_of({**tomllib.loads(resolved_wire(self.plan)), "expect": [table]})
         found = scorekeeper_on_disk(self.folder, plan)
-        for judged in found.judged(found.links()):
-            if not judged.held:
-                raise ExpectationFailed(judged.sentence)
+        for judged in failed(found.judged(found.links())):
+            raise ExpectationFailed(judged.sentence)
 
     def _endpoints_of(self, side: str) -> Sequence[str]:
         found = self._endpoints.get(side, ())

@@ -183,10 +183,15 @@ class WireScorekeeper:
 
     def _judged(self, table: WireExpectTable, link: WireLinkSummary) -> Judged:
         if table.link is not None:
-            return Judged(table.text, link.within_bounds, link.rate, table.wanted)
-        figure = WIRE_FIGURES[str(table.figure).rpartition(".")[2]]
-        found = figure.value(link, self._links[self._plan.named(table.subject).number], table.quantile)
-        return Judged(table.text, None if found is None else table.holds(found), found, table.wanted)
+            held, found, lacking = link.within_bounds, link.rate, "the link's models decided on no message"
+        else:
+            figure = WIRE_FIGURES[str(table.figure).rpartition(".")[2]]
+            found = figure.value(link, self._links[self._plan.named(table.subject).number], table.quantile)
+            held, lacking = None if found is None else table.holds(found), "no message was delivered"
+        if held is not None:
+            return Judged(table.text, held, found, table.wanted)
+        why = lacking if link.heard else "the link heard nothing"
+        return Judged(table.text, None, found, table.wanted, why=why)
 
     def _of_link(self, link: WireLink, tally: LinkTally) -> WireLinkSummary:
         streams = list(tally.streams.values())

@@ -1,4 +1,4 @@
-"""What the pages say of expectations that a run or a wire cannot decide is what the commands do."""
+"""An expectation that cannot be decided has failed, with every command: what the pages say is what they do."""
 
 from __future__ import annotations
 
@@ -59,35 +59,38 @@ def page(name: str) -> str:
     return re.sub(r"\s+", " ", (DOCS / name).read_text(encoding="utf-8"))
 
 
-def test_a_test_fails_and_a_study_does_not(
+def test_a_study_without_the_figure_fails(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A covariance-only study has no squared errors: it says so, with status 0; docs/testing.md says that a test fails."""
+    """A covariance-only study has no squared errors: it says so, with status 1."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "one.toml").write_text(SCENARIO, encoding="utf-8")
-    assert cli.main(["montecarlo", "one.toml", "--trials", "20", "--covariance-only", "--workers", "1"]) == 0
-    assert "not evaluated" in capsys.readouterr().out
-    text = page("testing.md")
-    assert "makes a test `FAILED`, with `evedrop test` and with pytest" in text
-    assert "call it *not evaluated* instead, and their exit status stays 0" in text
+    assert cli.main(["montecarlo", "one.toml", "--trials", "20", "--covariance-only", "--workers", "1"]) == 1
+    assert "below 100: FAILED, the run has no value for it" in capsys.readouterr().out
+    assert "**An expectation that cannot be decided has failed.**" in page("scenario.md")
+    assert "or could not be decided |" in page("testing.md")
 
 
 def test_a_test_lists_what_it_cannot_decide() -> None:
     """As a reason for its failure, whatever the manner of the test."""
     undecided = Judged("a", None, None, "below 1")
     assert [*_reasons([undecided])] == [undecided.sentence]
-    assert "not evaluated" in undecided.sentence
+    assert "FAILED" in undecided.sentence
 
 
-def test_a_wire_that_heard_nothing_passes(evedrop: Evedrop, tmp_path: Path) -> None:
-    """With status 0, and a line that says so: docs/wire.md warns of it."""
-    (tmp_path / "wire.toml").write_text(WIRE, encoding="utf-8")
+@pytest.mark.parametrize(("figure", "status"), [("delivery", 1), ("heard", 0)])
+def test_a_wire_that_heard_nothing_fails_unless_it_must_be_silent(
+    figure: str, status: int, evedrop: Evedrop, tmp_path: Path
+) -> None:
+    """Whatever is expected of a link that is silent, such as no loss at all, except that it is silent."""
+    text = WIRE.replace("radio.delivery", f"radio.{figure}").replace("above = 0.4", "below = 1")
+    (tmp_path / "wire.toml").write_text(text, encoding="utf-8")
     done = evedrop("wire", str(tmp_path / "wire.toml"), "--for", "1 s", "--out", str(tmp_path / "out"))
-    assert done.status == 0, done.err
-    assert "not evaluated" in done.out
-    text = page("wire.md")
-    assert "the line says that the condition was not evaluated, and the exit status stays 0" in text
-    assert "So a wire whose programs never started passes" in text
+    assert done.status == status, done.err
+    told = f"expected radio.{figure} below 1: {'FAILED, the link heard nothing' if status else 'held, found 0'}"
+    assert told in done.out + done.err
+    assert "a test whose robot never started does not pass" in page("wire.md")
+    assert "A link that must stay silent has the expectation `heard` below 1." in page("wire.md")
 
 
 def test_where_the_sensor_detects_nothing_detection_is_null() -> None:

@@ -111,7 +111,7 @@ def test_other_expectations_are_those_of_tables_and_summary(made: Runs) -> None:
     assert found["links.naive.lost above 0"]["found"] == results.summary["links"]["naive"]["lost"]
     unknown = found["links.naive.lost_by.nothing above 0"]
     assert (unknown["found"], unknown["held"]) == (None, None)
-    assert Judged(**unknown).sentence.endswith(": not evaluated, the run has no value for it")
+    assert Judged(**unknown).sentence.endswith(": FAILED, the run has no value for it")
     perfect = found["perfect secrecy against smart promised by theory and shown by the run"]
     assert (perfect["held"], perfect["found"]) == (False, "theory denies it, the run shows that it fails")
     states = np.isin(of_trials(results, "suspicious")["action"], ("state", "misled"))

@@ -107,11 +107,13 @@ def test_a_live_test_that_fails_says_how_to_see_it_again(evedrop: Evedrop) -> No
 
 
 def test_shipped_names_and_expectations_that_nobody_can_tell(evedrop: Evedrop) -> None:
-    """A shipped scenario by its name; a figure that the run does not have is not a pass, though not a failed run either."""
-    written(evedrop.folder, unknown=SCENARIO + '[[expect]]\nfigure = "links.smart.lost_by.gremlins"\nbelow = 1\n')
+    """A shipped scenario by its name; a figure that the run does not have has failed. A reason that did not occur counts 0."""
+    expected = [f'[[expect]]\nfigure = "links.smart.lost_by.{reason}"\nbelow = 1\n' for reason in ("gremlins", "down")]
+    written(evedrop.folder, unknown=SCENARIO + "".join(expected))
     done = evedrop("test", "bursts", "unknown.toml", "--in-memory", "--trials", "2")
+    assert "lost_by.down" not in done.out  # it held
     assert done.status == 1
-    assert "expected links.smart.lost_by.gremlins below 1: not evaluated, the run has no value for it" in done.out
+    assert "expected links.smart.lost_by.gremlins below 1: FAILED, the run has no value for it" in done.out
     assert re.search(r"^passed .* bursts$", done.out, re.MULTILINE)
 
 

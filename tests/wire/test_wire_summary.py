@@ -233,8 +233,33 @@ link = "scan"
     with pytest.raises(UsageError, match="to make its report: evedrop report"):
         write_report(tmp_path)
     nothing, status = run(tmp_path / "silent", plan, messages=0)
-    assert status == 0
-    assert {one["held"] for one in nothing["expectations"]} == {None}
+    assert status == 1
+    assert {(one["held"], one["why"]) for one in nothing["expectations"]} == {(None, "the link heard nothing")}
+    (tmp_path / "silent" / WIRE_FILE).write_text(resolved_wire(plan))
+    write_report(tmp_path / "silent")
+    page = checked(tmp_path / "silent")
+    assert {"5 of 5 expectations FAILED", "expected scan.gap_messages below 3: FAILED, the link heard nothing"} <= set(
+        page.texts
+    )
+
+
+@pytest.mark.parametrize(
+    ("fate", "text", "why"),
+    [
+        (Crossing.LOST, '[[expect]]\nfigure = "scan.latency"\nquantile = 0.5\nbelow = 1', "no message was delivered"),
+        (Crossing.CUT, '[[expect]]\nlink = "scan"', "the link's models decided on no message"),
+    ],
+)
+def test_a_figure_without_a_value_has_failed(fate: Crossing, text: str, why: str, tmp_path: Path) -> None:
+    """With the reason, on a link that heard something."""
+    plan = expecting(text)
+    with WireJournal(tmp_path, plan) as journal:
+        keeper = WireScorekeeper(plan, journal)
+        journal.record(1.0, 0, -1, 0.0, journal.key_code("a"), 0, 0, 0, Kind.PUT, fate)
+    summary = keeper.summary()
+    assert keeper.finish(tmp_path) == 1
+    assert summary.failed_expectations == 1
+    assert [line for line in wire_failures(summary) if line.endswith(f": FAILED, {why}")] != []
 
 
 @pytest.mark.parametrize(
@@ -328,7 +353,7 @@ below = 0.5
     for line in (
         "expect.0.below: is missing, and so is above; add one of them, or both",
         'expect.0.figure: is "scam.delivery", but there is no link scam; expected a figure or the name of scan',
-        'expect.1.figure: is "scan.latencies"; expected LINK.delivery, LINK.latency, LINK.gap_messages or LINK.gap_seconds',
+        'expect.1.figure: is "scan.latencies"; expected LINK.heard, LINK.delivery, LINK.latency, LINK.gap_messages or LINK.ga',
         'expect.1.below: is "3 apples"; expected a number, or a length of time such as "20 ms"',
         "expect.2.quantile: is set, but only a latency has quantiles",
         "expect.3.quantile: is missing; a latency needs one",
