@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from queue import Empty, SimpleQueue
+from threading import Condition
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -30,3 +31,10 @@ class TestClock:
             self.now += 0.0 if timeout is None else timeout
             raise Empty
         return queue.get()
+
+    def wait(self, condition: Condition, timeout: float | None) -> None:
+        """Let the time limit pass at once; without one, wait until the condition is notified."""
+        if timeout is None:
+            condition.wait()
+        else:
+            self.now += timeout

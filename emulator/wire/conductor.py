@@ -6,11 +6,11 @@ Source: docs/wire.md, events.
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Any, Self, final
 
+from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.relay import WireRelay
 from evedrop.wire.timeline import moment_at, times, with_change, with_cut_ended, with_partition_ended
@@ -18,20 +18,23 @@ from evedrop.wire.timeline import moment_at, times, with_change, with_cut_ended,
 
 @final
 class WireConductor:
-    """The clock of a wire; use it as a context manager. Its methods may be called by any thread."""
+    """The time of a wire; use it as a context manager. Its methods may be called by any thread."""
 
-    def __init__(self, plan: WirePlan, relay: WireRelay, say: Callable[[str], None]) -> None:
+    def __init__(
+        self, plan: WirePlan, relay: WireRelay, say: Callable[[str], None], clock: Clock = SYSTEM_CLOCK
+    ) -> None:
         """say: for a line about each event."""
+        self._clock = clock
         self._plan, self._relay, self._say = plan, relay, say
         self._changed = threading.Condition(threading.RLock())
         self._ended = False
         self._done = -1.0  # the time up to which all events are carried out
-        self._begun = time.monotonic()
+        self._begun = self._clock.monotonic()
         self._relay.apply(moment_at(plan, 0.0))
         self._thread = threading.Thread(target=self._run, name="events", daemon=True)
 
     def __enter__(self) -> Self:
-        self._begun = time.monotonic()
+        self._begun = self._clock.monotonic()
         self._thread.start()
         return self
 
@@ -46,7 +49,7 @@ class WireConductor:
     @property
     def seconds(self) -> float:
         """How long the wire has been running."""
-        return time.monotonic() - self._begun
+        return self._clock.monotonic() - self._begun
 
     @property
     def plan(self) -> WirePlan:
@@ -91,4 +94,4 @@ class WireConductor:
             while not self._ended:
                 self._carry_out(self.seconds)
                 following = [one for one in times(self._plan) if one > self._done]
-                self._changed.wait(max(0.0, following[0] - self.seconds) if following else None)
+                self._clock.wait(self._changed, max(0.0, following[0] - self.seconds) if following else None)

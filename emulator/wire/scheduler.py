@@ -8,9 +8,10 @@ from __future__ import annotations
 import heapq
 import itertools
 import threading
-import time
 from collections.abc import Callable
 from typing import NamedTuple, final
+
+from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 
 
 class _Held(NamedTuple):
@@ -25,8 +26,9 @@ class _Held(NamedTuple):
 class Scheduler:
     """A thread that carries out tasks when they are due. It holds a limited number of messages, and of bytes."""
 
-    def __init__(self, most: int, most_bytes: int, failed: Callable[[int], None]) -> None:
+    def __init__(self, most: int, most_bytes: int, failed: Callable[[int], None], clock: Clock = SYSTEM_CLOCK) -> None:
         """most, most_bytes: how much it may hold; failed: is given the row of a message that raised an error."""
+        self._clock = clock
         self._most, self._most_bytes, self._failed = most, most_bytes, failed
         self._heap: list[_Held] = []
         self._bytes = 0
@@ -41,7 +43,7 @@ class Scheduler:
         with self._changed:
             if self._ended or len(self._heap) >= self._most or self._bytes + size > self._most_bytes:
                 return False
-            held = _Held(time.monotonic() + delay, next(self._serial), size, row, send)
+            held = _Held(self._clock.monotonic() + delay, next(self._serial), size, row, send)
             heapq.heappush(self._heap, held)
             self._bytes += size
             if self._heap[0] is held:
@@ -77,12 +79,12 @@ class Scheduler:
         """The next message, when it is due; None at the end. The lock is held."""
         while not self._ended:
             if not self._heap:
-                self._changed.wait()
+                self._clock.wait(self._changed, None)
                 continue
-            wait = self._heap[0].due - time.monotonic()
+            wait = self._heap[0].due - self._clock.monotonic()
             if wait <= 0:
                 held = heapq.heappop(self._heap)
                 self._bytes -= held.size
                 return held
-            self._changed.wait(wait)
+            self._clock.wait(self._changed, wait)
         return None

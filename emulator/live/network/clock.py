@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from queue import SimpleQueue
 from typing import Protocol, TypeVar, final
@@ -21,6 +22,9 @@ class Clock(Protocol):
     def next(self, queue: SimpleQueue[T], timeout: float | None) -> T:
         """Wait for the next item of a queue. Raises Empty after `timeout` seconds; None: waits as long as it takes."""
 
+    def wait(self, condition: threading.Condition, timeout: float | None) -> None:
+        """Wait until a condition is notified, or for `timeout` seconds; None: waits as long as it takes."""
+
 
 @final
 class SystemClock:
@@ -37,6 +41,10 @@ class SystemClock:
     def next(self, queue: SimpleQueue[T], timeout: float | None) -> T:
         """Wait for the next item of a queue. Raises Empty."""
         return queue.get(timeout=timeout)
+
+    def wait(self, condition: threading.Condition, timeout: float | None) -> None:
+        """Wait until a condition is notified, or for some seconds."""
+        condition.wait(timeout)
 
 
 SYSTEM_CLOCK: Clock = SystemClock()

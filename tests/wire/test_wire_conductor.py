@@ -1,0 +1,111 @@
+"""When a wire carries out its events: at their times, by a clock that the test hands in."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from evedrop.live.network.clock import SystemClock
+from evedrop.wire.conductor import WireConductor
+from evedrop.wire.file import wire_of
+from evedrop.wire.plan import WirePlan
+from evedrop.wire.timeline import Moment
+from tests.clock import TestClock
+from tests.conftest import wait_until
+
+
+class Applied:
+    """In place of the wire's links: when they were given which state."""
+
+    def __init__(self, clock: TestClock) -> None:
+        self._clock, self._start = clock, clock.now
+        self.at: list[tuple[float, frozenset[str], tuple[str, ...]]] = []
+
+    def apply(self, moment: Moment) -> None:
+        """Note the seconds since the start, the links that are cut, and the lines."""
+        self.at.append((self._clock.now - self._start, moment.cut, moment.said))
+
+
+def plan_of(*events: dict[str, Any]) -> WirePlan:
+    """A wire of one link with these events."""
+    return wire_of({"side": {"robot": {}, "base": {}}, "link": [{"from": "robot", "to": "base"}], "event": [*events]})
+
+
+CUT, WHOLE = frozenset({"robot-base"}), frozenset[str]()
+
+
+def test_events_happen_at_their_times() -> None:
+    """Not before and not after, each once, in the order of time; the start is the beginning of the `with` block."""
+    clock = TestClock()
+    links, said = Applied(clock), list[str]()
+    plan = plan_of({"from": 12, "to": 60.5, "cut": "robot-base"}, {"at": 7, "note": "in the lift"})
+    conductor = WireConductor(plan, links, said.append, clock)  # type: ignore[arg-type]
+    assert links.at == [(0.0, WHOLE, ())]
+    clock.sleep(100.0)
+    with conductor:
+        wait_until(lambda: len(links.at) == 5, "all events are carried out")
+    assert links.at[1:] == [
+        (100.0, WHOLE, ()),
+        (107.0, WHOLE, ("in the lift",)),
+        (112.0, CUT, ("cut robot-base",)),
+        (160.5, WHOLE, ("heal robot-base",)),
+    ]
+    assert said == ["7.0 s: in the lift", "12.0 s: cut robot-base", "60.5 s: heal robot-base"]
+    assert conductor.seconds == 60.5
+
+
+def test_an_operator_changes_the_wire_at_once() -> None:
+    """Its lines say when; what it began lasts until it ends it."""
+    clock = TestClock()
+    links, said = Applied(clock), list[str]()
+    with WireConductor(plan_of(), links, said.append, clock) as conductor:  # type: ignore[arg-type]
+        wait_until(lambda: len(links.at) == 2, "the wire begins")
+        clock.sleep(3.25)
+        assert conductor.seconds == 3.25
+        assert conductor.change({"cut": "robot-base"}) == "cut robot-base"
+        clock.sleep(1.5)
+        assert conductor.end_cut("robot-base") == "heal robot-base"
+        clock.sleep(1.0)
+        assert conductor.change({"partition": ["robot", "base"]}) == "partition robot, base"
+        clock.sleep(1.0)
+        assert conductor.end_partition("base", "robot") == "heal robot, base"
+    assert links.at[2:] == [
+        (3.25, CUT, ("cut robot-base",)),
+        (4.75, WHOLE, ("heal robot-base",)),
+        (5.75, CUT, ("partition robot, base",)),
+        (6.75, WHOLE, ("heal robot, base",)),
+    ]
+    assert said == [
+        "3.2 s: cut robot-base",
+        "4.8 s: heal robot-base",
+        "5.8 s: partition robot, base",
+        "6.8 s: heal robot, base",
+    ]
+    assert [(one.start, one.stop) for one in conductor.plan.events] == [(3.25, 4.75), (5.75, 6.75)]
+
+
+def test_an_event_that_is_due_comes_before_what_an_operator_does() -> None:
+    """Also if the thread of the events has not come to it: the operator's change is made to what the event made."""
+    clock = TestClock()
+    links, said = Applied(clock), list[str]()
+    # Without its thread: nobody else looks at the time.
+    conductor = WireConductor(plan_of({"at": 2, "cut": "robot-base"}), links, said.append, clock)  # type: ignore[arg-type]
+    clock.sleep(5.0)
+    conductor.end_cut("robot-base")
+    assert said == ["2.0 s: cut robot-base", "5.0 s: heal robot-base"]
+    assert [(cut, lines) for _, cut, lines in links.at] == [
+        (WHOLE, ()),
+        (WHOLE, ()),
+        (CUT, ("cut robot-base",)),
+        (WHOLE, ("heal robot-base",)),
+    ]
+
+
+def test_the_clock_of_a_wire_is_that_of_the_machine() -> None:
+    """Unless another one is handed in."""
+    before = time.monotonic()
+    found = SystemClock().monotonic()
+    assert before <= found <= time.monotonic()
+    with WireConductor(plan_of(), Applied(TestClock()), print) as conductor:  # type: ignore[arg-type]
+        assert 0.0 <= conductor.seconds <= time.monotonic() - before
+        wait_until(lambda: conductor.seconds > 0.0, "time passes")
