@@ -16,6 +16,7 @@ from typing import Any, final
 from evedrop.model.slot.link import NEVER, Change, Fates, Link, LinkSchedule, streams_of
 from evedrop.scenario.wire_table import wire_stream_key
 from evedrop.streams import Batch, root_of_seed
+from evedrop.wire.advanced import numbered_as
 from evedrop.wire.plan import WireLink
 
 MessageFate = tuple[int, float, bool]
@@ -29,7 +30,7 @@ _PROMPT = tuple((code, 0.0, False) for code in range(256))  # shared by all mess
 
 @final
 class KeyFates:
-    """The fates of one key's messages of one kind on one link, in order.
+    """The fates of one key's messages of one kind on one link, in order. All keys `KEY/@adv/…` count as one key.
 
     kind: `put` (deletes are puts), `query` or `reply`; start: the number of the first message to decide; changes: earlier
     changes of the settings, each at the number of the first message that had them.
@@ -45,7 +46,8 @@ class KeyFates:
         made = tuple(Change(at, None if one.settings is None else _timeless(one.settings)) for at, one in last.items())
         schedule = LinkSchedule(_timeless(link.settings), _LATEST, made, correlation=link.correlation)
         root = root_of_seed(seed)
-        keys = {name: wire_stream_key(root, name, kind, key) for name in streams_of(link.name, schedule)}
+        stream = numbered_as(key)
+        keys = {name: wire_stream_key(root, name, kind, stream) for name in streams_of(link.name, schedule)}
         self._link = Link(schedule, link.name, keys, Batch(NEVER, 1))
         self._start = self._stop = start  # `_stop`: the end of the fates in `_ready`
         self._block = 0

@@ -21,10 +21,11 @@ from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.links import LOSS_MODELS
 from evedrop.model.slot.link import NEVER, Change
 from evedrop.scenario.table import model_mistakes
+from evedrop.wire.advanced import numbered_as
 from evedrop.wire.plan import WirePlan
 
 Numbered = tuple[str, str, str]
-"""Link, key, and kind of stream: what has numbers of its own."""
+"""Link, key as in `numbered_as`, and kind of stream: what has numbers of its own."""
 _FILE = "history.jsonl"
 
 
@@ -102,9 +103,9 @@ class WireHistory:
 
     def changes_of(self, link: str, key: str, kind: str) -> tuple[Change, ...]:
         """The settings of a stream's messages: the first from message 0 on, then the changes. For `KeyFates`."""
-        found: dict[int, Mapping[str, Any]] = {}
+        stream, found = (numbered_as(key), kind), dict[int, Mapping[str, Any]]()
         for one in self._settings.get(link, []):
-            found[one.since.get((key, kind), 0)] = one.settings
+            found[one.since.get(stream, 0)] = one.settings
         return tuple(Change(at, settings) for at, settings in sorted(found.items()))
 
     def expect_laws(self) -> None:
@@ -174,5 +175,7 @@ def _number(found: Any) -> int:
 
 
 def highest(counts: dict[Numbered, int], stream: Numbered, n: int) -> None:
-    """Raise the count of a stream to n, in place."""
-    counts[stream] = max(counts.get(stream, 0), n)
+    """Raise the count of the stream of a link, key and kind to n, in place."""
+    link, key, kind = stream
+    numbered = (link, numbered_as(key), kind)
+    counts[numbered] = max(counts.get(numbered, 0), n)

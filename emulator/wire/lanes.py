@@ -9,9 +9,11 @@ Source: docs/wire.md, how messages cross.
 from __future__ import annotations
 
 import threading
+from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any, final
 
+from evedrop.wire.advanced import numbered_as
 from evedrop.wire.crossing import Crossing
 from evedrop.wire.fates import KeyFates
 from evedrop.wire.journal import WireJournal
@@ -39,6 +41,8 @@ class LinkState:
         self._seed, self._largest = plan.seed, plan.largest
         self._journal = journal
         self._fates: dict[tuple[str, str], KeyFates] = {}
+        self._lanes: Counter[tuple[str, str]] = Counter()
+        """How many keys have each of the fates: several for those of an advanced publisher's history."""
         self._numbers: dict[tuple[str, str], int] = {}
         self._lock = threading.Lock()
         self._free = 0.0  # when the queue will have sent all its messages
@@ -56,26 +60,30 @@ class LinkState:
 
     def lane(self, kind: str, key: str, lossless: bool) -> Lane:
         """What decides on the messages of a key and kind."""
-        return self._never(kind, key) if lossless else self._decide(kind, key)
+        stream = (kind, numbered_as(key))
+        return self._never(*stream) if lossless else self._decide(*stream)
 
     def forget(self, kind: str, key: str) -> None:
         """Keep only the number of the next message of a key and kind, until there is one."""
+        stream = (kind, numbered_as(key))
         with self._lock:
-            fates = self._fates.pop((kind, key), None)
-            if fates is not None:
-                self._numbers[kind, key] = fates.n
+            self._lanes[stream] -= 1
+            if self._lanes[stream] <= 0:
+                del self._lanes[stream]
+                fates = self._fates.pop(stream, None)
+                if fates is not None:
+                    self._numbers[stream] = fates.n
 
     def _decide(self, kind: str, key: str) -> Lane:
         lock, largest = self._lock, self._largest
         with lock:
             fates = self._fates_of(kind, key)
-            n, after = fates.n, fates.next
+            after = fates.next
+            self._lanes[kind, key] += 1
 
         def decide(now: float, size: int) -> Decision:
-            nonlocal n
             with lock:
-                at = n
-                n = at + 1
+                at = fates.n  # not counted here: another key may have the same fates
                 code, delay, again = after()
                 if self._rate:
                     wait = self._wait(now, size)

@@ -12,10 +12,8 @@ from typing import Any
 
 import zenoh
 
+from evedrop.wire.advanced import published_key
 from evedrop.wire.expect import WireExpectTable
-
-_HISTORY = "/@adv/"
-"""What follows the key of an advanced publisher in the keys of its history."""
 
 
 @dataclass(frozen=True)
@@ -140,5 +138,5 @@ class WirePlan:
 
 def _with_published(key: zenoh.KeyExpr) -> tuple[zenoh.KeyExpr, ...]:
     """The key; and KEY as well if it is the history of an advanced publisher, `KEY/@adv/…`."""
-    published, verbatim, _ = str(key).partition(_HISTORY)
-    return (key, zenoh.KeyExpr(published)) if verbatim else (key,)
+    published = published_key(str(key))
+    return (key,) if published is None else (key, zenoh.KeyExpr(published))

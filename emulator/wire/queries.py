@@ -18,6 +18,7 @@ from typing import Any, final
 
 import zenoh
 
+from evedrop.wire.advanced import LOST_HISTORY_SECONDS, published_key
 from evedrop.wire.crossing import AGAIN, UNLINKED, Crossing, Kind
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.lanes import Decision, Lane, LinkState
@@ -35,11 +36,18 @@ _MOST_WAITING = 100_000
 class _Asked:
     """A query that was heard, until all its replies have arrived: then the asker is told that there are no more."""
 
-    def __init__(self, query: zenoh.Query, side: str) -> None:
+    def __init__(self, query: zenoh.Query, side: str, query_seconds: float) -> None:
         self.query, self.side = query, side
         self.key = str(query.key_expr)
+        self._over = time.monotonic() + reply_seconds(self.key, query_seconds)
         self._open = 1
         self._lock = threading.Lock()
+
+    @property
+    def patience(self) -> float:
+        """For how many seconds from now on its asker waits for something that is lost."""
+        left = max(0.0, self._over - time.monotonic())
+        return left if published_key(self.key) is None else min(left, LOST_HISTORY_SECONDS)
 
     def hold(self) -> None:
         """One thing more to wait for."""
@@ -149,7 +157,7 @@ class QueryRelay:
     def _run(self) -> None:
         while (heard := self._heard.get()) is not None:
             name, key, query = heard
-            asked = _Asked(query, name)
+            asked = _Asked(query, name, self._plan.query_seconds)
             try:
                 if self._responsible(name, query.key_expr) == key:
                     self._ask(asked)
@@ -244,8 +252,7 @@ class QueryRelay:
         mark = int(kind) | AGAIN if again else int(kind)
         row = self._journal.record(now, n, sequence, delay, code, sender, size, state.link.number, mark, fate)
         if fate:
-            if kind == Kind.QUERY:
-                self._wait_in_vain(asked)
+            self._wait_in_vain(asked)
             return
         asked.hold()
 
@@ -262,13 +269,13 @@ class QueryRelay:
             send()
         elif not self._scheduler.hold(delay, size, row, send):
             self._journal.amend(row, Crossing.HELD_UP)
+            self._wait_in_vain(asked)
             asked.release()
 
     def _wait_in_vain(self, asked: _Asked) -> None:
-        """Let the asker of a lost query wait: nothing tells it that the query is lost."""
+        """Let an asker wait for its query, or for a reply, that is lost: nothing tells it so."""
         asked.hold()
-        seconds = reply_seconds(asked.key, self._plan.query_seconds)
-        if not self._patience.hold(seconds, 0, -1, asked.release):
+        if not self._patience.hold(asked.patience, 0, -1, asked.release):
             asked.release()
 
     def _link(self, source: str, target: str, key: zenoh.KeyExpr) -> LinkState | None:

@@ -5,7 +5,7 @@ Source: docs/links.md, recordings of messages.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from evedrop.errors import TraceError, UsageError
 from evedrop.recordings.message_numbers import MessageArrivals, MessageSeries, joined, series_of
 from evedrop.recordings.message_recording import MessageRecording, check_parts
+from evedrop.wire.advanced import numbered_as
 from evedrop.wire.crossing import Crossing, Kind
 from evedrop.wire.file import load_wire
 from evedrop.wire.history import WireHistory
@@ -86,7 +87,7 @@ class _Reader:
         rows = self._rows.filter(pc.is_valid(self._rows["n"]))
         if not rows.num_rows:
             self._no("has only messages that no model decides on")
-        streams, n = self._streams(rows, "key", "kind"), _numbers(rows["n"])
+        streams, n = self._streams(rows, key=numbered_as, kind=_stream_of), _numbers(rows["n"])
         order = np.lexsort((n, streams))
         streams, n = streams[order], n[order]
         fates = _fates(rows)[order]
@@ -115,14 +116,14 @@ class _Reader:
 
     def _before(self, name: str, longest: float | None) -> MessageRecording:
         """What was lost before the wire heard it."""
-        puts = pa.array([Kind[one.upper()].stream == "put" for one in self._rows["kind"].to_pylist()])
+        puts = pa.array([_stream_of(one) == "put" for one in self._rows["kind"].to_pylist()])
         rows = self._rows.filter(pc.and_(puts, pc.is_valid(self._rows["sequence"])))
         if not rows.num_rows:
             self._no(
                 "has no publication with a number of its sender's, as rmw_zenoh and publishers with Zenoh's source info give it"
             )
         streams, numbers, heard = (
-            self._streams(rows, "key", "source"),
+            self._streams(rows, key=str, source=str),
             _numbers(rows["sequence"]),
             _floats(rows["time"]),
         )
@@ -174,16 +175,15 @@ class _Reader:
         ]
         return pc.is_in(rows["key"].cast(pa.string()), pa.array(taken, pa.string()))
 
-    def _streams(self, rows: pa.Table, *names: str) -> NDArray[np.int64]:
-        """A number for each row that is the same where the columns are; kinds that share their numbers are one."""
+    def _streams(self, rows: pa.Table, **columns_as: Callable[[str], str]) -> NDArray[np.int64]:
+        """A number for each row, the same where the columns are. columns_as: column → the word for each of its words."""
         columns = []
-        for name in names:
+        for name, word_for in columns_as.items():
             texts = rows[name].cast(pa.string()).combine_chunks().dictionary_encode()
             codes = texts.indices.fill_null(len(texts.dictionary)).to_numpy(zero_copy_only=False).astype(np.int64)
-            if name == "kind":
-                streams = [Kind[one.upper()].stream for one in texts.dictionary.to_pylist()]
-                codes = np.array([streams.index(one) for one in streams], np.int64)[codes]
-            columns.append(codes)
+            words = [word_for(one) for one in texts.dictionary.to_pylist()]
+            same = np.array([*(words.index(one) for one in words), len(words)], np.int64)
+            columns.append(same[codes])
         found: NDArray[np.int64] = (
             np.unique(np.stack(columns), axis=1, return_inverse=True)[1].reshape(-1).astype(np.int64)
         )
@@ -193,9 +193,7 @@ class _Reader:
         """Tell that a link did not have the same settings all the time."""
         history = WireHistory.read(self._folder / JOURNAL_FOLDER)
         pairs = pa.TableGroupBy(rows.select(["key", "kind"]), ["key", "kind"]).aggregate([]).to_pylist()
-        changes = max(
-            len(history.changes_of(self._link, one["key"], Kind[one["kind"].upper()].stream)) for one in pairs
-        )
+        changes = max(len(history.changes_of(self._link, one["key"], _stream_of(one["kind"]))) for one in pairs)
         if changes > 1:
             self._notes.append(f"the link had {changes} settings one after the other: fitted as one")
 
@@ -208,6 +206,11 @@ class _Reader:
 
     def _no(self, what: str, cause: Exception | None = None) -> NoReturn:
         raise TraceError(str(self._folder), "file", what) from cause
+
+
+def _stream_of(kind: str) -> str:
+    """The kind of messages with which a kind, by its word in the journal, shares its numbers."""
+    return Kind[kind.upper()].stream
 
 
 def _groups(codes: NDArray[np.int64]) -> Iterator[NDArray[np.intp]]:

@@ -99,6 +99,21 @@ def test_other_keys_kinds_links_and_seeds_have_other_fates() -> None:
     assert list(in_turn[0]) == taken(of_scan(FULL), 300)
 
 
+def test_the_history_of_a_key_has_the_same_fates_in_every_session() -> None:
+    """The Zenoh id of a session in a key of an advanced publisher changes no fate; the key that it publishes on does."""
+    histories = ("scan/@adv/pub/1af/7/_", "scan/@adv/*/88/12/**", "scan/@adv/**")
+    fates = [taken(of_scan(FULL, key=key), 300) for key in histories]
+    assert fates[0] == fates[1] == fates[2]
+    loss = loss_of(FULL["loss"])
+    key = stream_key(root_of_seed(SEED), "wire/link/scan/put/scan/@adv")
+    u = uniforms(Stream(key, range(1), loss.uniforms_per_slot).words(range(300))).transpose(0, 2, 1)
+    assert taken(of_scan({"loss": FULL["loss"]}, key=histories[0]), 300) == [
+        (code, 0.0, False) for code in loss.fates(0, u)[:, 0].tolist()
+    ]
+    assert fates[0] != taken(of_scan(FULL, key="scan"), 300)
+    assert fates[0] != taken(of_scan(FULL, key="pose/@adv/**"), 300)
+
+
 @settings(deadline=None, max_examples=examples(40))
 @given(
     model=st.sampled_from(sorted(LOSSES)),

@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from evedrop.wire.crossing import AGAIN, RECORD, UNLINKED, Crossing, Kind
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_part import STORED, JournalPart, Records, records_in
 from evedrop.wire.journal_reader import journal_tables, last_beat, part_names
+from evedrop.wire.lanes import LinkState
 from tests.conftest import wait_until
 from tests.wire.wire_plans import wire_plan
 
@@ -264,6 +266,24 @@ def test_the_settings_that_each_message_had_are_known_after_a_restart(tmp_path: 
     history.write_text("nonsense\n")
     with pytest.raises(UsageError, match=r"history.jsonl, line 1, is not the history of a wire; give another folder"):
         WireJournal(tmp_path, wire_plan())
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_a_history_goes_on_although_its_session_has_another_id(killed: bool, tmp_path: Path) -> None:
+    """After the end of the wire or of its process: messages of `KEY/@adv/…` have one number after another."""
+    folder, plan = tmp_path / "wire", wire_plan()
+    with WireJournal(folder, plan) as first:
+        code = first.key_code("scan/1/@adv/pub/aa/1/_")
+        for n in range(3):
+            first.record(time.time(), n, -1, 0.0, code, 0, 8, 0, Kind.QUERY, Crossing.DELIVERED)
+        first.change("scan", BETTER, {("scan/1/@adv", "query"): 2})
+        if killed:
+            shutil.copytree(folder, tmp_path / "killed")
+    with WireJournal(tmp_path / "killed" if killed else folder, plan) as second:
+        decide = LinkState(plan.links[0], plan, second).lane("query", "scan/1/@adv/pub/bb/1/_", lossless=False)
+        assert decide(time.time(), 8)[0] == 3
+        changes = second.changes_of("scan", "scan/1/@adv/*/cc/9/**", "query")
+        assert [(one.at, one.settings) for one in changes] == [(0, LOSSY), (2, BETTER), (3, LOSSY)]
 
 
 KILLED = """

@@ -69,6 +69,22 @@ def test_a_key_that_was_forgotten_goes_on(lossy: LinkState, lossless: bool) -> N
     assert lossy.lane("put", "pose", lossless)(0.0, 1)[0] == 0
 
 
+def test_the_keys_of_a_history_are_numbered_together(lossy: LinkState) -> None:
+    """Whichever session they are of, and although one of them is forgotten; so do a change and the end of all of them."""
+    first, second = "map/@adv/pub/aa/1/_", "map/@adv/pub/bb/1/_"
+    lossy.change(LOSSY)
+    fates = KeyFates(lossy.link, "map/@adv/**", "put", 7)
+    due = [fates.next()[0] for _ in range(40)]
+    decide, other = lossy.lane("put", first, False), lossy.lane("put", second, False)
+    found = [lane(0.0, 1) for _ in range(10) for lane in (decide, other)]
+    lossy.forget("put", first)
+    found += [other(0.0, 1) for _ in range(10)]
+    lossy.forget("put", second)
+    decide = lossy.lane("put", first, False)
+    found += [decide(0.0, 1) for _ in range(10)]
+    assert [one[:2] for one in found] == [*enumerate(due)]
+
+
 def test_threads_share_the_messages_of_a_key(tmp_path: Path) -> None:
     """Each number, with its fate, is given once, also while the settings change."""
     delays: dict[str, Any] = {

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 import zenoh
+from zenoh.ext import CacheConfig, MissDetectionConfig, RecoveryConfig
+from zenoh.ext import declare_advanced_publisher as advanced_publisher
+from zenoh.ext import declare_advanced_subscriber as advanced_subscriber
 
+from evedrop.wire.advanced import LOST_HISTORY_SECONDS
 from evedrop.wire.crossing import Crossing, Kind
 from tests.conftest import wait_until
-from tests.wire.wire_at_work import DEAD, PERFECT, WireAtWork, at_work, both_ways, link, plan_of
+from tests.wire.wire_at_work import DEAD, PERFECT, WireAtWork, at_work, both_ways, is_declared, link, plan_of
 
 COMPLETE = zenoh.QueryTarget.ALL_COMPLETE
 ALL = zenoh.QueryTarget.ALL
+WAIT = 0.3
+"""Seconds for which the wires of these tests wait for replies."""
 
 
 def answers(session: zenoh.Session, key: str, **how: Any) -> list[bytes]:
@@ -107,24 +114,93 @@ def test_nobody_waits_for_a_queryable_that_is_not_there(tmp_path: Path) -> None:
         assert not kinds(wire)
 
 
-def test_the_asker_of_a_lost_query_waits_and_a_lost_reply_is_missing(tmp_path: Path) -> None:
-    """A lost query leaves its asker waiting for as long as the wire does; after a lost reply the asker goes on."""
+@pytest.mark.parametrize(
+    ("lost", "fate"), [("there", Crossing.LOST), ("back", Crossing.LOST), ("large", Crossing.TOO_LARGE)]
+)
+def test_the_asker_of_a_lost_query_or_reply_waits(lost: str, fate: Crossing, tmp_path: Path) -> None:
+    """For as long as the wire does: a radio that loses a reply does not say that there was none."""
     plan = plan_of(
         link("robot", "base", DEAD, "there/**", name="there"),
         link("robot", "base"),
         link("base", "robot", DEAD, "back/**", name="back"),
+        link("base", "robot", keys="large/**", name="large"),
         link("base", "robot"),
-        query_seconds=0.3,
+        query_seconds=WAIT,
+        largest=100,
     )
     with at_work(plan, tmp_path) as wire, wire.program("robot") as asker, wire.program("base") as server:
-        offer(server, "there/1", b"x")
-        offer(server, "back/1", b"x")
+        offer(server, f"{lost}/1", b"x" * 101 if lost == "large" else b"x")
         offer(server, "ready", b"x")
         wait_until(lambda: answers(asker, "ready"), "the queryables are there")
-        assert not list(asker.get("there/1", timeout=60.0))
-        assert not list(asker.get("back/1", timeout=60.0))
-        assert wire.fates("there") == [Crossing.LOST]
-        assert wire.fates("back") == [Crossing.LOST]
+        asked = time.monotonic()
+        assert not list(asker.get(f"{lost}/1", timeout=60.0))
+        assert time.monotonic() - asked >= WAIT
+        assert wire.fates(lost) == [fate]
+
+
+def test_the_asker_waits_after_a_lost_reply_and_has_the_others(tmp_path: Path) -> None:
+    """They come at once; that there are no more is not said before the wire's time for queries is over."""
+    plan = plan_of(
+        link("robot", "base"),
+        link("base", "robot", DEAD, "map/1", name="dead"),
+        link("base", "robot"),
+        query_seconds=WAIT,
+    )
+    with at_work(plan, tmp_path) as wire, wire.program("robot") as asker, wire.program("base") as server:
+        offer(server, "map/1", b"lost")
+        offer(server, "map/2", b"not")
+        offer(server, "ready", b"x")
+        wait_until(lambda: answers(asker, "ready"), "the queryables are there")
+        asked = time.monotonic()
+        assert answers(asker, "map/*", timeout=60.0) == [b"not"]
+        assert time.monotonic() - asked >= WAIT
+        assert wire.fates("dead") == [Crossing.LOST]
+
+
+@pytest.mark.parametrize("lost", ["robot-base", "base-robot"])
+def test_a_lost_question_for_a_history_ends_soon(lost: str, tmp_path: Path) -> None:
+    """Long before other queries end: an advanced subscriber holds all new messages back until then."""
+    plan = both_ways(
+        DEAD if lost == "robot-base" else PERFECT, DEAD if lost == "base-robot" else PERFECT, query_seconds=1000.0
+    )
+    with at_work(plan, tmp_path) as wire, wire.program("robot") as asker, wire.program("base") as server:
+        offer(server, "map/@adv/pub/1a/2/_", b"x")
+        wait_until(lambda: is_declared(wire, "base", "queryable", "map/@adv/pub/1a/2/_"), "the queryable is there")
+        asked = time.monotonic()
+        assert not list(asker.get("map/@adv/*/1a/**", timeout=1000.0))
+        assert time.monotonic() - asked >= LOST_HISTORY_SECONDS
+        assert wire.fates(lost) == [Crossing.LOST]
+
+
+def test_a_lost_question_does_not_stop_an_advanced_subscriber(tmp_path: Path) -> None:
+    """It notices a lost message and asks for it; the question is lost; what follows comes all the same."""
+    plan = both_ways(query_seconds=1000.0)
+    with (
+        at_work(plan, tmp_path) as wire,
+        wire.program("robot", timestamping={"enabled": True}) as robot,
+        wire.program("base") as base,
+    ):
+        detection = MissDetectionConfig(heartbeat=1000.0, sporadic_heartbeat=None)
+        publisher = advanced_publisher(
+            robot, "map", cache=CacheConfig(max_samples=100), sample_miss_detection=detection, publisher_detection=True
+        )
+        got: list[str] = []
+        subscriber: Any = advanced_subscriber(
+            base, "map", lambda one: got.append(one.payload.to_string()),
+            recovery=RecoveryConfig(heartbeat=True, periodic_queries=None),
+        )  # fmt: skip
+        wait_until(lambda: publisher.put("first") or got, "the subscriber is known")
+        there, back = wire.relay.links["robot-base"], wire.relay.links["base-robot"]
+        there.change(DEAD)
+        publisher.put("lost")
+        wait_until(lambda: Crossing.LOST in wire.fates("robot-base"), "a message is lost")
+        there.change(PERFECT)
+        back.change(DEAD)
+        publisher.put("next")
+        wait_until(lambda: Crossing.LOST in wire.fates("base-robot"), "the question for it is lost")
+        wait_until(lambda: "next" in got, "what follows comes")
+        assert "lost" not in got
+        subscriber.undeclare()
 
 
 SERVICE = "0/add/example::srv::dds_::Add_/RIHS01_x"
