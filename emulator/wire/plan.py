@@ -32,7 +32,7 @@ class Side:
 
     name: str
     listen: tuple[str, ...] = ()
-    """Zenoh endpoints; port 0 lets the system choose."""
+    """Zenoh endpoints; port 0 stands for any free port."""
     connect: tuple[str, ...] = ()
     """Endpoints of routers that are there already."""
     tls: SideTls | None = None

@@ -11,6 +11,7 @@ import os
 import re
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, final
@@ -18,6 +19,7 @@ from typing import Any, Self, final
 import zenoh
 
 from evedrop.errors import UsageError
+from evedrop.ports import free_port
 from evedrop.wire.plan import Side, SideTls, WireLink
 
 ZenohConfig = dict[str, Any]
@@ -26,6 +28,8 @@ PROBES = "@evedrop/*/*"
 HIDDEN = ("@ros2_lv/**", "@/*/@ros2_lv/**", "**/@adv/**")
 """Keys that `**` does not match although programs use them: the graph of ROS 2, and the histories of advanced publishers."""
 _CONNECT_SECONDS = 10.0
+_ATTEMPTS = 5  # another program may take a port between its choice and its use
+_PORT_0 = re.compile(r":0(?=[?#]|$)")
 _IN_SOURCE = re.compile(r" at \S+\.rs:\d+\.")
 """Where in its source Zenoh raised an error, as its messages say it."""
 _CLIENT_MESSAGES = (
@@ -50,14 +54,9 @@ class SideSession:
         self.side = side
         self.name = side.name
         with _users_file(side.users) as users:
-            config = side_config(side, largest, users)
-            try:
-                self.session = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
-            except zenoh.ZError as error:
-                raise UsageError(_refusal(side, str(error))) from error
+            self.session, self.endpoints = _opened(side, largest, users)
+        """Its session, and where programs connect: with a free port where the plan has port 0."""
         self.zid = str(self.session.zid())
-        self.endpoints = self._endpoints()
-        """Where programs connect: the ports are those that the system chose where the plan has port 0."""
 
     def __enter__(self) -> Self:
         return self
@@ -67,15 +66,27 @@ class SideSession:
     ) -> None:
         self.session.close()
 
-    def _endpoints(self) -> tuple[str, ...]:
-        if all(not one.split("?")[0].split("#")[0].endswith(":0") for one in self.side.listen):
-            return self.side.listen
-        # Asked once, before programs can connect. Zenoh answers most questions about a router while it holds a lock that it needs
-        # again for the answer: a declaration that comes in between stops the router forever.
-        told = [
-            json.loads(reply.ok.payload.to_bytes()) for reply in self.session.get(f"@/{self.zid}/router") if reply.ok
-        ]
-        return tuple(told[0]["locators"])
+
+def _opened(side: Side, largest: int, users_file: str | None) -> tuple[zenoh.Session, tuple[str, ...]]:
+    """The session of a side, and its endpoints. Raises UsageError."""
+    for attempt in range(_ATTEMPTS):
+        endpoints = tuple(_with_port(one) for one in side.listen)
+        config = side_config(replace(side, listen=endpoints), largest, users_file)
+        try:
+            return zenoh.open(zenoh.Config.from_json5(json.dumps(config))), endpoints
+        except zenoh.ZError as error:
+            fixed = endpoints == side.listen or "in use" not in str(error)
+            if fixed or attempt == _ATTEMPTS - 1:
+                raise UsageError(_refusal(side, str(error))) from error
+    raise AssertionError
+
+
+def _with_port(endpoint: str) -> str:
+    """An endpoint with a free port in place of port 0.
+
+    Zenoh, too, listens at any free port for port 0, but tells which only in its administration space, which is closed.
+    """
+    return _PORT_0.sub(lambda _: f":{free_port()}", endpoint)
 
 
 def expressions_of(side: Side, links: Iterable[WireLink] = ()) -> tuple[str, ...]:
@@ -106,7 +117,8 @@ def side_config(side: Side, largest: int, users_file: str | None) -> ZenohConfig
             "retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
         },
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "adminspace": {"enabled": True, "permissions": {"read": True, "write": False}},
+        # A router that is asked for what it has while a program declares something may stop for ever (docs/upstream.md).
+        "adminspace": {"enabled": False},
         "timestamping": {"enabled": False},
         "transport": {"link": link},
     }
