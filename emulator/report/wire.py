@@ -102,9 +102,12 @@ def wire_faults(summary: WireSummary) -> Iterator[str]:
     if summary.unaccounted:
         yield f"unaccounted for: {_messages(summary.unaccounted)}; this is a fault of Evedrop"
     if summary.journal.missing:
-        yield f"the journal lacks {_messages(summary.journal.missing)}, because the disk was full"
+        yield f"the journal lacks {_messages(summary.journal.missing)}, because its folder could not be written"
     elif summary.journal.incomplete_since is not None:
-        yield "the disk was full for some time: the journal has all messages, but perhaps not all changes and events"
+        yield (
+            "the folder of the journal could not be written for some time: the journal has all messages, but perhaps not all "
+            "changes and events"
+        )
 
 
 def _unfinished(summary: WireSummary) -> str:

@@ -129,7 +129,8 @@ class WireControl:
             for name, (heard, delivered) in self._scorekeeper.counts().items()
         }
         sides = {name: list(endpoints) for name, endpoints in self._relay.endpoints.items()}
-        complete = "complete" if self._journal.incomplete_since is None else "incomplete, because the disk was full"
+        whole = self._journal.incomplete_since is None
+        complete = "complete" if whole else "incomplete, because its folder could not be written"
         return WireStatus(self._conductor.seconds, sides, links, list(self._events), complete)
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
-import os
 import shutil
 import struct
 import threading
@@ -27,7 +26,6 @@ import numpy as np
 from evedrop.errors import UsageError
 from evedrop.model.slot.link import Change
 from evedrop.output import warn
-from evedrop.results.folder import make_private
 from evedrop.results.wire_summary import JournalState
 from evedrop.wire.crossing import RECORD, Crossing, next_numbers
 from evedrop.wire.history import Numbered, WireHistory, highest
@@ -40,8 +38,9 @@ from evedrop.wire.journal_part import (
     table_of,
     write_parquet,
 )
-from evedrop.wire.journal_reader import JOURNAL_FOLDER, UNFINISHED, parquet_path
-from evedrop.wire.journal_recovery import locked, recover
+from evedrop.wire.journal_place import JournalPlace
+from evedrop.wire.journal_reader import JOURNAL_FOLDER, parquet_path
+from evedrop.wire.journal_recovery import recover
 from evedrop.wire.journal_words import JournalWords
 from evedrop.wire.plan import WirePlan
 
@@ -78,8 +77,6 @@ class WireJournal:
         self.listeners: list[Listener] = []
         self.amendment_listeners: list[AmendmentListener] = []
         self.event_listeners: list[EventListener] = []
-        self.incomplete_since: float | None = None
-        """When the disk was full for the first time; None: it always had room."""
         self.recorded = 0
         """The number of all records, when it is closed."""
         self.missing = 0
@@ -90,7 +87,6 @@ class WireJournal:
         self.folder = folder
         """The wire's folder."""
         self._folder = folder / JOURNAL_FOLDER
-        self._place = self._folder / UNFINISHED
         self._rows = part_rows
         self._state = threading.RLock()  # guards the parts
         self._handing = threading.RLock()  # so that listeners get blocks in order
@@ -103,12 +99,11 @@ class WireJournal:
         self._amended_late: deque[tuple[int, Crossing]] = deque()
         self._convert_after = 0.0
         try:
-            make_private(self._place)
-            self._lock = locked(self._folder)
+            self._place = JournalPlace(self._folder, tell)
             try:
                 self._begin(plan)
             except BaseException:
-                os.close(self._lock)
+                self._place.close()
                 raise
         except OSError as error:
             raise UsageError(
@@ -129,9 +124,8 @@ class WireJournal:
         """(link, key, kind of stream) → the number of its next message, as of the records handed to the listeners."""
         self._history.begin(plan, time.time())
         self._began = time.monotonic()  # the recovery of an earlier start does not count
-        self._words = JournalWords(self._place, self.start, self._miss)
-        self._alive = os.open(self._place / "alive", os.O_WRONLY | os.O_CREAT, 0o600)
-        self._beat()
+        self._words = JournalWords(self._place.unfinished, self.start, self._place.miss)
+        self._place.begin()
         self._add_part(0)
 
     @property
@@ -143,6 +137,16 @@ class WireJournal:
     def seconds(self) -> float:
         """How long this start has lasted."""
         return min(time.monotonic(), self._stopped) - self._began
+
+    @property
+    def incomplete_since(self) -> float | None:
+        """When something could not be written for the first time, in seconds since 1970; None: the disk always had room."""
+        return self._place.incomplete_since
+
+    @property
+    def removed(self) -> Path | None:
+        """The journal's folder, or the one inside it, if it was removed or moved while the wire ran."""
+        return self._place.removed
 
     @property
     def state(self) -> JournalState:
@@ -171,7 +175,7 @@ class WireJournal:
             try:
                 self._history.change(link, settings, since, time.time())
             except OSError as error:
-                self._miss(error)
+                self._place.miss(error)
 
     @property
     def events(self) -> list[tuple[float, str]]:
@@ -186,7 +190,7 @@ class WireJournal:
             try:
                 self._history.note(line, now)
             except OSError as error:
-                self._miss(error)
+                self._place.miss(error)
         self._hear(self.event_listeners, now, line)
 
     def amend(self, row: int, fate: Crossing) -> None:
@@ -230,20 +234,28 @@ class WireJournal:
         self._stopped = time.monotonic()
         self.recorded = next(self._number)
         self.flush()
+        self._place.look()
+        if self.removed is not None:
+            self.missing = self.recorded
+        else:
+            self._finish()
+        self._words.close()
+        self._place.close()
+
+    def _finish(self) -> None:
+        """Make the last Parquet files."""
         try:
             self._amend_converted()
             for at in sorted(self._parts):
                 self._convert(at)
             self._history.end(self.counts, time.time(), self.missing)
-            shutil.rmtree(self._place)
+            shutil.rmtree(self._place.unfinished)
         except OSError as error:
             self._tell(
-                f"the journal's last Parquet files cannot be written ({error.strerror}); its records stay in {self._place}, "
-                "where all commands read them; make room, and the next start of the wire makes the files"
+                f"the journal's last Parquet files cannot be written ({error.strerror}); its records stay in "
+                f"{self._place.unfinished}, where all commands read them; make room, and the next start of the wire makes the "
+                "files"
             )
-        self._words.close()
-        for descriptor in (self._alive, self._lock):
-            os.close(descriptor)
 
     def __enter__(self) -> WireJournal:
         return self
@@ -291,12 +303,12 @@ class WireJournal:
                 try:
                     self._add_part(at)
                 except OSError as error:
-                    self._miss(error)
+                    self._place.miss(error)
                     self._parts[at] = JournalPart(None, self._rows)
                     self._buffers[at] = self._parts[at].buffer
 
     def _add_part(self, at: int) -> None:
-        self._parts[at] = JournalPart(self._place / f"{self._name(at)}.rows", self._rows)
+        self._parts[at] = JournalPart(self._place.unfinished / f"{self._name(at)}.rows", self._rows)
         self._buffers[at] = self._parts[at].buffer
 
     def _name(self, at: int) -> str:
@@ -308,7 +320,8 @@ class WireJournal:
         while not self._ended.wait(_TICK):
             self.flush()
             with contextlib.suppress(OSError):  # if the wire is killed, more of the delayed messages count as underway
-                self._beat()
+                self._place.beat()
+            self._place.look()
             with self._state, contextlib.suppress(OSError):  # `_room` tries again, and reports it
                 part = self._parts.get(self._next)
                 if part is not None and 2 * part.handed > self._rows and self._next + 1 not in self._buffers:
@@ -328,9 +341,6 @@ class WireJournal:
                         self._convert(at)
             except OSError:  # the records are safe where they are
                 self._convert_after = now + _PATIENCE
-
-    def _beat(self) -> None:
-        os.pwrite(self._alive, struct.pack("<d", time.time()), 0)
 
     def _hear(self, listeners: list[Any], *what: Any) -> None:
         for listener in list(listeners):
@@ -388,13 +398,3 @@ class WireJournal:
                 raise
             for i, fate in enumerate(fates.values()):
                 self._hear(self.amendment_listeners, before[i : i + 1], fate)
-
-    def _miss(self, error: OSError) -> None:
-        """Note that the disk had no room for something, and tell so the first time."""
-        if self.incomplete_since is None:
-            self.incomplete_since = time.time()
-            at = time.strftime("%H:%M:%S", time.localtime(self.incomplete_since))
-            self._tell(
-                f"the journal is incomplete from {at} on, because {self._folder} cannot be written ({error.strerror}); the wire "
-                "goes on; make room"
-            )

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from evedrop.errors import RunError
 from evedrop.output import warn
 from evedrop.report.wire import wire_failures
 from evedrop.results.folder import make_private, new_folder, write_private
@@ -38,8 +39,9 @@ def run_wire(
     """Run a wire until a signal, or for some seconds; returns the exit status.
 
     out: its results folder, empty or that of an earlier start; say: for a line about each side and each event, and for the
-    summary; complain: for what went wrong, by default as `say`; view: as `live_view` takes it. Raises UsageError if the
-    folder or a side cannot be used.
+    summary; complain: for what went wrong, by default as `say`; view: as `live_view` takes it.
+
+    Raises UsageError if the folder or a side cannot be used, and RunError if the folder was removed while the wire ran.
     """
     if (out / JOURNAL_FOLDER).is_dir():
         make_private(out)
@@ -71,14 +73,25 @@ def run_wire(
                     WireControl(out, relay, conductor, scorekeeper, journal, events),
                 ):
                     stop.wait(seconds)
-        status = scorekeeper.finish(out)
+        status = scorekeeper.finish(out) if out.is_dir() else RunError.exit_status
     summary = scorekeeper.summary()
     for line in closing_lines(summary):
         say(line)
     for line in wire_failures(summary):
         (say if complain is None else complain)(line)
+    if journal.removed is not None:
+        raise RunError(_removed(journal.removed, out))
     say(f"results: {out}")
     return status
+
+
+def _removed(folder: Path, out: Path) -> str:
+    """The sentence about a wire without a journal. folder: the one that was removed."""
+    left = f"{out} has only the summary" if (out / WIRE_SUMMARY_FILE).is_file() else "only the table above is left"
+    return (
+        f"{folder} was removed or moved while the wire ran, so its records are not there, and {left}; start the "
+        "wire again, and leave its folder in place while it runs"
+    )
 
 
 def _begin_results(out: Path, plan: WirePlan) -> None:

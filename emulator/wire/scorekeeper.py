@@ -50,7 +50,10 @@ class SummarisedJournal(Protocol):
     amendment_listeners: list[AmendmentListener]
     recorded: int
     missing: int
-    incomplete_since: float | None
+
+    @property
+    def incomplete_since(self) -> float | None:
+        """When something could not be written for the first time, in seconds since 1970."""
 
     @property
     def start(self) -> int:

@@ -389,11 +389,13 @@ def test_the_exit_status_tells_of_an_incomplete_journal_and_of_unaccounted_messa
         keeper = WireScorekeeper(wire_plan(), journal)
     assert keeper.finish(tmp_path) == 0
     assert list(wire_failures(keeper.summary())) == []
-    journal.incomplete_since = 5.0
+    journal._place.incomplete_since = 5.0
     assert keeper.finish(tmp_path) == 1
     assert "the journal has all messages" in "".join(wire_failures(keeper.summary()))
     journal.missing = 7
-    assert list(wire_failures(keeper.summary())) == ["the journal lacks 7 messages, because the disk was full"]
+    assert list(wire_failures(keeper.summary())) == [
+        "the journal lacks 7 messages, because its folder could not be written"
+    ]
     journal.recorded += 1
     assert keeper.finish(tmp_path) == 3
     assert "unaccounted for: 1 message; this is a fault of Evedrop" in wire_failures(keeper.summary())
