@@ -56,6 +56,8 @@ def wire_outcome(summary: WireSummary) -> tuple[str, bool | None]:
     said, good = expectations_outcome(summary.expectations, "wire")
     if summary.unaccounted:
         return f"unaccounted for: {_messages(summary.unaccounted)}; {said}", False
+    if summary.bypasses:
+        return f"no verdict, because programs could speak past the wire; {said}", False
     if summary.journal.incomplete_since is not None:
         return f"the journal is incomplete; {said}", False
     if _unfinished(summary):
@@ -83,15 +85,16 @@ def unlinked_sentence(summary: WireSummary) -> Iterator[str]:
 
 
 def wire_failures(summary: WireSummary) -> Iterator[str]:
-    """What went wrong: faults of the wire, as below, and expectations that failed."""
+    """What went wrong: faults, as below, and expectations that failed."""
     yield from wire_faults(summary)
     yield from (one.sentence for one in failed(summary.expectations))
 
 
 def wire_faults(summary: WireSummary) -> Iterator[str]:
-    """A wire that has not ended, links outside their bounds, messages that are unaccounted for, and an incomplete journal."""
+    """A wire that has not ended, ways past it, links outside their bounds, unaccounted messages, and an incomplete journal."""
     if _unfinished(summary):
         yield f"{_unfinished(summary)}: these are the figures that its journal gives so far"
+    yield from (f"no verdict: {one.event}" for one in summary.bypasses)
     for name, link in summary.links.items():
         if link.within_bounds is False and link.bounds is not None:
             low, high = link.bounds

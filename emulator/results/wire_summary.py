@@ -78,11 +78,13 @@ class JournalSummary:
 
 @dataclass(frozen=True)
 class WireEventSummary:
-    """A cut, a partition, a change or a note, of the file or of an operator."""
+    """A cut, a partition, a change or a note, of the file or of an operator; or a way past the wire."""
 
     seconds: float
     """Since this start of the wire."""
     event: str
+    bypass: bool = False
+    """Whether it is a way past the wire, by which messages may have crossed that the journal does not have."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,11 @@ class WireSummary:
     def failed_expectations(self) -> int:
         """The number of expectations that failed."""
         return len(failed(self.expectations))
+
+    @property
+    def bypasses(self) -> list[WireEventSummary]:
+        """The ways past the wire that it noticed: with any, the wire has no verdict."""
+        return [one for one in self.events if one.bypass]
 
     def as_dict(self) -> dict[str, Any]:
         """The contents of summary.json."""

@@ -83,12 +83,14 @@ def _effects(link: WireLink) -> str:
 
 
 def _guards(side: Side) -> str:
-    """Who may use a side, if not everybody who can reach it."""
+    """Who may use a side, if not every client that can reach it."""
     said = [] if side.users is None else [f"users {', '.join(side.users)}"]
     if side.tls is not None and side.tls.authority is not None:
         said.append("certificates required")
     if side.keys != ("**",):
         said.append(f"only {', '.join(side.keys)}")
+    if side.peers:
+        said.append("mode peer allowed")
     return f"  ({'; '.join(said)})" if said else ""
 
 

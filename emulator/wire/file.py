@@ -121,7 +121,7 @@ def _plan(file: WireFile) -> WirePlan:
 
 def _side(name: str, table: SideTable) -> Side:
     tls = None if table.tls is None else SideTls(table.tls.certificate, table.tls.key, table.tls.authority)
-    return Side(name, table.endpoints, tuple(table.connect), tls, table.users, tuple(table.keys))
+    return Side(name, table.endpoints, tuple(table.connect), tls, table.users, tuple(table.keys), table.peers)
 
 
 def _link(number: int, name: str, table: WireLinkTable) -> WireLink:
@@ -150,6 +150,8 @@ def _side_table(side: Side) -> dict[str, Any]:
         table["tls"] = {"certificate": side.tls.certificate, "key": side.tls.key, **authority}
     if side.users is not None:
         table["users"] = dict(side.users)
+    if side.peers:
+        table["peers"] = True
     return table
 
 

@@ -13,7 +13,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 from evedrop.errors import UsageError
 from evedrop.model.checks import as_toml
@@ -27,6 +27,16 @@ from evedrop.wire.plan import WirePlan
 Numbered = tuple[str, str, str]
 """Link, key as in `numbered_as`, and kind of stream: what has numbers of its own."""
 _FILE = "history.jsonl"
+
+
+class Said(NamedTuple):
+    """An event of a wire."""
+
+    time: float
+    """In seconds: since 1970 in `WireHistory.said`, since the start in `WireHistory.events`."""
+    line: str
+    bypass: bool = False
+    """Whether it tells a way past the wire."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +63,8 @@ class WireHistory:
     """Start → the names of its links, in the order of their codes."""
     began: float = 0.0
     """When the latest start began, in seconds since 1970."""
-    said: list[tuple[float, str]] = field(default_factory=list)
-    """The events since the latest start: when, in seconds since 1970, and a line for each."""
+    said: list[Said] = field(default_factory=list)
+    """The events since the latest start."""
     _seed: int | None = None
     _settings: dict[str, list[_Settings]] = field(default_factory=dict)
 
@@ -77,9 +87,9 @@ class WireHistory:
         return history
 
     @property
-    def events(self) -> list[tuple[float, str]]:
-        """The events since the latest start: seconds since it began, and a line for each."""
-        return [(round(at - self.began, 3), line) for at, line in self.said]
+    def events(self) -> list[Said]:
+        """The events since the latest start, with seconds since it began."""
+        return [one._replace(time=round(one.time - self.began, 3)) for one in self.said]
 
     def begin(self, plan: WirePlan, now: float) -> None:
         """Begin the next start, which has the seed of the earlier ones. Raises OSError if the disk is full."""
@@ -91,9 +101,9 @@ class WireHistory:
         rows = [[*stream, n] for stream, n in since.items()]
         self._write({"change": link, "time": now, "settings": dict(settings), "since": rows})
 
-    def note(self, line: str, now: float) -> None:
+    def note(self, line: str, now: float, bypass: bool = False) -> None:
         """Note an event. Raises OSError."""
-        self._write({"said": line, "time": now})
+        self._write({"said": line, "time": now, **({"bypass": True} if bypass else {})})
 
     def end(self, counts: Mapping[Numbered, int], now: float, missing: int = 0) -> None:
         """End the latest start. missing: the number of rows for which the disk had no room. Raises OSError."""
@@ -152,7 +162,7 @@ class WireHistory:
                 entry["change"], entry["settings"], {(str(k), str(kind)): _number(n) for k, kind, n in entry["since"]}
             )
         elif "said" in entry:
-            self.said.append((float(entry["time"]), str(entry["said"])))
+            self.said.append(Said(float(entry["time"]), str(entry["said"]), bool(entry.get("bypass"))))
         elif int(entry["end"]) == self.start:
             self.ended = True
             self.counts = {(str(link), str(key), str(kind)): _number(n) for link, key, kind, n in entry["counts"]}

@@ -28,7 +28,7 @@ from evedrop.model.slot.link import Change
 from evedrop.output import warn
 from evedrop.results.wire_summary import JournalState
 from evedrop.wire.crossing import RECORD, Crossing, next_numbers
-from evedrop.wire.history import Numbered, WireHistory, highest
+from evedrop.wire.history import Numbered, Said, WireHistory, highest
 from evedrop.wire.journal_part import (
     STORED,
     JournalPart,
@@ -178,17 +178,17 @@ class WireJournal:
                 self._place.miss(error)
 
     @property
-    def events(self) -> list[tuple[float, str]]:
-        """The events of this start so far: seconds since it began, and a line for each."""
+    def events(self) -> list[Said]:
+        """The events of this start so far, with seconds since it began."""
         with self._state:
             return self._history.events
 
-    def note(self, line: str) -> None:
-        """Note an event that happens now, and tell the listeners."""
+    def note(self, line: str, *, bypass: bool = False) -> None:
+        """Note an event that happens now, and tell the listeners. bypass: whether it tells a way past the wire."""
         now = time.time()
         with self._state:
             try:
-                self._history.note(line, now)
+                self._history.note(line, now, bypass)
             except OSError as error:
                 self._place.miss(error)
         self._hear(self.event_listeners, now, line)

@@ -17,7 +17,7 @@ from evedrop.model.slot.link import Change
 from evedrop.results.wire_folder import WIRE_FILE
 from evedrop.results.wire_summary import WIRE_SUMMARY_FILE, JournalState, WireSummary
 from evedrop.wire.file import load_wire
-from evedrop.wire.history import WireHistory
+from evedrop.wire.history import Said, WireHistory
 from evedrop.wire.journal import AmendmentListener, Listener
 from evedrop.wire.journal_part import records_of
 from evedrop.wire.journal_reader import JOURNAL_FOLDER, UNFINISHED, journal_tables, last_beat
@@ -71,8 +71,8 @@ class JournalOnDisk:
         return self._history.start
 
     @property
-    def events(self) -> list[tuple[float, str]]:
-        """The events of the start: seconds since it began, and a line for each."""
+    def events(self) -> list[Said]:
+        """The events of the start, with seconds since it began."""
         return self._history.events
 
     def key_of(self, code: int) -> str:

@@ -17,6 +17,7 @@ from typing import final
 
 import zenoh
 
+from evedrop.wire.bypasses import Bypasses
 from evedrop.wire.lanes import LinkState
 from evedrop.wire.side import PROBES, SideSession
 
@@ -28,9 +29,13 @@ class Neighbours:
     """Watches which programs are connected to the sides, and reports changes."""
 
     def __init__(
-        self, sides: Mapping[str, SideSession], states: Sequence[LinkState], tell: Callable[[str], None]
+        self,
+        sides: Mapping[str, SideSession],
+        states: Sequence[LinkState],
+        tell: Callable[[str], None],
+        bypasses: Bypasses,
     ) -> None:
-        self._sides, self._states, self._tell = sides, states, tell
+        self._sides, self._states, self._tell, self._bypasses = sides, states, tell, bypasses
         self._told: set[tuple[str, str, str]] = set()
         self._heard: dict[tuple[str, str], float] = {}
         self._probes = {name: f"@evedrop/{secrets.token_hex(8)}/{at}" for at, name in enumerate(sides)}
@@ -62,7 +67,7 @@ class Neighbours:
                 found.add((f"router{'s' if len(joined) > 1 else ''} {', '.join(sorted(joined))}", one, other))
             found |= {(f"program {zid}", one, other) for zid in programs[one] & programs[other]}
         for who, one, other in sorted(found - self._told):
-            self._tell(_sentence(who, one, other))
+            (self._bypasses.add if who.startswith("router") else self._tell)(_sentence(who, one, other))
         for who, one, other in sorted(self._told - found):
             self._tell(
                 f"messages no longer pass between the sides {one} and {other} through the {who}; the links between them go on"

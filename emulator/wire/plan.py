@@ -40,6 +40,8 @@ class Side:
     """User → password of those who may connect; None: everybody may."""
     keys: tuple[str, ...] = ("**",)
     """The key expressions that programs on this side may use; all others are refused by access control."""
+    peers: bool = False
+    """Whether its programs may be in Zenoh's mode peer, because nothing introduces them to programs of other sides."""
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from typing import Self, final
 import zenoh
 
 from evedrop.output import warn
+from evedrop.wire.bypasses import Bypasses
 from evedrop.wire.crossing import Crossing
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.lanes import LinkState
@@ -95,18 +96,25 @@ class WireRelay:
         ]
         for relay in relays:
             stack.callback(relay.close)
-        self._neighbours = Neighbours(self.sides, [*links.values()], self._tell)
+        bypasses = Bypasses(self._note_bypass)
+        self._neighbours = Neighbours(self.sides, [*links.values()], self._tell, bypasses)
         self._liveliness = LivelinessRelay(self.sides, plan, self._woken.set, EntityLog(journal.folder).add)
         stack.callback(self._liveliness.close)
         self._look()
         self._queries.start()
         for relay in relays:
             relay.start()
+        bypasses.watch(self.sides.values())
         thread = threading.Thread(target=self._keep_up, name="wire", daemon=True)
         thread.start()
         stack.callback(thread.join)
         stack.callback(self._woken.set)
         stack.callback(self._ended.set)
+
+    def _note_bypass(self, line: str) -> None:
+        """Tell a way past the wire, and note it in the journal."""
+        self._journal.note(line, bypass=True)
+        self._tell(line)
 
     def _end_delays(self, scheduler: Scheduler) -> None:
         """Count the messages that were still delayed."""

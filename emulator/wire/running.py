@@ -28,6 +28,7 @@ from evedrop.live.network.operator import Answer, ask
 from evedrop.live.protocol.requests import LinkRequest, OperatorRequest, StatusRequest
 from evedrop.live.protocol.wire_status import WireStatus
 from evedrop.processes import kill, wait_for
+from evedrop.report.wire import wire_failures
 from evedrop.results.folder import claimed, default_folder, write_private
 from evedrop.results.wire_summary import WIRE_SUMMARY_FILE, WireSummary
 from evedrop.scenario.words import listed
@@ -47,7 +48,7 @@ LONGEST_SECONDS = 3600.0
 
 
 class ExpectationFailed(EvedropError, AssertionError):
-    """An expectation of a wire that failed."""
+    """An expectation of a wire that failed; or programs could speak past the wire."""
 
     exit_status = 1
 
@@ -66,7 +67,7 @@ def wire(
     itself. entries: with a file, changes by dotted key, with `__` for the dot, such as `seed=8` or `side__base__listen=[]`.
 
     Raises ScenarioError with every mistake of the wire. The `with` statement raises UsageError or RunError if the wire cannot
-    begin, and ExpectationFailed if one of its `[[expect]]` failed.
+    begin, and ExpectationFailed if one of its `[[expect]]` failed, or programs could speak past it.
     """
     if isinstance(source, WirePlan):
         if entries:
@@ -129,8 +130,9 @@ class RunningWire:
         if error is not None or status == 0:
             return
         with suppress(UsageError):
-            if failures := failed(self.typed_summary().expectations):
-                raise ExpectationFailed("\n".join(one.sentence for one in failures))
+            summary = self.typed_summary()
+            if summary.failed_expectations or summary.bypasses:
+                raise ExpectationFailed("\n".join(wire_failures(summary)))
         raise self._failure(status)
 
     @property
@@ -198,9 +200,10 @@ class RunningWire:
         """
         table = {"figure": figure, **bounds} if figure is not None else bounds
         plan = wire_of({**tomllib.loads(resolved_wire(self.plan)), "expect": [table]})
-        found = scorekeeper_on_disk(self.folder, plan)
-        for judged in failed(found.judged(found.links())):
-            raise ExpectationFailed(judged.sentence)
+        found = scorekeeper_on_disk(self.folder, plan).summary()
+        if failures := failed(found.expectations):
+            lines = [*(judged.sentence for judged in failures), *(bypass.event for bypass in found.bypasses)]
+            raise ExpectationFailed("\n".join(lines))
 
     def _endpoints_of(self, side: str) -> Sequence[str]:
         found = self._endpoints.get(side, ())

@@ -9,6 +9,7 @@ import importlib.metadata
 import platform
 import threading
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Protocol, final
@@ -34,6 +35,7 @@ from evedrop.score.summary import Judged
 from evedrop.wire.crossing import UNLINKED, Crossing, Kind
 from evedrop.wire.expect import WireExpectTable
 from evedrop.wire.figures import WIRE_FIGURES
+from evedrop.wire.history import Said
 from evedrop.wire.journal import AmendmentListener, Listener
 from evedrop.wire.journal_part import REASONS, Records
 from evedrop.wire.law import bounds, expected
@@ -41,6 +43,8 @@ from evedrop.wire.plan import WireLink, WirePlan
 from evedrop.wire.tallies import LinkTally, StreamTally
 
 _QUANTILES = (0.5, 0.9, 0.99)
+BYPASSED = "programs could speak past the wire"
+"""Why an expectation of a wire with bypasses did not hold."""
 
 
 class SummarisedJournal(Protocol):
@@ -72,8 +76,8 @@ class SummarisedJournal(Protocol):
         """The number of records that an earlier start had left behind."""
 
     @property
-    def events(self) -> Sequence[tuple[float, str]]:
-        """The events of this start: seconds since it began, and a line for each."""
+    def events(self) -> Sequence[Said]:
+        """The events of this start, with seconds since it began."""
 
     def key_of(self, code: int) -> str:
         """The key of a code."""
@@ -158,7 +162,7 @@ class WireScorekeeper:
             journal=JournalSummary(journal.recovered, journal.missing, journal.incomplete_since),
             links=links,
             expectations=self.judged(links),
-            events=[WireEventSummary(seconds, event) for seconds, event in journal.events],
+            events=[WireEventSummary(*one) for one in journal.events],
             made_with={
                 "python": platform.python_version(),
                 **{name: importlib.metadata.version(name) for name in ("evedrop", "eclipse-zenoh")},
@@ -166,13 +170,16 @@ class WireScorekeeper:
         )
 
     def judged(self, links: Mapping[str, WireLinkSummary]) -> list[Judged]:
-        """The expectations of the wire, and whether they held."""
-        return [self._judged(table, links[table.subject]) for table in self._plan.expectations]
+        """The expectations of the wire, and whether they held; past which programs could have spoken, none of them did."""
+        bypassed = any(one.bypass for one in self._journal.events)
+        judged = [self._judged(table, links[table.subject]) for table in self._plan.expectations]
+        return [replace(one, held=None, why=BYPASSED) if bypassed and one.held else one for one in judged]
 
     def finish(self, out: Path) -> int:
         """Write summary.json of a wire whose journal is closed; returns the exit status.
 
-        1 if an expectation failed or the journal is incomplete, 3 if a message is unaccounted for.
+        1 if an expectation failed, programs could have spoken past the wire, or the journal is incomplete; 3 if a message is
+        unaccounted for.
         """
         found = self.summary()
         try:
@@ -182,7 +189,7 @@ class WireScorekeeper:
             return 1
         if found.unaccounted:
             return 3
-        return 1 if found.failed_expectations or found.journal.incomplete_since is not None else 0
+        return 1 if found.failed_expectations or found.bypasses or found.journal.incomplete_since is not None else 0
 
     def _judged(self, table: WireExpectTable, link: WireLinkSummary) -> Judged:
         if table.link is not None:

@@ -173,6 +173,7 @@ class SideTable(Table):
         Field(examples=[{"ada": "a long password"}]),
     ] = None
     keys: Annotated[KeyExpressions, Field(default_factory=lambda: ["**"])]
+    peers: Annotated[bool, Field(strict=True)] = False
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:

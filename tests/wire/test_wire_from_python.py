@@ -47,6 +47,15 @@ def test_that_fails(evedrop_wire):
 
 def test_that_expects(evedrop_wire):
     hear(evedrop_wire(**WIRE))
+
+
+def test_that_is_passed_by(evedrop_wire):
+    radio = evedrop_wire(**{**WIRE, "expect": []})
+    config = radio.config("robot")
+    config.insert_json5("mode", '"peer"')
+    with zenoh.open(config):
+        while not radio.status().bypasses:
+            time.sleep(0.01)
 """
 
 LINK = {"name": "scan", "from": "robot", "to": "base", "quality": 0.6}
@@ -127,17 +136,29 @@ def used(running: RunningWire, got: list[int]) -> None:
 
 @pytest.mark.long
 def test_the_fixture_ends_the_wires_of_a_test_that_fails(tmp_path: Path) -> None:
-    """In order, and it fails a test whose wire does not meet an expectation."""
+    """In order, and it fails a test whose wire does not meet an expectation, or could be passed by, also in JUnit's report."""
     (tmp_path / "test_radio.py").write_text(FAILING)
-    options = ["-p", "evedrop.pytest_plugin", "-p", "no:cacheprovider", "--basetemp", "kept"]
+    options = [
+        "-p",
+        "evedrop.pytest_plugin",
+        "-p",
+        "no:cacheprovider",
+        "--basetemp",
+        "kept",
+        "--junitxml",
+        "report.xml",
+    ]
     command = [sys.executable, "-m", "pytest", *options, "."]
     environment = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
     done = subprocess.run(
         command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False, timeout=300
     )
-    assert re.search(r"1 failed, 1 passed, 2 errors", done.stdout), done.stdout
+    assert re.search(r"1 failed, 2 passed, 3 errors", done.stdout), done.stdout
     assert "the test's own error" in done.stdout
     assert "expected scan.delivery above 0.9: FAILED, found 0" in done.stdout
+    report = (tmp_path / "report.xml").read_text()
+    assert "test_that_is_passed_by" in report
+    assert "at side robot is in mode peer" in report
     folders = [tmp_path / "kept" / name / "wire-1" for name in ("test_that_fails0", "test_that_expects0")]
     for folder in folders:
         assert (folder / "summary.json").is_file()

@@ -43,6 +43,8 @@ class WireStatus:
     """The events so far, a line each."""
     journal: str = field(metadata=entry(text))
     """Whether the journal is complete, in words."""
+    bypasses: Sequence[str] = field(metadata=entry(listed(text)))
+    """The ways past the wire that it noticed, a line each."""
 
     @property
     def lines(self) -> Iterator[str]:
@@ -51,3 +53,4 @@ class WireStatus:
         yield from (f"side {name}: {', '.join(endpoints)}" for name, endpoints in self.sides.items())
         yield from (f"link {name}: {link}" for name, link in self.links.items())
         yield from (f"event at {event}" for event in self.events)
+        yield from (f"no verdict: {bypass}" for bypass in self.bypasses)

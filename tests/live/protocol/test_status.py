@@ -76,18 +76,24 @@ def test_the_status_of_shards_is_that_of_the_slowest_with_the_packets_of_all() -
 
 
 WIRE = WireStatus(
-    12.5, {"robot": ["tcp/127.0.0.1:7448"]}, {"scan": WireLinkStatus(4, 3, False)}, ["2.0 s: cut scan"], "complete"
+    12.5,
+    {"robot": ["tcp/127.0.0.1:7448"]},
+    {"scan": WireLinkStatus(4, 3, False)},
+    ["2.0 s: cut scan"],
+    "complete",
+    ["a program is in mode peer"],
 )
 
 
 def test_the_status_of_a_wire_is_read_as_it_was_sent() -> None:
-    """And shown a line for each side, link and event."""
+    """And shown a line for each side, link, event, and way past the wire."""
     assert read_answer(KEY, Answer(status=WIRE).pack()).status == WIRE
     assert list(WIRE.lines) == [
         "12.5 s, journal complete",
         "side robot: tcp/127.0.0.1:7448",
         "link scan: 3 of 4 messages delivered, 0.7500",
         "event at 2.0 s: cut scan",
+        "no verdict: a program is in mode peer",
     ]
     assert str(WireLinkStatus(0, 0, True)) == "0 of 0 messages delivered, –, cut"
     with pytest.raises(MalformedMessage, match=r"wire.seconds is -1, expected .* the status of a wire"):
