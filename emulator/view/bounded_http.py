@@ -1,7 +1,17 @@
-"""The HTTP server of views in a browser and of metrics: a bounded number of readers, each on its own thread, and no log."""
+"""The HTTP server of views in a browser and of metrics: a bounded number of readers, each on its own thread, and no log.
+
+A web page of somebody else may reach a server that listens on loopback only, if the name of its host is given our address
+(DNS rebinding); the browser then takes what the server sends for a part of that page. So a request must name an address, or a
+name that nobody can have in the public DNS.
+
+Source: RFC 9110, Section 7.4 (misdirected requests).
+"""
 
 from __future__ import annotations
 
+import ipaddress
+import re
+import socket
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -9,6 +19,32 @@ from typing import Any
 _LOOK_SECONDS = 0.05  # between two checks of whether the server is to stop
 _REQUEST_SECONDS = 10.0  # for a reader to send its request
 _MOST_READERS = 32  # at a time; further ones are turned away, so another user can use up all places
+
+_HOST = re.compile(r"(?:\[([0-9A-Fa-f:.]+)\]|([A-Za-z0-9._-]+))(?::[0-9]{1,5})?")
+_PRIVATE = (".localhost", ".internal")
+"""Domains that the public DNS does not have: RFC 6761, and ICANN's resolution of 29 July 2024."""
+
+
+def own_host(text: str) -> str | None:
+    """The host of a Host header, without the port and in lower case, as it stands in an address; None for a foreign one.
+
+    An address is never foreign, nor is a name without a dot, in a private domain, or of this machine (RFC 6762 for `.local`).
+    """
+    found = _HOST.fullmatch(text)
+    if found is None:
+        return None
+    if found[1] is not None:
+        return f"[{found[1].lower()}]" if _is_address(found[1], 6) else None
+    name, machine = found[2].lower(), socket.gethostname().lower()
+    of_machine = name in {machine, f"{machine.partition('.')[0]}.local"}
+    return name if of_machine or _is_address(name, 4) or "." not in name or name.endswith(_PRIVATE) else None
+
+
+def _is_address(text: str, version: int) -> bool:
+    try:
+        return ipaddress.ip_address(text).version == version
+    except ValueError:
+        return False
 
 
 class BoundedServer(ThreadingHTTPServer):
@@ -54,13 +90,33 @@ class QuietHandler(BaseHTTPRequestHandler):
 
     protocol_version = "HTTP/1.1"
     timeout = _REQUEST_SECONDS
+    asked_host = ""
+    """The host that the request names, as it stands in an address."""
 
-    def refuse(self, status: int) -> None:
-        """Reply with this status and nothing else."""
+    def parse_request(self) -> bool:
+        """Read the request line and the headers; refuses a request that is malformed or names a foreign host."""
+        if not super().parse_request():
+            return False
+        hosts = self.headers.get_all("Host") or []
+        if len(hosts) != 1:
+            self.refuse(400, "a request needs one Host header")
+            return False
+        host = own_host(hosts[0].strip())
+        if host is None:
+            self.refuse(421, "this server is not for that name; use the address that Evedrop printed")
+            return False
+        self.asked_host = host
+        return True
+
+    def refuse(self, status: int, why: str = "") -> None:
+        """Reply with this status, a sentence if there is one, and nothing else."""
+        content = f"{why}\n".encode() if why else b""
         self.close_connection = True
         self.send_response(status)
-        self.send_header("Content-Length", "0")
+        self.send_header("Content-Type", "text/plain; charset=utf-8")
+        self.send_header("Content-Length", str(len(content)))
         self.end_headers()
+        self.wfile.write(content)
 
     def log_message(self, *_: Any) -> None:
         """Log nothing."""

@@ -20,7 +20,7 @@ from rerun.experimental import ViewerClient, ViewerState
 from evedrop.errors import UsageError
 from evedrop.ports import free_port
 from evedrop.view.column import ELAPSED, TIMELINE
-from evedrop.view.viewer_process import end, spawn
+from evedrop.view.viewer_process import PortTaken, end, spawn
 
 _ATTEMPTS = 3
 _START_SECONDS = 120.0
@@ -35,8 +35,10 @@ T = TypeVar("T")
 class HeadlessViewer:
     """A viewer that has loaded a recording."""
 
-    def __init__(self, client: ViewerClient, process: subprocess.Popen[bytes]) -> None:
+    def __init__(self, client: ViewerClient, process: subprocess.Popen[bytes], rrd: Path) -> None:
+        """process: known to be the one that the client is connected to. rrd: the recording to load."""
         self._client, self._process = client, process
+        self._answer(lambda: self._client.open([str(rrd.resolve())]))
         self._timeline, self._last = self._loaded()
 
     def state(self) -> ViewerState:
@@ -115,9 +117,9 @@ def opened(rrd: Path, size: tuple[int, int], moment: float | None = None) -> Ite
     check(rrd)
     with tempfile.TemporaryDirectory() as folder:
         logs = Path(folder)
-        process, port = _started(rrd, size, logs)
+        process, port = _started(size, logs)
         try:
-            viewer = HeadlessViewer(ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy"), process)
+            viewer = HeadlessViewer(ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy"), process, rrd)
             viewer.show(moment)
             viewer.settle()
             yield viewer
@@ -146,20 +148,21 @@ def check(rrd: Path) -> None:
         raise UsageError(f"{rrd} is broken ({why}); remove it, and it is made again from the tables") from error
 
 
-def _started(rrd: Path, size: tuple[int, int], logs: Path) -> tuple[subprocess.Popen[bytes], int]:
+def _started(size: tuple[int, int], logs: Path) -> tuple[subprocess.Popen[bytes], int]:
     """A viewer's process, and the port on which it listens."""
     for attempt in range(1, _ATTEMPTS + 1):
         port = free_port()
-        shown = ["--window-size", f"{size[0]}x{size[1]}", "--hide-welcome-screen", str(rrd.resolve())]
+        shown = ["--window-size", f"{size[0]}x{size[1]}", "--hide-welcome-screen"]
         try:
             # Otherwise the viewer would write into the picture that it is drawing without a graphics card.
             quiet = {"RUST_LOG": "error"}
             arguments = ["--headless", "--port", str(port), *shown]
             return spawn(port, arguments, logs, environment=quiet, patience=_START_SECONDS), port
+        except PortTaken:
+            if attempt == _ATTEMPTS:
+                raise
         except UsageError as error:
-            driver = _without_driver(str(error))
-            if driver is not None or attempt == _ATTEMPTS:  # another process may have taken the port
-                raise UsageError(driver or str(error)) from error
+            raise UsageError(_without_driver(str(error)) or str(error)) from error
     raise AssertionError
 
 

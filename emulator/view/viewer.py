@@ -1,7 +1,8 @@
 """The viewer of a run: a window, or a page for browsers; either reads the recording as it is written to disk.
 
 A recording contains the truth, so it is never sent to a port where anybody could fetch it: a window reads it from a pipe, a
-browser from an address that cannot be guessed. Neither Rerun nor Zenoh is imported here.
+browser from an address that cannot be guessed. A window is a process of Rerun's command; the page is served by this process,
+from Rerun's files. Neither Rerun nor Zenoh is imported here.
 
 Source: docs/view.md, who sees it.
 """
@@ -11,10 +12,10 @@ from __future__ import annotations
 import contextlib
 import ipaddress
 import os
-import socket
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, final
@@ -22,7 +23,7 @@ from urllib.parse import quote
 
 from evedrop.errors import UsageError
 from evedrop.ports import free_port
-from evedrop.view.viewer_process import HOST, end, is_apart, spawn
+from evedrop.view.viewer_process import HOST, PortTaken, end, executable, is_apart, spawn
 
 if TYPE_CHECKING:
     from evedrop.view.growing_recording import Followed, Served
@@ -32,8 +33,6 @@ _ATTEMPTS = 3
 _WINDOW = ("--hide-welcome-screen",)
 _DARK = "theme=dark"
 """The page's theme, for which the colours of the panels are made, whatever the browser's theme is."""
-_NOTHING = f"rerun+http://{HOST}:9/proxy"
-"""The page's default source: with it Rerun serves only the page, and opens no port for recordings."""
 
 
 def has_screen() -> bool:
@@ -82,42 +81,32 @@ class WebAddress:
         """The address to type into a browser of this machine."""
         return HOST if self.host == "0.0.0.0" else self.host  # noqa: S104 - what was asked for
 
-    def check_free(self) -> None:
-        """Raise UsageError if a port is in use: its owner would be mistaken for the viewer."""
-        for port in (self.port, self.port + 1):
-            with socket.socket() as probe:
-                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                try:
-                    probe.bind((self.host, port))
-                except OSError as error:
-                    raise UsageError(
-                        f"--serve {self.host}:{self.port}: {self.host}:{port} cannot be used ({error.strerror}); give another"
-                    ) from error
-
 
 @final
 class Viewer:
     """A running viewer; made by `start` or `serve`.
 
-    It listens on loopback only unless a WebAddress says otherwise, in a session of its own so that Ctrl-C in the terminal does
-    not reach it, and on Linux it dies with the thread that started it, however that thread ends.
+    A page listens on loopback only unless a WebAddress says otherwise. A window has a session of its own so that Ctrl-C in the
+    terminal does not reach it, and on Linux it dies with the thread that started it, however that thread ends.
     """
 
     def __init__(
         self,
-        process: subprocess.Popen[bytes],
         followed: Followed,
+        process: subprocess.Popen[bytes] | None = None,
         servers: Sequence[Served | WebPage] = (),
         address: str | None = None,
     ) -> None:
-        self._process = process
+        """process: a window's; servers and address: a page's."""
         self._followed = followed
+        self._process = process
         self._servers = [*servers]
+        self._stopped = threading.Event()
         self.address = address
         """The address to open in a browser; None for a window. Anybody who has it sees the truth."""
         self.warning: str | None = None
         """A warning to the user if others can reach the viewer."""
-        if address is None and not is_apart(process):
+        if process is not None and not is_apart(process):
             self.warning = (
                 "other users of this machine can find the window's port, control the window and take pictures of what it "
                 "shows, for this system allows it no network of its own; the web view, whose address is a secret, or no view "
@@ -125,15 +114,15 @@ class Viewer:
             )
 
     @property
-    def pid(self) -> int:
-        """The id of the viewer's process."""
-        return self._process.pid
+    def pid(self) -> int | None:
+        """The id of a window's process; None for a page."""
+        return None if self._process is None else self._process.pid
 
     @classmethod
     def start(
         cls, mode: str, logs: Path, recording: Path, complete: bool = False, options: Sequence[str] = _WINDOW
     ) -> Viewer | None:
-        """Start a viewer and wait until it is ready; None for "off". Its output goes to viewer.log in the folder `logs`.
+        """Start a viewer and wait until it is ready; None for "off". A window's output goes to viewer.log in the folder `logs`.
 
         mode: "native", "web", "off", or "auto". recording: the file to show, from its beginning on and as it grows; it need not
         exist yet. complete: whether the file no longer grows. options: those that a window is started with.
@@ -147,41 +136,43 @@ class Viewer:
 
         followed = Followed(recording, complete)
         if mode == "web":
-            return _repeatedly(lambda: cls._page(followed, HOST, HOST, free_port(), free_port(), logs))
-        return _repeatedly(lambda: cls._window(followed, free_port(), logs, options))
+            return cls._page(followed, HOST, HOST, 0, 0)
+        for _ in range(_ATTEMPTS - 1):
+            with contextlib.suppress(PortTaken):
+                return cls._window(followed, free_port(), logs, options)
+        return cls._window(followed, free_port(), logs, options)
 
     @classmethod
-    def serve(cls, web_address: WebAddress, logs: Path, recording: Path, complete: bool = False) -> Viewer:
+    def serve(cls, web_address: WebAddress, recording: Path, complete: bool = False) -> Viewer:
         """Start a viewer for browsers at a given address; otherwise as `start`.
 
         Raises UsageError if it cannot be started, for example because a port is taken.
         """
         from evedrop.view.growing_recording import Followed  # noqa: PLC0415 - only with a view
 
-        web_address.check_free()
         followed = Followed(recording, complete)
         host, seen, port = web_address.host, web_address.seen, web_address.port
-        return _repeatedly(lambda: cls._page(followed, host, seen, port, port + 1, logs))
+        try:
+            return cls._page(followed, host, seen, port, port + 1)
+        except UsageError as error:
+            raise UsageError(f"--serve {host}:{port}: {error}") from error
 
     @classmethod
-    def _page(cls, followed: Followed, host: str, seen: str, port: int, data_port: int, logs: Path) -> Viewer:
+    def _page(cls, followed: Followed, host: str, seen: str, port: int, data_port: int) -> Viewer:
+        """A page at a port of ours, and the recording at another; 0: any free one."""
         from evedrop.view.growing_recording import Served  # noqa: PLC0415 - only with a view
+        from evedrop.view.rerun_page import RerunPage  # noqa: PLC0415 - the same
         from evedrop.view.web_page import WebPage  # noqa: PLC0415 - the same
 
+        rerun = RerunPage(executable())
         served = Served(followed, host, data_port)
         try:
-            rerun = free_port()
-            process = spawn(rerun, ["--serve-web", "--web-viewer-port", str(rerun), _NOTHING], logs)
-            try:
-                page = WebPage((HOST, rerun), host, port, seen, data_port)
-            except BaseException:
-                end(process)
-                raise
+            page = WebPage(rerun, host, port, seen, served.port)
         except BaseException:
             served.stop()
             raise
-        data = quote(f"http://{seen}:{data_port}{served.path}", safe="")
-        return cls(process, followed, [served, page], f"http://{seen}:{port}/?url={data}&{_DARK}")
+        data = quote(f"http://{seen}:{served.port}{served.path}", safe="")
+        return cls(followed, None, [served, page], f"http://{seen}:{page.port}/?url={data}&{_DARK}")
 
     @classmethod
     def _window(cls, followed: Followed, port: int, logs: Path, options: Sequence[str]) -> Viewer:
@@ -191,15 +182,11 @@ class Viewer:
         process = spawn(port, arguments, logs, stdin=subprocess.PIPE, apart=not _screen_is_remote())
         assert process.stdin is not None  # noqa: S101 - it is a pipe
         feed(followed, process.stdin)
-        return cls(process, followed)
+        return cls(followed, process)
 
     def alive(self) -> bool:
         """Whether it still runs; a window may have been closed."""
-        return self._process.poll() is None
-
-    def wait(self) -> None:
-        """Return when the viewer has ended by itself."""
-        self._process.wait()
+        return self._process.poll() is None if self._process is not None else not self._stopped.is_set()
 
     def complete(self) -> None:
         """Declare the recording finished; it stays in view."""
@@ -208,17 +195,11 @@ class Viewer:
     def stop(self) -> None:
         """End the viewer within seconds. Harmless if it has ended."""
         self._followed.complete()
+        self._stopped.set()
         while self._servers:
             self._servers.pop().stop()
-        end(self._process)
-
-
-def _repeatedly(open_viewer: Callable[[], Viewer]) -> Viewer:
-    """Try several times, because another process may take a port after it was found free."""
-    for _ in range(_ATTEMPTS - 1):
-        with contextlib.suppress(UsageError):
-            return open_viewer()
-    return open_viewer()
+        if self._process is not None:
+            end(self._process)
 
 
 def _screen_is_remote() -> bool:
@@ -236,7 +217,7 @@ def open_run(run: Path, mode: str, web_address: WebAddress | None = None, record
     if not recording.is_file():
         raise UsageError(f"{recording} does not exist; give the results folder of a run made with a view")
     if web_address is not None:
-        return Viewer.serve(web_address, run / "logs", recording, complete=True)
+        return Viewer.serve(web_address, recording, complete=True)
     viewer = Viewer.start(mode, run / "logs", recording, complete=True)
     if viewer is None:
         raise UsageError("a finished run cannot be opened with the view off; give auto, native or web")

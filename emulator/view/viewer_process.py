@@ -1,6 +1,8 @@
 """Starts and ends Rerun's viewer as a child process. Neither Rerun nor Zenoh is imported here.
 
-Rerun's own functions start viewers that listen on every interface; with its command, the interface can be chosen.
+Rerun's own functions start viewers that listen on every interface; with its command, the interface can be chosen. A viewer whose
+port another process has taken sends that process all it is given to show. So we give it nothing before it is known that the
+viewer itself listens.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from evedrop.processes import kill, wait_for
 from evedrop.results.folder import make_private, private_opener
 
 HOST = "127.0.0.1"
+_LSOF = "/usr/sbin/lsof"
 _START_SECONDS = 20.0
 _STOP_SECONDS = 3.0
 
@@ -68,6 +71,10 @@ os.execv(sys.argv[2], sys.argv[2:])
 """
 
 
+class PortTaken(UsageError):
+    """Another process listens at the port that a viewer was to have."""
+
+
 def guarded(command: Sequence[str], apart: bool = False) -> list[str]:
     """A command that ends with this process, on Linux; apart: with a network of its own, if the system allows it."""
     if sys.platform != "linux":
@@ -95,9 +102,11 @@ def spawn(
 ) -> subprocess.Popen[bytes]:
     """Start Rerun's command with these arguments, only on loopback; returns when it listens on `port`.
 
-    apart: with a network of its own, if the system allows it. patience: seconds to wait until it listens.
+    arguments: must not name what is to be shown, for another process may have taken the port. apart: with a network of its own,
+    if the system allows it. patience: seconds to wait until it listens.
 
-    Raises UsageError, with the last lines of its log, if it ends first or is not ready in time.
+    Raises PortTaken if another process listens there, and UsageError, with the last lines of its log, if it ends first or is not
+    ready in time.
     """
     with _log(logs) as log:
         start = log.tell()
@@ -114,10 +123,10 @@ def spawn(
             if _listens(process, port, patience):
                 return process
         except BaseException:
-            end(process)
+            _give_up(process)
             raise
         found = f"ended with status {process.poll()}" if process.poll() is not None else "was not ready in time"
-        end(process)
+        _give_up(process)
         log.seek(start)
         last = log.read().decode(errors="replace").strip().splitlines()[-5:]
     raise UsageError("\n".join([f"the viewer {found}; turn the view off to do without it. Its log ends:", *last]))
@@ -133,13 +142,20 @@ def end(process: subprocess.Popen[bytes]) -> None:
         shutil.rmtree(folder, ignore_errors=True)
 
 
+def _give_up(process: subprocess.Popen[bytes]) -> None:
+    end(process)
+    if process.stdin is not None:
+        process.stdin.close()
+
+
 def executable() -> Path:
-    """Rerun's command. Raises UsageError if rerun-sdk is not installed."""
+    """The file of Rerun's command. Raises UsageError if rerun-sdk is not installed."""
     found = importlib.util.find_spec("rerun_cli")
     if found is None or found.origin is None:
         raise UsageError("the viewer is not installed; install rerun-sdk, or turn the view off")
     folder = Path(found.origin).parent
-    return folder / ("rerun.exe" if sys.platform == "win32" else "rerun")
+    bundled = folder / "Rerun.app" / "Contents" / "MacOS" / "Rerun"
+    return bundled if sys.platform == "darwin" and bundled.exists() else folder / "rerun"
 
 
 def _listens(process: subprocess.Popen[bytes], port: int, patience: float) -> bool:
@@ -152,14 +168,52 @@ def _listens(process: subprocess.Popen[bytes], port: int, patience: float) -> bo
 
 
 def _is_there(process: subprocess.Popen[bytes], port: int) -> bool:
+    """Whether the process listens on the port. Raises PortTaken if another one does."""
     if is_apart(process):
-        lines = [
-            line.split() for line in Path(f"/proc/{process.pid}/net/tcp").read_text(encoding="ascii").splitlines()[1:]
-        ]
-        return any(local.endswith(f":{port:04X}") and state == "0A" for _, local, _, state, *_ in lines)
+        return bool(_inodes(process.pid, port))
     with socket.socket() as probe:
         probe.settimeout(1.0)
-        return probe.connect_ex((HOST, port)) == 0
+        if probe.connect_ex((HOST, port)) != 0:
+            return False
+    if owns(process.pid, port):
+        return True
+    raise PortTaken(
+        f"another process of this machine listens at {HOST}:{port}, where the viewer was to listen; nothing was shown to it. Try "
+        "again, choose the web view, or turn the view off"
+    )
+
+
+def owns(pid: int, port: int) -> bool:
+    """Whether a process of this user listens on a port of loopback; false, too, if the system does not say."""
+    if sys.platform != "linux":
+        return _lsof_says(pid, port)
+    sockets = {f"socket:[{inode}]" for inode in _inodes(pid, port)}
+    with contextlib.suppress(OSError):
+        for descriptor in Path(f"/proc/{pid}/fd").iterdir():
+            with contextlib.suppress(OSError):  # closed meanwhile
+                if os.readlink(descriptor) in sockets:
+                    return True
+    return False
+
+
+def _inodes(pid: int, port: int) -> list[str]:
+    """The inodes of the sockets that listen on a port of loopback in the network of a process; Linux only."""
+    try:
+        lines = Path(f"/proc/{pid}/net/tcp").read_text(encoding="ascii").splitlines()[1:]
+    except OSError:  # it has ended
+        return []
+    place = f"{int.from_bytes(socket.inet_aton(HOST), sys.byteorder):08X}:{port:04X}"
+    return [words[9] for words in map(str.split, lines) if words[1] == place and words[3] == "0A"]
+
+
+def _lsof_says(pid: int, port: int) -> bool:
+    """What lsof says, which macOS has."""
+    command = [_LSOF, "-nP", "-a", "-p", str(pid), f"-iTCP@{HOST}:{port}", "-sTCP:LISTEN", "-t"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=_START_SECONDS)
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    return done.stdout.split() == [str(pid)]
 
 
 def _log(logs: Path) -> IO[bytes]:

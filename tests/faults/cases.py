@@ -90,7 +90,7 @@ def _target(draw: random.Random, kind: str, variant: Variant) -> str:
     peers = [name for name in variant.processes if name != "router"]
     if kind in ("flap", "cut", "silence"):
         return draw.choice([*peers, EVERYBODY])
-    others = ["launcher", "router", *(["viewer"] if variant.view != "off" else [])]
+    others = ["launcher", "router"]
     if kind in SIGNALS:
         others += ["launcher"] * 4
     return draw.choice([*peers, *others])

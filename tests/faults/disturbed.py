@@ -130,8 +130,6 @@ class Disturbed:
         """The living processes of a name in a shard: one, or none."""
         if name == "launcher":
             return [] if self.over.is_set() else [self.launcher.pid]
-        if name == "viewer":
-            return [one.pid for one in ours.descendants() if one.is_viewer]
         firsts = self.firsts
         return [
             one.pid

@@ -54,11 +54,6 @@ class Process:
         last = self.words[-1] if self.words else ""
         return Path(last) if last.endswith(".json") and "/evedrop-" in last else None
 
-    @property
-    def is_viewer(self) -> bool:
-        """Whether it is Rerun's viewer."""
-        return bool(self.words) and Path(self.words[0]).name == "rerun"
-
 
 def descendants() -> Iterator[Process]:
     """All living processes that descend from us."""

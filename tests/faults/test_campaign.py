@@ -57,7 +57,7 @@ def test_a_number_is_always_the_same_case() -> None:
     assert {fault.kind for fault in faults} == set(KINDS)
     assert {fault.moment.phase for fault in faults} == set(PHASES)
     processes = {name for variant in VARIANTS.values() for name in variant.processes}
-    assert {fault.target for fault in faults} == {*processes, "launcher", "viewer", EVERYBODY, "results"}
+    assert {fault.target for fault in faults} == {*processes, "launcher", EVERYBODY, "results"}
     assert {fault.shard for fault in faults} == {0, 1}
 
 

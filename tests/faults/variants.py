@@ -58,7 +58,7 @@ class Variant:
 
     @property
     def processes(self) -> tuple[str, ...]:
-        """All that the launcher starts, for each shard, but the viewer."""
+        """All that the launcher starts, for each shard."""
         return ("router", "sensor", "observer", *self.receivers, *self.more)
 
     def path(self, folder: Path) -> str:

@@ -2,7 +2,7 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -35,10 +35,13 @@ def drawing(rrd: Path) -> int | None:
     for folder in Path("/proc").glob("[0-9]*"):
         try:
             words = (folder / "cmdline").read_text().split("\0")
+            parent = (folder / "stat").read_text().rpartition(")")[2].split()[1]
+            if "--headless" in words and Path(words[0]).name == "rerun":
+                assert str(rrd) not in words, "it would send the recording to whoever has its port"
+                if str(rrd) in Path(f"/proc/{parent}/cmdline").read_text().split("\0"):
+                    return int(folder.name)
         except OSError:
             continue
-        if "--headless" in words and str(rrd) in words and Path(words[0]).name == "rerun":
-            return int(folder.name)
     return None
 
 
@@ -120,6 +123,11 @@ class SlowClient:
         line = SimpleNamespace(name="slot_number", end=9)
         return SimpleNamespace(loading=[], views=[object()], recordings=[SimpleNamespace(timelines=[line])])
 
+    def open(self, urls: Sequence[str]) -> None:
+        """Load a recording."""
+        self._refuse()
+        self.opened = urls
+
     def take_screenshot(self, *_: object) -> bytes:
         """A picture."""
         self._refuse()
@@ -132,7 +140,8 @@ class SlowClient:
 
 def viewer_with(client: SlowClient, status: int | None = None) -> HeadlessViewer:
     """A viewer of this client, whose process has ended with this status, if any."""
-    return HeadlessViewer(cast(Any, client), cast(Any, SimpleNamespace(poll=lambda: status, returncode=status)))
+    process = SimpleNamespace(poll=lambda: status, returncode=status)
+    return HeadlessViewer(cast(Any, client), cast(Any, process), Path("r.rrd"))
 
 
 def test_a_busy_machine_does_not_end_a_picture() -> None:

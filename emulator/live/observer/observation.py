@@ -113,7 +113,7 @@ class ObservedRun:
 
     def show(self, web_address: WebAddress) -> Viewer:
         """Start a viewer for browsers at this address, which follows the recording of the run."""
-        viewer = Viewer.serve(web_address, self.folder / "logs", self.folder / "recording.rrd")
+        viewer = Viewer.serve(web_address, self.folder / "recording.rrd")
         tell(ViewOpened(viewer.address))
         return viewer
 
