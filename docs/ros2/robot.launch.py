@@ -22,7 +22,8 @@ def generate_launch_description() -> LaunchDescription:
     """The wire, and two nodes that know nothing of it."""
     return LaunchDescription(
         [
-            ExecuteProcess(cmd=["evedrop", "wire", str(WIRE), "--out", "runs/robot"], output="screen"),
+            # Without --out, each launch has its own folder and the same losses; with one, it would continue the last launch.
+            ExecuteProcess(cmd=["evedrop", "wire", str(WIRE)], output="screen"),
             Node(package="demo_nodes_cpp", executable="talker", additional_env=environment("robot")),
             Node(package="demo_nodes_cpp", executable="listener", additional_env=environment("base")),
         ]

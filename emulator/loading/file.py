@@ -194,13 +194,21 @@ def _across(
         return [f"modules: a class raised {place_of(error)} when it was asked about itself; expected no error"]
 
 
+_SHORT_FORMS = {"quality": "loss", "loss": "quality"}
+"""Entry of a link → the other form of it, which a change replaces."""
+
+
 def set_entry(tables: dict[str, Any], dotted: str, value: Any) -> None:
-    """Put a value at a dotted key. Tables may be new; list entries are given by number, including the next one."""
+    """Put a value at a dotted key; a link's `quality` replaces its `loss`, and the other way round.
+
+    Tables may be new; list entries are given by number, including the next one.
+    """
     names = dotted.split(".")
     inner: Any = tables
     for name, after in pairwise(names):
         new: Any = [] if after == "0" else {}
         if isinstance(inner, dict) and name:
+            inner.pop(_SHORT_FORMS.get(name), None)
             inner = inner.setdefault(name, new)
         elif isinstance(inner, list) and name.isdecimal() and int(name) <= len(inner):
             if int(name) == len(inner):
@@ -210,6 +218,7 @@ def set_entry(tables: dict[str, Any], dotted: str, value: Any) -> None:
             raise _no_such_key(dotted, name, inner)
     last = names[-1]
     if isinstance(inner, dict) and last:
+        inner.pop(_SHORT_FORMS.get(last), None)
         inner[last] = value
     elif isinstance(inner, list) and last.isdecimal() and int(last) <= len(inner):
         inner[int(last) : int(last) + 1] = [value]

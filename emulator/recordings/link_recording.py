@@ -27,7 +27,7 @@ Outcomes = NDArray[np.uint8]
 """1 delivered, 0 lost, (packets,)."""
 
 _PARQUET = (".parquet", ".pq")
-_EXPECTED = "expected a CSV or Parquet file of 0 (lost) and 1 (delivered)"
+_EXPECTED = "expected a CSV or Parquet file of 0 (lost) and 1 (delivered), or of delays"
 _LIMIT = Limit.of_rows(MOST_OUTCOMES)
 _MOST_BYTES = 2**28  # decompressed, of a row group of a Parquet file, whose column is in memory at once
 _LONGEST_VALUE = 100  # characters of a text found where a number should be
@@ -95,7 +95,7 @@ class LinkRecording:
         except ValueError:
             delay = -1.0
         if not delay >= 0.0 or math.isinf(delay):
-            self._no("file", f"{place} is {_shown(value)}; expected a delay in slots, or nothing for a lost packet")
+            self._no("file", f"{place} is {_shown(value)}; expected a delay, or nothing for a lost packet")
         return delay
 
     def columns(self) -> list[str]:

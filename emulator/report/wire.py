@@ -12,6 +12,8 @@ from evedrop.report.text_table import TextTable
 from evedrop.results.wire_summary import WireSummary
 from evedrop.score.summary import failed
 
+_WITHOUT_MODEL = {"overflow", "cut", "unlinked", "too_large", "looped"}
+"""The reasons for which messages are lost before a link's models decide on them."""
 _MARKS = {True: "yes", False: "NO", None: "–"}
 
 
@@ -70,10 +72,14 @@ def wire_sentences(summary: WireSummary) -> Iterator[str]:
     for name, link in summary.links.items():
         lost = _counted(link.lost_by)
         dropped = _counted(link.dropped_by)
+        undecided = [reason for reason in (*link.lost_by, *link.dropped_by) if reason in _WITHOUT_MODEL]
         if lost:
             yield f"{name} lost {lost}"
         if dropped:
             yield f"{name}: the wire itself, or Zenoh, dropped {dropped}"
+        if undecided and link.rate is not None:
+            reasons = " and ".join(reason.replace("_", " ") for reason in undecided)
+            yield f"{name}: rate, model and within leave out the messages by {reasons}, on which its models did not decide"
     yield from unlinked_sentence(summary)
     yield from (one.sentence for one in summary.expectations if one.held)
 

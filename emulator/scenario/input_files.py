@@ -116,9 +116,10 @@ def read_recordings(tables: Mapping[str, Any]) -> list[str]:
     mistakes = []
     delays = 0
     slots = tables.get("slots")
-    for path, trace, parameter in _recorded(tables):
+    for path, trace, model in _recorded(tables):
+        parameter = str(model.recorded)
         given, of_delays = parameter in trace, path.endswith("delay")
-        wrong = [f"{path}.{entry}: {what}" for entry, what in _replace(trace, parameter, of_delays)]
+        wrong = [f"{path}.{entry}: {what}" for entry, what in _replace(trace, model, of_delays)]
         mistakes += wrong
         contents = trace[parameter]
         if of_delays:
@@ -136,38 +137,41 @@ def read_recordings(tables: Mapping[str, Any]) -> list[str]:
     return mistakes
 
 
-def _recorded(tables: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any], str]]:
-    """Path and table of every loss or delay model that reads a recording, at any depth, and the parameter for its contents."""
+def _recorded(tables: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any], type[LossModel | DelayModel]]]:
+    """Path and table of every loss or delay model that reads a recording, at any depth, and its class."""
     entries = tables.items() if isinstance(tables, dict) else enumerate(tables) if isinstance(tables, list) else ()
     for name, inner in entries:
         if not isinstance(inner, (dict, list)):
             continue
-        parameter = _parameter_of(name, inner) if isinstance(inner, dict) else None
-        if isinstance(inner, dict) and parameter is not None:
-            yield f"{path}{name}", inner, parameter
+        model = _reader_of(name, inner) if isinstance(inner, dict) else None
+        if isinstance(inner, dict) and model is not None:
+            yield f"{path}{name}", inner, model
         else:
             yield from _recorded(inner, f"{path}{name}.")
 
 
-def _parameter_of(entry: str | int, table: Mapping[str, Any]) -> str | None:
-    """The parameter for the contents of a recording; None unless the table is a built-in loss or delay model that reads one."""
+def _reader_of(entry: str | int, table: Mapping[str, Any]) -> type[LossModel | DelayModel] | None:
+    """The class of a built-in loss or delay model that reads a recording; None for any other table."""
     models: Mapping[str, type[LossModel | DelayModel]]
     models = LOSS_MODELS if entry == "loss" else DELAY_MODELS if entry == "delay" else {}
-    model = table.get("model")
-    return models[model].recorded if isinstance(model, str) and model in {*models} else None
+    name = table.get("model")
+    model = models[name] if isinstance(name, str) and name in {*models} else None
+    return None if model is None or model.recorded is None else model
 
 
-def _replace(trace: dict[str, Any], entry: str, of_delays: bool) -> list[tuple[str, str]]:
-    """Put a recording's outcomes, or its delays, into an entry; returns the mistakes, (entry, description) each."""
+def _replace(trace: dict[str, Any], model: type[LossModel | DelayModel], of_delays: bool) -> list[tuple[str, str]]:
+    """Put a recording's outcomes, or its delays, into their entry; returns the mistakes, (entry, description) each."""
+    entry = str(model.recorded)
     file, column = trace.pop("file", None), trace.pop("column", None)
     lost = None if of_delays else trace.pop("lost", None)
     names = (("file", file), ("column", column), ("lost", lost))
     if entry in trace:
         extra = next((name for name, value in names if value is not None), None)
         return [(extra, f"is given together with {entry}; expected one of them")] if extra else []
+    misnamed = set(trace) - {"model", *model.parameters}  # perhaps the file, and a mistake of its own
     trace[entry] = [0.0] if of_delays else _STAND_IN
     if file is None:
-        return [("file", 'is missing; expected file = "walk.csv"')]
+        return [] if misnamed else [("file", f'is missing; expected file = "walk.csv", or {entry}')]
     wrong = [
         (name, f"is {as_toml(value)}; expected a string")
         for name, value in names

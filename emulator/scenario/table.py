@@ -176,8 +176,9 @@ def model_mistakes(entry: str, found: Any, models: Registry[Any]) -> list[Found]
         for name, example in model.parameters.items()
         if name not in given and name not in model.optional
     ]
+    names = {*model.parameters, *(("file",) if getattr(model, "recorded", None) is not None else ())}
     mistakes += [
-        (f"{entry}.{name}", f"is not a parameter of {found['model']}; expected {listed(sorted(model.parameters))}")
+        (f"{entry}.{name}", f"is not a parameter of {found['model']}; expected {listed(sorted(names))}")
         for name in given
         if name not in model.parameters
     ]

@@ -21,7 +21,7 @@ from evedrop.scenario.input_files import read_recordings, recordings_located
 from evedrop.scenario.sentences import sentences
 from evedrop.scenario.toml_text import toml_text
 from evedrop.scenario.values import unusable
-from evedrop.wire.across import link_names, mistakes_across
+from evedrop.wire.across import link_names, mistakes_across, unknown
 from evedrop.wire.plan import Side, SideTls, WireEvent, WireLink, WirePlan
 from evedrop.wire.tables import SideTable, TlsTable, WireEventTable, WireFile, WireLinkTable, changed_settings
 
@@ -29,7 +29,7 @@ _MOST_BYTES = 2**28
 
 
 def load_wire(path: str | Path, changes: Mapping[str, Any] | None = None) -> WirePlan:
-    """The wire in a file, with changes by dotted key.
+    """The wire in a file, with changes by dotted key, which names a link by its name or its number.
 
     Raises ScenarioError with every mistake, UsageError if the file cannot be read.
     """
@@ -40,8 +40,9 @@ def load_wire(path: str | Path, changes: Mapping[str, Any] | None = None) -> Wir
         example = "a wire file is a TOML file; `evedrop wire --example` prints one"
         raise UsageError(f"{shown(path)} cannot be read ({error}); {example}") from error
     tables = tables_in(text, shown(path))
-    with with_line_numbers(text, changes or ()):
-        return wire_of(tables, shown(path), changes, folder=path.parent)
+    numbered = {_by_number(key, tables): value for key, value in (changes or {}).items()}
+    with with_line_numbers(text, numbered):
+        return wire_of(tables, shown(path), numbered, folder=path.parent)
 
 
 def example_wire() -> str:
@@ -88,6 +89,19 @@ def resolved_wire(plan: WirePlan) -> str:
             "expect": [one.model_dump(exclude_none=True) for one in plan.expectations],
         }
     )
+
+
+def _by_number(key: str, tables: Mapping[str, Any]) -> str:
+    """The dotted key of a change, with a link's number in place of its name. Raises UsageError for another name."""
+    table, _, rest = key.partition(".")
+    name, dot, entry = rest.partition(".")
+    links = tables.get("link")
+    if table != "link" or not name or name.isdecimal() or not isinstance(links, list):
+        return key
+    names = link_names([link if isinstance(link, Mapping) else {} for link in links])
+    if name not in names:
+        raise UsageError(f"{key}: {unknown(name, names, 'link')}, or a number from 0")
+    return f"link.{names.index(name)}{dot}{entry}"
 
 
 def _located(tables: dict[str, Any], folder: Path) -> None:

@@ -5,7 +5,7 @@ Source: docs/wire.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from evedrop.errors import RunError
@@ -14,11 +14,13 @@ from evedrop.report.wire import wire_failures
 from evedrop.results.folder import make_private, new_folder, write_private
 from evedrop.results.wire_folder import WIRE_FILE
 from evedrop.results.wire_summary import WIRE_SUMMARY_FILE
+from evedrop.scenario.wire_table import PUT
 from evedrop.signals import stop_on_signals
 from evedrop.wire.closing import closing_lines
 from evedrop.wire.conductor import WireConductor
 from evedrop.wire.control import WireControl
 from evedrop.wire.file import resolved_wire
+from evedrop.wire.history import Numbered
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_reader import JOURNAL_FOLDER
 from evedrop.wire.live_view import live_view
@@ -65,6 +67,8 @@ def run_wire(
                 say(
                     f"{journal.recovered:,} messages were recovered from an earlier start, which was killed; their numbers go on"
                 )
+            if journal.start > 1:
+                say(continuation(journal.start, journal.counts))
             with WireRelay(plan, journal, warn) as relay:
                 for name, endpoints in relay.endpoints.items():
                     say(f"{name} {' '.join(endpoints)}")
@@ -83,6 +87,19 @@ def run_wire(
         raise RunError(_removed(journal.removed, out))
     say(f"results: {out}")
     return status
+
+
+def continuation(start: int, counts: Mapping[Numbered, int]) -> str:
+    """The sentence about a start in the folder of an earlier one. counts: the number of each stream's next message, from 0."""
+    if not counts:
+        return f"start {start} continues start {start - 1}, which numbered no message"
+    (link, key, kind), number = max(counts.items(), key=lambda one: one[1])
+    others = f", and likewise for {len(counts) - 1:,} more" if len(counts) > 1 else ""
+    what = "message" if kind == PUT else kind
+    return (
+        f"start {start} continues start {start - 1}: {what} {number + 1:,} of {key} on the link {link} is next{others}; for the "
+        "fates of a first start, give another folder"
+    )
 
 
 def _removed(folder: Path, out: Path) -> str:

@@ -104,7 +104,7 @@ def expressions_of(side: Side, links: Iterable[WireLink] = ()) -> tuple[str, ...
 
 def side_config(side: Side, largest: int, users_file: str | None) -> ZenohConfig:
     """The configuration of a side's session. Messages keep the timestamp that they have, or have none."""
-    link: ZenohConfig = {"rx": {"max_message_size": max(largest, 2**30)}}
+    link: ZenohConfig = {"rx": {"max_message_size": max(2 * largest, 2**30)}}  # what is larger is in no journal
     if side.tls is not None:
         link["tls"] = _tls(side.tls)
     config: ZenohConfig = {

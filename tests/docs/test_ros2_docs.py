@@ -23,6 +23,12 @@ def test_the_readme_says_so_too() -> None:
     assert "not yet with nodes" in row
 
 
+def test_each_launch_has_the_same_losses() -> None:
+    """Its wire has a folder of its own: in a fixed one, the second launch would continue the fates of the first."""
+    launch = (ROOT / "docs" / "ros2" / "robot.launch.py").read_text(encoding="utf-8")
+    assert re.findall(r"cmd=(.*?\])", launch) == ['["evedrop", "wire", str(WIRE)]']
+
+
 def test_no_test_runs_a_node() -> None:
     """The day one does, these pages may say more."""
     tests = (path for path in (ROOT / "tests").rglob("*.py") if path != Path(__file__).resolve())

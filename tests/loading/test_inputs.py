@@ -58,6 +58,16 @@ def test_all_mistyped_models_of_events_are_told_at_once() -> None:
         assert said in found
 
 
+def test_a_change_replaces_the_other_form_of_a_links_losses() -> None:
+    """A quality a loss model, a loss model a quality, and a part of a loss model a quality; not both in one file."""
+    changed = load("bursts", {"legitimate.link.quality": 0.8})
+    assert changed.legitimate.link.loss_spec == {"model": "bernoulli", "quality": 0.8}
+    model = {"model": "gilbert-elliott", "p": 0.1, "r": 0.5}
+    assert load("vehicle", {"legitimate.link.loss": model}).legitimate.link.loss_spec == model
+    parts = {f"legitimate.link.loss.{name}": value for name, value in model.items()}
+    assert load("vehicle", parts).legitimate.link.loss_spec == model
+
+
 def test_an_event_on_pooled_links_is_looked_at_too() -> None:
     """It puts one link in place of them all, which needs a quality or a loss model; both are checked."""
     text = BASE + POOLED + event("{ corrupt = 0.1 }", "pool") + event('{ loss = { model = "nope" } }', "pool", 5)

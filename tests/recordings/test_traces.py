@@ -148,7 +148,7 @@ def test_parquet_says_row_and_gap(tmp_path: Path) -> None:
 def test_a_delay_that_is_none_is_said(tmp_path: Path, delay: str) -> None:
     """Negative, infinite, no number."""
     path = write(tmp_path, "walk.csv", f"delay\n1\n{delay}\n")
-    with pytest.raises(TraceError, match=f'line 3 is "{delay}"; expected a delay in slots'):
+    with pytest.raises(TraceError, match=f'line 3 is "{delay}"; expected a delay, or nothing'):
         LinkRecording(path).delays("delay")
 
 
@@ -163,7 +163,8 @@ def mistakes(folder: Path, loss: dict[str, Any], **more: Any) -> list[str]:
 @pytest.mark.parametrize(
     ("loss", "said"),
     [
-        ({}, 'file: is missing; expected file = "walk.csv"'),
+        ({}, 'file: is missing; expected file = "walk.csv", or outcomes'),
+        ({"fiel": "walk.csv"}, "fiel: is not a parameter of trace; expected file, once, outcomes or random_start"),
         ({"column": "a"}, 'file: is missing; expected file = "walk.csv"'),
         ({"file": 3}, "file: is 3; expected a string"),
         ({"file": "walk.csv", "column": True}, "column: is true; expected a string"),

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zenoh
@@ -17,6 +18,8 @@ from evedrop.wire.crossing import Crossing
 from evedrop.wire.plan import Side
 from tests.conftest import wait_until
 from tests.wire.wire_at_work import ANYWHERE, WireAtWork, at_work, both_ways, link, plan_of
+
+PAGE = Path(__file__).parents[2] / "docs" / "wire.md"
 
 
 def alive(session: zenoh.Session, key: str = "**") -> list[str]:
@@ -46,6 +49,19 @@ def test_more_tokens_cross_than_a_channel_of_zenoh_holds(tmp_path: Path) -> None
 def wire_knows(wire: WireAtWork, side: str) -> bool:
     """Whether the wire knows that a program at a side holds the token."""
     return "both" in wire.relay.tokens[side]
+
+
+def test_matching_status_is_always_true(tmp_path: Path) -> None:
+    """Without any program at the other side, as docs/wire.md says: what the wire itself declares matches everything."""
+    with at_work(both_ways(), tmp_path) as wire, wire.program("robot") as robot:
+        publisher, querier = robot.declare_publisher("no/sub"), robot.declare_querier("no/such")
+        wait_until(lambda: _matches(publisher) and _matches(querier), "both match")
+    assert "| matching status of publishers and queriers | **always true**" in PAGE.read_text(encoding="utf-8")
+
+
+def _matches(declared: Any) -> bool:
+    status = declared.matching_status
+    return bool(status.matching)
 
 
 def test_the_same_token_at_both_sides_lives_as_long_as_one_of_its_programs(tmp_path: Path) -> None:

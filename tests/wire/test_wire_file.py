@@ -161,6 +161,50 @@ def test_changes_by_dotted_key(tmp_path: Path) -> None:
     assert plan.links[1].name == "base-robot"
 
 
+RADIO = """
+[side.robot]
+[side.base]
+[[link]]
+from = "robot"
+to = "base"
+quality = 0.5
+[[link]]
+name = "tele-metry"
+from = "base"
+to = "robot"
+loss = { model = "gilbert-elliott", p = 0.1, r = 0.3 }
+"""
+
+
+@pytest.mark.parametrize("link", ["1", "tele-metry"])
+def test_a_quality_replaces_a_loss_and_the_other_way_round(link: str, tmp_path: Path) -> None:
+    """By the number of a link or by its name, as it is in the file or as the wire calls it."""
+    path = tmp_path / "radio.toml"
+    path.write_text(RADIO)
+    both = {f"link.{link}.quality": 0.9, "link.robot-base.loss": {"model": "pattern", "outcomes": "10"}}
+    plan = load_wire(path, both)
+    assert [one.settings["loss"]["model"] for one in plan.links] == ["pattern", "bernoulli"]
+    assert plan.links[1].settings["loss"]["quality"] == 0.9
+    assert (
+        load_wire(path, {f"link.{link}": {"from": "base", "to": "robot"}}).links[1].settings["loss"]["quality"] == 1.0
+    )
+
+
+def test_an_unknown_link_and_a_mistake_in_a_change_are_named(tmp_path: Path) -> None:
+    """With the links that there are; a mistake in a changed entry has no line of the file."""
+    path = tmp_path / "radio.toml"
+    path.write_text(RADIO)
+    with pytest.raises(
+        UsageError, match=r"link\.telemetry\.quality: is .*telemetry.*expected robot-base or tele-metry"
+    ):
+        load_wire(path, {"link.telemetry.quality": 0.9})
+    with pytest.raises(ScenarioError) as caught:
+        load_wire(path, {"link.tele-metry.quality": 1.9})
+    (line,) = caught.value.mistakes
+    assert line.startswith("link.1.quality: is 1.9")
+    assert "(line" not in line
+
+
 def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
     """It is named, with the way to an example; text that is not TOML is refused."""
     with pytest.raises(UsageError, match=r"wire.toml cannot be read \(No such file.*--example"):

@@ -13,8 +13,10 @@ from evedrop.live.protocol.requests import StatusRequest
 from evedrop.live.protocol.wire_status import WireStatus
 from evedrop.wire.fates import KeyFates
 from evedrop.wire.file import load_wire
+from evedrop.wire.run import continuation, run_wire
 from tests.conftest import Evedrop, Live, wait_until
 from tests.wire.wire_at_work import program
+from tests.wire.wire_plans import wire_plan
 
 FILE = """
 seed = 7
@@ -54,6 +56,19 @@ def carrying(evedrop: Evedrop, path: Path, numbers: range, arrived: list[int]) -
     return wire
 
 
+def test_a_first_start_and_one_without_messages_continue_nothing(tmp_path: Path) -> None:
+    """Only a second start says so; the numbers of queries are named as such."""
+    first: list[str] = []
+    second: list[str] = []
+    for said in (first, second):
+        assert run_wire(wire_plan(), tmp_path / "out", seconds=0.01, say=said.append) == 0
+    assert [line for line in first if "continues" in line] == []
+    assert "start 2 continues start 1, which numbered no message" in second
+    assert continuation(3, {("up", "a", "query"): 7}).startswith(
+        "start 3 continues start 2: query 8 of a on the link up is next;"
+    )
+
+
 def test_a_wire_that_was_killed_goes_on_with_its_fates(evedrop: Evedrop) -> None:
     """Kill -9 of the command between two starts: what arrives is what one wire would have let through."""
     path = evedrop.folder / "robot.toml"
@@ -68,6 +83,8 @@ def test_a_wire_that_was_killed_goes_on_with_its_fates(evedrop: Evedrop) -> None
     done = wire.end()
     assert done.status == 0, done.err
     assert "messages were recovered from an earlier start, which was killed; their numbers go on" in done.out
+    said = f"start 2 continues start 1: message {COUNT + 1} of scan on the link scan is next, and likewise for 1 more; for the "
+    assert said in done.out
     (link, _) = load_wire(path).links
     fates = KeyFates(link, "scan", "put", 7)
     assert arrived == [n for n in range(2 * COUNT) if fates.next()[0] == 0]

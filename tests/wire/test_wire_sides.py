@@ -14,7 +14,7 @@ from evedrop.live.launch.authority import Authority
 from evedrop.ports import free_port
 from evedrop.wire.crossing import Crossing
 from evedrop.wire.plan import Side, SideTls
-from evedrop.wire.side import SideSession
+from evedrop.wire.side import SideSession, side_config
 from tests.conftest import wait_until
 from tests.wire.test_wire_publications import reader, ready
 from tests.wire.wire_at_work import ANYWHERE, at_work, both_ways, link, plan_of, program
@@ -26,16 +26,25 @@ def a_router(**config: Any) -> zenoh.Session:
     return zenoh.open(zenoh.Config.from_json5(json.dumps({"mode": "router", "scouting": quiet, **config})))
 
 
-def test_the_endpoint_has_the_real_port() -> None:
-    """And a fixed port is told as it is."""
+@pytest.mark.parametrize("protocol", ["tcp", "ws"])
+def test_the_endpoint_has_the_real_port(protocol: str) -> None:
+    """A program can connect there. And a fixed port is told as it is."""
     port = free_port()
     with (
-        SideSession(Side("a", (ANYWHERE,)), 100) as one,
+        SideSession(Side("a", (f"{protocol}/127.0.0.1:0",)), 100) as one,
         SideSession(Side("b", (f"tcp/127.0.0.1:{port}",)), 100) as other,
     ):
-        assert one.endpoints[0].startswith("tcp/127.0.0.1:")
+        assert one.endpoints[0].startswith(f"{protocol}/127.0.0.1:")
+        with program(one.endpoints) as session:
+            assert [str(router) for router in session.info.routers_zid()] == [one.zid]
         assert not one.endpoints[0].endswith(":0")
         assert other.endpoints == (f"tcp/127.0.0.1:{port}",)
+
+
+def test_a_message_twice_as_large_as_the_largest_is_still_heard() -> None:
+    """So it has a fate, `too_large`: Zenoh discards only what is larger still, and more than 1 GiB."""
+    for largest, limit in ((2**30, 2**31), (1000, 2**30)):
+        assert side_config(Side("a"), largest, None)["transport"]["link"]["rx"]["max_message_size"] == limit
 
 
 def test_a_port_that_is_taken_is_reported(tmp_path: Path) -> None:

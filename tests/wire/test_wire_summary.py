@@ -148,6 +148,8 @@ def test_what_no_model_decides_is_named_apart(tmp_path: Path) -> None:
     assert link["gap_messages"] == 10
     said = "\n".join(wire_sentences(read(tmp_path)))
     assert "link lost 1 by loss, 1 by corrupted, 1 by overflow, 1 by cut" in said
+    apart = "overflow and cut and unlinked and too large and looped"
+    assert f"link: rate, model and within leave out the messages by {apart}, on which its models did not decide" in said
     assert "the wire itself, or Zenoh, dropped 1 by unlinked, 1 by too large" in said
     assert "no link of the file takes 1 message" in said
     title, heading, _, first = [line for line in closing_lines(read(tmp_path)) if line.strip()][:4]
