@@ -15,7 +15,7 @@ import fcntl
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, final
@@ -159,10 +159,16 @@ class Unfinished:
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._rounds = os.open(place / _ROUNDS, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o600)
 
-    def round(self, at: str, slots: int, streams: Mapping[str, TableStream]) -> None:
-        """Write the rows that all streams hold back, then the line that makes them count. Raises OSError on failure."""
+    def round(
+        self, at: str, slots: int, streams: Mapping[str, TableStream], before: Callable[[], None] = lambda: None
+    ) -> None:
+        """Write the rows that all streams hold back, call `before`, and write the line that makes the rows count.
+
+        Raises OSError on failure.
+        """
         for stream in streams.values():
             stream.write()
+        before()
         tables = {name: (stream.file, stream.rows) for name, stream in streams.items()}
         line = json.dumps({"at": at, "slots": slots, "tables": tables}).encode() + b"\n"
         if os.write(self._rounds, line) != len(line):

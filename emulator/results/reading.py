@@ -230,7 +230,8 @@ def _cut_short(folder: Path) -> dict[str, Any]:
         else f"cut short at {at}, because its run was killed or its disk was full"
     )
     if summary["ended"] != at:
-        ended += f" (the figures are as of {summary['ended']}; the tables have more)"
+        more = "; the tables have more" if summary["slots"] < found.slots else ""
+        ended += f" (the figures are as of {summary['ended']}{more})"
     return {**summary, "slots": found.slots, "ended": ended}
 
 

@@ -160,17 +160,23 @@ class ResultsWriter:
         least, most = _ROUND_BYTES
         if began < self._round_due and self._bytes < min(most, max(least, self._on_disk // _ROUND_SHARE)):
             return
-        if began >= self._figures_due:
+        first = not self._figures_before
+        due = first or began >= self._figures_due
+        if due:
             before()
-        self._round()
-        self._round_due = time.monotonic() + _ROUND_SECONDS
-        if began >= self._figures_due:
-            self._figures_due = self._round_due
-            self.write_figures(figures())
-            # The first call imports the theory, so its time says nothing about the next.
-            took = time.monotonic() - began if self._figures_before else 0.0
+        if first:  # rows without figures could not be looked at, if the run were killed now
+            earliest = figures()
+            self._round(lambda: self.write_figures(earliest))
             self._figures_before = True
-            self._figures_due = time.monotonic() + max(_ROUND_SECONDS, _FIGURES_SHARE * took)
+        else:
+            self._round()
+        self._round_due = time.monotonic() + _ROUND_SECONDS
+        if due:
+            self._figures_due = self._round_due
+        if due and not first:  # the first figures import the theory, so their time says nothing about the next
+            self.write_figures(figures())
+            now = time.monotonic()
+            self._figures_due = now + max(_ROUND_SECONDS, _FIGURES_SHARE * (now - began))
 
     def write_rows(self, at: str) -> None:
         """Write all rows to disk now. Raises OSError as `checkpoint` does."""
@@ -193,13 +199,14 @@ class ResultsWriter:
         self._outdated.append(self._streams["slots"])
         self._streams["slots"] = self._stream("slots", self._restarts)
 
-    def _round(self) -> None:
+    def _round(self, before: Callable[[], None] = lambda: None) -> None:
+        """Write all rows; before: called when they are written, and do not count yet."""
         if self._broken:  # rows after an incomplete batch could not be read
             raise OSError(errno.EIO, "an earlier part could not be written")
         self._broken = True  # until the round succeeds
         if self._taken is not None:
             self._taken.write()
-        self._unfinished.round(self._at, self._slots, self._streams)
+        self._unfinished.round(self._at, self._slots, self._streams, before)
         self._broken = False
         self._on_disk, self._bytes = self._on_disk + self._bytes, 0
         for stream in self._outdated:

@@ -22,10 +22,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evedrop.errors import UsageError
+from evedrop.live.launch.process_set import note_end
+from evedrop.loading import load
 from evedrop.results.growing_tables import UNFINISHED, goes_on, last_round
+from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.summary_file import unwritten
 from evedrop.results.writer import Results, ResultsWriter, load_results
+from evedrop.score.scorekeeper import Ending, summary_of
+from evedrop.score.summary import Summary
 from evedrop.score.sums import SlotSums
+from evedrop.score.totals import Totals
 from evedrop.view.replay import replay
 from tests.conftest import Evedrop, Live, wait_until
 from tests.examples import examples
@@ -44,14 +50,21 @@ ResultsWriter.checkpoint = lambda *all: None
 
 def kill_all(live: Live) -> None:
     """Kill -9 of the command and of all its processes, at once."""
-    found = [live.process.pid, *live.left()]
-    for number in (signal.SIGSTOP, signal.SIGKILL):  # stopped, so that none can notice that another one is gone
-        for pid in found:
-            with suppress(ProcessLookupError):  # it may just have ended
-                os.kill(pid, number)
+    found: list[int] = []
+    # Stopped first, so that none can notice that another one is gone, and until none is left that may start others.
+    while started := [pid for pid in (live.process.pid, *live.left()) if pid not in found]:
+        found += started
+        _send(signal.SIGSTOP, started)
+    _send(signal.SIGKILL, found)
     live.process.communicate()
     wait_until(lambda: not live.left(), "no process left of the run")
     wait_until(lambda: all(map(ended, found)), "processes that have let go of their files")
+
+
+def _send(number: signal.Signals, processes: list[int]) -> None:
+    for pid in processes:
+        with suppress(ProcessLookupError):  # it may just have ended
+            os.kill(pid, number)
 
 
 def ended(pid: int) -> bool:
@@ -119,7 +132,8 @@ MOMENTS: dict[str, Callable[[Live], object]] = {
 )
 def test_a_run_may_be_killed_at_any_moment(evedrop: Evedrop, what: str) -> None:
     """From its first file to its last: the folder opens with whole tables, or says in a line why there is nothing."""
-    live = evedrop.live("eavesdroppers", "--slots", "20000" if what == "figures" else "3000")
+    slots = 20000 if what == "figures" else 3000
+    live = evedrop.live("eavesdroppers", "--slots", str(slots))
     wait_until(lambda: MOMENTS[what](live), what)
     kill_all(live)
     if not last_round(live.folder).at and not (live.folder / "summary.json").exists():
@@ -131,7 +145,7 @@ def test_a_run_may_be_killed_at_any_moment(evedrop: Evedrop, what: str) -> None:
     if results.summary["ended"] != "complete":
         cut_short(live)
     else:
-        assert results.trials.num_rows == 4 * 3000
+        assert results.trials.num_rows == 4 * slots
     if what in {"parquet", "end"}:
         assert results.summary["slots"] == 3000
     assert evedrop("view", "run", "--table").status == 0
@@ -283,6 +297,44 @@ def test_a_writer_may_stop_at_any_byte(rounds: list[int], data: st.DataObject) -
         assert last_round(folder).slots == slots
         rows = Results(folder, {}).slots.to_pylist()
         assert [row["slot"] for row in rows if row["peer"] == "smart"] == list(range(slots))
+
+
+def test_no_rows_are_on_disk_before_the_first_figures(tmp_path: Path) -> None:
+    """Or a run that is killed just then could not be looked at: only its own classes could make figures of nothing."""
+    scenario = load("microgrid")
+    nothing = summary_of(
+        scenario, Totals.nothing(scenario, 1), dict.fromkeys(scenario.digested), Ending(0.0, "slot 10")
+    )
+
+    def figures() -> Summary:
+        assert not last_round(tmp_path).slots
+        return nothing
+
+    write_resolved(tmp_path, scenario)
+    with ResultsWriter.of(tmp_path, scenario) as writer:
+        for receiver in scenario.receivers:
+            writer.slot_rows(0, receiver, sums(10), np.zeros(10))
+
+        def on_disk() -> bool:
+            writer.checkpoint("slot 10", figures)
+            return last_round(tmp_path).slots == 10
+
+        wait_until(on_disk, "rows on disk")
+        assert load_results(tmp_path).summary["ended"] == "the run goes on, at slot 10"
+
+
+def test_the_end_of_a_run_without_figures_keeps_its_rows(tmp_path: Path) -> None:
+    """The launcher notes why the run ended, and takes nothing from what was measured."""
+    scenario = load("microgrid")
+    write_resolved(tmp_path, scenario)
+    writer = ResultsWriter.of(tmp_path, scenario)
+    for receiver in scenario.receivers:
+        writer.slot_rows(0, receiver, sums(10), np.zeros(10))
+    writer.write_rows("slot 10")
+    note_end(tmp_path, scenario, "observer was ended by signal 9")
+    results = load_results(tmp_path)
+    assert (results.summary["ended"], results.summary["slots"]) == ("observer was ended by signal 9", 10)
+    assert results.slots.num_rows == 10 * len(scenario.receivers)
 
 
 def sizes(folder: Path) -> dict[str, int]:

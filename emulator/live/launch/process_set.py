@@ -100,7 +100,7 @@ def launch_one(
                 _forget(folder)
             elif isinstance(error, EvedropError):
                 with contextlib.suppress(OSError):
-                    _note(held.now, scenario, "interrupted" if isinstance(error, Interrupted) else str(error))
+                    note_end(held.now, scenario, "interrupted" if isinstance(error, Interrupted) else str(error))
             if isinstance(error, Interrupted):
                 raise Interrupted.with_results(_now(held)) from None
             raise
@@ -155,33 +155,36 @@ def _forget(folder: Path) -> None:
         shutil.rmtree(folder)
 
 
-def _note(folder: Path, scenario: Scenario, how: str) -> None:
+def note_end(folder: Path, scenario: Scenario, how: str) -> None:
     """Write the reason for the run's end into its summary, and finish the tables that the observer could not finish.
 
     Raises OSError if the folder cannot be written.
     """
     # Tables and theory are slow to import, and a run that ends well needs neither.
-    from evedrop.results.growing_tables import UNFINISHED, finish, is_unfinished  # noqa: PLC0415
+    from evedrop.results.growing_tables import UNFINISHED, finish, is_unfinished, last_round  # noqa: PLC0415
     from evedrop.results.writer import ResultsWriter, load_results, write_summary  # noqa: PLC0415
     from evedrop.score.scorekeeper import Ending, summary_of  # noqa: PLC0415
     from evedrop.score.totals import Totals  # noqa: PLC0415
 
     left_behind = is_unfinished(folder)
+    rows = last_round(folder)
     try:
         summary = replace(load_results(folder).typed_summary, ended=how)
-    except UsageError:
+    except UsageError:  # there are no figures
         totals = Totals.nothing(scenario, scenario.trials)
         summary = summary_of(scenario, totals, dict.fromkeys(scenario.digested), Ending(0.0, how))
-        shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
-        if not any(folder.glob("*.parquet")):
-            with ResultsWriter.of(folder, scenario):
-                pass
-    else:
-        if left_behind:
-            # The recording lacks its end; `evedrop view` makes another one from the tables.
-            (folder / "recording.rrd").unlink(missing_ok=True)
-            with contextlib.suppress(OSError):  # the disk is full: the streams stay, and can be read
-                finish(folder)
+        summary = replace(summary, slots=rows.slots)
+        if not rows.at:
+            left_behind = False
+            shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
+            if not any(folder.glob("*.parquet")):
+                with ResultsWriter.of(folder, scenario):
+                    pass
+    if left_behind:
+        # The recording lacks its end; `evedrop view` makes another one from the tables.
+        (folder / "recording.rrd").unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # the disk is full: the streams stay, and can be read
+            finish(folder)
     write_summary(folder, summary)
 
 
