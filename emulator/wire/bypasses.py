@@ -7,9 +7,12 @@ Source: docs/wire.md, what programs need.
 
 from __future__ import annotations
 
+import contextlib
+import json
 import threading
-from collections.abc import Callable, Iterable
-from typing import final
+import time
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, final
 
 import zenoh
 
@@ -17,6 +20,8 @@ from evedrop.wire.side import SideSession
 
 MOST = 20
 """The bypasses that are told one by one: programs that connect again and again must not fill the history."""
+_MULTICAST: Mapping[str, Any] = {"enabled": True}
+_SCOUT_SECONDS = 4.0  # Zenoh asks at once, after one second, and after two more
 
 
 @final
@@ -28,16 +33,39 @@ class Bypasses:
         self._tell = tell
         self._told = 0
         self._programs: set[tuple[str, str]] = set()
+        self._allowed: dict[str, str] = {}  # program that may be a peer, and has not been heard by multicast → its side
+        self._new = False  # whether one has come since the last scouting began
+        self._scout: zenoh.Scout[None] | None = None
+        self._until = 0.0
         self._lock = threading.Lock()
         self._listeners: list[object] = []  # Zenoh undeclares those that nobody holds
 
     def watch(self, sides: Iterable[SideSession]) -> None:
-        """Notice programs in mode peer from now on, and those that are there, at sides whose file does not allow them."""
+        """Notice programs in mode peer from now on, and those that are there."""
         self._listeners += [
-            side.session.info.declare_transport_events_listener(self._listener(side.name), history=True)
+            side.session.info.declare_transport_events_listener(
+                self._scouted(side.name) if side.side.peers else self._listener(side.name), history=True
+            )
             for side in sides
-            if not side.side.peers
         ]
+
+    def update(self) -> None:
+        """Look by multicast, for some seconds, for programs that may be peers because their multicast scouting is off."""
+        if self._scout is not None and time.monotonic() > self._until:
+            self.close()
+        if self._new and self._scout is None:
+            self._new = False
+            self._until = time.monotonic() + _SCOUT_SECONDS
+            config = zenoh.Config.from_json5(json.dumps({"scouting": {"multicast": _MULTICAST}}))
+            scout: Callable[..., Any] = zenoh.scout  # whose type hints lack the form with a callback
+            with contextlib.suppress(zenoh.ZError):  # a machine without multicast, on which nobody is found
+                self._scout = scout(self._answered, "peer", config)
+
+    def close(self) -> None:
+        """End the scouting, if there is one."""
+        if self._scout is not None:
+            self._scout.stop()
+            self._scout = None
 
     def add(self, line: str) -> None:
         """Tell a bypass; of more than MOST, only that there are more."""
@@ -54,7 +82,7 @@ class Bypasses:
             program = (side, str(event.transport.zid))
             if event.kind != zenoh.SampleKind.PUT or event.transport.whatami != zenoh.WhatAmI.PEER:
                 return
-            if program not in self._programs:  # each once, however often it connects
+            if program not in self._programs and self._told <= MOST:  # each once, however often it connects
                 self._programs.add(program)
                 self.add(
                     f"the program {program[1]} at side {side} is in mode peer: such programs find each other past the wire, so "
@@ -63,3 +91,26 @@ class Bypasses:
                 )
 
         return changed
+
+    def _scouted(self, side: str) -> Callable[[zenoh.TransportEvent], None]:
+        """Notes the peers of a side that allows them, for `update`."""
+
+        def changed(event: zenoh.TransportEvent) -> None:
+            program = str(event.transport.zid)
+            if event.kind != zenoh.SampleKind.PUT:
+                self._allowed.pop(program, None)
+            elif event.transport.whatami == zenoh.WhatAmI.PEER:
+                self._allowed[program] = side
+                self._new = True
+
+        return changed
+
+    def _answered(self, hello: zenoh.Hello) -> None:
+        """Tell a program that answers multicast scouting, if it is at a side."""
+        side = self._allowed.pop(str(hello.zid), None)
+        if side is not None:
+            self.add(
+                f"the program {hello.zid} at side {side} answers multicast scouting, although side.{side}.peers = true says that "
+                "its scouting is off: programs find it past the wire, so the wire has no verdict; set "
+                "scouting/multicast/enabled = false in its configuration"
+            )

@@ -96,15 +96,16 @@ class WireRelay:
         ]
         for relay in relays:
             stack.callback(relay.close)
-        bypasses = Bypasses(self._note_bypass)
-        self._neighbours = Neighbours(self.sides, [*links.values()], self._tell, bypasses)
+        self._bypasses = Bypasses(self._note_bypass)
+        self._neighbours = Neighbours(self.sides, [*links.values()], self._tell, self._bypasses)
         self._liveliness = LivelinessRelay(self.sides, plan, self._woken.set, EntityLog(journal.folder).add)
         stack.callback(self._liveliness.close)
         self._look()
         self._queries.start()
         for relay in relays:
             relay.start()
-        bypasses.watch(self.sides.values())
+        self._bypasses.watch(self.sides.values())
+        stack.callback(self._bypasses.close)
         thread = threading.Thread(target=self._keep_up, name="wire", daemon=True)
         thread.start()
         stack.callback(thread.join)
@@ -141,6 +142,7 @@ class WireRelay:
                 self._look()
                 if time.monotonic() >= due:
                     self._neighbours.update()
+                    self._bypasses.update()
                     due = time.monotonic() + _LOOK_SECONDS
             except Exception as error:  # whatever it is: the next look may succeed
                 if not self._ended.is_set():

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import sys
 import tomllib
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import pytest
 from evedrop import wire
 from evedrop.ports import free_port
 from evedrop.report.wire import wire_outcome
+from evedrop.wire import bypasses as bypasses_module
 from evedrop.wire.bypasses import MOST, Bypasses
 from evedrop.wire.check import wire_lines
 from evedrop.wire.file import resolved_wire, wire_of
@@ -19,15 +22,29 @@ from evedrop.wire.plan import Side
 from evedrop.wire.running import ExpectationFailed
 from tests.conftest import wait_until
 from tests.pages import checked
-from tests.wire.wire_at_work import WireAtWork, at_work, both_ways, program
+from tests.wire.wire_at_work import ANYWHERE, WireAtWork, at_work, both_ways, program
 
 PAGE = Path(__file__).parents[2] / "docs" / "wire.md"
 LINK = {"name": "scan", "from": "robot", "to": "base", "quality": 0.6}
 
 
+@pytest.fixture(autouse=True)
+def multicast(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """The multicast by which wires scout for a second, as entries of Zenoh's configuration: on this machine alone."""
+    made = {"enabled": True, "interface": "lo", "address": f"224.0.0.229:{free_port()}"}
+    monkeypatch.setattr(bypasses_module, "_MULTICAST", made)
+    monkeypatch.setattr(bypasses_module, "_SCOUT_SECONDS", 1.0)
+    return made
+
+
 def bypasses(at: WireAtWork) -> list[str]:
     """The ways past the wire that its journal has."""
     return [said.line for said in at.journal.events if said.bypass]
+
+
+def told(at: WireAtWork, said: str) -> bool:
+    """Whether the latest way past the wire begins with these words."""
+    return any(line.startswith(said) for line in bypasses(at)[-1:])
 
 
 def test_a_program_in_mode_peer_is_reported_once(tmp_path: Path) -> None:
@@ -65,14 +82,29 @@ def test_a_side_may_allow_mode_peer(tmp_path: Path) -> None:
         assert [str(other.zid()) in line for line in at.told] == [True]
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="multicast over the loopback interface lo")
+def test_a_program_that_scouts_by_multicast_is_reported_where_mode_peer_is_allowed(
+    tmp_path: Path, multicast: dict[str, Any]
+) -> None:
+    """The wire scouts when such a program connects, and again when another one does; one that does not scout is no bypass."""
+    silent = {"mode": "peer", "listen": {"endpoints": ["tcp/127.0.0.1:0"]}}
+    plan = both_ways(sides={"base": Side("base", (ANYWHERE,), peers=True)})
+    with at_work(plan, tmp_path) as at, at.program("base", **silent):
+        for _ in range(2):
+            with at.program("base", **silent, scouting={"multicast": multicast}) as peer:
+                said = f"the program {peer.zid()} at side base answers multicast scouting, although"
+                wait_until(partial(told, at, said), "it is reported")
+        assert at.told == bypasses(at)
+
+
 def test_programs_that_connect_again_and_again_do_not_fill_the_journal() -> None:
     """After some, one line says that there are more."""
-    told: list[str] = []
-    found = Bypasses(told.append)
+    lines: list[str] = []
+    found = Bypasses(lines.append)
     for number in range(3 * MOST):
         found.add(f"way {number}")
-    assert told[:MOST] == [f"way {number}" for number in range(MOST)]
-    assert [re.search(r"more than (\d+) ways", line) is not None for line in told[MOST:]] == [True]
+    assert lines[:MOST] == [f"way {number}" for number in range(MOST)]
+    assert [re.search(r"more than (\d+) ways", line) is not None for line in lines[MOST:]] == [True]
 
 
 def test_a_wire_past_which_programs_could_speak_has_no_verdict(tmp_path: Path) -> None:
