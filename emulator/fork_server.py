@@ -23,7 +23,8 @@ from typing import NoReturn
 from setproctitle import setproctitle
 
 from evedrop.interrupts import SIGNALS, heed_signals
-from evedrop.live.network.launcher_watch import continue_when_launcher_dies
+from evedrop.lacks import refuse_scipy_without_room
+from evedrop.processes import continue_when_parent_dies
 
 _MOST_BYTES = 1 << 17
 _FILES = 3
@@ -36,7 +37,7 @@ def serve(channel: socket.socket, modules: Sequence[str], further: Sequence[Serv
 
     further: servers that import these modules and more.
     """
-    continue_when_launcher_dies()  # the parent of a further server is the one before it, which ends with the launcher
+    continue_when_parent_dies()  # the parent of a further server is the one before it, which ends with the launcher
     for name in modules:
         with suppress(Exception):  # the process that needs it will say why it cannot be imported
             import_module(name)
@@ -132,5 +133,6 @@ def _become(request: bytes, files: list[int], own: tuple[int, int]) -> NoReturn:
 
 if __name__ == "__main__":
     heed_signals()
+    refuse_scipy_without_room()
     first, *others = [(socket.socket(fileno=int(one[0])), one[1:]) for one in json.loads(sys.argv[1])]
     serve(*first, others)

@@ -5,11 +5,16 @@ from __future__ import annotations
 import errno
 import os
 import resource
+import sys
+from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
+from typing import final
 
-_SPECIAL_BYTES = 200_000_000
-"""The address space that the import of scipy.special needs: 114 MB were measured, with two processors."""
+_SCIPY_BYTES, _THREAD_BYTES = 160_000_000, 45_000_000
+"""The address space that scipy needs with one thread of OpenBLAS, and for each further one: measured were 86 and 41 MB."""
+_MOST_THREADS = 64
 _WITHOUT_ROOM = ("failed to map segment", "cannot allocate memory")
 """What the system says in an ImportError about a library that found no memory."""
 _LACKS = {
@@ -35,18 +40,58 @@ def lack_of(error: BaseException) -> str | None:
     )
 
 
+@final
+class _ScipyFinder:
+    """Finds no module, but refuses to look for scipy where there is no room for it."""
+
+    @staticmethod
+    def find_spec(name: str, _path: Sequence[str] | None = None, _target: ModuleType | None = None) -> None:
+        """Called before each import. Raises MemoryError."""
+        if name == "scipy" and not _has_room():
+            raise MemoryError
+
+
+def refuse_scipy_without_room() -> None:
+    """If the address space is limited (ulimit -v), let the import of scipy raise MemoryError where it has no room.
+
+    OpenBLAS, which it loads, would ask for memory again and again, for ever, and no handler of a signal would run.
+    """
+    if _limit() is not None and not any(isinstance(finder, _ScipyFinder) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _ScipyFinder())
+
+
 def preload_within_limit() -> None:
     """If the address space is limited (ulimit -v), import now what a summary needs. Raises MemoryError if there is no room.
 
-    Later there may be none: OpenBLAS, which scipy.special loads, then asks for memory again and again, for ever.
+    Later there may be none, and a study would fail at its end.
     """
-    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    if limit == resource.RLIM_INFINITY:
+    if _limit() is None or "scipy.special" in sys.modules:
         return
-    try:
-        used = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * os.sysconf("SC_PAGE_SIZE")
-    except OSError:  # not Linux
-        used = 0
-    if limit - used < _SPECIAL_BYTES:
+    if not _has_room():
         raise MemoryError
     import_module("scipy.special")
+
+
+def _limit() -> int | None:
+    """The largest size of this process's address space, in bytes; None: unlimited."""
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    return None if limit == resource.RLIM_INFINITY else limit
+
+
+def _has_room() -> bool:
+    """Whether the address space has room for scipy; True where the system does not say how large it is (outside Linux)."""
+    limit = _limit()
+    try:
+        used = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        return True
+    return limit is None or limit - used >= _SCIPY_BYTES + _THREAD_BYTES * (_threads() - 1)
+
+
+def _threads() -> int:
+    """The threads that OpenBLAS starts."""
+    processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+        if (text := os.environ.get(name, "")).isdecimal() and int(text):
+            return min(int(text), processors, _MOST_THREADS)
+    return min(processors, _MOST_THREADS)

@@ -1,14 +1,22 @@
-"""Waits for the ends of processes, always with a limit."""
+"""Waits for the ends of processes, always with a limit, and deals with suspended ones."""
 
 from __future__ import annotations
 
+import ctypes
+import signal
 import subprocess
+import sys
 import time
 from collections.abc import Collection
-from typing import Protocol, TypeVar
+from pathlib import Path
+from typing import Protocol, TypeVar, final
 
 KILLED_SECONDS = 2.0
 """How long to wait for a killed process: the system ends it at once, unless it hangs in the system itself, as on a dead disk."""
+SUSPENDED_SECONDS = 60.0
+"""How long a process that others wait for may be suspended."""
+_LOOK_SECONDS = 1.0
+_PR_SET_PDEATHSIG = 1
 
 
 class KillableProcess(Protocol):
@@ -41,3 +49,37 @@ def wait_for(processes: Collection[P], seconds: float) -> list[P]:
         except subprocess.TimeoutExpired:
             left.append(process)
     return left
+
+
+def is_suspended(pid: int) -> bool:
+    """Whether a process is suspended, as by SIGSTOP; False where the system does not say (outside Linux)."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text("utf-8", "replace").rpartition(")")[2].split()[:1] == ["T"]
+    except OSError:
+        return False
+
+
+@final
+class SuspensionWatch:
+    """Finds processes that stay suspended. Only the time in which this process runs counts."""
+
+    def __init__(self) -> None:
+        self._looks: dict[int, int] = {}
+        self._next = time.monotonic()
+
+    def suspended_for_good(self, pids: Collection[int]) -> int | None:
+        """The first of these processes that has been suspended for `SUSPENDED_SECONDS`; None without one.
+
+        To be called often: it looks once a second.
+        """
+        if time.monotonic() < self._next:
+            return None
+        self._next = time.monotonic() + _LOOK_SECONDS
+        self._looks = {pid: self._looks.get(pid, 0) + 1 for pid in pids if is_suspended(pid)}
+        return next((pid for pid, looks in self._looks.items() if looks * _LOOK_SECONDS > SUSPENDED_SECONDS), None)
+
+
+def continue_when_parent_dies() -> None:
+    """Let the system continue this process if it is suspended when its parent dies: it would not notice (Linux only)."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGCONT), 0, 0, 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 
@@ -18,7 +19,11 @@ def parent_of(pid: int) -> int:
 
 
 def descendants(pid: int) -> Iterator[int]:
-    """The ids of all processes that descend from one."""
-    for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
+    """The ids of all processes that descend from one, whichever of its threads started them."""
+    children = list[str]()
+    for thread in Path(f"/proc/{pid}/task").iterdir():
+        with suppress(OSError):  # it has ended
+            children += (thread / "children").read_text().split()
+    for child in children:
         yield int(child)
         yield from descendants(int(child))

@@ -16,7 +16,7 @@ from evedrop.cli.parser import Parser
 from evedrop.cli.tables import written_tables
 from evedrop.errors import EvedropError, Interrupted, RunError, UsageError
 from evedrop.files import shown
-from evedrop.lacks import lack_of
+from evedrop.lacks import lack_of, refuse_scipy_without_room
 from evedrop.output import say, standard_streams, warn
 
 if TYPE_CHECKING:
@@ -45,6 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _status(given: list[str]) -> int:
     """Run the command line, and report its errors, and what the machine lacks."""
+    refuse_scipy_without_room()
     try:
         return _status_of(given)
     except Exception as error:

@@ -88,7 +88,11 @@ class Plan:
 
     @contextlib.contextmanager
     def crew(self, scenarios: Iterable[Scenario]) -> Iterator[Crew]:
-        """Where the trials of these scenarios are carried out. Raises UsageError if the scheduler does not answer."""
+        """Where the trials of these scenarios are carried out.
+
+        Raises UsageError if the scheduler does not answer, MemoryError if a limit leaves no room for what summaries need.
+        """
+        preload_within_limit()
         with crew_of(max(map(self.workers_for, scenarios)), self.scheduler, self.patience) as crew:
             yield crew
 
@@ -101,7 +105,6 @@ def simulate(scenario: Scenario, folder: Path, tell: Tell, plan: Plan = Plan(), 
     Raises UsageError for an unusable folder, plan or scheduler; Interrupted on Ctrl-C and RunError if a worker fails, with
     the results so far in the folder.
     """
-    preload_within_limit()
     check_mode(scenario, plan.mode)
     study = study_of("montecarlo", {"mode": plan.mode.value, "rare": plan.rare}, [scenario])
     failure: RunError | None = None

@@ -15,10 +15,13 @@ from typing import final
 
 from evedrop.errors import Interrupted
 from evedrop.live.network.launcher_watch import when_launcher_is_gone
+from evedrop.processes import SUSPENDED_SECONDS, SuspensionWatch, continue_when_parent_dies, kill, wait_for
 from evedrop.signals import stop_on_signals
 from evedrop.studies.scenario_tests import Finding, Manner, Outcome, carry_out
 
 _LOOK_SECONDS = 0.1
+_END_SECONDS = 60.0
+"""For the processes to end their runs, which takes seconds, and to write the results so far."""
 _WORK = "from evedrop.studies.scenario_test_jobs import work; work()"
 
 
@@ -39,6 +42,7 @@ def results(scenarios: Sequence[str], manner: Manner, jobs: int) -> Iterator[Fin
                 while not wait([one], _LOOK_SECONDS).done:
                     if stop.is_set():
                         raise _interrupted(manner)
+                    crew.kill_suspended()
                 yield one.result()
         finally:
             crew.end(waiting)
@@ -56,8 +60,11 @@ class _Crew:
 
     def __init__(self, manner: Manner) -> None:
         self._manner = manner
-        self._running: set[subprocess.Popen[str]] = set()
+        self._running: dict[int, subprocess.Popen[str]] = {}
         self._over = False
+        self._watch = SuspensionWatch()
+        self._suspended = set[int]()
+        """Ids of processes that were killed because they stayed suspended."""
 
     def carry_out(self, scenario: str) -> Finding:
         """Carry out one scenario in a process that a Ctrl-C in the terminal does not reach: this process passes it on."""
@@ -70,30 +77,43 @@ class _Crew:
             start_new_session=True,
         )
         with process:
-            self._running.add(process)
+            self._running[process.pid] = process
             if self._over:
                 process.terminate()
             assert process.stdout is not None  # noqa: S101 - it was started with a pipe
             said = process.stdout.read()
             status = process.wait()
-            self._running.discard(process)
+            del self._running[process.pid]
         if not said:
-            return Finding(scenario, Outcome.BROKEN, 0.0, (f"its process ended with status {status}",))
+            how = f"ended with status {status}"
+            if process.pid in self._suspended:
+                how = f"was suspended for {SUSPENDED_SECONDS:g} s (SIGSTOP)"
+            return Finding(scenario, Outcome.BROKEN, 0.0, (f"its process {how}",))
         found = json.loads(said)
         places = {name: None if found[name] is None else Path(found[name]) for name in ("folder", "report")}
         return Finding(**{**found, **places, "outcome": Outcome(found["outcome"]), "reasons": (*found["reasons"],)})
 
+    def kill_suspended(self) -> None:
+        """Kill a process that stays suspended."""
+        if (pid := self._watch.suspended_for_good(tuple(self._running))) is not None:
+            self._suspended.add(pid)
+            self._running[pid].kill()
+
     def end(self, waiting: Sequence[Future[Finding]]) -> None:
-        """Start no further processes, and end the running ones."""
+        """Start no further processes, and end the running ones, also suspended ones; kill those that do not end."""
         for one in waiting:
             one.cancel()
         self._over = True
-        for process in tuple(self._running):
+        for process in tuple(self._running.values()):
+            process.send_signal(signal.SIGCONT)
             process.terminate()
+        wait_for(tuple(self._running.values()), _END_SECONDS)
+        kill(*tuple(self._running.values()))
 
 
 def work() -> None:
     """Run one process: carry out the scenario in its argument, and write the result to standard output."""
+    continue_when_parent_dies()
     when_launcher_is_gone(lambda: os.kill(os.getpid(), signal.SIGTERM))
     scenario, manner = json.loads(sys.argv[1])
     out = None if manner["out"] is None else Path(manner["out"])

@@ -5,13 +5,17 @@ from __future__ import annotations
 import errno
 import os
 import resource
+import sys
 import threading
+from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
-from evedrop.lacks import lack_of, preload_within_limit
+from evedrop.lacks import lack_of, preload_within_limit, refuse_scipy_without_room
 from evedrop.memory import montecarlo, workers
+from evedrop.memory.montecarlo import Plan
 from evedrop.memory.tasks import Result, Stopped, Task, Tell
 from tests.conftest import Evedrop
 
@@ -98,13 +102,58 @@ def test_a_command_with_little_memory_never_ends_with_status_1(evedrop: Evedrop,
     assert "Traceback" not in done.err
 
 
-def test_what_a_summary_needs_is_imported_while_there_is_room() -> None:
-    """Without room it fails at once; OpenBLAS would try for ever."""
+@pytest.mark.parametrize("megabytes", [450, 560])
+def test_a_command_without_room_for_scipy_says_so(evedrop: Evedrop, megabytes: int) -> None:
+    """It used to hang for ever, and no signal but SIGKILL ended it."""
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_AS, (megabytes * 10**6,) * 2)
+
+    done = evedrop.process("design", "eavesdroppers", preexec_fn=limit)
+    assert done.status == 3
+    assert done.err.startswith("evedrop: there is not enough memory; ")
+    assert done.err.count("\n") == 1
+
+
+@pytest.fixture
+def without_room(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A process that has no room for scipy, and has not imported it."""
+    monkeypatch.delitem(sys.modules, "scipy.special", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [*sys.meta_path])
     used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     before = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (used + 100_000_000, before[1]))
-    try:
-        with pytest.raises(MemoryError):
-            preload_within_limit()
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, before)
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+@pytest.mark.usefixtures("without_room")
+def test_what_a_summary_needs_is_imported_while_there_is_room() -> None:
+    """Without room a study of any kind fails before its first trial; OpenBLAS would try for ever."""
+    with pytest.raises(MemoryError), Plan().crew([]):
+        pytest.fail("it began")
+
+
+@pytest.mark.usefixtures("without_room")
+def test_scipy_is_not_even_looked_for_without_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor twice; other modules are."""
+    for name in [name for name in sys.modules if name.partition(".")[0] == "scipy"]:
+        monkeypatch.delitem(sys.modules, name)
+    before = len(sys.meta_path)
+    refuse_scipy_without_room()
+    refuse_scipy_without_room()
+    assert len(sys.meta_path) == before + 1
+    with pytest.raises(MemoryError):
+        import_module("scipy.linalg")
+    with pytest.raises(ModuleNotFoundError):
+        import_module("no_such_module")
+
+
+def test_without_a_limit_nothing_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No module is imported early, and imports are as fast as before."""
+    monkeypatch.delitem(sys.modules, "scipy.special", raising=False)
+    before = [*sys.meta_path]
+    refuse_scipy_without_room()
+    preload_within_limit()
+    assert sys.meta_path == before
+    assert "scipy.special" not in sys.modules

@@ -109,6 +109,34 @@ def suspended(server: ForkServer, folder: Path) -> int:
     return pid
 
 
+def cleaners(live: Live) -> dict[int, Path]:
+    """The shells that remove the private folders of a run → their folders. There are two where a path is long."""
+    commands = {pid: command.split() for pid, command in live.left().items() if "while read -r _" in command}
+    assert commands
+    return {pid: Path(words[-1]) for pid, words in commands.items()}
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_a_suspended_cleaner_keeps_nothing_from_ending_and_leaves_no_folder(
+    evedrop: Evedrop, how: signal.Signals
+) -> None:
+    """Also if everything but the launcher is suspended, and the launcher killed: the system continues who has to end."""
+    live = evedrop.live("eavesdroppers", *ENDLESS)
+    live.running()
+    folders = cleaners(live)
+    assert all(folder.is_dir() for folder in folders.values())
+    for pid in folders:
+        os.kill(pid, signal.SIGSTOP)
+    if how == signal.SIGKILL:
+        suspend(live, "both")
+    live.process.send_signal(how)
+    status = live.end(SECONDS).status
+    assert status == (-signal.SIGKILL if how == signal.SIGKILL else 130)
+    wait_until(lambda: not live.left(), "no process left of the run", SECONDS)
+    assert not any(folder.exists() for folder in folders.values())
+    assert list(live.temporary.iterdir()) == []
+
+
 def test_a_run_that_is_to_end_waits_for_no_fork_server(tmp_path: Path) -> None:
     """A suspended one starts nothing, and ends with the block."""
     stop = threading.Event()

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import threading
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,10 +21,13 @@ from evedrop.errors import RunError
 from evedrop.loading import load
 from evedrop.memory.montecarlo import Plan
 from evedrop.memory.simulation import Mode
+from evedrop.memory.tasks import Result, Stopped, Task, Tell
 from evedrop.memory.trials import BLOCK_TRIALS, tasks_of
 from evedrop.memory.workers import in_processes, usable_cores
+from evedrop.processes import is_suspended
 from evedrop.results.writer import load_results
-from tests.conftest import Done, Evedrop, Live, wait_until, with_mark
+from tests.conftest import LIMIT, Done, Evedrop, Live, wait_until, with_mark
+from tests.processes import descendants
 
 SLOTS = 100_000
 ENDLESS = ("--slots", str(SLOTS), "--trials", "1000")
@@ -108,6 +114,143 @@ def test_workers_end_with_who_started_them(evedrop: Evedrop) -> None:
     live.process.kill()
     live.process.communicate()
     no_process_left(live)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_suspended_workers_keep_no_study_from_ending(evedrop: Evedrop, number: signal.Signals) -> None:
+    """They are continued, and hand over what they have done: all trials are in the summary."""
+    live, crew = started(evedrop, 2)
+    for pid in crew:
+        os.kill(pid, signal.SIGSTOP)
+    live.process.send_signal(number)
+    done = live.end()
+    assert done.status == 130, done.err
+    no_process_left(live)
+    assert live.results.summary["ended"] == "interrupted"
+    assert live.results.summary["trials"] == 1000
+
+
+def test_suspended_workers_do_not_outlive_a_killed_study(evedrop: Evedrop) -> None:
+    """The system continues them when their parent dies; they then find their pipes closed."""
+    live, crew = started(evedrop, 2)
+    for pid in crew:
+        os.kill(pid, signal.SIGSTOP)
+    live.process.kill()
+    live.process.communicate()
+    no_process_left(live)
+
+
+def own_crew() -> list[int]:
+    """The worker processes of this one."""
+    commands = {pid: Path(f"/proc/{pid}/cmdline") for pid in descendants(os.getpid())}
+    return [pid for pid, command in commands.items() if b"memory.workers import work" in command.read_bytes()]
+
+
+def outcome(of: Sequence[Task[Any]], tell: Tell = lambda _: None, until_first: bool = False) -> Any:
+    """What two processes make of tasks: their results, or the error that ended them. Fails the test if they do not end.
+
+    until_first: whether they are told to stop when the first result has come.
+    """
+    came: list[Any] = []
+    results: list[Any] = []
+
+    def carry_out() -> None:
+        try:
+            results.extend(in_processes(of, 2, tell, lambda: until_first and bool(results)))
+            came.append(results)
+        except Exception as error:
+            came.append(error)
+
+    thread = threading.Thread(target=carry_out, daemon=True)
+    thread.start()
+    thread.join(LIMIT)
+    assert came, "it did not end"
+    wait_until(lambda: not own_crew(), "no worker left")
+    return came[0]
+
+
+def test_a_worker_that_stays_suspended_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By its process id and its trials; one that is continued in time is not."""
+    monkeypatch.setattr("evedrop.processes.SUSPENDED_SECONDS", 3.0)
+    tasks = tasks_of(load("eavesdroppers", {"slots": SLOTS, "trials": 1000}), Mode.EXACT, 2)
+    suspended: list[int] = []
+
+    def suspend_last(_: int) -> None:
+        if not suspended:
+            suspended.append(own_crew()[-1])
+            os.kill(suspended[0], signal.SIGSTOP)
+
+    error = outcome(tasks, tell=suspend_last)
+    assert isinstance(error, RunError)
+    assert str(error).startswith(f"worker process {suspended[0]}, which computes trials ")
+    assert "has been suspended for " in str(error)
+
+
+def test_a_worker_that_is_continued_is_not_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It only slows the study."""
+    monkeypatch.setattr("evedrop.processes.SUSPENDED_SECONDS", 1000.0)
+    tasks = tasks_of(load("eavesdroppers", {"slots": 2000, "trials": 1000}), Mode.EXACT, 2)
+    suspended: list[int] = []
+
+    def pause(_: int) -> None:
+        if not suspended:
+            suspended.append(own_crew()[-1])
+            os.kill(suspended[0], signal.SIGSTOP)
+            wait_until(lambda: is_suspended(suspended[0]), "a suspended worker")
+            os.kill(suspended[0], signal.SIGCONT)
+
+    results = outcome(tasks, tell=pause)
+    assert sorted(number for number, _ in results) == [0, 1]
+    assert all(result.complete for _, result in results)
+
+
+class Hangs(Task[Result]):
+    """A task whose worker writes half a message as soon as it has read it, and then does nothing for ever."""
+
+    HALF = (
+        "import os, re, sys, time\n"
+        "os.write(int(re.search(r'work.(\\d+)', sys.orig_argv[-1])[1]), (1000).to_bytes(4, 'big') + b'half')\n"
+        "while True: time.sleep(60)"
+    )
+
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[str]]:
+        """What it is read by."""
+        return exec, (self.HALF,)
+
+    def carry_out(self, tell: Tell, stopped: Stopped) -> Result:
+        """Never called."""
+        raise NotImplementedError
+
+    def example(self) -> Result:
+        """Never called."""
+        raise NotImplementedError
+
+
+def test_a_stop_waits_for_no_worker_that_hangs_within_a_message(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is killed; what others did is there."""
+    monkeypatch.setattr("evedrop.memory.workers._LAST_SECONDS", 0.5)
+    whole = tasks_of(load("eavesdroppers", {"slots": 50, "trials": 1000}), Mode.EXACT, 2)[0]
+    results = outcome([Hangs({}, 0, 1), whole], until_first=True)
+    assert [number for number, _ in results] == [1]
+
+
+@pytest.mark.parametrize("lack", ["process", "thread"])
+def test_a_crew_of_which_one_cannot_be_started_is_ended(monkeypatch: pytest.MonkeyPatch, lack: str) -> None:
+    """The second process, or its thread: none is left of those that were."""
+    owner, name = (subprocess, "Popen") if lack == "process" else (threading.Thread, "start")
+    begin, calls = getattr(owner, name), []
+
+    def begin_first(*given: Any, **options: Any) -> Any:
+        calls.append(given)
+        if len(calls) > 1:
+            raise OSError("no more") if lack == "process" else RuntimeError("can't start new thread")
+        return begin(*given, **options)
+
+    monkeypatch.setattr(owner, name, begin_first)
+    with pytest.raises(RunError if lack == "process" else RuntimeError):
+        next(in_processes([], 2, lambda _: None, lambda: False))
+    monkeypatch.undo()
+    assert own_crew() == []
 
 
 def test_a_worker_is_given_no_tokens(evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -20,7 +22,7 @@ from evedrop.results.writer import load_results
 from evedrop.studies import scenario_tests as testing
 from evedrop.studies.junit import junit_of
 from evedrop.studies.scenario_tests import Finding, Manner, Outcome
-from tests.conftest import Done, Evedrop, Live, wait_until
+from tests.conftest import Done, Evedrop, Live, wait_until, with_mark
 from tests.pages import checked
 
 SCENARIO = (
@@ -197,6 +199,56 @@ def test_an_interrupt_ends_the_tests_and_leaves_no_process(evedrop: Evedrop, job
     live.nothing_left()
     (case,) = ET.parse(evedrop.folder / "report.xml").getroot()[0]  # noqa: S314 - our own
     assert case.get("name") == "a"
+
+
+def test_an_interrupt_ends_tests_whose_processes_are_suspended(evedrop: Evedrop) -> None:
+    """They are continued, so that they end their runs."""
+    written(evedrop.folder / "cases", a=HOLDS, b=ENDLESS)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "evedrop", "test", "cases", "--jobs", "2"],
+        cwd=evedrop.folder,
+        env=evedrop.environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    live = Live(process, evedrop.temporary, evedrop.folder)
+    assert process.stdout is not None
+    assert process.stdout.readline().startswith("passed")
+    live.child("sensor")
+    jobs = [pid for pid, command in live.left().items() if "scenario_test_jobs import work" in command]
+    assert jobs
+    for pid in jobs:
+        os.kill(pid, signal.SIGSTOP)
+    process.send_signal(signal.SIGINT)
+    assert live.end().status == 130
+    live.nothing_left()
+
+
+def test_a_test_whose_process_stays_suspended_is_broken(evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And named; the others are carried out."""
+    monkeypatch.setattr("evedrop.processes.SUSPENDED_SECONDS", 3.0)
+    written(evedrop.folder / "cases", a=ENDLESS, b=HOLDS)
+    over = threading.Event()
+    suspended: list[int] = []
+
+    def suspend() -> None:
+        while not suspended and not over.wait(0.1):
+            left = with_mark(str(evedrop.temporary)).items()
+            jobs = [pid for pid, command in left if "scenario_test_jobs import work" in command and "a.toml" in command]
+            if jobs and any("sensor" in command for _, command in left):
+                os.kill(jobs[0], signal.SIGSTOP)
+                suspended.append(jobs[0])
+
+    thread = threading.Thread(target=suspend, daemon=True)
+    thread.start()
+    done = evedrop("test", "cases", "--jobs", "2")
+    over.set()
+    thread.join()
+    assert suspended
+    assert done.status == 3
+    assert "its process was suspended for " in done.out + done.err
+    wait_until(lambda: not with_mark(str(evedrop.temporary)), "no process left")
 
 
 def test_tests_end_with_the_process_that_started_them(evedrop: Evedrop) -> None:

@@ -74,10 +74,10 @@ def _compose(options: argparse.Namespace) -> int:
 
 def process(options: argparse.Namespace) -> int:
     """Run one process of a run."""
-    from evedrop.live.network.launcher_watch import continue_when_launcher_dies
     from evedrop.live.protocol.brief import read_brief
     from evedrop.live.protocol.brief_parts import ImportingPart, ObserverPart, RoutingPart
     from evedrop.plugins import look_in
+    from evedrop.processes import continue_when_parent_dies
 
     os.umask(0o077)  # only this user may read its files
     from evedrop.signals import leave_on_signals, show_stacks_on_request
@@ -88,7 +88,7 @@ def process(options: argparse.Namespace) -> int:
     brief = read_brief(options.brief, options.role)
     if brief.ends_with_stdin:  # started by a launcher, which writes another brief if it restarts the process
         options.brief.unlink(missing_ok=True)  # its keys should not stay on disk
-        continue_when_launcher_dies()
+        continue_when_parent_dies()
         if isinstance(brief.part, RoutingPart):
             from evedrop.live.network.launcher_news import set_news_apart
 

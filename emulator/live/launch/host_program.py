@@ -35,9 +35,9 @@ from evedrop.live.launch.host_messages import (
 from evedrop.live.launch.preloading import preloaded_without_observer
 from evedrop.live.launch.private_folder import private_folder
 from evedrop.live.launch.starter import StartedProcess, Starter, end_all
-from evedrop.live.network.launcher_watch import continue_when_launcher_dies
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.brief_parts import ReceiverPart
+from evedrop.processes import continue_when_parent_dies
 from evedrop.signals import raise_on_signals
 
 _LAST_LINES_SECONDS = 1.0  # for the last lines of a process that has ended, whose own children may hold its log open
@@ -50,7 +50,7 @@ def serve_launcher() -> None:
     """
     if sys.stdin is None or sys.stdin.isatty():
         raise UsageError("`evedrop host` is started by `evedrop run SCENARIO --hosts FILE`, over ssh; use that command")
-    continue_when_launcher_dies()  # if suspended, once the connection, whose process on this host is the parent, is closed
+    continue_when_parent_dies()  # if suspended, once the connection, whose process on this host is the parent, is closed
     os.umask(0o077)
     answers = os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)  # so that nothing else can write between the messages

@@ -12,7 +12,9 @@ import fcntl
 import os
 import secrets
 import shutil
+import signal
 import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -32,6 +34,13 @@ _GUARD_SECONDS = 5.0
 _GUARD = (
     "while read -r _; do :; done; tries=0; "
     'while [ -e "$1" ] && [ $tries -lt 50 ]; do rm -rf -- "$1" 2>/dev/null || sleep 0.2; tries=$((tries + 1)); done'
+)
+
+
+# The system continues the shell if it is suspended when the launcher dies: PR_SET_PDEATHSIG is 1, and survives exec.
+_CONTINUED = (
+    "import ctypes, os, signal, sys; ctypes.CDLL(None).prctl(1, int(signal.SIGCONT), 0, 0, 0); "
+    "os.execv(sys.argv[1], sys.argv[1:])"
 )
 
 
@@ -87,8 +96,9 @@ def _unmade(error: OSError) -> UsageError:
 
 def _guard(folder: Path) -> subprocess.Popen[bytes]:
     """Start the shell that removes the folder when the launcher is dead; called before the folder is made."""
+    first = [sys.executable, "-I", "-S", "-c", _CONTINUED] if sys.platform == "linux" else []
     return subprocess.Popen(
-        ["/bin/sh", "-c", _GUARD, "sh", str(folder)],
+        [*first, "/bin/sh", "-c", _GUARD, "sh", str(folder)],
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
@@ -101,6 +111,7 @@ def _dismiss(guard: subprocess.Popen[bytes]) -> None:
     """End the shell, which finds nothing to remove."""
     assert guard.stdin is not None  # noqa: S101 - it was started with a pipe
     guard.stdin.close()
+    guard.send_signal(signal.SIGCONT)
     try:
         guard.wait(_GUARD_SECONDS)
     except subprocess.TimeoutExpired:

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import select
-import signal
-import sys
 import threading
 from collections.abc import Callable
-
-_PR_SET_PDEATHSIG = 1
 
 
 def when_launcher_is_gone(then: Callable[[], None], said: Callable[[bytes], None] = lambda _: None) -> None:
@@ -29,12 +24,6 @@ def when_launcher_is_gone(then: Callable[[], None], said: Callable[[bytes], None
         then()
 
     threading.Thread(target=wait, name="launcher-watch", daemon=True).start()
-
-
-def continue_when_launcher_dies() -> None:
-    """Let the system continue this process if it is paused when its parent dies: paused, it would not notice (Linux only)."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGCONT), 0, 0, 0)
 
 
 def launcher_is_gone() -> bool:
