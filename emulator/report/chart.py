@@ -14,10 +14,12 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from evedrop.model.process import Floats
+from evedrop.report.groups import GroupMeans
 from evedrop.report.markup import Node, element
 from evedrop.view.error_floor import floor_words
 
-_POINTS = 400  # of a curve, at most
+POINTS = 400
+"""The most points of a curve."""
 _WIDE, _HIGH = 2000, 1000  # of the drawing, in its own units
 _MOST_DECADES = 30  # shown below the highest value
 _TICKS = 6
@@ -49,6 +51,8 @@ class LogChart:
     curves: Sequence[Curve] = field(default_factory=list)
     x_words: Sequence[str] | None = None
     """Names of the places 0, 1, … of the x axis, if x is not a number."""
+    x_range: tuple[float, float] | None = None
+    """The ends of the x axis; None: the least and the greatest x."""
     floor: float = 0.0
     """Lesser values lie on the lower edge, and the chart says so. 0: all are shown that are not too far below the highest."""
 
@@ -67,8 +71,9 @@ class LogChart:
         bottom = max(float(np.log10(positive.min())), top - _MOST_DECADES)
         top = max(top, bottom + 1.0) if below else top
         x = np.concatenate([one.x for one in self.curves])
+        left, right = (float(x.min()), float(x.max())) if self.x_range is None else self.x_range
         room = 0.05 * (top - bottom + 0.2)
-        axes = _Axes(float(x.min()), float(x.max()), bottom - (0.0 if below else room), top + room)
+        axes = _Axes(left, right, bottom - (0.0 if below else room), top + room)
         if any(one.bars for one in curves):  # room for the marks
             room = 0.04 * (axes.right - axes.left)
             axes = _Axes(axes.left - room, axes.right + room, axes.bottom, axes.top)
@@ -169,23 +174,19 @@ def _path(parts: Sequence[Sequence[tuple[int, int]]]) -> str:
 
 
 def _thinned(one: Curve) -> Curve:
-    """The curve with at most `_POINTS` points, each the mean of its neighbours."""
+    """The curve with at most `POINTS` points, each the mean of its neighbours."""
     count = len(one.x)
-    if count <= _POINTS:
+    if count <= POINTS:
         return one
-    edges = np.linspace(0, count, _POINTS + 1).astype(int)
-
-    def means(of: Floats | None) -> Floats | None:
-        if of is None:
-            return None
-        lengths = np.diff(edges)
-        with np.errstate(over="ignore", invalid="ignore"):
-            return np.asarray(np.add.reduceat(of, edges[:-1]) / lengths, np.float64)
-
-    x, y = means(one.x), means(one.y)
+    rows = [one.x, one.y, one.low, one.high, one.theory]
+    given = [row for row in rows if row is not None]
+    groups = GroupMeans(count, POINTS, len(given))
+    groups.add(np.stack(given))
+    means = iter(groups.means)
+    x, y, low, high, theory = (None if row is None else next(means) for row in rows)
     assert x is not None  # noqa: S101 - it was given
     assert y is not None  # noqa: S101 - the same
-    return Curve(one.name, one.colour, x, y, means(one.low), means(one.high), means(one.theory))
+    return Curve(one.name, one.colour, x, y, low, high, theory)
 
 
 def _ticks(low: float, high: float) -> list[tuple[str, float]]:

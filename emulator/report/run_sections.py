@@ -6,8 +6,6 @@ import shlex
 from collections.abc import Iterator, Sequence
 from typing import final
 
-import numpy as np
-
 from evedrop.figures.text import figure_text
 from evedrop.report import closing
 from evedrop.report.chart import Curve, LogChart, legend
@@ -24,7 +22,6 @@ from evedrop.view.error_floor import error_floor
 from evedrop.view.lanes import EAVESDROPPER
 from evedrop.view.palette import hexadecimal
 
-_MOST_SPANS = 12
 _MOST_TEXT = 40_000
 _MARKS = {True: "✓", False: "✕"}
 
@@ -98,8 +95,9 @@ class ErrorsSection(Section[RunSource]):
         curves = [
             Curve(name, of.colour(name), one.slot, one.error, one.low, one.high, one.theory)
             for name, one in of.means.items()
-            if len(one.slot)
         ]
+        if not curves:
+            return
         several = of.summary.trials > 1
         bands = "bands: its 95 % interval; " if several else ""
         said = f"Mean squared error over {of.summary.trials:,} trials" if several else "Squared error of the trial"
@@ -108,9 +106,10 @@ class ErrorsSection(Section[RunSource]):
             "slot",
             f"{said}; {bands}dotted: theory",
             curves,
+            x_range=(min(one.first for one in of.means.values()), max(one.last for one in of.means.values())),
             floor=error_floor(of.noise, of.summary.trials),
         )
-        if curves and (node := chart.node) is not None:
+        if (node := chart.node) is not None:
             yield node
 
 
@@ -133,15 +132,14 @@ class LostTrackSection(Section[RunSource]):
         )
         table = TextTable.headed(["receiver"], ["in track", "drifting", "fooled", "spans lost", "longest"])
         for name, one in of.trial.items():
-            longest = max(one.spans, key=lambda span: span.slots, default=None)
             table.add(
                 name,
-                *(f"{float(np.mean(one.track == code)):.1%}" for code in Track),
-                f"{len(one.spans):,}",
-                "–" if longest is None else f"slots {_where(longest)}",
+                *(f"{share:.1%}" for share in one.track.shares),
+                f"{one.lost.count:,}",
+                f"slots {_where(one.lost.spans[0])}" if one.lost.count else "–",
             )
         yield html_table(table, "Shares of the slots, and spans in which the receiver lost track")
-        used = {int(code) for one in of.trial.values() for code in np.unique(one.outcome)}
+        used = {code for one in of.trial.values() for code, share in enumerate(one.outcome.shares) if share}
         yield element(
             "p",
             "Upper lanes: ",
@@ -160,14 +158,14 @@ def _where(span: LostSpan) -> str:
 
 def _lanes(name: str, one: RecordedTrial) -> Iterator[Node]:
     """The two lanes of a receiver, and its longest spans."""
-    spans = sorted(one.spans, key=lambda span: -span.slots)[:_MOST_SPANS]
-    last = f"{int(one.slot[-1]):,}"
+    spans = one.lost.spans
     yield element("h3", name)
-    label = f"{name}: in track in {float(np.mean(one.track == Track.IN_TRACK)):.1%} of the slots 0 to {last}"
-    yield strip(one.track, [TRACK_COLOURS[code] for code in Track], label, worst=True)
-    shares = [(word, float(np.mean(one.outcome == i))) for i, word in enumerate(OUTCOMES)]
-    counted = ", ".join(f"{share:.1%} {word}" for word, share in shares if share)
-    yield strip(one.outcome, EAVESDROPPER.colours, f"{name}: packets by what became of them: {counted}")
+    label = f"{name}: in track in {one.track.shares[Track.IN_TRACK]:.1%} of the slots 0 to {one.last:,}"
+    yield strip(one.track.highest, [TRACK_COLOURS[code] for code in Track], label)
+    counted = ", ".join(
+        f"{share:.1%} {word}" for word, share in zip(OUTCOMES, one.outcome.shares, strict=True) if share
+    )
+    yield strip(one.outcome.commonest, EAVESDROPPER.colours, f"{name}: packets by what became of them: {counted}")
     if spans:
         items = [
             f"slots {_where(span)}: lost track for {span.slots:,}"

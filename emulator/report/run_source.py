@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, final
 
 import numpy as np
 import pyarrow as pa
@@ -19,22 +19,30 @@ from evedrop.files import Unreadable, text_of
 from evedrop.loading.recorded import recorded_noise
 from evedrop.model.packet_words import NOTHING, SILENT
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Codes
+from evedrop.report.chart import POINTS
+from evedrop.report.groups import GroupCounts, GroupMeans
+from evedrop.report.slot_rows import RowExtent, SlotRows
+from evedrop.report.strip import PIXELS
 from evedrop.results.reading import Results, load_results
 from evedrop.score.summary import Summary
-from evedrop.score.track import LostSpan, Track, lost_spans, track_of
+from evedrop.score.track import LongestSpans, Track, track_of
 from evedrop.view import palette
 from evedrop.view.lanes import EAVESDROPPER
 
 _MOST_BYTES = 2**24
 OUTCOMES = EAVESDROPPER.words
 """The fates of a packet; the index of a word is its code."""
+MOST_SPANS = 12
+"""The most spans without track that a report lists for a receiver."""
 _INTERVAL = 1.96  # standard errors on either side: 95 %
 
 
 class SlotMeans(NamedTuple):
-    """The error of a receiver, slot by slot, (c,) each; NaN where it is unknown."""
+    """The error of a receiver, at most `POINTS` points: slot by slot, or means of neighbouring slots; NaN where it is unknown."""
 
+    first: int
+    last: int
+    """The last slot."""
     slot: Floats
     error: Floats
     low: Floats
@@ -43,15 +51,33 @@ class SlotMeans(NamedTuple):
     theory: Floats
 
 
-class RecordedTrial(NamedTuple):
-    """A receiver in the first recorded trial, (c,) each."""
+@final
+class RecordedTrial:
+    """A receiver in the first recorded trial."""
 
-    slot: Floats
-    outcome: Codes
-    """What became of every packet, as indices into `OUTCOMES`."""
-    track: Codes
-    spans: Sequence[LostSpan]
-    """The spans in which it lost track."""
+    def __init__(self, extent: RowExtent, noise: float) -> None:
+        """noise: tr Q."""
+        self._noise = noise
+        self.last = extent.last
+        """The last slot."""
+        self.outcome = GroupCounts(extent.rows, PIXELS, len(OUTCOMES))
+        """What became of every packet, as indices into `OUTCOMES`."""
+        self.track = GroupCounts(extent.rows, PIXELS, len(Track))
+        self.lost = LongestSpans(MOST_SPANS, extent.first)
+        """The spans in which it lost track."""
+
+    def add(self, rows: pa.Table) -> None:
+        """The rows of the next slots. Raises UsageError if one has an unknown action."""
+        sent, actions = (_words(rows[name]) for name in ("sent", "action"))
+        unknown = sorted(set(actions[1]) - set(OUTCOMES))
+        if unknown:
+            raise UsageError(f"trials.parquet has the unknown action {unknown[0]}; run the scenario again")
+        codes = np.array([OUTCOMES.index(word) for word in actions[1]], np.uint8)[actions[0]]
+        silent = np.array([word == NOTHING for word in sent[1]], np.bool_)[sent[0]]
+        self.outcome.add(np.where(silent, np.uint8(OUTCOMES.index(SILENT)), codes))
+        track = track_of(_numbers(rows["squared_error"]), _numbers(rows["trace_covariance"]), self._noise)
+        self.track.add(track)
+        self.lost.add(track)
 
 
 @dataclass(frozen=True)
@@ -89,40 +115,38 @@ class RunSource:
     @cached_property
     def means(self) -> dict[str, SlotMeans]:
         """Receiver → its error in every slot. Raises UsageError if the table cannot be read."""
-        columns = ["slot", "peer", "mean_squared_error", "mean_actual_trace_covariance", "standard_error"]
-        table = self.results.part("slots", [*columns, "expected_trace_covariance"])
-        return {name: _means(rows) for name, rows in self._by_receiver(table).items()}
+        columns = ["slot", "mean_squared_error", "mean_actual_trace_covariance", "standard_error"]
+        table = SlotRows(self.results, "slots", self.summary.peers)
+        groups = {name: GroupMeans(extent.rows, POINTS, 5) for name, extent in table.extents.items()}
+        for name, rows in table.pieces([*columns, "expected_trace_covariance"]):
+            groups[name].add(_means(rows))
+        return {
+            name: SlotMeans(extent.first, extent.last, *groups[name].means) for name, extent in table.extents.items()
+        }
 
     @cached_property
     def trial(self) -> dict[str, RecordedTrial]:
         """Receiver → its first recorded trial; empty without one. Raises UsageError if the table cannot be read."""
-        columns = ["slot", "peer", "sent", "action", "squared_error", "trace_covariance"]
-        table = self.results.part("trials", columns, pc.field("trial") == self.summary.first_trial)
-        return {name: _trial(rows, self.noise) for name, rows in self._by_receiver(table).items() if rows.num_rows}
+        table = SlotRows(self.results, "trials", self.summary.peers, self.summary.first_trial)
+        trials = {name: RecordedTrial(extent, self.noise) for name, extent in table.extents.items()}
+        for name, rows in table.pieces(["sent", "action", "squared_error", "trace_covariance"]):
+            trials[name].add(rows)
+        return trials
 
     @cached_property
     def noise(self) -> float:
         """The process noise tr Q; 0 if the scenario cannot be read."""
         return recorded_noise(self.folder)
 
-    def _by_receiver(self, table: pa.Table) -> dict[str, pa.Table]:
-        found = {name: table.filter(pc.equal(table["peer"], name)) for name in self.summary.peers}
-        return {name: rows if _in_order(rows) else rows.sort_by("slot") for name, rows in found.items()}
 
-
-def _in_order(rows: pa.Table) -> bool:
-    """Whether the slots of the rows increase, as in tables of the writer."""
-    return bool((np.diff(rows["slot"].to_numpy()) > 0).all())
-
-
-def _means(rows: pa.Table) -> SlotMeans:
+def _means(rows: pa.Table) -> Floats:
+    """Slot, error, the ends of its interval, and what theory expects, (5, c)."""
     error = _numbers(rows["mean_squared_error"])
     actual = _numbers(rows["mean_actual_trace_covariance"])
     error = np.where(np.isnan(error), actual, error)
     scatter = _INTERVAL * _numbers(rows["standard_error"])
-    return SlotMeans(
-        _numbers(rows["slot"]), error, error - scatter, error + scatter, _numbers(rows["expected_trace_covariance"])
-    )
+    theory = _numbers(rows["expected_trace_covariance"])
+    return np.stack([_numbers(rows["slot"]), error, error - scatter, error + scatter, theory])
 
 
 def _numbers(column: pa.ChunkedArray) -> Floats:
@@ -135,19 +159,6 @@ def _words(column: pa.ChunkedArray) -> tuple[NDArray[np.intp], list[str]]:
     if isinstance(whole, pa.ChunkedArray):  # without rows
         whole = whole.chunk(0) if whole.num_chunks else pa.array([], pa.string()).dictionary_encode()
     return whole.indices.to_numpy(zero_copy_only=False).astype(np.intp), whole.dictionary.to_pylist()
-
-
-def _trial(rows: pa.Table, noise: float) -> RecordedTrial:
-    sent, actions = (_words(rows[name]) for name in ("sent", "action"))
-    unknown = sorted(set(actions[1]) - set(OUTCOMES))
-    if unknown:
-        raise UsageError(f"trials.parquet has the unknown action {unknown[0]}; run the scenario again")
-    codes = np.array([OUTCOMES.index(word) for word in actions[1]], np.uint8)[actions[0]]
-    silent = np.array([word == NOTHING for word in sent[1]], np.bool_)[sent[0]]
-    outcome = np.where(silent, np.uint8(OUTCOMES.index(SILENT)), codes)
-    errors, traces = _numbers(rows["squared_error"]), _numbers(rows["trace_covariance"])
-    slots, track = _numbers(rows["slot"]), track_of(errors, traces, noise)
-    return RecordedTrial(slots, outcome, track, lost_spans(track, int(slots[0])))
 
 
 TRACK_COLOURS = dict(zip(Track, palette.KNOWLEDGE, strict=True))

@@ -7,21 +7,16 @@ import struct
 import zlib
 from collections.abc import Sequence
 
-import numpy as np
-
 from evedrop.model.receiver import Codes
 from evedrop.report.markup import Node, element
 from evedrop.view.palette import Colour
 
-_MOST_PIXELS = 2000
+PIXELS = 2000
+"""The most pixels of a lane. Each of a long run stands for several slots: for their most frequent code, or the highest."""
 
 
-def strip(codes: Codes, colours: Sequence[Colour], label: str, worst: bool = False) -> Node:
-    """A lane; codes (c,) are indices into colours, label: what it shows, in words.
-
-    A pixel of a long run stands for several slots: it has their most frequent code, or with `worst` the highest.
-    """
-    row = _shortened(codes, len(colours), worst)
+def strip(row: Codes, colours: Sequence[Colour], label: str) -> Node:
+    """A lane; row: the code of each pixel, an index into colours, at most `PIXELS`. label: what it shows, in words."""
     header = struct.pack(">IIBBBBB", len(row), 1, 8, 3, 0, 0, 0)
     data = b"\x89PNG\r\n\x1a\n" + b"".join(
         _chunk(kind, body)
@@ -34,18 +29,6 @@ def strip(codes: Codes, colours: Sequence[Colour], label: str, worst: bool = Fal
     )
     source = f"data:image/png;base64,{base64.b64encode(data).decode()}"
     return element("img", src=source, alt=label, class_="strip", width=len(row), height=1)
-
-
-def _shortened(codes: Codes, kinds: int, worst: bool) -> Codes:
-    count = len(codes)
-    if count <= _MOST_PIXELS:
-        return codes.astype(np.uint8)
-    starts = np.linspace(0, count, _MOST_PIXELS + 1).astype(int)[:-1]
-    if worst:
-        return np.maximum.reduceat(codes, starts).astype(np.uint8)
-    counts = [np.add.reduceat((codes == kind).astype(np.int64), starts) for kind in range(kinds)]
-    found: Codes = np.argmax(counts, axis=0).astype(np.uint8)
-    return found
 
 
 def _chunk(kind: bytes, body: bytes) -> bytes:

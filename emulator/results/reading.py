@@ -28,6 +28,7 @@ from evedrop.score.summary import Summary
 from evedrop.streams import MOST_SLOTS
 
 _MOST_BYTES = 2**28
+_PIECE_ROWS = 8192
 
 
 @dataclass(frozen=True)
@@ -105,6 +106,32 @@ class Results:
             raise UsageError(f"{path} cannot be read ({_one_line(error)}); run the scenario again") from error
         return table
 
+    def pieces(self, name: str, columns: Sequence[str]) -> Iterator[pa.Table]:
+        """Some columns of a table in pieces of some thousand rows: memory does not grow with the table.
+
+        Raises UsageError if the table cannot be read, or lacks a column.
+        """
+        path = self.folder / f"{name}.parquet"
+        try:
+            if path.exists():
+                with opened(path):  # reading a pipe would block
+                    pass
+                with pq.ParquetFile(path) as file:
+                    file.schema_arrow.empty_table().select(
+                        columns
+                    )  # `iter_batches` passes over columns that are not there
+                    # Without threads, each of which would keep memory.
+                    for batch in file.iter_batches(_PIECE_ROWS, columns=list(columns), use_threads=False):
+                        yield _validated(batch, columns)
+                        pa.default_memory_pool().release_unused()
+            elif schema_of(self.folder, name) is None:
+                raise FileNotFoundError("there is no such file")
+            else:
+                for batch in batches_of(self.folder, name):
+                    yield _validated(batch, columns)
+        except Exception as error:  # pyarrow raises many kinds of errors for a damaged file
+            raise UsageError(f"{path} cannot be read ({_one_line(error)}); run the scenario again") from error
+
     @property
     def slots(self) -> pa.Table:
         """A row per slot and peer: statistics over trials."""
@@ -133,6 +160,13 @@ class Results:
     def digests(self) -> pa.Table:
         """A row per peer, trial and block of 256 slots. Raises UsageError for the digests of an older version."""
         return self._table("digests", DIGESTS)
+
+
+def _validated(batch: pa.RecordBatch, columns: Sequence[str]) -> pa.Table:
+    """Some columns of a batch. Raises an error of Arrow if their contents are damaged, or one is not there."""
+    table = pa.Table.from_batches([batch]).select(columns)
+    table.validate(full=True)
+    return table
 
 
 def _states_in(schema: pa.Schema) -> int:

@@ -12,6 +12,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from heapq import nlargest
+from typing import final
 
 import numpy as np
 
@@ -86,3 +88,42 @@ def lost_spans(codes: Codes, first: int = 0) -> list[LostSpan]:
     fooled = so_far[ends + 1] - so_far[begins]
     spans = zip((begins + first).tolist(), (ends + first).tolist(), fooled.tolist(), strict=True)
     return [LostSpan(*span) for span in spans]
+
+
+@final
+class LongestSpans:
+    """The longest spans off the track, found in consecutive pieces of slots, and how many there are in all."""
+
+    def __init__(self, most: int, first: int = 0) -> None:
+        """most: how many are kept, of equally long ones the earlier; first: the first slot of the first piece."""
+        self._most, self._next = most, first
+        self._ended = 0
+        self._kept: list[LostSpan] = []
+        self._open: LostSpan | None = None
+        """The last span so far: further slots may prolong it."""
+
+    def add(self, codes: Codes) -> None:
+        """The codes of the next slots, (c,)."""
+        spans = lost_spans(codes, self._next)
+        self._next += len(codes)
+        if self._open is not None:
+            if spans and spans[0].first - self._open.last <= JOINED:
+                spans[0] = LostSpan(self._open.first, spans[0].last, self._open.fooled + spans[0].fooled)
+            else:
+                spans.insert(0, self._open)
+        self._open = spans.pop() if spans else None
+        self._ended += len(spans)
+        self._kept = self._longest(spans)
+
+    @property
+    def count(self) -> int:
+        """The number of spans."""
+        return self._ended + (self._open is not None)
+
+    @property
+    def spans(self) -> list[LostSpan]:
+        """The longest spans, longest first."""
+        return self._longest([] if self._open is None else [self._open])
+
+    def _longest(self, further: list[LostSpan]) -> list[LostSpan]:
+        return nlargest(self._most, [*self._kept, *further], key=lambda span: (span.slots, -span.first))

@@ -7,6 +7,8 @@ import json
 import math
 import shutil
 import stat
+import subprocess
+import sys
 import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Iterator
@@ -32,14 +34,16 @@ from evedrop.memory.montecarlo import Plan
 from evedrop.memory.simulation import Mode
 from evedrop.report import closing
 from evedrop.report.chart import Curve, LogChart
+from evedrop.report.groups import GroupCounts, GroupMeans
 from evedrop.report.markup import element, written
 from evedrop.report.run_sections import LostTrackSection
 from evedrop.report.run_source import OUTCOMES, RecordedTrial, RunSource
-from evedrop.report.strip import strip
+from evedrop.report.slot_rows import RowExtent
+from evedrop.report.strip import PIXELS, strip
 from evedrop.report.writing import REPORT, try_report, write_report
 from evedrop.results.writer import load_results
-from evedrop.score.track import LostSpan, Track, lost_spans, track_of
-from tests.conftest import Evedrop
+from evedrop.score.track import LongestSpans, LostSpan, Track, lost_spans, track_of
+from tests.conftest import LIMIT, Evedrop
 from tests.examples import examples
 from tests.pages import Checked, checked
 
@@ -144,6 +148,46 @@ def test_a_page_has_cautions_events_and_outages_and_does_not_depend_on_the_order
         assert page.values(name) == before.values(name)
 
 
+def lengthened(study: Path, folder: Path, times: int) -> None:
+    """A run with the slots of a study, so many times one after the other."""
+    folder.mkdir()
+    summary = json.loads((study / "summary.json").read_text())
+    once = summary["slots"]
+    (folder / "summary.json").write_text(json.dumps({**summary, "slots": once * times}))
+    (folder / "scenario.toml").write_bytes((study / "scenario.toml").read_bytes())
+    for name in ("slots", "trials"):
+        table = pq.read_table(study / f"{name}.parquet")
+        place = table.column_names.index("slot")
+        with pq.ParquetWriter(folder / f"{name}.parquet", table.schema) as writer:
+            for first in range(0, times, 100):
+                shifts = np.repeat(once * np.arange(first, min(times, first + 100)), table.num_rows)
+                part = pa.concat_tables([table] * (len(shifts) // table.num_rows))
+                slots = part["slot"].to_numpy() + shifts
+                writer.write_table(
+                    part.set_column(place, table.schema.field(place), pa.array(slots, part["slot"].type))
+                )
+
+
+def peak_of_report(folder: Path) -> int:
+    """The largest resident memory of a process that makes a report, in bytes."""
+    code = (
+        "import resource, sys; from pathlib import Path; from evedrop.report.writing import write_report; "
+        "write_report(Path(sys.argv[1])); print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
+    )
+    command = [sys.executable, "-c", code, str(folder)]
+    return 1024 * int(subprocess.run(command, check=True, capture_output=True, text=True, timeout=LIMIT).stdout)
+
+
+def test_the_memory_of_a_report_does_not_grow_with_the_slots(study: Path, tmp_path: Path) -> None:
+    """It used to read whole tables: 0.7 kB a slot, that is 170 MB for the further slots here."""
+    peaks = []
+    for times in (500, 4500):
+        lengthened(study, tmp_path / str(times), times)
+        peaks.append(peak_of_report(tmp_path / str(times)))
+    assert peaks[1] < 250e6
+    assert peaks[1] - peaks[0] < 40e6
+
+
 def test_a_slot_without_a_packet_is_silent_in_its_lane(study: Path, tmp_path: Path) -> None:
     """For every action of the receiver: nothing was sent."""
     for name in ("summary.json", "scenario.toml"):
@@ -151,15 +195,22 @@ def test_a_slot_without_a_packet_is_silent_in_its_lane(study: Path, tmp_path: Pa
     table = pq.read_table(study / "trials.parquet")
     column = pc.if_else(pc.less(table["slot"], 3), "nothing", table["sent"].cast(pa.string()))
     pq.write_table(table.set_column(table.column_names.index("sent"), "sent", column), tmp_path / "trials.parquet")
-    outcome = RunSource.read(tmp_path).trial["smart"].outcome
+    outcome = RunSource.read(tmp_path).trial["smart"].outcome.commonest
     assert [OUTCOMES[code] == "silent" for code in outcome[:6]] == [True] * 3 + [False] * 3
 
 
 def test_the_longest_spans_are_listed_in_the_order_of_time() -> None:
     """Of many spans without track those that say most."""
     spans = [LostSpan(100 * i, 100 * i + length, 0) for i, length in enumerate([5, 1, *range(10, 21)])]
-    slots = np.arange(1400.0)
-    trial = RecordedTrial(slots, np.zeros(1400, np.uint8), np.zeros(1400, np.uint8), spans)
+    errors = np.zeros(1400)
+    for span in spans:
+        errors[span.first : span.last + 1] = 100.0
+    words = pa.array([OUTCOMES[0]] * 1400)
+    trial = RecordedTrial(RowExtent(1400, 0, 1399), 1.0)
+    traces = np.full(1400, 50.0)  # it expects such errors: it drifts, and is never fooled
+    traces[errors == 0.0] = 1.0
+    rows = {"sent": pa.array(["state"] * 1400), "action": words, "squared_error": errors, "trace_covariance": traces}
+    trial.add(pa.table(rows))
     source: Any = SimpleNamespace(summary=SimpleNamespace(first_trial=0), trial={"smart": trial})
     nodes = [node for node in LostTrackSection.nodes(source) if not isinstance(node, str) and node.tag == "details"]
     (listed,) = nodes
@@ -212,12 +263,53 @@ def test_spans_cover_exactly_the_slots_off_the_track(
         assert other.first - one.last > 3
 
 
+codes_of_pieces = st.lists(st.lists(st.sampled_from([0, 0, 0, 1, 2]), max_size=12), max_size=12)
+
+
+@given(codes_of_pieces, st.integers(0, 9), st.integers(1, 6))
+@settings(deadline=None, max_examples=examples(200))
+def test_spans_do_not_depend_on_the_pieces_that_they_are_found_in(
+    pieces: list[list[int]], first: int, most: int
+) -> None:
+    """Their number, and the longest of them, are those of all slots at once."""
+    longest = LongestSpans(most, first)
+    for piece in pieces:
+        longest.add(np.array(piece, np.uint8))
+    spans = lost_spans(np.array([code for piece in pieces for code in piece], np.uint8), first)
+    assert longest.count == len(spans)
+    assert longest.spans == sorted(spans, key=lambda span: -span.slots)[:most]
+
+
+@given(st.lists(st.integers(0, 7), min_size=1, max_size=20), st.integers(1, 30))
+@settings(deadline=None, max_examples=examples(100))
+def test_means_and_counts_do_not_depend_on_the_pieces(lengths: list[int], most: int) -> None:
+    """Groups are neighbours, each place is in one group, and the groups' sizes differ by one at most."""
+    count = sum(lengths)
+    values = np.arange(count, dtype=float) ** 2
+    codes = np.arange(count) % 3
+    means, counts = GroupMeans(count, most, 1), GroupCounts(count, most, 3)
+    for part in np.split(np.arange(count), np.cumsum(lengths)[:-1]):
+        means.add(values[None, part])
+        counts.add(codes[part].astype(np.uint8))
+    edges = np.linspace(0, count, min(count, most) + 1).astype(int)
+    groups = [slice(*edge) for edge in pairwise(edges.tolist())]
+    assert np.allclose(means.means[0], [values[group].mean() for group in groups], rtol=1e-12)
+    tallies = [np.bincount(codes[group], minlength=3) for group in groups]
+    assert counts.commonest.tolist() == [int(tally.argmax()) for tally in tallies]
+    assert counts.highest.tolist() == [int(codes[group].max()) for group in groups]
+    if count:
+        assert counts.shares == [float(share) for share in np.bincount(codes, minlength=3) / count]
+
+
 def test_a_lane_has_a_pixel_for_every_slot_or_the_worst_of_several() -> None:
     """The PNG says what the codes say; in a lane that is too long no lost slot disappears."""
     colours = [(1, 2, 3), (200, 0, 9), (0, 0, 255)]
 
     def pixels(codes: np.ndarray, worst: bool) -> list[list[int]]:
-        found = strip(codes, colours, "label", worst)
+        lane = GroupCounts(len(codes), PIXELS, len(colours))
+        for part in np.array_split(codes, 7):
+            lane.add(part)
+        found = strip(lane.highest if worst else lane.commonest, colours, "label")
         assert not isinstance(found, str)
         data = base64.b64decode(str(found.get("src")).partition(",")[2])
         return list(np.asarray(Image.open(BytesIO(data)).convert("RGB"))[0].reshape(-1, 3).tolist())
