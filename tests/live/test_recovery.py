@@ -91,7 +91,7 @@ def test_a_killed_router_costs_nothing_but_time(what: str, evedrop: Evedrop, tmp
             # Losses that overlap are one outage: this one must be over before the next.
             wait_until(partial(has_told, live, "reconnected", times), "a run that continues")
     assert evedrop("resume", str(live.folder)).status == 0
-    done = live.end(120)
+    done = live.end()
     assert done.status == 0, done.err
     live.nothing_left()
     as_if_undisturbed(done.summary, scenario, tmp_path / "memory")
@@ -112,7 +112,7 @@ def test_either_of_two_linked_routers_may_be_killed(name: str, evedrop: Evedrop,
         live.kill(name)
         wait_until(lambda: live.children().get(name) not in {None, before}, f"another {name}")
     assert evedrop("resume", str(live.folder)).status == 0
-    done = live.end(120)
+    done = live.end()
     assert done.status == 0, done.err
     live.nothing_left()
     as_if_undisturbed(done.summary, scenario, tmp_path / "memory")
@@ -152,7 +152,7 @@ def test_what_an_operator_changed_survives_the_router(evedrop: Evedrop, tmp_path
     wait_until(lambda: evedrop("step", folder, "100").status == 0, "a router that lets an operator in")
     assert evedrop("link", folder, "smart", "heal").status == 0
     assert evedrop("resume", folder).status == 0
-    done = live.end(60)
+    done = live.end()
     assert done.status == 0, done.err
     assert [one["process"] for one in done.summary["outages"]] == ["router"]
     as_if_undisturbed(done.summary, load(live.folder / "scenario.toml"), tmp_path / "memory")

@@ -17,7 +17,7 @@ def test_what_is_ignored_from_birth_stays_ignored() -> None:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         with stop_on_signals() as stop:
             signal.raise_signal(number)
-            assert stop.wait(60)
+            assert stop.wait(LIMIT)
     code = (
         "import signal\nsignal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
         "from evedrop.signals import stop_on_signals\n"

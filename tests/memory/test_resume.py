@@ -25,7 +25,7 @@ from evedrop.memory.simulation import Mode
 from evedrop.memory.trials import tasks_of
 from evedrop.results.writer import load_results
 from evedrop.signals import stop_on_signals
-from tests.conftest import Evedrop, wait_until
+from tests.conftest import LIMIT, Evedrop, wait_until
 
 STUDY = (
     *("montecarlo", "eavesdroppers", "--trials", "4700", "--slots", "30"),
@@ -62,7 +62,7 @@ def interrupted_after(monkeypatch: pytest.MonkeyPatch, tasks: int) -> None:
         keep(kept, *given)
         if kept.count == tasks:
             os.kill(os.getpid(), signal.SIGINT)
-            assert stops[-1].wait(60)
+            assert stops[-1].wait(LIMIT)
 
     monkeypatch.setattr(KeptTasks, "keep", then)
     for module in ("memory.montecarlo", "studies.sweep", "studies.compare", "studies.parts"):

@@ -346,7 +346,7 @@ def test_all_rows_are_on_disk_before_the_observer_waits_for_the_others_to_end(ev
     """A router that is gone never confirms: an observer that is killed while it waits has lost nothing."""
     rogue = with_rogue(evedrop, "observer", WAITS_FOR_OTHERS)
     live = evedrop.live("eavesdroppers", "--slots", "60", "--pace", "0", env=rogue)
-    wait_until(lambda: last_round(live.folder).slots == 60, "all slots on disk", 60.0)
+    wait_until(lambda: last_round(live.folder).slots == 60, "all slots on disk")
     os.kill(live.child("observer"), signal.SIGKILL)
     done = live.end()
     assert done.status == 3, done.err

@@ -27,6 +27,7 @@ from evedrop.scenario.application import APPLICATIONS
 from evedrop.scenario.events import EVENTS
 from evedrop.scenario.table import Table
 from evedrop.wire.tables import WireFile
+from tests.conftest import LIMIT
 
 NEW = (Path(__file__).parents[2] / "scenarios" / "_new.toml").read_text(encoding="utf-8")
 WRITTEN_BY_EVEDROP = {"made_with"}
@@ -109,7 +110,7 @@ def test_a_new_scenario_is_written_completely_or_not_at_all(tmp_path: Path) -> N
         from evedrop.cli.main import main
         raise SystemExit(main(["new", {str(path)!r}]))
     """
-    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True, timeout=60)
+    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True, timeout=LIMIT)
     assert done.returncode == 2
     assert "mine.toml cannot be written (File too large); give another place" in done.stderr
     assert not path.exists()

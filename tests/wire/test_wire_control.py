@@ -20,7 +20,7 @@ from evedrop.names import OBSERVER
 from evedrop.wire.conductor import WireConductor
 from evedrop.wire.control import WireControl
 from evedrop.wire.scorekeeper import WireScorekeeper
-from tests.conftest import wait_until
+from tests.conftest import LIMIT, wait_until
 from tests.wire.wire_at_work import LOSSY, WireAtWork, at_work, both_ways, program
 
 
@@ -94,7 +94,7 @@ def test_what_cannot_be_done_is_refused(tmp_path: Path, capsys: pytest.CaptureFi
         assert "are not partitioned" in refused("heal", "robot", "base")
         assert "rabot" in refused("partition", "rabot", "base")
         control = read_control(tmp_path)
-        answer = ask(control, NoEvent(), 10.0)
+        answer = ask(control, NoEvent(), LIMIT)
         assert answer is not None
         assert answer.refused
         key = RunKeys(control.run).control(OBSERVER)
@@ -107,7 +107,7 @@ def test_what_cannot_be_done_is_refused(tmp_path: Path, capsys: pytest.CaptureFi
             assert not list(other.get(key, payload=b"nonsense", timeout=5.0))
             told = [
                 reply.ok.payload.to_bytes()
-                for reply in other.get(key, payload=enclosed(key, b"\xc1"), timeout=5.0)
+                for reply in other.get(key, payload=enclosed(key, b"\xc1"), timeout=LIMIT)
                 if reply.ok
             ]
             assert len(told) == 1

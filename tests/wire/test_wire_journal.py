@@ -24,7 +24,7 @@ from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_part import STORED, JournalPart, Records, records_in
 from evedrop.wire.journal_reader import journal_tables, last_beat, part_names
 from evedrop.wire.lanes import LinkState
-from tests.conftest import wait_until
+from tests.conftest import LIMIT, wait_until
 from tests.wire.wire_plans import wire_plan
 
 LOSSY = {"loss": {"model": "bernoulli", "quality": 0.6}}
@@ -343,7 +343,7 @@ def test_a_wire_may_be_killed_at_any_moment(tmp_path: Path) -> None:
     A message that was still delayed when its wire was killed is under way, not delivered.
     """
     command = [sys.executable, "-c", KILLED, str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT, check=False)
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) > 5000
 
@@ -403,7 +403,7 @@ def test_on_a_full_disk_the_wire_goes_on(then: str, tmp_path: Path) -> None:
     if os.geteuid() != 0 or shutil.which("unshare") is None:
         pytest.skip("only root may mount a small disk")
     command = ["unshare", "--mount", sys.executable, "-c", ON_SMALL_DISK, str(tmp_path), then]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT, check=False)
     if done.returncode in {1, 77} and "Traceback" not in done.stderr:
         pytest.skip("this machine lets nobody mount")
     assert done.returncode == 0, done.stderr

@@ -26,13 +26,12 @@ from evedrop.live.protocol.keys import RunKeys
 from evedrop.ports import free_port
 from evedrop.scenario import Scenario
 from tests.builders import MARGINAL, process_table
+from tests.conftest import LIMIT
 
-LIMIT_SECONDS = 60.0
-"""After which what a test waits for counts as never come: far above what a busy machine needs."""
 Message = tuple[str, bytes]
 
 
-def until(condition: Callable[[], Any], what: str, seconds: float = LIMIT_SECONDS) -> Any:
+def until(condition: Callable[[], Any], what: str, seconds: float = LIMIT) -> Any:
     """The first true value of a condition; fails, saying what was waited for, if it stays false."""
     deadline = time.monotonic() + seconds
     while not (value := condition()):
@@ -82,9 +81,9 @@ class Ear:
     def hear(self) -> Message:
         """The next message."""
         try:
-            return self.messages.get(timeout=LIMIT_SECONDS)
+            return self.messages.get(timeout=LIMIT)
         except Empty:
-            raise AssertionError(f"nothing arrived within {LIMIT_SECONDS:.0f} s") from None
+            raise AssertionError(f"nothing arrived within {LIMIT:.0f} s") from None
 
     def all(self) -> list[Message]:
         """Everything that has arrived by now."""
@@ -97,7 +96,7 @@ class Ear:
 def connect(brief: AnyBrief, **changes: Any) -> zenoh.Session:
     """A session with a brief's credentials, with a router that may not be up yet; changes replace top-level entries."""
     config = client_config(brief)
-    config["connect"]["timeout_ms"] = int(1000 * LIMIT_SECONDS)
+    config["connect"]["timeout_ms"] = int(1000 * LIMIT)
     return zenoh.open(zenoh.Config.from_json5(json.dumps({**config, **changes})))
 
 

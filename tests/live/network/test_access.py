@@ -23,7 +23,8 @@ from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
 from evedrop.live.protocol.commands import End, Unknown
 from evedrop.live.protocol.envelope import enclosed
-from tests.live.network.bench import LIMIT_SECONDS, Bench, Ear, bench_of, connect, scenario_of, until
+from tests.conftest import LIMIT
+from tests.live.network.bench import Bench, Ear, bench_of, connect, scenario_of, until
 
 EVE = "eve"
 PROCESSES = ("sensor", "legitimate", "eve", "mallory", "nadia")
@@ -353,7 +354,7 @@ def test_a_process_with_a_wrong_brief_says_so(stage: Bench, tmp_path: Path) -> N
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,
-        timeout=LIMIT_SECONDS,
+        timeout=LIMIT,
         check=False,
     )
     assert ended.returncode == 2

@@ -31,7 +31,8 @@ from evedrop.results.writer import load_results
 from evedrop.scenario import Scenario
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.streams import stream_key
-from tests.live.network.bench import LIMIT_SECONDS, Ear, connect, until
+from tests.conftest import LIMIT
+from tests.live.network.bench import Ear, connect, until
 from tests.processes import descendants, parent_of, words_of
 
 SCENARIO = """
@@ -221,7 +222,7 @@ def attack(folder: Path) -> Evidence:
             for name, pid in found.items()
         }
         run.send_signal(signal.SIGTERM)
-        output, _ = run.communicate(timeout=LIMIT_SECONDS)
+        output, _ = run.communicate(timeout=LIMIT)
     for name, trace in traces.items():
         trace["log"] = (out / "logs" / f"{name}.log").read_bytes()
     return Evidence(scenario, out, briefs, traces, overheard, heard, refused, run.returncode, output)

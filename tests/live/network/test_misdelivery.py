@@ -27,7 +27,8 @@ from evedrop.live.protocol.envelope import enclosed, head_of, named_in
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.requests import StatusRequest
 from evedrop.ports import free_port
-from tests.live.network.bench import LIMIT_SECONDS, is_matched, scenario_of, until
+from tests.conftest import LIMIT
+from tests.live.network.bench import is_matched, scenario_of, until
 from tests.proxy import Cable, cable
 
 GOOD = progress(7)
@@ -107,7 +108,7 @@ def test_a_funnel_drops_what_names_another_key(stage: Stage) -> None:
     with Session(stage.briefs["observer"]) as session:
         session.funnel(key, heard.put)
         stage.put(key, [*foreign(stage.keys, key), enclosed(key, GOOD)])
-        assert heard.get(timeout=LIMIT_SECONDS) == GOOD
+        assert heard.get(timeout=LIMIT) == GOOD
         assert heard.empty()
         assert session.dropped == len(foreign(stage.keys, key))
 
@@ -133,7 +134,7 @@ def test_a_question_that_names_another_key_is_not_answered(stage: Stage) -> None
         assert asked.empty()
         assert session.dropped == len(foreign(stage.keys, key))
         threading.Thread(target=lambda: list(stage.router.get(key, payload=enclosed(key, GOOD)))).start()
-        question = asked.get(timeout=LIMIT_SECONDS)
+        question = asked.get(timeout=LIMIT)
         assert question.payload == GOOD
         question.answer(GOOD)
 
@@ -152,7 +153,7 @@ def test_an_answer_that_names_another_key_is_none(stage: Stage) -> None:
         answers.put(message)
         assert ask(entry, StatusRequest(), 2.0) is None
     answers.put(enclosed(key, Answer(7, "yes").pack()))
-    assert ask(entry, StatusRequest(), LIMIT_SECONDS) == Answer(7, "yes")
+    assert ask(entry, StatusRequest(), LIMIT) == Answer(7, "yes")
 
 
 def test_a_malformed_message_of_its_own_key_is_an_error(stage: Stage) -> None:
@@ -181,27 +182,27 @@ def test_a_lost_connection_is_replaced(stage: Stage) -> None:
         put = session.outlet(keys.progress("eve"))
         session.watch("router", watched.put)
         session.ready()
-        assert watched.get(timeout=LIMIT_SECONDS)
-        assert tokens.get(timeout=LIMIT_SECONDS)
+        assert watched.get(timeout=LIMIT)
+        assert tokens.get(timeout=LIMIT)
         stage.put(keys.downlink("eve"), [enclosed(keys.downlink("eve"), progress(1))])
         stage.put(keys.telemetry("eve"), [enclosed(keys.telemetry("eve"), progress(0))])
-        assert funnelled.get(timeout=LIMIT_SECONDS) == progress(0)  # so the one before it has arrived too
+        assert funnelled.get(timeout=LIMIT) == progress(0)  # so the one before it has arrived too
         ids = {str(session.connection.session.zid())}
         for _ in range(3):
             stage.cable.flap()
-            assert [tokens.get(timeout=LIMIT_SECONDS) for _ in range(2)] == [False, True]
-            assert [watched.get(timeout=LIMIT_SECONDS) for _ in range(2)] == [False, True]
+            assert [tokens.get(timeout=LIMIT) for _ in range(2)] == [False, True]
+            assert [watched.get(timeout=LIMIT) for _ in range(2)] == [False, True]
             # One flap may cost two sessions; the news of the second then come early at the next flap.
             until(lambda: str(session.connection.session.zid()) not in ids, "another session")
             ids.add(str(session.connection.session.zid()))
         stage.put(keys.downlink("eve"), [enclosed(keys.downlink("eve"), progress(2))])
         stage.put(keys.telemetry("eve"), [enclosed(keys.telemetry("eve"), progress(3))])
         assert [inbox.recv(), inbox.recv()] == [progress(1), progress(2)]
-        assert funnelled.get(timeout=LIMIT_SECONDS) == progress(3)
+        assert funnelled.get(timeout=LIMIT) == progress(3)
         until(lambda: session.reaches(keys.progress("eve")), "the reader of its progress")
         put(GOOD)
-        assert heard.get(timeout=LIMIT_SECONDS) == enclosed(keys.progress("eve"), GOOD)
-    assert tokens.get(timeout=LIMIT_SECONDS) is False
+        assert heard.get(timeout=LIMIT) == enclosed(keys.progress("eve"), GOOD)
+    assert tokens.get(timeout=LIMIT) is False
     token.undeclare()
 
 
@@ -218,7 +219,7 @@ def test_a_connection_that_takes_one_key_for_another_is_replaced(stage: Stage) -
         reads = threading.Thread(target=lambda: list(inbox))
         reads.start()
         until(renewed, "another session")
-    reads.join(LIMIT_SECONDS)
+    reads.join(LIMIT)
     assert not reads.is_alive()
 
 
@@ -236,7 +237,7 @@ def test_an_inbox_that_is_closed_says_so(stage: Stage) -> None:
 
         reads = threading.Thread(target=read)
         reads.start()
-    reads.join(LIMIT_SECONDS)
+    reads.join(LIMIT)
     assert [str(error) for error in caught] == [stage.keys.downlink("eve")]
 
 

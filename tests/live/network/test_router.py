@@ -27,8 +27,9 @@ from evedrop.live.protocol.brief_parts import RouterPart
 from evedrop.live.protocol.commands import End
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.model.process import Floats
+from tests.conftest import LIMIT
 from tests.live.in_memory import Stage
-from tests.live.network.bench import LIMIT_SECONDS, Bench, scenario_of
+from tests.live.network.bench import Bench, scenario_of
 
 
 def uniforms_of(key: bytes, slots: int, trials: range) -> np.ndarray:
@@ -52,7 +53,7 @@ class Ear:
         """The next message."""
         kept = self.bench.heard[self.key]
         while not kept:
-            key, payload = self.bench.stage.put.get(timeout=LIMIT_SECONDS)
+            key, payload = self.bench.stage.put.get(timeout=LIMIT)
             self.bench.heard[key].append(payload)
         return self.key, kept.popleft()
 
@@ -88,7 +89,7 @@ class MemoryBench:
     def end(self) -> None:
         """The run is over: the router returns."""
         self.stage.commands.put(End().pack())
-        self._thread.join(LIMIT_SECONDS)
+        self._thread.join(LIMIT)
         assert not self._thread.is_alive()
 
     def packet(self, k: int) -> Floats:
@@ -133,7 +134,7 @@ def test_every_packet_is_accounted_for(bench: Callable[..., Bench]) -> None:
         quality = stage.scenario.quality[name]
         assert np.array_equal(gamma, uniforms_of(key, 61, range(1000, 1005)) < quality)
     stage.put("observer", stage.keys.control("router"), End().pack())
-    assert stage.router.wait(LIMIT_SECONDS) == 0
+    assert stage.router.wait(LIMIT) == 0
     assert stage.log.read_text() == ""
 
 
@@ -186,7 +187,7 @@ def test_bad_packet_ends_the_router(bench: Callable[..., Bench]) -> None:
     stage = bench(longest_outage=0.0)
     for message in messages:
         stage.put("sensor", stage.keys.uplink, message)
-    assert stage.router.wait(LIMIT_SECONDS) == 3
+    assert stage.router.wait(LIMIT) == 3
     text = stage.log.read_text()
     assert re.search(line, text), text
     assert "Traceback" not in text
