@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import signal
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -11,6 +12,15 @@ from pathlib import Path
 def words_of(pid: int | str) -> list[str]:
     """The command line of a process, without the spaces and zero bytes between its words. Raises OSError if it has ended."""
     return re.split(r"[\0 ]+", Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").strip("\0 "))
+
+
+def catches(pid: int, number: signal.Signals) -> bool:
+    """Whether a process has a handler for a signal in place."""
+    with suppress(OSError, StopIteration):
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+        caught = int(next(line for line in lines if line.startswith("SigCgt")).split()[1], 16)
+        return bool(caught >> (number - 1) & 1)
+    return False
 
 
 def parent_of(pid: int) -> int:

@@ -28,7 +28,7 @@ from evedrop.processes import KILLED_SECONDS, SUSPENDED_SECONDS, SuspensionWatch
 from evedrop.scenario.dry_run import foreign
 
 _LOOK_SECONDS = 0.1
-_LAST_SECONDS = 10.0  # after a stop, for the current chunk of slots
+_LAST_SECONDS = 30.0  # after a stop, for the current chunk of slots; only a worker that hangs needs them all
 
 
 def usable_cores() -> int:

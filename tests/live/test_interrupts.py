@@ -21,6 +21,7 @@ from evedrop.results.growing_tables import UNFINISHED, last_round
 from evedrop.results.writer import load_results
 from tests.by_hand import by_hand
 from tests.conftest import LIMIT, Done, Evedrop, Live, wait_until
+from tests.processes import catches
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 ENDLESS = ("--slots", "1000000")
@@ -31,11 +32,7 @@ Moment = Callable[[Live], object]
 
 def heeds(pid: int) -> bool:
     """Whether a process has its handlers for SIGHUP and SIGTERM in place."""
-    with contextlib.suppress(OSError, StopIteration):
-        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
-        caught = int(next(line for line in lines if line.startswith("SigCgt")).split()[1], 16)
-        return all(caught >> (number - 1) & 1 for number in (signal.SIGHUP, signal.SIGTERM))
-    return False
+    return catches(pid, signal.SIGHUP) and catches(pid, signal.SIGTERM)
 
 
 def has_loaded(pid: int, library: str) -> bool:
