@@ -7,7 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evedrop.live.network.resending import ReplayBuffer
+from evedrop.errors import Gap
+from evedrop.live.network.resending import GapDetector, ReplayBuffer
+from evedrop.live.protocol.codec import Reader
+from tests.clock import TestClock
 
 
 def slot_message(k: int) -> bytes:
@@ -69,3 +72,64 @@ def test_the_last_message_is_sent_in_any_case(k: int) -> None:
     del sent[:]
     kept.again(1, k + 1)
     assert sent == [slot_message(k)]
+
+
+def test_a_buffer_with_a_span_keeps_the_slots_of_the_span() -> None:
+    """Older slots, which are done, are not sent again; `back` slots more are kept."""
+    sent: list[bytes] = []
+    kept = ReplayBuffer(sent.append, span=4, head=head, back=1)
+    for k in range(10):
+        kept(k, slot_message(k))
+    assert sent == [slot_message(k) for k in range(10)]
+    del sent[:]
+    kept.again(1, 0)
+    assert sent == [head(1, 5, 4), *(slot_message(k) for k in range(4, 10))]
+
+
+KEY = "evedrop/r/uplink"
+
+
+def test_a_slot_that_is_missing_is_waited_for() -> None:
+    """For the patience, from the first later slot on, and not longer; earlier slots do not count."""
+    clock = TestClock()
+    gap = GapDetector(KEY, 5.0, clock)
+    gap.missed(7, 6)
+    clock.now += 100.0
+    gap.missed(7, 9)
+    clock.now += 5.0
+    gap.missed(7, 10)
+    clock.now += 0.5
+    gap.missed(7, 6)
+    with pytest.raises(Gap) as found:
+        gap.missed(7, 8)
+    assert str(found.value) == str(Gap(KEY, 7, 8))
+
+
+def test_another_slot_that_is_missing_is_waited_for_as_long() -> None:
+    """The time of the slot before it does not count."""
+    clock = TestClock()
+    gap = GapDetector(KEY, 5.0, clock)
+    gap.missed(0, 3)
+    clock.now += 4.0
+    gap.missed(2, 3)
+    clock.now += 4.0
+    gap.missed(2, 3)
+    clock.now += 2.0
+    with pytest.raises(Gap):
+        gap.missed(2, 3)
+
+
+def test_the_message_of_the_slot_that_is_due_is_taken() -> None:
+    """Those of earlier and later slots that come before it are left out."""
+    clock = TestClock()
+    gap = GapDetector(KEY, 5.0, clock)
+    coming = iter([3, 6, 5])
+    message = gap.take_message(lambda: Reader(KEY, slot_message(next(coming))), 5)
+    assert message.integer("k") == 5
+
+    def too_late() -> Reader:
+        clock.now += 3.0
+        return Reader(KEY, slot_message(8))
+
+    with pytest.raises(Gap):
+        gap.take_message(too_late, 6)
