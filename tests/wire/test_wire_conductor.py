@@ -38,19 +38,32 @@ def test_events_happen_at_their_times() -> None:
     """Not before and not after, each once, in the order of time; the start is the beginning of the `with` block."""
     clock = TestClock()
     links, said = Applied(clock), list[str]()
-    plan = plan_of({"from": 12, "to": 60.5, "cut": "robot-base"}, {"at": 7, "note": "in the lift"})
+    plan = plan_of(
+        {"from": 12, "to": 60.5, "cut": "robot-base"}, {"at": 7, "note": "in the lift"}, {"at": 0, "note": "go"},
+        {"from": 0.5, "to": 0.75, "cut": "robot-base"},
+    )  # fmt: skip
     conductor = WireConductor(plan, links, said.append, clock)  # type: ignore[arg-type]
-    assert links.at == [(0.0, WHOLE, ())]
+    assert [(at, cut) for at, cut, _ in links.at] == [(0.0, WHOLE)]
+    assert said == []
     clock.sleep(100.0)
     with conductor:
-        wait_until(lambda: len(links.at) == 5, "all events are carried out")
+        wait_until(lambda: len(links.at) == 7, "all events are carried out")
     assert links.at[1:] == [
-        (100.0, WHOLE, ()),
+        (100.0, WHOLE, ("go",)),
+        (100.5, CUT, ("cut robot-base",)),
+        (100.75, WHOLE, ("heal robot-base",)),
         (107.0, WHOLE, ("in the lift",)),
         (112.0, CUT, ("cut robot-base",)),
         (160.5, WHOLE, ("heal robot-base",)),
     ]
-    assert said == ["7.0 s: in the lift", "12.0 s: cut robot-base", "60.5 s: heal robot-base"]
+    assert said == [
+        "0.0 s: go",
+        "0.5 s: cut robot-base",
+        "0.8 s: heal robot-base",
+        "7.0 s: in the lift",
+        "12.0 s: cut robot-base",
+        "60.5 s: heal robot-base",
+    ]
     assert conductor.seconds == 60.5
 
 

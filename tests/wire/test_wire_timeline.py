@@ -141,3 +141,13 @@ def test_what_an_operator_cannot_do() -> None:
     assert refused(with_partition_ended, plan, "robot", "bse", 2.0) == [
         'heal: is "bse"; expected robot, base or listener; did you mean base?'
     ]
+
+
+def test_the_loss_model_of_correlated_links_cannot_change() -> None:
+    """Their losses share random numbers, so that another model is refused, as in a file; that of other links may change."""
+    tied = {"name": "back", "from": "base", "to": "robot", "correlation": {"with": "scan", "strength": 0.5}}
+    plan = wire_of({"side": SIDES, "link": [*LINKS[:2], tied]})
+    other = {"loss": {"model": "pattern", "outcomes": "10"}}
+    assert len(refused(with_change, plan, {"link": "back", "set": other}, 2.0)) == 1
+    assert with_change(plan, {"link": "robot-base", "set": other}, 2.0)[1].startswith("link robot-base: loss = ")
+    assert with_change(plan, {"link": "back", "set": {"quality": 0.4}}, 2.0)[1].startswith("link back: loss = ")

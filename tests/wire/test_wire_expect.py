@@ -1,0 +1,75 @@
+"""`[[expect]]` of a wire file: its bounds, its words, and its mistakes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from evedrop.errors import ScenarioError
+from evedrop.wire.expect import WireExpectTable, expectation_mistakes
+from evedrop.wire.file import wire_of
+
+
+def mistakes(**table: Any) -> list[str]:
+    """Those of a wire with one link, scan, and this expectation."""
+    link = {"name": "scan", "from": "robot", "to": "base"}
+    with pytest.raises(ScenarioError) as caught:
+        wire_of({"side": {"robot": {}, "base": {}}, "link": [link], "expect": [table]})
+    return caught.value.mistakes
+
+
+@pytest.mark.parametrize(
+    ("table", "subject", "text"),
+    [
+        ({"link": "scan"}, "scan", "link scan within the 99 % bounds of its model"),
+        ({"figure": "scan.delivery", "below": 0.9}, "scan", "scan.delivery below 0.9"),
+        ({"figure": "a.heard", "above": 0, "below": 5}, "a", "a.heard below 5 and above 0"),
+        (
+            {"figure": "scan.latency", "quantile": 0.99, "below": "20 ms"},
+            "scan",
+            "0.99 quantile of scan.latency below 0.02",
+        ),
+        ({"figure": "scan.latency", "quantile": 0.5, "above": 0.5}, "scan", "0.5 quantile of scan.latency above 0.5"),
+    ],
+)
+def test_an_expectation_in_words(table: dict[str, Any], subject: str, text: str) -> None:
+    """Its link, and the part of a sentence that says what is expected; a length of time is in seconds."""
+    found = WireExpectTable.model_validate(table)
+    assert (found.subject, found.text) == (subject, text)
+
+
+def test_both_bounds_hold_together() -> None:
+    """Nothing outside of them does."""
+    table = WireExpectTable.model_validate({"figure": "scan.gap_seconds", "above": "1 s", "below": "2 s"})
+    assert [table.holds(found) for found in (0.5, 1.0, 1.5, 2.0, 2.5)] == [False, False, True, False, False]
+
+
+@pytest.mark.parametrize("bound", [-0.5, float("inf"), float("nan"), True, "1"])
+def test_a_bound_is_a_number_that_a_figure_can_reach(bound: Any) -> None:
+    """Not below 0, not infinite, and a text only with a unit of time."""
+    assert [one.partition(":")[0] for one in mistakes(figure="scan.delivery", below=bound)] == ["expect.0.below"]
+
+
+def test_a_link_stands_alone() -> None:
+    """Each other entry is named, and no others; None is as good as an entry that is not there."""
+    found = mistakes(link="scan", figure="scan.heard", quantile=0.5, above=1)
+    assert sorted(one.partition(":")[0] for one in found) == ["expect.0.above", "expect.0.figure", "expect.0.quantile"]
+    assert WireExpectTable.model_validate({"link": "scan", "figure": None, "below": None}).link == "scan"
+
+
+def test_a_figure_is_that_of_a_link() -> None:
+    """Without a link it is refused, as is one of an unknown link; the message names what there is."""
+    assert mistakes(figure="delivery", below=1)[0].startswith('expect.0.figure: is "delivery"; expected LINK.heard, ')
+    (unknown,) = mistakes(figure="scam.heard", below=1)
+    assert unknown == (
+        'expect.0.figure: is "scam.heard", but there is no link scam; expected a figure or the name of scan; '
+        "did you mean scan?"
+    )
+    (unknown,) = mistakes(link="sc.an")
+    assert unknown.startswith('expect.0.link: is "sc.an", but there is no link sc.an; ')
+
+
+def test_malformed_names_of_links_are_the_tables_matter() -> None:
+    """Here they are passed over: the table itself refuses them."""
+    assert list(expectation_mistakes([{"figure": 3, "link": 4}, {"figure": ".heard"}, {"link": ""}], ["scan"])) == []
