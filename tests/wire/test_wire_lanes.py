@@ -49,9 +49,72 @@ def test_what_is_lossless_is_not_cut_but_does_not_go_round(lossy: LinkState) -> 
     decide = lossy.lane("put", "stop", lossless=True)
     lossy.cut = True
     assert [decide(0.0, LARGEST) for _ in range(3)] == [(n, Crossing.DELIVERED, 0.0, False) for n in range(3)]
-    assert decide(0.0, LARGEST + 1)[:2] == (3, Crossing.TOO_LARGE)
+    assert decide(0.0, LARGEST + 1) == (3, Crossing.TOO_LARGE, 0.0, False)
     lossy.looped = True
-    assert decide(0.0, 1)[:2] == (4, Crossing.LOOPED)
+    assert decide(0.0, 1) == (4, Crossing.LOOPED, 0.0, False)
+
+
+SLOW: dict[str, Any] = {
+    "loss": {"model": "bernoulli", "quality": 1.0},
+    "delay": {"model": "constant", "value": 0.25},
+    "duplicate": 1.0,
+}
+"""A link that holds every message back and delivers it twice."""
+
+
+def test_a_message_waits_for_those_before_it(tmp_path: Path) -> None:
+    """Its delay, then the bytes in the queue and its own at the link's rate; the queue is full beyond its bytes, not at them."""
+    plan = both_ways({**SLOW, "rate": 1000.0, "queue": 100}, largest=LARGEST)
+    with WireJournal(tmp_path, plan) as journal:
+        decide = LinkState(plan.links[0], plan, journal).lane("put", "scan", lossless=False)
+        sent = [
+            decide(now, size) for now, size in ((5.0, 50), (5.0, 50), (5.0, 50), (5.05, 50), (9.0, LARGEST), (9.0, 1))
+        ]
+    assert [one[:2] for one in sent] == [(0, 0), (1, 0), (2, Crossing.OVERFLOW), (3, 0), (4, 0), (5, Crossing.OVERFLOW)]
+    assert [one[2] for one in sent] == pytest.approx([0.3, 0.35, 0.0, 0.35, 0.35, 0.0])
+    assert [one[3] for one in sent] == [True, True, False, True, True, False]
+
+
+def test_what_is_not_delivered_has_no_delay_and_no_copy(tmp_path: Path) -> None:
+    """Whatever the reason; and a link without a rate has no queue."""
+    plan = both_ways(SLOW, largest=LARGEST)
+    with WireJournal(tmp_path, plan) as journal:
+        state = LinkState(plan.links[0], plan, journal)
+        decide = state.lane("put", "scan", lossless=False)
+        assert [decide(0.0, LARGEST) for _ in range(2)] == [(n, Crossing.DELIVERED, 0.25, True) for n in range(2)]
+        assert decide(0.0, LARGEST + 1) == (2, Crossing.TOO_LARGE, 0.0, False)
+        state.looped = True
+        assert decide(0.0, 1) == (3, Crossing.LOOPED, 0.0, False)
+        state.looped, state.cut = False, True
+        assert decide(0.0, 1) == (4, Crossing.CUT, 0.0, False)
+        state.cut = False
+        state.change({**SLOW, **DEAD})
+        assert decide(0.0, 1) == (5, Crossing.LOST, 0.0, False)
+
+
+def test_other_settings_hold_from_the_next_message_on(tmp_path: Path) -> None:
+    """Of every key that is in use, for its model and for the rate; the journal has the number of that message."""
+    plan = both_ways(SLOW)
+    with WireJournal(tmp_path, plan) as journal:
+        state = LinkState(plan.links[0], plan, journal)
+        scan, pose = (state.lane("put", key, lossless=False) for key in ("scan", "pose"))
+        for _ in range(3):
+            scan(0.0, 10)
+        slower = {**SLOW, "delay": {"model": "constant", "value": 1.0}, "duplicate": 0.0, "rate": 10.0, "queue": 1000}
+        state.change(slower)
+        assert [scan(0.0, 10), pose(0.0, 10)] == [(3, 0, 2.0, False), (0, 0, 3.0, False)]
+        state.change(SLOW)
+        assert scan(0.0, 10) == (4, 0, 0.25, True)
+        found = [[one.at for one in journal.changes_of("robot-base", key, "put")] for key in ("scan", "pose")]
+    assert [at[-2:] for at in found] == [[3, 4], [0, 1]]
+
+
+def test_two_who_ask_for_a_key_share_its_messages(lossy: LinkState) -> None:
+    """They have one sequence of numbers, with one sequence of fates."""
+    fates = KeyFates(lossy.link, "scan", "put", 7)
+    two = [lossy.lane("put", "scan", lossless=False) for _ in range(2)]
+    found = [two[n % 2](float(n), 1)[:2] for n in range(20)]
+    assert found == [(n, fates.next()[0]) for n in range(20)]
 
 
 @pytest.mark.parametrize("lossless", [False, True])
