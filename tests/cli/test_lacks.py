@@ -65,7 +65,8 @@ def test_a_run_without_threads_ends_with_a_sentence(evedrop: Evedrop, monkeypatc
     def fail(*_: object) -> None:
         raise RuntimeError("can't start new thread")
 
-    monkeypatch.setattr(threading, "_start_new_thread", fail)
+    starts = ("_start_joinable_thread", "_start_new_thread")  # since Python 3.13, and before
+    monkeypatch.setattr(threading, next(name for name in starts if hasattr(threading, name)), fail)
     done = evedrop("run", "eavesdroppers", "--slots", "5", "--view", "off", "--out", "run")
     assert done.status == 3
     assert done.err.startswith("evedrop: no further process or thread can be started; ")

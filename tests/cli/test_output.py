@@ -54,7 +54,7 @@ COMMANDS = {
 }  # fmt: skip
 LEFT_OUT = {"demo", "link", "partition", "heal", "pause", "resume", "step", "health", "host", *ROLES}
 """Commands that do what another one does, or that need a run in progress, and compute nothing."""
-FAILS_WITH = {"check": 2, "run": 1, "montecarlo": 1, "test": 1, "diff": 1, "status": 2}
+FAILS_WITH = {"check": 2, "run": 1, "montecarlo": 1, "test": 1, "diff": 1, "status": 2, "wire": 1}
 """Command → its status, if it is not 0."""
 SLOW = {"figures"}
 
