@@ -1,6 +1,6 @@
 """Handles Ctrl-C, SIGTERM and SIGHUP in a command that has begun its work: by an event, an exception, or at once.
 
-The first signal counts: while the block that it ends is left in order, further ones are ignored.
+The first signal counts: while the block that it ends is left in order, further ones are ignored, unless it says otherwise.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import faulthandler
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -23,6 +24,8 @@ AFTERTHOUGHT_SECONDS = 0.5
 
 A closing terminal hangs up on all processes; a user may end them one by one.
 """
+AGAIN_SECONDS = 1.0
+"""A signal that comes within this time of another is not a second one: some programs, and terminals, send several."""
 
 
 @contextmanager
@@ -32,6 +35,46 @@ def stop_on_signals() -> Iterator[threading.Event]:
     # By a thread: the main thread may hold the lock of the event right now, and would wait for itself.
     with _handled(lambda: _thread.start_new_thread(stop.set, ())):
         yield stop
+
+
+@contextmanager
+def stop_or_leave_on_signals(leave: Callable[[], object]) -> Iterator[threading.Event]:
+    """An event that the first signal sets while the block runs; a second one calls `leave`, which exits, whatever hangs.
+
+    Both happen on a thread of its own, even while the main thread waits outside Python. Signals within `AGAIN_SECONDS` of the
+    first count as one. Has no effect outside the main thread.
+    """
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    ours, theirs = os.pipe()
+    os.set_blocking(theirs, False)
+
+    def listen() -> None:
+        first = 0.0
+        while number := os.read(ours, 1):
+            if number[0] not in SIGNALS:
+                continue
+            if not stop.is_set():
+                first = time.monotonic()
+                stop.set()
+            elif time.monotonic() - first > AGAIN_SECONDS:
+                leave()
+        os.close(ours)
+
+    threading.Thread(target=listen, name="signals", daemon=True).start()
+    before = {number: signal.getsignal(number) for number in heeded()}
+    woken = signal.set_wakeup_fd(theirs, warn_on_full_buffer=False)
+    for number in before:
+        signal.signal(number, _ignore)
+    try:
+        yield stop
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)
+        signal.set_wakeup_fd(woken)
+        os.close(theirs)
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import Any, Self, final
 
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
+from evedrop.threads import wait_for_thread
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.relay import WireRelay
 from evedrop.wire.timeline import moment_at, times, with_change, with_cut_ended, with_partition_ended
@@ -44,7 +45,7 @@ class WireConductor:
         with self._changed:
             self._ended = True
             self._changed.notify()
-        self._thread.join()
+        wait_for_thread(self._thread)
 
     @property
     def seconds(self) -> float:

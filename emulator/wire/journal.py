@@ -27,6 +27,7 @@ from evedrop.errors import UsageError
 from evedrop.model.slot.link import Change
 from evedrop.output import warn
 from evedrop.results.wire_summary import JournalState
+from evedrop.threads import wait_for_thread
 from evedrop.wire.crossing import RECORD, Crossing, next_numbers
 from evedrop.wire.history import Numbered, Said, WireHistory, highest
 from evedrop.wire.journal_part import (
@@ -230,7 +231,7 @@ class WireJournal:
         if self._ended.is_set():
             return
         self._ended.set()
-        self._thread.join()
+        wait_for_thread(self._thread)
         self._stopped = time.monotonic()
         self.recorded = next(self._number)
         self.flush()
@@ -312,7 +313,6 @@ class WireJournal:
         self._buffers[at] = self._parts[at].buffer
 
     def _name(self, at: int) -> str:
-        """The name of a part."""
         return f"{self.start:03d}-{at + 1:04d}"
 
     def _tend(self) -> None:

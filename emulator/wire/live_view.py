@@ -7,9 +7,6 @@ Source: docs/wire.md, the view.
 
 from __future__ import annotations
 
-import atexit
-import os
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -51,17 +48,10 @@ def live_view(plan: WirePlan, out: Path, mode: str, say: Callable[[str], None]) 
         try:
             yield view
         finally:
-            if not view.close():
-                atexit.register(_leave)
+            view.close()
             if view.failure is not None:
                 warn(view.failure)
     finally:
         if viewer is not None:
             viewer.complete()
             viewer.stop()
-
-
-def _leave() -> None:
-    """End the process although Rerun hangs, which it does when its disk does not answer."""
-    sys.stdout.flush()
-    os._exit(1)

@@ -53,8 +53,11 @@ class LivelinessRelay:
         self._doubtful: dict[str, set[str]] = {name: set() for name in sides}
         """Side → tokens that the wire mirrored there: what Zenoh reports of them may be the wire's own doing."""
         self._subscribers = [
-            side.session.liveliness().declare_subscriber(
-                expression, zenoh.handlers.Callback(self._heard(name), indirect=True), history=True
+            (
+                name,
+                side.session.liveliness().declare_subscriber(
+                    expression, zenoh.handlers.Callback(self._heard(name), indirect=True), history=True
+                ),
             )
             for name, side in sides.items()
             for expression in expressions_of(side.side, plan.links)
@@ -97,12 +100,14 @@ class LivelinessRelay:
 
     def close(self) -> None:
         """End, and give up all mirrored tokens."""
-        for subscriber in self._subscribers:
-            subscriber.undeclare()
+        for name, subscriber in self._subscribers:
+            with self._sides[name].duty.busy():
+                subscriber.undeclare()
         with self._lock:
-            for mirrored in self._mirrored.values():
-                for token in mirrored.values():
-                    token.undeclare()
+            for name, mirrored in self._mirrored.items():
+                with self._sides[name].duty.busy():
+                    for token in mirrored.values():
+                        token.undeclare()
                 mirrored.clear()
 
     def _heard(self, name: str) -> Callable[[zenoh.Sample], None]:

@@ -14,6 +14,7 @@ from typing import Any, final
 
 import zenoh
 
+from evedrop.threads import wait_for_thread
 from evedrop.wire.crossing import AGAIN, UNLINKED, Crossing, Kind
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.lanes import LinkState
@@ -21,6 +22,7 @@ from evedrop.wire.plan import WirePlan
 from evedrop.wire.ros2 import SourceReader
 from evedrop.wire.scheduler import Scheduler
 from evedrop.wire.side import SideSession, expressions_of
+from evedrop.wire.watchdog import Duty
 
 WAITING = 8192
 """Messages of a side that may wait for the wire; then the side's programs wait, or Zenoh drops, as each message says."""
@@ -105,7 +107,8 @@ class PublicationRelay:
         """links, publishers: by the names of links and of sides; tell: for what the user must know."""
         self._links, self._publishers, self._plan = links, publishers, plan
         self._journal, self._scheduler = journal, scheduler
-        self._name, self._tell = side.name, tell
+        self._side, self._name, self._tell = side, side.name, tell
+        self.duties: list[Duty] = []
         expressions = [zenoh.KeyExpr(one) for one in expressions_of(side.side, plan.links)]
         self._subscribers = []
         self._threads = []
@@ -114,8 +117,10 @@ class PublicationRelay:
             subscriber = side.session.declare_subscriber(expression, channel, allowed_origin=_REMOTE)
             earlier = tuple(one for one in expressions[:at] if one.intersects(expression))
             self._subscribers.append(subscriber)
+            self.duties.append(Duty(f"among the messages from the side {side.name}"))
+            arguments = (subscriber, earlier, self.duties[-1])
             self._threads.append(
-                threading.Thread(target=self._run, args=(subscriber, earlier), name=f"from {side.name}", daemon=True)
+                threading.Thread(target=self._run, args=arguments, name=f"from {side.name}", daemon=True)
             )
 
     def start(self) -> None:
@@ -125,26 +130,26 @@ class PublicationRelay:
 
     def close(self) -> None:
         """End; messages that Zenoh has already handed over still cross."""
-        for subscriber in self._subscribers:
-            subscriber.undeclare()
+        with self._side.duty.busy():
+            for subscriber in self._subscribers:
+                subscriber.undeclare()
         for thread in self._threads:
-            thread.join()
+            wait_for_thread(thread)
 
-    def _run(self, samples: Any, earlier: tuple[zenoh.KeyExpr, ...]) -> None:
+    def _run(self, samples: Any, earlier: tuple[zenoh.KeyExpr, ...], duty: Duty) -> None:
         try:
-            self._take_all(samples, earlier)
+            self._take_all(samples, earlier, duty)
         except Exception as error:  # whatever it is: nothing may silently stop crossing
             self._tell(f"messages from the side {self._name} no longer cross ({error!r}); end the wire and report this")
 
-    def _take_all(self, samples: Any, earlier: tuple[zenoh.KeyExpr, ...]) -> None:
+    def _take_all(self, samples: Any, earlier: tuple[zenoh.KeyExpr, ...], duty: Duty) -> None:
         take = self._taker()
-        if earlier:  # a message that several subscriptions hear belongs to the first
-            for sample in samples:
-                if not any(one.intersects(sample.key_expr) for one in earlier):
-                    take(sample)
-        else:
-            for sample in samples:
+        for sample in samples:
+            duty.in_hand = sample
+            # A message that several subscriptions hear belongs to the first.
+            if not earlier or not any(one.intersects(sample.key_expr) for one in earlier):
                 take(sample)
+            duty.in_hand = None
 
     def _taker(self) -> Callable[[zenoh.Sample], None]:
         """The function that is called for every message: it looks up as little as possible."""

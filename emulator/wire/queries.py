@@ -18,6 +18,7 @@ from typing import Any, final
 
 import zenoh
 
+from evedrop.threads import wait_for_thread
 from evedrop.wire.advanced import LOST_HISTORY_SECONDS, published_key
 from evedrop.wire.crossing import AGAIN, UNLINKED, Crossing, Kind
 from evedrop.wire.journal import WireJournal
@@ -27,6 +28,7 @@ from evedrop.wire.publications import MOST_KEYS
 from evedrop.wire.ros2 import SourceReader, reply_seconds
 from evedrop.wire.scheduler import Scheduler
 from evedrop.wire.side import SideSession, expressions_of
+from evedrop.wire.watchdog import Duty
 
 _REMOTE = zenoh.Locality.REMOTE
 _MOST_WAITING = 100_000
@@ -89,9 +91,10 @@ class QueryRelay:
         self._read = SourceReader(journal.source_code)
         self._patience = Scheduler(_MOST_WAITING, 0, lambda _: None)
         self._heard: SimpleQueue[tuple[str, str | None, zenoh.Query] | None] = SimpleQueue()
+        self.duty = Duty("among the queries")
         self._thread = threading.Thread(target=self._run, name="queries", daemon=True)
         self._queryables = [
-            side.session.declare_queryable(expression, self._taker(name, None), allowed_origin=_REMOTE)
+            (name, side.session.declare_queryable(expression, self._taker(name, None), allowed_origin=_REMOTE))
             for name, side in sides.items()
             if any(state.link.source == name for state in self._states)
             for expression in expressions_of(side.side, plan.links)
@@ -103,17 +106,20 @@ class QueryRelay:
 
     def close(self) -> None:
         """End; queries that still wait get no more replies."""
-        for queryable in self._queryables:
-            queryable.undeclare()
+        for name, queryable in self._queryables:
+            with self._sides[name].duty.busy():
+                queryable.undeclare()
         self._heard.put(None)
-        self._thread.join()
+        wait_for_thread(self._thread)
         with self._lock:
-            for mirrored in self._mirrored.values():
-                for _, queryable in mirrored.values():
-                    queryable.undeclare()
+            for name, mirrored in self._mirrored.items():
+                with self._sides[name].duty.busy():
+                    for _, queryable in mirrored.values():
+                        queryable.undeclare()
                 mirrored.clear()
-            for querier in self._queriers.values():
-                querier.undeclare()
+            for (target, *_), querier in self._queriers.items():
+                with self._sides[target].duty.busy():
+                    querier.undeclare()
         self._patience.close()
 
     def update(self, services: Iterable[tuple[str, str]]) -> None:
@@ -156,6 +162,7 @@ class QueryRelay:
 
     def _run(self) -> None:
         while (heard := self._heard.get()) is not None:
+            self.duty.in_hand = heard
             name, key, query = heard
             asked = _Asked(query, name, self._plan.query_seconds)
             try:
@@ -164,6 +171,7 @@ class QueryRelay:
             except Exception as error:  # whatever it is: the next query must be asked
                 self._tell(f"a query on {asked.key} at the side {name} was not asked at the other sides ({error!r})")
             asked.release()
+            self.duty.in_hand = None
 
     def _responsible(self, name: str, key: zenoh.KeyExpr) -> str | None:
         """The mirrored queryable that answers for a key; None: the one for everything."""

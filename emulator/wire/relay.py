@@ -8,13 +8,14 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
 from typing import Self, final
 
 import zenoh
 
 from evedrop.output import warn
+from evedrop.threads import wait_for_thread
 from evedrop.wire.bypasses import Bypasses
 from evedrop.wire.crossing import Crossing
 from evedrop.wire.journal import WireJournal
@@ -29,6 +30,7 @@ from evedrop.wire.ros2_entities import EntityLog
 from evedrop.wire.scheduler import Scheduler
 from evedrop.wire.side import SideSession
 from evedrop.wire.timeline import Moment
+from evedrop.wire.watchdog import Duty
 
 _LOOK_SECONDS = 0.2
 
@@ -43,10 +45,13 @@ class WireRelay:
     def __init__(self, plan: WirePlan, journal: WireJournal, tell: Callable[[str], None] = warn) -> None:
         """tell: for what the user must know while the wire runs. Raises UsageError if a side cannot be opened."""
         self.plan = plan
+        self.duties: Sequence[Duty] = ()
+        """What its threads do, once it is open."""
         self.links: Mapping[str, LinkState] = {link.name: LinkState(link, plan, journal) for link in plan.links}
         """By their names."""
         self._journal, self._tell = journal, tell
         self._stack = contextlib.ExitStack()
+        self._duty = Duty("in the list of what programs declare")
         self._ended = threading.Event()
         self._woken = threading.Event()
         zenoh.init_log_from_env_or("error")
@@ -96,6 +101,9 @@ class WireRelay:
         ]
         for relay in relays:
             stack.callback(relay.close)
+        of_sides = [side.duty for side in self.sides.values()]
+        of_relays = [duty for relay in relays for duty in relay.duties]
+        self.duties = [*of_sides, *of_relays, scheduler.duty, self._queries.duty, self._duty]
         self._bypasses = Bypasses(self._note_bypass)
         self._neighbours = Neighbours(self.sides, [*links.values()], self._tell, self._bypasses)
         self._liveliness = LivelinessRelay(self.sides, plan, self._woken.set, EntityLog(journal.folder).add)
@@ -108,7 +116,7 @@ class WireRelay:
         stack.callback(self._bypasses.close)
         thread = threading.Thread(target=self._keep_up, name="wire", daemon=True)
         thread.start()
-        stack.callback(thread.join)
+        stack.callback(wait_for_thread, thread)
         stack.callback(self._woken.set)
         stack.callback(self._ended.set)
 
@@ -139,11 +147,12 @@ class WireRelay:
             self._woken.wait(max(0.0, due - time.monotonic()))
             self._woken.clear()
             try:
-                self._look()
-                if time.monotonic() >= due:
-                    self._neighbours.update()
-                    self._bypasses.update()
-                    due = time.monotonic() + _LOOK_SECONDS
+                with self._duty.busy():
+                    self._look()
+                    if time.monotonic() >= due:
+                        self._neighbours.update()
+                        self._bypasses.update()
+                        due = time.monotonic() + _LOOK_SECONDS
             except Exception as error:  # whatever it is: the next look may succeed
                 if not self._ended.is_set():
                     self._tell(f"Zenoh does not say what programs declare ({error!r}); trying again")

@@ -6,16 +6,19 @@ Source: docs/wire.md.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from pathlib import Path
+from typing import NoReturn
 
-from evedrop.errors import RunError
+from evedrop.errors import Interrupted, RunError
+from evedrop.live.network.control_file import remove_control
 from evedrop.output import warn
 from evedrop.report.wire import wire_failures
 from evedrop.results.folder import make_private, new_folder, write_private
 from evedrop.results.wire_folder import WIRE_FILE
 from evedrop.results.wire_summary import WIRE_SUMMARY_FILE
 from evedrop.scenario.wire_table import PUT
-from evedrop.signals import stop_on_signals
+from evedrop.signals import stop_or_leave_on_signals
 from evedrop.wire.closing import closing_lines
 from evedrop.wire.conductor import WireConductor
 from evedrop.wire.control import WireControl
@@ -27,6 +30,7 @@ from evedrop.wire.live_view import live_view
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.relay import WireRelay
 from evedrop.wire.scorekeeper import WireScorekeeper
+from evedrop.wire.watchdog import ANSWER_SECONDS, WORK_SECONDS, Duty, Watchdog, end_at_once
 
 
 def run_wire(
@@ -51,7 +55,13 @@ def run_wire(
         new_folder(out)
     events: list[str] = []
 
-    with stop_on_signals() as stop:
+    def leave(why: str, status: int) -> NoReturn:
+        end_at_once(f"{why}; {_on_disk(out)}", status, lambda: remove_control(out))
+
+    with (
+        Watchdog(lambda what: leave(f"the wire no longer answers: {what}", RunError.exit_status)) as watchdog,
+        stop_or_leave_on_signals(lambda: leave("interrupted again", Interrupted.exit_status)) as stop,
+    ):
         with live_view(plan, out, view, say) as shown, WireJournal(out, plan) as journal:
             scorekeeper = WireScorekeeper(plan, journal)
             if shown is not None:
@@ -69,14 +79,20 @@ def run_wire(
                 )
             if journal.start > 1:
                 say(continuation(journal.start, journal.counts))
-            with WireRelay(plan, journal, warn) as relay:
+            with ExitStack() as stack:
+                with watchdog.doing(Duty("while the sides were opened", ANSWER_SECONDS)):
+                    relay = stack.enter_context(WireRelay(plan, journal, warn))
                 for name, endpoints in relay.endpoints.items():
                     say(f"{name} {' '.join(endpoints)}")
-                with (
-                    WireConductor(plan, relay, happened) as conductor,
-                    WireControl(out, relay, conductor, scorekeeper, journal, events),
-                ):
-                    stop.wait(seconds)
+                conductor = stack.enter_context(WireConductor(plan, relay, happened))
+                stack.enter_context(WireControl(out, relay, conductor, scorekeeper, journal, events))
+                _watch(watchdog, relay, journal)
+                stop.wait(seconds)
+                watchdog.hurry()
+                with watchdog.doing(Duty("while the wire was ended", waits=True)):
+                    stack.close()
+            with watchdog.doing(Duty("in the journal, while its last files were written", end_seconds=WORK_SECONDS)):
+                journal.close()
         status = scorekeeper.finish(out) if out.is_dir() else RunError.exit_status
     summary = scorekeeper.summary()
     for line in closing_lines(summary):
@@ -99,6 +115,22 @@ def continuation(start: int, counts: Mapping[Numbered, int]) -> str:
     return (
         f"start {start} continues start {start - 1}: {what} {number + 1:,} of {key} on the link {link} is next{others}; for the "
         "fates of a first start, give another folder"
+    )
+
+
+def _watch(watchdog: Watchdog, relay: WireRelay, journal: WireJournal) -> None:
+    """Let a watchdog watch all threads of the wire, and ask its sides and its journal."""
+    watchdog.watch(*relay.duties)
+    for name, side in relay.sides.items():
+        watchdog.ask(f"at the side {name}", side.answer)
+    watchdog.ask("in the journal", journal.flush, WORK_SECONDS)
+
+
+def _on_disk(out: Path) -> str:
+    """What is left of a wire that ends at once."""
+    return (
+        f"the wire has ended with what is on disk: `evedrop report {out}` shows it, and the next start with this folder goes on "
+        "from there"
     )
 
 

@@ -12,6 +12,8 @@ from collections.abc import Callable
 from typing import NamedTuple, final
 
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
+from evedrop.threads import wait_for_thread
+from evedrop.wire.watchdog import Duty
 
 
 class _Held(NamedTuple):
@@ -35,6 +37,7 @@ class Scheduler:
         self._serial = itertools.count()
         self._changed = threading.Condition()
         self._ended = False
+        self.duty = Duty("among the delayed messages")
         self._thread = threading.Thread(target=self._run, name="delays", daemon=True)
         self._thread.start()
 
@@ -60,7 +63,7 @@ class Scheduler:
         with self._changed:
             self._ended = True
             self._changed.notify()
-        self._thread.join()
+        wait_for_thread(self._thread)
         left, self._heap = [held.row for held in sorted(self._heap)], []
         return left
 
@@ -70,10 +73,12 @@ class Scheduler:
                 held = self._due()
             if held is None:
                 return
+            self.duty.in_hand = held
             try:
                 held.send()
             except Exception:
                 self._failed(held.row)
+            self.duty.in_hand = None
 
     def _due(self) -> _Held | None:
         """The next message, when it is due; None at the end. The lock is held."""

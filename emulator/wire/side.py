@@ -21,7 +21,9 @@ import zenoh
 from evedrop.errors import UsageError
 from evedrop.ports import free_port
 from evedrop.wire.plan import Side, SideTls, WireLink
+from evedrop.wire.watchdog import ANSWER_SECONDS, Duty
 
+_REMOTE = zenoh.Locality.REMOTE
 ZenohConfig = dict[str, Any]
 PROBES = "@evedrop/*/*"
 """The keys of messages with which the wire finds out whether sides are joined outside it; `**` does not include them."""
@@ -57,6 +59,8 @@ class SideSession:
             self.session, self.endpoints = _opened(side, largest, users)
         """Its session, and where programs connect: with a free port where the plan has port 0."""
         self.zid = str(self.session.zid())
+        self.duty = Duty(f"at the side {side.name}", ANSWER_SECONDS)
+        """What the main thread does with the session when the wire ends."""
 
     def __enter__(self) -> Self:
         return self
@@ -64,7 +68,14 @@ class SideSession:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.session.close()
+        with self.duty.busy():
+            self.session.close()
+
+    def answer(self) -> None:
+        """Return if Zenoh answers at this side: a declaration needs all its locks."""
+        self.session.declare_subscriber(
+            f"@evedrop/{self.zid}/alive", lambda _: None, allowed_origin=_REMOTE
+        ).undeclare()
 
 
 def _opened(side: Side, largest: int, users_file: str | None) -> tuple[zenoh.Session, tuple[str, ...]]:

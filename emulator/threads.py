@@ -1,0 +1,20 @@
+"""Waits for the ends of threads, always with a limit."""
+
+from __future__ import annotations
+
+import threading
+
+from evedrop.errors import RunError
+
+THREAD_SECONDS = 600.0
+"""How long to wait for a thread that was told to end, and ends within seconds unless what it calls has hung."""
+
+
+def wait_for_thread(thread: threading.Thread, seconds: float = THREAD_SECONDS) -> None:
+    """Wait until a thread has ended. Raises RunError if it still runs after `seconds`."""
+    thread.join(seconds)
+    if thread.is_alive():
+        raise RunError(
+            f"the thread {thread.name} was told to end {seconds:g} s ago and still runs, because something that it called has "
+            "hung; report this"
+        )
