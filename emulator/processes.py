@@ -11,8 +11,8 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Protocol, TypeVar, final
 
-KILLED_SECONDS = 2.0
-"""How long to wait for a killed process: the system ends it at once, unless it hangs in the system itself, as on a dead disk."""
+KILLED_SECONDS = 10.0
+"""How long to wait for a killed process: the next turn of a busy processor ends it, unless it hangs in the system itself."""
 SUSPENDED_SECONDS = 60.0
 """How long a process that others wait for may be suspended."""
 _LOOK_SECONDS = 1.0
