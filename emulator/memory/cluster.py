@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import contextlib
 import importlib.metadata
+import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from queue import Empty, SimpleQueue
 from typing import Any, final
 
 from evedrop.errors import RunError, UsageError
@@ -17,6 +19,7 @@ from evedrop.output import say
 
 REACH_SECONDS = 5.0
 """For a Dask scheduler to answer."""
+_ANSWER_SECONDS = 60.0  # for a scheduler that has answered before; it may be busy
 _LOOK_SECONDS = 0.1
 _WORKERS_SECONDS = 1.0  # from one look at the list of workers to the next
 _LONELY_SECONDS = 3.0  # without a worker, before this is said
@@ -74,9 +77,11 @@ class Cluster:
 
         Waits while there is no worker, and says so on standard error after some seconds.
 
-        Raises RunError if a task fails, a worker has another version of evedrop, or the scheduler is gone.
+        Raises RunError if a task fails, a worker has another version of evedrop, or the scheduler is gone or does not answer.
         """
-        while not self._has_workers():  # a task that is submitted earlier could reach a worker of another version
+        while not self._has_workers(
+            stopped
+        ):  # a task that is submitted earlier could reach a worker of another version
             if stopped():
                 return
             time.sleep(_LOOK_SECONDS)
@@ -86,7 +91,7 @@ class Cluster:
             while left:
                 if stopped():
                     return
-                self._has_workers()
+                self._has_workers(stopped)
                 done = [number for number, future in left.items() if future.done()]
                 if not done:
                     time.sleep(_LOOK_SECONDS)
@@ -96,17 +101,51 @@ class Cluster:
             with contextlib.suppress(OSError):  # the scheduler may be gone
                 self._client.cancel(futures)
 
-    def _has_workers(self) -> bool:
-        """Whether there is a worker, by a look at most every second; says on standard error if there is none for long."""
+    def _answer(self, question: Callable[[], Any], stopped: Stopped) -> Any:
+        """The scheduler's answer; None after a stop. Another thread asks: a scheduler that is suspended never answers.
+
+        Raises RunError after `_ANSWER_SECONDS`, and what the question raises.
+        """
+        answers = SimpleQueue[Any]()
+
+        def ask() -> None:
+            try:
+                answers.put(question())
+            except Exception as error:
+                answers.put(error)
+
+        threading.Thread(target=ask, name="scheduler", daemon=True).start()
+        deadline = time.monotonic() + _ANSWER_SECONDS
+        while time.monotonic() < deadline:
+            if stopped():
+                return None
+            with contextlib.suppress(Empty):
+                answer = answers.get(timeout=_LOOK_SECONDS)
+                if isinstance(answer, Exception):
+                    raise answer
+                return answer
+        raise RunError(
+            f"the scheduler {self._scheduler} has not answered for {_ANSWER_SECONDS:g} s (suspended, or cut off?); look at it, "
+            "and run again"
+        )
+
+    def _has_workers(self, stopped: Stopped) -> bool:
+        """Whether there is a worker, by a look at most every second; says on standard error if there is none for long.
+
+        False after a stop.
+        """
         now = time.monotonic()
         if now - self._looked >= _WORKERS_SECONDS:
             self._looked = now
             try:
-                workers = frozenset(self._client.nthreads())
+                threads = self._answer(self._client.nthreads, stopped)
+                workers = frozenset(threads or ())
                 if workers - self._workers:
-                    self._check_versions()
+                    self._check_versions(stopped)
             except OSError as error:
                 raise RunError(f"the scheduler {self._scheduler} is gone; start it and its workers again") from error
+            if stopped():
+                return False
             self._workers = workers
         if self._workers:
             self._lonely_since, self._said = None, False
@@ -121,10 +160,11 @@ class Cluster:
             )
         return False
 
-    def _check_versions(self) -> None:
+    def _check_versions(self, stopped: Stopped) -> None:
         """Raise RunError if a worker has another version of evedrop, or none."""
         ours = importlib.metadata.version("evedrop")
-        for worker, found in self._client.get_versions(packages=["evedrop"])["workers"].items():
+        versions = self._answer(lambda: self._client.get_versions(packages=["evedrop"]), stopped)
+        for worker, found in ({} if versions is None else versions["workers"]).items():
             version = found["packages"]["evedrop"]
             if version != ours:
                 has = "no evedrop" if version is None else f"evedrop {version}"

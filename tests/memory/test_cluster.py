@@ -9,20 +9,23 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pyarrow.parquet as pq
 import pytest
 
 from evedrop.api import compare, cost, learned, montecarlo, sweep
-from evedrop.errors import UsageError
+from evedrop.errors import RunError, UsageError
 from evedrop.loading import shipped
+from evedrop.memory.cluster import Cluster
 from evedrop.memory.montecarlo import Plan
 from evedrop.ports import free_port
 from evedrop.results.writer import load_results
-from tests.conftest import Evedrop, Live, wait_until
+from tests.conftest import LIMIT, Evedrop, Live, wait_until
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -81,9 +84,14 @@ class Dask:
     def _workers(self) -> int:
         return self._log.read_text().count("Registered to:")
 
+    def suspend(self) -> None:
+        """Suspend the scheduler."""
+        self._processes[0].send_signal(signal.SIGSTOP)
+
     def end(self) -> None:
         """End all processes."""
         for process in reversed(self._processes):
+            process.send_signal(signal.SIGCONT)
             process.terminate()
             try:
                 process.wait(10)
@@ -273,6 +281,41 @@ def test_waiting_for_workers_ends_upon_ctrl_c(evedrop: Evedrop, lonely: Dask) ->
     live.process.send_signal(signal.SIGINT)
     assert live.end().status == 130
     assert not live.folder.exists()
+
+
+@pytest.mark.parametrize("silent", ["nthreads", "get_versions"])
+@pytest.mark.parametrize("stopping", [True, False])
+def test_a_scheduler_that_does_not_answer_keeps_nothing_waiting(
+    monkeypatch: pytest.MonkeyPatch, silent: str, stopping: bool
+) -> None:
+    """As a suspended one: a stop ends the study, and otherwise the scheduler is named after a while. No task is sent."""
+    asked = threading.Event()
+
+    def never(**_: object) -> None:
+        asked.set()
+        threading.Event().wait()
+
+    client = SimpleNamespace(**{"nthreads": lambda: {"tcp://worker": 1}, "get_versions": never, silent: never})
+    monkeypatch.setattr("evedrop.memory.cluster._ANSWER_SECONDS", LIMIT if stopping else 0.5)
+    results: Iterator[tuple[int, Any]] = Cluster("tcp://scheduler", client).results(
+        [], lambda: stopping and asked.is_set()
+    )
+    if stopping:
+        assert list(results) == []
+    else:
+        with pytest.raises(RunError, match=r"^the scheduler tcp://scheduler has not answered for 0\.5 s"):
+            list(results)
+    assert asked.is_set()
+
+
+def test_a_suspended_scheduler_keeps_no_study_from_ending(evedrop: Evedrop, lonely: Dask) -> None:
+    """Ctrl-C ends it, with status 130."""
+    study = ("montecarlo", "eavesdroppers", "--slots", "9", "--trials", "5")
+    live = evedrop.started(*study, "--scheduler", lonely.address, interpreter=True)
+    assert "has no workers" in first_line(live)
+    lonely.suspend()
+    live.process.send_signal(signal.SIGINT)
+    assert live.end().status == 130
 
 
 def test_a_worker_of_another_version_is_said(evedrop: Evedrop, lonely: Dask, tmp_path: Path) -> None:
