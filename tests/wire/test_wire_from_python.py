@@ -53,6 +53,7 @@ def test_that_is_passed_by(evedrop_wire):
     radio = evedrop_wire(**{**WIRE, "expect": []})
     config = radio.config("robot")
     config.insert_json5("mode", '"peer"')
+    config.insert_json5("listen/endpoints", "[]")
     with zenoh.open(config):
         while not radio.status().bypasses:
             time.sleep(0.01)

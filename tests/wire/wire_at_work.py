@@ -123,7 +123,12 @@ def sending(said: list[str]) -> Iterator[None]:
 def program(endpoints: Sequence[str], **config: Any) -> zenoh.Session:
     """A session of a program; config: entries of Zenoh's configuration."""
     quiet = {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}}
-    base = {"mode": "client", "connect": {"endpoints": list(endpoints)}, "scouting": quiet}
+    base = {
+        "mode": "client",
+        "connect": {"endpoints": list(endpoints)},
+        "listen": {"endpoints": []},  # in mode peer it would listen on all interfaces
+        "scouting": quiet,
+    }
     return zenoh.open(zenoh.Config.from_json5(json.dumps({**base, **config})))
 
 
