@@ -33,7 +33,7 @@ from evedrop.live.launch.starter import (
     start_process,
 )
 from evedrop.names import OBSERVER
-from evedrop.processes import KillableProcess, kill
+from evedrop.processes import KILLED_SECONDS, KillableProcess, kill
 from evedrop.signals import held_back
 
 _MOST_BYTES = 4096
@@ -135,7 +135,7 @@ class ForkServer:
     def close(self) -> None:
         """End the fork server, as soon as it has made its imports; its forks have ended before."""
         self._give_up()
-        self._follower.join()  # it reads the end of the channel at once
+        self._follower.join(KILLED_SECONDS)  # it reads the end of the channel at once
         self._channel.close()
 
     def _give_up(self) -> None:

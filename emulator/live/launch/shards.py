@@ -27,7 +27,10 @@ from evedrop.news import ConnectionOutage, FolderMoved, News, RunEnded, RunProgr
 from evedrop.results.folder import HeldFolder, new_folder
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.scenario import Scenario
+from evedrop.threads import wait_for_thread
 from evedrop.view.viewer import Viewer
+
+_LOOK_SECONDS = 0.25
 
 
 @final
@@ -144,9 +147,11 @@ def launch_shards(
         thread.start()
     # On this thread, not on another one: a viewer ends with the thread that started it.
     state.launched(*first, view, stop, starter)
-    for thread in threads:
-        thread.join()  # without a limit: a run that is told to stop ends within one, and a signal reaches a thread that joins
     try:
+        for thread in threads:
+            while thread.is_alive() and not stop.is_set():  # a run lasts as long as it lasts
+                thread.join(_LOOK_SECONDS)
+            wait_for_thread(thread)
         now = held.now
         if now != folder:
             tell(FolderMoved(str(now)))

@@ -93,7 +93,7 @@ class Connection:
         self._over.set()
         self._losses.put(None)
         if self._keeper is not None and self._keeper is not threading.current_thread():
-            self._keeper.join()
+            self._keeper.join(_LINGER_SECONDS)  # it may be opening a session that nobody needs any more
         _close(self.session)
         for one in self._declared:
             if isinstance(one, Inbox):

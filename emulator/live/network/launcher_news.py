@@ -65,7 +65,7 @@ class Heartbeat:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._over.set()
-        self._thread.join()
+        self._thread.join(_BEAT_SECONDS)  # it waits if the launcher does not read
 
     def _beat(self) -> None:
         while not self._over.wait(self._seconds):

@@ -196,9 +196,9 @@ class ObservedRun:
     def _steer(self, conductor: Conductor) -> None:
         """Handle confirmations from the launcher and questions from the operator, and carry out due events."""
         while not self._confirmations.empty():
-            self._steering.done(int(self._confirmations.get()))
+            self._steering.done(int(self._confirmations.get_nowait()))
         while not conductor.questions.empty():
-            self._answer(conductor, conductor.questions.get())
+            self._answer(conductor, conductor.questions.get_nowait())
         self._steering.carry_on(self._joiner.done)
         for event in self._steering.events[len(self._events) :]:
             self._events.append(event)
@@ -225,7 +225,7 @@ class ObservedRun:
             remove_control(self.folder)
         self._steering.answer_open_orders(self._joiner.done, complete=self._joiner.done == self._scenario.slots)
         while not conductor.questions.empty():
-            conductor.questions.get().answer(Answer(refused=("the run is over",)).pack())
+            conductor.questions.get_nowait().answer(Answer(refused=("the run is over",)).pack())
 
     def _status(self, conductor: Conductor) -> RunStatus:
         """The status of the run."""
