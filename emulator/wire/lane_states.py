@@ -36,8 +36,10 @@ def state_of(counts: Counts) -> LaneState:
 
     Messages that were still underway when the wire ended do not count.
     """
-    reasons = counts.copy()
-    reasons[[DELIVERED, UNDERWAY]] = 0
+    ended = counts.copy()
+    ended[UNDERWAY] = 0
+    reasons = ended.copy()
+    reasons[DELIVERED] = 0
     if not reasons.any():
         return LaneState.DELIVERED if counts[DELIVERED] else LaneState.QUIET
     reason = OUTCOMES[int(reasons.argmax())]
@@ -45,7 +47,7 @@ def state_of(counts: Counts) -> LaneState:
         return LaneState.CUT
     if reason is Crossing.OVERFLOW:
         return LaneState.FULL
-    return share_of(counts) if reason.emulated else LaneState.OWN
+    return share_of(ended) if reason.emulated else LaneState.OWN
 
 
 def share_of(counts: Counts) -> LaneState:

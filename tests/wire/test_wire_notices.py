@@ -7,7 +7,7 @@ import pytest
 
 from evedrop.wire.crossing import Crossing
 from evedrop.wire.graph import loss_of
-from evedrop.wire.lane_states import LaneState, legend, state_of
+from evedrop.wire.lane_states import LaneState, legend, share_of, state_of
 from evedrop.wire.notices import CutWatcher, LinkWatcher
 from evedrop.wire.step_counts import DELIVERED, OUTCOMES, WireSteps
 from tests.wire.wire_rows import plan_of, robot_plan
@@ -65,6 +65,26 @@ def test_shares_are_rounded_but_never_to_nothing_or_all(heard: int, lost: int, t
     counts = np.zeros(len(OUTCOMES), np.int64)
     counts[DELIVERED], counts[OUTCOMES.index(Crossing.LOST)] = heard - lost, lost
     assert loss_of(counts) == text
+
+
+def test_a_lane_tells_how_much_was_lost() -> None:
+    """Half of the messages is most of them; those that were still under way when the wire ended count for nothing."""
+    for delivered, lost, underway, state in (
+        (9, 1, 0, LaneState.SOME), (3, 2, 0, LaneState.SOME), (2, 2, 0, LaneState.MOST), (0, 5, 0, LaneState.MOST),
+        (9, 1, 20, LaneState.SOME), (2, 2, 20, LaneState.MOST), (4, 0, 20, LaneState.DELIVERED),
+    ):  # fmt: skip
+        counts = steps_of({Crossing.DELIVERED: delivered, Crossing.LOST: lost, Crossing.UNDERWAY: underway}).counts
+        assert state_of(counts[0, 0]) is state, (delivered, lost, underway)
+
+
+def test_the_share_of_a_link_counts_every_message() -> None:
+    """For whatever reason it was not delivered; a silent link has no share."""
+    for found, state in (
+        ({}, LaneState.QUIET), ({Crossing.DELIVERED: 3}, LaneState.DELIVERED),
+        ({Crossing.DELIVERED: 3, Crossing.REFUSED: 2}, LaneState.SOME),
+        ({Crossing.DELIVERED: 2, Crossing.CUT: 1, Crossing.LOST: 1}, LaneState.MOST),
+    ):  # fmt: skip
+        assert share_of(steps_of(found).counts[0, 0]) is state
 
 
 def test_the_main_reason_decides_on_a_lane() -> None:
