@@ -78,5 +78,8 @@ def recover(journal: Path, history: WireHistory) -> int:
 def _count_table(counts: dict[Numbered, int], path: Path) -> None:
     table = pq.read_table(path, columns=["link", "key", "kind", "n"], filters=pc.field("n").is_valid())
     for row in table.group_by(["link", "key", "kind"]).aggregate([("n", "max")]).to_pylist():
-        if row["link"] is not None:
-            highest(counts, (row["link"], row["key"], Kind[row["kind"].upper()].stream), row["n_max"] + 1)
+        if row["link"] is None:
+            continue
+        if row["key"] is None or row["kind"] is None:
+            raise pa.ArrowInvalid("a message with a number has no key or no kind")
+        highest(counts, (row["link"], row["key"], Kind[row["kind"].upper()].stream), row["n_max"] + 1)
