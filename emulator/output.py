@@ -101,6 +101,27 @@ class Output:
             except OSError as error:
                 self._end(error)
 
+    @contextlib.contextmanager
+    def at(self, descriptor: int, of: int) -> Iterator[None]:
+        """While the block runs, write to another descriptor of the same file, if the stream's own is `of`."""
+        former = self._stream
+        try:
+            its_own = isinstance(former, io.TextIOWrapper) and former.fileno() == of
+        except OSError:  # a stream without a descriptor
+            its_own = False
+        if not its_own:
+            yield
+            return
+        self.flush()
+        with open(descriptor, "w", encoding=former.encoding, errors=former.errors, closefd=False) as stream:
+            stream.reconfigure(line_buffering=former.line_buffering or former.write_through)
+            self._stream = stream
+            try:
+                yield
+            finally:
+                self.flush()
+                self._stream = former
+
     def _end(self, error: OSError) -> None:
         self._over = True
         if not (self._terminal or isinstance(error, ConnectionError)):

@@ -14,6 +14,7 @@ from typing import Self, final
 
 import zenoh
 
+from evedrop.live.network.zenoh_log import LOGGED
 from evedrop.output import warn
 from evedrop.threads import wait_for_thread
 from evedrop.wire.bypasses import Bypasses
@@ -54,7 +55,7 @@ class WireRelay:
         self._duty = Duty("in the list of what programs declare")
         self._ended = threading.Event()
         self._woken = threading.Event()
-        zenoh.init_log_from_env_or("error")
+        zenoh.init_log_from_env_or(LOGGED)
 
     def __enter__(self) -> Self:
         with contextlib.ExitStack() as stack:

@@ -25,6 +25,7 @@ import zenoh
 from evedrop.errors import EvedropError, RunError, UsageError
 from evedrop.live.network.control_file import no_run, read_control
 from evedrop.live.network.operator import Answer, ask
+from evedrop.live.network.zenoh_log import MARK
 from evedrop.live.protocol.requests import LinkRequest, OperatorRequest, StatusRequest
 from evedrop.live.protocol.wire_status import WireStatus
 from evedrop.processes import kill, wait_for
@@ -231,7 +232,7 @@ class RunningWire:
     def _hear_errors(self, process: subprocess.Popen[str]) -> None:
         assert process.stderr is not None  # noqa: S101 - it is a pipe
         with process.stderr as errors:
-            self._errors.extend(errors)
+            self._errors.extend(line for line in errors if not line.startswith(MARK))
 
     def _stop(self, number: int) -> int:
         """End the process, wait until it is gone, and return its status."""

@@ -119,9 +119,20 @@ def _play(brief: AnyBrief, serve: str | None) -> int:
         with Heartbeat() if brief.ends_with_stdin else contextlib.nullcontext():
             return _observe(brief, serve)
     expect_usable(brief)
-    with classes_known():
+    from evedrop.live.network.zenoh_log import zenoh_log_apart
+
+    with classes_known(), zenoh_log_apart() if _listens(brief) else contextlib.nullcontext():
         _take_part(brief)
     return 0
+
+
+def _listens(brief: AnyBrief) -> bool:
+    """Whether strangers may connect to the process: to a router, or a sensor that takes states from programs."""
+    from evedrop.live.protocol.brief_parts import RoutingPart, SensorPart
+
+    part = brief.part
+    program = part.program if isinstance(part, SensorPart) else None
+    return isinstance(part, RoutingPart) or (program is not None and program.listen is not None)
 
 
 def _take_part(brief: AnyBrief) -> None:

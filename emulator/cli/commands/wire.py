@@ -41,12 +41,14 @@ def wire(options: argparse.Namespace) -> int:
     if options.check:
         return 0
     from evedrop.cli.closing_report import report_page
+    from evedrop.live.network.zenoh_log import zenoh_log_apart
     from evedrop.results.folder import results_folder
     from evedrop.wire.run import run_wire
 
     with results_folder(options.out, f"wire-{options.file.stem}") as folder:
         said = {"say": _hush, "complain": complain} if options.quiet else {"say": _say}
-        status = run_wire(plan, folder, seconds=seconds, view=options.view, **said)
+        with zenoh_log_apart():
+            status = run_wire(plan, folder, seconds=seconds, view=options.view, **said)
         report_page(folder, options.quiet)
         return status
 

@@ -35,6 +35,7 @@ from evedrop.live.network.lifeline import Lifeline
 from evedrop.live.network.listening import listening
 from evedrop.live.network.mailbox import allowance
 from evedrop.live.network.resending import ReplayBuffer
+from evedrop.live.network.zenoh_log import LOGGED
 from evedrop.live.protocol.brief import AnyBrief, Brief
 from evedrop.live.protocol.brief_parts import Identity, RouterPart, RoutingPart
 from evedrop.live.protocol.codec import Reader, end_report, refusal
@@ -58,7 +59,7 @@ _ANSWER_BYTES = 64 * 2**20  # for the operator
 _WINDOWS = 8  # how many windows an inbox holds: messages that were sent again in some rounds wait there, too
 ATTEMPT: ZenohConfig = {"open_timeout": int(_LEASE_SECONDS * 1000)}
 """Zenoh's limit of one attempt to connect again: one that a cut connection has swallowed holds up the next for so long."""
-_LOGGED = "error,zenoh_transport::unicast::establishment::open=off"  # the program reports a refusal itself
+_LOGGED = f"{LOGGED},zenoh_transport::unicast::establishment::open=off"  # the program reports a refusal itself
 
 
 def _transport(identity: Identity | None, largest: int, packet: int, listens: bool = False) -> ZenohConfig:
