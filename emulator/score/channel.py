@@ -32,10 +32,13 @@ def link_summary_of(scenario: Scenario, receiver: str, tally: Tally) -> LinkSumm
     schedule = scenario.schedule(receiver)
     pieces = _pieces(schedule, tally.done)
     met = sum(len(slots) for slots, _ in pieces) * tally.trials - tally.lost.get("overflow", 0)
+    account = LinkAccount.of(tally)
+    # In a run cut short, late packets that were still to come are lost, although the router does not report them.
+    lost = {**tally.lost, "underway": account.lost - sum(tally.lost.values()) + tally.lost.get("underway", 0)}
     found = _with_delays(
         LinkSummary(
-            **asdict(LinkAccount.of(tally)),
-            lost_by={reason: count for reason, count in sorted(tally.lost.items()) if count},
+            **asdict(account),
+            lost_by={reason: count for reason, count in sorted(lost.items()) if count},
             bursts=np.trim_zeros(tally.bursts, "b").tolist(),
             mean_burst=_mean_burst(tally),
             expected_mean_burst=None if tally.lost.get("overflow") else _expected_burst(pieces),

@@ -103,6 +103,24 @@ def test_runs_without_a_trial_in_common_are_not_equal(runs: dict[str, Results]) 
     assert "in common" in found.text
 
 
+def test_a_run_cut_short_before_its_first_block_is_compared_by_its_rows(
+    runs: dict[str, Results], tmp_path: Path
+) -> None:
+    """A run that ended at slot 20 has no digest; its recorded rows are those of the whole run, or the first difference is named."""
+    short = tmp_path / "short"
+    shutil.copytree(runs["whole"].folder, short)
+    for name in ("trials", "digests"):
+        table = pq.read_table(short / f"{name}.parquet")
+        kept = table.filter(pc.less(table["slot"], 20)) if name == "trials" else table.slice(0, 0)
+        pq.write_table(kept, short / f"{name}.parquet")
+    found = difference(load_results(short), runs["again"])
+    assert found.same, found.text
+    assert found.text.startswith("no difference in 80 rows of recorded trials; ")
+    other = difference(load_results(short), runs["other seed"])
+    assert not other.same
+    assert other.text.startswith("first difference: slot 0")
+
+
 def test_a_folder_without_results_is_refused(tmp_path: Path, runs: dict[str, Results]) -> None:
     """No folder, an empty one, a broken summary and a broken table each say what is wrong."""
     with pytest.raises(UsageError, match="not a results folder"):

@@ -139,7 +139,9 @@ class RunMetrics:
         for name, link in summary.get("links", {}).items():
             packets.add_metric([name, "delivered"], link["delivered"])
             for reason, count in link["lost_by"].items():
-                packets.add_metric([name, reason], count)
+                # While the run goes on, packets that are under way may still be delivered: a counter must not fall.
+                if reason != "underway" or summary["slots"] == self._scenario.slots:
+                    packets.add_metric([name, reason], count)
         yield packets
         for figure, kind in estimated_figures().items():
             if kind.only_in_mode is not None:
