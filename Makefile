@@ -8,7 +8,7 @@ READY := $(VENV)/.ready
 DOCS_READY := $(VENV)/.docs-ready
 NOTEBOOKS_READY := $(VENV)/.notebooks-ready
 
-.PHONY: demo test test-wheel test-pictures notebooks bench coverage test-long test-hosts test-compose test-fresh test-faults docs lint lint-types lint-rest setup clean
+.PHONY: demo test test-wheel test-pictures notebooks bench coverage test-long test-hosts test-compose test-fresh test-faults test-mutants docs lint lint-types lint-rest setup clean
 
 demo: $(READY)
 	$(BIN)/evedrop demo
@@ -60,12 +60,18 @@ FRESH ?= all
 test-fresh: $(READY)
 	$(BIN)/python -m pytest -s -m fresh --machine=$(FRESH) tests/fresh
 
-# Disturbs live runs at random, by number: the same SEED is the same case. SEED alone repeats that one case, and COUNT is how
-# many from SEED on. As root a small disk can be filled as well.
+# Disturbs live runs, wires and studies at random, by number: the same SEED is the same case. SEED alone repeats that one case, and
+# COUNT is how many from SEED on. As root small disks can be filled and broken as well. What cannot be done here is said at the end.
 SEED ?=
 COUNT ?= $(if $(SEED),1,60)
 test-faults: $(READY)
 	$(BIN)/python -m tests.faults.campaign --seed $(or $(SEED),1) --count $(COUNT)
+
+# Whether that campaign notices mistakes: each of tests/faults/mutants.toml is put into a copy of the package, and cases are run
+# against it. Takes an hour or more. ONLY=wire: those whose file or description contains the word.
+ONLY ?=
+test-mutants: $(READY)
+	$(BIN)/python -m tests.faults.mutation --only "$(ONLY)"
 
 # The pages as a site, in build/site. Fails on broken links, on pages that the navigation does not have, and on commands that do
 # not print what a page shows; BUILD_ONLY=1 leaves out the commands, which take minutes. The environment gets

@@ -1,4 +1,4 @@
-"""Disturb live runs at random, seeded, and hold what becomes of them against what is promised.
+"""Disturb live runs, wires and studies at random, seeded, and hold what becomes of them against what is promised.
 
     python -m tests.faults.campaign --seed 1 --count 100
 
@@ -16,44 +16,59 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import final
+from typing import TypeVar, final
 
-from evedrop.results.writer import load_results
-from tests.faults import ours
-from tests.faults.cases import PATIENT_SECONDS, Case, case_of
-from tests.faults.disturbed import Disturbed, disturbed
+from tests.faults import ours, studies, wires
+from tests.faults.cases import PATIENT_SECONDS, AnyCase, Case, case_of
+from tests.faults.disturbed import FORK_SERVERS, Disturbed, disturbed
+from tests.faults.facilities import Facilities, facilities
 from tests.faults.judge import OUTCOMES, misses, outcome_of
 from tests.faults.kinds import KINDS, Fault
 from tests.faults.moments import Usual
-from tests.faults.reference import Reference, in_memory, unlike, with_journal
+from tests.faults.reference import Reference, in_memory
+from tests.faults.studies import StudyFault, Undisturbed
 from tests.faults.variants import Variant
+from tests.faults.wires import WireCase, WireFault
+
+T = TypeVar("T")
 
 _LIMIT_SECONDS = 75.0
 """Within which a run must have ended after its last fault; the longest outage comes on top."""
 
 
+_UNDISTURBED_SECONDS = 600.0
+_RESTART_SECONDS = 130.0
+"""Within which a run gives up a fork server that must start a process again and does not respond."""
 _HEADS = {"kind": "fault", "target": "target"}
+SKIPPED = "NOT TESTED HERE"
+
+
+class Refused(Exception):
+    """The campaign cannot begin, because what nobody disturbed is not as it must be."""
 
 
 @dataclass(frozen=True)
 class Verdict:
     """The outcome of a case."""
 
-    case: Case
-    hits: tuple[Fault, ...]
+    case: AnyCase
+    hits: tuple[Fault | WireFault | StudyFault, ...]
     """The faults that hit something: some come when the run is over."""
     outcome: str
     misses: tuple[str, ...]
     seconds: float
+    lack: str | None = None
+    """Why it was skipped."""
 
     def __str__(self) -> str:
         late = len(self.case.faults) - len(self.hits)
         some = f" ({late} too late)" if late else ""
-        return f"{self.case.seed:6d}  {self.outcome:18} {self.seconds:5.1f} s  {self.case}{some}"
+        why = f": {self.lack}" if self.lack is not None else some
+        return f"{self.case.seed:6d}  {self.outcome:18} {self.seconds:5.1f} s  {self.case}{why}"
 
 
 @final
@@ -62,17 +77,52 @@ class Campaign:
     """Cases in a folder."""
 
     folder: Path
-    small_disks: bool
+    facilities: Facilities
     _known: dict[str, tuple[Reference, Usual]] = field(default_factory=dict)
+    _study: Undisturbed | None = None
 
-    def carry_out(self, case: Case) -> Verdict:
-        """Run a case to its end."""
+    def carry_out(self, case: AnyCase) -> Verdict:
+        """Run a case to its end. Raises Refused if it goes wrong undisturbed."""
+        if isinstance(case, Case):
+            lacks = [self.facilities.lacks[need] for need in sorted(case.needs) if need in self.facilities.lacks]
+            return Verdict(case, (), SKIPPED, (), 0.0, lacks[0]) if lacks else self._run(case)
+        before = frozenset(one.pid for one in ours.descendants())
+        folder, begun = self.folder / str(case.seed), time.monotonic()
+        if isinstance(case, WireCase):
+            found = list(wires.carried_out(case, folder, before))
+        else:
+            found = list(studies.carried_out(case, folder, before, self._studied()))
+        return self._verdict(case, case.faults, found, OUTCOMES[0], time.monotonic() - begun)
+
+    def _verdict(
+        self,
+        case: AnyCase,
+        hits: tuple[Fault | WireFault | StudyFault, ...],
+        found: list[str],
+        outcome: str,
+        seconds: float,
+    ) -> Verdict:
+        """What became of a case, whose folder is kept if something promised did not hold."""
+        ours.reap()
+        if not found:
+            shutil.rmtree(self.folder / str(case.seed))
+        return Verdict(case, hits, OUTCOMES[-1] if found else outcome, tuple(found), seconds)
+
+    def _studied(self) -> Undisturbed:
+        if self._study is None:
+            folder = self.folder / "study"
+            folder.mkdir()
+            self._study = _begun(lambda: studies.undisturbed(folder))
+        return self._study
+
+    def _run(self, case: Case) -> Verdict:
+        """Disturb a live run."""
         reference, usual = self.known(case.variant)
         before = frozenset(one.pid for one in ours.descendants())
         folder = self.folder / str(case.seed)
-        hits: list[Fault] = []
+        hits: dict[Fault, float] = {}
         begun = time.monotonic()
-        with disturbed(case.variant, folder, case.options, case.wired, case.fills and self.small_disks) as run:
+        with disturbed(case.variant, folder, case.options, case.wired, self._disk(case), case.limits) as run:
             hung = _follow(run, case, usual, hits)
             seconds = time.monotonic() - begun
             if hung:
@@ -80,48 +130,63 @@ class Campaign:
             run.launcher.wait()
             found = misses(run, hits, case.longest_outage, reference, before) if not hung else [hung]
             ours.end_all(ours.none_left(before, 5.0 if hung else 0.0))
-        ours.reap()
-        outcome = OUTCOMES[-1] if found else outcome_of(run.launcher.returncode)
-        verdict = Verdict(case, tuple(hits), outcome, tuple(found), seconds)
-        if not found:
-            shutil.rmtree(folder)
-        return verdict
+        return self._verdict(case, tuple(hits), found, outcome_of(run.launcher.returncode), seconds)
+
+    def _disk(self, case: Case) -> str | None:
+        return case.disk if case.disk != "full" or self.facilities.small_disks else None
 
     def known(self, variant: Variant) -> tuple[Reference, Usual]:
         """The result of an undisturbed run of a variant, and how long it takes."""
         if variant.name not in self._known:
             folder = self.folder / variant.name
             folder.mkdir()
-            reference = in_memory(variant.scenario(folder), folder / "memory")
+            before = frozenset(one.pid for one in ours.descendants())
+            reference = _begun(lambda: in_memory(variant.scenario(folder), folder / "memory"))
             with disturbed(variant, folder / "live", ["--set", f"longest_outage={PATIENT_SECONDS}"]) as run:
-                run.launcher.wait()
+                try:
+                    run.launcher.wait(_UNDISTURBED_SECONDS)
+                except subprocess.TimeoutExpired:
+                    run.launcher.kill()
+                    ours.end_all(ours.none_left(before, 0.0))
+                    raise Refused(
+                        f"an undisturbed run of {variant.name} did not end within {_UNDISTURBED_SECONDS:.0f} s"
+                    ) from None
                 ended = time.monotonic()
                 run.over.wait(0.1)  # for the last news to be read
                 if run.launcher.returncode:
-                    raise SystemExit(f"an undisturbed run of {variant.name} fails: {run.text('stderr')}")
-                results = load_results(run.out)
-                wrong = list(unlike(results.summary, reference))
-                if wrong:
-                    raise SystemExit(f"an undisturbed run of {variant.name} is not as in memory: {'; '.join(wrong)}")
-                assert run.started is not None
-                assert run.finished is not None
+                    ours.end_all(ours.none_left(before, 5.0))
+                    raise Refused(f"an undisturbed run of {variant.name} fails: {run.text('stderr')}")
+                wrong = misses(run, {}, PATIENT_SECONDS, reference, before)
+                if wrong or run.started is None or run.finished is None:
+                    raise Refused(f"an undisturbed run of {variant.name} is not as it must be: {'; '.join(wrong)}")
                 usual = Usual(run.started - run.begun, run.finished - run.started, ended - run.finished)
-                self._known[variant.name] = with_journal(reference, results.journal), usual
+                self._known[variant.name] = reference, usual
             ours.reap()
         return self._known[variant.name]
 
 
-def _follow(run: Disturbed, case: Case, usual: Usual, hits: list[Fault]) -> str | None:
+def _begun(work: Callable[[], T]) -> T:
+    """The result of work that nobody disturbs. Raises Refused if it fails."""
+    try:
+        return work()
+    except Exception as error:
+        raise Refused(f"undisturbed, {type(error).__name__}: {error}") from error
+
+
+def _follow(run: Disturbed, case: Case, usual: Usual, hits: dict[Fault, float]) -> str | None:
     """Let the faults strike, and wait for the launcher's end; what is wrong if it does not come."""
 
     def strike(fault: Fault) -> None:
-        if fault.strike(run, usual):
-            hits.append(fault)
+        begun = fault.strike(run, usual)
+        if begun is not None:
+            hits[fault] = begun
 
     threads = [threading.Thread(target=strike, args=(fault,)) for fault in case.faults]
     for thread in threads:
         thread.start()
     lasting = sum(fault.seconds or 0.0 for fault in case.faults)
+    if any(fault.target in FORK_SERVERS and fault.seconds is None for fault in case.faults):
+        lasting += _RESTART_SECONDS
     limit = usual.start + usual.run + usual.finish + lasting + case.longest_outage + _LIMIT_SECONDS
     hung = None
     try:
@@ -156,10 +221,10 @@ def campaign(folder: Path | None = None) -> Iterator[Campaign]:
     """A campaign in a folder, by default a temporary one, which is removed if nothing is kept in it."""
     ours.adopt_orphans()
     ours.heed_signals()
-    small_disks = ours.mounts_of_our_own()
+    mounts = ours.mounts_of_our_own()
     made = folder or Path(tempfile.mkdtemp(prefix="faults-"))
     made.mkdir(parents=True, exist_ok=True)
-    one = Campaign(made, small_disks)
+    one = Campaign(made, facilities(mounts, made))
     try:
         yield one
     finally:
@@ -174,6 +239,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, nargs="+", default=[1], help="numbers of the first cases")
     parser.add_argument("--count", type=int, default=1, help="how many cases from each number on")
     parser.add_argument("--list", action="store_true", help="print the cases and run none")
+    parser.add_argument("--first", action="store_true", help="end at the first case in which something did not hold")
     parser.add_argument("--keep", type=Path, help="a folder for what is kept; default a temporary one")
     options = parser.parse_args(arguments)
     cases = [case_of(seed) for first in options.seed for seed in range(first, first + options.count)]
@@ -189,8 +255,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 say(str(verdicts[-1]))
                 for miss in verdicts[-1].misses:
                     say(f"        {miss}")
+                if options.first and verdicts[-1].misses:
+                    break
         except KeyboardInterrupt:
             say("interrupted")
+        except Refused as error:
+            say(f"REFUSED {error}")
     missed = [verdict for verdict in verdicts if verdict.misses]
     say(f"\n{tally(verdicts)}\n")
     say(f"{sum(len(verdict.hits) for verdict in verdicts)} faults in {len(verdicts)} runs, {len(missed)} with a miss")
@@ -198,6 +268,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         say(
             f"    make test-faults SEED={verdict.case.seed}    what is left of it: {one.folder / str(verdict.case.seed)}"
         )
+    skipped = [verdict for verdict in verdicts if verdict.lack is not None]
+    for lack in sorted({str(verdict.lack) for verdict in skipped}):
+        count = sum(verdict.lack == lack for verdict in skipped)
+        say(f"!!!!!!!! {SKIPPED}: {count} of {len(verdicts)} cases, because this machine cannot run them: {lack}")
     return 1 if missed or len(verdicts) < len(cases) else 0
 
 

@@ -5,9 +5,12 @@ from __future__ import annotations
 import random
 from dataclasses import dataclass
 
-from tests.faults.kinds import EVERYBODY, RESULTS, SIGNALS, Fault
+from tests.faults.disturbed import CLEANER, FORK_SERVERS
+from tests.faults.kinds import CONFUSED, EVERYBODY, LIMITS, NEEDS, RESULTS, SIGNALS, Fault
 from tests.faults.moments import Moment
+from tests.faults.studies import StudyCase, study_case
 from tests.faults.variants import VARIANTS, Variant
+from tests.faults.wires import WireCase, wire_case
 
 PATIENT_SECONDS = 30.0
 """The longest outage where all interruptions are short: nothing may end the run, however busy the machine is."""
@@ -21,11 +24,20 @@ _WEIGHTS = {
     "cut": 12,
     "silence": 6,
     "fill the disk": 5,
+    "break the disk": 3,
     "rename": 3,
     "remove": 2,
+    "stop and kill": 5,
+    CONFUSED: 5,
+    "few processes": 4,
+    "little memory": 4,
     **dict.fromkeys(SIGNALS, 6),
 }
+_FAMILIES = {"live": 84, "wire": 9, "study": 7}
 _PHASES = {"start": 25, "run": 50, "finish": 25}
+
+
+_CONDITIONS = {CONFUSED: "confused", **{kind: limit[0] for kind, limit in LIMITS.items()}}
 
 
 @dataclass(frozen=True)
@@ -49,22 +61,45 @@ class Case:
         return ["--set", f"longest_outage={self.longest_outage}"]
 
     @property
-    def fills(self) -> bool:
-        """Whether the disk is filled."""
-        return any(fault.kind == "fill the disk" for fault in self.faults)
+    def disk(self) -> str | None:
+        """The disk that its results need: `full`, `broken`, or None."""
+        kinds = {fault.kind for fault in self.faults}
+        return "broken" if "break the disk" in kinds else "full" if "fill the disk" in kinds else None
+
+    @property
+    def limits(self) -> dict[str, int]:
+        """The conditions under which the run is started: `memory`, `processes`, `confused`."""
+        return {_CONDITIONS[fault.kind]: fault.count for fault in self.faults if fault.kind in _CONDITIONS}
+
+    @property
+    def needs(self) -> set[str]:
+        """The facilities that its faults need."""
+        return {NEEDS[fault.kind] for fault in self.faults if fault.kind in NEEDS}
 
     def __str__(self) -> str:
         return f"{self.variant.name}: {'; '.join(map(str, self.faults))}"
 
 
-def case_of(seed: int) -> Case:
+AnyCase = Case | WireCase | StudyCase
+
+
+def case_of(seed: int) -> AnyCase:
     """The case of a seed."""
     draw = random.Random(f"faults {seed}")  # noqa: S311 - a campaign must be repeatable
+    (family,) = draw.choices([*_FAMILIES], [*_FAMILIES.values()])
+    if family == "wire":
+        return wire_case(seed, draw)
+    if family == "study":
+        return study_case(seed, draw)
     variant = draw.choice(list(VARIANTS.values()))
     hasty = draw.random() < 0.2
     faults = [_fault(draw, variant, hasty)]
     for _ in range(draw.choices((0, 1, 2), (5, 3, 2))[0]):
         faults.append(_fault(draw, variant, hasty))
+    if limits := [fault for fault in faults if fault.kind in LIMITS]:
+        faults = limits[:1]  # whatever else happens, the run may end for this reason
+    if any(fault.kind == "break the disk" for fault in faults):
+        faults = [fault for fault in faults if fault.kind != "fill the disk"]
     return Case(seed, variant, tuple(faults), HASTY_SECONDS if hasty else PATIENT_SECONDS)
 
 
@@ -74,23 +109,33 @@ def _fault(draw: random.Random, variant: Variant, hasty: bool) -> Fault:
     moment = Moment(phase, round(draw.random(), 3))
     shard = draw.randrange(variant.shards)
     target, seconds, count = _target(draw, kind, variant), None, 1
+    if kind == CONFUSED:
+        return Fault(kind, EVERYBODY, Moment("start", 0.0), count=draw.randint(20, 200))
+    if kind in LIMITS:
+        return Fault(kind, "launcher", Moment("start", 0.0), count=draw.randint(*LIMITS[kind][1:]))
     if kind == "flap":
         count, seconds = draw.randint(1, 30), draw.uniform(0.1, 2.0)
-    elif kind in ("stop", "cut", "silence"):
+    elif kind in ("stop", "stop and kill", "cut", "silence"):
         seconds = draw.uniform(0.05, 1.2)
-        if hasty and target != "launcher" and draw.random() < 0.5:
+        # At its start a run waits for two minutes for a fork server that is suspended for good.
+        waits = target == "launcher" or (target in FORK_SERVERS and phase == "start")
+        if hasty and not waits and draw.random() < 0.5:
             # An outage is noticed when the lease of a connection, some seconds, has run out.
             seconds = draw.choice((None, draw.uniform(3.0, 14.0)))
     return Fault(kind, target, moment, shard, None if seconds is None else round(seconds, 2), count)
 
 
 def _target(draw: random.Random, kind: str, variant: Variant) -> str:
-    if kind in ("fill the disk", "rename", "remove"):
+    if kind in ("fill the disk", "break the disk", "rename", "remove"):
         return RESULTS
+    if kind == "stop and kill":
+        return "launcher"
     peers = [name for name in variant.processes if name != "router"]
     if kind in ("flap", "cut", "silence"):
         return draw.choice([*peers, EVERYBODY])
     others = ["launcher", "router"]
     if kind in SIGNALS:
         others += ["launcher"] * 4
+    else:
+        others += [*FORK_SERVERS, CLEANER]
     return draw.choice([*peers, *others])

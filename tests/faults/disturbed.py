@@ -11,16 +11,20 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from tests.faults import ours
+from tests.faults.facilities import break_disk, limited, mount_breakable
 from tests.faults.variants import Variant
 from tests.proxy import Cable
 
 _WITHIN = Path(__file__).with_name("within")
+CLEANER = "cleaner"
+FORK_SERVERS = ("first fork server", "second fork server")
+"""Those of the observer and of all others: the second is forked from the first."""
 _DISK_BYTES = 24 * 2**20
 _ROOT = Path(__file__).parents[2]
 
@@ -28,14 +32,27 @@ _ROOT = Path(__file__).parents[2]
 class Disturbed:
     """A run of a variant in a folder of its own. Made by `disturbed`."""
 
-    def __init__(self, variant: Variant, folder: Path, options: list[str], wired: set[str], small_disk: bool) -> None:
-        """wired: processes that reach their router through a cable; small_disk: whether the results have a disk of their own."""
+    def __init__(
+        self,
+        variant: Variant,
+        folder: Path,
+        options: list[str],
+        wired: set[str],
+        disk: str | None,
+        limits: Mapping[str, int],
+    ) -> None:
+        """wired: processes that reach their router through a cable.
+
+        disk: `full` or `broken`, if the results have a disk of their own, on which that will happen. limits: `memory` and
+        `processes`, as for `limited`; `confused`: after how many deliveries the router puts one on another receiver's key, too.
+        """
         self.variant, self.folder, self._wired = variant, folder, wired
         self.temporary = folder / "temporary"
         self.temporary.mkdir(parents=True)
         self.disk = folder / "disk"
         self.disk.mkdir()
-        self._mounted = small_disk and _mount(self.disk)
+        self._kind = disk
+        self._mounted = disk is not None and _mount(self.disk, disk)
         self.out = self.disk / "run"
         self.renamed = self.disk / "renamed"
         self.over = threading.Event()
@@ -46,6 +63,8 @@ class Disturbed:
         """When its last slot was or will be done, as far as can be told."""
         self.done = 0
         """How many slots it said are done."""
+        self.told: list[dict[str, Any]] = []
+        """What it told, each with the time `at` which its launcher took it."""
         self.cables: dict[tuple[int, str], Cable] = {}
         self._shards: dict[str, int] = {}
         self._lock = threading.Lock()
@@ -54,9 +73,16 @@ class Disturbed:
         self._asked.listen(64)
         threading.Thread(target=self._answer, daemon=True).start()
         self.begun = time.monotonic()
+        words = [sys.executable, "-m", "evedrop", "run", variant.path(folder), *variant.options, *options]
+        words, self._group = limited(
+            [*words, "--out", str(self.out)],
+            limits.get("memory"),
+            limits.get("processes"),
+            f"evedrop-{os.getpid()}-{folder.name}",
+        )
         with (folder / "stdout").open("w") as out, (folder / "stderr").open("w") as err:
             self.launcher = subprocess.Popen(
-                [sys.executable, "-m", "evedrop", "run", variant.path(folder), *variant.options, *options, "--out", self.out],
+                words,
                 cwd=folder,
                 stdin=subprocess.DEVNULL,
                 stdout=out,
@@ -65,8 +91,10 @@ class Disturbed:
                 env={
                     **os.environ,
                     "TMPDIR": str(self.temporary),
-                    "PYTHONPATH": f"{_WITHIN}{os.pathsep}{_ROOT}",
+                    # What the campaign itself imports may come from elsewhere, too.
+                    "PYTHONPATH": os.pathsep.join(filter(None, [str(_WITHIN), str(_ROOT), os.environ.get("PYTHONPATH")])),
                     "EVEDROP_CAMPAIGN": str(folder),
+                    **({"PYTHON_EVEDROP_CONFUSED": str(limits["confused"])} if "confused" in limits else {}),
                     "COLUMNS": "160",
                 },
             )  # fmt: skip
@@ -111,6 +139,7 @@ class Disturbed:
             self.over.wait(0.02)
 
     def _take(self, told: dict[str, Any]) -> None:
+        self.told.append(told)
         if told["event"] == "started":
             self.started = told["at"]
         elif told["event"] == "progress":
@@ -130,6 +159,11 @@ class Disturbed:
         """The living processes of a name in a shard: one, or none."""
         if name == "launcher":
             return [] if self.over.is_set() else [self.launcher.pid]
+        if name == CLEANER:
+            return [one.pid for one in ours.descendants() if one.is_cleaner]
+        if name in FORK_SERVERS:
+            found = [one.pid for one in ours.descendants() if one.is_fork_server]
+            return found[:1] if name == FORK_SERVERS[0] else found[1:2]
         firsts = self.firsts
         return [
             one.pid
@@ -152,7 +186,7 @@ class Disturbed:
 
     def fill(self) -> bool:
         """Leave no room on the disk of the results; whether it has one."""
-        if not self._mounted:
+        if not self._mounted or self._kind != "full":
             return False
         with (self.disk / "filler").open("ab", buffering=0) as file, suppress(OSError):
             piece = bytes(1 << 16)
@@ -161,6 +195,13 @@ class Disturbed:
         with (self.disk / "filler").open("ab", buffering=0) as file, suppress(OSError):
             while True:
                 file.write(b"\0")
+        return True
+
+    def break_disk(self) -> bool:
+        """Have every access to the disk of the results fail; whether it has one."""
+        if not self._mounted or self._kind != "broken":
+            return False
+        break_disk(self.disk)
         return True
 
     def text(self, name: str) -> str:
@@ -175,19 +216,29 @@ class Disturbed:
             cable.close()
         if self._mounted:
             self._keep()
+        if self._group is not None:
+            with suppress(OSError):  # some process is left in it, which the judge has said
+                self._group.rmdir()
 
     def _keep(self) -> None:
         """Move the results from their small disk to where they are kept."""
         (self.disk / "filler").unlink(missing_ok=True)
         kept = self.folder / "kept"
-        shutil.copytree(self.disk, kept, symlinks=True)
+        if self._kind == "full":
+            shutil.copytree(self.disk, kept, symlinks=True)
+        else:
+            kept.mkdir()  # what was on a broken disk can no longer be read
         subprocess.run(["umount", "--lazy", self.disk], check=True)
         self.disk.rmdir()
         kept.rename(self.disk)
+        self.disk.with_name(f"{self.disk.name}.image").unlink(missing_ok=True)
 
 
-def _mount(folder: Path) -> bool:
+def _mount(folder: Path, kind: str) -> bool:
     """Mount a small disk, in the campaign's own mount namespace."""
+    if kind == "broken":
+        mount_breakable(folder)
+        return True
     command = ["mount", "-t", "tmpfs", "-o", f"size={_DISK_BYTES}", "none", str(folder)]
     return subprocess.run(command, check=False, capture_output=True).returncode == 0
 
@@ -198,10 +249,11 @@ def disturbed(
     folder: Path,
     options: list[str] | None = None,
     wired: set[str] | None = None,
-    small_disk: bool = False,
+    disk: str | None = None,
+    limits: Mapping[str, int] | None = None,
 ) -> Iterator[Disturbed]:
     """A run that has been started; when the block ends its cables and its disk are gone."""
-    run = Disturbed(variant, folder, options or [], wired or set(), small_disk)
+    run = Disturbed(variant, folder, options or [], wired or set(), disk, limits or {})
     try:
         yield run
     finally:

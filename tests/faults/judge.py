@@ -4,27 +4,40 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import pyarrow.parquet as pq
 
 from evedrop.errors import UsageError
-from evedrop.results.writer import Results, load_results
+from evedrop.results.writer import load_results
 from tests.faults import ours
-from tests.faults.kinds import SIGNALS, Fault
+from tests.faults.disturbed import CLEANER, FORK_SERVERS
+from tests.faults.figures import unlike_rows
+from tests.faults.kinds import CONFUSED, KILLING, LIMITS, RESULTS, SIGNALS, Fault
+from tests.faults.looks import failed_looks
+from tests.faults.outages import wrong_outages
 from tests.faults.reference import Reference, tables_of, unlike
 from tests.faults.variants import Variant
+from tests.faults.whole import missing_rows
 from tests.proxy import Cable
 
-FAILED, INTERRUPTED, KILLED = 3, 130, -9
+UNUSABLE, FAILED, INTERRUPTED, KILLED = 2, 3, 130, -9
 OUTCOMES = ("as if undisturbed", "failed by name", "interrupted", "launcher killed", "MISS")
+_HEEDED_SECONDS = 1.0
+"""After a signal to the launcher a run that has slots to come does not complete."""
 _LEAVE_SECONDS = 25.0
 """For processes whose launcher was killed to write the results and end; and for all others."""
 
 
 def outcome_of(status: int) -> str:
     """In a word."""
-    return {0: OUTCOMES[0], FAILED: OUTCOMES[1], INTERRUPTED: OUTCOMES[2], KILLED: OUTCOMES[3]}.get(status, OUTCOMES[4])
+    return {
+        0: OUTCOMES[0],
+        FAILED: OUTCOMES[1],
+        UNUSABLE: OUTCOMES[1],
+        INTERRUPTED: OUTCOMES[2],
+        KILLED: OUTCOMES[3],
+    }.get(status, OUTCOMES[4])
 
 
 class Launcher(Protocol):
@@ -70,33 +83,47 @@ class Run(Protocol):
     def cables(self) -> Mapping[tuple[int, str], Cable]:
         """Shard and process → its cable."""
 
+    @property
+    def told(self) -> Sequence[Mapping[str, Any]]:
+        """Its news, each with the time `at` which it came."""
+
     def text(self, name: str) -> str:
         """What it wrote to stdout or stderr."""
 
 
 def misses(
-    run: Run, hits: Sequence[Fault], longest_outage: float, reference: Reference, before: frozenset[int]
+    run: Run, hits: Mapping[Fault, float], longest_outage: float, reference: Reference, before: frozenset[int]
 ) -> list[str]:
-    """The broken promises, now that the launcher has ended; hits: the faults that hit something."""
-    left = ours.none_left(before, _LEAVE_SECONDS)
+    """The broken promises, now that the launcher has ended; hits: the faults that hit something, and when."""
+    left = ours.none_left(before, _LEAVE_SECONDS, run.temporary)
     found = [f"process {one.pid} is left: {' '.join(one.words)}; {ours.doing(one.pid)}" for one in left]
     ours.end_all(left)
     status = run.launcher.returncode
-    found += _of_status(status, run, hits, longest_outage)
-    found += _of_what_is_said(run)
-    found += [f"{path} is left" for path in sorted(run.temporary.iterdir())]
+    found += _of_status(status, run, hits, longest_outage, int(reference.summary["slots"]))
+    found += _of_what_is_said(run, any(map(_of_limits, hits)))
+    # Without its cleaner, the folder of a killed launcher is removed by the next run.
+    if not (status == KILLED and any(fault.kind == "kill" and fault.target == CLEANER for fault in hits)):
+        found += [f"{path} is left" for path in sorted(run.temporary.iterdir())]
     found += _of_ports(run)
-    if not any(fault.kind == "remove" for fault in hits):
+    if not any(fault.kind in ("remove", "break the disk") for fault in hits):
         found += _of_results(status, run, hits, reference)
+        found += _of_files(status, run, any(_of_disk(fault) or _of_limits(fault) for fault in hits))
     return found
 
 
-def _of_status(status: int, run: Run, hits: Sequence[Fault], longest_outage: float) -> Iterator[str]:
+def _of_status(status: int, run: Run, hits: Mapping[Fault, float], longest_outage: float, slots: int) -> Iterator[str]:
+    """Whether the status, and the first line, say what happened; slots: of the whole run."""
     fatal = [fault for fault in hits if not fault.survived(longest_outage)]
     if status != 0 and not fatal:
         yield f"status {status}, although nothing of this may end a run: {_first_line(run)}"
+    elif status == 0:
+        yield from _of_ignored_signals(run, fatal, hits, slots)
+    elif status == UNUSABLE and any(map(_of_disk, fatal)):
+        if "cannot be written" not in _first_line(run):  # before anything was started
+            yield f"status 2: {_first_line(run)}"
     elif status == FAILED:
-        complaint = _first_line(run)
+        # Which process lacked something is said first, and what it lacked comes from its log.
+        complaint = run.text("stderr") if any(map(_of_limits, fatal)) else _first_line(run)
         blamed = [word for fault in fatal for word in fault.blamed]
         if not any(word in complaint for word in blamed):
             yield f"the failure names none of {', '.join(blamed)}: {complaint or '(nothing was said)'}"
@@ -104,10 +131,22 @@ def _of_status(status: int, run: Run, hits: Sequence[Fault], longest_outage: flo
         if not any(fault.kind in SIGNALS for fault in fatal):
             yield "status 130, but no signal asked for the end"
     elif status == KILLED:
-        if not any(fault.kind == "kill" and fault.target == "launcher" for fault in fatal):
+        if not any(fault.kind in KILLING and fault.target == "launcher" for fault in fatal):
             yield "the launcher was killed by something else"
     elif status != 0:
         yield f"status {status}: {_first_line(run)}"
+
+
+def _of_ignored_signals(run: Run, fatal: Sequence[Fault], hits: Mapping[Fault, float], slots: int) -> Iterator[str]:
+    """A launcher that is told to end while slots are to come ends the run, rather than complete it.
+
+    It hears the news of the run in the loop in which it heeds signals, so that it is late for both on a busy machine.
+    """
+    for fault in fatal:
+        late = hits[fault] + _HEEDED_SECONDS
+        progress = [news for news in run.told if news["event"] == "progress" and news["at"] > late]
+        if fault.kind in SIGNALS and fault.target == "launcher" and any(news["done"] < slots for news in progress):
+            yield f"the run went on to its end, {_HEEDED_SECONDS:.0f} s and more after {fault}"
 
 
 def _first_line(run: Run) -> str:
@@ -117,12 +156,17 @@ def _first_line(run: Run) -> str:
     return complaints[0] if complaints else run.text("stderr").strip().partition("\n")[0]
 
 
-def _of_what_is_said(run: Run) -> Iterator[str]:
-    """Tracebacks, wherever they are."""
+def _of_what_is_said(run: Run, limited: bool) -> Iterator[str]:
+    """Tracebacks, wherever they are. limited: whether the run had too few threads or too little memory."""
     logs = [path for folder in _folders(run) for path in sorted(folder.glob("**/*.log"))]
     for path in (run.folder / "stdout", run.folder / "stderr", *logs):
-        text = path.read_text(errors="replace")
-        if "Traceback (most recent call last)" in text or "panicked at" in text:
+        try:
+            text = path.read_text(errors="replace")
+        except OSError:  # its disk is broken
+            continue
+        # Where no thread can be started, Zenoh panics in its own.
+        panic = limited and "PanicException: OS can't spawn worker thread" in text
+        if not panic and ("Traceback (most recent call last)" in text or "panicked at" in text):
             yield f"{path.relative_to(run.folder)} has a traceback: {text.strip().splitlines()[-1]}"
 
 
@@ -132,14 +176,27 @@ def _of_ports(run: Run) -> Iterator[str]:
             yield f"a router of {cable} still listens"
 
 
+def _of_files(status: int, run: Run, lacking: bool) -> Iterator[str]:
+    """Files that others may read, and those of a run that goes on, which a run that has ended does not have.
+
+    lacking: whether the run had too little of something to clean up.
+    """
+    for folder in (run.out, run.renamed):
+        for path in sorted(folder.glob("**/*")):
+            if path.stat().st_mode & 0o077:
+                yield f"others may use {path.relative_to(run.folder)}, whose mode is {path.stat().st_mode & 0o777:o}"
+            if status != KILLED and not lacking and path.name in ("control.json", "unfinished"):
+                yield f"{path.relative_to(run.folder)} is left of the run"
+
+
 def _folders(run: Run) -> list[Path]:
     """Where results are, or were moved to: those of each shard where they could not be made one."""
     found = [folder for folder in (run.out, run.renamed) if folder.is_dir()]
     return [one for folder in found for one in (sorted((folder / "shards").glob("*")) or [folder])]
 
 
-def _of_results(status: int, run: Run, hits: Sequence[Fault], reference: Reference) -> Iterator[str]:
-    disk = any(fault.target == "results" for fault in hits)
+def _of_results(status: int, run: Run, hits: Mapping[Fault, float], reference: Reference) -> Iterator[str]:
+    disk, limited = any(map(_of_disk, hits)), any(map(_of_limits, hits))
     folders = _folders(run)
     written = [folder for folder in folders if any(_has_rows(path) for path in folder.glob("**/*.parquet"))]
     for folder in folders:
@@ -148,20 +205,25 @@ def _of_results(status: int, run: Run, hits: Sequence[Fault], reference: Referen
             tables = dict(tables_of(results))
         except UsageError as error:
             # Where nothing was measured there is nothing to read.
-            if folder in written or (run.done and len(folders) == 1) or (status != KILLED and not disk):
+            if folder in written or (run.done and len(folders) == 1) or (status != KILLED and not disk and not limited):
                 yield f"{folder.name} cannot be read: {error}"
             continue
+        summary = results.summary
         for name, table in tables.items():
-            yield from reference.wrong_rows(name, table)
+            yield from reference.wrong_rows(name, table, int(summary["slots"]) if len(folders) == 1 else 0)
+        yield from missing_rows(tables, summary, reference, status == 0)
+        yield from unlike_rows(summary, tables)
         if not disk:
-            yield from _of_summary(status, run, hits, results, reference)
+            yield from _of_summary(status, run, hits, summary, reference)
+        yield from failed_looks(folder, reference.folder if summary["slots"] else None)
     if not folders and status == 0:
         yield "there are no results"
 
 
-def _of_summary(status: int, run: Run, hits: Sequence[Fault], results: Results, reference: Reference) -> Iterator[str]:
-    """Whether the summary says how it ended, and accounts for every packet; tables are whole up to what it says."""
-    summary = results.summary
+def _of_summary(
+    status: int, run: Run, hits: Mapping[Fault, float], summary: Mapping[str, Any], reference: Reference
+) -> Iterator[str]:
+    """Whether the summary says how the run ended and what it went through, and accounts for every packet."""
     unexplained = [name for name, link in summary["links"].items() if link["unexplained"]]
     if unexplained:
         yield f"packets to {', '.join(unexplained)} are unexplained"
@@ -169,22 +231,35 @@ def _of_summary(status: int, run: Run, hits: Sequence[Fault], results: Results, 
         if summary["ended"] != "complete":
             yield f"the run ended well, and its summary says {summary['ended']}"
         yield from unlike(summary, reference)
-        tables = dict(tables_of(results))
-        for name, table in tables.items():
-            if name in reference.tables and len(table) != len(reference.tables[name]):
-                yield f"{name} has {len(table)} rows, not {len(reference.tables[name])}"
+        yield from _of_verification(summary, reference)
+        if any(fault.kind == CONFUSED for fault in hits) and not summary["misdelivered"]:
+            yield "messages came on keys that they do not name, and the summary lists none"
     # A signal may come when the run is complete, and end a launcher that prints its report.
     elif summary["ended"] == "complete" and status not in (KILLED, INTERRUPTED):
         yield f"status {status}, and the summary says complete"
-    if not any(fault.target in ("observer", "launcher") and fault.kind == "kill" for fault in hits):
-        if summary["slots"] < run.done:
-            yield f"{run.done} slots were done, and the summary has {summary['slots']}"
-        rows, whole = len(results.slots), summary["slots"] * len(run.variant.receivers)
-        # Shards that were cut short at different slots leave rows for slots that only some of them reached: with fewer trials.
-        trials = results.slots["trials"].to_numpy()
-        further = results.slots["slot"].to_numpy() >= summary["slots"]
-        if rows - further.sum() != whole or (trials[further] >= summary["trials"]).any():
-            yield f"the table of slots has {rows} rows, and {summary['slots']} slots were measured"
+    if any(fault.target in ("observer", "launcher", *FORK_SERVERS) and fault.kind in KILLING for fault in hits):
+        return
+    if summary["slots"] < run.done:
+        yield f"{run.done} slots were done, and the summary has {summary['slots']}"
+    complete = summary["ended"] == "complete"
+    slots = int(reference.summary["slots"])
+    yield from wrong_outages(summary["outages"], run.told, hits, slots, complete)
+
+
+def _of_verification(summary: Mapping[str, Any], reference: Reference) -> Iterator[str]:
+    """Whether a complete run says that it has computed the digests of every recorded trial again."""
+    recorded = len({key[2] for key in reference.tables["trials"]})
+    for name, one in summary["verification"].items():
+        if one["recomputed_trials"] != recorded:
+            yield f"{one['recomputed_trials']} trials of {name} were verified, of {recorded} that are recorded"
+
+
+def _of_disk(fault: Fault) -> bool:
+    return fault.target == RESULTS
+
+
+def _of_limits(fault: Fault) -> bool:
+    return fault.kind in LIMITS
 
 
 def _has_rows(path: Path) -> bool:

@@ -6,13 +6,14 @@ import os
 import resource
 import shutil
 import signal
+import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from tests.faults.disturbed import Disturbed
+from tests.faults.disturbed import CLEANER, FORK_SERVERS, Disturbed
 from tests.faults.moments import Moment, Usual
 
 SIGNALS = {"hang up": signal.SIGHUP, "interrupt": signal.SIGINT, "terminate": signal.SIGTERM}
@@ -32,6 +33,21 @@ _UNWRITTEN = (
     "was removed while the run went on",
 )
 _NETWORK = ("flap", "cut", "silence")
+_WITHOUT = (
+    "not enough memory",
+    "no further process or thread can be started",
+    "cannot be started",
+    "fork server",
+    "resource",
+)
+"""What a machine that lacks something may be told to lack."""
+LIMITS = {"few processes": ("processes", 5, 90), "little memory": ("memory", 200, 3000)}
+"""Limits of a whole run: the resource, and the least and most of it (processes and threads; megabytes of addresses)."""
+CONFUSED = "confuse"
+"""A message arrives on a key that it does not name, too, as connections that flap have been seen to deliver them."""
+NEEDS = {"few processes": "a limit of processes", "break the disk": "a disk that breaks"}
+"""Kind of fault → the facility that it needs."""
+KILLING = ("kill", "stop and kill")
 
 
 @dataclass(frozen=True)
@@ -46,32 +62,48 @@ class Fault:
     seconds: float | None = None
     """How long it lasts; None for good, or where it does not last."""
     count: int = 1
-    """How often a connection flaps."""
+    """How often a connection flaps; or the limit that the run has."""
 
     def __str__(self) -> str:
         lasts = "" if self.seconds is None else f" {self.seconds:.1f} s"
         often = f" {self.count} times" if self.kind == "flap" else ""
+        if self.kind in LIMITS:
+            return f"{self.kind}: {self.count}"
+        if self.kind == CONFUSED:
+            return f"confuse keys after every {self.count} deliveries"
         good = " for good" if self.seconds is None and self.kind in ("stop", "cut", "silence") else ""
         where = f" (shard {self.shard + 1})" if self.shard else ""
         return f"{self.kind} {self.target}{where}{often}{lasts}{good} at {self.moment}"
 
-    def strike(self, run: Disturbed, usual: Usual) -> bool:
-        """Wait for the moment and do it; whether it hit anything."""
-        return self.moment.wait(run, usual) and _STRIKES[self.kind](self, run)
+    def strike(self, run: Disturbed, usual: Usual) -> float | None:
+        """Wait for the moment and do it; when, by the monotonic clock, or None if it hit nothing."""
+        if not self.moment.wait(run, usual):
+            return None
+        begun = time.monotonic()
+        hit = _STRIKES[self.kind](self, run)
+        if self.kind in SIGNALS:  # perhaps only when the launcher heeded it
+            begun = time.monotonic()
+        return begun if hit else None
 
     def survived(self, longest_outage: float) -> bool:
         """Whether the run must go on to the end as if nothing had happened."""
+        if self.target == CLEANER:
+            return True
         # On a busy machine a router takes its time to be back, and so do connections.
         patient = longest_outage >= _PATIENT_SECONDS
         if self.kind in (*_NETWORK, "stop"):
             return patient and self.seconds is not None
-        return patient and self.kind == "kill" and self.target in _ROUTERS
+        return patient and (self.kind == CONFUSED or (self.kind == "kill" and self.target in _ROUTERS))
 
     @property
     def blamed(self) -> tuple[str, ...]:
         """What a failure that this fault causes may name."""
         if self.target == RESULTS:
             return _UNWRITTEN
+        if self.kind in LIMITS:
+            return _WITHOUT
+        if self.target in FORK_SERVERS:
+            return ("fork server",)
         if self.target == EVERYBODY:
             return (*_ROUTERS, "observer")
         # Whose own connection is gone cannot tell who is at fault: to it all others vanish behind the router.
@@ -132,6 +164,23 @@ def _stop(fault: Fault, run: Disturbed) -> bool:
     return bool(found)
 
 
+def _stop_and_kill(fault: Fault, run: Disturbed) -> bool:
+    found = _process(fault, run)
+    for number in (signal.SIGSTOP, signal.SIGKILL):
+        for pid in found:
+            with suppress(ProcessLookupError):
+                os.kill(pid, number)
+        if number == signal.SIGSTOP:
+            run.over.wait(fault.seconds)
+    return bool(found)
+
+
+def _limited(fault: Fault, run: Disturbed) -> bool:
+    """The run was started with it."""
+    del fault, run
+    return True
+
+
 def _flap(fault: Fault, run: Disturbed) -> bool:
     hit = False
     _awaited(lambda: run.wires(fault.target, fault.shard), run)
@@ -179,6 +228,11 @@ def _fill(fault: Fault, run: Disturbed) -> bool:
     return hit
 
 
+def _break(fault: Fault, run: Disturbed) -> bool:
+    del fault
+    return run.break_disk()
+
+
 def _rename(fault: Fault, run: Disturbed) -> bool:
     del fault
     with suppress(OSError):
@@ -198,10 +252,13 @@ _STRIKES: Mapping[str, Callable[[Fault, Disturbed], bool]] = {
     "kill": _send(signal.SIGKILL),
     **{kind: _send(number) for kind, number in SIGNALS.items()},
     "stop": _stop,
+    "stop and kill": _stop_and_kill,
+    **dict.fromkeys((*LIMITS, CONFUSED), _limited),
     "flap": _flap,
     "cut": _cut,
     "silence": _silence,
     "fill the disk": _fill,
+    "break the disk": _break,
     "rename": _rename,
     "remove": _remove,
 }

@@ -1,4 +1,9 @@
-"""The processes of a run as the system knows them: all descendants of the campaign, whatever their parents are now."""
+"""The processes of a run as the system knows them: all descendants of the campaign, whatever their parents are now.
+
+A look at /proc takes time, and a process whose parent dies meanwhile is listed below a parent that is no longer there. So a
+look is repeated until two in a row agree; a process is also known by the folder for temporary files that it was given; and the
+campaign, which adopts orphans, asks the system whether it has any child, which the system answers at one instant.
+"""
 
 from __future__ import annotations
 
@@ -54,32 +59,87 @@ class Process:
         last = self.words[-1] if self.words else ""
         return Path(last) if last.endswith(".json") and "/evedrop-" in last else None
 
+    @property
+    def is_fork_server(self) -> bool:
+        """Whether it is a fork server of the run."""
+        return "evedrop.fork_server" in self.words
 
-def descendants() -> Iterator[Process]:
+    @property
+    def is_cleaner(self) -> bool:
+        """Whether it is the shell that removes the private folder when the launcher is dead."""
+        return (
+            len(self.words) > 1
+            and Path(self.words[0]).name == "sh"
+            and Path(self.words[-1]).name.startswith("evedrop-")
+        )
+
+
+def descendants() -> list[Process]:
     """All living processes that descend from us."""
+    seen = _look()
+    while (again := _look()) != seen:
+        seen = again
+    return [Process(pid, tuple(words)) for pid in sorted(seen) if (words := _words(pid)) is not None]
+
+
+def _words(pid: int) -> list[str] | None:
+    try:
+        return words_of(pid)
+    except OSError:
+        return None
+
+
+def _look() -> frozenset[int]:
+    """The descendants by one look at all processes."""
     children: dict[int, list[int]] = {}
     for folder in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
             state, parent = (folder / "stat").read_text().rpartition(")")[2].split()[:2]
             if state not in "ZX":
                 children.setdefault(int(parent), []).append(int(folder.name))
-    waiting = list(children.get(os.getpid(), []))
+    found, waiting = set[int](), list(children.get(os.getpid(), []))
     while waiting:
         pid = waiting.pop()
+        found.add(pid)
         waiting += children.get(pid, [])
+    return frozenset(found)
+
+
+def marked(temporary: Path) -> Iterator[Process]:
+    """All living processes that were given this folder for temporary files, whoever their parents are."""
+    mark = f"TMPDIR={temporary}".encode()
+    for folder in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
-            words = words_of(pid)
-            yield Process(pid, tuple(words))
+            if mark in (folder / "environ").read_bytes().split(b"\0") and folder.name != str(os.getpid()):
+                state = (folder / "stat").read_text().rpartition(")")[2].split()[0]
+                if state not in "ZX":
+                    yield Process(int(folder.name), tuple(words_of(folder.name)))
 
 
-def none_left(before: frozenset[int], seconds: float) -> list[Process]:
-    """Wait until no descendants are left except the earlier ones; returns those that remain after this number of seconds."""
+def none_left(before: frozenset[int], seconds: float, temporary: Path | None = None) -> list[Process]:
+    """Wait until no descendants are left except the earlier ones; returns those that remain after this number of seconds.
+
+    temporary: the run's folder for temporary files, by which its processes are known as well.
+    """
     deadline = time.monotonic() + seconds
     while True:
-        found = [one for one in descendants() if one.pid not in before]
-        if not found or time.monotonic() > deadline:
-            return found
-        time.sleep(0.05)
+        found = {one.pid: one for one in descendants() if one.pid not in before}
+        if temporary is not None:
+            found |= {one.pid: one for one in marked(temporary) if one.pid not in before}
+        if not found and (before or not _has_children()):
+            return []
+        if found and time.monotonic() > deadline:
+            return list(found.values())
+        time.sleep(0.05 if found else 0.001)  # a child that no look found moves fast
+
+
+def _has_children() -> bool:
+    """Whether we have a child that lives; collects those that have ended. Only for a process that has no other children."""
+    with suppress(ChildProcessError):
+        while os.waitpid(-1, os.WNOHANG)[0]:
+            pass
+        return True
+    return False
 
 
 def doing(pid: int) -> str:

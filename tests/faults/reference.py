@@ -1,18 +1,21 @@
-"""What a run must come to: the same trials in memory, and an undisturbed live run, which is held against them."""
+"""What a run must come to: the same trials in memory, and the fates that the link model decides there."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 
 from evedrop import montecarlo
+from evedrop.model.digest import block_starts
 from evedrop.results.writer import Results
 from evedrop.scenario import Scenario
+from tests.faults.fates import journal_rows
+from tests.faults.figures import unlike_memory
 
 KEYS: Mapping[str, tuple[str, ...]] = {
     "slots": ("slot", "peer"),
@@ -36,9 +39,14 @@ class Reference:
     summary: Mapping[str, Any]
     tables: Mapping[str, Mapping[tuple[Any, ...], Row]]
     shards: int = 1
+    folder: Path | None = None
+    """The results in memory."""
 
-    def wrong_rows(self, name: str, table: pa.Table) -> Iterator[str]:
-        """Rows of a table on disk that differ from those that are right; rows that must not be there."""
+    def wrong_rows(self, name: str, table: pa.Table, whole: int | None = None) -> Iterator[str]:
+        """Rows of a table on disk that differ from those that are right; rows that must not be there.
+
+        whole: the slots that all shards have done, whose rows must be of all trials; None for the whole run.
+        """
         known, found = self.tables.get(name), 0
         if known is None:
             return
@@ -51,7 +59,9 @@ class Reference:
                 if key in seen
                 else "must not be there"
                 if wanted is None
-                else _difference(name, row, wanted, self.shards)
+                else _difference(
+                    name, row, wanted, self.shards > 1 and whole is not None and row.get("slot", 0) >= whole
+                )
             )
             seen.add(key)
             if why is not None:
@@ -63,15 +73,27 @@ class Reference:
 
 
 def in_memory(scenario: Scenario, folder: Path) -> Reference:
-    """The same trials in memory."""
+    """The same trials in memory, whose results come into a folder.
+
+    Raises ValueError if its tables are not whole: the judge misses only rows that are there.
+    """
     results = montecarlo(scenario, trials=scenario.trials, out=folder)
     tables = {name: _rows(name, table) for name, table in tables_of(results, journal=False)}
-    return Reference(results.summary, tables, scenario.shards)
-
-
-def with_journal(reference: Reference, journal: pa.Table) -> Reference:
-    """A reference that knows the journal of an undisturbed live run as well."""
-    return replace(reference, tables={**reference.tables, "journal": _rows("journal", journal)})
+    slots, trials, peers = scenario.slots, scenario.trials, len(scenario.receivers)
+    expected = {"slots": slots * peers, "trials": slots * peers * scenario.record_trials}
+    if "inputs" in tables:
+        expected["inputs"] = slots * scenario.record_trials
+    blocks = sum(len(block_starts(slots, scenario.outage_bounds(name))) for name in scenario.digested)
+    expected["digests"] = blocks * trials
+    wrong = [
+        f"{name} has {len(tables[name])} rows, not {count}"
+        for name, count in expected.items()
+        if len(tables[name]) != count
+    ]
+    if wrong:
+        raise ValueError(f"the same trials in memory are not whole: {'; '.join(wrong)}")
+    journal = {_key("journal", row): row for row in journal_rows(scenario)}
+    return Reference(results.summary, {**tables, "journal": journal}, scenario.shards, folder)
 
 
 def tables_of(results: Results, journal: bool = True) -> Iterator[tuple[str, pa.Table]]:
@@ -91,10 +113,10 @@ def _rows(name: str, table: pa.Table) -> dict[tuple[Any, ...], Row]:
     return {_key(name, row): row for row in table.to_pylist()}
 
 
-def _difference(name: str, row: Row, wanted: Row, shards: int) -> str | None:
-    """Why a row is not the one that it must be; None if it is."""
+def _difference(name: str, row: Row, wanted: Row, fewer: bool) -> str | None:
+    """Why a row is not the one that it must be; None if it is. fewer: it may be of some trials only."""
     counts = _COUNTS.get(name)
-    if shards > 1 and counts is not None and row[counts] < wanted[counts]:
+    if fewer and counts is not None and row[counts] < wanted[counts]:
         return None  # some shards were cut short: of fewer trials
     for column, value in row.items():
         expected = wanted[column]
@@ -124,14 +146,4 @@ def _nothing(value: Any) -> bool:
 
 def unlike(summary: Mapping[str, Any], reference: Reference) -> Iterator[str]:
     """The entries of a whole run's summary that differ from those in memory."""
-    wanted = reference.summary
-    for entry in ("slots", "trials"):
-        if summary[entry] != wanted[entry]:
-            yield f"{entry} is {summary[entry]}, not {wanted[entry]}"
-    for name, peer in wanted["peers"].items():
-        if summary["peers"][name]["digest"] != peer["digest"]:
-            yield f"the digest of {name} is {summary['peers'][name]['digest']}, not {peer['digest']}"
-        if summary["links"][name] != wanted["links"][name]:
-            yield f"the account of {name}'s link differs"
-    if wanted.get("controller") is not None and summary["controller"]["digest"] != wanted["controller"]["digest"]:
-        yield "the digest of the controller differs"
+    yield from unlike_memory(summary, reference.summary)

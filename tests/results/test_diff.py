@@ -106,7 +106,7 @@ def test_runs_without_a_trial_in_common_are_not_equal(runs: dict[str, Results]) 
 def test_a_run_cut_short_before_its_first_block_is_compared_by_its_rows(
     runs: dict[str, Results], tmp_path: Path
 ) -> None:
-    """A run that ended at slot 20 has no digest; its recorded rows are those of the whole run, or the first difference is named."""
+    """A run that ended at slot 20 has no digest; its recorded rows are compared, and the first difference is named."""
     short = tmp_path / "short"
     shutil.copytree(runs["whole"].folder, short)
     for name in ("trials", "digests"):

@@ -1,5 +1,6 @@
-"""Loaded by the launcher of a run that the campaign disturbs: says what happens, and has cables put before the router.
+"""Loaded by the processes of a run that the campaign disturbs.
 
+The launcher says what happens, and has cables put before the router. A fork server, if asked to, makes the router confuse keys.
 Modules are changed when they are imported and not before, so that the launcher starts as it always does.
 """
 
@@ -9,8 +10,12 @@ import os
 import sys
 
 FOLDER = os.environ.get("EVEDROP_CAMPAIGN")
+CONFUSED = os.environ.get("PYTHON_EVEDROP_CONFUSED")
+"""After how many deliveries the router puts one on another receiver's key, too. Evedrop hands on variables of Python."""
+MOST_CONFUSED = 5
 
-if FOLDER and sys.orig_argv[1:4] == ["-m", "evedrop", "run"]:
+LAUNCHES = bool(FOLDER) and sys.orig_argv[1:4] == ["-m", "evedrop", "run"]
+if LAUNCHES or (CONFUSED and "evedrop.fork_server" in sys.orig_argv):
     from importlib.machinery import ModuleSpec, PathFinder
     from types import ModuleType
     from typing import Any
@@ -46,7 +51,31 @@ if FOLDER and sys.orig_argv[1:4] == ["-m", "evedrop", "run"]:
 
         module.Brief.write = write
 
-    _CHANGES = {"evedrop.cli.progress_line": _telling, "evedrop.live.protocol.brief": _wired}
+    def _confused(module: ModuleType) -> None:
+        put, every, before, count = module.Outlet.__call__, int(CONFUSED or 0), [None], [0]
+
+        def confuse(outlet: Any, payload: bytes) -> None:
+            put(outlet, payload)
+            if "/downlink/" not in outlet.key:
+                return
+            count[0] += 1
+            other: Any = before[0]
+            if (
+                other is not None
+                and other.key != outlet.key
+                and count[0] % every == 0
+                and count[0] <= MOST_CONFUSED * every
+            ):
+                other._publisher.put(outlet._head + payload)
+            before[0] = outlet
+
+        module.Outlet.__call__ = confuse
+
+    _CHANGES = (
+        {"evedrop.cli.progress_line": _telling, "evedrop.live.protocol.brief": _wired}
+        if LAUNCHES
+        else {"evedrop.live.network.declared": _confused}
+    )
 
     class _Finder:
         """Finds the modules that are to be changed, and changes them when they have been run."""

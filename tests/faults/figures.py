@@ -1,0 +1,128 @@
+"""The figures of a summary, held against the rows of its tables and against the summary of the same trials in memory.
+
+Source: docs/results.md, summary.json.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import pyarrow as pa
+
+_ROUNDED = 1e-9
+"""Relative difference of figures that a live run adds up in another order."""
+_OF_CLOCK = frozenset({"wall_seconds", "slots_per_second", "mean_solve_seconds", "longest_solve_seconds", "replay"})
+"""Entries that the clock or the folder decides."""
+_OF_A_LIVE_RUN = frozenset({"mode", "ended", "outages", "verification", "misdelivered"})
+"""Entries that say what only a live run can do."""
+_ERRORS = ("mean_squared_error", "mean_trace_covariance")
+_FRACTIONS = ("received_fraction", "used_fraction")
+_MEANS = (*_ERRORS, *_FRACTIONS)
+
+
+def unlike_memory(summary: Mapping[str, Any], wanted: Mapping[str, Any]) -> Iterator[str]:
+    """The entries of a complete run's summary that differ from those of the same trials in memory."""
+    for name, value in wanted.items():
+        if name not in _OF_A_LIVE_RUN:
+            yield from _differences(name, summary.get(name), value)
+    for name in summary.keys() - wanted.keys() - _OF_A_LIVE_RUN:
+        yield f"the summary has {name}, and in memory it has not"
+
+
+def _differences(place: str, value: Any, wanted: Any) -> Iterator[str]:
+    if place.rpartition(".")[2] in _OF_CLOCK:
+        return
+    if isinstance(wanted, Mapping) and isinstance(value, Mapping):
+        for name in sorted({*wanted, *value}):
+            yield from _differences(f"{place}.{name}", value.get(name), wanted.get(name))
+    elif isinstance(wanted, list) and isinstance(value, list) and len(wanted) == len(value):
+        for number, (one, other) in enumerate(zip(value, wanted, strict=True)):
+            yield from _differences(f"{place}.{number}", one, other)
+    elif not same(value, wanted):
+        yield f"{place} is {value}, and in memory {wanted}"
+
+
+def same(value: Any, wanted: Any) -> bool:
+    """Whether two entries are equal, numbers within rounding."""
+    if isinstance(value, bool) or isinstance(wanted, bool):
+        return value is wanted
+    if isinstance(value, (int, float)) and isinstance(wanted, (int, float)):
+        if math.isnan(value) or math.isnan(wanted):
+            return math.isnan(value) and math.isnan(wanted)
+        return math.isclose(value, wanted, rel_tol=_ROUNDED, abs_tol=1e-12)
+    return bool(value == wanted)
+
+
+def slots_of_figures(summary: Mapping[str, Any]) -> int | None:
+    """How many slots the figures of a summary cover; None if it has none yet.
+
+    A run that was killed has figures of an earlier moment than its rows, and says so.
+    """
+    earlier = re.search(r"the figures are as of slot (\d+)", str(summary["ended"]))
+    slots = int(earlier.group(1)) if earlier else int(summary["slots"])
+    return slots or None
+
+
+def unlike_rows(summary: Mapping[str, Any], tables: Mapping[str, pa.Table]) -> Iterator[str]:
+    """The figures of receivers and links that are not those of the rows, which may be of a run that ended early."""
+    slots = slots_of_figures(summary)
+    if slots is None:
+        return
+    means, links = _means(tables["slots"], slots), _accounts(tables["journal"], slots)
+    latecomers = {name: account["late"] for name, account in links.items()}
+    for name, peer in summary["peers"].items():
+        found, late = means[name], latecomers[name]
+        for figure in _MEANS:
+            # A late packet counts as received, and perhaps as used, when it arrives; rows of slots have none of them.
+            least = found[figure] / found["trials"]
+            most = least + (late / found["trials"] if figure in _FRACTIONS else 0.0)
+            if not (same(peer[figure], least) or same(peer[figure], most) or least < peer[figure] < most):
+                yield f"{figure} of {name} is {peer[figure]}, and by the rows of slots {least}"
+    for name, link in summary["links"].items():
+        account = links[name]
+        offered, lost_by = account["offered"], account["lost_by"]
+        if link["offered"] != offered:
+            yield f"{link['offered']} packets were offered to {name}'s link, and by the rows of the journal {offered}"
+        # What the journal calls late was under way, and is lost, if the run ended before it came.
+        came = {**link["lost_by"], "underway": link["lost_by"].get("underway", 0) - lost_by.get("underway", 0)}
+        cut_off = came.pop("underway")
+        rest = {reason: count for reason, count in lost_by.items() if reason != "underway"}
+        if came != rest or not 0 <= cut_off <= latecomers[name]:
+            yield f"losses of {name}'s link are {link['lost_by']}, and by the rows of the journal {lost_by}"
+        if sum(link["lost_by"].values()) != link["lost"] or link["delivered"] + link["lost"] != offered:
+            yield f"the account of {name}'s link does not add up: {link}"
+
+
+def _means(slots: pa.Table, end: int) -> dict[str, dict[str, float]]:
+    """Receiver → figure → its sum over slots and trials; and the number of these, as `trials`."""
+    sums: dict[str, dict[str, float]] = defaultdict(lambda: dict.fromkeys((*_MEANS, "trials"), 0.0))
+    for row in slots.select(["slot", "peer", "trials", *_MEANS]).to_pylist():
+        if row["slot"] < end:
+            found = sums[row["peer"]]
+            found["trials"] += row["trials"]
+            for figure in _MEANS:
+                found[figure] += row[figure] * row["trials"]
+    return sums
+
+
+def _accounts(journal: pa.Table, end: int) -> dict[str, dict[str, Any]]:
+    """Link → entries of its account, and how many packets were late, by the rows of the journal."""
+    sums: dict[str, Counter[str]] = defaultdict(Counter)
+    names = [name for name in journal.column_names if name not in ("slot", "link", "delivered_mask")]
+    for row in journal.select(["slot", "link", *names]).to_pylist():
+        if row["slot"] < end:
+            for name in names:
+                sums[row["link"]][name] += row[name]
+    reasons = [name.removeprefix("lost_by_") for name in names if name.startswith("lost_by_")]
+    return {
+        link: {
+            "offered": found["offered"],
+            "late": found["late"],
+            "lost_by": {reason: found[f"lost_by_{reason}"] for reason in reasons if found[f"lost_by_{reason}"]},
+        }
+        for link, found in sums.items()
+    }

@@ -1,0 +1,62 @@
+"""The outages of a summary, held against the faults of the case and against what the run told while it went on.
+
+Source: docs/results.md, outages.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from tests.faults.kinds import CONFUSED, EVERYBODY, Fault
+
+_ROUTERS = ("router", "relay")
+_CUTTING = ("flap", "cut", "silence", "stop", CONFUSED)
+_LAG_SECONDS = 0.3
+"""By which news of the run may be late: later news of slots to come prove that the run was not over when a fault struck."""
+
+
+def wrong_outages(
+    listed: Sequence[Mapping[str, Any]],
+    told: Sequence[Mapping[str, Any]],
+    struck: Mapping[Fault, float],
+    slots: int,
+    complete: bool,
+) -> Iterator[str]:
+    """What is wrong with a summary's `outages`.
+
+    told: the run's news, each with the time `at` which it came; struck: when each fault hit something; slots: of the whole run.
+    """
+    entries = {(one["process"], one["slot"]) for one in listed}
+    for news in told:
+        if news["event"] == "reconnected" and (news["process"], news["slot"]) not in entries:
+            yield f"the run told of an outage of {news['process']} at slot {news['slot']}, and the summary lists none"
+    for one in listed:
+        if not _explained(str(one["process"]), struck):
+            yield f"an outage of {one['process']} at slot {one['slot']}, and no fault caused one"
+        if complete and (one["until"] is None or not one["slot"] <= one["until"] <= slots):
+            yield f"an outage of {one['process']} at slot {one['slot']} until {one['until']}, in a run that is complete"
+        if one["seconds"] < 0.0:
+            yield f"an outage of {one['seconds']} s"
+    for fault, at in struck.items():
+        killed = fault.kind == "kill" and fault.target == "router" and _went_on(told, at, slots)
+        if complete and killed and not {one["process"] for one in listed} & {*_ROUTERS, "observer"}:
+            yield "the router was killed in the middle of the run, and the summary lists no outage"
+
+
+def _explained(process: str, struck: Mapping[Fault, float]) -> bool:
+    """Whether a fault can have cut a process off. Routers, and the observer, stand for all that were connected to them."""
+    for fault in struck:
+        if fault.kind in _CUTTING and (fault.target in (process, EVERYBODY) or process in (*_ROUTERS, "observer")):
+            return True
+        if fault.kind not in _CUTTING and fault.target not in ("results", "cleaner"):
+            return True  # whatever ends may be missed first
+    return False
+
+
+def _went_on(told: Sequence[Mapping[str, Any]], struck: float, slots: int) -> bool:
+    """Whether slots were still to come well after a fault struck."""
+    return any(
+        news["event"] == "progress" and news["at"] > struck + _LAG_SECONDS and 0 < news["done"] < slots - 1
+        for news in told
+    )

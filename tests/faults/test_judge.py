@@ -1,0 +1,396 @@
+"""The judge of the campaign sees what it looks for, in runs that are complete and in runs that ended early."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+import pytest
+
+from evedrop import montecarlo
+from evedrop.results.writer import JOURNAL, load_results
+from tests.conftest import wait_until
+from tests.faults import judge, ours
+from tests.faults.cases import PATIENT_SECONDS
+from tests.faults.fates import journal_rows
+from tests.faults.kinds import CONFUSED, EVERYBODY, Fault
+from tests.faults.moments import Moment
+from tests.faults.reference import Reference, in_memory, tables_of, unlike
+from tests.faults.variants import VARIANTS, Variant
+from tests.proxy import Cable
+
+EARLY = 150
+"""The slot at which a run of this file ends early."""
+KILL = Fault("kill", "smart", Moment("run", 0.5))
+ROUTER = Fault("kill", "router", Moment("run", 0.5))
+INTERRUPT = Fault("interrupt", "launcher", Moment("run", 0.5))
+FLAP = Fault("flap", "smart", Moment("run", 0.5), seconds=1.0, count=3)
+
+
+@pytest.fixture(scope="module")
+def memory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the results of `reference` are."""
+    return tmp_path_factory.mktemp("reference") / "memory"
+
+
+@pytest.fixture(scope="module")
+def reference(memory: Path) -> Reference:
+    """The variant `plain` in memory."""
+    return in_memory(VARIANTS["plain"].scenario(memory.parent), memory)
+
+
+def test_wrong_rows_are_seen(reference: Reference, memory: Path) -> None:
+    """A number that is off in its last bit, a row that is another's, one that is there twice; and no other."""
+    tables = dict(tables_of(load_results(memory), journal=False))
+    assert [line for name, table in tables.items() for line in reference.wrong_rows(name, table)] == []
+    rows = tables["trials"].slice(100, 3).to_pylist()
+    rows[0]["squared_error"] = math.nextafter(rows[0]["squared_error"], math.inf)
+    rows[1]["peer"] = "smart" if rows[1]["peer"] != "smart" else "naive"
+    wrong = pa.Table.from_pylist([*rows, rows[2]], schema=tables["trials"].schema.remove_metadata())
+    found = list(reference.wrong_rows("trials", wrong))
+    assert len(found) == 3
+    assert "squared_error is" in found[0]
+    assert "twice" in found[2]
+
+
+def test_another_summary_is_seen(reference: Reference) -> None:
+    """Another digest, another account of a link, a slot that is missing, an entry that memory does not have."""
+    summary: dict[str, Any] = {
+        **reference.summary,
+        "slots": 1,
+        "peers": {name: {**peer, "digest": "00"} for name, peer in reference.summary["peers"].items()},
+        "links": {name: {**link, "delivered": 0} for name, link in reference.summary["links"].items()},
+        "more": 1,
+    }
+    assert list(unlike(reference.summary, reference)) == []
+    assert len(list(unlike(summary, reference))) == 2 + 2 * len(VARIANTS["plain"].receivers)
+
+
+@dataclass
+class Status:
+    """A launcher that has ended."""
+
+    returncode: int = 0
+
+
+@dataclass
+class Ended:
+    """What the judge looks at of a run."""
+
+    folder: Path
+    out: Path
+    launcher: Status = field(default_factory=Status)
+    variant: Variant = VARIANTS["plain"]
+    done: int = 400
+    cables: dict[tuple[int, str], Cable] = field(default_factory=dict)
+    told: list[dict[str, Any]] = field(default_factory=list)
+
+    @property
+    def renamed(self) -> Path:
+        """Nothing is there."""
+        return self.folder / "renamed"
+
+    @property
+    def temporary(self) -> Path:
+        """Empty, as it should be."""
+        return self.folder / "temporary"
+
+    def text(self, name: str) -> str:
+        """What it wrote to stdout or stderr."""
+        return (self.folder / name).read_text()
+
+    def change(self, name: str, change: Callable[[pa.Table], pa.Table]) -> None:
+        """Replace one of its tables."""
+        path = self.out / f"{name}.parquet"
+        pq.write_table(change(pq.read_table(path)), path)
+
+    def edit(self, change: Callable[[dict[str, Any]], object]) -> None:
+        """Change its summary."""
+        path = self.out / "summary.json"
+        summary = json.loads(path.read_text())
+        change(summary)
+        path.write_text(json.dumps(summary))
+
+    def misses(self, reference: Reference, *hits: Fault) -> list[str]:
+        """What the judge says."""
+        before = frozenset(one.pid for one in ours.descendants())
+        return judge.misses(self, dict.fromkeys(hits, 1.0), PATIENT_SECONDS, reference, before)
+
+
+def ended_run(folder: Path, results: Path, slots: int, how: str) -> Ended:
+    """A run for the judge, from results in memory: as a live run writes them, with its journal and its own entries."""
+    out = folder / "run"
+    shutil.copytree(results, out)
+    rows = [row for row in journal_rows(VARIANTS["plain"].scenario(folder)) if row["slot"] < slots]
+    pq.write_table(pa.Table.from_pylist(rows, schema=JOURNAL), out / "journal.parquet")
+    (folder / "temporary").mkdir()
+    for name in ("stdout", "stderr"):
+        (folder / name).touch()
+    run = Ended(folder, out, done=slots)
+
+    def as_live(summary: dict[str, Any]) -> None:
+        names = VARIANTS["plain"].receivers
+        checked = {name: {"recomputed_trials": 1, "verified": [], "own_word": []} for name in names}
+        summary |= {"mode": "live", "ended": how, "verification": checked, "outages": []}
+
+    run.edit(as_live)
+    return run
+
+
+@pytest.fixture
+def ended(tmp_path: Path, memory: Path, reference: Reference) -> Ended:
+    """A run for the judge, which ended as if nothing had happened."""
+    del reference
+    return ended_run(tmp_path, memory, 400, "complete")
+
+
+@pytest.fixture
+def early(tmp_path: Path) -> Ended:
+    """A run for the judge that a killed process ended early, as it should."""
+    scenario = VARIANTS["plain"].scenario(tmp_path)
+    montecarlo(scenario, trials=1, slots=EARLY, out=tmp_path / "short")
+    run = ended_run(tmp_path, tmp_path / "short", EARLY, "smart was ended by signal 9")
+    run.change("digests", lambda table: table.slice(0, 0))  # its only block was cut short
+    (tmp_path / "stderr").write_text("evedrop: smart was ended by signal 9\n")
+    run.launcher.returncode = judge.FAILED
+    return run
+
+
+STATUSES: dict[str, tuple[int, str, list[Fault], str]] = {
+    "a status that nothing explains": (3, "evedrop: smart left", [FLAP], "although nothing of this may end a run"),
+    "somebody else blamed": (3, "evedrop: naive was ended by signal 9", [KILL], "names none of smart"),
+    "a status that is none": (1, "", [KILL], "status 1"),
+    "an interrupt out of nothing": (130, "evedrop: interrupted", [KILL], "no signal asked for the end"),
+    "a traceback": (0, "Traceback (most recent call last):\n  boom", [], "has a traceback"),
+}
+
+
+@pytest.mark.parametrize("what", STATUSES)
+def test_the_judge_sees(what: str, ended: Ended, reference: Reference) -> None:
+    """What a launcher must not do or say."""
+    ended.launcher.returncode, said, hits, expected = STATUSES[what]
+    (ended.folder / "stderr").write_text(said)
+    found = ended.misses(reference, *hits)
+    assert [line for line in found if expected in line], found
+
+
+def without(*places: int) -> Callable[[pa.Table], pa.Table]:
+    """A table without some rows; negative places count from its end."""
+
+    def change(table: pa.Table) -> pa.Table:
+        gone = {place % table.num_rows for place in places}
+        return table.take([row for row in range(table.num_rows) if row not in gone])
+
+    return change
+
+
+def without_slot(slot: int) -> Callable[[pa.Table], pa.Table]:
+    """A table without the rows of a slot."""
+    return lambda table: table.filter(pc.not_equal(table["slot"], slot))
+
+
+def half(table: pa.Table) -> pa.Table:
+    """The first half of a table."""
+    return table.slice(0, table.num_rows // 2)
+
+
+LACKING = {
+    "one slot of the journal": ("journal", without_slot(20)),
+    "one slot of the trials": ("trials", without_slot(20)),
+    "one slot of the slots": ("slots", without_slot(20)),
+    "the last row of the journal": ("journal", without(-1)),
+    "the last row of the trials": ("trials", without(-1)),
+    "half of the trials": ("trials", half),
+    "half of the journal": ("journal", half),
+}
+"""What was missing in runs that ended early without being noticed."""
+
+
+def test_the_judge_has_nothing_to_say_of_runs_that_are_whole(ended: Ended, reference: Reference) -> None:
+    """A complete one."""
+    assert ended.misses(reference) == []
+
+
+def test_the_judge_has_nothing_to_say_of_early_ends_that_are_whole(early: Ended, reference: Reference) -> None:
+    """One that ended early, for which a fault is to blame."""
+    assert early.misses(reference, KILL) == []
+
+
+@pytest.mark.parametrize("what", LACKING)
+def test_missing_rows_of_a_run_that_ended_early_are_seen(what: str, early: Ended, reference: Reference) -> None:
+    """All tables are counted up to the slot of the summary."""
+    name, change = LACKING[what]
+    early.change(name, change)
+    found = early.misses(reference, KILL)
+    assert [line for line in found if line.startswith(f"{name} lacks")], found
+
+
+def test_missing_digests_are_seen(ended: Ended, reference: Reference) -> None:
+    """Each block that has ended has one, for each receiver and trial."""
+    ended.change("digests", without(-1))
+    assert [line for line in ended.misses(reference) if line.startswith("digests lacks 1 of 8 rows")]
+
+
+@pytest.mark.parametrize("figure", ["mean_squared_error", "mean_trace_covariance", "received_fraction"])
+@pytest.mark.parametrize("when", ["ended", "early"])
+def test_swapped_figures_are_seen(when: str, figure: str, request: pytest.FixtureRequest, reference: Reference) -> None:
+    """Figures of two receivers exchanged in the summary, of a complete run and of one that ended early."""
+    run: Ended = request.getfixturevalue(when)
+
+    def swap(summary: dict[str, Any]) -> None:
+        a, b = summary["peers"]["smart"], summary["peers"]["naive"]
+        a[figure], b[figure] = b[figure], a[figure] + 1e-3
+
+    run.edit(swap)
+    found = run.misses(reference, *([KILL] if when == "early" else []))
+    assert [line for line in found if line.startswith(f"{figure} of smart is")], found
+
+
+def test_another_account_of_a_run_that_ended_early_is_seen(early: Ended, reference: Reference) -> None:
+    """A loss of another reason, and one that is not counted."""
+    early.edit(lambda summary: summary["links"]["smart"].update(lost_by={"cut": summary["links"]["smart"]["lost"]}))
+    early.edit(lambda summary: summary["links"]["naive"].update(lost=0))
+    found = early.misses(reference, KILL)
+    assert [line for line in found if "losses of smart's link" in line], found
+    assert [line for line in found if "account of naive's link does not add up" in line], found
+
+
+def progress(done: int, at: float) -> dict[str, Any]:
+    """News of the progress of a run."""
+    return {"event": "progress", "done": done, "at": at}
+
+
+def test_an_outage_that_is_not_listed_is_seen(ended: Ended, reference: Reference) -> None:
+    """A router was killed at 1.0 s and slots came afterwards; and one that the run told of."""
+    ended.told = [progress(100, 0.9), progress(200, 2.0)]
+    assert [line for line in ended.misses(reference, ROUTER) if "the summary lists no outage" in line]
+    ended.told = [progress(399, 0.9)]  # it may have been over already
+    assert ended.misses(reference, ROUTER) == []
+    ended.told = [{"event": "reconnected", "process": "router", "slot": 7, "at": 2.0}]
+    assert [line for line in ended.misses(reference, ROUTER) if "told of an outage of router at slot 7" in line]
+
+
+def test_an_outage_without_a_cause_is_seen(ended: Ended, reference: Reference) -> None:
+    """Of a process that nobody cut off; of one that a fault did, it may be listed."""
+    outage = {"process": "smart", "slot": 3, "until": 9, "seconds": 1.0}
+    ended.edit(lambda summary: summary["outages"].append(outage))
+    assert [line for line in ended.misses(reference) if "no fault caused one" in line]
+    assert ended.misses(reference, FLAP) == []
+
+
+def test_the_judge_sees_what_is_left_and_what_cannot_be_read(ended: Ended, reference: Reference) -> None:
+    """A private folder, and a table that is cut off."""
+    (ended.temporary / "evedrop-x").mkdir()
+    whole = (ended.out / "slots.parquet").read_bytes()
+    (ended.out / "slots.parquet").write_bytes(whole[: len(whole) // 2])
+    lines = ended.misses(reference)
+    assert [line for line in lines if "evedrop-x is left" in line]
+    assert [line for line in lines if "slots.parquet cannot be read" in line]
+
+
+def test_a_launcher_that_heeds_no_signal_is_seen(ended: Ended, reference: Reference) -> None:
+    """Slots are done a second after the signal, and all of them at the end; news of the end alone say nothing."""
+    ended.told = [progress(399, 2.5), progress(400, 2.6)]
+    assert [line for line in ended.misses(reference, INTERRUPT) if "the run went on to its end" in line]
+    ended.told = [progress(399, 1.5), progress(400, 2.6)]
+    assert ended.misses(reference, INTERRUPT) == []
+
+
+def test_files_that_others_may_read_and_files_of_a_run_that_goes_on_are_seen(
+    ended: Ended, reference: Reference
+) -> None:
+    """The results have the seed and the truth; a control file has a password."""
+    (ended.out / "control.json").touch(mode=0o644)
+    found = ended.misses(reference)
+    assert [line for line in found if "others may use run/control.json, whose mode is 644" in line], found
+    assert [line for line in found if "run/control.json is left of the run" in line], found
+
+
+def test_messages_on_wrong_keys_must_be_listed(ended: Ended, reference: Reference) -> None:
+    """A router that confuses keys was asked for, and no process says that it dropped a message."""
+    confused = Fault(CONFUSED, EVERYBODY, Moment("start", 0.0), count=30)
+    assert [line for line in ended.misses(reference, confused) if "keys that they do not name" in line]
+    ended.edit(lambda summary: summary.update(misdelivered={"smart": 5}))
+    assert ended.misses(reference, confused) == []
+
+
+def test_a_folder_that_no_command_can_show_is_seen(ended: Ended, reference: Reference) -> None:
+    """Its page cannot be written; and one that lacks a part says so."""
+    (ended.out / "report.html").mkdir()
+    assert [line for line in ended.misses(reference) if line.startswith("evedrop report ")]
+
+
+MOVING = """
+import os, sys, time
+end = time.monotonic() + 600.0
+open(sys.argv[1], "w").close()
+while time.monotonic() < end and os.path.exists(sys.argv[1]):
+    if os.fork():
+        os._exit(0)
+    time.sleep(0.002)
+"""
+"""A process that is handed to a new parent again and again."""
+
+
+@pytest.fixture
+def moving(tmp_path: Path) -> Iterator[Path]:
+    """The folder of a process that moves from parent to parent until its file `there` is removed."""
+    there = tmp_path / "there"
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    subprocess.run([sys.executable, "-c", MOVING, there], check=True, env=environment)
+    try:
+        yield tmp_path
+    finally:
+        there.unlink()
+
+
+LOOK = """
+import sys, pathlib, subprocess
+from tests.faults import ours
+ours.adopt_orphans()
+there = pathlib.Path(sys.argv[1]) / "there"
+subprocess.run([sys.executable, "-c", sys.argv[2], str(there)], check=True)
+missed = sum(not ours.none_left(frozenset(), 0.0) for _ in range(8))
+there.unlink()
+print(missed, len(ours.none_left(frozenset(), 120.0)))
+"""
+
+
+def test_a_leftover_that_moves_to_a_new_parent_is_found(tmp_path: Path) -> None:
+    """Every time, by a campaign that adopts orphans: it asks the system whether there is any child."""
+    command = [sys.executable, "-c", LOOK, str(tmp_path), MOVING]
+    done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False)
+    assert done.stdout.split() == ["0", "0"], done.stderr
+
+
+def test_a_leftover_that_has_left_us_is_found_by_its_folder(moving: Path) -> None:
+    """Its parent is the system's first process: no descendant of ours."""
+    wait_until(lambda: list(ours.marked(moving)), "the process")
+    assert list(ours.marked(moving / "other")) == []
+
+
+def test_a_suspended_leftover_is_found(tmp_path: Path) -> None:
+    """A stopped process ends only by force, and what it does is said."""
+    before = frozenset(one.pid for one in ours.descendants())
+    sleeping = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], env={"TMPDIR": str(tmp_path)})
+    sleeping.send_signal(signal.SIGSTOP)
+    begun = time.monotonic()
+    left = ours.none_left(before, 0.2, tmp_path)
+    assert time.monotonic() - begun >= 0.2
+    assert [one.pid for one in left] == [sleeping.pid]
+    sleeping.kill()
+    sleeping.wait()
+    assert ours.none_left(before, 0.0, tmp_path) == []
