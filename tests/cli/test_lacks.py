@@ -62,7 +62,7 @@ def test_other_errors_are_no_lack(error: Exception) -> None:
 def test_a_run_without_threads_ends_with_a_sentence(evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch) -> None:
     """As under a container's limit of processes, which counts threads."""
 
-    def fail(*_: object) -> None:
+    def fail(*_: object, **__: object) -> None:
         raise RuntimeError("can't start new thread")
 
     starts = ("_start_joinable_thread", "_start_new_thread")  # since Python 3.13, and before

@@ -54,6 +54,7 @@ def test_a_program_in_mode_peer_is_reported_once(tmp_path: Path) -> None:
             pass  # clients are no bypass: what follows is all
         with at.program("base", mode="peer") as peer:
             zid = str(peer.zid())
+            wait_until(peer.info.routers_zid, "it is connected")  # a program in mode peer does not wait for it
         wait_until(lambda: at.told, "it is reported")
         with at.program("robot", mode="peer"):
             wait_until(lambda: len(at.told) > 1, "the other one is reported")
