@@ -64,6 +64,14 @@ def print_json(value: object) -> None:
     sys.stdout.write(f"{text}\n")
 
 
+def _descriptor(stream: io.TextIOWrapper) -> int | None:
+    """The file descriptor of a stream; None for one without, as where tests or notebooks take the output."""
+    try:
+        return stream.fileno()
+    except OSError:
+        return None
+
+
 @final
 class Output:
     """A text stream that never fails, and escapes control characters; after the first error, what is written to it is lost."""
@@ -105,11 +113,7 @@ class Output:
     def at(self, descriptor: int, of: int) -> Iterator[None]:
         """While the block runs, write to another descriptor of the same file, if the stream's own is `of`."""
         former = self._stream
-        try:
-            its_own = isinstance(former, io.TextIOWrapper) and former.fileno() == of
-        except OSError:  # a stream without a descriptor
-            its_own = False
-        if not its_own:
+        if not isinstance(former, io.TextIOWrapper) or _descriptor(former) != of:
             yield
             return
         self.flush()
