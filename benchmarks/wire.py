@@ -1,29 +1,39 @@
-"""What a wire carries: messages a second, what it adds to the latency, large messages, and whether it accounts for all.
+"""What a wire carries: messages a second, the latency it adds, large messages, new keys, and whether it accounts for all.
 
     python benchmarks/wire.py [--quick]
     python benchmarks/wire.py --full          # also ten million messages: each must be accounted for
 
 Everything runs on this machine: a sender and a receiver in plain zenoh-python (wire_peers.py), and the wire with its journal in
-this process. The yardstick of the rate is a bare relay: two sessions and a loop that puts what it hears.
+this process, or for new keys in one of its own. The yardstick of the rate is a bare relay: two sessions and a loop that puts
+what it hears.
 """
 
 from __future__ import annotations
 
 import statistics
+import subprocess
 import sys
 import tempfile
 import threading
+import time
 import tomllib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import zenoh
+from processes import processes_of
 from table import Row, judged, run_alone
-from wire_peers import Carried, Traffic, carry
+from wire_peers import Carried, Traffic, carry, session_to
 
+from evedrop.errors import UsageError
+from evedrop.live.network.control_file import read_control
+from evedrop.live.network.operator import ask
+from evedrop.live.protocol.requests import StatusRequest
+from evedrop.live.protocol.wire_status import WireStatus
 from evedrop.wire.crossing import Crossing
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_part import Records
@@ -35,6 +45,14 @@ from evedrop.wire.side import SideSession
 _ANYWHERE = ("tcp/127.0.0.1:0",)
 PERFECT: Mapping[str, Any] = {"loss": {"model": "bernoulli", "quality": 1.0}}
 BURSTS: Mapping[str, Any] = {"loss": {"model": "gilbert-elliott", "p": 0.01, "r": 0.2}}
+_TWO_SIDES = """
+[side.robot]
+[side.base]
+[[link]]
+from = "robot"
+to = "base"
+quality = 0.9
+"""
 _LOSSES = Path(__file__).parents[1] / "tests" / "wire" / "losses.toml"
 
 
@@ -222,6 +240,58 @@ def losses(count: int) -> Iterator[Row]:
     )
 
 
+def new_keys(count: int) -> Iterator[Row]:
+    """What the first message of a key costs a wire, in a process of its own, and how long the wire then takes to end."""
+    with tempfile.TemporaryDirectory() as folder:
+        file, out = Path(folder, "wire.toml"), Path(folder, "out")
+        file.write_text(_TWO_SIDES, encoding="utf-8")
+        command = [sys.executable, "-P", "-m", "evedrop", "wire", str(file), "--out", str(out)]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        try:
+            costs = [_looked_at(process, out)]
+            with session_to(process.stdout.readline().split()[1]) as sender:
+                for keys in (["robot/scan"] * count, [f"robot/{at:032x}" for at in range(count)]):
+                    for key in keys:
+                        sender.put(key, b"x" * 64, congestion_control=zenoh.CongestionControl.BLOCK)
+                    costs.append(_looked_at(process, out, len(costs) * count))
+            begun = time.monotonic()
+            process.terminate()
+            process.stdout.read()
+            process.wait()
+            ended = time.monotonic() - begun
+        finally:
+            process.kill()
+            process.wait()
+    (known, _), (new, kept) = [
+        ((after[0] - before[0]) / count * 1e6, (after[1] - before[1]) / count * 1e3)
+        for before, after in pairwise(costs)
+    ]
+    yield Row(
+        f"wire, a message on each of {count:,} new keys",
+        f"{new:.0f} µs of the processor and {kept:.1f} kB a key; ended in {ended:.1f} s",
+        f"{known:.0f} µs a message of one key",
+        "100 µs and 2 kB; 5 s",
+        "50 µs and 1 kB; 5 s",
+        judged(new < 100 and kept < 2 and ended < 5, new < 50 and kept < 1 and ended < 5),
+    )
+
+
+def _looked_at(process: subprocess.Popen[str], out: Path, heard: int = 0) -> tuple[float, float]:
+    """Processor seconds and private MB of a wire's process, once it has heard a number of messages."""
+    deadline = time.monotonic() + 300.0
+    while True:
+        time.sleep(0.1)
+        with suppress(UsageError, zenoh.ZError):  # it has not begun yet
+            answer = ask(read_control(out), StatusRequest(), 60.0)
+            status = None if answer is None else answer.status
+            if isinstance(status, WireStatus) and sum(link.heard for link in status.links.values()) >= heard:
+                [now] = processes_of(process.pid)
+                return now.cpu_seconds, now.private
+        if time.monotonic() > deadline or process.poll() is not None:
+            raise RuntimeError(f"the wire did not hear {heard} messages")
+
+
 def rows(quick: bool) -> Iterator[Row]:
     """All figures."""
     yield from rates(1 if quick else 5, 5_000 if quick else 300_000)
@@ -229,6 +299,7 @@ def rows(quick: bool) -> Iterator[Row]:
     yield from large(1 if quick else 3, 10 if quick else 400, 2**22)
     yield from accounted(10_000 if quick else 10_000_000 if "--full" in sys.argv else 500_000)
     yield from losses(500 if quick else 20_000)
+    yield from new_keys(3_000 if quick else 100_000)
 
 
 if __name__ == "__main__":

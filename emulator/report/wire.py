@@ -12,7 +12,7 @@ from evedrop.report.text_table import TextTable
 from evedrop.results.wire_summary import WireSummary
 from evedrop.score.summary import failed
 
-_WITHOUT_MODEL = {"overflow", "cut", "unlinked", "too_large", "looped"}
+_WITHOUT_MODEL = {"overflow", "cut", "unlinked", "too_large", "looped", "too_many_keys"}
 """The reasons for which messages are lost before a link's models decide on them."""
 _MARKS = {True: "yes", False: "NO", None: "–"}
 

@@ -37,9 +37,11 @@ class Crossing(IntEnum):
     LOOPED = 19
     """A router outside the wire joins both sides, so the message would go round."""
     UNDERWAY = 20
-    """Still delayed when the wire ended."""
+    """Still delayed, or waiting for the wire, when it ended."""
     REFUSED = 21
     """Zenoh raised an error when the message was put on the other side."""
+    TOO_MANY_KEYS = 22
+    """Its key is new, and the programs of its side have already used as many keys as a wire keeps."""
 
     @property
     def emulated(self) -> bool:
@@ -73,7 +75,7 @@ RECORD = np.dtype(
         ("n", "<i8"),  # its number among the messages of its key and kind on its link, from 0; -1 if it has none
         ("sequence", "<i8"),  # its sender's own number for it; -1 if it has none
         ("delay", "<f8"),  # seconds that the link holds it back, its queue included
-        ("key", "<u4"),  # code of the key
+        ("key", "<u4"),  # code of the key; 0 if it is not kept, `Crossing.TOO_MANY_KEYS`
         ("source", "<u4"),  # code of the sender; 0 if it is not known
         ("size", "<u4"),  # bytes of payload and attachment
         ("link", "<u2"),  # code of the link

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping
 from itertools import repeat
 from typing import Any, final
 
-from evedrop.model.slot.link import NEVER, Change, Fates, Link, LinkSchedule, streams_of
+from evedrop.model.slot.link import NEVER, Change, Fates, Link, LinkSchedule
 from evedrop.scenario.wire_table import wire_stream_key
 from evedrop.streams import Batch, root_of_seed
 from evedrop.wire.advanced import numbered_as
@@ -21,10 +21,12 @@ from evedrop.wire.plan import WireLink
 
 MessageFate = tuple[int, float, bool]
 """`Crossing` code, delay in seconds, and whether a second copy arrives with the first."""
-_FIRST_BLOCK, _LARGEST_BLOCK = 32, 2048  # fates made at once: a key with few messages needs little memory
+_FIRST_BLOCK, _LARGEST_BLOCK = 8, 2048  # fates made at once: a key with few messages needs little time and memory
+_LITTLE = 64  # messages after which a key is not new any more
 _PASSED_AT_ONCE = 65_536
 _LATEST = 2**32 - 1  # seconds: more than the longest delay, so that no message is too late
 _BY_TIME = frozenset({"rate", "queue"})
+_MESSAGES = Batch(NEVER, 1)
 _PROMPT = tuple((code, 0.0, False) for code in range(256))  # shared by all messages without delay and copy
 
 
@@ -35,21 +37,27 @@ class KeyFates:
     kind: `put` (deletes are puts), `query` or `reply`; start: the number of the first message to decide; changes: earlier
     changes of the settings, each at the number of the first message that had them.
 
+    schedule: `schedule_of` the link and the changes, which keys may share.
+
     Only one thread may call its methods at a time: `LinkState` holds its lock.
     """
 
+    __slots__ = ("_block", "_link", "_name", "_of", "_ready", "_schedule", "_stop")
+
     def __init__(
-        self, link: WireLink, key: str, kind: str, seed: int, start: int = 0, changes: Iterable[Change] = ()
+        self,
+        link: WireLink,
+        key: str,
+        kind: str,
+        seed: int,
+        start: int = 0,
+        changes: Iterable[Change] = (),
+        schedule: LinkSchedule | None = None,
     ) -> None:
-        # Of several changes at one message the last one counts, as with `change`.
-        last = {change.at: change for change in sorted(changes, key=lambda one: one.at)}
-        made = tuple(Change(at, None if one.settings is None else _timeless(one.settings)) for at, one in last.items())
-        schedule = LinkSchedule(_timeless(link.settings), _LATEST, made, correlation=link.correlation)
-        root = root_of_seed(seed)
-        stream = numbered_as(key)
-        keys = {name: wire_stream_key(root, name, kind, stream) for name in streams_of(link.name, schedule)}
-        self._link = Link(schedule, link.name, keys, Batch(NEVER, 1))
-        self._start = self._stop = start  # `_stop`: the end of the fates in `_ready`
+        self._schedule, self._name = schedule or schedule_of(link, changes), link.name
+        self._of = (root_of_seed(seed), kind, numbered_as(key))
+        self._link: Link | None = None
+        self._stop = start  # the end of the fates in `_ready`
         self._block = 0
         self._ready: list[MessageFate] = []  # the next fates, the last one first
 
@@ -58,7 +66,7 @@ class KeyFates:
         try:
             return self._ready.pop()
         except IndexError:
-            self._ready = self._planned()
+            self._ready = self._first() if self._stop < _LITTLE and not self._block else self._planned()
             return self._ready.pop()
 
     @property
@@ -68,22 +76,57 @@ class KeyFates:
 
     def change(self, settings: Mapping[str, Any]) -> int:
         """Give the link other settings, as in `WireLink.settings`. Returns the number of the first message that has them."""
-        if not self._ready:
-            self._ready = self._planned()
         at = self.n
+        if self._link is None or not self._ready:
+            self._stop = at
+            self._planned()
+        assert self._link is not None  # noqa: S101 - it has planned
         self._ready = _rows(self._link.amended(at, [Change(at, _timeless(settings))]))
         return at
 
+    def _first(self) -> list[MessageFate]:
+        """The fates of the first block, without a link that is kept: most keys of many have few messages."""
+        self._block = _FIRST_BLOCK
+        slots = range(self._stop, self._stop + self._block)
+        self._stop = slots.stop
+        return _rows(self._begun(slots.start).fates(slots))
+
     def _planned(self) -> list[MessageFate]:
         """The fates of the next block, the last one first."""
-        if self._block == 0:
-            # The memory of a loss model is that of all messages before.
-            for first in range(0, self._start, _PASSED_AT_ONCE):
-                self._link.fates(range(first, min(first + _PASSED_AT_ONCE, self._start)))
-        self._block = min(2 * self._block or _FIRST_BLOCK, _LARGEST_BLOCK)
+        if self._link is None:
+            self._link = self._begun(self._stop)
+        self._block = min(8 * self._block or _FIRST_BLOCK, _LARGEST_BLOCK)
         slots = range(self._stop, self._stop + self._block)
         self._stop = slots.stop
         return _rows(self._link.planned(slots))
+
+    def _begun(self, start: int) -> Link:
+        """The link, which decides on message `start` next: the memory of a loss model is that of all messages before."""
+        link = Link(self._schedule, self._name, _StreamKeys(*self._of), _MESSAGES)
+        for first in range(0, start, _PASSED_AT_ONCE):
+            link.fates(range(first, min(first + _PASSED_AT_ONCE, start)))
+        return link
+
+
+def schedule_of(link: WireLink, changes: Iterable[Change]) -> LinkSchedule:
+    """What is known in advance of a key's messages on a link. changes: as for `KeyFates`."""
+    # Of several changes at one message the last one counts, as with `KeyFates.change`.
+    last = {change.at: change for change in sorted(changes, key=lambda one: one.at)}
+    made = tuple(Change(at, None if one.settings is None else _timeless(one.settings)) for at, one in last.items())
+    return LinkSchedule(_timeless(link.settings), _LATEST, made, correlation=link.correlation)
+
+
+@final
+class _StreamKeys(dict[str, bytes]):
+    """The keys of the random streams of a key's messages, each made when it is asked for: a new key needs few of them."""
+
+    def __init__(self, root: bytes, kind: str, key: str) -> None:
+        super().__init__()
+        self._of = (root, kind, key)
+
+    def __missing__(self, stream: str) -> bytes:
+        root, kind, key = self._of
+        return wire_stream_key(root, stream, kind, key)
 
 
 def _timeless(settings: Mapping[str, Any]) -> Mapping[str, Any]:

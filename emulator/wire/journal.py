@@ -43,6 +43,7 @@ from evedrop.wire.journal_place import JournalPlace
 from evedrop.wire.journal_reader import JOURNAL_FOLDER, parquet_path
 from evedrop.wire.journal_recovery import recover
 from evedrop.wire.journal_words import JournalWords
+from evedrop.wire.key_limit import KeyLimit
 from evedrop.wire.plan import WirePlan
 
 PART_ROWS = 2**17
@@ -84,11 +85,10 @@ class WireJournal:
         """The number of records that are not on the disk, because it had no room for them; listeners still got them."""
         self.links = [link.name for link in plan.links]
         """The names of the links, in the order of their codes."""
-        self._tell = tell
+        self._tell, self._rows = tell, part_rows
         self.folder = folder
         """The wire's folder."""
         self._folder = folder / JOURNAL_FOLDER
-        self._rows = part_rows
         self._state = threading.RLock()  # guards the parts
         self._handing = threading.RLock()  # so that listeners get blocks in order
         self._parts: dict[int, JournalPart] = {}
@@ -96,9 +96,8 @@ class WireJournal:
         self._next = 0  # the part whose rows are handed over now
         self._amended: deque[tuple[Records, Crossing]] = deque()
         self._number = itertools.count()
-        self._stopped = math.inf
+        self._stopped, self._convert_after = math.inf, 0.0
         self._amended_late: deque[tuple[int, Crossing]] = deque()
-        self._convert_after = 0.0
         try:
             self._place = JournalPlace(self._folder, tell)
             try:
@@ -125,7 +124,8 @@ class WireJournal:
         """(link, key, kind of stream) → the number of its next message, as of the records handed to the listeners."""
         self._history.begin(plan, time.time())
         self._began = time.monotonic()  # the recovery of an earlier start does not count
-        self._words = JournalWords(self._place.unfinished, self.start, self._place.miss)
+        admits = KeyLimit(plan.links, self.counts, self._tell).admits
+        self._words = JournalWords(self._place.unfinished, self.start, self._place.miss, admits)
         self._place.begin()
         self._add_part(0)
 
@@ -154,9 +154,9 @@ class WireJournal:
         """Whether this start still runs."""
         return "ended" if self._ended.is_set() else "running"
 
-    def key_code(self, key: str) -> int:
-        """The code of a key in records."""
-        return self._words.key_code(key)
+    def key_code(self, key: str, side: str = "") -> int:
+        """The code of a key of a side's programs in records; 0 if it is new, and there are too many (`KeyLimit`)."""
+        return self._words.key_code(key, side)
 
     def source_code(self, source: str) -> int:
         """The code of a sender in records; 0 for "", a sender that is not known."""

@@ -62,8 +62,8 @@ class JournalOnDisk:
         self.state: JournalState = "ended"
         if not self._history.ended:
             self.state = "running" if is_in_use(folder / JOURNAL_FOLDER) else "killed"
-        self._keys: list[str] = []
-        self._codes: dict[str, int] = {}
+        self._keys = [""]  # the code 0 is that of a key that was not kept
+        self._codes = {"": 0}
 
     @property
     def start(self) -> int:

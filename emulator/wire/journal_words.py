@@ -22,17 +22,30 @@ from evedrop.wire.journal_part import Words
 class JournalWords:
     """The keys and senders of one start of a wire. Threads may call its methods at the same time."""
 
-    def __init__(self, unfinished: Path, start: int, miss: Callable[[OSError], None]) -> None:
-        """unfinished: the folder of the file; miss: called when the disk has no room for a word. Raises OSError."""
+    def __init__(
+        self,
+        unfinished: Path,
+        start: int,
+        miss: Callable[[OSError], None],
+        admits: Callable[[str, str], bool] = lambda _key, _side: True,
+    ) -> None:
+        """unfinished: the folder of the file; miss: called when the disk has no room for a word.
+
+        admits: whether there is room for a new key of a side, as `KeyLimit`. Raises OSError.
+        """
         self._file = os.open(_path(unfinished, start), os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600)
-        self._miss = miss
+        self._size = os.fstat(self._file).st_size
+        self._miss, self._admits = miss, admits
         self._naming = threading.Lock()
         self._codes: dict[str, dict[str, int]] = {"key": {"": 0}, "source": {"": 0}}
         self._texts: dict[str, list[str]] = {"key": [""], "source": [""]}
 
-    def key_code(self, key: str) -> int:
-        """The code of a key."""
-        return self._codes["key"].get(key) or self._new_code("key", key)
+    def key_code(self, key: str, side: str = "") -> int:
+        """The code of a key that a program of a side uses; 0 for a new key for which there is no room."""
+        code = self._codes["key"].get(key)
+        if code:
+            return code
+        return self._new_code("key", key) if self._admits(key, side) else 0
 
     def source_code(self, source: str) -> int:
         """The code of a sender; 0 for "", a sender that is not known."""
@@ -65,10 +78,11 @@ class JournalWords:
             return codes[text]
 
     def _write(self, line: bytes) -> None:
-        before = os.fstat(self._file).st_size
         try:
-            if os.write(self._file, line) != len(line):
-                os.ftruncate(self._file, before)
+            if os.write(self._file, line) == len(line):
+                self._size += len(line)
+            else:
+                os.ftruncate(self._file, self._size)
                 raise OSError(28, os.strerror(28))  # ENOSPC: only a full disk accepts part of a line
         except OSError as error:
             self._miss(error)

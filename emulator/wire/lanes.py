@@ -13,9 +13,10 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any, final
 
+from evedrop.model.slot.link import Change, LinkSchedule
 from evedrop.wire.advanced import numbered_as
 from evedrop.wire.crossing import Crossing
-from evedrop.wire.fates import KeyFates
+from evedrop.wire.fates import KeyFates, schedule_of
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.plan import WireLink, WirePlan
 
@@ -42,8 +43,9 @@ class LinkState:
         self._journal = journal
         self._fates: dict[tuple[str, str], KeyFates] = {}
         self._lanes: Counter[tuple[str, str]] = Counter()
-        """How many keys have each of the fates: several for those of an advanced publisher's history."""
+        """How many keys have each of the numbers: several for those of an advanced publisher's history."""
         self._numbers: dict[tuple[str, str], int] = {}
+        self._schedule: tuple[tuple[Change, ...], LinkSchedule] | None = None  # the latest, which new keys share
         self._lock = threading.Lock()
         self._free = 0.0  # when the queue will have sent all its messages
         self._set(link.settings)
@@ -53,7 +55,9 @@ class LinkState:
         with self._lock:
             if settings == self._settings:
                 return
-            since = {(key, kind): n for (kind, key), n in self._numbers.items()}
+            counts = dict(self._journal.counts)  # a copy: the journal's thread goes on counting
+            since = {(key, kind): n for (link, key, kind), n in counts.items() if link == self.link.name}
+            since |= {(key, kind): n for (kind, key), n in self._numbers.items()}
             since |= {(key, kind): fates.change(settings) for (kind, key), fates in self._fates.items()}
             self._set(settings)
             self._journal.change(self.link.name, settings, since)
@@ -64,15 +68,16 @@ class LinkState:
         return self._never(*stream) if lossless else self._decide(*stream)
 
     def forget(self, kind: str, key: str) -> None:
-        """Keep only the number of the next message of a key and kind, until there is one."""
+        """Keep only the number of the next message of a key and kind, until there is one: the journal's, if it has it."""
         stream = (kind, numbered_as(key))
         with self._lock:
             self._lanes[stream] -= 1
             if self._lanes[stream] <= 0:
                 del self._lanes[stream]
                 fates = self._fates.pop(stream, None)
-                if fates is not None:
-                    self._numbers[stream] = fates.n
+                n = self._numbers.pop(stream, None) if fates is None else fates.n
+                if n is not None and n != self._counted(*stream):
+                    self._numbers[stream] = n
 
     def _decide(self, kind: str, key: str) -> Lane:
         lock, largest = self._lock, self._largest
@@ -105,6 +110,7 @@ class LinkState:
         lock, largest, numbers, stream = self._lock, self._largest, self._numbers, (kind, key)
         with lock:
             numbers.setdefault(stream, self._counted(kind, key))
+            self._lanes[stream] += 1
 
         def decide(_now: float, size: int) -> Decision:
             with lock:
@@ -122,11 +128,15 @@ class LinkState:
         if fates is None:
             start = self._numbers.pop((kind, key), self._counted(kind, key))
             changes = self._journal.changes_of(self.link.name, key, kind)
-            fates = self._fates[kind, key] = KeyFates(self.link, key, kind, self._seed, start, changes)
+            if self._schedule is None or self._schedule[0] != changes:
+                self._schedule = (changes, schedule_of(self.link, changes))
+            fates = self._fates[kind, key] = KeyFates(
+                self.link, key, kind, self._seed, start, schedule=self._schedule[1]
+            )
         return fates
 
     def _counted(self, kind: str, key: str) -> int:
-        """How many messages of a key and kind earlier starts of the wire numbered."""
+        """How many messages of a key and kind were numbered, as of the records that the journal has handed over."""
         return self._journal.counts.get((self.link.name, key, kind), 0)
 
     def _set(self, settings: Mapping[str, Any]) -> None:

@@ -25,6 +25,7 @@ WORDS = {
     Crossing.LOOPED: "looped",
     Crossing.UNDERWAY: "underway",
     Crossing.REFUSED: "refused by Zenoh",
+    Crossing.TOO_MANY_KEYS: "too many keys",
 }
 """What became of messages that were not delivered, in a word or two."""
 

@@ -7,6 +7,7 @@ Source: docs/wire.md, how messages cross.
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -17,7 +18,7 @@ import zenoh
 from evedrop.threads import wait_for_thread
 from evedrop.wire.crossing import AGAIN, UNLINKED, Crossing, Kind
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.lanes import LinkState
+from evedrop.wire.lanes import Lane, LinkState
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.ros2 import SourceReader
 from evedrop.wire.scheduler import Scheduler
@@ -27,63 +28,86 @@ from evedrop.wire.watchdog import Duty
 WAITING = 8192
 """Messages of a side that may wait for the wire; then the side's programs wait, or Zenoh drops, as each message says."""
 MOST_KEYS = 8192
-"""Keys that a subscription keeps everything ready for; a key takes some 10 kB."""
+"""Keys that a subscription keeps everything ready for; a key takes some 5 kB."""
+MOST_PUBLISHERS = 1024
+"""Publishers that are declared at a side."""
+OFTEN = 100
+"""Messages of a key over a link until a publisher is declared for it: this costs as much as it saves for as many messages."""
 _REMOTE = zenoh.Locality.REMOTE
 
 
 @final
 class Publishers:
-    """The publishers that a wire has declared at a side, one for each key and quality of service."""
+    """The publishers that a wire has declared at a side, of which there are at most `MOST_PUBLISHERS`."""
 
     def __init__(self, session: zenoh.Session) -> None:
-        self._session = session
-        self._declared: dict[tuple[str, str, str, bool], zenoh.Publisher] = {}
+        self.session = session
+        self._count = 0
         self._lock = threading.Lock()
 
-    def of(self, key: str, sample: zenoh.Sample) -> zenoh.Publisher:
-        """The publisher of messages with the same key, priority, congestion control and express as a sample."""
-        name = (key, str(sample.priority), str(sample.congestion_control), sample.express)
+    def declare(self, sample: zenoh.Sample) -> zenoh.Publisher | None:
+        """A publisher with the key, priority, congestion control and express of a sample; None if there are too many."""
         with self._lock:
-            if name not in self._declared:
-                if len(self._declared) >= MOST_KEYS:
-                    self._declared.pop(next(iter(self._declared)))
-                self._declared[name] = self._session.declare_publisher(
-                    sample.key_expr,
-                    priority=sample.priority,
-                    congestion_control=sample.congestion_control,
-                    express=sample.express,
-                    allowed_destination=_REMOTE,
-                )
-            return self._declared[name]
+            if self._count >= MOST_PUBLISHERS:
+                return None
+            self._count += 1
+        return self.session.declare_publisher(
+            sample.key_expr,
+            priority=sample.priority,
+            congestion_control=sample.congestion_control,
+            express=sample.express,
+            allowed_destination=_REMOTE,
+        )
+
+    def release(self, publisher: zenoh.Publisher) -> None:
+        """Undeclare a publisher."""
+        publisher.undeclare()
+        with self._lock:
+            self._count -= 1
 
 
 @final
 class _Way:
-    """The way of a key's messages over one link."""
+    """The way of a key's messages over one link. Only the thread that takes the key's messages uses it."""
 
-    def __init__(self, state: LinkState, key: str, publishers: Publishers, lossless: bool) -> None:
-        self.decide = state.lane("put", key, lossless)
+    __slots__ = ("_count", "_key", "_last", "_publishers", "_state", "decide", "link", "session", "used")
+
+    def __init__(self, state: LinkState, key: str, publishers: Publishers, decide: Lane) -> None:
+        self.decide = decide
         self.link = state.link.number
+        self.session = publishers.session
+        self.used = False
+        """Whether a further message came since this was last set to False."""
         self._key, self._publishers, self._state = key, publishers, state
+        self._count = 0
         self._last: tuple[zenoh.Publisher, Any, Any, bool] | None = None
 
     def forget(self) -> None:
         """Release the resources of the key; its next message gets the next fate all the same."""
         self._state.forget("put", self._key)
+        self._release()
 
-    def publisher(self, sample: zenoh.Sample) -> zenoh.Publisher:
-        """The publisher for a message; nearly always that of the message before."""
+    def publisher(self, sample: zenoh.Sample) -> zenoh.Publisher | None:
+        """The publisher for a message; None for the first messages of a key, and where there are too many publishers."""
         last = self._last
-        if (
-            last is not None
-            and last[1] == sample.priority
-            and last[2] == sample.congestion_control
-            and last[3] == sample.express
-        ):
+        if last is None:
+            self._count += 1
+            if self._count <= OFTEN:
+                return None
+            self._count = 0  # if there are too many, ask again after as many messages
+            publisher = self._publishers.declare(sample)
+            if publisher is not None:
+                self._last = (publisher, sample.priority, sample.congestion_control, sample.express)
+            return publisher
+        if last[1] == sample.priority and last[2] == sample.congestion_control and last[3] == sample.express:
             return last[0]
-        found = self._publishers.of(self._key, sample)
-        self._last = (found, sample.priority, sample.congestion_control, sample.express)
-        return found
+        self._release()
+        return None
+
+    def _release(self) -> None:
+        if self._last is not None:
+            self._publishers.release(self._last[0])
+            self._last = None
 
 
 _Ways = tuple[tuple[_Way, ...], int]
@@ -109,6 +133,7 @@ class PublicationRelay:
         self._journal, self._scheduler = journal, scheduler
         self._side, self._name, self._tell = side, side.name, tell
         self.duties: list[Duty] = []
+        self._until = math.inf
         expressions = [zenoh.KeyExpr(one) for one in expressions_of(side.side, plan.links)]
         self._subscribers = []
         self._threads = []
@@ -128,8 +153,12 @@ class PublicationRelay:
         for thread in self._threads:
             thread.start()
 
+    def leave(self, until: float) -> None:
+        """Let messages that wait after a time, in seconds since 1970, be underway: to take them all may last too long."""
+        self._until = until
+
     def close(self) -> None:
-        """End; messages that Zenoh has already handed over still cross."""
+        """End; messages that Zenoh has already handed over still cross, or are underway as `leave` says."""
         with self._side.duty.busy():
             for subscriber in self._subscribers:
                 subscriber.undeclare()
@@ -158,12 +187,8 @@ class PublicationRelay:
         record, hold, amend = self._journal.record, self._scheduler.hold, self._journal.amend
         read = SourceReader(self._journal.source_code)
         put, put_kind, delete_kind = zenoh.SampleKind.PUT, int(Kind.PUT), int(Kind.DELETE)
-        unlinked, held_up, refused, zenoh_error = (
-            int(Crossing.UNLINKED),
-            Crossing.HELD_UP,
-            Crossing.REFUSED,
-            zenoh.ZError,
-        )
+        unlinked, underway, zenoh_error = int(Crossing.UNLINKED), int(Crossing.UNDERWAY), zenoh.ZError
+        held_up, refused = Crossing.HELD_UP, Crossing.REFUSED
 
         def take(sample: zenoh.Sample) -> None:
             heard = now()
@@ -183,19 +208,25 @@ class PublicationRelay:
             if not ways:
                 record(heard, -1, sequence, 0.0, code, sender, size, UNLINKED, kind, unlinked)
             for way in ways:
+                way.used = found is not None
                 n, fate, delay, again = way.decide(heard, size)
+                if heard > self._until and not fate:
+                    fate, delay, again = underway, 0.0, False
                 row = record(
                     heard, n, sequence, delay, code, sender, size, way.link, kind | AGAIN if again else kind, fate
                 )
                 if fate:
                     continue
                 try:
-                    publisher = way.publisher(sample)
                     if delay:
                         copies = 2 if again else 1
-                        if not hold(delay, size, row, _Later(publisher, sample, is_put, copies)):
+                        if not hold(delay, size, row, _Later(way.session, sample, copies)):
                             amend(row, held_up)
-                    elif is_put:
+                        continue
+                    publisher = way.publisher(sample) if is_put else None
+                    if publisher is None:
+                        _publish(way.session, sample)
+                    else:
                         publisher.put(
                             payload,
                             encoding=sample.encoding,
@@ -203,12 +234,8 @@ class PublicationRelay:
                             timestamp=sample.timestamp,
                             source_info=source,
                         )
-                        if again:
-                            _send(publisher, sample, is_put)
-                    else:
-                        _send(publisher, sample, is_put)
-                        if again:
-                            _send(publisher, sample, is_put)
+                    if again:
+                        _publish(way.session, sample)
                 except zenoh_error:
                     amend(row, refused)
 
@@ -218,43 +245,77 @@ class PublicationRelay:
         """The ways of a key that is heard for the first time, or again after many other keys, and its code."""
         while len(ways_of) >= MOST_KEYS:
             oldest = next(iter(ways_of))
-            for way in ways_of.pop(oldest)[0]:
-                way.forget()
-        code = self._journal.key_code(key)
-        lossless = self._plan.is_lossless(expression)
+            found = ways_of.pop(oldest)
+            if any(way.used for way in found[0]):
+                for way in found[0]:
+                    way.used = False
+                ways_of[oldest] = found  # now the newest
+            else:
+                for way in found[0]:
+                    way.forget()
+        code = self._journal.key_code(key, self._name)
         taken = (self._plan.link_of(self._name, target, expression) for target in self._publishers)
+        states = [self._links[link.name] for link in taken if link is not None]
+        ended = time.time() > self._until
+        if code and not ended:
+            lossless = self._plan.is_lossless(expression)
+            decisions = [state.lane("put", key, lossless) for state in states]
+        else:
+            decisions = [_UNDERWAY if code else _TOO_MANY_KEYS] * len(states)
         ways = tuple(
-            _Way(self._links[link.name], key, self._publishers[link.target], lossless)
-            for link in taken
-            if link is not None
+            _Way(state, key, self._publishers[state.link.target], decide)
+            for state, decide in zip(states, decisions, strict=True)
         )
-        ways_of[key] = (ways, code)
+        if code and not ended:
+            ways_of[key] = (ways, code)
         return ways, code
+
+
+def _undecided(fate: Crossing) -> Lane:
+    """The lane of messages with a fate that is not the link's, which get no numbers."""
+    return lambda _now, _size: (-1, int(fate), 0.0, False)
+
+
+_UNDERWAY, _TOO_MANY_KEYS = _undecided(Crossing.UNDERWAY), _undecided(Crossing.TOO_MANY_KEYS)
 
 
 @final
 class _Later:
     """A message that is sent when its delay is over."""
 
-    __slots__ = ("_copies", "_is_put", "_publisher", "_sample")
+    __slots__ = ("_copies", "_sample", "_session")
 
-    def __init__(self, publisher: zenoh.Publisher, sample: zenoh.Sample, is_put: bool, copies: int) -> None:
-        self._publisher, self._sample, self._is_put, self._copies = publisher, sample, is_put, copies
+    def __init__(self, session: zenoh.Session, sample: zenoh.Sample, copies: int) -> None:
+        self._session, self._sample, self._copies = session, sample, copies
 
     def __call__(self) -> None:
         for _ in range(self._copies):
-            _send(self._publisher, self._sample, self._is_put)
+            _publish(self._session, self._sample)
 
 
-def _send(publisher: zenoh.Publisher, sample: zenoh.Sample, is_put: bool) -> None:
-    """Publish a message whole. Raises zenoh.ZError."""
-    if is_put:
-        publisher.put(
+def _publish(session: zenoh.Session, sample: zenoh.Sample) -> None:
+    """Publish a message whole, without a publisher. Raises zenoh.ZError."""
+    if sample.kind == zenoh.SampleKind.PUT:
+        session.put(
+            sample.key_expr,
             sample.payload,
             encoding=sample.encoding,
+            congestion_control=sample.congestion_control,
+            priority=sample.priority,
+            express=sample.express,
             attachment=sample.attachment,
             timestamp=sample.timestamp,
+            allowed_destination=_REMOTE,
             source_info=sample.source_info,
         )
     else:
-        publisher.delete(attachment=sample.attachment, timestamp=sample.timestamp, source_info=sample.source_info)
+        session.delete(
+            sample.key_expr,
+            congestion_control=sample.congestion_control,
+            priority=sample.priority,
+            express=sample.express,
+            attachment=sample.attachment,
+            timestamp=sample.timestamp,
+            allowed_destination=_REMOTE,
+            source_info=sample.source_info,
+        )

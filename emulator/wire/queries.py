@@ -251,12 +251,14 @@ class QueryRelay:
         now, size = time.time(), message.size
         with self._lock:
             sender, sequence = self._read(message.attachment, message.source)
-        code = self._journal.key_code(key)
+        code = self._journal.key_code(key, way[0])
         state = self._link(*way, expression)
         if state is None:
             self._journal.record(now, -1, sequence, 0.0, code, sender, size, UNLINKED, kind, Crossing.UNLINKED)
             return
-        n, fate, delay, again = self._decided(state, kind.stream, key, expression, now, size)
+        n, fate, delay, again = -1, int(Crossing.TOO_MANY_KEYS), 0.0, False
+        if code:
+            n, fate, delay, again = self._decided(state, kind.stream, key, expression, now, size)
         mark = int(kind) | AGAIN if again else int(kind)
         row = self._journal.record(now, n, sequence, delay, code, sender, size, state.link.number, mark, fate)
         if fate:

@@ -34,6 +34,7 @@ from evedrop.wire.timeline import Moment
 from evedrop.wire.watchdog import Duty
 
 _LOOK_SECONDS = 0.2
+_LAST_SECONDS = 1.0  # for the messages that still wait when the wire ends; a longer backlog is not worth the wait
 
 
 @final
@@ -102,6 +103,7 @@ class WireRelay:
         ]
         for relay in relays:
             stack.callback(relay.close)
+        stack.callback(self._leave, relays)
         of_sides = [side.duty for side in self.sides.values()]
         of_relays = [duty for relay in relays for duty in relay.duties]
         self.duties = [*of_sides, *of_relays, scheduler.duty, self._queries.duty, self._duty]
@@ -125,6 +127,12 @@ class WireRelay:
         """Tell a way past the wire, and note it in the journal."""
         self._journal.note(line, bypass=True)
         self._tell(line)
+
+    def _leave(self, relays: Sequence[PublicationRelay]) -> None:
+        """Limit the time in which messages that wait still cross."""
+        until = time.time() + _LAST_SECONDS
+        for relay in relays:
+            relay.leave(until)
 
     def _end_delays(self, scheduler: Scheduler) -> None:
         """Count the messages that were still delayed."""

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Protocol, final
+from typing import Any, Protocol, final
 
 import numpy as np
 import zenoh
@@ -42,6 +42,7 @@ from evedrop.wire.law import bounds, expected
 from evedrop.wire.plan import WireLink, WirePlan
 from evedrop.wire.tallies import LinkTally, StreamTally
 
+_FEW = 8  # messages of a key in a block; more are added as arrays
 _QUANTILES = (0.5, 0.9, 0.99)
 BYPASSED = "programs could speak past the wire"
 """Why an expectation of a wire with bypasses did not hold."""
@@ -109,11 +110,19 @@ class WireScorekeeper:
             streams, records = streams[:, order], records[order]
             for part in _split(records, streams[:1]):
                 self._tally(int(part["link"][0])).add(part)
-            for (code, key, kind), part in zip(_firsts(streams), _split(records, streams), strict=True):
-                if code != UNLINKED:
-                    streams_of = self._links[code].streams
-                    stream = streams_of.get((key, kind)) or streams_of.setdefault((key, kind), StreamTally())
-                    stream.add(part, not self._is_lossless(key))
+            times, numbers, fates = (records[name].tolist() for name in ("time", "n", "fate"))
+            starts = [0, *_changes(streams).tolist(), len(records)]
+            for (code, key, kind), start, stop in zip(_firsts(streams), starts, starts[1:], strict=False):
+                if code == UNLINKED or not key:
+                    continue  # a key that is not kept has no numbers
+                streams_of = self._links[code].streams
+                stream = streams_of.get((key, kind)) or streams_of.setdefault((key, kind), StreamTally())
+                decided = not self._is_lossless(key)
+                if stop - start > _FEW:
+                    stream.add(records[start:stop], decided)
+                else:
+                    for at in range(start, stop):
+                        stream.add_one(times[at], numbers[at], fates[at], decided)
 
     def amend(self, records: Records, fate: Crossing) -> None:
         """Count records of the journal that were added with another fate."""
@@ -208,7 +217,8 @@ class WireScorekeeper:
         tried, passed = (sum(getattr(one, name) for one in streams) for name in ("tried", "passed"))
         rate = model = between = within = None
         if tried:
-            laws = [self._law(link, *stream, one) for stream, one in tally.streams.items() if one.tried]
+            known: dict[Any, tuple[float, float]] = {}
+            laws = [self._law(link, *stream, one, known) for stream, one in tally.streams.items() if one.tried]
             mean, variance = (sum_in_order(law[i] for law in laws) for i in (0, 1))
             low, high = bounds(mean, variance, tried)
             rate, model, between, within = (
@@ -238,25 +248,31 @@ class WireScorekeeper:
             gap_seconds=max((one.silence for one in streams), default=0.0),
         )
 
-    def _law(self, link: WireLink, key: int, kind: int, tally: StreamTally) -> tuple[float, float]:
+    def _law(
+        self, link: WireLink, key: int, kind: int, tally: StreamTally, known: dict[Any, tuple[float, float]]
+    ) -> tuple[float, float]:
         """How many of a stream's messages its models should have let through, and the variance of this number.
 
-        Raises UsageError if a message has two fates, which only a journal on disk that was changed can say.
+        known: the laws of the link so far, which streams with the same numbers and settings share: a key that never came again
+        is like all others. Raises UsageError if a message has two fates, which only a journal on disk that was changed can say.
         """
         changes = self._journal.changes_of(link.name, self._journal.key_of(key), Kind(kind).stream)
-        ranges = [range(*numbers) for numbers in sorted(tally.ranges)]
-        for before, after in pairwise(ranges):
-            if after.start < before.stop:
-                raise UsageError(
-                    f"the journal has two fates for message {after.start} of {self._journal.key_of(key)!r} on the link "
-                    f"{link.name!r}; a file of it was changed, so give the results folder as the wire wrote it"
-                )
-        mean, variance = expected(link.settings, changes, ranges)
-        if not tally.scattered:
-            return mean, variance
-        # A sample of a known range: the range varies as a whole, and the sample within it.
-        share = tally.tried / sum(len(numbers) for numbers in ranges)
-        return mean * share, variance * share**2 + mean * share * (1.0 - mean * share / tally.tried)
+        numbers = tuple(sorted(tally.ranges))
+        name = (tuple((one.at, id(one.settings)) for one in changes), numbers, tally.tried)
+        if name not in known:
+            ranges = [range(*one) for one in numbers]
+            for before, after in pairwise(ranges):
+                if after.start < before.stop:
+                    raise UsageError(
+                        f"the journal has two fates for message {after.start} of {self._journal.key_of(key)!r} on the link "
+                        f"{link.name!r}; a file of it was changed, so give the results folder as the wire wrote it"
+                    )
+            mean, variance = expected(link.settings, changes, ranges)
+            if tally.scattered:  # a sample of a known range: the range varies as a whole, and the sample within it
+                share = tally.tried / sum(map(len, ranges))
+                mean, variance = mean * share, variance * share**2 + mean * share * (1.0 - mean * share / tally.tried)
+            known[name] = (mean, variance)
+        return known[name]
 
 
 def _changes(columns: NDArray[np.int64]) -> NDArray[np.intp]:

@@ -29,6 +29,8 @@ for _fate in (Crossing.DELIVERED, Crossing.HELD_UP, Crossing.UNDERWAY, Crossing.
 class StreamTally:
     """The messages of one key and kind on one link."""
 
+    __slots__ = ("_missing", "_since", "longest", "passed", "ranges", "scattered", "silence", "tried")
+
     def __init__(self) -> None:
         self.tried = 0
         """Messages on which the link's models decided."""
@@ -44,6 +46,20 @@ class StreamTally:
         """Whether they are too scattered to be kept: then `ranges` is one that contains all of them."""
         self._missing = 0
         self._since: float | None = None  # when the latest delivered message was heard, or else the first message
+
+    def add_one(self, time: float, n: int, fate: int, decided: bool) -> None:
+        """Add a message, as `add` does: for few messages, which are most of all where keys are many, arrays cost more."""
+        if decided and n >= 0 and _TRIED[fate]:
+            self.tried += 1
+            self.passed += int(_PASSED[fate])
+            self._add_ranges([(n, n + 1)])
+        since = time if self._since is None else self._since
+        delivered = fate == Crossing.DELIVERED
+        if self._missing or not delivered:
+            self.silence = max(self.silence, time - since)
+        self._missing = 0 if delivered else self._missing + 1
+        self.longest = max(self.longest, self._missing)
+        self._since = time if delivered else since
 
     def add(self, records: Records, decided: bool) -> None:
         """Add messages in the order in which they were heard. decided: whether the link's models decide on this key at all."""
@@ -74,7 +90,9 @@ class StreamTally:
             return
         breaks = np.flatnonzero(np.diff(numbers) != 1) + 1
         starts, stops = numbers[np.r_[0, breaks]].tolist(), (numbers[np.r_[breaks - 1, -1]] + 1).tolist()
-        found = list(zip(starts, stops, strict=True))
+        self._add_ranges(list(zip(starts, stops, strict=True)))
+
+    def _add_ranges(self, found: list[tuple[int, int]]) -> None:
         if self.ranges and self.ranges[-1][1] == found[0][0]:
             found[0] = (self.ranges.pop()[0], found[0][1])
         self.ranges += found

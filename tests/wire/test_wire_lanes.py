@@ -148,6 +148,25 @@ def test_the_keys_of_a_history_are_numbered_together(lossy: LinkState) -> None:
     assert [one[:2] for one in found] == [*enumerate(due)]
 
 
+@pytest.mark.parametrize("lossless", [False, True])
+def test_a_key_that_only_the_journal_remembers_goes_on(lossy: LinkState, tmp_path: Path, lossless: bool) -> None:
+    """Its numbers need no memory of the link's, also for the settings that it has from its next message on."""
+    decide = lossy.lane("put", "scan", lossless)
+    journal = lossy._journal
+    for n in range(50):
+        journal.record(1.0, decide(float(n), 1)[0], -1, 0.0, journal.key_code("scan"), 0, 1, 0, 0, 0)
+    journal.flush()
+    lossy.forget("put", "scan")
+    assert not lossy._numbers
+    lossy.change(DEAD)
+    decide = lossy.lane("put", "scan", lossless)
+    assert [decide(100.0 + n, 1)[:2] for n in range(50)] == [(50 + n, 0 if lossless else 1) for n in range(50)]
+    lossy.change(dict(lossy.link.settings))
+    fates = KeyFates(lossy.link, "scan", "put", 7)
+    due = [fates.next()[0] for _ in range(150)]
+    assert [decide(200.0 + n, 1)[1] for n in range(50)] == [0 if lossless else due[100 + n] for n in range(50)]
+
+
 def test_threads_share_the_messages_of_a_key(tmp_path: Path) -> None:
     """Each number, with its fate, is given once, also while the settings change."""
     delays: dict[str, Any] = {

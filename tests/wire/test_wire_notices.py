@@ -91,7 +91,7 @@ def test_the_main_reason_decides_on_a_lane() -> None:
     """Also for a full queue and for losses of the wire's own; the legend has the queue only for links with a rate."""
     expected = {
         Crossing.CORRUPTED: LaneState.SOME, Crossing.OVERFLOW: LaneState.FULL, Crossing.CUT: LaneState.CUT,
-        Crossing.REFUSED: LaneState.OWN, Crossing.HELD_UP: LaneState.OWN,
+        Crossing.REFUSED: LaneState.OWN, Crossing.HELD_UP: LaneState.OWN, Crossing.TOO_MANY_KEYS: LaneState.OWN,
     }  # fmt: skip
     for fate, state in expected.items():
         assert state_of(steps_of({Crossing.DELIVERED: 9, Crossing.LOST: 1, fate: 3}).counts[0, 0]) is state

@@ -46,8 +46,10 @@ def everything(sample: zenoh.Sample) -> dict[str, Any]:
     }
 
 
-def test_everything_that_a_message_carries_crosses(tmp_path: Path) -> None:
-    """A reader at the other side gets exactly what a reader at the same side gets."""
+@pytest.mark.parametrize("often", [0, 100])
+def test_everything_that_a_message_carries_crosses(tmp_path: Path, often: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A reader at the other side gets exactly what a reader at the same side gets, with publishers and without."""
+    monkeypatch.setattr("evedrop.wire.publications.OFTEN", often)
     with (
         at_work(both_ways(), tmp_path) as wire,
         wire.program("robot") as sender,

@@ -89,7 +89,7 @@ def at_work(plan: WirePlan, folder: Path) -> Iterator[WireAtWork]:
     """A wire that runs in this process."""
     told: list[str] = []
     rows: list[Records] = []
-    with WireJournal(folder, plan) as journal:
+    with WireJournal(folder, plan, tell=told.append) as journal:
         journal.listeners.append(lambda block: rows.append(block.copy()))
         with WireRelay(plan, journal, told.append) as relay:
             yield WireAtWork(relay, journal, told, rows)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import sys
 from pathlib import Path
 
@@ -45,6 +46,7 @@ def wire(options: argparse.Namespace) -> int:
     from evedrop.results.folder import results_folder
     from evedrop.wire.run import run_wire
 
+    gc.freeze()  # what is imported stays: otherwise the collector looks at all of it each time that there are more keys
     with results_folder(options.out, f"wire-{options.file.stem}") as folder:
         said = {"say": _hush, "complain": complain} if options.quiet else {"say": _say}
         with zenoh_log_apart():

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, NamedTuple, final
 
@@ -121,7 +121,7 @@ class _State:
 
     def copied(self) -> _State:
         """A copy that may change; a loss model never changes its memory in place."""
-        return replace(self, loss=copy.copy(self.loss))
+        return _State(self.settings, copy.copy(self.loss), self.cut, self.free)
 
 
 @final
