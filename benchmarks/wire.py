@@ -241,7 +241,7 @@ def losses(count: int) -> Iterator[Row]:
 
 
 def new_keys(count: int) -> Iterator[Row]:
-    """What the first message of a key costs a wire, in a process of its own, and how long the wire then takes to end."""
+    """The cost of a new key's first message to a wire in its own process, and how long the wire then takes to end."""
     with tempfile.TemporaryDirectory() as folder:
         file, out = Path(folder, "wire.toml"), Path(folder, "out")
         file.write_text(_TWO_SIDES, encoding="utf-8")

@@ -42,7 +42,7 @@ def lack_of(error: BaseException) -> str | None:
 
 @final
 class _ScipyFinder:
-    """Finds no module, but refuses to look for scipy where there is no room for it."""
+    """A finder that finds nothing: it only refuses scipy where the address space has no room for it."""
 
     @staticmethod
     def find_spec(name: str, _path: Sequence[str] | None = None, _target: ModuleType | None = None) -> None:

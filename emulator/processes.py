@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Protocol, TypeVar, final
 
@@ -17,6 +18,16 @@ SUSPENDED_SECONDS = 60.0
 """How long a process that others wait for may be suspended."""
 _LOOK_SECONDS = 1.0
 _PR_SET_PDEATHSIG = 1
+# The setting survives exec. A parent that died before it was made sends no signal any more.
+_SIGNALLED = """
+import ctypes, os, signal, sys
+{first}
+number, parent = int(sys.argv[1]), int(sys.argv[2])
+ctypes.CDLL(None).prctl(1, number, 0, 0, 0)
+if os.getppid() != parent:
+    os.kill(os.getpid(), number)
+os.execv(sys.argv[3], sys.argv[3:])
+"""
 
 
 class KillableProcess(Protocol):
@@ -83,3 +94,14 @@ def continue_when_parent_dies() -> None:
     """Let the system continue this process if it is suspended when its parent dies: it would not notice (Linux only)."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGCONT), 0, 0, 0)
+
+
+def signalled_when_parent_dies(command: Sequence[str], number: signal.Signals, first: str = "") -> list[str]:
+    """A command whose process gets a signal when this process dies, however it dies; the same command outside Linux.
+
+    command: begins with the path of a file; first: Python code that runs before it, with `ctypes` and `os` imported.
+    """
+    if sys.platform != "linux":
+        return [*command]
+    code = _SIGNALLED.format(first=first)
+    return [sys.executable, "-I", "-S", "-c", code, str(int(number)), str(os.getpid()), *command]

@@ -7,7 +7,7 @@ import threading
 from evedrop.errors import RunError
 
 THREAD_SECONDS = 600.0
-"""How long to wait for a thread that was told to end, and ends within seconds unless what it calls has hung."""
+"""How long to wait for a thread that was told to end. It ends within seconds, unless something that it calls hangs."""
 
 
 def wait_for_thread(thread: threading.Thread, seconds: float = THREAD_SECONDS) -> None:

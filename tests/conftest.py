@@ -34,7 +34,7 @@ from tests.privileged import say_what_was_skipped
 FORKABLE = frozenset({"env", "cwd", "start_new_session", "stdout", "umask"})
 """The options of Popen that a forked command can have, too; it has a session of its own in any case."""
 LIMIT = 300.0
-"""Seconds after which a condition that a test waits for counts as never met: far above what a machine needs whose load is 40."""
+"""Seconds after which a test gives up waiting for a condition: far more than a machine with a load of 40 needs."""
 
 register_profiles()
 

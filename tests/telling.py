@@ -84,6 +84,7 @@ def limited_program() -> NoReturn:
     """`program`, whose files are no larger than the environment says."""
     largest = int(os.environ.get("EVEDROP_TEST_LARGEST_FILE", "0"))
     if largest:
+        sys.dont_write_bytecode = True  # before 3.12.8, Python would leave half a .pyc for the next process
         resource.setrlimit(resource.RLIMIT_FSIZE, (largest, largest))
     program()
 

@@ -79,9 +79,8 @@ class Cluster:
 
         Raises RunError if a task fails, a worker has another version of evedrop, or the scheduler is gone or does not answer.
         """
-        while not self._has_workers(
-            stopped
-        ):  # a task that is submitted earlier could reach a worker of another version
+        # A task that is submitted earlier could reach a worker of another version.
+        while not self._has_workers(stopped):
             if stopped():
                 return
             time.sleep(_LOOK_SECONDS)
@@ -164,8 +163,8 @@ class Cluster:
         """Raise RunError if a worker has another version of evedrop, or none."""
         ours = importlib.metadata.version("evedrop")
         versions = self._answer(lambda: self._client.get_versions(packages=["evedrop"]), stopped)
-        for worker, found in ({} if versions is None else versions["workers"]).items():
-            version = found["packages"]["evedrop"]
+        for worker, installed in ({} if versions is None else versions["workers"]).items():
+            version = installed["packages"]["evedrop"]
             if version != ours:
                 has = "no evedrop" if version is None else f"evedrop {version}"
                 raise RunError(

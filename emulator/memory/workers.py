@@ -81,7 +81,7 @@ class _Worker:
     """A worker process, and the thread that talks with it."""
 
     def __init__(self, inbox: _Inbox) -> None:
-        """inbox: gets what the worker says: counts of trial-slots done, reasons for failures, results; and what ended it."""
+        """inbox: gets the worker's counts of trial-slots done, reasons for failures and results, and the error that ends it."""
         self._inbox = inbox
         self._tasks: SimpleQueue[Task[Any] | None] = SimpleQueue()
         self.pipe, theirs = Pipe()

@@ -64,7 +64,7 @@ class GroupCounts(_Groups):
 
     @property
     def shares(self) -> list[float]:
-        """How often each code occurs, as a share of all codes so far, of which there is at least one."""
+        """The share of each code among all codes so far; there must be at least one."""
         return [int(total) / self.taken for total in self._counts.sum(0)]
 
     @property

@@ -106,7 +106,7 @@ class ErrorsSection(Section[RunSource]):
             "slot",
             f"{said}; {bands}dotted: theory",
             curves,
-            x_range=(min(one.first for one in of.means.values()), max(one.last for one in of.means.values())),
+            x_range=(min(curve.first for curve in of.means.values()), max(curve.last for curve in of.means.values())),
             floor=error_floor(of.noise, of.summary.trials),
         )
         if (node := chart.node) is not None:
@@ -139,7 +139,7 @@ class LostTrackSection(Section[RunSource]):
                 f"slots {_where(one.lost.spans[0])}" if one.lost.count else "–",
             )
         yield html_table(table, "Shares of the slots, and spans in which the receiver lost track")
-        used = {code for one in of.trial.values() for code, share in enumerate(one.outcome.shares) if share}
+        used = {code for lanes in of.trial.values() for code, share in enumerate(lanes.outcome.shares) if share}
         yield element(
             "p",
             "Upper lanes: ",

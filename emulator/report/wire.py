@@ -12,7 +12,7 @@ from evedrop.report.text_table import TextTable
 from evedrop.results.wire_summary import WireSummary
 from evedrop.score.summary import failed
 
-_WITHOUT_MODEL = {"overflow", "cut", "unlinked", "too_large", "looped", "too_many_keys"}
+WITHOUT_MODEL = {"overflow", "cut", "unlinked", "too_large", "looped", "too_many_keys"}
 """The reasons for which messages are lost before a link's models decide on them."""
 _MARKS = {True: "yes", False: "NO", None: "–"}
 
@@ -72,7 +72,7 @@ def wire_sentences(summary: WireSummary) -> Iterator[str]:
     for name, link in summary.links.items():
         lost = _counted(link.lost_by)
         dropped = _counted(link.dropped_by)
-        undecided = [reason for reason in (*link.lost_by, *link.dropped_by) if reason in _WITHOUT_MODEL]
+        undecided = [reason for reason in (*link.lost_by, *link.dropped_by) if reason in WITHOUT_MODEL]
         if lost:
             yield f"{name} lost {lost}"
         if dropped:
@@ -81,7 +81,7 @@ def wire_sentences(summary: WireSummary) -> Iterator[str]:
             reasons = " and ".join(reason.replace("_", " ") for reason in undecided)
             yield f"{name}: rate, model and within leave out the messages by {reasons}, on which its models did not decide"
     yield from unlinked_sentence(summary)
-    yield from (one.sentence for one in summary.expectations if one.held)
+    yield from (judged.sentence for judged in summary.expectations if judged.held)
 
 
 def unlinked_sentence(summary: WireSummary) -> Iterator[str]:
@@ -93,14 +93,14 @@ def unlinked_sentence(summary: WireSummary) -> Iterator[str]:
 def wire_failures(summary: WireSummary) -> Iterator[str]:
     """What went wrong: faults, as below, and expectations that failed."""
     yield from wire_faults(summary)
-    yield from (one.sentence for one in failed(summary.expectations))
+    yield from (judged.sentence for judged in failed(summary.expectations))
 
 
 def wire_faults(summary: WireSummary) -> Iterator[str]:
     """A wire that has not ended, ways past it, links outside their bounds, unaccounted messages, and an incomplete journal."""
     if _unfinished(summary):
         yield f"{_unfinished(summary)}: these are the figures that its journal gives so far"
-    yield from (f"no verdict: {one.event}" for one in summary.bypasses)
+    yield from (f"no verdict: {bypass.event}" for bypass in summary.bypasses)
     for name, link in summary.links.items():
         if link.within_bounds is False and link.bounds is not None:
             low, high = link.bounds

@@ -67,8 +67,7 @@ class Results:
         schema = None if path.exists() else schema_of(self.folder, name)
         try:
             if schema is None:
-                with opened(path):  # reading a pipe would block
-                    pass
+                _refuse_pipe(path)
                 # By its path: threads of Arrow that read a Python file may abort the interpreter at its end (Python 3.11).
                 table = pq.read_table(path)
             else:
@@ -95,8 +94,7 @@ class Results:
         path = self.folder / f"{name}.parquet"
         try:
             if path.exists():
-                with opened(path):  # reading a pipe would block
-                    pass
+                _refuse_pipe(path)
                 table = pq.read_table(path, columns=list(columns), filters=where)
             else:
                 whole = pa.Table.from_batches(batches_of(self.folder, name), schema_of(self.folder, name))
@@ -114,12 +112,10 @@ class Results:
         path = self.folder / f"{name}.parquet"
         try:
             if path.exists():
-                with opened(path):  # reading a pipe would block
-                    pass
+                _refuse_pipe(path)
                 with pq.ParquetFile(path) as file:
-                    file.schema_arrow.empty_table().select(
-                        columns
-                    )  # `iter_batches` passes over columns that are not there
+                    # `iter_batches` passes over columns that are not there, and this raises an error.
+                    file.schema_arrow.empty_table().select(columns)
                     # Without threads, each of which would keep memory.
                     for batch in file.iter_batches(_PIECE_ROWS, columns=list(columns), use_threads=False):
                         yield _validated(batch, columns)
@@ -160,6 +156,12 @@ class Results:
     def digests(self) -> pa.Table:
         """A row per peer, trial and block of 256 slots. Raises UsageError for the digests of an older version."""
         return self._table("digests", DIGESTS)
+
+
+def _refuse_pipe(path: Path) -> None:
+    """Raise an error unless a path is that of a regular file: reading a pipe would block."""
+    with opened(path):
+        pass
 
 
 def _validated(batch: pa.RecordBatch, columns: Sequence[str]) -> pa.Table:

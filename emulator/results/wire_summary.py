@@ -118,7 +118,7 @@ class WireSummary:
     @property
     def bypasses(self) -> list[WireEventSummary]:
         """The ways past the wire that it noticed: with any, the wire has no verdict."""
-        return [one for one in self.events if one.bypass]
+        return [event for event in self.events if event.bypass]
 
     def as_dict(self) -> dict[str, Any]:
         """The contents of summary.json."""

@@ -83,8 +83,8 @@ class Evidence:
         for part in place:
             inner = entries.get(part)
             entries = inner if isinstance(inner, Mapping) else {}
-        found = entries.get(figure, 0 if place == ["lost_by"] and figure in REASONS else None)
-        return found if isinstance(found, (int, float)) else None
+        value = entries.get(figure, 0 if place == ["lost_by"] and figure in REASONS else None)
+        return value if isinstance(value, (int, float)) else None
 
     def _of_receiver(self, expect: ExpectTable, receiver: str, figure: str) -> float | None:
         """A figure of the whole run or of some slots, or a quantile of it over trials."""

@@ -285,13 +285,13 @@ class Judged:
     def sentence(self) -> str:
         """The expectation as a sentence of the closing report."""
         words = {True: "held", False: "FAILED", None: f"FAILED, {self.why or 'the run has no value for it'}"}
-        said = f"expected {self.text}: {words[self.held]}"
+        sentence = f"expected {self.text}: {words[self.held]}"
         if self.found is None:
-            return said + (", found none" if self.held is False else "")
+            return sentence + (", found none" if self.held is False else "")
         if isinstance(self.found, str) and self.found not in {"inf", "-inf", "nan"}:
-            return f"{said}, found {self.found}"
+            return f"{sentence}, found {self.found}"
         number = str(self.found) if isinstance(self.found, int) else f"{float(self.found):.6g}"
-        return f"{said}, found {number}"
+        return f"{sentence}, found {number}"
 
 
 _OPTIONAL = {"replay", "why"}
@@ -304,7 +304,7 @@ def failed(expectations: Iterable[Judged]) -> list[Judged]:
 
     Source: docs/scenario.md, expect.
     """
-    return [one for one in expectations if one.held is not True]
+    return [judged for judged in expectations if judged.held is not True]
 
 
 @dataclass(frozen=True)

@@ -177,5 +177,5 @@ def _run(scenario: Scenario, folder: Path, manner: Manner) -> Path:
 
 def _reasons(expectations: Sequence[Judged]) -> Iterator[str]:
     """A line for each expectation that failed."""
-    for one in failed(expectations):
-        yield one.sentence + (f"; see it again: {one.replay}" if one.replay is not None else "")
+    for judged in failed(expectations):
+        yield judged.sentence + (f"; see it again: {judged.replay}" if judged.replay is not None else "")

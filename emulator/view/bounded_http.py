@@ -1,8 +1,8 @@
 """The HTTP server of views in a browser and of metrics: a bounded number of readers, each on its own thread, and no log.
 
-A web page of somebody else may reach a server that listens on loopback only, if the name of its host is given our address
-(DNS rebinding); the browser then takes what the server sends for a part of that page. So a request must name an address, or a
-name that nobody can have in the public DNS.
+Somebody else's web page can reach a server that listens only on loopback, if the DNS gives the page's host name our address
+(DNS rebinding): the browser then treats our answers as part of that page. So a request must name an address, or a
+name that cannot exist in the public DNS.
 
 Source: RFC 9110, Section 7.4 (misdirected requests).
 """
@@ -30,12 +30,12 @@ def own_host(text: str) -> str | None:
 
     An address is never foreign, nor is a name without a dot, in a private domain, or of this machine (RFC 6762 for `.local`).
     """
-    found = _HOST.fullmatch(text)
-    if found is None:
+    match = _HOST.fullmatch(text)
+    if match is None:
         return None
-    if found[1] is not None:
-        return f"[{found[1].lower()}]" if _is_address(found[1], 6) else None
-    name, machine = found[2].lower(), socket.gethostname().lower()
+    if match[1] is not None:
+        return f"[{match[1].lower()}]" if _is_address(match[1], 6) else None
+    name, machine = match[2].lower(), socket.gethostname().lower()
     of_machine = name in {machine, f"{machine.partition('.')[0]}.local"}
     return name if of_machine or _is_address(name, 4) or "." not in name or name.endswith(_PRIVATE) else None
 

@@ -11,6 +11,7 @@ import contextlib
 import importlib.util
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -22,7 +23,7 @@ from typing import IO
 
 from evedrop.environment import viewer_environment
 from evedrop.errors import UsageError
-from evedrop.processes import kill, wait_for
+from evedrop.processes import kill, signalled_when_parent_dies, wait_for
 from evedrop.results.folder import make_private, private_opener
 
 HOST = "127.0.0.1"
@@ -61,14 +62,6 @@ def allowed():
 if allowed():
     apart()
 """
-# Ends the viewer together with this process, even if it is killed: PR_SET_PDEATHSIG is 1, and survives exec.
-_GUARD = """
-import ctypes, os, signal, sys
-{first}
-ctypes.CDLL(None).prctl(1, signal.SIGKILL)
-os.getppid() == int(sys.argv[1]) or sys.exit(1)
-os.execv(sys.argv[2], sys.argv[2:])
-"""
 
 
 class PortTaken(UsageError):
@@ -77,10 +70,7 @@ class PortTaken(UsageError):
 
 def guarded(command: Sequence[str], apart: bool = False) -> list[str]:
     """A command that ends with this process, on Linux; apart: with a network of its own, if the system allows it."""
-    if sys.platform != "linux":
-        return [*command]
-    guard = _GUARD.format(first=_APART if apart else "")
-    return [sys.executable, "-I", "-S", "-c", guard, str(os.getpid()), *command]
+    return signalled_when_parent_dies(command, signal.SIGKILL, _APART if apart else "")
 
 
 def is_apart(process: subprocess.Popen[bytes]) -> bool:

@@ -1,4 +1,4 @@
-"""The keys of Zenoh's advanced publishers: KEY/@adv/… for the history, heartbeats and recovery of what is published on KEY.
+"""The keys of Zenoh's advanced publishers: KEY/@adv/… for the history, heartbeats and recovery of the messages on KEY.
 
 After `@adv` come the Zenoh id of a session, and numbers of its own, which differ from run to run.
 
@@ -11,7 +11,7 @@ from typing import Final
 
 _MARK = "/@adv"
 LOST_HISTORY_SECONDS: Final = 0.5
-"""How long the asker of a history waits for what is lost: an advanced subscriber holds new messages back until then."""
+"""How long the asker of a history waits for a lost question or answer: an advanced subscriber holds back new messages."""
 
 
 def published_key(key: str) -> str | None:

@@ -1,6 +1,6 @@
 """Notices ways past a wire: programs in mode peer, which find each other without it, and routers that join two sides.
 
-A wire past which programs could have spoken has no verdict, because its journal does not tell what they got.
+A wire past which programs could have spoken has no verdict, because its journal does not show which messages they received.
 
 Source: docs/wire.md, what programs need.
 """

@@ -131,7 +131,7 @@ class WireControl:
         sides = {name: list(endpoints) for name, endpoints in self._relay.endpoints.items()}
         whole = self._journal.incomplete_since is None
         complete = "complete" if whole else "incomplete, because its folder could not be written"
-        bypasses = [one.line for one in self._journal.events if one.bypass]
+        bypasses = [event.line for event in self._journal.events if event.bypass]
         return WireStatus(self._conductor.seconds, sides, links, list(self._events), complete, bypasses)
 
 

@@ -48,6 +48,16 @@ class Crossing(IntEnum):
         """Whether a link's settings decide this outcome."""
         return self <= Crossing.CUT
 
+    @property
+    def decided(self) -> bool:
+        """Whether the loss and corruption models of a link decided on such a message, and how is known."""
+        return self.passed or self in {Crossing.LOST, Crossing.CORRUPTED}
+
+    @property
+    def passed(self) -> bool:
+        """Whether these models let such a message pass."""
+        return self in {Crossing.DELIVERED, Crossing.HELD_UP, Crossing.UNDERWAY, Crossing.REFUSED}
+
 
 class Kind(IntEnum):
     """What a message is."""

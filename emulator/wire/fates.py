@@ -109,10 +109,12 @@ class KeyFates:
 
 
 def schedule_of(link: WireLink, changes: Iterable[Change]) -> LinkSchedule:
-    """What is known in advance of a key's messages on a link. changes: as for `KeyFates`."""
+    """The schedule of a link for the messages of a key. changes: as for `KeyFates`."""
     # Of several changes at one message the last one counts, as with `KeyFates.change`.
-    last = {change.at: change for change in sorted(changes, key=lambda one: one.at)}
-    made = tuple(Change(at, None if one.settings is None else _timeless(one.settings)) for at, one in last.items())
+    last = {change.at: change for change in sorted(changes, key=lambda change: change.at)}
+    made = tuple(
+        Change(at, None if change.settings is None else _timeless(change.settings)) for at, change in last.items()
+    )
     return LinkSchedule(_timeless(link.settings), _LATEST, made, correlation=link.correlation)
 
 

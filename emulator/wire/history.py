@@ -25,15 +25,15 @@ from evedrop.wire.advanced import numbered_as
 from evedrop.wire.plan import WirePlan
 
 Numbered = tuple[str, str, str]
-"""Link, key as in `numbered_as`, and kind of stream: what has numbers of its own."""
+"""Link, key as in `numbered_as`, and kind: the messages that share these are numbered from 0."""
 _FILE = "history.jsonl"
 
 
-class Said(NamedTuple):
+class NotedEvent(NamedTuple):
     """An event of a wire."""
 
     time: float
-    """In seconds: since 1970 in `WireHistory.said`, since the start in `WireHistory.events`."""
+    """In seconds: since 1970 in `WireHistory.noted`, since the start in `WireHistory.events`."""
     line: str
     bypass: bool = False
     """Whether it tells a way past the wire."""
@@ -63,7 +63,7 @@ class WireHistory:
     """Start → the names of its links, in the order of their codes."""
     began: float = 0.0
     """When the latest start began, in seconds since 1970."""
-    said: list[Said] = field(default_factory=list)
+    noted: list[NotedEvent] = field(default_factory=list)
     """The events since the latest start."""
     _seed: int | None = None
     _settings: dict[str, list[_Settings]] = field(default_factory=dict)
@@ -87,9 +87,9 @@ class WireHistory:
         return history
 
     @property
-    def events(self) -> list[Said]:
+    def events(self) -> list[NotedEvent]:
         """The events since the latest start, with seconds since it began."""
-        return [one._replace(time=round(one.time - self.began, 3)) for one in self.said]
+        return [event._replace(time=round(event.time - self.began, 3)) for event in self.noted]
 
     def begin(self, plan: WirePlan, now: float) -> None:
         """Begin the next start, which has the seed of the earlier ones. Raises OSError if the disk is full."""
@@ -113,10 +113,10 @@ class WireHistory:
 
     def changes_of(self, link: str, key: str, kind: str) -> tuple[Change, ...]:
         """The settings of a stream's messages: the first from message 0 on, then the changes. For `KeyFates`."""
-        stream, found = (numbered_as(key), kind), dict[int, Mapping[str, Any]]()
+        stream, changes = (numbered_as(key), kind), dict[int, Mapping[str, Any]]()
         for one in self._settings.get(link, []):
-            found[one.since.get(stream, 0)] = one.settings
-        return tuple(Change(at, settings) for at, settings in sorted(found.items()))
+            changes[one.since.get(stream, 0)] = one.settings
+        return tuple(Change(at, settings) for at, settings in sorted(changes.items()))
 
     def expect_laws(self) -> None:
         """Raise UsageError unless each link had settings from which the fates of its messages, and their law, can be computed."""
@@ -153,7 +153,7 @@ class WireHistory:
     def _take(self, entry: Mapping[str, Any]) -> None:
         if "start" in entry:
             self.start, self.ended, self._seed = _number(entry["start"]), False, int(entry["seed"])
-            self.began, self.said = float(entry["time"]), []
+            self.began, self.noted = float(entry["time"]), []
             self.links[self.start] = list(entry["links"])
             for name, settings in entry["links"].items():
                 self._add(name, settings, {})
@@ -162,7 +162,7 @@ class WireHistory:
                 entry["change"], entry["settings"], {(str(k), str(kind)): _number(n) for k, kind, n in entry["since"]}
             )
         elif "said" in entry:
-            self.said.append(Said(float(entry["time"]), str(entry["said"]), bool(entry.get("bypass"))))
+            self.noted.append(NotedEvent(float(entry["time"]), str(entry["said"]), bool(entry.get("bypass"))))
         elif int(entry["end"]) == self.start:
             self.ended = True
             self.counts = {(str(link), str(key), str(kind)): _number(n) for link, key, kind, n in entry["counts"]}

@@ -29,7 +29,7 @@ from evedrop.output import warn
 from evedrop.results.wire_summary import JournalState
 from evedrop.threads import wait_for_thread
 from evedrop.wire.crossing import RECORD, Crossing, next_numbers
-from evedrop.wire.history import Numbered, Said, WireHistory, highest
+from evedrop.wire.history import NotedEvent, Numbered, WireHistory, highest
 from evedrop.wire.journal_part import (
     STORED,
     JournalPart,
@@ -179,7 +179,7 @@ class WireJournal:
                 self._place.miss(error)
 
     @property
-    def events(self) -> list[Said]:
+    def events(self) -> list[NotedEvent]:
         """The events of this start so far, with seconds since it began."""
         with self._state:
             return self._history.events

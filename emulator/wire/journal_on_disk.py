@@ -17,7 +17,7 @@ from evedrop.model.slot.link import Change
 from evedrop.results.wire_folder import WIRE_FILE
 from evedrop.results.wire_summary import WIRE_SUMMARY_FILE, JournalState, WireSummary
 from evedrop.wire.file import load_wire
-from evedrop.wire.history import Said, WireHistory
+from evedrop.wire.history import NotedEvent, WireHistory
 from evedrop.wire.journal import AmendmentListener, Listener
 from evedrop.wire.journal_part import records_of
 from evedrop.wire.journal_reader import JOURNAL_FOLDER, UNFINISHED, journal_tables, last_beat
@@ -62,7 +62,7 @@ class JournalOnDisk:
         self.state: JournalState = "ended"
         if not self._history.ended:
             self.state = "running" if is_in_use(folder / JOURNAL_FOLDER) else "killed"
-        self._keys = [""]  # the code 0 is that of a key that was not kept
+        self._keys = [""]  # code 0 stands for all keys beyond the limit
         self._codes = {"": 0}
 
     @property
@@ -71,7 +71,7 @@ class JournalOnDisk:
         return self._history.start
 
     @property
-    def events(self) -> list[Said]:
+    def events(self) -> list[NotedEvent]:
         """The events of the start, with seconds since it began."""
         return self._history.events
 

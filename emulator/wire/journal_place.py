@@ -55,7 +55,7 @@ class JournalPlace:
         if self.removed is not None:
             self.incomplete_since = self.incomplete_since or time.time()
             self._tell(
-                f"{self.removed} was removed or moved while the wire runs, so the wire has no journal any more; it goes on; end "
+                f"{self.removed} was removed or moved while the wire runs, so the wire no longer has a journal; it goes on; end "
                 "it, and start it again"
             )
 

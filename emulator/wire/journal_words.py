@@ -41,7 +41,7 @@ class JournalWords:
         self._texts: dict[str, list[str]] = {"key": [""], "source": [""]}
 
     def key_code(self, key: str, side: str = "") -> int:
-        """The code of a key that a program of a side uses; 0 for a new key for which there is no room."""
+        """The code of a key that a program of a side uses; 0 if the key is new and the limit is reached."""
         code = self._codes["key"].get(key)
         if code:
             return code

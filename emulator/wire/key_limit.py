@@ -1,4 +1,4 @@
-"""The limit on the keys that programs use: what a wire keeps for a key, it keeps until it ends.
+"""The limit on the keys that programs use. A wire keeps the records of a key until it ends.
 
 Each side has its own limit, so that programs of one side cannot use up the keys of others.
 
@@ -25,7 +25,7 @@ class KeyLimit:
     """The keys of a wire that are new, counted for each side. Threads may call its methods at the same time."""
 
     def __init__(self, links: Iterable[WireLink], earlier: Iterable[Numbered], tell: Callable[[str], None]) -> None:
-        """earlier: what earlier starts numbered, whose keys keep their places; tell: for what the user must know."""
+        """earlier: the streams that earlier starts numbered; their keys count, too. tell: for warnings."""
         self._tell = tell
         self._used: dict[str, tuple[int, int]] = {}  # side → keys, characters
         self._full: set[str] = set()

@@ -43,7 +43,7 @@ class LinkState:
         self._journal = journal
         self._fates: dict[tuple[str, str], KeyFates] = {}
         self._lanes: Counter[tuple[str, str]] = Counter()
-        """How many keys have each of the numbers: several for those of an advanced publisher's history."""
+        """How many keys share each stream: several for the history of an advanced publisher."""
         self._numbers: dict[tuple[str, str], int] = {}
         self._schedule: tuple[tuple[Change, ...], LinkSchedule] | None = None  # the latest, which new keys share
         self._lock = threading.Lock()

@@ -27,7 +27,7 @@ from evedrop.wire.watchdog import Duty
 
 WAITING = 8192
 """Messages of a side that may wait for the wire; then the side's programs wait, or Zenoh drops, as each message says."""
-MOST_KEYS = 8192
+READY_KEYS = 8192
 """Keys that a subscription keeps everything ready for; a key takes some 5 kB."""
 MOST_PUBLISHERS = 1024
 """Publishers that are declared at a side."""
@@ -38,7 +38,7 @@ _REMOTE = zenoh.Locality.REMOTE
 
 @final
 class Publishers:
-    """The publishers that a wire has declared at a side, of which there are at most `MOST_PUBLISHERS`."""
+    """The publishers that a wire has declared at a side, at most `MOST_PUBLISHERS`."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self.session = session
@@ -176,7 +176,7 @@ class PublicationRelay:
         for sample in samples:
             duty.in_hand = sample
             # A message that several subscriptions hear belongs to the first.
-            if not earlier or not any(one.intersects(sample.key_expr) for one in earlier):
+            if not earlier or not any(expression.intersects(sample.key_expr) for expression in earlier):
                 take(sample)
             duty.in_hand = None
 
@@ -193,8 +193,8 @@ class PublicationRelay:
         def take(sample: zenoh.Sample) -> None:
             heard = now()
             key = str(sample.key_expr)
-            found = ways_of.get(key)
-            ways, code = way_to(ways_of, key, sample.key_expr) if found is None else found
+            ready = ways_of.get(key)
+            ways, code = way_to(ways_of, key, sample.key_expr) if ready is None else ready
             payload, attachment, source = sample.payload, sample.attachment, sample.source_info
             size = len(payload)
             sender, sequence = 0, -1
@@ -208,7 +208,7 @@ class PublicationRelay:
             if not ways:
                 record(heard, -1, sequence, 0.0, code, sender, size, UNLINKED, kind, unlinked)
             for way in ways:
-                way.used = found is not None
+                way.used = ready is not None
                 n, fate, delay, again = way.decide(heard, size)
                 if heard > self._until and not fate:
                     fate, delay, again = underway, 0.0, False
@@ -243,15 +243,15 @@ class PublicationRelay:
 
     def _way_to(self, ways_of: dict[str, _Ways], key: str, expression: zenoh.KeyExpr) -> _Ways:
         """The ways of a key that is heard for the first time, or again after many other keys, and its code."""
-        while len(ways_of) >= MOST_KEYS:
+        while len(ways_of) >= READY_KEYS:
             oldest = next(iter(ways_of))
-            found = ways_of.pop(oldest)
-            if any(way.used for way in found[0]):
-                for way in found[0]:
+            ready = ways_of.pop(oldest)
+            if any(way.used for way in ready[0]):
+                for way in ready[0]:
                     way.used = False
-                ways_of[oldest] = found  # now the newest
+                ways_of[oldest] = ready  # now the newest
             else:
-                for way in found[0]:
+                for way in ready[0]:
                     way.forget()
         code = self._journal.key_code(key, self._name)
         taken = (self._plan.link_of(self._name, target, expression) for target in self._publishers)
@@ -295,27 +295,16 @@ class _Later:
 
 def _publish(session: zenoh.Session, sample: zenoh.Sample) -> None:
     """Publish a message whole, without a publisher. Raises zenoh.ZError."""
+    how: dict[str, Any] = {
+        "congestion_control": sample.congestion_control,
+        "priority": sample.priority,
+        "express": sample.express,
+        "attachment": sample.attachment,
+        "timestamp": sample.timestamp,
+        "allowed_destination": _REMOTE,
+        "source_info": sample.source_info,
+    }
     if sample.kind == zenoh.SampleKind.PUT:
-        session.put(
-            sample.key_expr,
-            sample.payload,
-            encoding=sample.encoding,
-            congestion_control=sample.congestion_control,
-            priority=sample.priority,
-            express=sample.express,
-            attachment=sample.attachment,
-            timestamp=sample.timestamp,
-            allowed_destination=_REMOTE,
-            source_info=sample.source_info,
-        )
+        session.put(sample.key_expr, sample.payload, encoding=sample.encoding, **how)
     else:
-        session.delete(
-            sample.key_expr,
-            congestion_control=sample.congestion_control,
-            priority=sample.priority,
-            express=sample.express,
-            attachment=sample.attachment,
-            timestamp=sample.timestamp,
-            allowed_destination=_REMOTE,
-            source_info=sample.source_info,
-        )
+        session.delete(sample.key_expr, **how)

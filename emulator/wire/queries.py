@@ -24,7 +24,7 @@ from evedrop.wire.crossing import AGAIN, UNLINKED, Crossing, Kind
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.lanes import Decision, Lane, LinkState
 from evedrop.wire.plan import WirePlan
-from evedrop.wire.publications import MOST_KEYS
+from evedrop.wire.publications import READY_KEYS
 from evedrop.wire.ros2 import SourceReader, reply_seconds
 from evedrop.wire.scheduler import Scheduler
 from evedrop.wire.side import SideSession, expressions_of
@@ -298,7 +298,7 @@ class QueryRelay:
         with self._lock:
             name = (state.link.name, kind, key)
             if name not in self._lanes:
-                if len(self._lanes) >= MOST_KEYS:
+                if len(self._lanes) >= READY_KEYS:
                     oldest, forget = next(iter(self._lanes.items()))
                     forget[1].forget(*oldest[1:])
                     del self._lanes[oldest]
@@ -311,7 +311,7 @@ class QueryRelay:
         name = (target, key, complete, anything)
         with self._lock:
             if name not in self._queriers:
-                if len(self._queriers) >= MOST_KEYS:
+                if len(self._queriers) >= READY_KEYS:
                     self._queriers.pop(next(iter(self._queriers)))
                 self._queriers[name] = self._sides[target].session.declare_querier(
                     query.key_expr,

@@ -116,7 +116,7 @@ class _Reader:
 
     def _before(self, name: str, longest: float | None) -> MessageRecording:
         """What was lost before the wire heard it."""
-        puts = pa.array([_stream_of(one) == "put" for one in self._rows["kind"].to_pylist()])
+        puts = pa.array([_stream_of(kind) == "put" for kind in self._rows["kind"].to_pylist()])
         rows = self._rows.filter(pc.and_(puts, pc.is_valid(self._rows["sequence"])))
         if not rows.num_rows:
             self._no(
@@ -181,8 +181,8 @@ class _Reader:
         for name, word_for in columns_as.items():
             texts = rows[name].cast(pa.string()).combine_chunks().dictionary_encode()
             codes = texts.indices.fill_null(len(texts.dictionary)).to_numpy(zero_copy_only=False).astype(np.int64)
-            words = [word_for(one) for one in texts.dictionary.to_pylist()]
-            same = np.array([*(words.index(one) for one in words), len(words)], np.int64)
+            words = [word_for(text) for text in texts.dictionary.to_pylist()]
+            same = np.array([*(words.index(word) for word in words), len(words)], np.int64)
             columns.append(same[codes])
         found: NDArray[np.int64] = (
             np.unique(np.stack(columns), axis=1, return_inverse=True)[1].reshape(-1).astype(np.int64)
@@ -193,7 +193,7 @@ class _Reader:
         """Tell that a link did not have the same settings all the time."""
         history = WireHistory.read(self._folder / JOURNAL_FOLDER)
         pairs = pa.TableGroupBy(rows.select(["key", "kind"]), ["key", "kind"]).aggregate([]).to_pylist()
-        changes = max(len(history.changes_of(self._link, one["key"], _stream_of(one["kind"]))) for one in pairs)
+        changes = max(len(history.changes_of(self._link, pair["key"], _stream_of(pair["kind"]))) for pair in pairs)
         if changes > 1:
             self._notes.append(f"the link had {changes} settings one after the other: fitted as one")
 

@@ -64,5 +64,5 @@ def _notices(plan: WirePlan, history: WireHistory) -> Iterator[Notice]:
     """The lines of the events panel that do not come from messages."""
     again = "" if history.start == 1 else f"; start {history.start} in this folder"
     yield Notice(0.0, "INFO", introduction(plan) + again)
-    for one in history.said:
-        yield Notice(max(0.0, one.time - history.began), level_of(one.line), one.line)
+    for event in history.noted:
+        yield Notice(max(0.0, event.time - history.began), level_of(event.line), event.line)

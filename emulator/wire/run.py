@@ -109,7 +109,7 @@ def continuation(start: int, counts: Mapping[Numbered, int]) -> str:
     """The sentence about a start in the folder of an earlier one. counts: the number of each stream's next message, from 0."""
     if not counts:
         return f"start {start} continues start {start - 1}, which numbered no message"
-    (link, key, kind), number = max(counts.items(), key=lambda one: one[1])
+    (link, key, kind), number = max(counts.items(), key=lambda item: item[1])
     others = f", and likewise for {len(counts) - 1:,} more" if len(counts) > 1 else ""
     what = "message" if kind == PUT else kind
     return (
@@ -127,7 +127,7 @@ def _watch(watchdog: Watchdog, relay: WireRelay, journal: WireJournal) -> None:
 
 
 def _on_disk(out: Path) -> str:
-    """What is left of a wire that ends at once."""
+    """The part of a sentence that says how to use the results of a wire that ended at once."""
     return (
         f"the wire has ended with what is on disk: `evedrop report {out}` shows it, and the next start with this folder goes on "
         "from there"

@@ -201,9 +201,9 @@ class RunningWire:
         """
         table = {"figure": figure, **bounds} if figure is not None else bounds
         plan = wire_of({**tomllib.loads(resolved_wire(self.plan)), "expect": [table]})
-        found = scorekeeper_on_disk(self.folder, plan).summary()
-        if failures := failed(found.expectations):
-            lines = [*(judged.sentence for judged in failures), *(bypass.event for bypass in found.bypasses)]
+        summary = scorekeeper_on_disk(self.folder, plan).summary()
+        if failures := failed(summary.expectations):
+            lines = [*(judged.sentence for judged in failures), *(bypass.event for bypass in summary.bypasses)]
             raise ExpectationFailed("\n".join(lines))
 
     def _endpoints_of(self, side: str) -> Sequence[str]:

@@ -35,7 +35,7 @@ from evedrop.score.summary import Judged
 from evedrop.wire.crossing import UNLINKED, Crossing, Kind
 from evedrop.wire.expect import WireExpectTable
 from evedrop.wire.figures import WIRE_FIGURES
-from evedrop.wire.history import Said
+from evedrop.wire.history import NotedEvent
 from evedrop.wire.journal import AmendmentListener, Listener
 from evedrop.wire.journal_part import REASONS, Records
 from evedrop.wire.law import bounds, expected
@@ -77,7 +77,7 @@ class SummarisedJournal(Protocol):
         """The number of records that an earlier start had left behind."""
 
     @property
-    def events(self) -> Sequence[Said]:
+    def events(self) -> Sequence[NotedEvent]:
         """The events of this start, with seconds since it began."""
 
     def key_of(self, code: int) -> str:
@@ -171,7 +171,7 @@ class WireScorekeeper:
             journal=JournalSummary(journal.recovered, journal.missing, journal.incomplete_since),
             links=links,
             expectations=self.judged(links),
-            events=[WireEventSummary(*one) for one in journal.events],
+            events=[WireEventSummary(*event) for event in journal.events],
             made_with={
                 "python": platform.python_version(),
                 **{name: importlib.metadata.version(name) for name in ("evedrop", "eclipse-zenoh")},
@@ -179,10 +179,10 @@ class WireScorekeeper:
         )
 
     def judged(self, links: Mapping[str, WireLinkSummary]) -> list[Judged]:
-        """The expectations of the wire, and whether they held; past which programs could have spoken, none of them did."""
-        bypassed = any(one.bypass for one in self._journal.events)
+        """The expectations of the wire, and whether they held. None held if programs could have spoken past the wire."""
+        bypassed = any(event.bypass for event in self._journal.events)
         judged = [self._judged(table, links[table.subject]) for table in self._plan.expectations]
-        return [replace(one, held=None, why=BYPASSED) if bypassed and one.held else one for one in judged]
+        return [replace(result, held=None, why=BYPASSED) if bypassed and result.held else result for result in judged]
 
     def finish(self, out: Path) -> int:
         """Write summary.json of a wire whose journal is closed; returns the exit status.
@@ -202,23 +202,27 @@ class WireScorekeeper:
 
     def _judged(self, table: WireExpectTable, link: WireLinkSummary) -> Judged:
         if table.link is not None:
-            held, found, lacking = link.within_bounds, link.rate, "the link's models decided on no message"
+            held, value, lacking = link.within_bounds, link.rate, "the link's models decided on no message"
         else:
             figure = WIRE_FIGURES[str(table.figure).rpartition(".")[2]]
-            found = figure.value(link, self._links[self._plan.named(table.subject).number], table.quantile)
-            held, lacking = None if found is None else table.holds(found), "no message was delivered"
+            value = figure.value(link, self._links[self._plan.named(table.subject).number], table.quantile)
+            held, lacking = None if value is None else table.holds(value), "no message was delivered"
         if held is not None:
-            return Judged(table.text, held, found, table.wanted)
+            return Judged(table.text, held, value, table.wanted)
         why = lacking if link.heard else "the link heard nothing"
-        return Judged(table.text, None, found, table.wanted, why=why)
+        return Judged(table.text, None, value, table.wanted, why=why)
 
     def _of_link(self, link: WireLink, tally: LinkTally) -> WireLinkSummary:
         streams = list(tally.streams.values())
         tried, passed = (sum(getattr(one, name) for one in streams) for name in ("tried", "passed"))
         rate = model = between = within = None
         if tried:
-            known: dict[Any, tuple[float, float]] = {}
-            laws = [self._law(link, *stream, one, known) for stream, one in tally.streams.items() if one.tried]
+            shared: dict[Any, tuple[float, float]] = {}
+            laws = [
+                self._law(link, *stream, stream_tally, shared)
+                for stream, stream_tally in tally.streams.items()
+                if stream_tally.tried
+            ]
             mean, variance = (sum_in_order(law[i] for law in laws) for i in (0, 1))
             low, high = bounds(mean, variance, tried)
             rate, model, between, within = (
@@ -249,7 +253,7 @@ class WireScorekeeper:
         )
 
     def _law(
-        self, link: WireLink, key: int, kind: int, tally: StreamTally, known: dict[Any, tuple[float, float]]
+        self, link: WireLink, key: int, kind: int, tally: StreamTally, shared: dict[Any, tuple[float, float]]
     ) -> tuple[float, float]:
         """How many of a stream's messages its models should have let through, and the variance of this number.
 
@@ -258,9 +262,9 @@ class WireScorekeeper:
         """
         changes = self._journal.changes_of(link.name, self._journal.key_of(key), Kind(kind).stream)
         numbers = tuple(sorted(tally.ranges))
-        name = (tuple((one.at, id(one.settings)) for one in changes), numbers, tally.tried)
-        if name not in known:
-            ranges = [range(*one) for one in numbers]
+        name = (tuple((change.at, id(change.settings)) for change in changes), numbers, tally.tried)
+        if name not in shared:
+            ranges = [range(*pair) for pair in numbers]
             for before, after in pairwise(ranges):
                 if after.start < before.stop:
                     raise UsageError(
@@ -271,8 +275,8 @@ class WireScorekeeper:
             if tally.scattered:  # a sample of a known range: the range varies as a whole, and the sample within it
                 share = tally.tried / sum(map(len, ranges))
                 mean, variance = mean * share, variance * share**2 + mean * share * (1.0 - mean * share / tally.tried)
-            known[name] = (mean, variance)
-        return known[name]
+            shared[name] = (mean, variance)
+        return shared[name]
 
 
 def _changes(columns: NDArray[np.int64]) -> NDArray[np.intp]:

@@ -60,7 +60,7 @@ class SideSession:
         """Its session, and where programs connect: with a free port where the plan has port 0."""
         self.zid = str(self.session.zid())
         self.duty = Duty(f"at the side {side.name}", ANSWER_SECONDS)
-        """What the main thread does with the session when the wire ends."""
+        """The work of the main thread on the session when the wire ends."""
 
     def __enter__(self) -> Self:
         return self
@@ -81,7 +81,7 @@ class SideSession:
 def _opened(side: Side, largest: int, users_file: str | None) -> tuple[zenoh.Session, tuple[str, ...]]:
     """The session of a side, and its endpoints. Raises UsageError."""
     for attempt in range(_ATTEMPTS):
-        endpoints = tuple(_with_port(one) for one in side.listen)
+        endpoints = tuple(_with_port(endpoint) for endpoint in side.listen)
         config = side_config(replace(side, listen=endpoints), largest, users_file)
         try:
             return zenoh.open(zenoh.Config.from_json5(json.dumps(config))), endpoints
@@ -128,7 +128,7 @@ def side_config(side: Side, largest: int, users_file: str | None) -> ZenohConfig
             "retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
         },
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        # A router that is asked for what it has while a program declares something may stop for ever (docs/upstream.md).
+        # A router may hang for ever if its administration space is asked while a program declares something (docs/upstream.md).
         "adminspace": {"enabled": False},
         "timestamping": {"enabled": False},
         "transport": {"link": link},

@@ -19,10 +19,8 @@ _SAMPLE = 2**17  # delays of a link that are kept; of more, every second, fourth
 _MOST_RANGES = 2048
 _TRIED = np.zeros(256, bool)  # of fates: the link's models decided, and that decision is known
 _PASSED = np.zeros(256, bool)
-for _fate in (Crossing.LOST, Crossing.CORRUPTED):
-    _TRIED[_fate] = True
-for _fate in (Crossing.DELIVERED, Crossing.HELD_UP, Crossing.UNDERWAY, Crossing.REFUSED):
-    _TRIED[_fate] = _PASSED[_fate] = True
+for _fate in Crossing:
+    _TRIED[_fate], _PASSED[_fate] = _fate.decided, _fate.passed
 
 
 @final
@@ -92,10 +90,10 @@ class StreamTally:
         starts, stops = numbers[np.r_[0, breaks]].tolist(), (numbers[np.r_[breaks - 1, -1]] + 1).tolist()
         self._add_ranges(list(zip(starts, stops, strict=True)))
 
-    def _add_ranges(self, found: list[tuple[int, int]]) -> None:
-        if self.ranges and self.ranges[-1][1] == found[0][0]:
-            found[0] = (self.ranges.pop()[0], found[0][1])
-        self.ranges += found
+    def _add_ranges(self, ranges: list[tuple[int, int]]) -> None:
+        if self.ranges and self.ranges[-1][1] == ranges[0][0]:
+            ranges[0] = (self.ranges.pop()[0], ranges[0][1])
+        self.ranges += ranges
         if self.scattered or len(self.ranges) > _MOST_RANGES:
             self.scattered = True
             self.ranges = [(min(start for start, _ in self.ranges), max(stop for _, stop in self.ranges))]

@@ -1,7 +1,7 @@
-"""Ends a wire that no longer answers, and names what has hung: nothing that hangs, Zenoh or a disk, can keep a wire from ending.
+"""Ends a wire that no longer answers, and names the part that hangs, such as Zenoh or the disk.
 
-Each thread of the wire says what it has in hand, and further threads ask each side and the journal now and then whether they
-answer. If something is in hand for too long, the process ends at once: its journal is on disk at every instruction.
+Each thread of the wire marks the work that it has in hand, and further threads put questions to each side and the journal. If a
+piece of work takes too long, the process ends at once: its journal is on disk at every instruction.
 
 Source: docs/wire.md, a wire that hangs.
 """
@@ -31,7 +31,7 @@ _LAST_SECONDS = 5.0  # for the last steps of a process that ends at once
 
 @final
 class Duty:
-    """The work of a thread: `in_hand` is what it has in hand, another object for each piece, and None while it has nothing."""
+    """The work of a thread. `in_hand` is a new object for each piece of work, and None while the thread waits for work."""
 
     __slots__ = ("end_seconds", "in_hand", "seconds", "waits", "where")
 
@@ -61,7 +61,7 @@ class Duty:
 class Watchdog:
     """Watches duties; use it as a context manager.
 
-    Time counts in ticks of its own thread: a process that was suspended, or a machine too busy to run it, is no hang.
+    Time counts in ticks of its own thread, so a suspended process or a busy machine does not count as a hang.
     """
 
     def __init__(self, end: Callable[[str], object]) -> None:
@@ -69,8 +69,8 @@ class Watchdog:
         self._end = end
         self._duties: dict[Duty, tuple[object, int]] = {}  # what it had in hand, and for how many ticks
         self._lock = threading.Lock()
-        self._ending = self._over = False
-        self._changed = threading.Event()
+        self._ending = False
+        self._over = threading.Event()
         self._asks_no_more = threading.Event()
         self._thread = threading.Thread(target=self._run, name="watchdog", daemon=True)
 
@@ -81,9 +81,8 @@ class Watchdog:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._over = True
+        self._over.set()
         self._asks_no_more.set()
-        self._changed.set()
 
     def watch(self, *duties: Duty) -> None:
         """Watch further duties."""
@@ -115,9 +114,9 @@ class Watchdog:
         self._asks_no_more.set()
 
     def _run(self) -> None:
-        while not self._changed.wait(_TICK):
+        while not self._over.wait(_TICK):
             hung = self._tick()
-            if hung and not self._over:
+            if hung and not self._over.is_set():
                 self._end(f"nothing has moved {hung[0].where} for {self._allowed(hung[0]):g} s")
                 return
 

@@ -1,4 +1,4 @@
-"""What SECURITY.md says of `python -m evedrop`: only it runs what lies in the current folder."""
+"""`python -m evedrop` imports modules from the current folder, as SECURITY.md says; `evedrop` does not."""
 
 from __future__ import annotations
 

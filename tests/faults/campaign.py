@@ -86,13 +86,13 @@ class Campaign:
         if isinstance(case, Case):
             lacks = [self.facilities.lacks[need] for need in sorted(case.needs) if need in self.facilities.lacks]
             return Verdict(case, (), SKIPPED, (), 0.0, lacks[0]) if lacks else self._run(case)
-        before = frozenset(one.pid for one in ours.descendants())
+        before = frozenset(process.pid for process in ours.descendants())
         folder, begun = self.folder / str(case.seed), time.monotonic()
         if isinstance(case, WireCase):
-            found = list(wires.carried_out(case, folder, before))
+            misses = list(wires.carried_out(case, folder, before))
         else:
-            found = list(studies.carried_out(case, folder, before, self._studied()))
-        return self._verdict(case, case.faults, found, OUTCOMES[0], time.monotonic() - begun)
+            misses = list(studies.carried_out(case, folder, before, self._studied()))
+        return self._verdict(case, case.faults, misses, OUTCOMES[0], time.monotonic() - begun)
 
     def _verdict(
         self,
@@ -118,7 +118,7 @@ class Campaign:
     def _run(self, case: Case) -> Verdict:
         """Disturb a live run."""
         reference, usual = self.known(case.variant)
-        before = frozenset(one.pid for one in ours.descendants())
+        before = frozenset(process.pid for process in ours.descendants())
         folder = self.folder / str(case.seed)
         hits: dict[Fault, float] = {}
         begun = time.monotonic()
@@ -224,9 +224,9 @@ def campaign(folder: Path | None = None) -> Iterator[Campaign]:
     mounts = ours.mounts_of_our_own()
     made = folder or Path(tempfile.mkdtemp(prefix="faults-"))
     made.mkdir(parents=True, exist_ok=True)
-    one = Campaign(made, facilities(mounts, made))
+    campaign = Campaign(made, facilities(mounts, made))
     try:
-        yield one
+        yield campaign
     finally:
         kept = [path for path in made.iterdir() if path.name.isdecimal()]
         if not kept and folder is None:

@@ -95,6 +95,7 @@ class Disturbed:
                     "PYTHONPATH": os.pathsep.join(filter(None, [str(_WITHIN), str(_ROOT), os.environ.get("PYTHONPATH")])),
                     "EVEDROP_CAMPAIGN": str(folder),
                     **({"PYTHON_EVEDROP_CONFUSED": str(limits["confused"])} if "confused" in limits else {}),
+                    "PYTHONDONTWRITEBYTECODE": "1",  # on a full disk, Python would leave half a .pyc for the next process
                     "COLUMNS": "160",
                 },
             )  # fmt: skip
@@ -160,10 +161,10 @@ class Disturbed:
         if name == "launcher":
             return [] if self.over.is_set() else [self.launcher.pid]
         if name == CLEANER:
-            return [one.pid for one in ours.descendants() if one.is_cleaner]
+            return [process.pid for process in ours.descendants() if process.is_cleaner]
         if name in FORK_SERVERS:
-            found = [one.pid for one in ours.descendants() if one.is_fork_server]
-            return found[:1] if name == FORK_SERVERS[0] else found[1:2]
+            servers = [process.pid for process in ours.descendants() if process.is_fork_server]
+            return servers[:1] if name == FORK_SERVERS[0] else servers[1:2]
         firsts = self.firsts
         return [
             one.pid

@@ -102,10 +102,10 @@ def _means(slots: pa.Table, end: int) -> dict[str, dict[str, float]]:
     sums: dict[str, dict[str, float]] = defaultdict(lambda: dict.fromkeys((*_MEANS, "trials"), 0.0))
     for row in slots.select(["slot", "peer", "trials", *_MEANS]).to_pylist():
         if row["slot"] < end:
-            found = sums[row["peer"]]
-            found["trials"] += row["trials"]
+            sums_of_peer = sums[row["peer"]]
+            sums_of_peer["trials"] += row["trials"]
             for figure in _MEANS:
-                found[figure] += row[figure] * row["trials"]
+                sums_of_peer[figure] += row[figure] * row["trials"]
     return sums
 
 
@@ -120,9 +120,9 @@ def _accounts(journal: pa.Table, end: int) -> dict[str, dict[str, Any]]:
     reasons = [name.removeprefix("lost_by_") for name in names if name.startswith("lost_by_")]
     return {
         link: {
-            "offered": found["offered"],
-            "late": found["late"],
-            "lost_by": {reason: found[f"lost_by_{reason}"] for reason in reasons if found[f"lost_by_{reason}"]},
+            "offered": account["offered"],
+            "late": account["late"],
+            "lost_by": {reason: account[f"lost_by_{reason}"] for reason in reasons if account[f"lost_by_{reason}"]},
         }
-        for link, found in sums.items()
+        for link, account in sums.items()
     }

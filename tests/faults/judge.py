@@ -249,9 +249,9 @@ def _of_summary(
 def _of_verification(summary: Mapping[str, Any], reference: Reference) -> Iterator[str]:
     """Whether a complete run says that it has computed the digests of every recorded trial again."""
     recorded = len({key[2] for key in reference.tables["trials"]})
-    for name, one in summary["verification"].items():
-        if one["recomputed_trials"] != recorded:
-            yield f"{one['recomputed_trials']} trials of {name} were verified, of {recorded} that are recorded"
+    for name, verification in summary["verification"].items():
+        if verification["recomputed_trials"] != recorded:
+            yield f"{verification['recomputed_trials']} trials of {name} were verified, of {recorded} that are recorded"
 
 
 def _of_disk(fault: Fault) -> bool:

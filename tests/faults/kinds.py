@@ -152,16 +152,16 @@ def _send(number: signal.Signals) -> Callable[[Fault, Disturbed], bool]:
 
 
 def _stop(fault: Fault, run: Disturbed) -> bool:
-    found = _process(fault, run)
-    for pid in found:
+    process = _process(fault, run)
+    for pid in process:
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGSTOP)
     run.over.wait(fault.seconds)  # for good: until the launcher has ended, which ends or frees it
-    for pid in found:
+    for pid in process:
         if pid in run.pids(fault.target, fault.shard):
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGCONT)
-    return bool(found)
+    return bool(process)
 
 
 def _stop_and_kill(fault: Fault, run: Disturbed) -> bool:

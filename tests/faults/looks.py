@@ -16,15 +16,15 @@ def failed_looks(folder: Path, memory: Path | None) -> Iterator[str]:
     if memory is not None:
         commands.append(["diff", str(folder), str(memory)])
     for words in commands:
-        said = io.StringIO()
+        output = io.StringIO()
         try:
-            with redirect_stdout(said), redirect_stderr(said):
+            with redirect_stdout(output), redirect_stderr(output):
                 status = main(words)
         except Exception as error:
             yield f"evedrop {words[0]} fails with {error!r}"
             continue
         if status != 0:
-            yield f"evedrop {words[0]} ends with {status}: {said.getvalue().strip()}"
+            yield f"evedrop {words[0]} ends with {status}: {output.getvalue().strip()}"
     page = folder / "report.html"
     text = page.read_text(encoding="utf-8") if page.is_file() else ""
     if not text.rstrip().endswith("</html>") or "cannot be read" in text:

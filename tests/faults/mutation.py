@@ -98,25 +98,25 @@ def tried(mutant: Mutant, folder: Path) -> Outcome:
         done = subprocess.run(
             command, cwd=_ROOT, env=environment, capture_output=True, text=True, check=False, timeout=_LIMIT_SECONDS
         )
-        said = done.stdout if done.returncode in (0, 1) else f"REFUSED {done.stderr.strip().splitlines()[-1]}"
+        output = done.stdout if done.returncode in (0, 1) else f"REFUSED {done.stderr.strip().splitlines()[-1]}"
     except subprocess.TimeoutExpired:
-        said = f"REFUSED the campaign did not end within {_LIMIT_SECONDS:.0f} s"
+        output = f"REFUSED the campaign did not end within {_LIMIT_SECONDS:.0f} s"
         for temporary in (folder / "kept").glob("**/temporary"):
             ours.end_all(list(ours.marked(temporary)))
-    return outcome_of(mutant, said, time.monotonic() - begun, folder)
+    return outcome_of(mutant, output, time.monotonic() - begun, folder)
 
 
-def outcome_of(mutant: Mutant, said: str, seconds: float, folder: Path) -> Outcome:
-    """What the campaign's output says of a mutant."""
+def outcome_of(mutant: Mutant, output: str, seconds: float, folder: Path) -> Outcome:
+    """Whether the campaign noticed a mutant, read from its output."""
     cases = 0
-    for line in said.splitlines():
+    for line in output.splitlines():
         if line.startswith("REFUSED "):
-            return Outcome(mutant, f"undisturbed: {_short(line.removeprefix('REFUSED '), folder)}", said, 0, seconds)
+            return Outcome(mutant, f"undisturbed: {_short(line.removeprefix('REFUSED '), folder)}", output, 0, seconds)
         if re.match(r" *\d+  ", line):
             cases += 1
         elif line.startswith("        "):
-            return Outcome(mutant, _short(line, folder), said, cases, seconds)
-    return Outcome(mutant, None, said, cases, seconds)
+            return Outcome(mutant, _short(line, folder), output, cases, seconds)
+    return Outcome(mutant, None, output, cases, seconds)
 
 
 def _short(line: str, folder: Path) -> str:
@@ -129,7 +129,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.faults.mutation", description=__doc__.partition("\n")[0])
     parser.add_argument("--only", default="", help="mutants whose description or file contains this")
     options = parser.parse_args(arguments)
-    chosen = [one for one in mutants() if options.only in f"{one.breaks} {one.file}"]
+    chosen = [mutant for mutant in mutants() if options.only in f"{mutant.breaks} {mutant.file}"]
     _say(f"| {len(chosen)} mutants | file | noticed by | cases | time |\n|---|---|---|---|---|")
     outcomes = []
     for mutant in chosen:
@@ -138,7 +138,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _say(str(outcomes[-1]))
         if outcomes[-1].noticed is None:
             _say(outcomes[-1].said)
-    missed = [one for one in outcomes if one.noticed is None]
+    missed = [outcome for outcome in outcomes if outcome.noticed is None]
     _say(f"\n{len(outcomes) - len(missed)} of {len(outcomes)} mutants were noticed")
     return 1 if missed else 0
 

@@ -106,7 +106,7 @@ def _look() -> frozenset[int]:
 
 
 def marked(temporary: Path) -> Iterator[Process]:
-    """All living processes that were given this folder for temporary files, whoever their parents are."""
+    """All living processes whose TMPDIR is this folder, including those that have a new parent."""
     mark = f"TMPDIR={temporary}".encode()
     for folder in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
@@ -123,14 +123,14 @@ def none_left(before: frozenset[int], seconds: float, temporary: Path | None = N
     """
     deadline = time.monotonic() + seconds
     while True:
-        found = {one.pid: one for one in descendants() if one.pid not in before}
+        left = {process.pid: process for process in descendants() if process.pid not in before}
         if temporary is not None:
-            found |= {one.pid: one for one in marked(temporary) if one.pid not in before}
-        if not found and (before or not _has_children()):
+            left |= {process.pid: process for process in marked(temporary) if process.pid not in before}
+        if not left and (before or not _has_children()):
             return []
-        if found and time.monotonic() > deadline:
-            return list(found.values())
-        time.sleep(0.05 if found else 0.001)  # a child that no look found moves fast
+        if left and time.monotonic() > deadline:
+            return list(left.values())
+        time.sleep(0.05 if left else 0.001)  # a child that no look found moves fast
 
 
 def _has_children() -> bool:

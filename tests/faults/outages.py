@@ -27,20 +27,20 @@ def wrong_outages(
 
     told: the run's news, each with the time `at` which it came; struck: when each fault hit something; slots: of the whole run.
     """
-    entries = {(one["process"], one["slot"]) for one in listed}
+    entries = {(entry["process"], entry["slot"]) for entry in listed}
     for news in told:
         if news["event"] == "reconnected" and (news["process"], news["slot"]) not in entries:
             yield f"the run told of an outage of {news['process']} at slot {news['slot']}, and the summary lists none"
-    for one in listed:
-        if not _explained(str(one["process"]), struck):
-            yield f"an outage of {one['process']} at slot {one['slot']}, and no fault caused one"
-        if complete and (one["until"] is None or not one["slot"] <= one["until"] <= slots):
-            yield f"an outage of {one['process']} at slot {one['slot']} until {one['until']}, in a run that is complete"
-        if one["seconds"] < 0.0:
-            yield f"an outage of {one['seconds']} s"
+    for entry in listed:
+        if not _explained(str(entry["process"]), struck):
+            yield f"an outage of {entry['process']} at slot {entry['slot']}, and no fault caused one"
+        if complete and (entry["until"] is None or not entry["slot"] <= entry["until"] <= slots):
+            yield f"an outage of {entry['process']} at slot {entry['slot']} until {entry['until']}, in a run that is complete"
+        if entry["seconds"] < 0.0:
+            yield f"an outage of {entry['seconds']} s"
     for fault, at in struck.items():
         killed = fault.kind == "kill" and fault.target == "router" and _went_on(told, at, slots)
-        if complete and killed and not {one["process"] for one in listed} & {*_ROUTERS, "observer"}:
+        if complete and killed and not {entry["process"] for entry in listed} & {*_ROUTERS, "observer"}:
             yield "the router was killed in the middle of the run, and the summary lists no outage"
 
 

@@ -86,8 +86,8 @@ def undisturbed(folder: Path) -> Undisturbed:
     """The study in this process, and a command that does the same, to know how long that takes."""
     montecarlo(_SCENARIO, trials=TRIALS, slots=SLOTS, out=folder / "memory")
     begun = time.monotonic()
-    with (folder / "said").open("w") as said:
-        command = subprocess.run(_command("usual", False), cwd=folder, stdout=said, stderr=said, check=False)
+    with (folder / "said").open("w") as output:
+        command = subprocess.run(_command("usual", False), cwd=folder, stdout=output, stderr=output, check=False)
     if command.returncode != 0:
         raise ValueError(f"an undisturbed study ends with status {command.returncode}: {(folder / 'said').read_text()}")
     return Undisturbed(load_results(folder / "memory"), time.monotonic() - begun)
@@ -106,11 +106,13 @@ def carried_out(case: StudyCase, folder: Path, before: frozenset[int], usual: Un
     for number, fault in enumerate((*case.faults, None)):
         if complete:
             break
-        status, said = yield from _attempt(fault, folder, number, usual.seconds)
+        status, text = yield from _attempt(fault, folder, number, usual.seconds)
         complete = status == 0
-        yield from _of_status(fault, status, said)
+        yield from _of_status(fault, status, text)
         left = ours.none_left(before, _LEAVE_SECONDS, temporary)
-        yield from (f"process {one.pid} is left: {' '.join(one.words)}; {ours.doing(one.pid)}" for one in left)
+        yield from (
+            f"process {process.pid} is left: {' '.join(process.words)}; {ours.doing(process.pid)}" for process in left
+        )
         ours.end_all(left)
         yield from (f"{path} is left" for path in sorted(temporary.iterdir()))
         yield from _partial(folder / "out", complete)
@@ -136,13 +138,13 @@ def _attempt(fault: StudyFault | None, folder: Path, number: int, seconds: float
     """Begin or resume the study, and disturb it; returns its status and what it said."""
     environment = {**os.environ, "TMPDIR": str(folder / "temporary")}
     path = folder / f"attempt-{number}"
-    with path.open("w") as said:
+    with path.open("w") as output:
         study = subprocess.Popen(
             _command("out", number > 0),
             cwd=folder,
             stdin=subprocess.DEVNULL,
-            stdout=said,
-            stderr=said,
+            stdout=output,
+            stderr=output,
             env=environment,
             start_new_session=True,
         )
@@ -164,7 +166,11 @@ def _strike(fault: StudyFault, study: subprocess.Popen[bytes]) -> None:
         return
     pids = [study.pid]
     if fault.target == "worker":
-        pids = [one.pid for one in ours.descendants() if "work" in " ".join(one.words) and one.pid != study.pid][:1]
+        pids = [
+            process.pid
+            for process in ours.descendants()
+            if "work" in " ".join(process.words) and process.pid != study.pid
+        ][:1]
     for pid in pids:
         with suppress(ProcessLookupError):
             if fault.stopped is not None:
@@ -175,20 +181,20 @@ def _strike(fault: StudyFault, study: subprocess.Popen[bytes]) -> None:
                 os.kill(pid, _ENDS[fault.kind])
 
 
-def _of_status(fault: StudyFault | None, status: int, said: str) -> Iterator[str]:
-    if "Traceback (most recent call last)" in said:
-        yield f"a traceback: {said.strip().splitlines()[-1]}"
+def _of_status(fault: StudyFault | None, status: int, text: str) -> Iterator[str]:
+    if "Traceback (most recent call last)" in text:
+        yield f"a traceback: {text.strip().splitlines()[-1]}"
     allowed = {0}
     if fault is not None and fault.target == "worker" and fault.kind == "kill":
         allowed.add(_FAILED)
-        if status == _FAILED and "a worker process was ended by signal 9" not in said:
-            yield f"the failure does not name the worker: {said.strip()[-300:]}"
+        if status == _FAILED and "a worker process was ended by signal 9" not in text:
+            yield f"the failure does not name the worker: {text.strip()[-300:]}"
     elif fault is not None and fault.kind == "kill":
         allowed.add(-signal.SIGKILL)
     elif fault is not None and fault.kind in _ENDS:
         allowed |= {_INTERRUPTED, -_ENDS[fault.kind]}  # by the signal itself, before the first line of ours
     if status not in allowed:
-        yield f"status {status}: {said.strip()[-300:]}"
+        yield f"status {status}: {text.strip()[-300:]}"
 
 
 def _partial(out: Path, complete: bool) -> Iterator[str]:

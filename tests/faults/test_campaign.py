@@ -96,6 +96,10 @@ def test_the_outcome_of_a_mutant_is_read_from_what_the_campaign_says(tmp_path: P
     """Noticed by a miss, by a run that nobody disturbed, or not at all."""
     mutant = mutants()[0]
     passed, missed = "     5  interrupted  1.0 s  plain: x", "    12  MISS  1.0 s  plain: y\n        rows are missing\n"
-    found = [outcome_of(mutant, said, 1.0, tmp_path) for said in (passed, f"{passed}\n{missed}", "REFUSED no")]
-    assert [(one.noticed, one.cases) for one in found] == [(None, 1), ("rows are missing", 2), ("undisturbed: no", 0)]
-    assert "NOT NOTICED" in str(found[0])
+    outcomes = [outcome_of(mutant, text, 1.0, tmp_path) for text in (passed, f"{passed}\n{missed}", "REFUSED no")]
+    assert [(outcome.noticed, outcome.cases) for outcome in outcomes] == [
+        (None, 1),
+        ("rows are missing", 2),
+        ("undisturbed: no", 0),
+    ]
+    assert "NOT NOTICED" in str(outcomes[0])

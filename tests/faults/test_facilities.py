@@ -47,19 +47,19 @@ def test_processes_are_limited() -> None:
     command = [sys.executable, "-c", THREADS]
     assert ended(command) == ""
     try:
-        found = ended(command, processes=10)
+        status = ended(command, processes=10)
     except CannotRun as error:
         skip(error)
-    assert "can't start new thread" in found
+    assert "can't start new thread" in status
     with pytest.raises(CannotRun, match="no control group"):
         process_group("no/such/place", 10)
 
 
 def test_without_a_mount_namespace_no_disk_breaks(tmp_path: Path) -> None:
     """And it is said why."""
-    found = facilities(False, tmp_path)
-    assert not found.small_disks
-    assert found.lacks["a disk that breaks"] == "mounting takes root and a mount namespace"
+    present = facilities(False, tmp_path)
+    assert not present.small_disks
+    assert present.lacks["a disk that breaks"] == "mounting takes root and a mount namespace"
 
 
 @pytest.mark.parametrize("key", KEYS)
@@ -67,7 +67,7 @@ def test_the_fates_of_a_wire_are_those_of_its_model(key: str, tmp_path: Path) ->
     """Decided in one go, they are those that the wire decides block by block; in the share of the link."""
     path = tmp_path / "robot.toml"
     path.write_text(wires.FILE)
-    link = next(one for one in load_wire(path).links if one.name == key)
+    link = next(each for each in load_wire(path).links if each.name == key)
     fates = KeyFates(link, key, "put", wires.SEED)
     lost = lost_by_model(key, 3000)
     assert [bool(fates.next()[0]) for _ in range(3000)] == lost
@@ -109,8 +109,8 @@ def test_a_journal_that_is_true_to_its_receivers_is_accepted() -> None:
 )
 def test_a_journal_that_is_not_true_is_seen(rows: list[dict[str, object]], received: list[int], says: str) -> None:
     """Of a wire that ended by itself."""
-    found = complaints(rows, received)
-    assert [line for line in found if says in line], found
+    lines = complaints(rows, received)
+    assert [line for line in lines if says in line], lines
 
 
 def test_numbers_and_fates_that_are_wrong_are_seen() -> None:
@@ -121,5 +121,5 @@ def test_numbers_and_fates_that_are_wrong_are_seen() -> None:
     assert "gaps at [2]" in next(wires.wrong_numbers({1: right[:2], 2: right[3:]}))
     assert "twice [0]" in next(wires.wrong_numbers({1: right, 2: right[:1]}))
     assert Counter(lost)[True] < 5
-    turned = [{**one, "reason": None if one["reason"] else "loss"} for one in right]
+    turned = [{**row, "reason": None if row["reason"] else "loss"} for row in right]
     assert "5 fates of scan are not those of its model" in next(wires.wrong_fates({1: turned}))

@@ -60,10 +60,10 @@ def test_wrong_rows_are_seen(reference: Reference, memory: Path) -> None:
     rows[0]["squared_error"] = math.nextafter(rows[0]["squared_error"], math.inf)
     rows[1]["peer"] = "smart" if rows[1]["peer"] != "smart" else "naive"
     wrong = pa.Table.from_pylist([*rows, rows[2]], schema=tables["trials"].schema.remove_metadata())
-    found = list(reference.wrong_rows("trials", wrong))
-    assert len(found) == 3
-    assert "squared_error is" in found[0]
-    assert "twice" in found[2]
+    misses = list(reference.wrong_rows("trials", wrong))
+    assert len(misses) == 3
+    assert "squared_error is" in misses[0]
+    assert "twice" in misses[2]
 
 
 def test_another_summary_is_seen(reference: Reference) -> None:
@@ -126,7 +126,7 @@ class Ended:
 
     def misses(self, reference: Reference, *hits: Fault) -> list[str]:
         """What the judge says."""
-        before = frozenset(one.pid for one in ours.descendants())
+        before = frozenset(process.pid for process in ours.descendants())
         return judge.misses(self, dict.fromkeys(hits, 1.0), PATIENT_SECONDS, reference, before)
 
 
@@ -183,8 +183,8 @@ def test_the_judge_sees(what: str, ended: Ended, reference: Reference) -> None:
     """What a launcher must not do or say."""
     ended.launcher.returncode, said, hits, expected = STATUSES[what]
     (ended.folder / "stderr").write_text(said)
-    found = ended.misses(reference, *hits)
-    assert [line for line in found if expected in line], found
+    misses = ended.misses(reference, *hits)
+    assert [line for line in misses if expected in line], misses
 
 
 def without(*places: int) -> Callable[[pa.Table], pa.Table]:
@@ -234,8 +234,8 @@ def test_missing_rows_of_a_run_that_ended_early_are_seen(what: str, early: Ended
     """All tables are counted up to the slot of the summary."""
     name, change = LACKING[what]
     early.change(name, change)
-    found = early.misses(reference, KILL)
-    assert [line for line in found if line.startswith(f"{name} lacks")], found
+    misses = early.misses(reference, KILL)
+    assert [line for line in misses if line.startswith(f"{name} lacks")], misses
 
 
 def test_missing_digests_are_seen(ended: Ended, reference: Reference) -> None:
@@ -255,17 +255,17 @@ def test_swapped_figures_are_seen(when: str, figure: str, request: pytest.Fixtur
         a[figure], b[figure] = b[figure], a[figure] + 1e-3
 
     run.edit(swap)
-    found = run.misses(reference, *([KILL] if when == "early" else []))
-    assert [line for line in found if line.startswith(f"{figure} of smart is")], found
+    misses = run.misses(reference, *([KILL] if when == "early" else []))
+    assert [line for line in misses if line.startswith(f"{figure} of smart is")], misses
 
 
 def test_another_account_of_a_run_that_ended_early_is_seen(early: Ended, reference: Reference) -> None:
     """A loss of another reason, and one that is not counted."""
     early.edit(lambda summary: summary["links"]["smart"].update(lost_by={"cut": summary["links"]["smart"]["lost"]}))
     early.edit(lambda summary: summary["links"]["naive"].update(lost=0))
-    found = early.misses(reference, KILL)
-    assert [line for line in found if "losses of smart's link" in line], found
-    assert [line for line in found if "account of naive's link does not add up" in line], found
+    misses = early.misses(reference, KILL)
+    assert [line for line in misses if "losses of smart's link" in line], misses
+    assert [line for line in misses if "account of naive's link does not add up" in line], misses
 
 
 def progress(done: int, at: float) -> dict[str, Any]:
@@ -314,9 +314,9 @@ def test_files_that_others_may_read_and_files_of_a_run_that_goes_on_are_seen(
 ) -> None:
     """The results have the seed and the truth; a control file has a password."""
     (ended.out / "control.json").touch(mode=0o644)
-    found = ended.misses(reference)
-    assert [line for line in found if "others may use run/control.json, whose mode is 644" in line], found
-    assert [line for line in found if "run/control.json is left of the run" in line], found
+    misses = ended.misses(reference)
+    assert [line for line in misses if "others may use run/control.json, whose mode is 644" in line], misses
+    assert [line for line in misses if "run/control.json is left of the run" in line], misses
 
 
 def test_messages_on_wrong_keys_must_be_listed(ended: Ended, reference: Reference) -> None:
@@ -384,13 +384,13 @@ def test_a_leftover_that_has_left_us_is_found_by_its_folder(moving: Path) -> Non
 
 def test_a_suspended_leftover_is_found(tmp_path: Path) -> None:
     """A stopped process ends only by force, and what it does is said."""
-    before = frozenset(one.pid for one in ours.descendants())
+    before = frozenset(process.pid for process in ours.descendants())
     sleeping = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], env={"TMPDIR": str(tmp_path)})
     sleeping.send_signal(signal.SIGSTOP)
     begun = time.monotonic()
     left = ours.none_left(before, 0.2, tmp_path)
     assert time.monotonic() - begun >= 0.2
-    assert [one.pid for one in left] == [sleeping.pid]
+    assert [process.pid for process in left] == [sleeping.pid]
     sleeping.kill()
     sleeping.wait()
     assert ours.none_left(before, 0.0, tmp_path) == []

@@ -51,20 +51,20 @@ def _ended(
     peer, trial, block = key
     if peer == _CONTROLLER and not complete:  # its reports may come later than the slots that are joined
         return False
-    ends = [other for name, one, other in wanted if (name, one) == (peer, trial) and other > block]
+    ends = [other for name, number, other in wanted if (name, number) == (peer, trial) and other > block]
     return min(ends, default=int(reference.summary["slots"])) <= slots
 
 
 def _uneven(tables: Mapping[str, pa.Table], slots: int) -> Iterator[str]:
     """Slots beyond those of the summary, which only some shards have reached: every table has them for every receiver."""
-    found = {}
+    ends = {}
     for name, column in (("slots", "peer"), ("journal", "link"), ("trials", "peer")):
         rows = zip(tables[name]["slot"].to_pylist(), tables[name][column].to_pylist(), strict=True)
-        found[name] = Counter(key for key in rows if key[0] >= slots)
-    if found["slots"].keys() != found["journal"].keys():
+        ends[name] = Counter(key for key in rows if key[0] >= slots)
+    if ends["slots"].keys() != ends["journal"].keys():
         yield "slots and journal have rows of different slots beyond those that all trials have"
-    if found["trials"].keys() != found["slots"].keys() or len({*_by_slot(found["trials"])}) > len(
-        {slot for slot, _ in found["trials"]}
+    if ends["trials"].keys() != ends["slots"].keys() or len({*_by_slot(ends["trials"])}) > len(
+        {slot for slot, _ in ends["trials"]}
     ):
         yield "trials has rows of different slots, or of some receivers only, beyond those that all trials have"
 

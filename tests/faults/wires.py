@@ -59,14 +59,14 @@ _APPEAR_SECONDS = 120.0
 _END_SECONDS = 90.0
 _LEAVE_SECONDS = 60.0
 _SETTLE_SECONDS = 0.4
-"""For what was handed on before the wire ended to come to the subscriber."""
+"""Time for messages that the wire handed on before its end to reach the subscriber."""
 _LOST_IN_ZENOH = 40
 """Messages that a wire may have given to Zenoh in the instant before it was killed, and that did not go out."""
 
 
 @dataclass(frozen=True)
 class WireFault:
-    """What happens to one start of a wire, at the end of which it is over."""
+    """The fault in one start of a wire, which also ends it."""
 
     kind: str
     target: str
@@ -125,7 +125,9 @@ def carried_out(case: WireCase, folder: Path, before: frozenset[int]) -> Iterato
         starts.append(start)
         yield from _started(fault, start, folder, f"start-{number + 1}")
         left = ours.none_left(before, _LEAVE_SECONDS, temporary)
-        yield from (f"process {one.pid} is left: {' '.join(one.words)}; {ours.doing(one.pid)}" for one in left)
+        yield from (
+            f"process {process.pid} is left: {' '.join(process.words)}; {ours.doing(process.pid)}" for process in left
+        )
         ours.end_all(left)
         yield from (f"{path} is left" for path in sorted(temporary.iterdir()))
     out = folder / "out"
@@ -193,11 +195,11 @@ def _started(fault: WireFault, start: Start, folder: Path, name: str) -> Iterato
     start.sent = set(_written(folder / name / "sent"))
     start.received = _written(folder / name / "received")
     wanted = -signal.SIGKILL if fault.kind == "kill" else 0
-    said = (folder / f"{name}.err").read_text(errors="replace")
+    text = (folder / f"{name}.err").read_text(errors="replace")
     if start.status != wanted:
-        yield f"status {start.status} after {fault.kind}: {said.strip()[-300:]}"
-    if "Traceback (most recent call last)" in said or "panicked at" in said:
-        yield f"a traceback: {said.strip().splitlines()[-1]}"
+        yield f"status {start.status} after {fault.kind}: {text.strip()[-300:]}"
+    if "Traceback (most recent call last)" in text or "panicked at" in text:
+        yield f"a traceback: {text.strip().splitlines()[-1]}"
 
 
 def _until(there: Any, seconds: float) -> bool:
@@ -209,18 +211,18 @@ def _until(there: Any, seconds: float) -> bool:
     return True
 
 
-def _endpoints(wire: subprocess.Popen[bytes], said: Path) -> list[str] | None:
+def _endpoints(wire: subprocess.Popen[bytes], output: Path) -> list[str] | None:
     """Where the sides listen, as the wire says."""
-    found: dict[str, str] = {}
+    endpoints: dict[str, str] = {}
 
     def look() -> bool:
-        for line in said.read_text().splitlines():
+        for line in output.read_text().splitlines():
             words = line.split()
             if len(words) > 1 and words[0] in ("robot", "base") and "/" in words[1]:
-                found[words[0]] = words[1]
-        return len(found) == 2 or wire.poll() is not None
+                endpoints[words[0]] = words[1]
+        return len(endpoints) == 2 or wire.poll() is not None
 
-    return [found["robot"], found["base"]] if _until(look, _APPEAR_SECONDS) and len(found) == 2 else None
+    return [endpoints["robot"], endpoints["base"]] if _until(look, _APPEAR_SECONDS) and len(endpoints) == 2 else None
 
 
 def _written(path: Path) -> list[tuple[str, int]]:
@@ -233,11 +235,11 @@ def _written(path: Path) -> list[tuple[str, int]]:
 
 def wrong_numbers(rows: Mapping[int, list[dict[str, Any]]]) -> Iterator[str]:
     """The numbers of each key's messages go on over all starts, without a gap and without one twice."""
-    found = defaultdict(list)
+    numbered = defaultdict(list)
     for start in rows.values():
         for row in start:
-            found[row["link"], row["key"], row["kind"]].append(row["n"])
-    for stream, numbers in found.items():
+            numbered[row["link"], row["key"], row["kind"]].append(row["n"])
+    for stream, numbers in numbered.items():
         if sorted(numbers) != list(range(len(numbers))):
             twice = [n for n, count in Counter(numbers).items() if count > 1][:3]
             gaps = sorted(set(range(max(numbers))) - set(numbers))[:3]
@@ -272,7 +274,7 @@ def true_to_receivers(number: int, start: Start, rows: list[dict[str, Any]]) -> 
     where = f"start {number}"
     killed = start.status != 0
     got = Counter(start.received)
-    if twice := [one for one, count in got.items() if count > 1]:
+    if twice := [message for message, count in got.items() if count > 1]:
         yield f"{where}: {twice[0]} arrived {got[twice[0]]} times"
     ours_only = [row for row in rows if row["key"] in KEYS]
     by_fate = defaultdict(set)
@@ -316,7 +318,7 @@ def _summary(out: Path, rows: list[dict[str, Any]], start: int) -> Iterator[str]
     for name, link in summary["links"].items():
         of_link = [row for row in rows if row["link"] == name]
         counts = Counter(row["fate"] for row in of_link)
-        found = (link["heard"], link["delivered"], sum(link["lost_by"].values()), sum(link["dropped_by"].values()))
+        account = (link["heard"], link["delivered"], sum(link["lost_by"].values()), sum(link["dropped_by"].values()))
         wanted = (len(of_link), counts["delivered"], counts["lost"], counts["dropped"])
-        if found != wanted:
-            yield f"link {name} heard, delivered, lost and dropped {found}, and by the journal {wanted}"
+        if account != wanted:
+            yield f"link {name} heard, delivered, lost and dropped {account}, and by the journal {wanted}"

@@ -219,7 +219,8 @@ def test_whatever_is_drawn_is_a_scenario(
         spans = happening(scenario, name)
         for (_, end, _), (start, _, _) in pairwise(spans):
             assert end is None or start > end
-    assert scenario.timeline.acts
+    # A single partition may hit no receiver.
+    assert scenario.timeline.acts or faults == ["partition"]
 
 
 def test_the_same_faults_live_and_in_memory(tmp_path: Path) -> None:

@@ -55,16 +55,16 @@ def test_processes_are_asked_before_they_are_killed() -> None:
     assert willing.signals == [signal.SIGCONT, signal.SIGTERM]
     assert stays.signals == [signal.SIGCONT, signal.SIGTERM, SHOW_STACKS, signal.SIGKILL]
     assert gone.signals == [signal.SIGCONT]
-    assert all(one.stdin.closed for one in (willing, stays, gone))
+    assert all(process.stdin.closed for process in (willing, stays, gone))
 
 
 def test_a_process_that_cannot_be_killed_is_waited_for_with_a_limit() -> None:
     """As on a dead disk: the grace, the time for stacks, and the time after the kill are all that it gets."""
     hangs = Stubborn(ends_with=0)
     end_all([hangs])
-    limits = [one for one in hangs.waited if one is not None]
+    limits = [seconds for seconds in hangs.waited if seconds is not None]
     assert len(limits) == len(hangs.waited) == 3
-    assert all(0.0 < found <= most for found, most in zip(limits, (GRACE_SECONDS, 0.3, KILLED_SECONDS), strict=True))
+    assert all(0.0 < limit <= most for limit, most in zip(limits, (GRACE_SECONDS, 0.3, KILLED_SECONDS), strict=True))
     assert limits[0] > 1.0
 
 

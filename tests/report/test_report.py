@@ -314,9 +314,9 @@ def test_a_lane_has_a_pixel_for_every_slot_or_the_worst_of_several() -> None:
         lane = GroupCounts(len(codes), PIXELS, len(colours))
         for part in np.array_split(codes, 7):
             lane.add(part)
-        found = strip(lane.highest if worst else lane.commonest, colours, "label")
-        assert not isinstance(found, str)
-        data = base64.b64decode(str(found.get("src")).partition(",")[2])
+        image = strip(lane.highest if worst else lane.commonest, colours, "label")
+        assert not isinstance(image, str)
+        data = base64.b64decode(str(image.get("src")).partition(",")[2])
         return list(np.asarray(Image.open(BytesIO(data)).convert("RGB"))[0].reshape(-1, 3).tolist())
 
     codes = np.array([0, 2, 1, 1, 0], np.uint8)

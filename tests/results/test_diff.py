@@ -113,9 +113,9 @@ def test_a_run_cut_short_before_its_first_block_is_compared_by_its_rows(
         table = pq.read_table(short / f"{name}.parquet")
         kept = table.filter(pc.less(table["slot"], 20)) if name == "trials" else table.slice(0, 0)
         pq.write_table(kept, short / f"{name}.parquet")
-    found = difference(load_results(short), runs["again"])
-    assert found.same, found.text
-    assert found.text.startswith("no difference in 80 rows of recorded trials; ")
+    difference_found = difference(load_results(short), runs["again"])
+    assert difference_found.same, difference_found.text
+    assert difference_found.text.startswith("no difference in 80 rows of recorded trials; ")
     other = difference(load_results(short), runs["other seed"])
     assert not other.same
     assert other.text.startswith("first difference: slot 0")

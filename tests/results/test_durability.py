@@ -50,15 +50,15 @@ ResultsWriter.checkpoint = lambda *all: None
 
 def kill_all(live: Live) -> None:
     """Kill -9 of the command and of all its processes, at once."""
-    found: list[int] = []
+    processes: list[int] = []
     # Stopped first, so that none can notice that another one is gone, and until none is left that may start others.
-    while started := [pid for pid in (live.process.pid, *live.left()) if pid not in found]:
-        found += started
+    while started := [pid for pid in (live.process.pid, *live.left()) if pid not in processes]:
+        processes += started
         _send(signal.SIGSTOP, started)
-    _send(signal.SIGKILL, found)
+    _send(signal.SIGKILL, processes)
     live.process.communicate()
     wait_until(lambda: not live.left(), "no process left of the run")
-    wait_until(lambda: all(map(ended, found)), "processes that have let go of their files")
+    wait_until(lambda: all(map(ended, processes)), "processes that have let go of their files")
 
 
 def _send(number: signal.Signals, processes: list[int]) -> None:

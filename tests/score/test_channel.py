@@ -93,12 +93,12 @@ def test_a_link_with_another_model_is_flagged(name: str) -> None:
 
 def test_every_loss_has_a_reason_in_a_run_cut_short() -> None:
     """Late packets that the receiver has not taken when the run ends are under way."""
-    one = scenario(3)
-    tally = tally_of(one, "slow")
+    lossy = scenario(3)
+    tally = tally_of(lossy, "slow")
     assert tally.late_sent > tally.late == 0
-    found = link_summary_of(one, "slow", tally)
-    assert found.lost_by["underway"] == tally.late_sent + tally.lost["underway"]
-    assert sum(found.lost_by.values()) == found.lost
+    account = link_summary_of(lossy, "slow", tally)
+    assert account.lost_by["underway"] == tally.late_sent + tally.lost["underway"]
+    assert sum(account.lost_by.values()) == account.lost
 
 
 def test_the_interval_is_clopper_and_pearsons() -> None:

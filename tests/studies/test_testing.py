@@ -175,12 +175,10 @@ def test_a_report_holds_what_xml_cannot() -> None:
     assert (case[1].tag, case[1].get("message"), case[1].text) == ("error", known, f"{known}\nsecond")
 
 
-@pytest.mark.parametrize("jobs", [pytest.param("1", marks=pytest.mark.long), "2"])
-def test_an_interrupt_ends_the_tests_and_leaves_no_process(evedrop: Evedrop, jobs: str) -> None:
-    """Ctrl-C in the middle of a live run: exit 130, a report of what was done, no process and no brief left."""
-    written(evedrop.folder / "cases", a=HOLDS, b=ENDLESS)
+def in_the_second(*words: str, evedrop: Evedrop) -> Live:
+    """`evedrop test cases` once its first scenario has passed and a later one is running."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "evedrop", "test", "cases", "--jobs", jobs, "--junit", "report.xml"],
+        [sys.executable, "-m", "evedrop", "test", "cases", *words],
         cwd=evedrop.folder,
         env=evedrop.environment,
         stdout=subprocess.PIPE,
@@ -189,10 +187,17 @@ def test_an_interrupt_ends_the_tests_and_leaves_no_process(evedrop: Evedrop, job
     )
     live = Live(process, evedrop.temporary, evedrop.folder)
     assert process.stdout is not None
-    first = process.stdout.readline()
-    assert first.startswith("passed")
+    assert process.stdout.readline().startswith("passed")
     live.child("sensor")
-    process.send_signal(signal.SIGINT)
+    return live
+
+
+@pytest.mark.parametrize("jobs", [pytest.param("1", marks=pytest.mark.long), "2"])
+def test_an_interrupt_ends_the_tests_and_leaves_no_process(evedrop: Evedrop, jobs: str) -> None:
+    """Ctrl-C in the middle of a live run: exit 130, a report of what was done, no process and no brief left."""
+    written(evedrop.folder / "cases", a=HOLDS, b=ENDLESS)
+    live = in_the_second("--jobs", jobs, "--junit", "report.xml", evedrop=evedrop)
+    live.process.send_signal(signal.SIGINT)
     done = live.end()
     assert done.status == 130
     assert "interrupted" in done.err
@@ -204,23 +209,12 @@ def test_an_interrupt_ends_the_tests_and_leaves_no_process(evedrop: Evedrop, job
 def test_an_interrupt_ends_tests_whose_processes_are_suspended(evedrop: Evedrop) -> None:
     """They are continued, so that they end their runs."""
     written(evedrop.folder / "cases", a=HOLDS, b=ENDLESS)
-    process = subprocess.Popen(
-        [sys.executable, "-m", "evedrop", "test", "cases", "--jobs", "2"],
-        cwd=evedrop.folder,
-        env=evedrop.environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    live = Live(process, evedrop.temporary, evedrop.folder)
-    assert process.stdout is not None
-    assert process.stdout.readline().startswith("passed")
-    live.child("sensor")
+    live = in_the_second("--jobs", "2", evedrop=evedrop)
     jobs = [pid for pid, command in live.left().items() if "scenario_test_jobs import work" in command]
     assert jobs
     for pid in jobs:
         os.kill(pid, signal.SIGSTOP)
-    process.send_signal(signal.SIGINT)
+    live.process.send_signal(signal.SIGINT)
     assert live.end().status == 130
     live.nothing_left()
 

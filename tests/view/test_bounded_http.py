@@ -1,4 +1,4 @@
-"""The HTTP servers of views and metrics answer nobody who asks for a foreign host."""
+"""The HTTP servers of views and metrics refuse requests that name a foreign host."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ def _machine(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize(("text", "host"), OWN.items())
 def test_addresses_and_private_names_are_our_own(text: str, host: str) -> None:
-    """What no name of somebody else can be, whichever way the reader takes, such as a forwarded port."""
+    """Names that cannot belong to somebody else, also by a forwarded port."""
     assert own_host(text) == host
 
 
 @pytest.mark.parametrize("text", FOREIGN)
 def test_other_names_are_foreign(text: str) -> None:
-    """A name that somebody may have given our address, and what is not a host."""
+    """A name that may point to our address, and texts that are not hosts."""
     assert own_host(text) is None
 
 

@@ -37,7 +37,7 @@ def drawing(rrd: Path) -> int | None:
             words = (folder / "cmdline").read_text().split("\0")
             parent = (folder / "stat").read_text().rpartition(")")[2].split()[1]
             if "--headless" in words and Path(words[0]).name == "rerun":
-                assert str(rrd) not in words, "it would send the recording to whoever has its port"
+                assert str(rrd) not in words, "any program at its port would get the recording"
                 if str(rrd) in Path(f"/proc/{parent}/cmdline").read_text().split("\0"):
                     return int(folder.name)
         except OSError:

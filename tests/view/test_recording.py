@@ -198,7 +198,7 @@ os._exit(0)
 
 def test_full_disk_ends_the_recording_and_not_the_run(tmp_path: Path) -> None:
     """When the file can grow no more, adding and closing still end in time, and the reason is kept."""
-    command = [sys.executable, "-c", FULL_DISK, str(Path(__file__).parent), str(tmp_path / "r.rrd")]
+    command = [sys.executable, "-B", "-c", FULL_DISK, str(Path(__file__).parent), str(tmp_path / "r.rrd")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT, check=True)
     assert done.stdout.startswith("unsafe the recording is incomplete")
 

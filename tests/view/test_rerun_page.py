@@ -71,10 +71,10 @@ def test_the_parts_are_where_they_are(tmp_path: Path) -> None:
     for order in ((PAGE, SCRIPT, MODULE), (MODULE, PAGE, SCRIPT)):
         for after in (b"", b"\0\0\0\0", b"\0\2\0\0", b"\1\1\0", b"\xff", b"\0asm\1\0\0\0", b"\0\x7f\1\xff"):
             (tmp_path / "rerun").write_bytes(b"ELF" + b"..".join([*decoys, *(part + after for part in order)]))
-            found = RerunPage(tmp_path / "rerun")
-            assert found.html.encode() == PAGE
-            assert b"".join(found.pieces(found.script)) == SCRIPT
-            assert b"".join(found.pieces(found.program)) == MODULE
+            page = RerunPage(tmp_path / "rerun")
+            assert page.html.encode() == PAGE
+            assert b"".join(page.pieces(page.script)) == SCRIPT
+            assert b"".join(page.pieces(page.program)) == MODULE
 
 
 @pytest.mark.parametrize(

@@ -80,7 +80,7 @@ def test_off_starts_nothing(tmp_path: Path) -> None:
 
 @LINUX
 def test_only_loopback_listens(viewer: Viewer, tmp_path: Path) -> None:
-    """We serve page and recording ourselves, on 127.0.0.1; there is no process of Rerun, and no log."""
+    """Evedrop itself serves page and recording, on 127.0.0.1: it starts no Rerun process and writes no log."""
     assert viewer.address is not None
     for url in (viewer.address, data_of(viewer)):
         assert places(os.getpid(), urlsplit(url).port) == ["0100007F"]
@@ -208,8 +208,8 @@ def test_nobody_can_connect_to_a_window(tmp_path: Path) -> None:
         assert pid is not None
         assert places(pid) == ["0100007F"]
         with socket.socket() as probe:
-            found = probe.connect_ex(("127.0.0.1", port_of(pid)))
-        assert (found == errno.ECONNREFUSED) == (started.warning is None)
+            error = probe.connect_ex(("127.0.0.1", port_of(pid)))
+        assert (error == errno.ECONNREFUSED) == (started.warning is None)
     finally:
         started.stop()
     assert not started.alive()

@@ -95,8 +95,8 @@ def zenoh() -> None:
     config_of = side.side_config
 
     def with_administration(*arguments: Any) -> dict[str, Any]:
-        found = json.loads(json.dumps(config_of(*arguments)))
-        return {**found, "adminspace": {"enabled": True, "permissions": {"read": True, "write": False}}}
+        config = json.loads(json.dumps(config_of(*arguments)))
+        return {**config, "adminspace": {"enabled": True, "permissions": {"read": True, "write": False}}}
 
     patch.object(side, "side_config", with_administration).start()
 

@@ -39,9 +39,9 @@ def test_asking_for_the_administration_while_others_declare_stops_no_side(tmp_pa
         with program([endpoint]) as session:
             while not over.is_set():
                 for question in QUESTIONS:
-                    found = [str(reply.ok.key_expr) for reply in session.get(question, timeout=5.0) if reply.ok]
+                    keys = [str(reply.ok.key_expr) for reply in session.get(question, timeout=5.0) if reply.ok]
                     # A session may look at itself: its own part tells of no other.
-                    replies.extend(key for key in found if not key.startswith(f"@/{session.zid()}/"))
+                    replies.extend(key for key in keys if not key.startswith(f"@/{session.zid()}/"))
                     asked[0] += 1
 
     def declare(endpoint: str) -> None:
@@ -94,8 +94,8 @@ def test_no_side_answers_questions_about_its_router(protected: bool, tmp_path: P
         zids = {name: side.zid for name, side in wire_there.relay.sides.items()}
         with wire_there.program("robot", **login) as robot:
             for question in (*QUESTIONS, *(f"@/{zid}/**" for zid in zids.values())):
-                found = [str(reply.ok.key_expr) for reply in robot.get(question, timeout=5.0) if reply.ok]
-                assert [key for key in found if not key.startswith(f"@/{robot.zid()}/")] == []
+                keys = [str(reply.ok.key_expr) for reply in robot.get(question, timeout=5.0) if reply.ok]
+                assert [key for key in keys if not key.startswith(f"@/{robot.zid()}/")] == []
 
 
 @pytest.mark.parametrize(

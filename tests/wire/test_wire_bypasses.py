@@ -39,12 +39,12 @@ def multicast(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 def bypasses(at: WireAtWork) -> list[str]:
     """The ways past the wire that its journal has."""
-    return [said.line for said in at.journal.events if said.bypass]
+    return [event.line for event in at.journal.events if event.bypass]
 
 
-def told(at: WireAtWork, said: str) -> bool:
+def told(at: WireAtWork, beginning: str) -> bool:
     """Whether the latest way past the wire begins with these words."""
-    return any(line.startswith(said) for line in bypasses(at)[-1:])
+    return any(line.startswith(beginning) for line in bypasses(at)[-1:])
 
 
 def test_a_program_in_mode_peer_is_reported_once(tmp_path: Path) -> None:
@@ -93,17 +93,17 @@ def test_a_program_that_scouts_by_multicast_is_reported_where_mode_peer_is_allow
     with at_work(plan, tmp_path) as at, at.program("base", **silent):
         for _ in range(2):
             with at.program("base", **silent, scouting={"multicast": multicast}) as peer:
-                said = f"the program {peer.zid()} at side base answers multicast scouting, although"
-                wait_until(partial(told, at, said), "it is reported")
+                beginning = f"the program {peer.zid()} at side base answers multicast scouting, although"
+                wait_until(partial(told, at, beginning), "it is reported")
         assert at.told == bypasses(at)
 
 
 def test_programs_that_connect_again_and_again_do_not_fill_the_journal() -> None:
     """After some, one line says that there are more."""
     lines: list[str] = []
-    found = Bypasses(lines.append)
+    ways = Bypasses(lines.append)
     for number in range(3 * MOST):
-        found.add(f"way {number}")
+        ways.add(f"way {number}")
     assert lines[:MOST] == [f"way {number}" for number in range(MOST)]
     assert [re.search(r"more than (\d+) ways", line) is not None for line in lines[MOST:]] == [True]
 
@@ -126,8 +126,10 @@ def test_a_wire_past_which_programs_could_speak_has_no_verdict(tmp_path: Path) -
     with pytest.raises(ExpectationFailed, match=r"is in mode peer[^\n]*\n.*heard below 1: FAILED"), running:
         use()
     summary = running.typed_summary()
-    assert [one.event.split()[0] for one in summary.bypasses] == ["the"]
-    assert [(one.held, one.why) for one in summary.expectations] == [(None, "programs could speak past the wire")]
+    assert [bypass.event.split()[0] for bypass in summary.bypasses] == ["the"]
+    assert [(judged.held, judged.why) for judged in summary.expectations] == [
+        (None, "programs could speak past the wire")
+    ]
     assert wire_outcome(summary) == (
         "no verdict, because programs could speak past the wire; 1 of 1 expectations FAILED",
         False,

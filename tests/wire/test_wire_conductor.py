@@ -37,14 +37,14 @@ CUT, WHOLE = frozenset({"robot-base"}), frozenset[str]()
 def test_events_happen_at_their_times() -> None:
     """Not before and not after, each once, in the order of time; the start is the beginning of the `with` block."""
     clock = TestClock()
-    links, said = Applied(clock), list[str]()
+    links, lines = Applied(clock), list[str]()
     plan = plan_of(
         {"from": 12, "to": 60.5, "cut": "robot-base"}, {"at": 7, "note": "in the lift"}, {"at": 0, "note": "go"},
         {"from": 0.5, "to": 0.75, "cut": "robot-base"},
     )  # fmt: skip
-    conductor = WireConductor(plan, links, said.append, clock)  # type: ignore[arg-type]
+    conductor = WireConductor(plan, links, lines.append, clock)  # type: ignore[arg-type]
     assert [(at, cut) for at, cut, _ in links.at] == [(0.0, WHOLE)]
-    assert said == []
+    assert lines == []
     clock.sleep(100.0)
     with conductor:
         wait_until(lambda: len(links.at) == 7, "all events are carried out")
@@ -56,7 +56,7 @@ def test_events_happen_at_their_times() -> None:
         (112.0, CUT, ("cut robot-base",)),
         (160.5, WHOLE, ("heal robot-base",)),
     ]
-    assert said == [
+    assert lines == [
         "0.0 s: go",
         "0.5 s: cut robot-base",
         "0.8 s: heal robot-base",
@@ -70,8 +70,8 @@ def test_events_happen_at_their_times() -> None:
 def test_an_operator_changes_the_wire_at_once() -> None:
     """Its lines say when; what it began lasts until it ends it."""
     clock = TestClock()
-    links, said = Applied(clock), list[str]()
-    with WireConductor(plan_of(), links, said.append, clock) as conductor:  # type: ignore[arg-type]
+    links, lines = Applied(clock), list[str]()
+    with WireConductor(plan_of(), links, lines.append, clock) as conductor:  # type: ignore[arg-type]
         wait_until(lambda: len(links.at) == 2, "the wire begins")
         clock.sleep(3.25)
         assert conductor.seconds == 3.25
@@ -88,24 +88,24 @@ def test_an_operator_changes_the_wire_at_once() -> None:
         (5.75, CUT, ("partition robot, base",)),
         (6.75, WHOLE, ("heal robot, base",)),
     ]
-    assert said == [
+    assert lines == [
         "3.2 s: cut robot-base",
         "4.8 s: heal robot-base",
         "5.8 s: partition robot, base",
         "6.8 s: heal robot, base",
     ]
-    assert [(one.start, one.stop) for one in conductor.plan.events] == [(3.25, 4.75), (5.75, 6.75)]
+    assert [(event.start, event.stop) for event in conductor.plan.events] == [(3.25, 4.75), (5.75, 6.75)]
 
 
 def test_an_event_that_is_due_comes_before_what_an_operator_does() -> None:
     """Also if the thread of the events has not come to it: the operator's change is made to what the event made."""
     clock = TestClock()
-    links, said = Applied(clock), list[str]()
+    links, lines = Applied(clock), list[str]()
     # Without its thread: nobody else looks at the time.
-    conductor = WireConductor(plan_of({"at": 2, "cut": "robot-base"}), links, said.append, clock)  # type: ignore[arg-type]
+    conductor = WireConductor(plan_of({"at": 2, "cut": "robot-base"}), links, lines.append, clock)  # type: ignore[arg-type]
     clock.sleep(5.0)
     conductor.end_cut("robot-base")
-    assert said == ["2.0 s: cut robot-base", "5.0 s: heal robot-base"]
+    assert lines == ["2.0 s: cut robot-base", "5.0 s: heal robot-base"]
     assert [(cut, lines) for _, cut, lines in links.at] == [
         (WHOLE, ()),
         (WHOLE, ()),
@@ -117,8 +117,8 @@ def test_an_event_that_is_due_comes_before_what_an_operator_does() -> None:
 def test_the_clock_of_a_wire_is_that_of_the_machine() -> None:
     """Unless another one is handed in."""
     before = time.monotonic()
-    found = SystemClock().monotonic()
-    assert before <= found <= time.monotonic()
+    now = SystemClock().monotonic()
+    assert before <= now <= time.monotonic()
     with WireConductor(plan_of(), Applied(TestClock()), print) as conductor:  # type: ignore[arg-type]
         assert 0.0 <= conductor.seconds <= time.monotonic() - before
         wait_until(lambda: conductor.seconds > 0.0, "time passes")

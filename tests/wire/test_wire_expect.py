@@ -35,26 +35,32 @@ def mistakes(**table: Any) -> list[str]:
 )
 def test_an_expectation_in_words(table: dict[str, Any], subject: str, text: str) -> None:
     """Its link, and the part of a sentence that says what is expected; a length of time is in seconds."""
-    found = WireExpectTable.model_validate(table)
-    assert (found.subject, found.text) == (subject, text)
+    expectation = WireExpectTable.model_validate(table)
+    assert (expectation.subject, expectation.text) == (subject, text)
 
 
 def test_both_bounds_hold_together() -> None:
     """Nothing outside of them does."""
     table = WireExpectTable.model_validate({"figure": "scan.gap_seconds", "above": "1 s", "below": "2 s"})
-    assert [table.holds(found) for found in (0.5, 1.0, 1.5, 2.0, 2.5)] == [False, False, True, False, False]
+    assert [table.holds(value) for value in (0.5, 1.0, 1.5, 2.0, 2.5)] == [False, False, True, False, False]
 
 
 @pytest.mark.parametrize("bound", [-0.5, float("inf"), float("nan"), True, "1"])
 def test_a_bound_is_a_number_that_a_figure_can_reach(bound: Any) -> None:
     """Not below 0, not infinite, and a text only with a unit of time."""
-    assert [one.partition(":")[0] for one in mistakes(figure="scan.delivery", below=bound)] == ["expect.0.below"]
+    assert [mistake.partition(":")[0] for mistake in mistakes(figure="scan.delivery", below=bound)] == [
+        "expect.0.below"
+    ]
 
 
 def test_a_link_stands_alone() -> None:
     """Each other entry is named, and no others; None is as good as an entry that is not there."""
-    found = mistakes(link="scan", figure="scan.heard", quantile=0.5, above=1)
-    assert sorted(one.partition(":")[0] for one in found) == ["expect.0.above", "expect.0.figure", "expect.0.quantile"]
+    sentences = mistakes(link="scan", figure="scan.heard", quantile=0.5, above=1)
+    assert sorted(mistake.partition(":")[0] for mistake in sentences) == [
+        "expect.0.above",
+        "expect.0.figure",
+        "expect.0.quantile",
+    ]
     assert WireExpectTable.model_validate({"link": "scan", "figure": None, "below": None}).link == "scan"
 
 

@@ -183,7 +183,7 @@ def test_a_quality_replaces_a_loss_and_the_other_way_round(link: str, tmp_path: 
     path.write_text(RADIO)
     both = {f"link.{link}.quality": 0.9, "link.robot-base.loss": {"model": "pattern", "outcomes": "10"}}
     plan = load_wire(path, both)
-    assert [one.settings["loss"]["model"] for one in plan.links] == ["pattern", "bernoulli"]
+    assert [link.settings["loss"]["model"] for link in plan.links] == ["pattern", "bernoulli"]
     assert plan.links[1].settings["loss"]["quality"] == 0.9
     assert (
         load_wire(path, {f"link.{link}": {"from": "base", "to": "robot"}}).links[1].settings["loss"]["quality"] == 1.0

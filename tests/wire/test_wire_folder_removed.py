@@ -18,11 +18,17 @@ from tests.conftest import wait_until
 from tests.wire.wire_at_work import program
 from tests.wire.wire_plans import wire_plan
 
+
+def removed_at_once(folder: Path) -> None:
+    """Remove a folder so that nobody can see it half removed."""
+    shutil.rmtree(folder.rename(folder.with_name("gone")))
+
+
 LOST: dict[str, tuple[Callable[[Path], object], str, bool]] = {
-    "all": (shutil.rmtree, "out/journal", False),
+    "all": (removed_at_once, "out/journal", False),
     "moved": (lambda out: out.rename(out.with_name("elsewhere")), "out/journal", False),
-    "journal": (lambda out: shutil.rmtree(out / "journal"), "out/journal", True),
-    "unfinished": (lambda out: shutil.rmtree(out / "journal" / "unfinished"), "out/journal/unfinished", True),
+    "journal": (lambda out: removed_at_once(out / "journal"), "out/journal", True),
+    "unfinished": (lambda out: removed_at_once(out / "journal" / "unfinished"), "out/journal/unfinished", True),
 }
 """What happens to a wire's folder → how, which folder is named, and whether the summary can be written."""
 
@@ -41,7 +47,7 @@ def removed_while_it_runs(running: RunningWire, remove: Callable[[Path], object]
             wait_until(lambda: robot.put("before", b"") or "before" in got, "messages cross")
             remove(running.folder)
             (said,) = wait_until(lambda: errors_of(running), "it is said at once")
-            assert f"{folder} was removed or moved while the wire runs, so the wire has no journal any more" in said
+            assert f"{folder} was removed or moved while the wire runs, so the wire no longer has a journal" in said
             wait_until(lambda: robot.put("after", b"") or "after" in got, "messages go on crossing")
 
 

@@ -1,4 +1,4 @@
-"""A wire of which a part hangs ends all the same: by its watchdog, which names that part, or upon a second signal."""
+"""A wire with a part that hangs still ends: its watchdog ends it and names the part, or a second signal ends it."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ REPOSITORY = Path(__file__).parents[2]
 
 
 class Wire:
-    """A wire in a process of its own, of which a part hangs."""
+    """A wire in its own process, with a part that hangs."""
 
     def __init__(self, how: str, folder: Path, *options: str) -> None:
         """how: the function of `hanging_wire` that makes it hang; options: of the command."""
@@ -72,7 +72,7 @@ class Wire:
 
 @contextmanager
 def hanging(how: str, folder: Path, *options: str) -> Iterator[Wire]:
-    """A wire of which a part hangs; it is killed if it does not end."""
+    """A wire with a part that hangs; the fixture kills it if it does not end."""
     wire = Wire(how, folder, *options)
     try:
         yield wire
@@ -97,12 +97,12 @@ def heard(wire: Wire) -> int:
 
 def is_on_disk(wire: Wire) -> None:
     """What the wire heard is on disk, can be read, and the next start goes on from there."""
-    found = summary_of_wire(wire.out)
-    assert found.state == "killed"
-    assert found.heard > 0
+    summary = summary_of_wire(wire.out)
+    assert summary.state == "killed"
+    assert summary.heard > 0
     assert not (wire.out / "control.json").exists()
     with WireJournal(wire.out, load_wire(wire.file)) as journal:
-        assert journal.recovered == found.heard
+        assert journal.recovered == summary.heard
         assert journal.start == 2
 
 

@@ -283,7 +283,7 @@ def test_a_history_goes_on_although_its_session_has_another_id(killed: bool, tmp
         decide = LinkState(plan.links[0], plan, second).lane("query", "scan/1/@adv/pub/bb/1/_", lossless=False)
         assert decide(time.time(), 8)[0] == 3
         changes = second.changes_of("scan", "scan/1/@adv/*/cc/9/**", "query")
-        assert [(one.at, one.settings) for one in changes] == [(0, LOSSY), (2, BETTER), (3, LOSSY)]
+        assert [(change.at, change.settings) for change in changes] == [(0, LOSSY), (2, BETTER), (3, LOSSY)]
 
 
 KILLED = """

@@ -70,9 +70,16 @@ def test_a_message_waits_for_those_before_it(tmp_path: Path) -> None:
         sent = [
             decide(now, size) for now, size in ((5.0, 50), (5.0, 50), (5.0, 50), (5.05, 50), (9.0, LARGEST), (9.0, 1))
         ]
-    assert [one[:2] for one in sent] == [(0, 0), (1, 0), (2, Crossing.OVERFLOW), (3, 0), (4, 0), (5, Crossing.OVERFLOW)]
-    assert [one[2] for one in sent] == pytest.approx([0.3, 0.35, 0.0, 0.35, 0.35, 0.0])
-    assert [one[3] for one in sent] == [True, True, False, True, True, False]
+    assert [decision[:2] for decision in sent] == [
+        (0, 0),
+        (1, 0),
+        (2, Crossing.OVERFLOW),
+        (3, 0),
+        (4, 0),
+        (5, Crossing.OVERFLOW),
+    ]
+    assert [decision[2] for decision in sent] == pytest.approx([0.3, 0.35, 0.0, 0.35, 0.35, 0.0])
+    assert [decision[3] for decision in sent] == [True, True, False, True, True, False]
 
 
 def test_what_is_not_delivered_has_no_delay_and_no_copy(tmp_path: Path) -> None:
@@ -105,16 +112,16 @@ def test_other_settings_hold_from_the_next_message_on(tmp_path: Path) -> None:
         assert [scan(0.0, 10), pose(0.0, 10)] == [(3, 0, 2.0, False), (0, 0, 3.0, False)]
         state.change(SLOW)
         assert scan(0.0, 10) == (4, 0, 0.25, True)
-        found = [[one.at for one in journal.changes_of("robot-base", key, "put")] for key in ("scan", "pose")]
-    assert [at[-2:] for at in found] == [[3, 4], [0, 1]]
+        messages = [[change.at for change in journal.changes_of("robot-base", key, "put")] for key in ("scan", "pose")]
+    assert [at[-2:] for at in messages] == [[3, 4], [0, 1]]
 
 
 def test_two_who_ask_for_a_key_share_its_messages(lossy: LinkState) -> None:
     """They have one sequence of numbers, with one sequence of fates."""
     fates = KeyFates(lossy.link, "scan", "put", 7)
     two = [lossy.lane("put", "scan", lossless=False) for _ in range(2)]
-    found = [two[n % 2](float(n), 1)[:2] for n in range(20)]
-    assert found == [(n, fates.next()[0]) for n in range(20)]
+    decisions = [two[n % 2](float(n), 1)[:2] for n in range(20)]
+    assert decisions == [(n, fates.next()[0]) for n in range(20)]
 
 
 @pytest.mark.parametrize("lossless", [False, True])
@@ -139,13 +146,13 @@ def test_the_keys_of_a_history_are_numbered_together(lossy: LinkState) -> None:
     fates = KeyFates(lossy.link, "map/@adv/**", "put", 7)
     due = [fates.next()[0] for _ in range(40)]
     decide, other = lossy.lane("put", first, False), lossy.lane("put", second, False)
-    found = [lane(0.0, 1) for _ in range(10) for lane in (decide, other)]
+    decisions = [lane(0.0, 1) for _ in range(10) for lane in (decide, other)]
     lossy.forget("put", first)
-    found += [other(0.0, 1) for _ in range(10)]
+    decisions += [other(0.0, 1) for _ in range(10)]
     lossy.forget("put", second)
     decide = lossy.lane("put", first, False)
-    found += [decide(0.0, 1) for _ in range(10)]
-    assert [one[:2] for one in found] == [*enumerate(due)]
+    decisions += [decide(0.0, 1) for _ in range(10)]
+    assert [decision[:2] for decision in decisions] == [*enumerate(due)]
 
 
 @pytest.mark.parametrize("lossless", [False, True])

@@ -1,4 +1,4 @@
-"""Keys that come once, and never again: what a wire declares and keeps for them."""
+"""Keys that come only once: what a wire declares for them and keeps of them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ BLOCK = zenoh.CongestionControl.BLOCK
 def declared(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The keys for which publishers are declared now; a key is frequent after 3 messages, and there is room for 8 keys."""
     monkeypatch.setattr("evedrop.wire.publications.OFTEN", 3)
-    monkeypatch.setattr("evedrop.wire.publications.MOST_KEYS", 8)
+    monkeypatch.setattr("evedrop.wire.publications.READY_KEYS", 8)
     monkeypatch.setattr("evedrop.wire.publications.MOST_PUBLISHERS", 2)
     keys: list[str] = []
     declare, release = Publishers.declare, Publishers.release
@@ -80,7 +80,7 @@ def test_publishers_are_declared_for_frequent_keys_only(tmp_path: Path, declared
             sent.append(str(len(sent)))
 
         def arrived() -> list[str]:
-            return [one.payload.to_string() for one in got if "ready" not in str(one.key_expr)]
+            return [sample.payload.to_string() for sample in got if "ready" not in str(sample.key_expr)]
 
         def new_keys(name: str) -> None:
             for n in range(40):
@@ -137,10 +137,10 @@ def test_keys_beyond_the_limit_are_dropped_and_the_wire_says_so(tmp_path: Path) 
         assert wire.fates("base-robot") == [Crossing.DELIVERED] * 5
         assert len(wire.told) == 1
         assert "the side robot have used 5 keys of 25 characters" in wire.told[0]
-        found = scorekeeper.links()["robot-base"]
-    assert found.dropped_by == {"too_many_keys": 6}
-    assert (found.heard, found.delivered, found.gap_messages) == (16, 10, 0)
-    assert scorekeeper_on_disk(tmp_path, wire.relay.plan).links()["robot-base"] == found
+        summary = scorekeeper.links()["robot-base"]
+    assert summary.dropped_by == {"too_many_keys": 6}
+    assert (summary.heard, summary.delivered, summary.gap_messages) == (16, 10, 0)
+    assert scorekeeper_on_disk(tmp_path, wire.relay.plan).links()["robot-base"] == summary
     rows = pa.concat_tables(journal_tables(tmp_path)).to_pylist()
     assert [row["key"] for row in rows if row["reason"] == "too_many_keys"] == [None] * 6
     assert [row["key"] for row in rows[:5]] == [f"key/{n}" for n in range(5)]

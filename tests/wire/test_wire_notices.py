@@ -79,12 +79,12 @@ def test_a_lane_tells_how_much_was_lost() -> None:
 
 def test_the_share_of_a_link_counts_every_message() -> None:
     """For whatever reason it was not delivered; a silent link has no share."""
-    for found, state in (
+    for stretch, state in (
         ({}, LaneState.QUIET), ({Crossing.DELIVERED: 3}, LaneState.DELIVERED),
         ({Crossing.DELIVERED: 3, Crossing.REFUSED: 2}, LaneState.SOME),
         ({Crossing.DELIVERED: 2, Crossing.CUT: 1, Crossing.LOST: 1}, LaneState.MOST),
     ):  # fmt: skip
-        assert share_of(steps_of(found).counts[0, 0]) is state
+        assert share_of(steps_of(stretch).counts[0, 0]) is state
 
 
 def test_the_main_reason_decides_on_a_lane() -> None:

@@ -186,7 +186,7 @@ def test_why_a_message_does_not_cross(
 
 def test_a_key_that_was_forgotten_goes_on_with_its_next_fate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With room for two keys, three in turns have the fates that each would have alone, with the settings of their link."""
-    monkeypatch.setattr("evedrop.wire.publications.MOST_KEYS", 2)
+    monkeypatch.setattr("evedrop.wire.publications.READY_KEYS", 2)
     plan = both_ways({"loss": {"model": "gilbert-elliott", "p": 0.2, "r": 0.3}})
     keys = ("a", "b", "c")
     with at_work(plan, tmp_path) as wire, wire.program("robot") as sender:

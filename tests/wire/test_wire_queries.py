@@ -186,7 +186,7 @@ def test_a_lost_question_does_not_stop_an_advanced_subscriber(tmp_path: Path) ->
         )
         got: list[str] = []
         subscriber: Any = advanced_subscriber(
-            base, "map", lambda one: got.append(one.payload.to_string()),
+            base, "map", lambda sample: got.append(sample.payload.to_string()),
             recovery=RecoveryConfig(heartbeat=True, periodic_queries=None),
         )  # fmt: skip
         wait_until(lambda: publisher.put("first") or got, "the subscriber is known")

@@ -60,8 +60,8 @@ def test_a_first_start_and_one_without_messages_continue_nothing(tmp_path: Path)
     """Only a second start says so; the numbers of queries are named as such."""
     first: list[str] = []
     second: list[str] = []
-    for said in (first, second):
-        assert run_wire(wire_plan(), tmp_path / "out", seconds=0.01, say=said.append) == 0
+    for lines in (first, second):
+        assert run_wire(wire_plan(), tmp_path / "out", seconds=0.01, say=lines.append) == 0
     assert [line for line in first if "continues" in line] == []
     assert "start 2 continues start 1, which numbered no message" in second
     assert continuation(3, {("up", "a", "query"): 7}).startswith(
@@ -83,8 +83,10 @@ def test_a_wire_that_was_killed_goes_on_with_its_fates(evedrop: Evedrop) -> None
     done = wire.end()
     assert done.status == 0, done.err
     assert "messages were recovered from an earlier start, which was killed; their numbers go on" in done.out
-    said = f"start 2 continues start 1: message {COUNT + 1} of scan on the link scan is next, and likewise for 1 more; for the "
-    assert said in done.out
+    sentence = (
+        f"start 2 continues start 1: message {COUNT + 1} of scan on the link scan is next, and likewise for 1 more; "
+    )
+    assert sentence in done.out
     (link, _) = load_wire(path).links
     fates = KeyFates(link, "scan", "put", 7)
     assert arrived == [n for n in range(2 * COUNT) if fates.next()[0] == 0]

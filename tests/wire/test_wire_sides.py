@@ -31,13 +31,13 @@ def test_the_endpoint_has_the_real_port(protocol: str) -> None:
     """A program can connect there. And a fixed port is told as it is."""
     port = free_port()
     with (
-        SideSession(Side("a", (f"{protocol}/127.0.0.1:0",)), 100) as one,
+        SideSession(Side("a", (f"{protocol}/127.0.0.1:0",)), 100) as side,
         SideSession(Side("b", (f"tcp/127.0.0.1:{port}",)), 100) as other,
     ):
-        assert one.endpoints[0].startswith(f"{protocol}/127.0.0.1:")
-        with program(one.endpoints) as session:
-            assert [str(router) for router in session.info.routers_zid()] == [one.zid]
-        assert not one.endpoints[0].endswith(":0")
+        assert side.endpoints[0].startswith(f"{protocol}/127.0.0.1:")
+        with program(side.endpoints) as session:
+            assert [str(router) for router in session.info.routers_zid()] == [side.zid]
+        assert not side.endpoints[0].endswith(":0")
         assert other.endpoints == (f"tcp/127.0.0.1:{port}",)
 
 
@@ -96,7 +96,7 @@ def test_a_router_that_joins_two_sides_is_reported_and_nothing_goes_round(tmp_pa
             robot.put("stop", b"")
             wait_until(lambda: len(wire.rows_of("stop")), "the wire hears a lossless one")
             assert set(wire.rows_of("stop")["fate"]) == {Crossing.LOOPED}
-            (bypass,) = [said.line for said in wire.journal.events if said.bypass]  # programs speak past the wire
+            (bypass,) = [event.line for event in wire.journal.events if event.bypass]  # programs speak past the wire
             assert "outside the wire, through the router " in bypass
         wait_until(lambda: any("no longer pass between the sides" in line for line in wire.told), "its end is reported")
         got = reader(base, "y")

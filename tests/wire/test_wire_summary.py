@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from evedrop.errors import ScenarioError, UsageError
-from evedrop.report.wire import wire_failures, wire_sentences, wire_table
+from evedrop.report.wire import WITHOUT_MODEL, wire_failures, wire_sentences, wire_table
 from evedrop.report.writing import write_report
 from evedrop.results.wire_folder import WIRE_FILE
 from evedrop.results.wire_summary import WireLinkSummary, WireSummary
@@ -236,7 +236,7 @@ link = "scan"
         write_report(tmp_path)
     nothing, status = run(tmp_path / "silent", plan, messages=0)
     assert status == 1
-    assert {(one["held"], one["why"]) for one in nothing["expectations"]} == {(None, "the link heard nothing")}
+    assert {(judged["held"], judged["why"]) for judged in nothing["expectations"]} == {(None, "the link heard nothing")}
     (tmp_path / "silent" / WIRE_FILE).write_text(resolved_wire(plan))
     write_report(tmp_path / "silent")
     page = checked(tmp_path / "silent")
@@ -425,3 +425,8 @@ def test_the_page_lists_every_figure_of_a_link() -> None:
     page = (Path(__file__).parents[2] / "docs" / "wire.md").read_text(encoding="utf-8")
     section = page.partition("## Expectations")[2].partition("\n## ")[0]
     assert [name for name in WIRE_FIGURES if name not in section] == []
+
+
+def test_the_report_names_the_reasons_on_which_no_model_decided() -> None:
+    """As a fate says of itself, so that a new one is not forgotten."""
+    assert {fate.name.lower() for fate in Crossing if not fate.decided} == WITHOUT_MODEL

@@ -27,7 +27,7 @@ _OF_THE_ROOT = {
 """Pages outside docs/, and their names on the site."""
 
 _OF_THE_REPOSITORY = re.compile(r"\[([^\]\n]+)\]\(((?:tests/|CITATION\.cff)[^)#\n]*)\)")
-"""A link to a file of the repository that is no page of the site."""
+"""A link to a file that the repository has and the site has not."""
 
 _ENTRY = re.compile(r"(^```.*?^```|`[^`\n]*`)|\]\[", re.DOTALL | re.MULTILINE)
 """The middle of M[i][j], which would be read as a link, outside of code."""

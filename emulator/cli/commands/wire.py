@@ -46,7 +46,7 @@ def wire(options: argparse.Namespace) -> int:
     from evedrop.results.folder import results_folder
     from evedrop.wire.run import run_wire
 
-    gc.freeze()  # what is imported stays: otherwise the collector looks at all of it each time that there are more keys
+    gc.freeze()  # imported modules stay: the collections that new keys cause need not look at them
     with results_folder(options.out, f"wire-{options.file.stem}") as folder:
         said = {"say": _hush, "complain": complain} if options.quiet else {"say": _say}
         with zenoh_log_apart():

@@ -14,7 +14,6 @@ import secrets
 import shutil
 import signal
 import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,7 +22,7 @@ from evedrop.environment import own_environment
 from evedrop.errors import UsageError
 from evedrop.live.network.endpoint import can_be_socket
 from evedrop.names import ROUTER
-from evedrop.processes import kill
+from evedrop.processes import kill, signalled_when_parent_dies
 
 _PREFIX = "evedrop-"
 _LOCK = "lock"
@@ -34,13 +33,6 @@ _GUARD_SECONDS = 5.0
 _GUARD = (
     "while read -r _; do :; done; tries=0; "
     'while [ -e "$1" ] && [ $tries -lt 50 ]; do rm -rf -- "$1" 2>/dev/null || sleep 0.2; tries=$((tries + 1)); done'
-)
-
-
-# The system continues the shell if it is suspended when the launcher dies: PR_SET_PDEATHSIG is 1, and survives exec.
-_CONTINUED = (
-    "import ctypes, os, signal, sys; ctypes.CDLL(None).prctl(1, int(signal.SIGCONT), 0, 0, 0); "
-    "os.execv(sys.argv[1], sys.argv[1:])"
 )
 
 
@@ -96,9 +88,9 @@ def _unmade(error: OSError) -> UsageError:
 
 def _guard(folder: Path) -> subprocess.Popen[bytes]:
     """Start the shell that removes the folder when the launcher is dead; called before the folder is made."""
-    first = [sys.executable, "-I", "-S", "-c", _CONTINUED] if sys.platform == "linux" else []
+    # A suspended shell would not notice that the launcher is dead.
     return subprocess.Popen(
-        [*first, "/bin/sh", "-c", _GUARD, "sh", str(folder)],
+        signalled_when_parent_dies(["/bin/sh", "-c", _GUARD, "sh", str(folder)], signal.SIGCONT),
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,

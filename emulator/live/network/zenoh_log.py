@@ -43,7 +43,7 @@ def zenoh_log_apart() -> Iterator[None]:
             stack.enter_context(stdout.at(former, of=_STDOUT))
         reading, writing = os.pipe()
         lines = os.fdopen(reading, "rb")
-        # A thread of Zenoh never waits for us: it may hold what a thread of Python waits for.
+        # A thread of Zenoh must never wait for us: it may hold a lock that a Python thread waits for.
         os.set_blocking(writing, False)
         os.dup2(writing, _STDOUT)
         os.close(writing)
