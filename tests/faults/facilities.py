@@ -110,17 +110,17 @@ def limited(command: list[str], memory: int | None, processes: int | None, name:
 
     memory: megabytes of address space; processes: how many processes and threads may run.
     """
-    script, group = [], None
+    # Not with ulimit: the shell of Debian 13 cannot limit processes.
+    limits: list[str] = []
+    group = None
     if memory is not None:
-        script.append(f"ulimit -v {memory * 1000}")
+        limits.append(f"--as={memory * 1_024_000}")
     if processes is not None and os.geteuid() == 0:
         group = process_group(name, processes)
-        script.append(f"echo $$ > {group}/cgroup.procs")
+        command = ["sh", "-c", f'echo $$ > {group}/cgroup.procs && exec "$@"', "sh", *command]
     elif processes is not None:
-        script.append(f"ulimit -u {_threads_of_ours() + processes}")
-    if not script:
-        return command, None
-    return ["sh", "-c", " && ".join([*script, 'exec "$@"']), "sh", *command], group
+        limits.append(f"--nproc={_threads_of_ours() + processes}")
+    return (["prlimit", *limits, "--", *command] if limits else command), group
 
 
 def _threads_of_ours() -> int:

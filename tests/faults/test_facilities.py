@@ -18,10 +18,12 @@ from tests.faults.wires import Start, lost_by_model
 from tests.privileged import CannotRun, skip
 
 HUNGRY = "x = bytes(500_000_000)"
+# For an ordinary user, the threads that other processes end meanwhile are free again: so there are many.
 THREADS = """
 import threading
+threading.stack_size(65536)
 ended = threading.Event()
-for _ in range(40):
+for _ in range(2000):
     threading.Thread(target=ended.wait, daemon=True).start()
 """
 
