@@ -85,8 +85,7 @@ class TrialsTask(Task[BatchResult]):
         expected = {name: np.zeros(scenario.slots) for name in scenario.receivers}
         histograms = {name: SlotHistograms(1, 1.0) for name in scenario.receivers}
         (block, _) = _empty_block(scenario, self, self.start, expected)
-        for tally in block.totals.tallies.values():
-            tally.watched.begin()
+        block.totals.begin()
         return BatchResult(self.start, [block], histograms, histograms, [Slots.example(scenario.receivers)])
 
 

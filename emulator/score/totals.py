@@ -51,6 +51,11 @@ class Totals:
             FilterTally.from_scenario(scenario),
         )
 
+    def begin(self) -> None:
+        """Make the tallies of packages' figures now, not with the first slot: an example of all that totals consist of."""
+        for tally in self.tallies.values():
+            tally.watched.begin()
+
     @property
     def failures(self) -> list[str]:
         """Why figures of packages failed, in words."""

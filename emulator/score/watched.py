@@ -71,12 +71,16 @@ class GuardedTally(FigureTally):
             self._tally = found
         return self._tally
 
+    def fail(self, why: str) -> None:
+        """From now on the figure is None; why: in words."""
+        self.failure, self._tally = f"the figure {self._name} of an installed package failed: {why}", None
+
     def _asked(self, ask: Callable[[], T]) -> T | None:
         if not self.failure:
             try:
                 return ask()
             except Exception as error:
-                self.failure = f"the figure {self._name} of an installed package failed: {place_of(error)}"
+                self.fail(place_of(error))
         return None
 
 
@@ -188,14 +192,18 @@ class Watched:
 
     def begin(self) -> None:
         """Make the tallies of packages' figures now, not with the first slot."""
-        for kept in self._kept.values():
-            if isinstance(kept, GuardedTally):
-                kept.begin()
+        for tally in self.of_packages.values():
+            tally.begin()
+
+    @property
+    def of_packages(self) -> dict[WatchedSlots, GuardedTally]:
+        """The tallies of packages' figures."""
+        return {watch: tally for watch, tally in self._kept.items() if isinstance(tally, GuardedTally)}
 
     @property
     def failures(self) -> list[str]:
         """Why figures of packages failed, in words."""
-        return [one.failure for one in self._kept.values() if isinstance(one, GuardedTally) and one.failure]
+        return [tally.failure for tally in self.of_packages.values() if tally.failure]
 
     def tally(self, watch: WatchedSlots) -> FigureTally:
         """The tally of a quantity over its slots."""

@@ -72,6 +72,22 @@ def test_a_figure_of_a_package_needs_nothing_here(evedrop: Evedrop) -> None:
     assert "largest_error" not in FIGURES.names
 
 
+def test_a_tally_that_is_not_data_fails_alone_in_shards(evedrop: Evedrop) -> None:
+    """An instance where a new tally has none could be of any class; the run and its other figures are not concerned."""
+    becomes = "    def add(self, slots):\n        self.last = type('Last', (), {})()\n        self.last.k = 1\n"
+    module = of_the_docs().replace("    def add(self, slots):\n", becomes)
+    module = module.replace(
+        "    def __init__(self, trials):\n", "    def __init__(self, trials):\n        self.last = None\n"
+    )
+    run = ("run", "eavesdroppers", "--view", "off", "--set", "shards=2", "--json", *RUN)
+    done = evedrop.process(*run, "--out", "shards", env=installed(evedrop, module))
+    assert done.status == 3
+    assert "a shard cannot store its tally (an instance where the example has none); docs/your-own.md says" in done.err
+    smart = json.loads(done.out)["peers"]["smart"]
+    assert smart["largest_error"] is None
+    assert smart["mean_squared_error"] > 0
+
+
 def test_a_figure_that_needs_states_is_null_without_them(evedrop: Evedrop) -> None:
     """And one of eavesdroppers is not the legitimate estimator's."""
     facts = "    needs_states = True\n    of = 'eavesdropper'\n    by_trial = True\n"

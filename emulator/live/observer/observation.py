@@ -347,7 +347,7 @@ class ObservedRun:
             for name, sums in self._joiner.trace_sums.items():
                 self._keeper.totals.tallies[name].know_traces(sums)
         if self._brief.part.shard:
-            dump_score(self._keeper.totals, folder)
+            dump_score(self._keeper.totals, folder, self._scenario)
         digests = {name: digest_of(self._scenario, name, blocks) for name, blocks in self._joiner.digests.items()}
         replay, wall = replay_of(folder, self._scenario), self._ended - self._started
         ending = Ending(
