@@ -30,6 +30,8 @@ HOST = "127.0.0.1"
 _LSOF = "/usr/sbin/lsof"
 _START_SECONDS = 120.0
 _STOP_SECONDS = 3.0
+_FOREIGN_PROBES = 5
+"""How often in succession a port must belong to another process before a viewer is given up."""
 
 # Rerun's settings: it reports no usage statistics, and writes nothing to the user's home.
 _CONFIG = Path(__file__).with_name("rerun_config")
@@ -148,28 +150,30 @@ def executable() -> Path:
 
 
 def _listens(process: subprocess.Popen[bytes], port: int) -> bool:
-    deadline = time.monotonic() + _START_SECONDS
-    while process.poll() is None and time.monotonic() < deadline:
-        if _is_there(process, port):
+    """Whether the process listens on the port in time; false if it ends first. Raises PortTaken if another one listens there."""
+    deadline, foreign = time.monotonic() + _START_SECONDS, 0
+    # A process that is about to end owns nothing any more, a moment before its port is closed: so one foreign probe is none.
+    while process.poll() is None and foreign < _FOREIGN_PROBES and time.monotonic() < deadline:
+        listened_at = _is_listened_at(process, port)
+        if listened_at and (is_apart(process) or owns(process.pid, port)):
             return True
+        foreign = foreign + 1 if listened_at else 0
         time.sleep(0.02)
+    if foreign == _FOREIGN_PROBES or (process.poll() is not None and _is_listened_at(process, port)):
+        raise PortTaken(
+            f"another process of this machine listens at {HOST}:{port}, where the viewer was to listen; nothing was shown to it. "
+            "Try again, choose the web view, or turn the view off"
+        )
     return False
 
 
-def _is_there(process: subprocess.Popen[bytes], port: int) -> bool:
-    """Whether the process listens on the port. Raises PortTaken if another one does."""
+def _is_listened_at(process: subprocess.Popen[bytes], port: int) -> bool:
+    """Whether any process listens on the port in the network of this process."""
     if is_apart(process):
         return bool(_inodes(process.pid, port))
     with socket.socket() as probe:
         probe.settimeout(1.0)
-        if probe.connect_ex((HOST, port)) != 0:
-            return False
-    if owns(process.pid, port):
-        return True
-    raise PortTaken(
-        f"another process of this machine listens at {HOST}:{port}, where the viewer was to listen; nothing was shown to it. Try "
-        "again, choose the web view, or turn the view off"
-    )
+        return probe.connect_ex((HOST, port)) == 0
 
 
 def owns(pid: int, port: int) -> bool:

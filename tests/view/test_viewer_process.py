@@ -17,7 +17,7 @@ from rerun.chunk import RrdReader
 
 from evedrop.errors import UsageError
 from evedrop.ports import free_port
-from evedrop.view import headless
+from evedrop.view import headless, viewer_process
 from evedrop.view.recording import ViewRecording
 from evedrop.view.viewer import Viewer, WebAddress
 from evedrop.view.viewer_process import _LSOF, PortTaken, _lsof_says, end, owns, spawn
@@ -180,6 +180,24 @@ def test_who_takes_the_port_of_a_viewer_gets_nothing(
         end(thief)
     with warnings.catch_warnings(action="ignore"):  # it has no footer
         assert not stolen.exists() or RrdReader(stolen).recordings() == []
+
+
+def test_a_viewer_that_ends_after_it_listened_is_no_stranger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As without a driver: it is said that it ended, and with which status."""
+    program = tmp_path / "viewer"
+    listens = "import socket, sys\nsocket.create_server(('127.0.0.1', int(sys.argv[-1]))).accept()\nsys.exit(7)\n"
+    program.write_text(f"#!{sys.executable}\n{listens}")
+    program.chmod(0o700)
+
+    def asked_too_late(pid: int, port: int) -> bool:
+        wait_until(lambda: gone(pid), "the viewer's end")
+        return owns(pid, port)
+
+    monkeypatch.setattr(viewer_process, "executable", lambda: program)
+    monkeypatch.setattr(viewer_process, "owns", asked_too_late)
+    port = free_port()
+    with pytest.raises(UsageError, match="the viewer ended with status 7"):
+        spawn(port, [str(port)], tmp_path)
 
 
 @pytest.fixture
