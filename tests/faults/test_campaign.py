@@ -20,8 +20,15 @@ from tests.faults.variants import VARIANTS
 from tests.faults.wires import WireCase
 
 ROOT = Path(__file__).parents[2]
-ENDURED, FAILED, INTERRUPTED, WIRE, STUDY = "218", "273", "190", "10", "34"
-"""Cases: a process that is suspended for a while, a killed estimator, a SIGTERM, a wire that ends twice, an interrupted study."""
+ENDURED, FAILED, INTERRUPTED, WIRE, STUDY = "326", "273", "190", "10", "34"
+WORDS = {
+    ENDURED: "stop sensor 0.9 s",
+    FAILED: "kill smart",
+    INTERRUPTED: "terminate launcher",
+    WIRE: "interrupt at 0.21 s; stop 1.5 s, terminate at",
+    STUDY: "interrupt study at 0.14; interrupt study at",
+}
+"""Case → its disturbance, on which its end depends."""
 
 
 @pytest.mark.parametrize(
@@ -58,6 +65,7 @@ def test_a_number_is_always_the_same_case() -> None:
     assert {fault.target for fault in faults} == {*processes, "launcher", EVERYBODY, "results"}
     assert {fault.shard for fault in faults} == {0, 1}
     assert {type(case) for case in cases} == {Case, WireCase, StudyCase}
+    assert [number for number, words in WORDS.items() if words not in str(case_of(int(number)))] == []
     wires = {fault.kind for case in cases if isinstance(case, WireCase) for fault in case.faults}
     assert wires == {"kill", "interrupt", "terminate", "hang up"}
     studies = {(fault.kind, fault.target) for case in cases if isinstance(case, StudyCase) for fault in case.faults}
