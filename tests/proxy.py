@@ -35,7 +35,12 @@ class Cable:
     @property
     def endpoint(self) -> str:
         """Where it listens, as Zenoh writes it."""
-        return f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
+        return f"tcp/127.0.0.1:{self.port}"
+
+    @property
+    def port(self) -> int:
+        """The port where it listens."""
+        return int(self._listener.getsockname()[1])
 
     @property
     def leads_somewhere(self) -> bool:

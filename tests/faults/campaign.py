@@ -33,6 +33,7 @@ from tests.faults.reference import Reference, in_memory
 from tests.faults.studies import StudyFault, Undisturbed
 from tests.faults.variants import Variant
 from tests.faults.wires import WireCase, WireFault
+from tests.sshd import Sshd, sshd
 
 T = TypeVar("T")
 
@@ -118,18 +119,20 @@ class Campaign:
     def _run(self, case: Case) -> Verdict:
         """Disturb a live run."""
         reference, usual = self.known(case.variant)
-        before = frozenset(process.pid for process in ours.descendants())
         folder = self.folder / str(case.seed)
         hits: dict[Fault, float] = {}
-        begun = time.monotonic()
-        with disturbed(case.variant, folder, case.options, case.wired, self._disk(case), case.limits) as run:
-            hung = _follow(run, case, usual, hits)
-            seconds = time.monotonic() - begun
-            if hung:
-                run.launcher.kill()
-            run.launcher.wait()
-            found = misses(run, hits, case.longest_outage, reference, before) if not hung else [hung]
-            ours.end_all(ours.none_left(before, 5.0 if hung else 0.0))
+        with _server(case.variant, folder) as server:
+            before = frozenset(process.pid for process in ours.descendants())
+            begun = time.monotonic()
+            disk = self._disk(case)
+            with disturbed(case.variant, folder, case.options, case.wired, disk, case.limits, server) as run:
+                hung = _follow(run, case, usual, hits)
+                seconds = time.monotonic() - begun
+                if hung:
+                    run.launcher.kill()
+                run.launcher.wait()
+                found = misses(run, hits, case.longest_outage, reference, before) if not hung else [hung]
+                ours.end_all(ours.none_left(before, 5.0 if hung else 0.0))
         return self._verdict(case, tuple(hits), found, outcome_of(run.launcher.returncode), seconds)
 
     def _disk(self, case: Case) -> str | None:
@@ -140,29 +143,49 @@ class Campaign:
         if variant.name not in self._known:
             folder = self.folder / variant.name
             folder.mkdir()
-            before = frozenset(one.pid for one in ours.descendants())
             reference = _begun(lambda: in_memory(variant.scenario(folder), folder / "memory"))
-            with disturbed(variant, folder / "live", ["--set", f"longest_outage={PATIENT_SECONDS}"]) as run:
-                try:
-                    run.launcher.wait(_UNDISTURBED_SECONDS)
-                except subprocess.TimeoutExpired:
-                    run.launcher.kill()
-                    ours.end_all(ours.none_left(before, 0.0))
-                    raise Refused(
-                        f"an undisturbed run of {variant.name} did not end within {_UNDISTURBED_SECONDS:.0f} s"
-                    ) from None
-                ended = time.monotonic()
-                run.over.wait(0.1)  # for the last news to be read
-                if run.launcher.returncode:
-                    ours.end_all(ours.none_left(before, 5.0))
-                    raise Refused(f"an undisturbed run of {variant.name} fails: {run.text('stderr')}")
-                wrong = misses(run, {}, PATIENT_SECONDS, reference, before)
-                if wrong or run.started is None or run.finished is None:
-                    raise Refused(f"an undisturbed run of {variant.name} is not as it must be: {'; '.join(wrong)}")
-                usual = Usual(run.started - run.begun, run.finished - run.started, ended - run.finished)
-                self._known[variant.name] = reference, usual
+            with _server(variant, folder / "live") as server:
+                self._known[variant.name] = reference, _usual(variant, folder / "live", reference, server)
             ours.reap()
         return self._known[variant.name]
+
+
+@contextmanager
+def _server(variant: Variant, folder: Path) -> Iterator[Sshd | None]:
+    """An sshd for one run of a variant, if it is over ssh.
+
+    Not one for all runs: while we have no other child, the system itself can say that a run has left no process.
+    """
+    if not variant.hosts:
+        yield None
+        return
+    place = folder / "sshd"
+    place.mkdir(parents=True)
+    with sshd(place) as server:
+        yield server
+
+
+def _usual(variant: Variant, folder: Path, reference: Reference, server: Sshd | None) -> Usual:
+    """How long an undisturbed run takes. Raises Refused if it does not keep what is promised."""
+    before = frozenset(one.pid for one in ours.descendants())
+    with disturbed(variant, folder, ["--set", f"longest_outage={PATIENT_SECONDS}"], server=server) as run:
+        try:
+            run.launcher.wait(_UNDISTURBED_SECONDS)
+        except subprocess.TimeoutExpired:
+            run.launcher.kill()
+            ours.end_all(ours.none_left(before, 0.0))
+            raise Refused(
+                f"an undisturbed run of {variant.name} did not end within {_UNDISTURBED_SECONDS:.0f} s"
+            ) from None
+        ended = time.monotonic()
+        run.over.wait(0.1)  # for the last news to be read
+        if run.launcher.returncode:
+            ours.end_all(ours.none_left(before, 5.0))
+            raise Refused(f"an undisturbed run of {variant.name} fails: {run.text('stderr')}")
+        wrong = misses(run, {}, PATIENT_SECONDS, reference, before)
+        if wrong or run.started is None or run.finished is None:
+            raise Refused(f"an undisturbed run of {variant.name} is not as it must be: {'; '.join(wrong)}")
+        return Usual(run.started - run.begun, run.finished - run.started, ended - run.finished)
 
 
 def _begun(work: Callable[[], T]) -> T:
@@ -193,6 +216,7 @@ def _follow(run: Disturbed, case: Case, usual: Usual, hits: dict[Fault, float]) 
         run.launcher.wait(limit)
     except subprocess.TimeoutExpired:
         hung = f"the run did not end within {limit:.0f} s"
+    run.ended = time.monotonic()
     run.over.set()
     for thread in threads:
         thread.join()

@@ -6,10 +6,19 @@ import random
 from dataclasses import dataclass
 
 from tests.faults.disturbed import CLEANER, FORK_SERVERS
-from tests.faults.kinds import CONFUSED, EVERYBODY, LIMITS, NEEDS, RESULTS, SIGNALS, Fault
+from tests.faults.hosts import (
+    CONNECTION,
+    HOST_CLEANER,
+    HOST_FORK_SERVER,
+    PROGRAM,
+    SESSION,
+    SSH,
+    target_on,
+)
+from tests.faults.kinds import CONFUSED, EVERYBODY, LIMITS, NEEDS, NETWORK, RESULTS, SIGNALS, Fault
 from tests.faults.moments import Moment
 from tests.faults.studies import StudyCase, study_case
-from tests.faults.variants import VARIANTS, Variant
+from tests.faults.variants import HOSTED, VARIANTS, Variant
 from tests.faults.wires import WireCase, wire_case
 
 PATIENT_SECONDS = 30.0
@@ -35,6 +44,10 @@ _WEIGHTS = {
 }
 _FAMILIES = {"live": 84, "wire": 9, "study": 7}
 _PHASES = {"start": 25, "run": 50, "finish": 25}
+_OVER_SSH = (16, 15)
+"""Numbers with this remainder, when divided by the first, are runs over ssh, drawn separately: all others stay as they were."""
+_PARTS = {SSH: 25, PROGRAM: 25, SESSION: 20, CONNECTION: 20, HOST_FORK_SERVER: 7, HOST_CLEANER: 3}
+_ON_HOSTS = {"kill": 5, "stop": 6, "stop and kill": 3, **dict.fromkeys(SIGNALS, 2)}
 
 
 _CONDITIONS = {CONFUSED: "confused", **{kind: limit[0] for kind, limit in LIMITS.items()}}
@@ -52,7 +65,7 @@ class Case:
     @property
     def wired(self) -> set[str]:
         """The processes that need a cable."""
-        names = {fault.target for fault in self.faults if fault.kind in ("flap", "cut", "silence")}
+        names = {fault.target for fault in self.faults if fault.kind in NETWORK}
         return {*self.variant.processes, *names} if EVERYBODY in names else names
 
     @property
@@ -74,7 +87,8 @@ class Case:
     @property
     def needs(self) -> set[str]:
         """The facilities that its faults need."""
-        return {NEEDS[fault.kind] for fault in self.faults if fault.kind in NEEDS}
+        over_ssh = {"sshd"} if self.variant.hosts else set()
+        return {NEEDS[fault.kind] for fault in self.faults if fault.kind in NEEDS} | over_ssh
 
     def __str__(self) -> str:
         return f"{self.variant.name}: {'; '.join(map(str, self.faults))}"
@@ -85,6 +99,9 @@ AnyCase = Case | WireCase | StudyCase
 
 def case_of(seed: int) -> AnyCase:
     """The case of a seed."""
+    count, remainder = _OVER_SSH
+    if seed % count == remainder:
+        return _case_over_ssh(seed)
     draw = random.Random(f"faults {seed}")  # noqa: S311 - a campaign must be repeatable
     (family,) = draw.choices([*_FAMILIES], [*_FAMILIES.values()])
     if family == "wire":
@@ -116,13 +133,60 @@ def _fault(draw: random.Random, variant: Variant, hasty: bool) -> Fault:
     if kind == "flap":
         count, seconds = draw.randint(1, 30), draw.uniform(0.1, 2.0)
     elif kind in ("stop", "stop and kill", "cut", "silence"):
-        seconds = draw.uniform(0.05, 1.2)
         # At its start a run waits for two minutes for a fork server that is suspended for good.
         waits = target == "launcher" or (target in FORK_SERVERS and phase == "start")
-        if hasty and not waits and draw.random() < 0.5:
-            # An outage is noticed when the lease of a connection, some seconds, has run out.
-            seconds = draw.choice((None, draw.uniform(3.0, 14.0)))
+        seconds = _lasting(draw, hasty and not waits)
     return Fault(kind, target, moment, shard, None if seconds is None else round(seconds, 2), count)
+
+
+def _lasting(draw: random.Random, long: bool) -> float | None:
+    """How long something lasts; None for good. long: whether it may be longer than a second."""
+    seconds = draw.uniform(0.05, 1.2)
+    if long and draw.random() < 0.5:
+        # An outage is noticed when the lease of a connection, some seconds, has run out.
+        return draw.choice((None, draw.uniform(3.0, 14.0)))
+    return seconds
+
+
+def _case_over_ssh(seed: int) -> Case:
+    """A run that is spread over hosts; its first fault, at least, disturbs a part of one of them."""
+    draw = random.Random(f"faults over ssh {seed}")  # noqa: S311 - a campaign must be repeatable
+    variant = draw.choice(list(HOSTED.values()))
+    hasty = draw.random() < 0.2
+    faults = [_fault_on_host(draw, variant, hasty)]
+    for _ in range(draw.choices((0, 1, 2), (5, 3, 2))[0]):
+        faults.append(_fault_on_host(draw, variant, hasty) if draw.random() < 0.5 else _other(draw, variant, hasty))
+    return Case(seed, variant, tuple(faults), HASTY_SECONDS if hasty else PATIENT_SECONDS)
+
+
+def _other(draw: random.Random, variant: Variant, hasty: bool) -> Fault:
+    """A fault of a process of the run, of the network, or of the launcher."""
+    while True:
+        fault = _fault(draw, variant, hasty)
+        if fault.kind not in LIMITS and fault.kind != CONFUSED and fault.target != RESULTS:
+            return fault
+
+
+def _fault_on_host(draw: random.Random, variant: Variant, hasty: bool) -> Fault:
+    (part,) = draw.choices([*_PARTS], [*_PARTS.values()])
+    target = target_on(part, draw.choice([*variant.hosts]))
+    phase = draw.choices([*_PHASES], [*_PHASES.values()])[0]
+    moment = Moment(phase, round(draw.random(), 3))
+    if part == CONNECTION:
+        kind = draw.choice(NETWORK)
+    elif part in (HOST_FORK_SERVER, HOST_CLEANER):
+        kind = draw.choice(("kill", "stop"))
+    else:
+        (kind,) = draw.choices([*_ON_HOSTS], [*_ON_HOSTS.values()])
+    if kind == "flap":
+        return Fault(kind, target, moment, seconds=round(draw.uniform(0.1, 2.0), 2), count=draw.randint(1, 5))
+    if kind not in ("stop", "stop and kill", "silence", "cut"):
+        return Fault(kind, target, moment)
+    # What is suspended for good at the start is waited for, for a minute or two.
+    seconds = _lasting(draw, hasty and phase != "start")
+    if kind == "stop" and part in (PROGRAM, SSH) and phase != "start" and draw.random() < 0.4:
+        seconds = None
+    return Fault(kind, target, moment, seconds=None if seconds is None else round(seconds, 2))
 
 
 def _target(draw: random.Random, kind: str, variant: Variant) -> str:
@@ -131,7 +195,7 @@ def _target(draw: random.Random, kind: str, variant: Variant) -> str:
     if kind == "stop and kill":
         return "launcher"
     peers = [name for name in variant.processes if name != "router"]
-    if kind in ("flap", "cut", "silence"):
+    if kind in NETWORK:
         return draw.choice([*peers, EVERYBODY])
     others = ["launcher", "router"]
     if kind in SIGNALS:

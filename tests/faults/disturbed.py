@@ -18,8 +18,10 @@ from typing import Any
 
 from tests.faults import ours
 from tests.faults.facilities import break_disk, limited, mount_breakable
+from tests.faults.hosts import Hosts, host_of, part_of
 from tests.faults.variants import Variant
 from tests.proxy import Cable
+from tests.sshd import Sshd
 
 _WITHIN = Path(__file__).with_name("within")
 CLEANER = "cleaner"
@@ -40,8 +42,9 @@ class Disturbed:
         wired: set[str],
         disk: str | None,
         limits: Mapping[str, int],
+        server: Sshd | None = None,
     ) -> None:
-        """wired: processes that reach their router through a cable.
+        """wired: processes that reach their router through a cable. server: for a variant that is spread over hosts.
 
         disk: `full` or `broken`, if the results have a disk of their own, on which that will happen. limits: `memory` and
         `processes`, as for `limited`; `confused`: after how many deliveries the router puts one on another receiver's key, too.
@@ -61,6 +64,8 @@ class Disturbed:
         """When the run was started, by the monotonic clock."""
         self.finished: float | None = None
         """When its last slot was or will be done, as far as can be told."""
+        self.ended: float | None = None
+        """When its launcher ended."""
         self.done = 0
         """How many slots it said are done."""
         self.told: list[dict[str, Any]] = []
@@ -68,12 +73,15 @@ class Disturbed:
         self.cables: dict[tuple[int, str], Cable] = {}
         self._shards: dict[str, int] = {}
         self._lock = threading.Lock()
+        self.hosts = Hosts(variant.hosts, folder, server) if server is not None else None
         self._asked = socket.socket(socket.AF_UNIX)
         self._asked.bind(str(folder / "asked"))
         self._asked.listen(64)
         threading.Thread(target=self._answer, daemon=True).start()
         self.begun = time.monotonic()
         words = [sys.executable, "-m", "evedrop", "run", variant.path(folder), *variant.options, *options]
+        if self.hosts is not None:
+            words += ["--hosts", str(self.hosts.path)]
         words, self._group = limited(
             [*words, "--out", str(self.out)],
             limits.get("memory"),
@@ -151,19 +159,26 @@ class Disturbed:
             self.finished = min(told["at"], self.finished or told["at"])
 
     @property
+    def temporaries(self) -> Mapping[str, Path]:
+        """Where processes put what is temporary: host → its folder, and "" → that of this machine."""
+        return {"": self.temporary, **({} if self.hosts is None else self.hosts.temporaries)}
+
+    @property
     def firsts(self) -> list[int]:
         """The first trial of each shard, in order, as far as they are known."""
         with self._lock:
             return sorted(set(self._shards.values()))
 
     def pids(self, name: str, shard: int = 0) -> list[int]:
-        """The living processes of a name in a shard: one, or none."""
+        """The living processes of a name in a shard, or of a part of a host: one, or none."""
         if name == "launcher":
             return [] if self.over.is_set() else [self.launcher.pid]
+        if self.hosts is not None and (host := host_of(name)):
+            return self.hosts.pids(part_of(name), host)
         if name == CLEANER:
-            return [process.pid for process in ours.descendants() if process.is_cleaner]
+            return sorted(process.pid for process in ours.marked(self.temporary) if process.is_cleaner)
         if name in FORK_SERVERS:
-            servers = [process.pid for process in ours.descendants() if process.is_fork_server]
+            servers = sorted(process.pid for process in ours.marked(self.temporary) if process.is_fork_server)
             return servers[:1] if name == FORK_SERVERS[0] else servers[1:2]
         firsts = self.firsts
         return [
@@ -171,11 +186,19 @@ class Disturbed:
             for one in ours.descendants()
             if one.brief is not None
             and one.brief.stem == name
-            and self._shards.get(str(one.brief.parent)) == (firsts[shard] if shard < len(firsts) else None)
+            and self._first_at(one.brief.parent) == (firsts[shard] if shard < len(firsts) else None)
         ]
 
+    def _first_at(self, private: Path) -> int | None:
+        """The first trial of the shard whose briefs are in a folder. A run over hosts has one shard, and a folder on each."""
+        if self.hosts is not None and private.parent in self.hosts.temporaries.values():
+            return next(iter(self.firsts), None)
+        return self._shards.get(str(private))
+
     def wires(self, name: str, shard: int = 0) -> list[Cable]:
-        """The cables of a process, or of `everybody`."""
+        """The cables of a process, of `everybody`, or of the connection with a host."""
+        if self.hosts is not None and (host := host_of(name)):
+            return [self.hosts.cable(host)]
         firsts = self.firsts
         if shard >= len(firsts):
             return []
@@ -215,6 +238,8 @@ class Disturbed:
         self._asked.close()
         for cable in self.cables.values():
             cable.close()
+        if self.hosts is not None:
+            self.hosts.close()
         if self._mounted:
             self._keep()
         if self._group is not None:
@@ -252,9 +277,10 @@ def disturbed(
     wired: set[str] | None = None,
     disk: str | None = None,
     limits: Mapping[str, int] | None = None,
+    server: Sshd | None = None,
 ) -> Iterator[Disturbed]:
     """A run that has been started; when the block ends its cables and its disk are gone."""
-    run = Disturbed(variant, folder, options or [], wired or set(), disk, limits or {})
+    run = Disturbed(variant, folder, options or [], wired or set(), disk, limits or {}, server)
     try:
         yield run
     finally:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tests.privileged import CannotRun
-from tests.sshd import program
+from tests.sshd import sshd
 
 _SHUT_DOWN = 0x8004587D  # EXT4_IOC_SHUTDOWN, with EXT4_GOING_FLAGS_NOLOGFLUSH: from now on everything is EIO
 _NO_LOG_FLUSH = (2).to_bytes(4, "little")
@@ -37,7 +37,7 @@ def facilities(mounts: bool, folder: Path) -> Facilities:
     trials: Mapping[str, Callable[[], object]] = {
         "a disk that breaks": lambda: _try_disk(mounts, folder),
         "a limit of processes": _try_processes,
-        "sshd": program,
+        "sshd": lambda: _try_sshd(folder),
     }
     lacks = {}
     for name, attempt in trials.items():
@@ -81,6 +81,16 @@ def break_disk(folder: Path) -> None:
         fcntl.ioctl(descriptor, _SHUT_DOWN, _NO_LOG_FLUSH)
     finally:
         os.close(descriptor)
+
+
+def _try_sshd(folder: Path) -> None:
+    place = folder / "sshd"
+    place.mkdir()
+    try:
+        with sshd(place):
+            pass
+    finally:
+        shutil.rmtree(place)
 
 
 def _try_processes() -> None:

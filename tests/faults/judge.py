@@ -13,9 +13,11 @@ from evedrop.results.writer import load_results
 from tests.faults import ours
 from tests.faults.disturbed import CLEANER, FORK_SERVERS
 from tests.faults.figures import unlike_rows
+from tests.faults.hosts import host_of
 from tests.faults.kinds import CONFUSED, KILLING, LIMITS, RESULTS, SIGNALS, Fault
 from tests.faults.looks import failed_looks
 from tests.faults.outages import wrong_outages
+from tests.faults.over_ssh import ended_late, may_leave_files, unlike_first_line, unlike_refusal
 from tests.faults.reference import Reference, tables_of, unlike
 from tests.faults.variants import Variant
 from tests.faults.whole import missing_rows
@@ -68,8 +70,12 @@ class Run(Protocol):
         """Its results, if they were moved."""
 
     @property
-    def temporary(self) -> Path:
-        """Where its processes put what is temporary."""
+    def temporaries(self) -> Mapping[str, Path]:
+        """Where its processes put what is temporary: host → its folder, and "" → that of this machine."""
+
+    @property
+    def ended(self) -> float | None:
+        """When its launcher ended."""
 
     @property
     def launcher(self) -> Launcher:
@@ -95,15 +101,15 @@ def misses(
     run: Run, hits: Mapping[Fault, float], longest_outage: float, reference: Reference, before: frozenset[int]
 ) -> list[str]:
     """The broken promises, now that the launcher has ended; hits: the faults that hit something, and when."""
-    left = ours.none_left(before, _LEAVE_SECONDS, run.temporary)
+    left = ours.none_left(before, _LEAVE_SECONDS, *run.temporaries.values())
     found = [f"process {one.pid} is left: {' '.join(one.words)}; {ours.doing(one.pid)}" for one in left]
     ours.end_all(left)
     status = run.launcher.returncode
     found += _of_status(status, run, hits, longest_outage, int(reference.summary["slots"]))
     found += _of_what_is_said(run, any(map(_of_limits, hits)))
-    # Without its cleaner, the folder of a killed launcher is removed by the next run.
-    if not (status == KILLED and any(fault.kind == "kill" and fault.target == CLEANER for fault in hits)):
-        found += [f"{path} is left" for path in sorted(run.temporary.iterdir())]
+    for host, folder in run.temporaries.items():
+        if not _may_leave_files(status, [*hits], host):
+            found += [f"{path} is left" for path in sorted(folder.iterdir())]
     found += _of_ports(run)
     if not any(fault.kind in ("remove", "break the disk") for fault in hits):
         found += _of_results(status, run, hits, reference)
@@ -111,30 +117,47 @@ def misses(
     return found
 
 
+def _may_leave_files(status: int, hits: Sequence[Fault], host: str) -> bool:
+    """Whether a private folder is removed by the next run only: its launcher, or host, and its cleaner were killed."""
+    if host:
+        return may_leave_files(hits, host)
+    return status == KILLED and any(fault.kind == "kill" and fault.target == CLEANER for fault in hits)
+
+
 def _of_status(status: int, run: Run, hits: Mapping[Fault, float], longest_outage: float, slots: int) -> Iterator[str]:
     """Whether the status, and the first line, say what happened; slots: of the whole run."""
     fatal = [fault for fault in hits if not fault.survived(longest_outage)]
+    if run.ended is not None:
+        yield from ended_late(run.told, run.ended, hits, slots)
     if status != 0 and not fatal:
         yield f"status {status}, although nothing of this may end a run: {_first_line(run)}"
     elif status == 0:
         yield from _of_ignored_signals(run, fatal, hits, slots)
-    elif status == UNUSABLE and any(map(_of_disk, fatal)):
-        if "cannot be written" not in _first_line(run):  # before anything was started
-            yield f"status 2: {_first_line(run)}"
+    elif status == UNUSABLE and (run.variant.hosts or any(map(_of_disk, fatal))):
+        yield from _of_refusal(run, fatal)
     elif status == FAILED:
         # Which process lacked something is said first, and what it lacked comes from its log.
         complaint = run.text("stderr") if any(map(_of_limits, fatal)) else _first_line(run)
         blamed = [word for fault in fatal for word in fault.blamed]
         if not any(word in complaint for word in blamed):
             yield f"the failure names none of {', '.join(blamed)}: {complaint or '(nothing was said)'}"
+        yield from unlike_first_line(_first_line(run), fatal, run.variant.hosts)
     elif status == INTERRUPTED:
-        if not any(fault.kind in SIGNALS for fault in fatal):
+        if not any(fault.kind in SIGNALS and not host_of(fault.target) for fault in fatal):
             yield "status 130, but no signal asked for the end"
     elif status == KILLED:
         if not any(fault.kind in KILLING and fault.target == "launcher" for fault in fatal):
             yield "the launcher was killed by something else"
     elif status != 0:
         yield f"status {status}: {_first_line(run)}"
+
+
+def _of_refusal(run: Run, fatal: Sequence[Fault]) -> Iterator[str]:
+    """Whether a run that ended before anything was started says why."""
+    if run.variant.hosts:
+        yield from unlike_refusal(_first_line(run), fatal, _folders(run))
+    elif "cannot be written" not in _first_line(run):
+        yield f"status 2: {_first_line(run)}"
 
 
 def _of_ignored_signals(run: Run, fatal: Sequence[Fault], hits: Mapping[Fault, float], slots: int) -> Iterator[str]:
@@ -159,7 +182,8 @@ def _first_line(run: Run) -> str:
 def _of_what_is_said(run: Run, limited: bool) -> Iterator[str]:
     """Tracebacks, wherever they are. limited: whether the run had too few threads or too little memory."""
     logs = [path for folder in _folders(run) for path in sorted(folder.glob("**/*.log"))]
-    for path in (run.folder / "stdout", run.folder / "stderr", *logs):
+    hosts = [run.folder / f"{host}.stderr" for host in run.variant.hosts]
+    for path in (run.folder / "stdout", run.folder / "stderr", *filter(Path.exists, hosts), *logs):
         try:
             text = path.read_text(errors="replace")
         except OSError:  # its disk is broken

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from tests.faults.disturbed import CLEANER, FORK_SERVERS, Disturbed
+from tests.faults.hosts import CONNECTION, HOST_CLEANER, HOST_FORK_SERVER, PROGRAM, SSH, host_of, part_of
 from tests.faults.moments import Moment, Usual
 
 SIGNALS = {"hang up": signal.SIGHUP, "interrupt": signal.SIGINT, "terminate": signal.SIGTERM}
@@ -32,7 +33,7 @@ _UNWRITTEN = (
     "cannot be started",
     "was removed while the run went on",
 )
-_NETWORK = ("flap", "cut", "silence")
+NETWORK = ("flap", "cut", "silence")
 _WITHOUT = (
     "not enough memory",
     "no further process or thread can be started",
@@ -56,7 +57,7 @@ class Fault:
 
     kind: str
     target: str
-    """A process, `everybody` of the network, or the `results`."""
+    """A process, a part of a host, `everybody` of the network, or the `results`."""
     moment: Moment
     shard: int = 0
     seconds: float | None = None
@@ -87,17 +88,32 @@ class Fault:
 
     def survived(self, longest_outage: float) -> bool:
         """Whether the run must go on to the end as if nothing had happened."""
-        if self.target == CLEANER:
+        if self.target == CLEANER or part_of(self.target) == HOST_CLEANER:
             return True
         # On a busy machine a router takes its time to be back, and so do connections.
         patient = longest_outage >= _PATIENT_SECONDS
-        if self.kind in (*_NETWORK, "stop"):
+        if self.is_ignored:
+            return patient
+        if part_of(self.target) == CONNECTION and self.kind != "silence":
+            return False  # ssh does not connect again
+        if self.kind in (*NETWORK, "stop"):
             return patient and self.seconds is not None
         return patient and (self.kind == CONFUSED or (self.kind == "kill" and self.target in _ROUTERS))
 
     @property
+    def is_ignored(self) -> bool:
+        """Whether a host's program, or the client of the connection with it, is suspended for good while the run goes on.
+
+        Nobody needs them then, and the run ends within half a minute of its last slot. Source: docs/hosts.md, how it ends.
+        """
+        return self.kind == "stop" and self.seconds is None and part_of(self.target) in (PROGRAM, SSH)
+
+    @property
     def blamed(self) -> tuple[str, ...]:
         """What a failure that this fault causes may name."""
+        if host := host_of(self.target):
+            named = (f"host {host}",)
+            return (*named, "fork server") if part_of(self.target) == HOST_FORK_SERVER else named
         if self.target == RESULTS:
             return _UNWRITTEN
         if self.kind in LIMITS:
@@ -140,8 +156,8 @@ def _heeds(pid: int) -> bool:
 def _send(number: signal.Signals) -> Callable[[Fault, Disturbed], bool]:
     def strike(fault: Fault, run: Disturbed) -> bool:
         hit = False
-        if fault.target == "launcher" and fault.kind in SIGNALS:
-            _awaited(lambda: [True] if _heeds(run.launcher.pid) else [], run)
+        if fault.kind in SIGNALS and (fault.target == "launcher" or part_of(fault.target) == PROGRAM):
+            _awaited(lambda: [pid for pid in run.pids(fault.target, fault.shard) if _heeds(pid)], run)
         for pid in _process(fault, run):
             with suppress(ProcessLookupError):
                 os.kill(pid, number)
@@ -157,6 +173,8 @@ def _stop(fault: Fault, run: Disturbed) -> bool:
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGSTOP)
     run.over.wait(fault.seconds)  # for good: until the launcher has ended, which ends or frees it
+    if fault.is_ignored:
+        return bool(process)  # it is freed or ended with the connection
     for pid in process:
         if pid in run.pids(fault.target, fault.shard):
             with suppress(ProcessLookupError):

@@ -105,27 +105,26 @@ def _look() -> frozenset[int]:
     return frozenset(found)
 
 
-def marked(temporary: Path) -> Iterator[Process]:
-    """All living processes whose TMPDIR is this folder, including those that have a new parent."""
-    mark = f"TMPDIR={temporary}".encode()
+def marked(*temporaries: Path) -> Iterator[Process]:
+    """All living processes whose TMPDIR is one of these folders, including those that have a new parent."""
+    marks = {f"TMPDIR={temporary}".encode() for temporary in temporaries}
     for folder in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
-            if mark in (folder / "environ").read_bytes().split(b"\0") and folder.name != str(os.getpid()):
+            if marks & {*(folder / "environ").read_bytes().split(b"\0")} and folder.name != str(os.getpid()):
                 state = (folder / "stat").read_text().rpartition(")")[2].split()[0]
                 if state not in "ZX":
                     yield Process(int(folder.name), tuple(words_of(folder.name)))
 
 
-def none_left(before: frozenset[int], seconds: float, temporary: Path | None = None) -> list[Process]:
+def none_left(before: frozenset[int], seconds: float, *temporaries: Path) -> list[Process]:
     """Wait until no descendants are left except the earlier ones; returns those that remain after this number of seconds.
 
-    temporary: the run's folder for temporary files, by which its processes are known as well.
+    temporaries: the run's folders for temporary files, by which its processes are known as well.
     """
     deadline = time.monotonic() + seconds
     while True:
         left = {process.pid: process for process in descendants() if process.pid not in before}
-        if temporary is not None:
-            left |= {process.pid: process for process in marked(temporary) if process.pid not in before}
+        left |= {process.pid: process for process in marked(*temporaries) if process.pid not in before}
         if not left and (before or not _has_children()):
             return []
         if left and time.monotonic() > deadline:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from tests.faults.hosts import host_of
 from tests.faults.kinds import CONFUSED, EVERYBODY, Fault
 
 _ROUTERS = ("router", "relay")
@@ -47,6 +48,8 @@ def wrong_outages(
 def _explained(process: str, struck: Mapping[Fault, float]) -> bool:
     """Whether a fault can have cut a process off. Routers, and the observer, stand for all that were connected to them."""
     for fault in struck:
+        if fault.kind in _CUTTING and host_of(fault.target):
+            continue  # the processes on a host talk with their router directly
         if fault.kind in _CUTTING and (fault.target in (process, EVERYBODY) or process in (*_ROUTERS, "observer")):
             return True
         if fault.kind not in _CUTTING and fault.target not in ("results", "cleaner"):

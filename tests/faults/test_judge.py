@@ -2,54 +2,33 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
-import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 import pytest
 
-from evedrop import montecarlo
-from evedrop.results.writer import JOURNAL, load_results
+from evedrop.results.writer import load_results
 from tests.conftest import wait_until
-from tests.faults import judge, ours
-from tests.faults.cases import PATIENT_SECONDS
-from tests.faults.fates import journal_rows
+from tests.faults import ours
+from tests.faults.ended import Ended
 from tests.faults.kinds import CONFUSED, EVERYBODY, Fault
 from tests.faults.moments import Moment
-from tests.faults.reference import Reference, in_memory, tables_of, unlike
-from tests.faults.variants import VARIANTS, Variant
-from tests.proxy import Cable
+from tests.faults.reference import Reference, tables_of, unlike
+from tests.faults.variants import VARIANTS
 
-EARLY = 150
-"""The slot at which a run of this file ends early."""
 KILL = Fault("kill", "smart", Moment("run", 0.5))
 ROUTER = Fault("kill", "router", Moment("run", 0.5))
 INTERRUPT = Fault("interrupt", "launcher", Moment("run", 0.5))
 FLAP = Fault("flap", "smart", Moment("run", 0.5), seconds=1.0, count=3)
-
-
-@pytest.fixture(scope="module")
-def memory(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where the results of `reference` are."""
-    return tmp_path_factory.mktemp("reference") / "memory"
-
-
-@pytest.fixture(scope="module")
-def reference(memory: Path) -> Reference:
-    """The variant `plain` in memory."""
-    return in_memory(VARIANTS["plain"].scenario(memory.parent), memory)
 
 
 def test_wrong_rows_are_seen(reference: Reference, memory: Path) -> None:
@@ -77,96 +56,6 @@ def test_another_summary_is_seen(reference: Reference) -> None:
     }
     assert list(unlike(reference.summary, reference)) == []
     assert len(list(unlike(summary, reference))) == 2 + 2 * len(VARIANTS["plain"].receivers)
-
-
-@dataclass
-class Status:
-    """A launcher that has ended."""
-
-    returncode: int = 0
-
-
-@dataclass
-class Ended:
-    """What the judge looks at of a run."""
-
-    folder: Path
-    out: Path
-    launcher: Status = field(default_factory=Status)
-    variant: Variant = VARIANTS["plain"]
-    done: int = 400
-    cables: dict[tuple[int, str], Cable] = field(default_factory=dict)
-    told: list[dict[str, Any]] = field(default_factory=list)
-
-    @property
-    def renamed(self) -> Path:
-        """Nothing is there."""
-        return self.folder / "renamed"
-
-    @property
-    def temporary(self) -> Path:
-        """Empty, as it should be."""
-        return self.folder / "temporary"
-
-    def text(self, name: str) -> str:
-        """What it wrote to stdout or stderr."""
-        return (self.folder / name).read_text()
-
-    def change(self, name: str, change: Callable[[pa.Table], pa.Table]) -> None:
-        """Replace one of its tables."""
-        path = self.out / f"{name}.parquet"
-        pq.write_table(change(pq.read_table(path)), path)
-
-    def edit(self, change: Callable[[dict[str, Any]], object]) -> None:
-        """Change its summary."""
-        path = self.out / "summary.json"
-        summary = json.loads(path.read_text())
-        change(summary)
-        path.write_text(json.dumps(summary))
-
-    def misses(self, reference: Reference, *hits: Fault) -> list[str]:
-        """What the judge says."""
-        before = frozenset(process.pid for process in ours.descendants())
-        return judge.misses(self, dict.fromkeys(hits, 1.0), PATIENT_SECONDS, reference, before)
-
-
-def ended_run(folder: Path, results: Path, slots: int, how: str) -> Ended:
-    """A run for the judge, from results in memory: as a live run writes them, with its journal and its own entries."""
-    out = folder / "run"
-    shutil.copytree(results, out)
-    rows = [row for row in journal_rows(VARIANTS["plain"].scenario(folder)) if row["slot"] < slots]
-    pq.write_table(pa.Table.from_pylist(rows, schema=JOURNAL), out / "journal.parquet")
-    (folder / "temporary").mkdir()
-    for name in ("stdout", "stderr"):
-        (folder / name).touch()
-    run = Ended(folder, out, done=slots)
-
-    def as_live(summary: dict[str, Any]) -> None:
-        names = VARIANTS["plain"].receivers
-        checked = {name: {"recomputed_trials": 1, "verified": [], "own_word": []} for name in names}
-        summary |= {"mode": "live", "ended": how, "verification": checked, "outages": []}
-
-    run.edit(as_live)
-    return run
-
-
-@pytest.fixture
-def ended(tmp_path: Path, memory: Path, reference: Reference) -> Ended:
-    """A run for the judge, which ended as if nothing had happened."""
-    del reference
-    return ended_run(tmp_path, memory, 400, "complete")
-
-
-@pytest.fixture
-def early(tmp_path: Path) -> Ended:
-    """A run for the judge that a killed process ended early, as it should."""
-    scenario = VARIANTS["plain"].scenario(tmp_path)
-    montecarlo(scenario, trials=1, slots=EARLY, out=tmp_path / "short")
-    run = ended_run(tmp_path, tmp_path / "short", EARLY, "smart was ended by signal 9")
-    run.change("digests", lambda table: table.slice(0, 0))  # its only block was cut short
-    (tmp_path / "stderr").write_text("evedrop: smart was ended by signal 9\n")
-    run.launcher.returncode = judge.FAILED
-    return run
 
 
 STATUSES: dict[str, tuple[int, str, list[Fault], str]] = {
@@ -293,7 +182,7 @@ def test_an_outage_without_a_cause_is_seen(ended: Ended, reference: Reference) -
 
 def test_the_judge_sees_what_is_left_and_what_cannot_be_read(ended: Ended, reference: Reference) -> None:
     """A private folder, and a table that is cut off."""
-    (ended.temporary / "evedrop-x").mkdir()
+    (ended.temporaries[""] / "evedrop-x").mkdir()
     whole = (ended.out / "slots.parquet").read_bytes()
     (ended.out / "slots.parquet").write_bytes(whole[: len(whole) // 2])
     lines = ended.misses(reference)

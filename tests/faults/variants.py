@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +55,8 @@ class Variant:
     """`relay` and `controller`, where there are such processes."""
     shards: int = 1
     view: str = "off"
+    hosts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Host → its processes, where a run is over ssh; the others are here."""
 
     @property
     def processes(self) -> tuple[str, ...]:
@@ -103,3 +105,18 @@ VARIANTS: Mapping[str, Variant] = {
         Variant("shards", "eavesdroppers", {**_SHORT, "trials": 20, "record_trials": 12, "shards": 2}, _EVES, shards=2),
     )
 }  # fmt: skip
+
+HOSTED: Mapping[str, Variant] = {
+    one.name: one
+    for one in (
+        Variant(
+            "hosts", "eavesdroppers", _SHORT, _EVES,
+            hosts={"alpha": ("router", "sensor", "legitimate"), "beta": ("naive", "smart")},
+        ),
+        Variant(
+            "sites", VARIANTS["relayed"].source, {}, _TWO, ("controller", "relay"),
+            hosts={"alpha": ("router", "sensor", "controller"), "beta": ("relay", "legitimate", "naive")},
+        ),
+    )
+}  # fmt: skip
+"""Runs over ssh, each with some processes here: on two hosts, and at two sites with a router each."""

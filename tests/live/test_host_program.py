@@ -15,7 +15,7 @@ from typing import IO, Any
 
 import pytest
 
-from evedrop.live.launch.host_messages import LogText, ProcessEnded, StartProcess, answer_in
+from evedrop.live.launch.host_messages import LogText, ProcessEnded, SendSignal, StartProcess, answer_in
 from evedrop.live.launch.host_program import HostProcesses
 from evedrop.live.launch.starter import StartedProcess
 from evedrop.live.protocol.brief import brief_from
@@ -60,7 +60,7 @@ class Process:
 
 
 def test_a_process_has_its_files_in_the_private_folder(tmp_path: Path) -> None:
-    """Its brief, its state and its temporary files; its log and its end are sent, and `end` ends it."""
+    """Its brief, its state and its temporary files; its log and its end are sent."""
     started: list[tuple[dict[str, Any], Mapping[str, str], int]] = []
     sent: list[bytes] = []
 
@@ -82,9 +82,27 @@ def test_a_process_has_its_files_in_the_private_folder(tmp_path: Path) -> None:
     assert brief_from(brief).keys == given.keys
     assert (environment["TMPDIR"], environment["A"], mode) == (str(tmp_path), "1", 0o600)
     wait_until(lambda: b"".join(sent).endswith(b"\n"), "the log")
-    host.end()
+    host.obey(SendSignal(7, signal.SIGTERM))
     wait_until(lambda: b"".join(sent).count(b"\n") == 2, "the end")
     assert [answer_in(line) for line in b"".join(sent).splitlines()] == [LogText(7, "a line\n"), ProcessEnded(7, -15)]
+
+
+def test_what_the_program_itself_ends_is_not_reported(tmp_path: Path) -> None:
+    """The launcher would take it for the failure of a process; it learns of it by the end of the connection."""
+    sent: list[bytes] = []
+    process = Process()
+
+    def send(text: memoryview) -> int:
+        sent.append(bytes(text))
+        return len(text)
+
+    host = HostProcesses(tmp_path, lambda *_: process, send)
+    before = threading.active_count()
+    host.obey(ORDER)
+    host.end()
+    assert process.over.is_set()
+    wait_until(lambda: threading.active_count() == before, "the thread that follows the process has ended")
+    assert sent == []
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="reads /proc")

@@ -117,20 +117,34 @@ def test_ctrl_c_ends_everything_on_all_hosts(evedrop: Evedrop, server: Sshd) -> 
     assert live.results.slots.num_rows > 0
 
 
-def test_ctrl_c_ends_a_run_whose_host_program_is_suspended(evedrop: Evedrop, server: Sshd) -> None:
-    """It reports no end; once the connection is closed, the system continues it, and it ends its processes."""
+def struck(evedrop: Evedrop, what: str, number: signal.Signals) -> None:
+    """Send a signal to the program on the host beta, its fork server, or the ssh that is connected with it."""
+    mark = evedrop.folder / "beta.sh" if what == "ssh" else temporary(evedrop, "beta")
+    word = "evedrop.fork_server" if what == "fork server" else "host"
+    (pid,) = (pid for pid, command in with_mark(str(mark)).items() if word in command.split())
+    os.kill(pid, number)
+
+
+@pytest.mark.parametrize("what", ["evedrop host", "ssh"])
+def test_ctrl_c_ends_a_run_whose_connection_hangs(what: str, evedrop: Evedrop, server: Sshd) -> None:
+    """The host reports no end; once the connection is closed, the system continues it, and it ends its processes."""
     live = running(evedrop, server, direct=True)
-    programs = [
-        pid for pid, command in with_mark(str(temporary(evedrop, "beta"))).items() if command.split()[-1] == "host"
-    ]
-    for program in programs:
-        os.kill(program, signal.SIGSTOP)
+    struck(evedrop, what, signal.SIGSTOP)
     live.process.send_signal(signal.SIGINT)
     done = live.end()
     assert done.status == 130, done.err
     nothing_left(evedrop)
-    assert programs
     assert live.results.slots.num_rows > 0
+
+
+@pytest.mark.parametrize("what", ["evedrop host", "ssh"])
+def test_a_killed_launcher_leaves_nothing_where_a_connection_hangs(what: str, evedrop: Evedrop, server: Sshd) -> None:
+    """The system ends ssh with the launcher; it would wait for a suspended host, or is suspended itself."""
+    live = running(evedrop, server, direct=True)
+    struck(evedrop, what, signal.SIGSTOP)
+    live.process.kill()
+    live.process.wait()
+    nothing_left(evedrop)
 
 
 def test_a_killed_launcher_leaves_nothing_on_any_host(evedrop: Evedrop, server: Sshd) -> None:
@@ -163,6 +177,23 @@ def test_a_host_that_dies_in_the_middle_is_named(evedrop: Evedrop, server: Sshd)
     nothing_left(evedrop)
     assert live.results.slots.num_rows > 0
     assert "host beta" in live.results.summary["ended"]
+
+
+ENDS = {
+    "evedrop host": (signal.SIGTERM, "the connection with host beta ended: "),
+    "fork server": (signal.SIGKILL, "the fork server on host beta ended or stopped responding"),
+}
+
+
+@pytest.mark.parametrize("what", ENDS)
+def test_a_host_whose_program_ends_is_named(what: str, evedrop: Evedrop, server: Sshd) -> None:
+    """And no process there is said to have been ended by a signal."""
+    live = running(evedrop, server, direct=True)
+    struck(evedrop, what, ENDS[what][0])
+    done = live.end()
+    assert done.status == 3
+    assert done.err.startswith(f"evedrop: naive was lost: {ENDS[what][1]}"), done.err
+    nothing_left(evedrop)
 
 
 def nobody_listens(evedrop: Evedrop, server: Sshd) -> Path:

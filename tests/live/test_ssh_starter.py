@@ -13,20 +13,22 @@ from typing import Any
 import pytest
 
 from evedrop.environment import own_environment
-from evedrop.errors import UsageError
+from evedrop.errors import RunError, UsageError
 from evedrop.live.launch.host_messages import (
     MOST_NOISE,
     Greeting,
     LauncherHeartbeat,
     Order,
+    ProcessEnded,
     StartProcess,
+    answer_in,
     line_of,
     order_in,
     own_version,
 )
 from evedrop.live.launch.hosts_file import HostTable
 from evedrop.live.launch.ssh_starter import SshHost
-from evedrop.live.launch.starter import CONNECTION_LOST
+from evedrop.live.launch.starter import CONNECTION_LOST, FORK_SERVER_LOST
 from tests.conftest import LIMIT, wait_until
 from tests.live.network.bench import brief_of_eve
 
@@ -89,6 +91,23 @@ def test_a_brief_without_classes_gets_no_folder_of_classes(connect: Connect, tmp
     host.close(time.monotonic() + LIMIT)
     (order,) = (one for one in told(tmp_path) if isinstance(one, StartProcess))
     assert order.brief.part == brief_of_eve().part
+
+
+def test_a_process_whose_fork_server_is_gone_is_lost_with_its_host(connect: Connect, tmp_path: Path) -> None:
+    """Its log names the host. A process that is to be started on a host that is gone names it, too, as a failure of the run."""
+    host = connect(GREETING)
+    ready(host)
+    path, log = brief_of_eve().write(tmp_path), tmp_path / "eve.log"
+    with log.open("wb") as file:
+        process = host.start(7, path, file, {})
+        host._take(answer_in(line_of(ProcessEnded(7, FORK_SERVER_LOST))))
+        assert process.poll() == CONNECTION_LOST
+        assert log.read_text().startswith("evedrop: the fork server on host beta ended or stopped responding")
+        host.hang_up()
+        wait_until(host._lost.is_set, "the end of the connection")
+        with pytest.raises(RunError, match=r"^eve cannot be started: the connection with host beta ended: ssh ended"):
+            host.start(8, brief_of_eve().write(tmp_path), file, {})
+        host.close(time.monotonic() + LIMIT)
 
 
 def test_what_a_login_shell_prints_is_passed_over(connect: Connect) -> None:

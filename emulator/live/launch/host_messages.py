@@ -28,6 +28,7 @@ from evedrop.entries import (
     text,
     whole,
 )
+from evedrop.live.launch.starter import FORK_SERVER_LOST
 from evedrop.live.protocol.brief import AnyBrief, brief_from
 
 MOST_NOISE = 200
@@ -97,8 +98,8 @@ class ProcessEnded(HostMessage):
 
     kind = "ended"
     number: int = field(metadata=_NUMBER)
-    status: int = field(metadata=entry(whole(-64, 255)))
-    """Negative: the signal that ended it."""
+    status: int = field(metadata=entry(whole(-64, FORK_SERVER_LOST)))
+    """Negative: the signal that ended it. `FORK_SERVER_LOST`: it ended with its fork server."""
 
 
 Order = StartProcess | SendSignal | LauncherHeartbeat

@@ -102,6 +102,7 @@ class HostProcesses:
     def __init__(self, private: Path, start: Starter, send: Any) -> None:
         self._private, self._start, self._send = private, start, send
         self._sending = threading.Lock()
+        self._ending = False
         self._processes: dict[int, StartedProcess] = {}
 
     def answer(self, message: Greeting | Answer) -> None:
@@ -120,7 +121,8 @@ class HostProcesses:
                 process.send_signal(order.signal)
 
     def end(self) -> None:
-        """End all processes."""
+        """End all processes. The launcher learns of it by the end of the connection: no process there failed by itself."""
+        self._ending = True
         end_all(self._processes.values())
 
     def _begin(self, order: StartProcess) -> None:
@@ -161,7 +163,8 @@ class HostProcesses:
         if process.stdin is not None:
             process.stdin.close()
         reader.join(_LAST_LINES_SECONDS)
-        self.answer(ProcessEnded(number, status))
+        if not self._ending:
+            self.answer(ProcessEnded(number, status))
 
     def _read(self, number: int, log: int) -> None:
         with os.fdopen(log, "rb", buffering=0) as lines:

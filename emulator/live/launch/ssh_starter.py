@@ -9,10 +9,13 @@ Source: docs/hosts.md, how it works.
 from __future__ import annotations
 
 import contextlib
+import errno
 import itertools
 import os
 import select
 import shlex
+import shutil
+import signal
 import subprocess
 import tempfile
 import threading
@@ -24,7 +27,7 @@ from pathlib import Path
 from typing import IO, final
 
 from evedrop.environment import own_environment
-from evedrop.errors import Interrupted, UsageError
+from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.live.launch.host_messages import (
     MOST_NOISE,
     Answer,
@@ -39,10 +42,10 @@ from evedrop.live.launch.host_messages import (
     own_version,
 )
 from evedrop.live.launch.hosts_file import HostsPlan, HostTable
-from evedrop.live.launch.starter import CONNECTION_LOST, ReportedProcess, StartedProcess, Starter
+from evedrop.live.launch.starter import CONNECTION_LOST, FORK_SERVER_LOST, ReportedProcess, StartedProcess, Starter
 from evedrop.live.protocol.brief import read_brief
 from evedrop.live.protocol.brief_parts import ImportingPart
-from evedrop.processes import kill, wait_for
+from evedrop.processes import kill, signalled_when_parent_dies, wait_for
 
 ANSWER_SECONDS = 60.0
 """How long a host may take to connect and to start Python."""
@@ -113,7 +116,7 @@ class SshHost:
         self._said = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the connection
         try:
             self._ssh = subprocess.Popen(
-                ssh_command(table, config, longest_outage),
+                _ended_with_us(ssh_command(table, config, longest_outage)),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=self._said,
@@ -151,7 +154,7 @@ class SshHost:
             )
 
     def start(self, number: int, path: Path, log: IO[bytes], environment: Mapping[str, str]) -> HostedProcess:
-        """Start the process of the brief at a path there. Raises OSError if the connection is lost."""
+        """Start the process of the brief at a path there. Raises RunError if the connection is lost."""
         brief = read_brief(path)
         path.unlink()  # its keys should not stay on disk
         if self._table.modules is not None and isinstance(brief.part, ImportingPart) and brief.part.modules is not None:
@@ -160,7 +163,7 @@ class SshHost:
         with self._guard:
             if self._lost.is_set():
                 process.ended(CONNECTION_LOST)
-                raise OSError(f"the connection with host {self.name} is lost")
+                raise RunError(f"{brief.process} cannot be started: {self._ending()}; run again")
             self._processes[number] = process
         own = own_environment()
         added = {name: value for name, value in environment.items() if own.get(name) != value}
@@ -218,6 +221,11 @@ class SshHost:
                 del self._processes[process.pid]
         if isinstance(answer, LogText):
             process.write(answer.written)
+        elif answer.status == FORK_SERVER_LOST:
+            process.write(
+                f"evedrop: the fork server on host {self.name} ended or stopped responding (killed, suspended or out of memory)\n"
+            )
+            process.ended(CONNECTION_LOST)
         else:
             process.ended(answer.status)
 
@@ -228,8 +236,12 @@ class SshHost:
             self._lost.set()
             left, self._processes = list(self._processes.values()), {}
         for process in left:
-            process.write(f"evedrop: the connection with host {self.name} ended: {self._reason()}\n")
+            process.write(f"evedrop: {self._ending()}\n")
             process.ended(CONNECTION_LOST)
+
+    def _ending(self) -> str:
+        """Why the host can be used no more."""
+        return f"the connection with host {self.name} ended: {self._reason()}"
 
     @property
     def _named(self) -> str:
@@ -269,6 +281,20 @@ def ssh_command(table: HostTable, config: Path | None, longest_outage: float) ->
     return ["ssh", *given, *_OPTIONS, *alive, *ssh_words(table), f"{folder}exec {shlex.join([*table.command, 'host'])}"]
 
 
+def _ended_with_us(command: list[str]) -> list[str]:
+    """The same command, whose process the system kills when this one dies: ssh would wait for a host that hangs, or hang itself.
+
+    Raises FileNotFoundError if there is no such program.
+    """
+    program = shutil.which(command[0])
+    if program is None:
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
+    # Python ignores SIGPIPE, and a program that it becomes would, too.
+    return signalled_when_parent_dies(
+        [program, *command[1:]], signal.SIGKILL, "signal.signal(signal.SIGPIPE, signal.SIG_DFL)"
+    )
+
+
 @final
 class SshStarter:
     """Starts each process on its host, and those without one by another starter."""
@@ -279,7 +305,7 @@ class SshStarter:
         self._numbers = itertools.count(2**32)
 
     def __call__(self, role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:
-        """Start the process of a brief. Raises OSError."""
+        """Start the process of a brief. Raises OSError, and RunError if the connection with its host is lost."""
         host = self._plan.host_of(brief.stem)
         if host is None:
             return self._here(role, brief, log, environment)

@@ -20,7 +20,7 @@ TELLING = frozenset({OBSERVER, ROUTER, RELAY})
 """The roles whose processes send the launcher news on their standard output."""
 GRACE_SECONDS = 3.0  # for all processes to leave
 CONNECTION_LOST = 1000
-"""The status of a process on another host if the connection with the host ended; no process ends with it."""
+"""The status of a process on another host if the connection with the host, or its fork server, ended; no process ends with it."""
 FORK_SERVER_LOST = 1001
 """The status of a process whose fork server ended or stopped responding; no process ends with it."""
 _STACKS_SECONDS = 0.3  # for a process that does not leave to write the stacks of its threads into its log

@@ -1,6 +1,7 @@
 """Loaded by the processes of a run that the campaign disturbs.
 
-The launcher says what happens, and has cables put before the router. A fork server, if asked to, makes the router confuse keys.
+The launcher says what happens, has cables put before the router, and keeps what the hosts of a run over ssh write to stderr.
+A fork server, if asked to, makes the router confuse keys.
 Modules are changed when they are imported and not before, so that the launcher starts as it always does.
 """
 
@@ -51,6 +52,23 @@ if LAUNCHES or (CONFUSED and "evedrop.fork_server" in sys.orig_argv):
 
         module.Brief.write = write
 
+    def _heard(module: ModuleType) -> None:
+        import os
+
+        begin, close = module.SshHost.__init__, module.SshHost.close
+
+        def begun(host: Any, *given: Any) -> None:
+            begin(host, *given)
+            host.heard = os.dup(host._said.fileno())  # ours outlives that of the connection
+
+        def closed(host: Any, deadline: float) -> None:
+            close(host, deadline)
+            with open(f"{FOLDER}/{host.name}.stderr", "wb") as file:
+                file.write(os.pread(host.heard, 2**20, 0))
+            os.close(host.heard)
+
+        module.SshHost.__init__, module.SshHost.close = begun, closed
+
     def _confused(module: ModuleType) -> None:
         put, every, before, count = module.Outlet.__call__, int(CONFUSED or 0), [None], [0]
 
@@ -72,7 +90,11 @@ if LAUNCHES or (CONFUSED and "evedrop.fork_server" in sys.orig_argv):
         module.Outlet.__call__ = confuse
 
     _CHANGES = (
-        {"evedrop.cli.progress_line": _telling, "evedrop.live.protocol.brief": _wired}
+        {
+            "evedrop.cli.progress_line": _telling,
+            "evedrop.live.protocol.brief": _wired,
+            "evedrop.live.launch.ssh_starter": _heard,
+        }
         if LAUNCHES
         else {"evedrop.live.network.declared": _confused}
     )

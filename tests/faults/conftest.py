@@ -1,0 +1,44 @@
+"""Runs that have ended, for the tests of the judge, and what they must come to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from evedrop import montecarlo
+from tests.faults import judge
+from tests.faults.ended import EARLY, Ended, ended_run
+from tests.faults.reference import Reference, in_memory
+from tests.faults.variants import VARIANTS
+
+
+@pytest.fixture(scope="module")
+def memory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the results of `reference` are."""
+    return tmp_path_factory.mktemp("reference") / "memory"
+
+
+@pytest.fixture(scope="module")
+def reference(memory: Path) -> Reference:
+    """The variant `plain` in memory."""
+    return in_memory(VARIANTS["plain"].scenario(memory.parent), memory)
+
+
+@pytest.fixture
+def ended(tmp_path: Path, memory: Path, reference: Reference) -> Ended:
+    """A run for the judge, which ended as if nothing had happened."""
+    del reference
+    return ended_run(tmp_path, memory, 400, "complete")
+
+
+@pytest.fixture
+def early(tmp_path: Path) -> Ended:
+    """A run for the judge that a killed process ended early, as it should."""
+    scenario = VARIANTS["plain"].scenario(tmp_path)
+    montecarlo(scenario, trials=1, slots=EARLY, out=tmp_path / "short")
+    run = ended_run(tmp_path, tmp_path / "short", EARLY, "smart was ended by signal 9")
+    run.change("digests", lambda table: table.slice(0, 0))  # its only block was cut short
+    (tmp_path / "stderr").write_text("evedrop: smart was ended by signal 9\n")
+    run.launcher.returncode = judge.FAILED
+    return run
