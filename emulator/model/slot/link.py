@@ -163,6 +163,8 @@ class Link:
 
     def fates(self, slots: range) -> Fates:
         """The fates of the packets of the next slots in every trial."""
+        if not self._changes:
+            return self._unchanged(slots)
         marks = sorted({change.at for change in self._changes if slots.start < change.at < slots.stop})
         bounds = [slots.start, *marks, slots.stop]
         parts = []
@@ -185,7 +187,7 @@ class Link:
         """The fates of slots during which the settings stay the same."""
         settings, shape = self._state.settings, (len(slots), self.batch.trials)
         codes = self._state.loss.fates(slots.start, self._loss_uniforms(slots))
-        befalls = any(settings.get(name) for name in ("reorder", "duplicate", "corrupt"))
+        befalls = settings.get("reorder") or settings.get("duplicate") or settings.get("corrupt")
         chances = self._uniforms("fate", slots, 3) if befalls else None
         if chances is not None and settings.get("corrupt"):
             codes = np.where((codes == 0) & (chances[:, 0] < settings["corrupt"]), np.uint8(Fate.CORRUPTED), codes)
@@ -231,6 +233,8 @@ class Link:
 
     def _received(self, slots: range, codes: Codes, delays: NDArray[np.uint32] | None) -> Codes:
         """The fates after checking whether the receiver can accept the packets that the network delivers."""
+        if delays is None and not self.schedule.outages:
+            return codes
         arrives: NDArray[np.int64] = np.arange(slots.start, slots.stop)[:, None]
         sent = arrives
         if delays is not None:
