@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from tests.faults.kinds import CONFUSED, EVERYBODY, Fault
 from tests.faults.moments import Moment
 from tests.faults.reference import Reference, tables_of, unlike
 from tests.faults.variants import VARIANTS
+from tests.faults.whole import missing_rows
 
 KILL = Fault("kill", "smart", Moment("run", 0.5))
 ROUTER = Fault("kill", "router", Moment("run", 0.5))
@@ -125,6 +127,20 @@ def test_missing_rows_of_a_run_that_ended_early_are_seen(what: str, early: Ended
     early.change(name, change)
     misses = early.misses(reference, KILL)
     assert [line for line in misses if line.startswith(f"{name} lacks")], misses
+
+
+def test_a_closed_loop_needs_inputs_from_its_first_slot_on(memory: Path, reference: Reference) -> None:
+    """A run that ended before has no account of its controller."""
+    loop = replace(reference, tables={**reference.tables, "inputs": {(0, 0): {}}})
+    results = load_results(memory)
+    tables = {name: table.slice(0, 0) for name, table in tables_of(results)}
+    tables["journal"] = results.journal.slice(0, 0)
+
+    def missing(slots: int) -> list[str]:
+        return list(missing_rows(tables, {"slots": slots, "first_trial": 0, "trials": 1}, loop, complete=False))
+
+    assert missing(0) == []
+    assert "there is no table inputs" in missing(1)
 
 
 def test_missing_digests_are_seen(ended: Ended, reference: Reference) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -17,7 +18,7 @@ import pytest
 
 from evedrop.live.launch.host_messages import LogText, ProcessEnded, SendSignal, StartProcess, answer_in
 from evedrop.live.launch.host_program import HostProcesses
-from evedrop.live.launch.starter import StartedProcess
+from evedrop.live.launch.starter import FORK_SERVER_LOST, StartedProcess
 from evedrop.live.protocol.brief import brief_from
 from tests.conftest import LIMIT, Evedrop, wait_until
 from tests.live.network.bench import brief_of_eve
@@ -126,6 +127,22 @@ def test_a_process_that_cannot_be_started_is_reported(folder: str, why: str, tmp
     assert why in log.written
     assert end == ProcessEnded(7, 1)
     host.end()
+
+
+@pytest.mark.parametrize("number", [errno.ESRCH, errno.ETIMEDOUT])
+def test_a_process_whose_fork_server_is_gone_is_reported_as_lost_with_it(number: int, tmp_path: Path) -> None:
+    """The launcher then names the host, and not the process alone."""
+    sent: list[bytes] = []
+
+    def start(role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:
+        raise OSError(number, "its fork server is gone")
+
+    def send(text: memoryview) -> int:
+        sent.append(bytes(text))
+        return len(text)
+
+    HostProcesses(tmp_path, start, send).obey(ORDER)
+    assert answer_in(sent[-1]) == ProcessEnded(7, FORK_SERVER_LOST)
 
 
 MALFORMED = (b"no order", b'{"kind": "start"}', b"[" * 100_000, b'{"kind": "signal", "number": -1, "signal": 9}')

@@ -9,6 +9,7 @@ Source: docs/hosts.md, how it works.
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import signal
 import sys
@@ -34,7 +35,7 @@ from evedrop.live.launch.host_messages import (
 )
 from evedrop.live.launch.preloading import preloaded_without_observer
 from evedrop.live.launch.private_folder import private_folder
-from evedrop.live.launch.starter import StartedProcess, Starter, end_all
+from evedrop.live.launch.starter import FORK_SERVER_LOST, StartedProcess, Starter, end_all
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.brief_parts import ReceiverPart
 from evedrop.processes import continue_when_parent_dies
@@ -140,7 +141,8 @@ class HostProcesses:
         except OSError as error:
             os.close(read)
             self.answer(LogText(number, f"evedrop: {brief.process} cannot be started ({error})\n"))
-            self.answer(ProcessEnded(number, 1))
+            gone = error.errno in (errno.ESRCH, errno.ETIMEDOUT)  # its fork server, whose host is to blame
+            self.answer(ProcessEnded(number, FORK_SERVER_LOST if gone else 1))
             return
         news = self._processes[number].stdout
         if news is not None:
