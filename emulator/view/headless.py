@@ -20,7 +20,7 @@ from rerun.experimental import ViewerClient, ViewerState
 from evedrop.errors import UsageError
 from evedrop.ports import free_port
 from evedrop.view.column import ELAPSED, TIMELINE
-from evedrop.view.viewer_process import PortTaken, end, spawn
+from evedrop.view.viewer_process import PortTaken, end, spawn, without_driver
 
 _ATTEMPTS = 3
 _PATIENCE = 600.0  # seconds for one answer, for loading and for drawing; only a viewer that hangs needs them
@@ -124,7 +124,7 @@ def opened(rrd: Path, size: tuple[int, int], moment: float | None = None) -> Ite
             yield viewer
         except (RuntimeError, ConnectionError) as error:
             log = (logs / "viewer.log").read_text("utf-8", "replace")
-            raise UsageError(_without_driver(log) or f"the headless viewer failed: {error}; its log:\n{log}") from error
+            raise UsageError(without_driver(log) or f"the headless viewer failed: {error}; its log:\n{log}") from error
         finally:
             end(process)
 
@@ -160,8 +160,6 @@ def _started(size: tuple[int, int], logs: Path) -> tuple[subprocess.Popen[bytes]
         except PortTaken:
             if attempt == _ATTEMPTS:
                 raise
-        except UsageError as error:
-            raise UsageError(_without_driver(str(error)) or str(error)) from error
     raise AssertionError
 
 
@@ -170,9 +168,3 @@ def _end(state: ViewerState) -> tuple[str, int] | None:
         return None
     lines = [line for recording in state.recordings for line in recording.timelines if line.name in {TIMELINE, ELAPSED}]
     return (lines[0].name, int(lines[0].end)) if lines and lines[0].end is not None else None
-
-
-def _without_driver(log: str) -> str | None:
-    if "graphics adapter" not in log and "render context" not in log:
-        return None
-    return "no Vulkan driver to draw with; install one, on Debian: apt-get install mesa-vulkan-drivers"

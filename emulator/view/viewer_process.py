@@ -119,8 +119,18 @@ def spawn(
         found = f"ended with status {process.poll()}" if process.poll() is not None else "was not ready in time"
         _give_up(process)
         log.seek(start)
-        last = log.read().decode(errors="replace").strip().splitlines()[-5:]
+        text = log.read().decode(errors="replace")
+    if (why := without_driver(text)) is not None:
+        raise UsageError(why)
+    last = text.strip().splitlines()[-5:]
     raise UsageError("\n".join([f"the viewer {found}; turn the view off to do without it. Its log ends:", *last]))
+
+
+def without_driver(log: str) -> str | None:
+    """What to install, if a viewer's log says that it found nothing to draw with; None otherwise."""
+    if "graphics adapter" not in log and "render context" not in log:
+        return None
+    return "no Vulkan driver to draw with; install one, on Debian: apt-get install mesa-vulkan-drivers"
 
 
 def end(process: subprocess.Popen[bytes]) -> None:

@@ -86,7 +86,7 @@ def test_a_viewer_that_draws_leaves_no_temporary_folder(tmp_path: Path, temporar
     try:
         process = spawn(port, ["--headless", "--port", str(port)], tmp_path)
     except UsageError as error:
-        assert "the viewer ended with status" in str(error)  # noqa: PT017 - without a driver
+        assert "no Vulkan driver" in str(error)  # noqa: PT017 - the only reason to end
     else:
         wait_until(lambda: process.poll() is not None or len(list(temporary.iterdir())) > 1, "a viewer under way")
         end(process)
@@ -183,9 +183,12 @@ def test_who_takes_the_port_of_a_viewer_gets_nothing(
 
 
 def test_a_viewer_that_ends_after_it_listened_is_no_stranger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As without a driver: it is said that it ended, and with which status."""
+    """It is said that it ended, and with which status; or what to install if it found nothing to draw with."""
     program = tmp_path / "viewer"
-    listens = "import socket, sys\nsocket.create_server(('127.0.0.1', int(sys.argv[-1]))).accept()\nsys.exit(7)\n"
+    listens = (
+        "import socket, sys\nsocket.create_server(('127.0.0.1', int(sys.argv[-1]))).accept()\n"
+        "print('no graphics adapter' * (len(sys.argv) == 5), *range(9), sep='\\n')\nsys.exit(7)\n"
+    )
     program.write_text(f"#!{sys.executable}\n{listens}")
     program.chmod(0o700)
 
@@ -198,6 +201,8 @@ def test_a_viewer_that_ends_after_it_listened_is_no_stranger(tmp_path: Path, mon
     port = free_port()
     with pytest.raises(UsageError, match="the viewer ended with status 7"):
         spawn(port, [str(port)], tmp_path)
+    with pytest.raises(UsageError, match="mesa-vulkan-drivers"):
+        spawn(port, ["--headless", str(port)], tmp_path)
 
 
 @pytest.fixture
