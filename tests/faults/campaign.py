@@ -131,6 +131,7 @@ class Campaign:
                 if hung:
                     run.launcher.kill()
                 run.launcher.wait()
+                run.free()
                 found = misses(run, hits, case.longest_outage, reference, before) if not hung else [hung]
                 ours.end_all(ours.none_left(before, 5.0 if hung else 0.0))
         return self._verdict(case, tuple(hits), found, outcome_of(run.launcher.returncode), seconds)

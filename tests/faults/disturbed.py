@@ -221,6 +221,10 @@ class Disturbed:
                 file.write(b"\0")
         return True
 
+    def free(self) -> None:
+        """Make room again on a disk that is full, so that the results can be looked at."""
+        (self.disk / "filler").unlink(missing_ok=True)
+
     def break_disk(self) -> bool:
         """Have every access to the disk of the results fail; whether it has one."""
         if not self._mounted or self._kind != "broken":
@@ -248,7 +252,7 @@ class Disturbed:
 
     def _keep(self) -> None:
         """Move the results from their small disk to where they are kept."""
-        (self.disk / "filler").unlink(missing_ok=True)
+        self.free()
         kept = self.folder / "kept"
         if self._kind == "full":
             shutil.copytree(self.disk, kept, symlinks=True)
