@@ -106,6 +106,8 @@ class ResultsWriter:
         self._at = "slot 0"
         self._broken = self._figures_before = False
         self._round_due = self._figures_due = time.monotonic() + _ROUND_SECONDS
+        self.with_figures: Callable[[], None] = lambda: None
+        """Called whenever figures are about to be written: their rows are on disk by then."""
         self._round()
 
     def _stream(self, name: str, number: int) -> TableStream:
@@ -191,6 +193,7 @@ class ResultsWriter:
 
     def write_figures(self, figures: Summary) -> None:
         """Write the summary so far, of a run that has not ended."""
+        self.with_figures()
         write_figures(self._held.now, summary_text(replace(figures, ended=self._at)))
 
     def restart_slots(self) -> None:

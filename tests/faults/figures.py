@@ -73,6 +73,10 @@ def unlike_rows(summary: Mapping[str, Any], tables: Mapping[str, pa.Table]) -> I
     if slots is None:
         return
     means, links = _means(tables["slots"], slots), _accounts(tables["journal"], slots)
+    without = [name for name in summary["peers"] if name not in means or name not in links]
+    if without:
+        yield f"the figures are of {slots} slots, and the tables have no rows of {', '.join(without)}"
+        return
     latecomers = {name: account["late"] for name, account in links.items()}
     for name, peer in summary["peers"].items():
         found, late = means[name], latecomers[name]

@@ -58,8 +58,9 @@ def _explained(process: str, struck: Mapping[Fault, float]) -> bool:
 
 
 def _went_on(told: Sequence[Mapping[str, Any]], struck: float, slots: int) -> bool:
-    """Whether slots were still to come well after a fault struck."""
-    return any(
+    """Whether the run had begun when a fault struck, and slots were still to come well after it."""
+    begun = any(news["event"] in ("started", "progress") and news["at"] < struck for news in told)
+    return begun and any(
         news["event"] == "progress" and news["at"] > struck + _LAG_SECONDS and 0 < news["done"] < slots - 1
         for news in told
     )

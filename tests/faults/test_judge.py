@@ -15,6 +15,7 @@ from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.parquet as pq
 import pytest
 
 from evedrop.results.writer import load_results
@@ -184,8 +185,17 @@ def test_an_outage_that_is_not_listed_is_seen(ended: Ended, reference: Reference
     assert [line for line in ended.misses(reference, ROUTER) if "the summary lists no outage" in line]
     ended.told = [progress(399, 0.9)]  # it may have been over already
     assert ended.misses(reference, ROUTER) == []
+    ended.told = [{"event": "started", "at": 1.5}, progress(200, 2.0)]  # it had not begun
+    assert ended.misses(reference, ROUTER) == []
     ended.told = [{"event": "reconnected", "process": "router", "slot": 7, "at": 2.0}]
     assert [line for line in ended.misses(reference, ROUTER) if "told of an outage of router at slot 7" in line]
+
+
+def test_figures_without_rows_are_seen(ended: Ended, reference: Reference) -> None:
+    """Of a receiver that is in the summary and in no row of the journal."""
+    table = pq.read_table(ended.out / "journal.parquet")
+    pq.write_table(table.filter(pc.field("link") != "smart"), ended.out / "journal.parquet")
+    assert [line for line in ended.misses(reference) if "the tables have no rows of smart" in line]
 
 
 def test_an_outage_without_a_cause_is_seen(ended: Ended, reference: Reference) -> None:

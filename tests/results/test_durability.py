@@ -323,6 +323,37 @@ def test_no_rows_are_on_disk_before_the_first_figures(tmp_path: Path) -> None:
         assert load_results(tmp_path).summary["ended"] == "the run goes on, at slot 10"
 
 
+def test_a_score_is_saved_only_with_rows(tmp_path: Path) -> None:
+    """What a shard saves together with its figures: if it is killed before, it has neither score nor rows."""
+    scenario = load("microgrid")
+    nothing = summary_of(
+        scenario, Totals.nothing(scenario, 1), dict.fromkeys(scenario.digested), Ending(0.0, "slot 10")
+    )
+    events: list[str] = []
+
+    def figures() -> Summary:
+        events.append("figures")
+        return nothing
+
+    def save() -> None:
+        empty = sizes(tmp_path)["slots-0.arrows"] == before
+        events.append("save without rows" if empty else "save")
+
+    write_resolved(tmp_path, scenario)
+    with ResultsWriter.of(tmp_path, scenario) as writer:
+        writer.with_figures = save
+        before = sizes(tmp_path)["slots-0.arrows"]
+        for receiver in scenario.receivers:
+            writer.slot_rows(0, receiver, sums(10), np.zeros(10))
+
+        def saved() -> bool:
+            writer.checkpoint("slot 10", figures)
+            return bool(events)
+
+        wait_until(saved, "a checkpoint")
+    assert events == ["figures", "save"]
+
+
 def test_the_end_of_a_run_without_figures_keeps_its_rows(tmp_path: Path) -> None:
     """The launcher notes why the run ended, and takes nothing from what was measured."""
     scenario = load("microgrid")

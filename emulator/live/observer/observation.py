@@ -120,6 +120,7 @@ class ObservedRun:
     def writer(self) -> ResultsWriter:
         """The writer of the results folder, to be entered around `conduct`."""
         self._writer = ResultsWriter.of(self.folder, self._scenario)
+        self._writer.with_figures = self._dump_score
         return self._writer
 
     def conduct(self, stop: Stop) -> None:
@@ -341,15 +342,11 @@ class ObservedRun:
         return self._summary("")
 
     def _summary(self, how: str) -> Summary:
-        """The summary; a shard also dumps its score, for the summary of the whole run."""
-        folder = self.folder
         if self._joiner.done == self._scenario.slots:
             for name, sums in self._joiner.trace_sums.items():
                 self._keeper.totals.tallies[name].know_traces(sums)
-        if self._brief.part.shard:
-            dump_score(self._keeper.totals, folder, self._scenario)
         digests = {name: digest_of(self._scenario, name, blocks) for name, blocks in self._joiner.digests.items()}
-        replay, wall = replay_of(folder, self._scenario), self._ended - self._started
+        replay, wall = replay_of(self.folder, self._scenario), self._ended - self._started
         ending = Ending(
             wall,
             how,
@@ -360,6 +357,11 @@ class ObservedRun:
             misdelivered=self._misdelivered,
         )
         return summary_of(self._scenario, self._keeper.totals, digests, ending)
+
+    def _dump_score(self) -> None:
+        """Dump the score of a shard, for the summary of the whole run. Raises OSError."""
+        if self._brief.part.shard:
+            dump_score(self._keeper.totals, self.folder, self._scenario)
 
     def settle(self, how: str) -> None:
         """Compute the summary, and save it and all rows to disk. Raises OSError if they cannot be written."""
@@ -384,6 +386,8 @@ class ObservedRun:
                 status, how = RunError.exit_status, summary.ended
             if status == 0 and summary.failed_expectations:
                 status = 1
+            if self._final is None:
+                self._dump_score()
             write_summary(self.folder, replace(summary, ended=how))
         except OSError as error:
             status, how = RunError.exit_status, unwritten(error)

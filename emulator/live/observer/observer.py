@@ -81,11 +81,10 @@ def observe(brief: Brief[ObserverPart], report: Report, serve: str | None = None
             f"an eavesdropper's class could not give the covariance expected of it: {error}",
         )
     except Exception as error:  # a bug in the observer must not cost the results
-        traceback.print_exc()
-        status, how = (
-            RunError.exit_status,
-            lack_of(error) or f"the observer failed ({error!r}); please report its log",
-        )
+        status, lack = RunError.exit_status, lack_of(error)
+        if lack is None:
+            traceback.print_exc()
+        how = lack or f"the observer failed ({error!r}); please report its log"
     status = observation.finish(status, how, report)
     if viewer is not None:
         viewer.stop()
