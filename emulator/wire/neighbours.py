@@ -2,7 +2,8 @@
 
 A program at two sides gets a message from each. Routers that join two sides pass messages between them by themselves, and every
 message that the wire passed on would come back to it: the links between such sides carry nothing. Where routers are connected to
-several sides, the wire finds this out with a message of its own.
+several sides, the wire finds this out with messages of its own. Each has a random number that was never sent before, so that a
+program at one side cannot pretend that one of them came from another side: neither by a guess, nor with an old one.
 
 Source: docs/wire.md, no loops.
 """
@@ -21,7 +22,8 @@ from evedrop.wire.bypasses import Bypasses
 from evedrop.wire.lanes import LinkState
 from evedrop.wire.side import PROBES, SideSession
 
-_PROBE_SECONDS = 2.0  # after which a probe that was heard says nothing any more
+_PROBE_SECONDS = 2.0  # after which a probe that was sent, or heard, says nothing any more
+_NONCE_BYTES = 16
 
 
 @final
@@ -39,6 +41,8 @@ class Neighbours:
         self._told: set[tuple[str, str, str]] = set()
         self._heard: dict[tuple[str, str], float] = {}
         self._probes = {name: f"@evedrop/{secrets.token_hex(8)}/{at}" for at, name in enumerate(sides)}
+        self._sent: dict[bytes, tuple[str, float]] = {}
+        """Number in a probe → the side at which it was sent, and when."""
         self._subscribers = [
             side.session.declare_subscriber(PROBES, self._listener(name), allowed_origin=zenoh.Locality.REMOTE)
             for name, side in sides.items()
@@ -52,13 +56,12 @@ class Neighbours:
             programs[name] = {str(one.zid) for one in transports if one.whatami != zenoh.WhatAmI.ROUTER}
             routers[name] = {str(one.zid) for one in transports if one.whatami == zenoh.WhatAmI.ROUTER}
         if sum(map(bool, routers.values())) > 1:
-            for name, side in self._sides.items():
-                side.session.put(self._probes[name], b"")
+            self._probe()
         found = set()
         for one, other in combinations(self._sides, 2):
             ends = {self._sides[one].zid, self._sides[other].zid}
             joined = (routers[one] | ends) & routers[other] | routers[one] & ends
-            if not joined and self._passes(one, other):
+            if not joined and routers[one] and routers[other] and self._passes(one, other):
                 joined = routers[one] | routers[other]
             for state in self._states:
                 if {state.link.source, state.link.target} == {one, other}:
@@ -76,13 +79,23 @@ class Neighbours:
             )
         self._told = found
 
-    def _listener(self, name: str) -> Callable[[zenoh.Sample], None]:
-        sources = {key: source for source, key in self._probes.items()}
+    def _probe(self) -> None:
+        """Send a probe at each side. Those of the last seconds still count: on a busy machine they are slow."""
+        now = time.monotonic()
+        self._sent = {nonce: sent for nonce, sent in self._sent.items() if sent[1] > now - _PROBE_SECONDS}
+        for name, side in self._sides.items():
+            nonce = secrets.token_bytes(_NONCE_BYTES)
+            self._sent[nonce] = (name, now)
+            side.session.put(self._probes[name], nonce)
 
+    def _listener(self, name: str) -> Callable[[zenoh.Sample], None]:
         def heard(sample: zenoh.Sample) -> None:
-            source = sources.get(str(sample.key_expr))
-            if source is not None:
-                self._heard[source, name] = time.monotonic()
+            if len(sample.payload) != _NONCE_BYTES:
+                return
+            source, sent = self._sent.get(sample.payload.to_bytes(), (name, 0.0))
+            now = time.monotonic()
+            if source != name and sent > now - _PROBE_SECONDS:
+                self._heard[source, name] = now
 
         return heard
 

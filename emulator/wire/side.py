@@ -136,7 +136,9 @@ def side_config(side: Side, largest: int, users_file: str | None) -> ZenohConfig
     if users_file is not None:
         config["transport"]["auth"] = {"usrpwd": {"dictionary_file": users_file}}
     if side.keys != ("**",):
-        config["access_control"] = _access((*expressions_of(side), PROBES))
+        # Only a side that connects to a router needs probes, and with them its programs could say that sides are joined.
+        probes = (PROBES,) if side.connect else ()
+        config["access_control"] = _access((*expressions_of(side), *probes))
     return config
 
 

@@ -113,6 +113,37 @@ def test_sides_that_routers_join_outside_the_wire_carry_nothing(tmp_path: Path, 
             assert all(fate == Crossing.LOOPED for fate in wire.fates())
 
 
+def test_a_program_cannot_say_that_sides_are_joined(tmp_path: Path) -> None:
+    """Each side has a router of its own; a probe of the wire that one program reads, another puts at the other side, too late."""
+    with router() as (_, first), router() as (_, second):
+        sides = {"robot": Side("robot", (ANYWHERE,), (first,)), "base": Side("base", (ANYWHERE,), (second,))}
+        with (
+            at_work(plan_of(link("robot", "base"), sides=sides), tmp_path) as wire,
+            wire.program("robot") as spy,
+            wire.program("base") as forger,
+            wire.program("base") as witness,
+        ):
+            probes: list[tuple[str, bytes]] = []
+            spy.declare_subscriber(
+                "@evedrop/*/*", lambda one: probes.append((str(one.key_expr), one.payload.to_bytes()))
+            )
+            wait_until(lambda: probes, "the wire probes")
+            forged: list[str] = []
+            witness.declare_subscriber("forged", lambda one: forged.append(one.payload.to_string()))
+            key, old = probes[0]
+            wait_until(lambda: old not in wire.relay._neighbours._sent, "the first probe is too old")
+            assert len({payload for _, payload in probes}) == len(probes) > 1
+            for payload in (old, b"", bytes(len(old)), bytes(len(old) + 1)):
+                forger.put(key, payload)
+            wait_until(lambda: forger.put("forged", b"") or forged, "what was forged is at the side")
+            count = len(probes)
+            wait_until(lambda: len(probes) > count + 3, "the wire looks again")
+            spy.put("a", b"x")
+            wait_until(lambda: len(wire.rows_of("a")) == 1, "the wire hears")
+            assert wire.rows_of("a")["fate"].tolist() == [Crossing.DELIVERED]
+            assert not wire.told
+
+
 def test_routers_that_do_not_join_sides_are_no_loop(tmp_path: Path) -> None:
     """Each side may have a router of its own, as robots have."""
     with router() as (one, first), router() as (other, second):

@@ -14,7 +14,7 @@ from evedrop.live.launch.authority import Authority
 from evedrop.ports import free_port
 from evedrop.wire.crossing import Crossing
 from evedrop.wire.plan import Side, SideTls
-from evedrop.wire.side import SideSession, side_config
+from evedrop.wire.side import PROBES, SideSession, side_config
 from tests.conftest import wait_until
 from tests.wire.test_wire_publications import reader, ready
 from tests.wire.wire_at_work import ANYWHERE, at_work, both_ways, link, plan_of, program
@@ -144,6 +144,14 @@ def test_programs_may_use_only_the_keys_of_their_side(tmp_path: Path) -> None:
         assert "secret/up" not in {str(one.key_expr) for one in there}
         assert "secret/down" not in {str(one.key_expr) for one in everything}
         del token
+
+
+@pytest.mark.parametrize(("connect", "granted"), [((), False), (("tcp/127.0.0.1:7447",), True)])
+def test_programs_may_not_use_the_probes_of_the_wire(connect: tuple[str, ...], granted: bool) -> None:
+    """At a side with keys; only a side that connects to a router must let them pass."""
+    side = Side("robot", (ANYWHERE,), connect, keys=("robot/**",))
+    (rule,) = side_config(side, 1000, None)["access_control"]["rules"]
+    assert (PROBES in rule["key_exprs"]) == granted
 
 
 def test_a_side_with_tls_wants_certificates_of_its_authority(tmp_path: Path) -> None:
