@@ -38,6 +38,7 @@ EXCEPTIONS = {
     "emulator/view/picture.py _why process.wait": COMMAND,
     "emulator/view/video.py add self._process.wait": COMMAND,
     "emulator/view/video.py finish self._process.wait": COMMAND,
+    "emulator/wire/outlet.py _wait self._bell.acquire": WORK,
     "emulator/wire/queries.py _run self._heard.get": WORK,
     "peers/closed_loop.py of self._inbox.recv": PROCESS,
     "peers/controller.py steer inbox.recv": PROCESS,

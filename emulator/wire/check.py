@@ -77,6 +77,8 @@ def _effects(link: WireLink) -> str:
     """The settings of a link, without those that do nothing."""
     settings: Mapping[str, Any] = link.settings
     told = [f"{name} = {as_toml(value)}" for name, value in settings.items() if (name, value) != ("loss", NOTHING_LOST)]
+    if link.ordered:
+        told.append("in order")
     if link.correlation is not None:
         told.append(f"losses tied to {link.correlation[0]} with strength {link.correlation[1]}")
     return ", ".join(told) or "no faults"

@@ -42,6 +42,8 @@ class Crossing(IntEnum):
     """Zenoh raised an error when the message was put on the other side."""
     TOO_MANY_KEYS = 22
     """Its key is new, and the programs of its side have already used as many keys as a wire keeps."""
+    CONGESTED = 23
+    """The other side no longer took messages, or too slowly, and the wire already kept as many for it as it may."""
 
     @property
     def emulated(self) -> bool:
@@ -56,7 +58,7 @@ class Crossing(IntEnum):
     @property
     def passed(self) -> bool:
         """Whether these models let such a message pass."""
-        return self in {Crossing.DELIVERED, Crossing.HELD_UP, Crossing.UNDERWAY, Crossing.REFUSED}
+        return self in {Crossing.DELIVERED, Crossing.HELD_UP, Crossing.UNDERWAY, Crossing.REFUSED, Crossing.CONGESTED}
 
 
 class Kind(IntEnum):
@@ -76,6 +78,9 @@ class Kind(IntEnum):
 AGAIN = 0x80
 """Added to the kind in the record of a message that was delivered twice."""
 
+HELD = 0x80
+"""Added to the fate in the record of a message that will be delivered, until it is: it is delayed, or waits for its turn."""
+
 UNLINKED = 2**16 - 1
 """The code of a link in the record of a message that no link takes."""
 
@@ -90,7 +95,7 @@ RECORD = np.dtype(
         ("size", "<u4"),  # bytes of payload and attachment
         ("link", "<u2"),  # code of the link
         ("kind", "u1"),  # `Kind`, with `AGAIN`
-        ("fate", "u1"),  # `Crossing`
+        ("fate", "u1"),  # `Crossing`, with `HELD`
     ]
 )
 """A row of the journal while the wire runs, 48 bytes; codes of keys and sources are in another file."""

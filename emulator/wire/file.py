@@ -140,7 +140,9 @@ def _side(name: str, table: SideTable) -> Side:
 
 def _link(number: int, name: str, table: WireLinkTable) -> WireLink:
     tie = None if table.correlation is None else (table.correlation.to, table.correlation.strength)
-    return WireLink(name, number, table.source, table.target, table.keys, table.wire_settings(), table.tap, tie)
+    return WireLink(
+        name, number, table.source, table.target, table.keys, table.wire_settings(), table.tap, table.ordered, tie
+    )
 
 
 def wire_event(
@@ -176,6 +178,7 @@ def _link_table(link: WireLink) -> dict[str, Any]:
         "to": link.target,
         "keys": link.keys,
         "tap": link.tap,
+        "ordered": link.ordered,
         **link.settings,
     }
     if link.correlation is not None:

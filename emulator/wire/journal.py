@@ -18,7 +18,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any, final
 
 import numpy as np
@@ -28,7 +27,7 @@ from evedrop.model.slot.link import Change
 from evedrop.output import warn
 from evedrop.results.wire_summary import JournalState
 from evedrop.threads import wait_for_thread
-from evedrop.wire.crossing import RECORD, Crossing, next_numbers
+from evedrop.wire.crossing import HELD, RECORD, Crossing, next_numbers
 from evedrop.wire.history import NotedEvent, Numbered, WireHistory, highest
 from evedrop.wire.journal_part import (
     STORED,
@@ -50,13 +49,11 @@ PART_ROWS = 2**17
 """Records in a file: at 70 000 messages a second it is full after two seconds."""
 _TICK = 0.1  # seconds between two blocks for the listeners
 _PATIENCE = 10.0  # seconds after the last delay of a part, until its Parquet file is made, and after a full disk
-_LARGEST = 2**32 - 1
 
 Listener = Callable[[Records], None]
 """Gets each block of new records."""
 AmendmentListener = Callable[[Records, Crossing], None]
 """Gets records that it got before, and the fate that they have now."""
-
 EventListener = Callable[[float, str], None]
 """Gets the time of an event, in seconds since 1970, and a line about it."""
 
@@ -206,6 +203,12 @@ class WireJournal:
             if place < part.handed:
                 self._amended.append((before, fate))
 
+    def sent(self, row: int) -> None:
+        """Note that a message whose row was recorded as `HELD` has been delivered."""
+        at, place = divmod(row, self._rows)
+        if (buffer := self._buffers.get(at)) is not None:  # its Parquet file never has the mark
+            buffer[(place + 1) * RECORD.itemsize - 1] &= ~HELD & 0xFF
+
     def flush(self) -> None:
         """Hand all records to the listeners now, and all amendments."""
         with self._handing:
@@ -244,7 +247,6 @@ class WireJournal:
         self._place.close()
 
     def _finish(self) -> None:
-        """Make the last Parquet files."""
         try:
             self._amend_converted()
             for at in sorted(self._parts):
@@ -261,9 +263,7 @@ class WireJournal:
     def __enter__(self) -> WireJournal:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def _recorder(self) -> Callable[..., int]:
@@ -291,7 +291,7 @@ class WireJournal:
             try:
                 write(buffers[part], at, time, n, sequence, delay, key, source, size, link, kind, stored)
             except does_not_fit:  # a row that is not written would hold up all later ones
-                fits = min(size, _LARGEST)
+                fits = min(size, 2**32 - 1)
                 write(buffers[part], at, time, n, -1, delay, key, source, fits, link, kind, stored)
             return row
 
@@ -305,12 +305,12 @@ class WireJournal:
                     self._add_part(at)
                 except OSError as error:
                     self._place.miss(error)
-                    self._parts[at] = JournalPart(None, self._rows)
-                    self._buffers[at] = self._parts[at].buffer
+                    self._add_part(at, in_memory=True)
 
-    def _add_part(self, at: int) -> None:
-        self._parts[at] = JournalPart(self._place.unfinished / f"{self._name(at)}.rows", self._rows)
-        self._buffers[at] = self._parts[at].buffer
+    def _add_part(self, at: int, in_memory: bool = False) -> None:
+        path = None if in_memory else self._place.unfinished / f"{self._name(at)}.rows"
+        self._parts[at] = part = JournalPart(path, self._rows)
+        self._buffers[at] = part.buffer
 
     def _name(self, at: int) -> str:
         return f"{self.start:03d}-{at + 1:04d}"
@@ -319,7 +319,7 @@ class WireJournal:
         """The thread: blocks for the listeners, room for the next records, Parquet files."""
         while not self._ended.wait(_TICK):
             self.flush()
-            with contextlib.suppress(OSError):  # if the wire is killed, more of the delayed messages count as underway
+            with contextlib.suppress(OSError):  # only a killed wire needs to have noted it
                 self._place.beat()
             self._place.look()
             with self._state, contextlib.suppress(OSError):  # `_room` tries again, and reports it
@@ -328,10 +328,10 @@ class WireJournal:
                     self._add_part(self._next + 1)
             now = time.time()
             with self._state:  # a thread that records may make a part
-                over = sorted(at for at, part in self._parts.items() if part.full and part.settled + _PATIENCE < now)
-            for at in over:
-                if self._parts[at].path is None:  # many parts would need too much memory
-                    self._convert(at)
+                settled = [at for at, part in self._parts.items() if part.full and part.settled + _PATIENCE < now]
+            over = sorted(at for at in settled if not self._parts[at].holds)
+            for at in [at for at in over if self._parts[at].path is None]:  # many parts would need too much memory
+                self._convert(at)
             if now < self._convert_after:
                 continue
             try:

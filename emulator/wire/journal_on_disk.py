@@ -85,9 +85,8 @@ class JournalOnDisk:
 
     def read(self) -> None:
         """Hand all records to the listeners. Raises UsageError if there is no journal, or it is damaged."""
-        alive = last_beat(self._folder / JOURNAL_FOLDER / UNFINISHED)
-        self._is_alive_at(alive)
-        for table in journal_tables(self._folder, self.start, alive if self.state == "killed" else None):
+        self._is_alive_at(last_beat(self._folder / JOURNAL_FOLDER / UNFINISHED))
+        for table in journal_tables(self._folder, self.start, killed=self.state == "killed"):
             for key in {*_words(table["key"])} - {*self._codes}:
                 try:
                     zenoh.KeyExpr(key)

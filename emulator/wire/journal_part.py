@@ -2,7 +2,7 @@
 
 The file is mapped into memory, so its records survive the end of the process at any instruction. Its place on the disk is taken
 when it is made, so a full disk cannot end the process later. The last byte of a record, which is written last, is its fate + 1:
-a record whose last byte is 0 is not whole.
+a record whose last byte is 0 is not whole. Its highest bit is set until a message that is to be delivered has been delivered.
 
 Source: docs/wire.md, the journal.
 """
@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from evedrop.results.folder import private_replacement
-from evedrop.wire.crossing import AGAIN, RECORD, UNLINKED, Crossing, Kind
+from evedrop.wire.crossing import AGAIN, HELD, RECORD, UNLINKED, Crossing, Kind
 
 Records = NDArray[Any]
 """Structured, of the type `RECORD`."""
@@ -111,6 +111,11 @@ class JournalPart:
         """A copy of all rows that are whole."""
         return _whole(self._stored)
 
+    @property
+    def holds(self) -> bool:
+        """Whether a message of these rows is still to be delivered."""
+        return bool((self._stored["fate"] & HELD).any())
+
     def amend(self, place: int, fate: int) -> Records:
         """Change the fate of a row; returns the row as it was, (1,)."""
         before = _whole(self._stored[place : place + 1])
@@ -143,13 +148,19 @@ def _mapped(path: Path, size: int) -> mmap.mmap:
 def _whole(stored: Records) -> Records:
     """A copy of the stored records that are complete, with their fates."""
     records: Records = stored[stored["fate"] != 0]
-    records["fate"] -= STORED
+    records["fate"] = (records["fate"] & ~np.uint8(HELD)) - STORED
     return records
 
 
-def records_in(path: Path) -> Records:
-    """The whole records of a part's file, in order. Raises OSError if it cannot be read."""
-    return _whole(np.fromfile(path, RECORD))
+def records_in(path: Path, killed: bool = False) -> Records:
+    """The whole records of a part's file, in order. Raises OSError if it cannot be read.
+
+    killed: whether the process that wrote them was killed, so that what was still to be delivered never was.
+    """
+    stored = np.fromfile(path, RECORD)
+    if killed:
+        stored["fate"][(stored["fate"] & HELD) != 0] = Crossing.UNDERWAY + STORED
+    return _whole(stored)
 
 
 def table_of(records: Records, words: Words) -> pa.Table:

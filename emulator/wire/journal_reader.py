@@ -19,7 +19,7 @@ from evedrop.errors import UsageError
 from evedrop.model.slot.link import NEVER
 from evedrop.wire.crossing import UNLINKED, Crossing, Kind
 from evedrop.wire.history import WireHistory
-from evedrop.wire.journal_part import PARQUET, Records, records_in, table_of
+from evedrop.wire.journal_part import PARQUET, records_in, table_of
 from evedrop.wire.journal_words import words_in
 
 JOURNAL_FOLDER = "journal"
@@ -29,12 +29,12 @@ UNFINISHED = "unfinished"
 """The folder inside it for records that are not yet in a Parquet file."""
 
 
-def journal_tables(folder: Path | str, start: int | None = None, alive: float | None = None) -> Iterator[pa.Table]:
+def journal_tables(folder: Path | str, start: int | None = None, killed: bool = False) -> Iterator[pa.Table]:
     """The journal of a wire's folder in the order of its rows, a table for each part.
 
     The wire may still run, or may have been killed. A journal without messages is one empty table.
 
-    start: only the rows of this start of the wire, from 1; None: the rows of all starts. alive: as for `unfinished_table`.
+    start: only the rows of this start of the wire, from 1; None: the rows of all starts. killed: as for `records_in`.
 
     Raises UsageError if there is no journal, or a part cannot be read.
     """
@@ -49,16 +49,16 @@ def journal_tables(folder: Path | str, start: int | None = None, alive: float | 
         yield PARQUET.empty_table()
     for name in names:
         try:
-            yield _table(journal, name, links, alive)
+            yield _table(journal, name, links, killed)
         except (OSError, pa.ArrowException) as error:
             raise damaged(journal, name, error) from error
 
 
-def _table(journal: Path, name: str, links: dict[int, list[str]], alive: float | None) -> pa.Table:
+def _table(journal: Path, name: str, links: dict[int, list[str]], killed: bool) -> pa.Table:
     path = journal / UNFINISHED / f"{name}.rows"
     with contextlib.suppress(FileNotFoundError):  # a running wire may just have made the Parquet file
         if not parquet_path(journal, name).exists():
-            return unfinished_table(path, links, alive)
+            return unfinished_table(path, links, killed)
     return pq.read_table(parquet_path(journal, name), schema=PARQUET)
 
 
@@ -74,20 +74,20 @@ def damaged(journal: Path, name: str, why: object) -> UsageError:
     )
 
 
-def unfinished_table(path: Path, links: Mapping[int, list[str]], alive: float | None = None) -> pa.Table:
+def unfinished_table(path: Path, links: Mapping[int, list[str]], killed: bool) -> pa.Table:
     """The records that are not yet in a Parquet file, as a table. Raises OSError, and UsageError if they are damaged.
 
-    links: as in `WireHistory`; alive: as in `lost_with_the_process`, for the records of a wire that was killed.
+    links: as in `WireHistory`; killed: as for `records_in`.
     """
     start = _start_of(path.stem)
-    words, records = words_in(path.parent, start, links.get(start, [])), records_in(path)
+    words, records = words_in(path.parent, start, links.get(start, [])), records_in(path, killed)
     wrong = ~np.isin(records["fate"], [*Crossing]) | ((records["kind"] & 0x7F) > max(Kind)) | (records["n"] >= NEVER)
     wrong |= (records["link"] != UNLINKED) & (records["link"] >= len(words.links))
     for name in ("time", "delay"):
         wrong |= ~(np.abs(records[name]) < _LATEST)  # not a number, too
     if wrong.any():
         raise damaged(path.parents[1], path.stem, f"record {int(wrong.argmax())} is not one of this wire")
-    return table_of(records if alive is None else lost_with_the_process(records, alive), words)
+    return table_of(records, words)
 
 
 def part_names(journal: Path) -> list[str]:
@@ -100,18 +100,6 @@ def part_names(journal: Path) -> list[str]:
 def parquet_path(journal: Path, name: str) -> Path:
     """The Parquet file of a part."""
     return journal / f"{name}.parquet"
-
-
-def lost_with_the_process(records: Records, alive: float) -> Records:
-    """The records of a wire that was killed, as they must be: a message that was still delayed did not arrive.
-
-    alive: a time at which the wire still ran.
-    """
-    if len(records):
-        alive = max(alive, float(records["time"].max()))
-        held = (records["fate"] == Crossing.DELIVERED) & (records["time"] + records["delay"] > alive)
-        records["fate"][held] = Crossing.UNDERWAY
-    return records
 
 
 def last_beat(unfinished: Path) -> float:

@@ -63,7 +63,7 @@ def recover(journal: Path, history: WireHistory) -> int:
             path = parquet_path(journal, name)
             try:
                 if not path.exists():
-                    table = unfinished_table(place / f"{name}.rows", history.links, alive)
+                    table = unfinished_table(place / f"{name}.rows", history.links, killed=True)
                     recovered += table.num_rows
                     write_parquet(path, table)
                 _count_table(counts, path)

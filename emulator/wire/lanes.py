@@ -9,6 +9,7 @@ Source: docs/wire.md, how messages cross.
 from __future__ import annotations
 
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any, final
@@ -19,6 +20,7 @@ from evedrop.wire.crossing import Crossing
 from evedrop.wire.fates import KeyFates, schedule_of
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.plan import WireLink, WirePlan
+from evedrop.wire.scheduler import KeyOrder
 
 _CUT, _OVERFLOW, _TOO_LARGE = int(Crossing.CUT), int(Crossing.OVERFLOW), int(Crossing.TOO_LARGE)
 _LOOPED = int(Crossing.LOOPED)
@@ -46,6 +48,7 @@ class LinkState:
         """How many keys share each stream: several for the history of an advanced publisher."""
         self._numbers: dict[tuple[str, str], int] = {}
         self._schedule: tuple[tuple[Change, ...], LinkSchedule] | None = None  # the latest, which new keys share
+        self._orders: dict[tuple[str, str], KeyOrder] = {}
         self._lock = threading.Lock()
         self._free = 0.0  # when the queue will have sent all its messages
         self._set(link.settings)
@@ -67,6 +70,10 @@ class LinkState:
         stream = (kind, numbered_as(key))
         return self._never(*stream) if lossless else self._decide(*stream)
 
+    def order(self, kind: str, key: str) -> KeyOrder | None:
+        """The order that messages of a key and kind keep; None if they may overtake each other."""
+        return self._orders.get((kind, numbered_as(key)))
+
     def forget(self, kind: str, key: str) -> None:
         """Keep only the number of the next message of a key and kind, until there is one: the journal's, if it has it."""
         stream = (kind, numbered_as(key))
@@ -78,12 +85,16 @@ class LinkState:
                 n = self._numbers.pop(stream, None) if fates is None else fates.n
                 if n is not None and n != self._counted(*stream):
                     self._numbers[stream] = n
+                order = self._orders.get(stream)
+                if order is not None and order.due <= time.monotonic():
+                    del self._orders[stream]
 
     def _decide(self, kind: str, key: str) -> Lane:
         lock, largest = self._lock, self._largest
         with lock:
             fates = self._fates_of(kind, key)
             after = fates.next
+            order = self._orders.setdefault((kind, key), KeyOrder()) if self.link.ordered else None
             self._lanes[kind, key] += 1
 
         def decide(now: float, size: int) -> Decision:
@@ -101,6 +112,8 @@ class LinkState:
                 return at, _LOOPED, 0.0, False
             if self.cut:
                 return at, _CUT, 0.0, False
+            if order is not None and code == 0:
+                delay = order.delay(delay, time.monotonic())
             return at, code, delay if code == 0 else 0.0, again
 
         return decide

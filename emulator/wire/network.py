@@ -114,6 +114,9 @@ def _unusable(name: str, link: WireLink, links: Mapping[str, WireLink], happens:
     if any("rate" in moment.settings[link.name] for moment in happens):
         why = "has a rate in bytes per second, and a packet of a scenario has no bytes; leave the rate out"
         yield f"{link.name}, the link of {name}, {why}"
+    if link.ordered and any("delay" in moment.settings[link.name] for moment in happens):
+        why = "has ordered = true, and the delays of a scenario's packets do not depend on each other; leave it out"
+        yield f"{link.name}, the link of {name}, {why}"
     tie = None if link.correlation is None else link.correlation[0]
     if tie is not None and tie not in {one.name for other, one in links.items() if other != name}:
         yield f"{link.name}, the link of {name}, is tied to {tie}, which is not the link of another receiver"

@@ -26,6 +26,7 @@ WORDS = {
     Crossing.UNDERWAY: "underway",
     Crossing.REFUSED: "refused by Zenoh",
     Crossing.TOO_MANY_KEYS: "too many keys",
+    Crossing.CONGESTED: "not taken by readers",
 }
 """What became of messages that were not delivered, in a word or two."""
 

@@ -62,6 +62,8 @@ class WireLink:
     `rate` in bytes per second and `queue` in bytes."""
     tap: bool = False
     """Whether it only copies publications, and carries no queries."""
+    ordered: bool = False
+    """Whether no message is delivered before an earlier one of its key."""
     correlation: tuple[str, float] | None = None
     """The name of the link whose losses these are tied to, and how strongly."""
 

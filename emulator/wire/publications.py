@@ -11,17 +11,19 @@ import math
 import threading
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, final
 
 import zenoh
 
 from evedrop.threads import wait_for_thread
-from evedrop.wire.crossing import AGAIN, UNLINKED, Crossing, Kind
+from evedrop.wire.crossing import AGAIN, HELD, UNLINKED, Crossing, Kind
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.lanes import Lane, LinkState
+from evedrop.wire.outlet import LONG_SECONDS, SideOutlet
 from evedrop.wire.plan import WirePlan
+from evedrop.wire.publishers import OFTEN, REMOTE, Message, Publishers
 from evedrop.wire.ros2 import SourceReader
-from evedrop.wire.scheduler import Scheduler
 from evedrop.wire.side import SideSession, expressions_of
 from evedrop.wire.watchdog import Duty
 
@@ -29,56 +31,33 @@ WAITING = 8192
 """Messages of a side that may wait for the wire; then the side's programs wait, or Zenoh drops, as each message says."""
 READY_KEYS = 8192
 """Keys that a subscription keeps everything ready for; a key takes some 5 kB."""
-MOST_PUBLISHERS = 1024
-"""Publishers that are declared at a side."""
-OFTEN = 100
-"""Messages of a key over a link until a publisher is declared for it: this costs as much as it saves for as many messages."""
-_REMOTE = zenoh.Locality.REMOTE
-
-
-@final
-class Publishers:
-    """The publishers that a wire has declared at a side, at most `MOST_PUBLISHERS`."""
-
-    def __init__(self, session: zenoh.Session) -> None:
-        self.session = session
-        self._count = 0
-        self._lock = threading.Lock()
-
-    def declare(self, sample: zenoh.Sample) -> zenoh.Publisher | None:
-        """A publisher with the key, priority, congestion control and express of a sample; None if there are too many."""
-        with self._lock:
-            if self._count >= MOST_PUBLISHERS:
-                return None
-            self._count += 1
-        return self.session.declare_publisher(
-            sample.key_expr,
-            priority=sample.priority,
-            congestion_control=sample.congestion_control,
-            express=sample.express,
-            allowed_destination=_REMOTE,
-        )
-
-    def release(self, publisher: zenoh.Publisher) -> None:
-        """Undeclare a publisher."""
-        publisher.undeclare()
-        with self._lock:
-            self._count -= 1
+_DROP = zenoh.CongestionControl.DROP
 
 
 @final
 class _Way:
     """The way of a key's messages over one link. Only the thread that takes the key's messages uses it."""
 
-    __slots__ = ("_count", "_key", "_last", "_publishers", "_state", "decide", "link", "session", "used")
+    __slots__ = (
+        "_count", "_key", "_last", "_publishers", "_session", "_state", "alone", "decide", "link", "order", "outlet", "patient",
+        "used",
+    )  # fmt: skip
 
-    def __init__(self, state: LinkState, key: str, publishers: Publishers, decide: Lane) -> None:
+    def __init__(
+        self, state: LinkState, key: str, publishers: Publishers, outlet: SideOutlet, decide: Lane, only: bool
+    ) -> None:
+        """only: whether all links from its side lead to the same other side, apart from taps."""
         self.decide = decide
         self.link = state.link.number
-        self.session = publishers.session
+        self.outlet = outlet
+        self.patient = not state.link.tap
+        """Whether its messages wait for room at the other side."""
+        self.order = state.order("put", key)
+        self.alone = only and self.patient
+        """Whether all links from its side lead to the same other side, so that no third side waits with its messages."""
         self.used = False
         """Whether a further message came since this was last set to False."""
-        self._key, self._publishers, self._state = key, publishers, state
+        self._key, self._publishers, self._session, self._state = key, publishers, publishers.session, state
         self._count = 0
         self._last: tuple[zenoh.Publisher, Any, Any, bool] | None = None
 
@@ -87,15 +66,37 @@ class _Way:
         self._state.forget("put", self._key)
         self._release()
 
+    def drops(self, sample: zenoh.Sample) -> bool:
+        """Whether Zenoh drops a message at a reader that is slow, and lets nobody wait long: always copies over a tap."""
+        return not self.patient or sample.congestion_control == _DROP
+
+    def message(
+        self, sample: zenoh.Sample, copies: int, publisher: zenoh.Publisher | None = None
+    ) -> Callable[[], object]:
+        """What sends a message."""
+        if publisher is None:
+            return Message(self._session, sample, sample.congestion_control if self.patient else _DROP, copies)
+        return partial(
+            publisher.put,
+            sample.payload,
+            encoding=sample.encoding,
+            attachment=sample.attachment,
+            timestamp=sample.timestamp,
+            source_info=sample.source_info,
+        )
+
     def publisher(self, sample: zenoh.Sample) -> zenoh.Publisher | None:
-        """The publisher for a message; None for the first messages of a key, and where there are too many publishers."""
+        """The publisher for a message; None for the first messages of a key, and where there are too many publishers.
+
+        Raises zenoh.ZError.
+        """
         last = self._last
         if last is None:
             self._count += 1
             if self._count <= OFTEN:
                 return None
             self._count = 0  # if there are too many, ask again after as many messages
-            publisher = self._publishers.declare(sample)
+            publisher = self._publishers.declare(sample, sample.congestion_control if self.patient else _DROP)
             if publisher is not None:
                 self._last = (publisher, sample.priority, sample.congestion_control, sample.express)
             return publisher
@@ -105,8 +106,9 @@ class _Way:
         return None
 
     def _release(self) -> None:
+        """Undeclare the publisher after the messages that still wait for their turn with it."""
         if self._last is not None:
-            self._publishers.release(self._last[0])
+            self.outlet.follow(partial(self._publishers.release, self._last[0]))
             self._last = None
 
 
@@ -123,14 +125,17 @@ class PublicationRelay:
         side: SideSession,
         links: Mapping[str, LinkState],
         publishers: Mapping[str, Publishers],
+        outlets: Mapping[str, SideOutlet],
         plan: WirePlan,
         journal: WireJournal,
-        scheduler: Scheduler,
         tell: Callable[[str], None],
     ) -> None:
-        """links, publishers: by the names of links and of sides; tell: for what the user must know."""
-        self._links, self._publishers, self._plan = links, publishers, plan
-        self._journal, self._scheduler = journal, scheduler
+        """links, publishers, outlets: by the names of links and of sides; tell: for what the user must know."""
+        self._links, self._publishers, self._outlets = links, publishers, outlets
+        self._plan, self._journal = plan, journal
+        self._has_one_target = (
+            len({link.target for link in plan.links if link.source == side.name and not link.tap}) == 1
+        )
         self._side, self._name, self._tell = side, side.name, tell
         self.duties: list[Duty] = []
         self._until = math.inf
@@ -139,7 +144,7 @@ class PublicationRelay:
         self._threads = []
         for at, expression in enumerate(expressions):
             channel: zenoh.handlers.FifoChannel[zenoh.Sample] = zenoh.handlers.FifoChannel(WAITING)
-            subscriber = side.session.declare_subscriber(expression, channel, allowed_origin=_REMOTE)
+            subscriber = side.session.declare_subscriber(expression, channel, allowed_origin=REMOTE)
             earlier = tuple(one for one in expressions[:at] if one.intersects(expression))
             self._subscribers.append(subscriber)
             self.duties.append(Duty(f"among the messages from the side {side.name}"))
@@ -183,12 +188,12 @@ class PublicationRelay:
     def _taker(self) -> Callable[[zenoh.Sample], None]:
         """The function that is called for every message: it looks up as little as possible."""
         ways_of: dict[str, _Ways] = {}
-        now, way_to = time.time, self._way_to
-        record, hold, amend = self._journal.record, self._scheduler.hold, self._journal.amend
+        now, clock, way_to = time.time, time.monotonic, self._way_to
+        record, amend = self._journal.record, self._journal.amend
         read = SourceReader(self._journal.source_code)
         put, put_kind, delete_kind = zenoh.SampleKind.PUT, int(Kind.PUT), int(Kind.DELETE)
         unlinked, underway, zenoh_error = int(Crossing.UNLINKED), int(Crossing.UNDERWAY), zenoh.ZError
-        held_up, refused = Crossing.HELD_UP, Crossing.REFUSED
+        refused = Crossing.REFUSED
 
         def take(sample: zenoh.Sample) -> None:
             heard = now()
@@ -212,20 +217,32 @@ class PublicationRelay:
                 n, fate, delay, again = way.decide(heard, size)
                 if heard > self._until and not fate:
                     fate, delay, again = underway, 0.0, False
+                outlet = way.outlet
+                at_once = not delay and way.order is None and outlet.is_free and (way.alone or way.drops(sample))
                 row = record(
-                    heard, n, sequence, delay, code, sender, size, way.link, kind | AGAIN if again else kind, fate
+                    heard,
+                    n,
+                    sequence,
+                    delay,
+                    code,
+                    sender,
+                    size,
+                    way.link,
+                    kind | AGAIN if again else kind,
+                    fate or (0 if at_once else HELD),
                 )
                 if fate:
                     continue
                 try:
-                    if delay:
-                        copies = 2 if again else 1
-                        if not hold(delay, size, row, _Later(way.session, sample, copies)):
-                            amend(row, held_up)
+                    frequent = is_put and not (delay or again or way.order)
+                    publisher = way.publisher(sample) if frequent else None
+                    if not at_once:
+                        message = way.message(sample, 2 if again else 1, publisher)
+                        outlet.send(delay, size, row, message, patient=way.patient, order=way.order)
                         continue
-                    publisher = way.publisher(sample) if is_put else None
+                    begun = clock()
                     if publisher is None:
-                        _publish(way.session, sample)
+                        way.message(sample, 2 if again else 1)()
                     else:
                         publisher.put(
                             payload,
@@ -234,8 +251,8 @@ class PublicationRelay:
                             timestamp=sample.timestamp,
                             source_info=source,
                         )
-                    if again:
-                        _publish(way.session, sample)
+                    if clock() - begun > LONG_SECONDS:
+                        outlet.took(clock() - begun, way.alone)
                 except zenoh_error:
                     amend(row, refused)
 
@@ -263,7 +280,14 @@ class PublicationRelay:
         else:
             decisions = [_UNDERWAY if code else _TOO_MANY_KEYS] * len(states)
         ways = tuple(
-            _Way(state, key, self._publishers[state.link.target], decide)
+            _Way(
+                state,
+                key,
+                self._publishers[state.link.target],
+                self._outlets[state.link.target],
+                decide,
+                self._has_one_target,
+            )
             for state, decide in zip(states, decisions, strict=True)
         )
         if code and not ended:
@@ -277,34 +301,3 @@ def _undecided(fate: Crossing) -> Lane:
 
 
 _UNDERWAY, _TOO_MANY_KEYS = _undecided(Crossing.UNDERWAY), _undecided(Crossing.TOO_MANY_KEYS)
-
-
-@final
-class _Later:
-    """A message that is sent when its delay is over."""
-
-    __slots__ = ("_copies", "_sample", "_session")
-
-    def __init__(self, session: zenoh.Session, sample: zenoh.Sample, copies: int) -> None:
-        self._session, self._sample, self._copies = session, sample, copies
-
-    def __call__(self) -> None:
-        for _ in range(self._copies):
-            _publish(self._session, self._sample)
-
-
-def _publish(session: zenoh.Session, sample: zenoh.Sample) -> None:
-    """Publish a message whole, without a publisher. Raises zenoh.ZError."""
-    how: dict[str, Any] = {
-        "congestion_control": sample.congestion_control,
-        "priority": sample.priority,
-        "express": sample.express,
-        "attachment": sample.attachment,
-        "timestamp": sample.timestamp,
-        "allowed_destination": _REMOTE,
-        "source_info": sample.source_info,
-    }
-    if sample.kind == zenoh.SampleKind.PUT:
-        session.put(sample.key_expr, sample.payload, encoding=sample.encoding, **how)
-    else:
-        session.delete(sample.key_expr, **how)

@@ -20,9 +20,10 @@ import zenoh
 
 from evedrop.threads import wait_for_thread
 from evedrop.wire.advanced import LOST_HISTORY_SECONDS, published_key
-from evedrop.wire.crossing import AGAIN, UNLINKED, Crossing, Kind
+from evedrop.wire.crossing import AGAIN, HELD, UNLINKED, Crossing, Kind
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.lanes import Decision, Lane, LinkState
+from evedrop.wire.outlet import SideOutlet
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.publications import READY_KEYS
 from evedrop.wire.ros2 import SourceReader, reply_seconds
@@ -38,8 +39,9 @@ _MOST_WAITING = 100_000
 class _Asked:
     """A query that was heard, until all its replies have arrived: then the asker is told that there are no more."""
 
-    def __init__(self, query: zenoh.Query, side: str, query_seconds: float) -> None:
-        self.query, self.side = query, side
+    def __init__(self, query: zenoh.Query, side: str, outlet: SideOutlet, query_seconds: float) -> None:
+        """outlet: of the side at which it was asked."""
+        self.query, self.side, self._outlet = query, side, outlet
         self.key = str(query.key_expr)
         self._over = time.monotonic() + reply_seconds(self.key, query_seconds)
         self._open = 1
@@ -62,7 +64,7 @@ class _Asked:
             self._open -= 1
             over = self._open == 0
         if over:
-            self.query.drop()
+            self._outlet.follow(self.query.drop)
 
 
 @final
@@ -73,15 +75,15 @@ class QueryRelay:
         self,
         sides: Mapping[str, SideSession],
         links: Mapping[str, LinkState],
+        outlets: Mapping[str, SideOutlet],
         plan: WirePlan,
         journal: WireJournal,
-        scheduler: Scheduler,
         tell: Callable[[str], None],
     ) -> None:
-        """links: by their names; tell: for what the user must know."""
+        """links, outlets: by the names of links and of sides; tell: for what the user must know."""
         self._tell = tell
-        self._sides, self._plan, self._journal, self._scheduler = sides, plan, journal, scheduler
-        self._links = links
+        self._sides, self._plan, self._journal = sides, plan, journal
+        self._links, self._outlets = links, outlets
         self._states = [state for state in links.values() if not state.link.tap]
         self._lanes: dict[tuple[str, str, str], tuple[Lane, LinkState]] = {}
         self._queriers: dict[tuple[str, str, bool, bool], zenoh.Querier] = {}
@@ -164,7 +166,7 @@ class QueryRelay:
         while (heard := self._heard.get()) is not None:
             self.duty.in_hand = heard
             name, key, query = heard
-            asked = _Asked(query, name, self._plan.query_seconds)
+            asked = _Asked(query, name, self._outlets[name], self._plan.query_seconds)
             try:
                 if self._responsible(name, query.key_expr) == key:
                     self._ask(asked)
@@ -260,7 +262,7 @@ class QueryRelay:
         if code:
             n, fate, delay, again = self._decided(state, kind.stream, key, expression, now, size)
         mark = int(kind) | AGAIN if again else int(kind)
-        row = self._journal.record(now, n, sequence, delay, code, sender, size, state.link.number, mark, fate)
+        row = self._journal.record(now, n, sequence, delay, code, sender, size, state.link.number, mark, fate or HELD)
         if fate:
             self._wait_in_vain(asked)
             return
@@ -270,17 +272,16 @@ class QueryRelay:
             try:
                 for _ in range(2 if again else 1):
                     message.send()
-            except zenoh.ZError:
-                self._journal.amend(row, Crossing.REFUSED)
             finally:
                 asked.release()
 
-        if not delay:
-            send()
-        elif not self._scheduler.hold(delay, size, row, send):
-            self._journal.amend(row, Crossing.HELD_UP)
+        def lost() -> None:
             self._wait_in_vain(asked)
             asked.release()
+
+        # Replies wait for room: one query may have many.
+        order = state.order(kind.stream, key)
+        self._outlets[way[1]].send(delay, size, row, send, patient=kind == Kind.REPLY, order=order, lost=lost)
 
     def _wait_in_vain(self, asked: _Asked) -> None:
         """Let an asker wait for its query, or for a reply, that is lost: nothing tells it so."""

@@ -6,6 +6,7 @@ Source: docs/wire.md.
 from __future__ import annotations
 
 import contextlib
+import os
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -18,23 +19,26 @@ from evedrop.live.network.zenoh_log import LOGGED
 from evedrop.output import warn
 from evedrop.threads import wait_for_thread
 from evedrop.wire.bypasses import Bypasses
-from evedrop.wire.crossing import Crossing
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.lanes import LinkState
 from evedrop.wire.liveliness import LivelinessRelay
 from evedrop.wire.neighbours import Neighbours
+from evedrop.wire.outlet import LAST_SECONDS, SideOutlet
 from evedrop.wire.plan import WirePlan
-from evedrop.wire.publications import PublicationRelay, Publishers
+from evedrop.wire.publications import PublicationRelay
+from evedrop.wire.publishers import Publishers
 from evedrop.wire.queries import QueryRelay
 from evedrop.wire.ros2 import service_key
 from evedrop.wire.ros2_entities import EntityLog
-from evedrop.wire.scheduler import Scheduler
 from evedrop.wire.side import SideSession
 from evedrop.wire.timeline import Moment
 from evedrop.wire.watchdog import Duty
 
 _LOOK_SECONDS = 0.2
-_LAST_SECONDS = 1.0  # for the messages that still wait when the wire ends; a longer backlog is not worth the wait
+_RECEIVERS = (
+    32  # threads of Zenoh: a program that waits for the wire holds one, and with none left all sides would wait
+)
+_LAST_SECONDS = 1.0  # for the messages that wait for the wire when it ends; a longer backlog is not worth the wait
 
 
 @final
@@ -56,6 +60,7 @@ class WireRelay:
         self._duty = Duty("in the list of what programs declare")
         self._ended = threading.Event()
         self._woken = threading.Event()
+        os.environ.setdefault("ZENOH_RUNTIME", f"(rx: (worker_threads: {_RECEIVERS}))")  # read with the first session
         zenoh.init_log_from_env_or(LOGGED)
 
     def __enter__(self) -> Self:
@@ -92,21 +97,22 @@ class WireRelay:
     def _open(self, stack: contextlib.ExitStack) -> None:
         plan, journal, links = self.plan, self._journal, self.links
         self.sides = {name: stack.enter_context(SideSession(side, plan.largest)) for name, side in plan.sides.items()}
-        scheduler = Scheduler(plan.held_messages, plan.held_bytes, lambda row: journal.amend(row, Crossing.REFUSED))
-        stack.callback(self._end_delays, scheduler)
+        outlets = {name: SideOutlet(name, plan, journal, self._tell) for name in plan.sides}
+        stack.callback(self._end_outlets, [*outlets.values()])
         publishers = {name: Publishers(side.session) for name, side in self.sides.items()}
-        self._queries = QueryRelay(self.sides, links, plan, journal, scheduler, self._tell)
+        self._queries = QueryRelay(self.sides, links, outlets, plan, journal, self._tell)
         stack.callback(self._queries.close)
         relays = [
-            PublicationRelay(side, links, publishers, plan, journal, scheduler, self._tell)
+            PublicationRelay(side, links, publishers, outlets, plan, journal, self._tell)
             for side in self.sides.values()
         ]
         for relay in relays:
             stack.callback(relay.close)
         stack.callback(self._leave, relays)
         of_sides = [side.duty for side in self.sides.values()]
+        of_outlets = [duty for outlet in outlets.values() for duty in outlet.duties]
         of_relays = [duty for relay in relays for duty in relay.duties]
-        self.duties = [*of_sides, *of_relays, scheduler.duty, self._queries.duty, self._duty]
+        self.duties = [*of_sides, *of_relays, *of_outlets, self._queries.duty, self._duty]
         self._bypasses = Bypasses(self._note_bypass)
         self._neighbours = Neighbours(self.sides, [*links.values()], self._tell, self._bypasses)
         self._liveliness = LivelinessRelay(self.sides, plan, self._woken.set, EntityLog(journal.folder).add)
@@ -134,10 +140,13 @@ class WireRelay:
         for relay in relays:
             relay.leave(until)
 
-    def _end_delays(self, scheduler: Scheduler) -> None:
-        """Count the messages that were still delayed."""
-        for row in scheduler.close():
-            self._journal.amend(row, Crossing.UNDERWAY)
+    def _end_outlets(self, outlets: Sequence[SideOutlet]) -> None:
+        """End what sends to the sides, all at once: each may have to wait for its programs."""
+        for outlet in outlets:
+            outlet.end()
+        deadline = time.monotonic() + LAST_SECONDS
+        for outlet in outlets:
+            outlet.close(deadline)
 
     def _look(self) -> None:
         """Follow what programs declare.

@@ -25,6 +25,28 @@ class _Held(NamedTuple):
 
 
 @final
+class KeyOrder:
+    """Messages of which none is sent before an earlier one, such as those of a key."""
+
+    __slots__ = ("_latest", "due")
+
+    def __init__(self) -> None:
+        self.due = 0.0
+        """When the latest decided message is due, in seconds of the monotonic clock."""
+        self._latest = 0.0
+
+    def delay(self, delay: float, now: float) -> float:
+        """The delay, in seconds, of the next message, which by itself has another one."""
+        self.due = max(self.due, now + delay)
+        return self.due - now
+
+    def send_at(self, due: float) -> float:
+        """When a message is sent that is due at a time: not before the one that was held before."""
+        self._latest = max(self._latest, due)
+        return self._latest
+
+
+@final
 class Scheduler:
     """A thread that carries out tasks when they are due. It holds a limited number of messages, and of bytes."""
 
@@ -41,12 +63,18 @@ class Scheduler:
         self._thread = threading.Thread(target=self._run, name="delays", daemon=True)
         self._thread.start()
 
-    def hold(self, delay: float, size: int, row: int, send: Callable[[], object]) -> bool:
-        """Send a message of some bytes after some seconds; returns whether there is room for it. row: its row in the journal."""
+    def hold(
+        self, delay: float, size: int, row: int, send: Callable[[], object], order: KeyOrder | None = None
+    ) -> bool:
+        """Send a message of some bytes after some seconds, or later to keep an order; returns whether there is room for it.
+
+        row: its row in the journal.
+        """
         with self._changed:
             if self._ended or len(self._heap) >= self._most or self._bytes + size > self._most_bytes:
                 return False
-            held = _Held(self._clock.monotonic() + delay, next(self._serial), size, row, send)
+            due = self._clock.monotonic() + delay
+            held = _Held(due if order is None else order.send_at(due), next(self._serial), size, row, send)
             heapq.heappush(self._heap, held)
             self._bytes += size
             if self._heap[0] is held:

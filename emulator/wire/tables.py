@@ -152,6 +152,15 @@ class WireLinkTable(WireSettingsTable):
     target: Annotated[str, Field(strict=True, alias="to", examples=["base"])]
     keys: Annotated[KeyExpression, Field(examples=["robot/scan/**"])] = "**"
     tap: Annotated[bool, Field(strict=True)] = False
+    ordered: Annotated[bool, Field(strict=True)] = False
+
+    @classmethod
+    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+        """Those of the settings, and messages that are to overtake others, on a link on which none does."""
+        found = super().mistakes(table)
+        if table.get("ordered") is True and table.get("reorder"):
+            found.append(("reorder", "is given together with ordered = true; expected one of them"))
+        return found
 
 
 class TlsTable(Table):

@@ -53,6 +53,26 @@ def test_a_delayed_message_comes_later_and_in_order(tmp_path: Path) -> None:
         assert set(delayed["delay"].tolist()) == {0.2}
 
 
+def test_messages_of_an_ordered_link_do_not_overtake_each_other(tmp_path: Path) -> None:
+    """Although their delays differ by more than the time between them; without `ordered` some do."""
+    varying = {**PERFECT, "delay": {"model": "normal", "mean": 0.1, "deviation": 0.05}}
+    plan = plan_of(
+        READY,
+        link("robot", "base", varying, "in/**", name="in", ordered=True),
+        link("robot", "base", varying, "out/**", name="out"),
+    )
+    with at_work(plan, tmp_path) as wire, wire.program("robot") as robot, wire.program("base") as base:
+        ready(wire, robot, base)
+        ordered, free = reader(base, "in/x"), reader(base, "out/x")
+        wait_until(lambda: all(is_declared(wire, "base", "subscriber", key) for key in ("in/x", "out/x")), "it reads")
+        for n in range(100):
+            for key in ("in/x", "out/x"):
+                robot.put(key, str(n), congestion_control=BLOCK)
+        wait_until(lambda: len(ordered) == len(free) == 100, "all come")
+        assert [int(one.payload.to_string()) for one in ordered] == [*range(100)]
+        assert [int(one.payload.to_string()) for one in free] != [*range(100)]
+
+
 def test_what_is_still_delayed_when_the_wire_ends_is_counted(tmp_path: Path) -> None:
     """As under way, in the journal's files too."""
     with at_work(both_ways(slow(1000.0)), tmp_path) as wire, wire.program("robot") as robot:

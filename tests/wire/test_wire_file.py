@@ -289,6 +289,8 @@ def test_all_mistakes_at_once() -> None:
         (f"{BASE}rate = '2 MB'", 'link.0.rate: is "2 MB"; expected bytes per second, or a text such as "2 MB/s"; the units are '
          'B/s, kB/s, MB/s, GB/s, KiB/s, MiB/s, GiB/s, bit/s, kbit/s, Mbit/s, Gbit/s, such as "2 MB/s"'),
         (f"{BASE}queue = 1000", "link.0.queue: is given without a rate, so that nothing queues; expected a rate as well"),
+        (f"{BASE}ordered = true\nreorder = 0.1\ndelay = {{ model = \"constant\", value = 1 }}",
+         "link.0.reorder: is given together with ordered = true; expected one of them"),
         (f"{BASE}reorder = 0.1", "link.0.reorder: is given without a delay, so that nothing can overtake; expected a delay as "
          "well"),
         (f"{BASE}quality = 0.5\nloss = {{ model = 'bernoulli', quality = 0.5 }}", "link.0.quality: is given together with loss, "

@@ -19,10 +19,10 @@ import pytest
 
 from evedrop.errors import UsageError
 from evedrop.wire import journal as journal_module
-from evedrop.wire.crossing import AGAIN, RECORD, UNLINKED, Crossing, Kind
+from evedrop.wire.crossing import AGAIN, HELD, RECORD, UNLINKED, Crossing, Kind
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_part import STORED, JournalPart, Records, records_in
-from evedrop.wire.journal_reader import journal_tables, last_beat, part_names
+from evedrop.wire.journal_reader import journal_tables, part_names
 from evedrop.wire.lanes import LinkState
 from tests.conftest import LIMIT, wait_until
 from tests.wire.wire_plans import wire_plan
@@ -208,17 +208,37 @@ def test_parts_are_read_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     assert part_names(tmp_path / "journal") == ["001-0001", "001-9999", "001-10000", "002-0001"]
 
 
-def test_what_was_underway_depends_on_when_the_wire_was_last_alive(tmp_path: Path) -> None:
-    """A message whose delay was over before that is delivered, although nothing was heard afterwards."""
+def test_what_a_killed_wire_had_not_sent_is_underway(tmp_path: Path) -> None:
+    """Not what should have been sent by then, and not a message without a delay that waited for its turn."""
     folder, killed = tmp_path / "wire", tmp_path / "killed"
     with WireJournal(folder, wire_plan()) as journal:
-        alive = last_beat(folder / "journal" / "unfinished")
-        for n, over in enumerate((alive - 1.0, alive + 3600.0)):
-            journal.record(alive - 60.0, n, -1, over - (alive - 60.0), journal.key_code("scan/1"), 0, 0, 0, Kind.PUT, 0)
+        for n, delay in enumerate((3600.0, 3600.0, 0.0, 0.0)):
+            code = journal.key_code("scan/1")
+            row = journal.record(time.time(), n, -1, delay, code, 0, 0, 0, Kind.PUT, Crossing.DELIVERED | HELD)
+            if n % 2:
+                journal.sent(row)
+        assert [row["reason"] for row in rows_of(folder)] == [None] * 4
         shutil.copytree(folder, killed)
     with WireJournal(killed, wire_plan()):
         pass
-    assert [row["reason"] for row in rows_of(killed)] == [None, "underway"]
+    assert [row["reason"] for row in rows_of(killed)] == ["underway", None, "underway", None]
+
+
+def test_a_file_of_rows_stays_while_one_of_them_was_not_sent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its Parquet file would no longer know which; it is made as soon as all are sent, or when the wire ends."""
+    monkeypatch.setattr(journal_module, "_PATIENCE", 0.0)
+    with WireJournal(tmp_path, wire_plan(), part_rows=2) as journal:
+        rows = []
+        for n in range(6):
+            fate = Crossing.DELIVERED | HELD if n in (0, 4) else Crossing.DELIVERED
+            rows.append(journal.record(time.time() - 60.0, n, -1, 0.0, journal.key_code("a"), 0, 0, 0, Kind.PUT, fate))
+        made = tmp_path / "journal"
+        wait_until((made / "001-0002.parquet").exists, "the file of the rows that are sent")
+        assert not (made / "001-0001.parquet").exists()
+        journal.sent(rows[0])
+        wait_until((made / "001-0001.parquet").exists, "the file, after all are sent")
+        assert not (made / "001-0003.parquet").exists()
+    assert [row["reason"] for row in rows_of(tmp_path)] == [None] * 6
 
 
 def test_a_listener_that_fails_gets_no_more_records(tmp_path: Path) -> None:
@@ -291,7 +311,7 @@ import mmap, os, random, signal, sys, time
 from pathlib import Path
 import numpy as np
 import pyarrow as pa
-from evedrop.wire.crossing import Kind
+from evedrop.wire.crossing import HELD, Kind
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_reader import journal_tables
 from tests.wire.wire_plans import wire_plan
@@ -306,7 +326,7 @@ def write(first):
     n = first = journal.counts.get(("scan", "scan/1", "put"), 0)
     key = journal.key_code("scan/1")
     while True:
-        journal.record(time.time(), n, n, 0.0 if n % 2 else 3600.0, key, 0, 64, 0, Kind.PUT, 0)
+        journal.record(time.time(), n, n, 0.0 if n % 2 else 3600.0, key, 0, 64, 0, Kind.PUT, 0 if n % 2 else HELD)
         n += 1
         recorded[0] = n
 

@@ -17,7 +17,7 @@ from evedrop.cli.main import main
 from evedrop.errors import UsageError
 from evedrop.results.wire_folder import WIRE_FILE
 from evedrop.wire import journal as journal_module
-from evedrop.wire.crossing import Crossing, Kind
+from evedrop.wire.crossing import HELD, Crossing, Kind
 from evedrop.wire.file import resolved_wire
 from evedrop.wire.history import WireHistory
 from evedrop.wire.journal import WireJournal
@@ -41,8 +41,8 @@ def folders(tmp_path: Path) -> Iterator[dict[str, Path]]:
         (out / WIRE_FILE).write_text(resolved_wire(plan))
         fates = [Crossing.DELIVERED] * (DELIVERED + DELAYED) + [Crossing.LOST] * LOST
         for n, fate in enumerate(fates):
-            delay = 1000.0 if n < DELAYED else 0.0
-            journal.record(time.time(), 1 + n, -1, delay, journal.key_code("scan"), 0, 8, 0, Kind.PUT, fate)
+            delay, held = (1000.0, HELD) if n < DELAYED else (0.0, 0)
+            journal.record(time.time(), 1 + n, -1, delay, journal.key_code("scan"), 0, 8, 0, Kind.PUT, fate | held)
         shutil.copytree(out, found["killed"])
         yield found
 

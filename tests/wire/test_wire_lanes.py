@@ -6,6 +6,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,7 +15,7 @@ from evedrop.wire.crossing import Crossing
 from evedrop.wire.fates import KeyFates
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.lanes import Decision, LinkState
-from tests.wire.wire_at_work import DEAD, LOSSY, both_ways
+from tests.wire.wire_at_work import DEAD, LOSSY, both_ways, link, plan_of
 
 LARGEST = 100
 
@@ -137,6 +138,27 @@ def test_a_key_that_was_forgotten_goes_on(lossy: LinkState, lossless: bool) -> N
     assert [one[:2] for one in found] == [(n, 0 if lossless else fates.next()[0]) for n in range(100)]
     assert lossy.lane("query", "scan", lossless)(0.0, 1)[0] == 0
     assert lossy.lane("put", "pose", lossless)(0.0, 1)[0] == 0
+
+
+def test_an_ordered_link_delays_a_message_as_long_as_the_one_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The losses, and the delays of messages that no earlier one holds up, are those of the same link without an order."""
+    now = [100.0]
+    monkeypatch.setattr("evedrop.wire.lanes.time", SimpleNamespace(monotonic=lambda: now[0]))
+    settings = {**LOSSY, "delay": {"model": "normal", "mean": 0.05, "deviation": 0.02}}
+    plan = plan_of(link("robot", "base", settings, ordered=True), link("base", "robot"))
+    fates = KeyFates(plan.links[0], "scan", "put", plan.seed)
+    with WireJournal(tmp_path, plan) as journal:
+        decide, latest = LinkState(plan.links[0], plan, journal).lane("put", "scan", lossless=False), 0.0
+        for n in range(200):
+            now[0] = 100.0 + n / 100
+            code, delay, _ = fates.next()
+            due = max(latest, now[0] + delay)
+            at, fate, waits, _ = decide(0.0, 1)
+            assert (at, fate) == (n, code)
+            assert waits == pytest.approx(due - now[0] if code == 0 else 0.0, abs=1e-9)
+            latest = due if code == 0 else latest
 
 
 def test_the_keys_of_a_history_are_numbered_together(lossy: LinkState) -> None:

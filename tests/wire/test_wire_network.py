@@ -204,6 +204,8 @@ def test_what_a_run_cannot_have_is_refused() -> None:
     )
     rate = refusal(wire(radio={"rate": "1 kB/s"}), scenario_of())
     assert "radio, the link of legitimate, has a rate in bytes per second" in rate
+    ordered = wire(radio={"ordered": True, "delay": {"model": "constant", "value": 0.1}})
+    assert "radio, the link of legitimate, has ordered = true, and the delays" in refusal(ordered, scenario_of())
     apart = [{"at": "1 s", "partition": ["robot", "base"]}]
     assert "the scenario has no slot_seconds" in refusal(wire(event=apart), scenario_of(slot_seconds=None))
     both = refusal(tied_to_a_third(), scenario_of())

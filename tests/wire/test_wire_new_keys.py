@@ -14,11 +14,13 @@ from evedrop.wire.crossing import Crossing, Kind
 from evedrop.wire.journal_on_disk import scorekeeper_on_disk
 from evedrop.wire.journal_reader import journal_tables
 from evedrop.wire.key_limit import KeyLimit
-from evedrop.wire.publications import PublicationRelay, Publishers
+from evedrop.wire.plan import WirePlan
+from evedrop.wire.publications import PublicationRelay
+from evedrop.wire.publishers import Publishers
 from evedrop.wire.scorekeeper import WireScorekeeper
 from tests.conftest import LIMIT, wait_until
 from tests.wire.test_wire_publications import reader, ready
-from tests.wire.wire_at_work import at_work, both_ways, is_declared
+from tests.wire.wire_at_work import at_work, both_ways, is_declared, link, plan_of
 
 BLOCK = zenoh.CongestionControl.BLOCK
 
@@ -28,12 +30,12 @@ def declared(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The keys for which publishers are declared now; a key is frequent after 3 messages, and there is room for 8 keys."""
     monkeypatch.setattr("evedrop.wire.publications.OFTEN", 3)
     monkeypatch.setattr("evedrop.wire.publications.READY_KEYS", 8)
-    monkeypatch.setattr("evedrop.wire.publications.MOST_PUBLISHERS", 2)
+    monkeypatch.setattr("evedrop.wire.publishers.MOST_PUBLISHERS", 2)
     keys: list[str] = []
     declare, release = Publishers.declare, Publishers.release
 
-    def declares(self: Publishers, sample: zenoh.Sample) -> zenoh.Publisher | None:
-        publisher = declare(self, sample)
+    def declares(self: Publishers, sample: zenoh.Sample, *rest: Any) -> zenoh.Publisher | None:
+        publisher = declare(self, sample, *rest)
         if publisher is not None:
             keys.append(str(sample.key_expr))
         return publisher
@@ -67,9 +69,14 @@ def relays(monkeypatch: pytest.MonkeyPatch) -> list[PublicationRelay]:
     return started
 
 
-def test_publishers_are_declared_for_frequent_keys_only(tmp_path: Path, declared: list[str]) -> None:
-    """There is a limited number of them, which other keys get when keys are not used any more; all messages cross in order."""
-    with at_work(both_ways(), tmp_path) as wire, wire.program("robot") as sender, wire.program("base") as far:
+@pytest.mark.parametrize("plan", [both_ways(), plan_of(link("robot", "base"), link("robot", "third"))])
+def test_publishers_are_declared_for_frequent_keys_only(tmp_path: Path, declared: list[str], plan: WirePlan) -> None:
+    """There is a limited number of them, which other keys get when keys are not used any more; all messages cross in order.
+
+    Also with two sides, where messages wait for their turn: a publisher is released after those that it has to send.
+    """
+    targets = len(plan.sides) - 1
+    with at_work(plan, tmp_path) as wire, wire.program("robot") as sender, wire.program("base") as far:
         ready(wire, sender, far)
         got = reader(far, "key/**")
         wait_until(lambda: sender.put("key/ready", b"") or got, "the reader hears")
@@ -93,16 +100,16 @@ def test_publishers_are_declared_for_frequent_keys_only(tmp_path: Path, declared
             for name in ("one", "two", "three"):
                 put(name)
         wait_until(lambda: arrived() == sent, "all arrive in order")
-        assert len(declared) == 2
+        assert len(declared) == 2 * targets
         new_keys("b")
-        assert not declared
+        wait_until(lambda: not declared, "their publishers are released")
         for _ in range(8):
             put("three")
         wait_until(lambda: arrived() == sent, "all arrive in order")
-        assert declared == ["key/three"]
+        assert declared == ["key/three"] * targets
         put("three", zenoh.Priority.DATA_HIGH)
         wait_until(lambda: sorted(arrived(), key=int) == sent, "it arrives")
-        assert not declared
+        wait_until(lambda: not declared, "its publisher is released")
 
 
 def test_a_key_that_is_in_use_is_not_forgotten_for_new_ones(

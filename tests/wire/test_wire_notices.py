@@ -24,13 +24,17 @@ def steps_of(*counts: dict[Crossing, int]) -> WireSteps:
 
 def test_losses_of_the_wire_itself_are_told_once() -> None:
     """For each reason, and as errors: they are not what the file asked for."""
-    steps = steps_of({Crossing.HELD_UP: 3}, {Crossing.HELD_UP: 3, Crossing.REFUSED: 1}, {Crossing.LOST: 4})
+    steps = steps_of(
+        {Crossing.HELD_UP: 3}, {Crossing.HELD_UP: 3, Crossing.REFUSED: 1}, {Crossing.LOST: 4, Crossing.CONGESTED: 1}
+    )
     watcher = LinkWatcher(["scan"], 0.2)
     lines = watcher.watch(steps)
     assert [(round(one.seconds, 6), one.level) for one in lines if "does not cross" in one.text] == [
         (0.0, "ERROR"),
         (0.2, "ERROR"),
+        (0.4, "ERROR"),
     ]
+    assert "scan: the first message that does not cross: not taken by readers" in [one.text for one in lines]
     assert not [one for one in watcher.watch(steps) if "does not cross" in one.text]
 
 
@@ -92,6 +96,7 @@ def test_the_main_reason_decides_on_a_lane() -> None:
     expected = {
         Crossing.CORRUPTED: LaneState.SOME, Crossing.OVERFLOW: LaneState.FULL, Crossing.CUT: LaneState.CUT,
         Crossing.REFUSED: LaneState.OWN, Crossing.HELD_UP: LaneState.OWN, Crossing.TOO_MANY_KEYS: LaneState.OWN,
+        Crossing.CONGESTED: LaneState.OWN,
     }  # fmt: skip
     for fate, state in expected.items():
         assert state_of(steps_of({Crossing.DELIVERED: 9, Crossing.LOST: 1, fate: 3}).counts[0, 0]) is state

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import signal
 from pathlib import Path
+
+import pyarrow as pa
 
 from evedrop.live.network.control_file import read_control
 from evedrop.live.network.operator import ask
@@ -13,6 +16,7 @@ from evedrop.live.protocol.requests import StatusRequest
 from evedrop.live.protocol.wire_status import WireStatus
 from evedrop.wire.fates import KeyFates
 from evedrop.wire.file import load_wire
+from evedrop.wire.journal_reader import journal_tables
 from evedrop.wire.run import continuation, run_wire
 from tests.conftest import Evedrop, Live, wait_until
 from tests.wire.wire_at_work import program
@@ -94,3 +98,36 @@ def test_a_wire_that_was_killed_goes_on_with_its_fates(evedrop: Evedrop) -> None
     assert (summary["start"], summary["links"]["scan"]["heard"], summary["unaccounted"]) == (2, COUNT, 0)
     assert summary["journal"]["recovered"] >= COUNT
     assert not (wire.folder / "control.json").exists()
+
+
+DELAYED = """
+[side.robot]
+[side.base]
+[[link]]
+from = "robot"
+to = "base"
+delay = { model = "normal", mean = "100 ms", deviation = "30 ms" }
+"""
+
+
+def test_a_killed_wire_calls_delivered_what_it_had_sent(evedrop: Evedrop) -> None:
+    """Kill -9 while delayed messages pass: what arrived is delivered, but for one that may have been in its hands."""
+    path = evedrop.folder / "robot.toml"
+    path.write_text(DELAYED)
+    wire = evedrop.started("wire", str(path))
+    control = wire.folder / "control.json"
+    wait_until(lambda: control.exists() or wire.process.poll() is not None, "a wire that can be asked")
+    answer = ask(read_control(wire.folder), StatusRequest(), 30.0)
+    assert answer is not None
+    assert isinstance(answer.status, WireStatus)
+    arrived: set[int] = set()
+    with program(answer.status.sides["robot"]) as robot, program(answer.status.sides["base"]) as base:
+        base.declare_subscriber("scan", lambda sample: arrived.add(int(sample.payload.to_bytes())))
+        numbers = itertools.count()
+        wait_until(lambda: robot.put("scan", str(next(numbers)).encode()) or len(arrived) > 200, "many have arrived")
+        os.kill(wire.process.pid, signal.SIGKILL)
+        wire.process.communicate()
+    rows = pa.concat_tables(journal_tables(wire.folder, killed=True)).to_pylist()
+    delivered = {row["n"] for row in rows if row["fate"] == "delivered"}
+    assert {row["reason"] for row in rows} == {None, "underway"}
+    assert len(arrived - delivered) <= 1

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from functools import partial
 
-from evedrop.wire.scheduler import Scheduler
+from evedrop.wire.scheduler import KeyOrder, Scheduler
 from tests.clock import TestClock
 from tests.conftest import LIMIT, wait_until
 
@@ -29,7 +30,11 @@ class Held:
 
     def hold(self, delay: float, size: int = 1, row: int = 0, name: str = "") -> bool:
         """Hold a message that notes its name and the time at which it is sent."""
-        return self.scheduler.hold(delay, size, row, lambda: self.sent.append((name, self.clock.now - 1000.0)))
+        return self.scheduler.hold(delay, size, row, partial(self.note, name))
+
+    def note(self, name: str) -> None:
+        """Note that a message is sent now."""
+        self.sent.append((name, self.clock.now - 1000.0))
 
     def let_go(self, until: Callable[[], object]) -> None:
         """Let the thread go on, until a condition holds."""
@@ -50,6 +55,16 @@ def test_messages_are_sent_when_they_are_due() -> None:
     assert held.sent[-1] == ("e", 3.5)
     assert held.scheduler.held == 0
     assert held.scheduler.close() == []
+
+
+def test_an_order_is_kept() -> None:
+    """A message of an order waits for those before it; others do not."""
+    held, order = Held(), KeyOrder()
+    for delay, name in ((3.0, "a"), (1.0, "b"), (3.5, "c"), (0.0, "d")):
+        assert held.scheduler.hold(delay, 1, 0, partial(held.note, name), order)
+    held.hold(1.0, name="other")
+    held.let_go(lambda: len(held.sent) == 5)
+    assert held.sent == [("other", 1.0), ("a", 3.0), ("b", 3.0), ("c", 3.5), ("d", 3.5)]
 
 
 def test_a_limited_number_of_messages_waits() -> None:

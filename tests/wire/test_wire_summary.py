@@ -133,19 +133,20 @@ def test_what_no_model_decides_is_named_apart(tmp_path: Path) -> None:
             journal.record(1.0 * n, n, -1, 0.1, keys[0], 0, 1, 0, Kind.DELETE if n % 2 else Kind.PUT, fate)
             journal.record(1.0 * n, n, -1, 0.0, keys[1], 0, 1, 0, Kind.PUT, Crossing.DELIVERED)
         journal.record(20.0, -1, -1, 0.0, keys[2], 0, 1, UNLINKED, Kind.QUERY, Crossing.UNLINKED)
-        row = journal.record(21.0, 12, -1, 0.2, keys[0], 0, 1, 0, Kind.PUT | AGAIN, Crossing.DELIVERED)
+        row = journal.record(21.0, len(Crossing), -1, 0.2, keys[0], 0, 1, 0, Kind.PUT | AGAIN, Crossing.DELIVERED)
         journal.flush()
         journal.amend(row, Crossing.REFUSED)
     assert keeper.finish(tmp_path) == 0
     found = json.loads((tmp_path / "summary.json").read_text())
     link = found["links"]["link"]
-    assert (found["heard"], found["unlinked"], found["unaccounted"]) == (26, 1, 0)
-    assert (link["heard"], link["delivered"], link["again"]) == (25, 13, 1)
+    assert (found["heard"], found["unlinked"], found["unaccounted"]) == (28, 1, 0)
+    assert (link["heard"], link["delivered"], link["again"]) == (27, 14, 1)
     assert link["lost_by"] == dict.fromkeys(("loss", "corrupted", "overflow", "cut"), 1)
-    dropped = ("unlinked", "too_large", "held_up", "looped", "underway", "too_many_keys")
+    dropped = ("unlinked", "too_large", "held_up", "looped", "underway", "too_many_keys", "congested")
     assert link["dropped_by"] == {**dict.fromkeys(dropped, 1), "refused": 2}
-    assert link["rate"] == pytest.approx(5 / 7)  # of delivered, lost, corrupted, held up, underway and twice refused
-    assert link["gap_messages"] == 11
+    # Of delivered, lost, corrupted, held up, underway, congested and twice refused.
+    assert link["rate"] == pytest.approx(6 / 8)
+    assert link["gap_messages"] == 12
     said = "\n".join(wire_sentences(read(tmp_path)))
     assert "link lost 1 by loss, 1 by corrupted, 1 by overflow, 1 by cut" in said
     apart = "overflow and cut and unlinked and too large and looped and too many keys"
@@ -153,7 +154,7 @@ def test_what_no_model_decides_is_named_apart(tmp_path: Path) -> None:
     assert "the wire itself, or Zenoh, dropped 1 by unlinked, 1 by too large" in said
     assert "no link of the file takes 1 message" in said
     title, heading, _, first = [line for line in closing_lines(read(tmp_path)) if line.strip()][:4]
-    assert title.startswith("wire · seed 7 · 26 messages · ")
+    assert title.startswith("wire · seed 7 · 28 messages · ")
     assert heading.split() == [
         "link",
         "heard",
@@ -166,7 +167,7 @@ def test_what_no_model_decides_is_named_apart(tmp_path: Path) -> None:
         "delay",
         "gap",
     ]
-    assert first.split()[:6] == ["link", "25", "13", "4", "8", "0.7143"]
+    assert first.split()[:6] == ["link", "27", "14", "4", "9", "0.7500"]
 
 
 EXPECTING = """
