@@ -12,6 +12,8 @@ THREAD_SECONDS = 600.0
 
 def wait_for_thread(thread: threading.Thread, seconds: float = THREAD_SECONDS) -> None:
     """Wait until a thread has ended. Raises RunError if it still runs after `seconds`."""
+    if thread.ident is None:  # it was never started, as on a machine that lacks threads: the reason is told elsewhere
+        return
     thread.join(seconds)
     if thread.is_alive():
         raise RunError(

@@ -68,7 +68,8 @@ class SideSession:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        with self.duty.busy():
+        # Zenoh gives up after 10 s if a program that does not read keeps its connection: the process ends all the same.
+        with self.duty.busy(), contextlib.suppress(zenoh.ZError):
             self.session.close()
 
     def answer(self) -> None:

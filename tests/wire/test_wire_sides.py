@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import threading
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import zenoh
 
 from evedrop.errors import UsageError
+from evedrop.lacks import lack_of
 from evedrop.live.launch.authority import Authority
 from evedrop.ports import free_port
 from evedrop.wire.crossing import Crossing
@@ -39,6 +42,35 @@ def test_the_endpoint_has_the_real_port(protocol: str) -> None:
             assert [str(router) for router in session.info.routers_zid()] == [side.zid]
         assert not side.endpoints[0].endswith(":0")
         assert other.endpoints == (f"tcp/127.0.0.1:{port}",)
+
+
+def test_a_side_that_zenoh_does_not_close_in_time_ends_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As when a program no longer reads and keeps its connection; the journal and the summary must still be written."""
+
+    def times_out() -> None:
+        raise zenoh.ZError("close operation timed out!")
+
+    side = SideSession(Side("a", (ANYWHERE,)), 100)
+    with side.session, monkeypatch.context() as patched:
+        patched.setattr(side, "session", SimpleNamespace(close=times_out))
+        with side:
+            pass
+
+
+@pytest.mark.parametrize("name", ["to base", "from robot", "from base", "queries"])
+def test_a_wire_that_lacks_threads_says_so(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And not that a thread cannot be joined: the first error is the one that `lack_of` knows."""
+    start = threading.Thread.start
+
+    def fails(thread: threading.Thread) -> None:
+        if thread.name == name:
+            raise RuntimeError("can't start new thread")
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", fails)
+    with pytest.raises(RuntimeError) as raised:
+        at_work(both_ways(), tmp_path).__enter__()
+    assert lack_of(raised.value) is not None
 
 
 def test_a_message_twice_as_large_as_the_largest_is_still_heard() -> None:
