@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
+import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -211,3 +213,22 @@ def test_a_further_server_has_modules_that_the_first_has_not(tmp_path: Path, mon
     assert json.loads(second.splitlines()[0]) == given
     assert len({*parents, os.getpid()}) == 3
     wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in parents), "no server left")
+
+
+def test_a_machine_without_threads_leaves_no_socket_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a fork server that nobody could follow."""
+    made, pair = list[socket.socket](), socket.socketpair
+
+    def recorded(family: int, kind: int) -> tuple[socket.socket, socket.socket]:
+        ends = pair(family, kind)
+        made.extend(ends)
+        return ends
+
+    def fails(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(socket, "socketpair", recorded)
+    monkeypatch.setattr(threading.Thread, "start", fails)
+    with pytest.raises(RuntimeError, match="can't start new thread"), fork_servers(["json"]):
+        pytest.fail("it began")
+    assert [end.fileno() for end in made] == [-1, -1]

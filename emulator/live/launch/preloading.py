@@ -248,6 +248,8 @@ def fork_servers(*modules: Sequence[str]) -> Iterator[tuple[ForkServer, ...]]:
     """Fork servers, each of which imports these modules and those of the servers before it. Raises OSError."""
     with ExitStack() as stack:
         pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in modules]
+        for ours, _ in pairs:  # also if no process, or no thread, can be started
+            stack.callback(ours.close)
         with ExitStack() as theirs:
             for _, end in pairs:
                 theirs.enter_context(end)
