@@ -18,7 +18,8 @@ SUSPENDED_SECONDS = 60.0
 """How long a process that others wait for may be suspended."""
 _LOOK_SECONDS = 1.0
 _PR_SET_PDEATHSIG = 1
-# The setting survives exec. A parent that died before it was made sends no signal any more.
+# The setting survives exec. A parent that died before it was made sends no signal any more. Python ignores SIGPIPE, and a program
+# that it becomes would, too.
 _SIGNALLED = """
 import ctypes, os, signal, sys
 {first}
@@ -26,6 +27,7 @@ number, parent = int(sys.argv[1]), int(sys.argv[2])
 ctypes.CDLL(None).prctl(1, number, 0, 0, 0)
 if os.getppid() != parent:
     os.kill(os.getpid(), number)
+signal.signal(signal.SIGPIPE, signal.SIG_DFL)
 os.execv(sys.argv[3], sys.argv[3:])
 """
 

@@ -106,8 +106,7 @@ class ResultsWriter:
         self._at = "slot 0"
         self._broken = self._figures_before = False
         self._round_due = self._figures_due = time.monotonic() + _ROUND_SECONDS
-        self.with_figures: Callable[[], None] = lambda: None
-        """Called whenever figures are about to be written: their rows are on disk by then."""
+        self._with_figures: Callable[[], None] = lambda: None
         self._round()
 
     def _stream(self, name: str, number: int) -> TableStream:
@@ -115,8 +114,11 @@ class ResultsWriter:
         return TableStream(self._held.now / UNFINISHED / f"{name}-{number}.arrows", schema, names)
 
     @classmethod
-    def of(cls, folder: Path, scenario: Scenario) -> Self:
-        """A writer for the results of a scenario."""
+    def of(cls, folder: Path, scenario: Scenario, with_figures: Callable[[], None] = lambda: None) -> Self:
+        """A writer for the results of a scenario.
+
+        with_figures: called before figures are written; their rows are on disk by then.
+        """
         loop = (
             None
             if scenario.driven is None or scenario.controller is None
@@ -124,7 +126,9 @@ class ResultsWriter:
         )
         states, around = len(scenario.process.A), scenario.process.around
         program = scenario.process if scenario.process.source == "zenoh" else None
-        return cls(folder, scenario.receivers, states, around, loop, monitor_of(scenario) is not None, program)
+        writer = cls(folder, scenario.receivers, states, around, loop, monitor_of(scenario) is not None, program)
+        writer._with_figures = with_figures
+        return writer
 
     def __enter__(self) -> Self:
         return self
@@ -193,7 +197,7 @@ class ResultsWriter:
 
     def write_figures(self, figures: Summary) -> None:
         """Write the summary so far, of a run that has not ended."""
-        self.with_figures()
+        self._with_figures()
         write_figures(self._held.now, summary_text(replace(figures, ended=self._at)))
 
     def restart_slots(self) -> None:

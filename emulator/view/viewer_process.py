@@ -96,8 +96,8 @@ def spawn(
     arguments: must not name what is to be shown, for another process may have taken the port. apart: with a network of its own,
     if the system allows it.
 
-    Raises PortTaken if another process listens there, and UsageError, with the last lines of its log, if it ends first or is not
-    ready in time.
+    Raises PortTaken if another process listens there, and UsageError if it ends first or is not ready in time: with the driver
+    that it lacks, or the last lines of its log.
     """
     with _log(logs) as log:
         start = log.tell()
@@ -162,7 +162,7 @@ def executable() -> Path:
 def _listens(process: subprocess.Popen[bytes], port: int) -> bool:
     """Whether the process listens on the port in time; false if it ends first. Raises PortTaken if another one listens there."""
     deadline, foreign = time.monotonic() + _START_SECONDS, 0
-    # A process that is about to end owns nothing any more, a moment before its port is closed: so one foreign probe is none.
+    # A process that is about to end owns nothing any more a moment before its port is closed, so a single probe proves nothing.
     while process.poll() is None and foreign < _FOREIGN_PROBES and time.monotonic() < deadline:
         listened_at = _is_listened_at(process, port)
         if listened_at and (is_apart(process) or owns(process.pid, port)):

@@ -236,21 +236,12 @@ class PublicationRelay:
                 try:
                     frequent = is_put and not (delay or again or way.order)
                     publisher = way.publisher(sample) if frequent else None
+                    message = way.message(sample, 2 if again else 1, publisher)
                     if not at_once:
-                        message = way.message(sample, 2 if again else 1, publisher)
                         outlet.send(delay, size, row, message, patient=way.patient, order=way.order)
                         continue
                     begun = clock()
-                    if publisher is None:
-                        way.message(sample, 2 if again else 1)()
-                    else:
-                        publisher.put(
-                            payload,
-                            encoding=sample.encoding,
-                            attachment=attachment,
-                            timestamp=sample.timestamp,
-                            source_info=source,
-                        )
+                    message()
                     if clock() - begun > LONG_SECONDS:
                         outlet.took(clock() - begun, way.alone)
                 except zenoh_error:

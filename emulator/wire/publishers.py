@@ -34,17 +34,24 @@ class Publishers:
             if self._count >= MOST_PUBLISHERS:
                 return None
             self._count += 1
-        return self.session.declare_publisher(
-            sample.key_expr,
-            priority=sample.priority,
-            congestion_control=congestion,
-            express=sample.express,
-            allowed_destination=REMOTE,
-        )
+        try:
+            return self.session.declare_publisher(
+                sample.key_expr,
+                priority=sample.priority,
+                congestion_control=congestion,
+                express=sample.express,
+                allowed_destination=REMOTE,
+            )
+        except zenoh.ZError:
+            self._release()
+            raise
 
     def release(self, publisher: zenoh.Publisher) -> None:
         """Undeclare a publisher."""
         publisher.undeclare()
+        self._release()
+
+    def _release(self) -> None:
         with self._lock:
             self._count -= 1
 

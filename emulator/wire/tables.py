@@ -157,10 +157,10 @@ class WireLinkTable(WireSettingsTable):
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
         """Those of the settings, and messages that are to overtake others, on a link on which none does."""
-        found = super().mistakes(table)
+        mistakes = super().mistakes(table)
         if table.get("ordered") is True and table.get("reorder"):
-            found.append(("reorder", "is given together with ordered = true; expected one of them"))
-        return found
+            mistakes.append(("reorder", "is given together with ordered = true; expected one of them"))
+        return mistakes
 
 
 class TlsTable(Table):

@@ -132,9 +132,9 @@ class Campaign:
                     run.launcher.kill()
                 run.launcher.wait()
                 run.free()
-                found = misses(run, hits, case.longest_outage, reference, before) if not hung else [hung]
+                complaints = misses(run, hits, case.longest_outage, reference, before) if not hung else [hung]
                 ours.end_all(ours.none_left(before, 5.0 if hung else 0.0))
-        return self._verdict(case, tuple(hits), found, outcome_of(run.launcher.returncode), seconds)
+        return self._verdict(case, tuple(hits), complaints, outcome_of(run.launcher.returncode), seconds)
 
     def _disk(self, case: Case) -> str | None:
         return case.disk if case.disk != "full" or self.facilities.small_disks else None
@@ -168,7 +168,7 @@ def _server(variant: Variant, folder: Path) -> Iterator[Sshd | None]:
 
 def _usual(variant: Variant, folder: Path, reference: Reference, server: Sshd | None) -> Usual:
     """How long an undisturbed run takes. Raises Refused if it does not keep what is promised."""
-    before = frozenset(one.pid for one in ours.descendants())
+    before = frozenset(process.pid for process in ours.descendants())
     with disturbed(variant, folder, ["--set", f"longest_outage={PATIENT_SECONDS}"], server=server) as run:
         try:
             run.launcher.wait(_UNDISTURBED_SECONDS)

@@ -78,7 +78,7 @@ class Ended:
         path.write_text(json.dumps(summary))
 
     def misses(self, reference: Reference, *hits: Fault) -> list[str]:
-        """What the judge says of it, if all of these faults struck at 1.0 s."""
+        """The complaints of the judge about it, given that all of these faults struck at 1.0 s."""
         before = frozenset(process.pid for process in ours.descendants())
         return judge.misses(self, dict.fromkeys(hits, 1.0), PATIENT_SECONDS, reference, before)
 

@@ -38,12 +38,12 @@ def target_on(part: str, host: str) -> str:
 
 
 def part_of(target: str) -> str:
-    """The part that a target stands for; empty for a target that is no part of a host."""
+    """The part of a host that is disturbed, such as `ssh`; empty if the target is a process or something else."""
     return target.rpartition(_OF)[0]
 
 
 def host_of(target: str) -> str:
-    """The host that a target is a part of; empty for a target that is no part of a host."""
+    """The host of which a part is disturbed; empty if the target is a process or something else."""
     return target.rpartition(_OF)[2] if _OF in target else ""
 
 
@@ -82,13 +82,14 @@ class Hosts:
         """The living processes of a part of a host: one or none, except that sshd may have two for a connection."""
         if part == SSH:
             script = self._scripts[host]
-            return [one.pid for one in ours.descendants() if Path(one.words[0]).name == "ssh" and script in one.words]
+            clients = (process for process in ours.descendants() if Path(process.words[0]).name == "ssh")
+            return [process.pid for process in clients if script in process.words]
         there = list(ours.marked(self.temporaries[host]))
         if part == HOST_FORK_SERVER:
-            return [one.pid for one in there if one.is_fork_server]
+            return [process.pid for process in there if process.is_fork_server]
         if part == HOST_CLEANER:
-            return [one.pid for one in there if one.is_cleaner]
-        programs = [one.pid for one in there if one.words[-3:] == ("-m", "evedrop", "host")]
+            return [process.pid for process in there if process.is_cleaner]
+        programs = [process.pid for process in there if process.words[-3:] == ("-m", "evedrop", "host")]
         return programs if part == PROGRAM else [pid for program in programs for pid in self._serving(program)]
 
     def _serving(self, program: int) -> list[int]:

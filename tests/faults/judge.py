@@ -13,11 +13,11 @@ from evedrop.results.writer import load_results
 from tests.faults import ours
 from tests.faults.disturbed import CLEANER, FORK_SERVERS
 from tests.faults.figures import unlike_rows
-from tests.faults.hosts import host_of
+from tests.faults.hosts import HOST_CLEANER, PROGRAM, host_of, target_on
 from tests.faults.kinds import CONFUSED, KILLING, LIMITS, RESULTS, SIGNALS, Fault
 from tests.faults.looks import failed_looks
 from tests.faults.outages import wrong_outages
-from tests.faults.over_ssh import ended_late, may_leave_files, unlike_first_line, unlike_refusal
+from tests.faults.over_ssh import ended_late, unlike_first_line, unlike_refusal
 from tests.faults.reference import Reference, tables_of, unlike
 from tests.faults.variants import Variant
 from tests.faults.whole import missing_rows
@@ -119,9 +119,10 @@ def misses(
 
 def _may_leave_files(status: int, hits: Sequence[Fault], host: str) -> bool:
     """Whether a private folder is removed by the next run only: its launcher, or host, and its cleaner were killed."""
+    killed = {fault.target for fault in hits if fault.kind in KILLING}
     if host:
-        return may_leave_files(hits, host)
-    return status == KILLED and any(fault.kind == "kill" and fault.target == CLEANER for fault in hits)
+        return {target_on(PROGRAM, host), target_on(HOST_CLEANER, host)} <= killed
+    return status == KILLED and CLEANER in killed
 
 
 def _of_status(status: int, run: Run, hits: Mapping[Fault, float], longest_outage: float, slots: int) -> Iterator[str]:

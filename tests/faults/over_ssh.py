@@ -7,8 +7,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tests.faults.hosts import HOST_CLEANER, PROGRAM, host_of, target_on
-from tests.faults.kinds import KILLING, SIGNALS, Fault
+from tests.faults.hosts import host_of
+from tests.faults.kinds import SIGNALS, Fault
 
 _HALF_A_MINUTE = 30.0
 _BUSY_SECONDS = 15.0
@@ -54,9 +54,3 @@ def ended_late(
     begun = min([*last[:1], *signalled], default=ended)
     if ended - max(begun, *hits.values()) > _HALF_A_MINUTE + _BUSY_SECONDS:
         yield f"the run ended {ended - begun:.0f} s after its last slot or a signal, although half a minute is promised"
-
-
-def may_leave_files(hits: Sequence[Fault], host: str) -> bool:
-    """Whether a host's private folder may stay until the next run there: its program and its cleaner were killed."""
-    killed = {fault.target for fault in hits if fault.kind in KILLING}
-    return {target_on(PROGRAM, host), target_on(HOST_CLEANER, host)} <= killed

@@ -20,16 +20,8 @@ from tests.faults.variants import VARIANTS
 from tests.faults.wires import WireCase
 
 ROOT = Path(__file__).parents[2]
-ENDURED, FAILED, INTERRUPTED, WIRE, STUDY, FULL, EARLY, LITTLE = (
-    "326",
-    "273",
-    "190",
-    "10",
-    "34",
-    "70003",
-    "70048",
-    "70029",
-)
+ENDURED, FAILED, INTERRUPTED, WIRE, STUDY = "326", "273", "190", "10", "34"
+FULL, FULL_EARLY, EARLY, LITTLE = "70003", "70011", "70048", "70029"
 WORDS = {
     ENDURED: "stop sensor 0.9 s",
     FAILED: "kill smart",
@@ -37,6 +29,7 @@ WORDS = {
     WIRE: "interrupt at 0.21 s; stop 1.5 s, terminate at",
     STUDY: "interrupt study at 0.14; interrupt study at",
     FULL: "fill the disk results at finish",
+    FULL_EARLY: "shards: fill the disk results at run 0.07",
     LITTLE: "little memory: 1958",
     EARLY: "kill second fork server (shard 2) at run 0.06",
 }
@@ -49,10 +42,10 @@ WORDS = {
         {FAILED: "failed by name"},
         pytest.param({ENDURED: "as if undisturbed", INTERRUPTED: "interrupted"}, marks=pytest.mark.long),
         # Whichever end: their results are looked at.
-        pytest.param({FULL: "", EARLY: "failed by name", LITTLE: ""}, marks=pytest.mark.long),
+        pytest.param({FULL: "", FULL_EARLY: "", EARLY: "failed by name", LITTLE: ""}, marks=pytest.mark.long),
         pytest.param({WIRE: "as if undisturbed", STUDY: "as if undisturbed"}, marks=pytest.mark.long),
     ],
-    ids=["failed", "endured and interrupted", "full disk, before the first figures, little memory", "wire and study"],
+    ids=["failed", "endured and interrupted", "full disks, before the first figures, little memory", "wire and study"],
 )
 def test_cases_of_the_campaign_keep_what_is_promised(ends: dict[str, str]) -> None:
     """One of each end, as `make test-faults` runs them. `tests/live` endures and interrupts runs in every `make test`."""

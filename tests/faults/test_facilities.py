@@ -18,7 +18,7 @@ from tests.faults.wires import Start, lost_by_model
 from tests.privileged import CannotRun, skip
 
 HUNGRY = "x = bytes(500_000_000)"
-# For an ordinary user, the threads that other processes end meanwhile are free again: so there are many.
+# The limit of an ordinary user is of all processes together: where others end theirs meanwhile, as many more can be started.
 THREADS = """
 import threading
 threading.stack_size(65536)

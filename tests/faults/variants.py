@@ -107,8 +107,8 @@ VARIANTS: Mapping[str, Variant] = {
 }  # fmt: skip
 
 HOSTED: Mapping[str, Variant] = {
-    one.name: one
-    for one in (
+    variant.name: variant
+    for variant in (
         Variant(
             "hosts", "eavesdroppers", _SHORT, _EVES,
             hosts={"alpha": ("router", "sensor", "legitimate"), "beta": ("naive", "smart")},

@@ -22,8 +22,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evedrop.errors import UsageError
-from evedrop.live.launch.process_set import note_end
 from evedrop.loading import load
+from evedrop.results.ending import note_end
 from evedrop.results.growing_tables import UNFINISHED, goes_on, last_round
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.summary_file import unwritten
@@ -340,8 +340,7 @@ def test_a_score_is_saved_only_with_rows(tmp_path: Path) -> None:
         events.append("save without rows" if empty else "save")
 
     write_resolved(tmp_path, scenario)
-    with ResultsWriter.of(tmp_path, scenario) as writer:
-        writer.with_figures = save
+    with ResultsWriter.of(tmp_path, scenario, save) as writer:
         before = sizes(tmp_path)["slots-0.arrows"]
         for receiver in scenario.receivers:
             writer.slot_rows(0, receiver, sums(10), np.zeros(10))

@@ -125,11 +125,11 @@ def test_a_program_cannot_say_that_sides_are_joined(tmp_path: Path) -> None:
         ):
             probes: list[tuple[str, bytes]] = []
             spy.declare_subscriber(
-                "@evedrop/*/*", lambda one: probes.append((str(one.key_expr), one.payload.to_bytes()))
+                "@evedrop/*/*", lambda probe: probes.append((str(probe.key_expr), probe.payload.to_bytes()))
             )
             wait_until(lambda: probes, "the wire probes")
             forged: list[str] = []
-            witness.declare_subscriber("forged", lambda one: forged.append(one.payload.to_string()))
+            witness.declare_subscriber("forged", lambda sample: forged.append(sample.payload.to_string()))
             key, old = probes[0]
             wait_until(lambda: old not in wire.relay._neighbours._sent, "the first probe is too old")
             assert len({payload for _, payload in probes}) == len(probes) > 1

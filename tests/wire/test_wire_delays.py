@@ -69,8 +69,8 @@ def test_messages_of_an_ordered_link_do_not_overtake_each_other(tmp_path: Path) 
             for key in ("in/x", "out/x"):
                 robot.put(key, str(n), congestion_control=BLOCK)
         wait_until(lambda: len(ordered) == len(free) == 100, "all come")
-        assert [int(one.payload.to_string()) for one in ordered] == [*range(100)]
-        assert [int(one.payload.to_string()) for one in free] != [*range(100)]
+        assert [int(sample.payload.to_string()) for sample in ordered] == [*range(100)]
+        assert [int(sample.payload.to_string()) for sample in free] != [*range(100)]
 
 
 def test_what_is_still_delayed_when_the_wire_ends_is_counted(tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ def test_losses_of_the_wire_itself_are_told_once() -> None:
         (0.2, "ERROR"),
         (0.4, "ERROR"),
     ]
-    assert "scan: the first message that does not cross: not taken by readers" in [one.text for one in lines]
+    assert "scan: the first message that does not cross: not taken by readers" in [line.text for line in lines]
     assert not [one for one in watcher.watch(steps) if "does not cross" in one.text]
 
 

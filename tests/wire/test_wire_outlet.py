@@ -56,7 +56,7 @@ class Queue:
     def fates(self, killed: bool = False) -> list[Crossing]:
         """The fates on the disk. killed: as they are if the process were killed now."""
         rows = records_in(self.folder / "journal" / "unfinished" / "001-0001.rows", killed)
-        return [Crossing(one) for one in rows["fate"].tolist()]
+        return [Crossing(fate) for fate in rows["fate"].tolist()]
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ import itertools
 import json
 import os
 import signal
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pyarrow as pa
@@ -39,15 +40,20 @@ to = "base"
 COUNT = 500
 
 
-def carrying(evedrop: Evedrop, path: Path, numbers: range, arrived: list[int]) -> Live:
-    """Start the wire, and put messages with these numbers at one side; those that come to the other side go into `arrived`."""
+def started(evedrop: Evedrop, path: Path) -> tuple[Live, Mapping[str, Sequence[str]]]:
+    """A wire that has begun, and the endpoints of its sides."""
     wire = evedrop.started("wire", str(path))
     control = wire.folder / "control.json"
     wait_until(lambda: control.exists() or wire.process.poll() is not None, "a wire that can be asked")
     answer = ask(read_control(wire.folder), StatusRequest(), 30.0)
     assert answer is not None
     assert isinstance(answer.status, WireStatus)
-    sides = answer.status.sides
+    return wire, answer.status.sides
+
+
+def carrying(evedrop: Evedrop, path: Path, numbers: range, arrived: list[int]) -> Live:
+    """Start the wire, and put messages with these numbers at one side; those that come to the other side go into `arrived`."""
+    wire, sides = started(evedrop, path)
     with program(sides["robot"]) as robot, program(sides["base"]) as base:
         ready: list[bytes] = []
         base.declare_subscriber("ready", lambda sample: ready.append(sample.payload.to_bytes()))
@@ -114,14 +120,9 @@ def test_a_killed_wire_calls_delivered_what_it_had_sent(evedrop: Evedrop) -> Non
     """Kill -9 while delayed messages pass: what arrived is delivered, but for one that may have been in its hands."""
     path = evedrop.folder / "robot.toml"
     path.write_text(DELAYED)
-    wire = evedrop.started("wire", str(path))
-    control = wire.folder / "control.json"
-    wait_until(lambda: control.exists() or wire.process.poll() is not None, "a wire that can be asked")
-    answer = ask(read_control(wire.folder), StatusRequest(), 30.0)
-    assert answer is not None
-    assert isinstance(answer.status, WireStatus)
+    wire, sides = started(evedrop, path)
     arrived: set[int] = set()
-    with program(answer.status.sides["robot"]) as robot, program(answer.status.sides["base"]) as base:
+    with program(sides["robot"]) as robot, program(sides["base"]) as base:
         base.declare_subscriber("scan", lambda sample: arrived.add(int(sample.payload.to_bytes())))
         numbers = itertools.count()
         wait_until(lambda: robot.put("scan", str(next(numbers)).encode()) or len(arrived) > 200, "many have arrived")

@@ -115,7 +115,7 @@ def test_a_stopped_reader_at_a_third_side_holds_up_nobody(tap: bool, tmp_path: P
         for n in range(COUNT):
             robot.put("scan", str(n).encode().ljust(LARGE), congestion_control=BLOCK)
         wait_until(lambda: len(got) == COUNT, "the base has all")
-        assert [int(one.payload.to_bytes()) for one in got] == [*range(COUNT)]
+        assert [int(sample.payload.to_bytes()) for sample in got] == [*range(COUNT)]
         assert wire.fates("robot-base") == [Crossing.DELIVERED] * COUNT
 
 
@@ -152,7 +152,7 @@ def test_no_message_overtakes_those_that_wait_for_their_turn(tmp_path: Path) -> 
         for n in range(2001):
             robot.put("scan", str(n).encode(), congestion_control=zenoh.CongestionControl.DROP if n % 2 else BLOCK)
         wait_until(lambda: got and got[-1].payload.to_bytes() == b"2000", "the last one arrives")
-        numbers = [int(one.payload.to_bytes()) for one in got]
+        numbers = [int(sample.payload.to_bytes()) for sample in got]
         assert numbers == sorted(numbers)
         assert {*range(0, 2001, 2)} <= {*numbers}
 
@@ -207,8 +207,8 @@ def test_a_wire_ends_although_programs_have_stopped_reading(evedrop: Evedrop) ->
     assert wire.process.returncode == 0, out + errors
     summary = json.loads((wire.folder / "summary.json").read_text())
     assert summary["unaccounted"] == 0
-    for found in summary["links"].values():
-        assert found["heard"] == found["delivered"] + sum(found["dropped_by"].values())
+    for account in summary["links"].values():
+        assert account["heard"] == account["delivered"] + sum(account["dropped_by"].values())
 
 
 CROWDED = """

@@ -11,7 +11,7 @@ import shutil
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from evedrop.errors import EvedropError, Interrupted, RunError, UsageError
@@ -99,6 +99,9 @@ def launch_one(
             if isinstance(error, UsageError):
                 _forget(folder)
             elif isinstance(error, EvedropError):
+                # Tables and theory are slow to import, and a run that ends well needs neither.
+                from evedrop.results.ending import note_end  # noqa: PLC0415
+
                 with contextlib.suppress(OSError):
                     note_end(held.now, scenario, "interrupted" if isinstance(error, Interrupted) else str(error))
             if isinstance(error, Interrupted):
@@ -153,39 +156,6 @@ def _forget(folder: Path) -> None:
     """Remove the folder of a run that was not started, so that the next run can use it."""
     with contextlib.suppress(OSError):
         shutil.rmtree(folder)
-
-
-def note_end(folder: Path, scenario: Scenario, how: str) -> None:
-    """Write the reason for the run's end into its summary, and finish the tables that the observer could not finish.
-
-    Raises OSError if the folder cannot be written.
-    """
-    # Tables and theory are slow to import, and a run that ends well needs neither.
-    from evedrop.results.growing_tables import UNFINISHED, finish, is_unfinished, last_round  # noqa: PLC0415
-    from evedrop.results.writer import ResultsWriter, load_results, write_summary  # noqa: PLC0415
-    from evedrop.score.scorekeeper import Ending, summary_of  # noqa: PLC0415
-    from evedrop.score.totals import Totals  # noqa: PLC0415
-
-    left_behind = is_unfinished(folder)
-    rows = last_round(folder)
-    try:
-        summary = replace(load_results(folder).typed_summary, ended=how)
-    except UsageError:  # there are no figures
-        totals = Totals.nothing(scenario, scenario.trials)
-        summary = summary_of(scenario, totals, dict.fromkeys(scenario.digested), Ending(0.0, how))
-        summary = replace(summary, slots=rows.slots)
-        if not rows.at:
-            left_behind = False
-            shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
-            if not any(folder.glob("*.parquet")):
-                with ResultsWriter.of(folder, scenario):
-                    pass
-    if left_behind:
-        # The recording lacks its end; `evedrop view` makes another one from the tables.
-        (folder / "recording.rrd").unlink(missing_ok=True)
-        with contextlib.suppress(OSError):  # the disk is full: the streams stay, and can be read
-            finish(folder)
-    write_summary(folder, summary)
 
 
 def follow_to_end(children: Children, stop: threading.Event, tell: Tell) -> int:

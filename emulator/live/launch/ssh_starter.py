@@ -289,10 +289,7 @@ def _ended_with_us(command: list[str]) -> list[str]:
     program = shutil.which(command[0])
     if program is None:
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
-    # Python ignores SIGPIPE, and a program that it becomes would, too.
-    return signalled_when_parent_dies(
-        [program, *command[1:]], signal.SIGKILL, "signal.signal(signal.SIGPIPE, signal.SIG_DFL)"
-    )
+    return signalled_when_parent_dies([program, *command[1:]], signal.SIGKILL)
 
 
 @final

@@ -39,6 +39,7 @@ from evedrop.live.protocol.whereabouts import is_whereabouts, read_whereabouts
 from evedrop.model.digest import Blocks
 from evedrop.names import CONTROLLER, OBSERVER, OPERATOR, ROUTER, SENSOR
 from evedrop.news import ConnectionOutage, RunEnded, RunEvent, RunProgress, Started, ViewOpened
+from evedrop.results.ending import note_end
 from evedrop.results.folder import HeldFolder
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.rows import DigestRows, write_rows
@@ -119,8 +120,7 @@ class ObservedRun:
 
     def writer(self) -> ResultsWriter:
         """The writer of the results folder, to be entered around `conduct`."""
-        self._writer = ResultsWriter.of(self.folder, self._scenario)
-        self._writer.with_figures = self._dump_score
+        self._writer = ResultsWriter.of(self.folder, self._scenario, self._dump_score)
         return self._writer
 
     def conduct(self, stop: Stop) -> None:
@@ -371,14 +371,15 @@ class ObservedRun:
         if self._scenario.process.source == "zenoh" and self._joiner.done == self._scenario.slots:
             write_resolved(self.folder, self._scenario, taken=True)
 
-    def finish(self, status: int, how: str, report: Report) -> int:
+    def finish(self, status: int, how: str, report: Report, saved: bool = True) -> int:
         """Close the view, write the summary, and tell the launcher; returns the exit status of the run.
 
-        report: prints how the run ended, if it was started by hand.
+        report: prints how the run ended, if it was started by hand. saved: whether all rows are on disk; otherwise the summary
+        has the last figures whose rows are.
         """
         safe = self._recording.close() if self._recording is not None else True
         try:
-            summary = self._final or self._summary(how)
+            summary = (self._final or self._summary(how)) if saved else note_end(self.folder, self._scenario, how)
             if status == 0 and any(link.unexplained for link in summary.links.values()):
                 status = RunError.exit_status
                 how = "packets are unaccounted for: see links.*.unexplained, and look at the router's log"
@@ -386,9 +387,10 @@ class ObservedRun:
                 status, how = RunError.exit_status, summary.ended
             if status == 0 and summary.failed_expectations:
                 status = 1
-            if self._final is None:
-                self._dump_score()
-            write_summary(self.folder, replace(summary, ended=how))
+            if saved:
+                if self._final is None:
+                    self._dump_score()
+                write_summary(self.folder, replace(summary, ended=how))
         except OSError as error:
             status, how = RunError.exit_status, unwritten(error)
         view = self._recording.failure if self._recording is not None else None

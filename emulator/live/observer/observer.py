@@ -61,7 +61,7 @@ def observe(brief: Brief[ObserverPart], report: Report, serve: str | None = None
         with Session(brief, meanwhile=stop.check):
             pass
     viewer = None if web_address is None else observation.show(web_address)
-    status, how = 0, "complete"
+    status, how, saved = 0, "complete", True
     try:
         observation.hold()
         write_resolved(observation.folder, scenario)
@@ -74,6 +74,7 @@ def observe(brief: Brief[ObserverPart], report: Report, serve: str | None = None
                 tell(Finishing())
             observation.settle(how)
     except OSError as error:
+        saved = False
         status, how = RunError.exit_status, how if status == RunError.exit_status else unwritten(error)
     except NoAnswer as error:  # of a class that is asked again after the operator's change of a link
         status, how = (
@@ -85,7 +86,7 @@ def observe(brief: Brief[ObserverPart], report: Report, serve: str | None = None
         if lack is None:
             traceback.print_exc()
         how = lack or f"the observer failed ({error!r}); please report its log"
-    status = observation.finish(status, how, report)
+    status = observation.finish(status, how, report, saved)
     if viewer is not None:
         viewer.stop()
     return status
