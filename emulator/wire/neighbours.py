@@ -92,10 +92,9 @@ class Neighbours:
         def heard(sample: zenoh.Sample) -> None:
             if len(sample.payload) != _NONCE_BYTES:
                 return
-            source, sent = self._sent.get(sample.payload.to_bytes(), (name, 0.0))
-            now = time.monotonic()
-            if source != name and sent > now - _PROBE_SECONDS:
-                self._heard[source, name] = now
+            source, _ = self._sent.get(sample.payload.to_bytes(), (name, 0.0))
+            if source != name:
+                self._heard[source, name] = time.monotonic()
 
         return heard
 

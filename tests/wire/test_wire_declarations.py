@@ -144,6 +144,24 @@ def test_a_program_cannot_say_that_sides_are_joined(tmp_path: Path) -> None:
             assert not wire.told
 
 
+def test_a_program_that_passes_probes_on_joins_no_side_without_a_router(tmp_path: Path) -> None:
+    """Even if it does so at once: routers join sides, and there is none."""
+    with router() as (_, first), router() as (_, second):
+        sides = {"robot": Side("robot", (ANYWHERE,), (first,)), "base": Side("base", (ANYWHERE,), (second,))}
+        plan = plan_of(link("robot", "base"), link("robot", "third"), sides=sides)
+        with at_work(plan, tmp_path) as wire, wire.program("robot") as spy, wire.program("third") as forger:
+            neighbours = wire.relay._neighbours
+            spy.declare_subscriber("@evedrop/*/*", lambda probe: forger.put(probe.key_expr, probe.payload))
+            wait_until(lambda: neighbours._passes("robot", "third"), "a probe was passed on")
+            looks = {*neighbours._sent}
+            wait_until(lambda: not looks & {*neighbours._sent}, "the wire looks again and again")
+            assert neighbours._passes("robot", "third")
+            spy.put("a", b"x")
+            wait_until(lambda: len(wire.fates("robot-third")) == 1, "the wire hears")
+            assert wire.fates("robot-third") == [Crossing.DELIVERED]
+            assert not wire.told
+
+
 def test_routers_that_do_not_join_sides_are_no_loop(tmp_path: Path) -> None:
     """Each side may have a router of its own, as robots have."""
     with router() as (one, first), router() as (other, second):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +16,7 @@ from evedrop.wire.crossing import Crossing
 from evedrop.wire.fates import KeyFates
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.lanes import Decision, LinkState
-from tests.wire.wire_at_work import DEAD, LOSSY, both_ways, link, plan_of
+from tests.wire.wire_at_work import DEAD, LOSSY, PERFECT, both_ways, link, plan_of
 
 LARGEST = 100
 
@@ -161,6 +162,25 @@ def test_an_ordered_link_delays_a_message_as_long_as_the_one_before(
             latest = due if code == 0 else latest
 
 
+def test_an_order_is_kept_until_its_last_message_is_due(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Although the key is forgotten, and used again, meanwhile."""
+    now = [100.0]
+    monkeypatch.setattr("evedrop.wire.lanes.time", SimpleNamespace(monotonic=lambda: now[0]))
+    plan = plan_of(link("robot", "base", {**PERFECT, "delay": {"model": "constant", "value": 5.0}}, ordered=True))
+    with WireJournal(tmp_path, plan) as journal:
+        state = LinkState(plan.links[0], plan, journal)
+        state.lane("put", "scan", lossless=False)(0.0, 1)
+        order = state.order("put", "scan")
+        state.forget("put", "scan")
+        assert order is not None
+        assert state.order("put", "scan") is order
+        state.lane("put", "scan", lossless=False)
+        assert state.order("put", "scan") is order
+        now[0] += 5.0
+        state.forget("put", "scan")
+        assert state.order("put", "scan") is None
+
+
 def test_the_keys_of_a_history_are_numbered_together(lossy: LinkState) -> None:
     """Whichever session they are of, and although one of them is forgotten; so do a change and the end of all of them."""
     first, second = "map/@adv/pub/aa/1/_", "map/@adv/pub/bb/1/_"
@@ -220,8 +240,12 @@ def test_threads_share_the_messages_of_a_key(tmp_path: Path) -> None:
                 thread.start()
             changes = 0
             while any(thread.is_alive() for thread in threads):
-                changes += 1
-                state.change({**delays, "queue": changes})
+                if (
+                    sum(map(len, found)) >= 100 * changes
+                ):  # as often as they like, changes would leave the threads no turn
+                    changes += 1
+                    state.change({**delays, "queue": changes})
+                time.sleep(0.0)
         finally:
             sys.setswitchinterval(before)
     assert changes > 1

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 from threading import Event
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pyarrow as pa
 import pytest
@@ -110,6 +111,23 @@ def test_publishers_are_declared_for_frequent_keys_only(tmp_path: Path, declared
         put("three", zenoh.Priority.DATA_HIGH)
         wait_until(lambda: sorted(arrived(), key=int) == sent, "it arrives")
         wait_until(lambda: not declared, "its publisher is released")
+
+
+def test_a_publisher_that_cannot_be_declared_takes_no_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Zenoh raises an error for it; the next one finds its place."""
+    monkeypatch.setattr("evedrop.wire.publishers.MOST_PUBLISHERS", 1)
+    sample = SimpleNamespace(key_expr="scan", priority=zenoh.Priority.DATA, express=False)
+
+    def refuse(*_: object, **__: object) -> None:
+        raise zenoh.ZError("no")
+
+    session = SimpleNamespace(declare_publisher=refuse)
+    publishers = Publishers(cast(zenoh.Session, session))
+    with pytest.raises(zenoh.ZError):
+        publishers.declare(cast(zenoh.Sample, sample), BLOCK)
+    session.declare_publisher = lambda *_, **__: "a publisher"
+    declared = [publishers.declare(cast(zenoh.Sample, sample), BLOCK) for _ in range(2)]
+    assert declared == ["a publisher", None]
 
 
 def test_a_key_that_is_in_use_is_not_forgotten_for_new_ones(

@@ -157,6 +157,22 @@ def test_the_asker_waits_after_a_lost_reply_and_has_the_others(tmp_path: Path) -
         assert wire.fates("dead") == [Crossing.LOST]
 
 
+@pytest.mark.parametrize(("full", "fates"), [("base", ["congested"]), ("robot", ["delivered", "congested"])])
+def test_the_asker_of_a_query_or_reply_without_room_waits(full: str, fates: list[str], tmp_path: Path) -> None:
+    """As if it had been lost: the programs of a side no longer read."""
+    plan = both_ways(query_seconds=WAIT)
+    with at_work(plan, tmp_path) as wire, wire.program("robot") as asker, wire.program("base") as server:
+        offer(server, "map", b"x")
+        wait_until(lambda: answers(asker, "map"), "the queryable is there")
+        before = len(wire.fates())
+        outlet = wire.relay._queries._outlets[full]
+        outlet._most, outlet._stopped = -1, True
+        asked = time.monotonic()
+        assert not list(asker.get("map", timeout=60.0))
+        assert time.monotonic() - asked >= WAIT
+        assert [fate.name.lower() for fate in wire.fates()[before:]] == fates
+
+
 @pytest.mark.parametrize("lost", ["robot-base", "base-robot"])
 def test_a_lost_question_for_a_history_ends_soon(lost: str, tmp_path: Path) -> None:
     """Long before other queries end: an advanced subscriber holds all new messages back until then."""
