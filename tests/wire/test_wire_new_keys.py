@@ -126,7 +126,7 @@ def test_a_publisher_that_cannot_be_declared_takes_no_place(monkeypatch: pytest.
     with pytest.raises(zenoh.ZError):
         publishers.declare(cast(zenoh.Sample, sample), BLOCK)
     session.declare_publisher = lambda *_, **__: "a publisher"
-    declared = [publishers.declare(cast(zenoh.Sample, sample), BLOCK) for _ in range(2)]
+    declared: list[Any] = [publishers.declare(cast(zenoh.Sample, sample), BLOCK) for _ in range(2)]
     assert declared == ["a publisher", None]
 
 
