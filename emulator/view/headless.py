@@ -5,6 +5,8 @@ Needs a Vulkan driver; a software driver is enough, such as Debian's mesa-vulkan
 
 from __future__ import annotations
 
+import os
+import struct
 import subprocess
 import tempfile
 import time
@@ -25,6 +27,10 @@ from evedrop.view.viewer_process import PortTaken, end, spawn, without_driver
 _ATTEMPTS = 3
 _PATIENCE = 600.0  # seconds for one answer, for loading and for drawing; only a viewer that hangs needs them
 _PAUSE = 0.05
+_FILE_HEADER_BYTES = 12
+_MESSAGE_HEADER = struct.Struct("<QQ")  # the kind of the message, and the number of its bytes
+_END = 0
+_FOOTER_BYTES, _FOOTER_WORD = 32, b"RRF2FOOT"
 _TINY = 16  # pixels: even the smallest picture makes the viewer draw everything once, and it is sent quickly
 
 T = TypeVar("T")
@@ -142,9 +148,29 @@ def check(rrd: Path) -> None:
             warnings.simplefilter("ignore")
             for _ in RrdReader(rrd).stream():
                 pass
+        _check_end(rrd)
     except (RuntimeError, OSError) as error:
         why = " ".join(str(error).split())
         raise UsageError(f"{rrd} is broken ({why}); remove it, and it is made again from the tables") from error
+
+
+def _check_end(rrd: Path) -> None:
+    """Raise OSError if anything but a footer follows the message that ends a recording.
+
+    Rerun's reader takes zeros between two messages for that end, and leaves out whatever follows.
+    """
+    with rrd.open("rb") as file:
+        file.seek(_FILE_HEADER_BYTES)
+        while len(header := file.read(_MESSAGE_HEADER.size)) == _MESSAGE_HEADER.size:
+            kind, length = _MESSAGE_HEADER.unpack(header)
+            if kind == _END:
+                file.seek(length, os.SEEK_CUR)
+                end = file.tell()
+                footer = file.read(_FOOTER_BYTES + 1)
+                if footer and not (len(footer) == _FOOTER_BYTES and _FOOTER_WORD in footer):
+                    raise OSError(f"it ends at byte {end}, and more follows")
+                return
+            file.seek(length, os.SEEK_CUR)
 
 
 def _started(size: tuple[int, int], logs: Path) -> tuple[subprocess.Popen[bytes], int]:

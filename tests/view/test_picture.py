@@ -177,11 +177,17 @@ def _end_of_a_message(whole: bytes) -> int:
     return end
 
 
+def _zeros(whole: bytes, at: int) -> bytes:
+    return whole[:at] + bytes(500) + whole[at + 500 :]
+
+
 BROKEN: dict[str, Callable[[bytes], bytes]] = {
     "empty": lambda _: b"",
     "not a recording": lambda _: b"nonsense" * 100,
     "cut short": lambda whole: whole[: _end_of_a_message(whole) - 1],  # between two messages it would be no mistake
-    "damaged": lambda whole: whole[:2000] + bytes(500) + whole[2500:],
+    "zeros between two messages": lambda whole: _zeros(whole, _end_of_a_message(whole)),  # they look like its end
+    "zeros after its end": lambda whole: whole + bytes(40),
+    "damaged": lambda whole: _zeros(whole, _end_of_a_message(whole) - 100),
 }
 
 
