@@ -17,6 +17,8 @@ _SCIPY_BYTES, _THREAD_BYTES = 160_000_000, 45_000_000
 _MOST_THREADS = 64
 _WITHOUT_ROOM = ("failed to map segment", "cannot allocate memory")
 """What the system says in an ImportError about a library that found no memory."""
+_WITHOUT_THREAD = ("can't start new thread", "can't spawn worker thread", "Failed to launch worker thread")
+"""What Python, Zenoh (in a PanicException, which is no Exception) and Arrow say."""
 _LACKS = {
     errno.EAGAIN: "no further process or thread can be started",
     errno.ENOMEM: "there is not enough memory",
@@ -29,7 +31,7 @@ def lack_of(error: BaseException) -> str | None:
         isinstance(error, ImportError) and any(words in str(error).lower() for words in _WITHOUT_ROOM)
     ):
         lack = _LACKS[errno.ENOMEM]
-    elif isinstance(error, RuntimeError) and "can't start new thread" in str(error):
+    elif any(words in str(error) for words in _WITHOUT_THREAD):
         lack = _LACKS[errno.EAGAIN]
     elif isinstance(error, OSError) and error.filename is None and error.errno in _LACKS:
         lack = _LACKS[error.errno]

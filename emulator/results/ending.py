@@ -12,6 +12,7 @@ from pathlib import Path
 
 from evedrop.errors import UsageError
 from evedrop.results.growing_tables import UNFINISHED, finish, is_unfinished, last_round
+from evedrop.results.reading import age_of_figures
 from evedrop.results.writer import ResultsWriter, load_results, write_summary
 from evedrop.scenario import Scenario
 from evedrop.score.scorekeeper import Ending, summary_of
@@ -22,12 +23,16 @@ from evedrop.score.totals import Totals
 def note_end(folder: Path, scenario: Scenario, how: str) -> Summary:
     """Write the reason for the run's end into its summary, and finish the tables that could not be finished before.
 
+    The figures are the last that were written; if they are of an earlier slot than the rows, the first line of `ended` says so.
+
     Raises OSError if the folder cannot be written.
     """
     left_behind = is_unfinished(folder)
     rows = last_round(folder)
     try:
-        summary = replace(load_results(folder).typed_summary, ended=how)
+        summary = load_results(folder).typed_summary
+        first, *excerpt = how.splitlines()  # of a log
+        summary = replace(summary, ended="\n".join([first + age_of_figures(folder), *excerpt]))
     except UsageError:  # there are no figures
         totals = Totals.nothing(scenario, scenario.trials)
         summary = summary_of(scenario, totals, dict.fromkeys(scenario.digested), Ending(0.0, how))

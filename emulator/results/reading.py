@@ -265,10 +265,19 @@ def _cut_short(folder: Path) -> dict[str, Any]:
         if goes_on(folder)
         else f"cut short at {at}, because its run was killed or its disk was full"
     )
-    if summary["ended"] != at:
-        more = "; the tables have more" if summary["slots"] < found.slots else ""
-        ended += f" (the figures are as of {summary['ended']}{more})"
-    return {**summary, "slots": found.slots, "ended": ended}
+    return {**summary, "slots": found.slots, "ended": ended + age_of_figures(folder)}
+
+
+def age_of_figures(folder: Path) -> str:
+    """Of an unfinished results folder: which moment its figures are of, in brackets, if it is not that of its rows."""
+    rows = last_round(folder)
+    try:
+        figures = _read_summary(figures_path(folder))
+    except UsageError:
+        return ""
+    if figures["ended"] == rows.at:
+        return ""
+    return f" (the figures are as of {figures['ended']}{'; the tables have more' if figures['slots'] < rows.slots else ''})"
 
 
 def _no_figures(folder: Path) -> dict[str, Any]:

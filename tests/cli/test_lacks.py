@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 
+import pyarrow as pa
 import pytest
 
 from evedrop.lacks import lack_of, preload_within_limit, refuse_scipy_without_room
@@ -19,11 +20,24 @@ from evedrop.memory.montecarlo import Plan
 from evedrop.memory.tasks import Result, Stopped, Task, Tell
 from tests.conftest import Evedrop
 
-LACKS = [
+
+class PanicException(BaseException):
+    """It cannot be imported."""
+
+
+LACKS: list[tuple[BaseException, str]] = [
+    (
+        PanicException("OS can't spawn worker thread: Resource temporarily unavailable (os error 11)"),
+        "no further process or thread can be started; ",
+    ),
     (MemoryError(), "there is not enough memory; "),
     (OSError(errno.ENOMEM, "Cannot allocate memory"), "there is not enough memory; "),
     (
         BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable"),
+        "no further process or thread can be started; ",
+    ),
+    (
+        pa.ArrowException("Unknown error: Failed to launch worker thread: Resource temporarily unavailable"),
         "no further process or thread can be started; ",
     ),
     (RuntimeError("can't start new thread"), "no further process or thread can be started; "),

@@ -24,6 +24,8 @@ from tests.proxy import Cable
 from tests.sshd import Sshd
 
 _WITHIN = Path(__file__).with_name("within")
+CONFUSED_FILE = "confused"
+"""In the folder of a run whose router has confused keys."""
 CLEANER = "cleaner"
 FORK_SERVERS = ("first fork server", "second fork server")
 """Those of the observer and of all others: the second is forked from the first."""
@@ -102,7 +104,11 @@ class Disturbed:
                     # What the campaign itself imports may come from elsewhere, too.
                     "PYTHONPATH": os.pathsep.join(filter(None, [str(_WITHIN), str(_ROOT), os.environ.get("PYTHONPATH")])),
                     "EVEDROP_CAMPAIGN": str(folder),
-                    **({"PYTHON_EVEDROP_CONFUSED": str(limits["confused"])} if "confused" in limits else {}),
+                    **(
+                        {"PYTHON_EVEDROP_CONFUSED": f"{limits['confused']}:{folder / CONFUSED_FILE}"}
+                        if "confused" in limits
+                        else {}
+                    ),
                     "PYTHONDONTWRITEBYTECODE": "1",  # on a full disk, Python would leave half a .pyc for the next process
                     "COLUMNS": "160",
                 },

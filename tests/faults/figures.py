@@ -13,6 +13,8 @@ from typing import Any
 
 import pyarrow as pa
 
+from evedrop.model.checks import MOST_SLOTS
+
 _ROUNDED = 1e-9
 """Relative difference of figures that a live run adds up in another order."""
 _OF_CLOCK = frozenset({"wall_seconds", "slots_per_second", "mean_solve_seconds", "longest_solve_seconds", "replay"})
@@ -57,19 +59,23 @@ def same(value: Any, wanted: Any) -> bool:
     return bool(value == wanted)
 
 
-def slots_of_figures(summary: Mapping[str, Any]) -> int | None:
-    """How many slots the figures of a summary cover; None if it has none yet.
+def slots_of_figures(summary: Mapping[str, Any], shards: int = 1) -> int | None:
+    """The slot before which all rows count in the figures of a summary; None if it has none, or they cannot be told.
 
-    A run that was killed has figures of an earlier moment than its rows, and says so.
+    A run that was killed has figures of an earlier moment than its rows, and says so; of a run in shards, only those of some
+    shards are. Otherwise the figures of shards cover all rows, however far each shard came.
     """
     earlier = re.search(r"the figures are as of slot (\d+)", str(summary["ended"]))
+    if shards > 1:
+        begun = any(link["offered"] for link in summary["links"].values())
+        return MOST_SLOTS if begun and not earlier else None
     slots = int(earlier.group(1)) if earlier else int(summary["slots"])
     return slots or None
 
 
-def unlike_rows(summary: Mapping[str, Any], tables: Mapping[str, pa.Table]) -> Iterator[str]:
+def unlike_rows(summary: Mapping[str, Any], tables: Mapping[str, pa.Table], shards: int = 1) -> Iterator[str]:
     """The figures of receivers and links that are not those of the rows, which may be of a run that ended early."""
-    slots = slots_of_figures(summary)
+    slots = slots_of_figures(summary, shards)
     if slots is None:
         return
     means, links = _means(tables["slots"], slots), _accounts(tables["journal"], slots)

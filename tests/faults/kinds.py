@@ -117,7 +117,8 @@ class Fault:
         if self.target == RESULTS:
             return _UNWRITTEN
         if self.kind in LIMITS:
-            return _WITHOUT
+            # A router in which Zenoh waits for a thread that the system refuses neither listens nor fails.
+            return (*_WITHOUT, "router did not listen") if self.kind == "few processes" else _WITHOUT
         if self.target in FORK_SERVERS:
             return ("fork server",)
         if self.target == EVERYBODY:

@@ -33,7 +33,7 @@ def wrong_outages(
         if news["event"] == "reconnected" and (news["process"], news["slot"]) not in entries:
             yield f"the run told of an outage of {news['process']} at slot {news['slot']}, and the summary lists none"
     for entry in listed:
-        if not _explained(str(entry["process"]), struck):
+        if not _explained(str(entry["process"]), struck, complete):
             yield f"an outage of {entry['process']} at slot {entry['slot']}, and no fault caused one"
         if complete and (entry["until"] is None or not entry["slot"] <= entry["until"] <= slots):
             yield f"an outage of {entry['process']} at slot {entry['slot']} until {entry['until']}, in a run that is complete"
@@ -45,12 +45,19 @@ def wrong_outages(
             yield "the router was killed in the middle of the run, and the summary lists no outage"
 
 
-def _explained(process: str, struck: Mapping[Fault, float]) -> bool:
-    """Whether a fault can have cut a process off. Routers, and the observer, stand for all that were connected to them."""
+def _explained(process: str, struck: Mapping[Fault, float], complete: bool) -> bool:
+    """Whether a fault can have cut a process off. Routers, and the observer, stand for all that were connected to them.
+
+    To an observer whose own connection flaps, the others are back one after the other, and no longer all at once.
+    """
     for fault in struck:
         if fault.kind in _CUTTING and host_of(fault.target):
-            continue  # the processes on a host talk with their router directly
-        if fault.kind in _CUTTING and (fault.target in (process, EVERYBODY) or process in (*_ROUTERS, "observer")):
+            if complete:
+                continue  # the processes on a host talk with their router directly
+            return True  # and end with the connection of their host
+        if fault.kind in _CUTTING and (
+            fault.target in (process, EVERYBODY, "observer") or process in (*_ROUTERS, "observer")
+        ):
             return True
         if fault.kind not in _CUTTING and fault.target not in ("results", "cleaner"):
             return True  # whatever ends may be missed first

@@ -107,7 +107,7 @@ def carried_out(case: StudyCase, folder: Path, before: frozenset[int], usual: Un
         if complete:
             break
         status, text = yield from _attempt(fault, folder, number, usual.seconds)
-        complete = status == 0
+        complete = status == 0 or _interrupted_at_its_end(status, folder / "out")
         yield from _of_status(fault, status, text)
         left = ours.none_left(before, _LEAVE_SECONDS, temporary)
         yield from (
@@ -159,6 +159,17 @@ def _attempt(fault: StudyFault | None, folder: Path, number: int, seconds: float
         study.kill()
         status = study.wait()
     return status, path.read_text(errors="replace")
+
+
+def _interrupted_at_its_end(status: int, out: Path) -> bool:
+    """Whether a signal came when the study was complete on disk, while its report was made or printed."""
+    signals = {_INTERRUPTED, *(-number for number in _ENDS.values())}
+    if status not in signals or (out / "kept").exists():
+        return False
+    try:
+        return bool(load_results(out).summary["ended"] == "complete")
+    except UsageError:
+        return False
 
 
 def _strike(fault: StudyFault, study: subprocess.Popen[bytes]) -> None:

@@ -21,9 +21,12 @@ import pytest
 from evedrop.results.writer import load_results
 from tests.conftest import wait_until
 from tests.faults import ours
+from tests.faults.disturbed import CONFUSED_FILE
 from tests.faults.ended import Ended
+from tests.faults.figures import unlike_rows
 from tests.faults.kinds import CONFUSED, EVERYBODY, Fault
 from tests.faults.moments import Moment
+from tests.faults.outages import wrong_outages
 from tests.faults.reference import Reference, tables_of, unlike
 from tests.faults.variants import VARIANTS
 from tests.faults.whole import missing_rows
@@ -235,11 +238,51 @@ def test_files_that_others_may_read_and_files_of_a_run_that_goes_on_are_seen(
 
 
 def test_messages_on_wrong_keys_must_be_listed(ended: Ended, reference: Reference) -> None:
-    """A router that confuses keys was asked for, and no process says that it dropped a message."""
+    """A router has confused keys, and no process says that it dropped a message; one of few messages confuses none."""
     confused = Fault(CONFUSED, EVERYBODY, Moment("start", 0.0), count=30)
+    assert ended.misses(reference, confused) == []
+    (ended.folder / CONFUSED_FILE).touch()
     assert [line for line in ended.misses(reference, confused) if "keys that they do not name" in line]
     ended.edit(lambda summary: summary.update(misdelivered={"smart": 5}))
     assert ended.misses(reference, confused) == []
+
+
+@pytest.mark.parametrize("complete", [True, False])
+def test_an_outage_is_explained_by_a_fault_that_can_cause_it(complete: bool) -> None:
+    """Whose own connection flaps sees all others go; the end of a host's connection ends what runs there."""
+
+    def unexplained(process: str, target: str) -> list[str]:
+        listed = [{"process": process, "slot": 5, "until": 9, "seconds": 0.1}]
+        flap = Fault("flap", target, Moment("run", 0.5), seconds=1.0, count=3)
+        return list(wrong_outages(listed, [], {flap: 1.0}, 400, complete))
+
+    assert unexplained("naive", "observer") == unexplained("naive", "naive") == unexplained("router", "naive") == []
+    assert unexplained("naive", "smart")
+    assert bool(unexplained("relay", "connection of beta")) == complete
+
+
+def test_a_panic_of_zenoh_is_no_mistake_where_threads_are_few(ended: Ended, reference: Reference) -> None:
+    """Its own report cannot be helped; anywhere else it is one."""
+    log = ended.out / "logs" / "smart.log"
+    log.parent.mkdir(exist_ok=True, mode=0o700)
+    log.write_text("thread '<unnamed>' (1) panicked at worker.rs:514:13:\nOS can't spawn worker thread\n")
+    log.chmod(0o600)
+    few = Fault("few processes", EVERYBODY, Moment("start", 0.0), count=30)
+    assert not [line for line in ended.misses(reference, few) if "traceback" in line]
+    assert [line for line in ended.misses(reference, KILL) if "smart.log has a traceback" in line]
+
+
+def test_figures_of_shards_cover_all_rows(ended: Ended, reference: Reference) -> None:
+    """However far each shard came; unless the run says that some are of an earlier slot."""
+    results = load_results(ended.out)
+    tables = dict(tables_of(results))
+    summary = {**results.summary, "slots": results.summary["slots"] // 2}
+    assert list(unlike_rows(summary, tables))
+    assert list(unlike_rows(summary, tables, shards=2)) == []
+    summary["peers"]["legitimate"]["mean_squared_error"] *= 2.0
+    assert list(unlike_rows(summary, tables, shards=2))
+    summary["ended"] = "killed (the figures are as of slot 10 in shard 2; the tables have more)"
+    assert list(unlike_rows(summary, tables, shards=2)) == []
 
 
 def test_a_folder_that_no_command_can_show_is_seen(ended: Ended, reference: Reference) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 from collections.abc import Callable, Mapping
 from functools import cache
@@ -20,6 +21,7 @@ from evedrop.live.launch.shards import OneProgress
 from evedrop.loading import load
 from evedrop.news import News, RunEnded, RunProgress, Started, silent
 from evedrop.results.growing_tables import last_round
+from evedrop.results.reading import age_of_figures
 from evedrop.results.writer import Results
 from tests.builders import digests_of
 from tests.conftest import Evedrop, Live, wait_until, with_mark
@@ -254,9 +256,14 @@ def test_a_killed_process_of_a_shard_ends_all(evedrop: Evedrop, name: str) -> No
 
 
 def test_a_killed_observer_costs_no_slot_that_is_on_disk(evedrop: Evedrop) -> None:
-    """The slots of both shards are in the folder, up to those that the observer had written when it was killed."""
+    """The slots of both shards are in the folder, up to those that the observer had written when it was killed.
+
+    The summary says that its last figures were of an earlier slot.
+    """
     live = evedrop.live("eavesdroppers", *ENDLESS)
-    wait_until(lambda: last_round(live.folder / "shards" / "2").slots > 0, "slots of the second shard on disk")
+    second = live.folder / "shards" / "2"
+    wait_until(lambda: last_round(second).slots > 0, "slots of the second shard on disk")
+    wait_until(lambda: "the tables have more" in age_of_figures(second), "rows that are later than the figures")
     os.kill(child(live, 2, "observer"), signal.SIGKILL)
     done = live.end()
     assert done.status == 3
@@ -265,6 +272,7 @@ def test_a_killed_observer_costs_no_slot_that_is_on_disk(evedrop: Evedrop) -> No
     results = live.results
     assert results.slots.num_rows == results.journal.num_rows
     assert {3, 5} & set(results.slots["trials"].to_pylist())
+    assert re.search(r"\(the figures are as of slot \d+ in shard 2; the tables have more\)$", results.summary["ended"])
 
 
 def test_an_interrupted_run_leaves_one_folder_and_no_process(evedrop: Evedrop) -> None:

@@ -11,7 +11,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -365,6 +365,29 @@ def test_the_end_of_a_run_without_figures_keeps_its_rows(tmp_path: Path) -> None
     results = load_results(tmp_path)
     assert (results.summary["ended"], results.summary["slots"]) == ("observer was ended by signal 9", 10)
     assert results.slots.num_rows == 10 * len(scenario.receivers)
+
+
+def test_the_end_of_a_killed_run_says_which_slot_its_figures_are_of(tmp_path: Path) -> None:
+    """They were written when fewer slots were done; an excerpt of a log follows in lines of its own."""
+    scenario = load("microgrid")
+    write_resolved(tmp_path, scenario)
+    empty = summary_of(scenario, Totals.nothing(scenario, 1), dict.fromkeys(scenario.digested), Ending(0.0, ""))
+    writer = ResultsWriter.of(tmp_path, scenario)
+    for first, at in ((0, "slot 10"), (10, "slot 30")):
+        for receiver in scenario.receivers:
+            writer.slot_rows(first, receiver, sums(10 if first == 0 else 20), np.zeros(10 if first == 0 else 20))
+        if first == 0:
+            writer.settle(at, replace(empty, slots=10))
+        else:
+            writer.write_rows(at)
+    note_end(tmp_path, scenario, "observer was ended by signal 9\nits log:\n    nothing")
+    summary = load_results(tmp_path).summary
+    assert summary["slots"] == 30
+    assert summary["ended"].splitlines() == [
+        "observer was ended by signal 9 (the figures are as of slot 10; the tables have more)",
+        "its log:",
+        "    nothing",
+    ]
 
 
 def sizes(folder: Path) -> dict[str, int]:

@@ -26,6 +26,7 @@ from evedrop.errors import UsageError
 from evedrop.live.launch.gathered_tables import Gathered, Journals, Recorded, Statistics
 from evedrop.live.launch.shard import Shard
 from evedrop.model.digest import DIGEST_BYTES, Digests, RunDigest, block_starts
+from evedrop.names import LEGITIMATE
 from evedrop.news import ConnectionOutage, RunEvent
 from evedrop.results.folder import make_private
 from evedrop.results.growing_tables import parquet_or_stream
@@ -53,11 +54,17 @@ def gather(scenario: Scenario, folder: Path, shards: Sequence[Shard], started: f
     for name, gathered in _tables(scenario, shards).items():
         gathered.write([shard.folder / f"{name}.parquet" for shard in shards], folder / f"{name}.parquet")
     wall = 0.0 if started is None else time.monotonic() - started
-    totals = Totals.merged([load_score(shard.folder, shard.scenario) for shard in shards])
+    scores = [load_score(shard.folder, shard.scenario) for shard in shards]
+    totals = Totals.merged(scores)
     replay = replay_of(folder, scenario)
     parts = _summaries(shards)
     ending = Ending(
-        wall, how, replay, events=_events(parts), outages=_outages(parts), misdelivered=_misdelivered(parts)
+        wall,
+        how + _age_of_figures(shards, scores, parts),
+        replay,
+        events=_events(parts),
+        outages=_outages(parts),
+        misdelivered=_misdelivered(parts),
     )
     summary = summary_of(scenario, totals, digests, ending)
     write_summary(folder, summary)
@@ -102,6 +109,16 @@ def _blocks(shard: Shard, name: str) -> dict[int, Digests]:
     starts, values = table["block"].to_numpy(), b"".join(table["digest"].to_pylist())
     digests = np.frombuffer(values, np.uint8).reshape(-1, DIGEST_BYTES)
     return {int(start): digests[starts == start] for start in np.unique(starts)}
+
+
+def _age_of_figures(shards: Sequence[Shard], scores: Sequence[Totals], summaries: Mapping[int, Summary]) -> str:
+    """Which shards' figures are of an earlier slot than their rows, in brackets, because their observers were killed."""
+    earlier = [
+        f"slot {score.tallies[LEGITIMATE].done} in shard {shard.number}"
+        for shard, score in zip(shards, scores, strict=True)
+        if shard.number in summaries and score.tallies[LEGITIMATE].done < summaries[shard.number].slots
+    ]
+    return f" (the figures are as of {', '.join(earlier)}; the tables have more)" if earlier else ""
 
 
 def _events(summaries: Mapping[int, Summary]) -> list[RunEvent]:

@@ -12,7 +12,10 @@ import sys
 
 FOLDER = os.environ.get("EVEDROP_CAMPAIGN")
 CONFUSED = os.environ.get("PYTHON_EVEDROP_CONFUSED")
-"""After how many deliveries the router puts one on another receiver's key, too. Evedrop hands on variables of Python."""
+"""After how many deliveries the router puts one on another receiver's key, too, and a file that says that it did.
+
+Evedrop hands on variables of Python.
+"""
 MOST_CONFUSED = 5
 
 LAUNCHES = bool(FOLDER) and sys.orig_argv[1:4] == ["-m", "evedrop", "run"]
@@ -70,7 +73,8 @@ if LAUNCHES or (CONFUSED and "evedrop.fork_server" in sys.orig_argv):
         module.SshHost.__init__, module.SshHost.close = begun, closed
 
     def _confused(module: ModuleType) -> None:
-        put, every, before, count = module.Outlet.__call__, int(CONFUSED or 0), [None], [0]
+        number, _, place = (CONFUSED or "").partition(":")
+        put, every, before, count = module.Outlet.__call__, int(number), [None], [0]
 
         def confuse(outlet: Any, payload: bytes) -> None:
             put(outlet, payload)
@@ -85,6 +89,8 @@ if LAUNCHES or (CONFUSED and "evedrop.fork_server" in sys.orig_argv):
                 and count[0] <= MOST_CONFUSED * every
             ):
                 other._publisher.put(outlet._head + payload)
+                with open(place, "w"):
+                    pass
             before[0] = outlet
 
         module.Outlet.__call__ = confuse
