@@ -117,8 +117,9 @@ class Fault:
         if self.target == RESULTS:
             return _UNWRITTEN
         if self.kind in LIMITS:
-            # A router in which Zenoh waits for a thread that the system refuses neither listens nor fails.
-            return (*_WITHOUT, "router did not listen") if self.kind == "few processes" else _WITHOUT
+            # Where the system refuses Zenoh a thread, Zenoh may wait for it, in a router that does not listen, or abort.
+            few = ("router did not listen", "can't spawn worker thread")
+            return (*_WITHOUT, *few) if self.kind == "few processes" else _WITHOUT
         if self.target in FORK_SERVERS:
             return ("fork server",)
         if self.target == EVERYBODY:

@@ -124,6 +124,25 @@ def test_a_signal_that_comes_when_the_run_is_complete_changes_nothing(bench: Ben
 MISSED = "evedrop: eve: legitimate, observer did not appear within 30 s, and nobody reads evedrop/r/telemetry/eve; start them\n"
 
 
+PANIC = """
+thread '<unnamed>' (18226) panicked at tokio-1.53.2/src/runtime/scheduler/multi_thread/worker.rs:514:13:
+OS can't spawn worker thread: Resource temporarily unavailable (os error 11)
+stack backtrace:
+   0: __rustc::rust_begin_unwind
+  75:     0x7f3e7ac4524a - __libc_start_call_main
+                               at ./csu/../sysdeps/nptl/libc_start_call_main.h:58:16
+""".lstrip()
+
+
+def test_why_zenoh_panicked_is_shown_without_its_stack(bench: Bench) -> None:
+    """The stack has dozens of lines, and the reason is before them."""
+    bench.starter.status = -6
+    bench.children.start(bench.briefs["eve"])
+    (bench.results / "logs" / "eve.log").write_text(PANIC)
+    report = bench.children.failure_report(Exit("eve", -6), None)
+    assert report.splitlines()[-1] == "    OS can't spawn worker thread: Resource temporarily unavailable (os error 11)"
+
+
 @pytest.mark.parametrize("first", [Exit("eve", 3), Exit("observer", 3)])
 def test_who_ends_for_lack_of_an_observer_is_not_at_fault(bench: Bench, first: Exit) -> None:
     """Cut off from the router, the observer and all others give up after the same time; it is named, and why."""

@@ -45,6 +45,8 @@ _COMPLAINT = "evedrop: "
 _HUBS = frozenset({ROUTER, RELAY, OBSERVER})
 _ROUTER_LOST = "has had no connection with the router"
 _NOT_THERE = re.compile(rf"evedrop: \S+: .*\b{OBSERVER}\b.* did not appear within")
+_FRAME = re.compile(r"stack backtrace:$|\s+\d+: |\s+at \S+:\d+")
+"""A line of a stack that Zenoh shows when it panics; the line before them says why."""
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 _ZENOH_CLOSES = "Received Data for unknown expr_id"
 _REFUSED = re.compile(r"(?:malformed message|gap) on (evedrop/[^/\s]+/[a-z0-9_/-]+)")
@@ -370,5 +372,6 @@ class Children:
         return [line for line in text.splitlines() if _ZENOH_CLOSES not in line]
 
     def _log_lines(self, name: str) -> list[str]:
-        lines = self._log(name)[-_LOG_LINES:] or ["(it wrote nothing)"]
+        log = [line for line in self._log(name) if not _FRAME.match(line)]
+        lines = log[-_LOG_LINES:] or ["(it wrote nothing)"]
         return [f"the last lines of logs/{name}.log:", *(f"    {line}" for line in lines)]
