@@ -1,7 +1,14 @@
-"""How many random examples a test looks at: fewer in `make test`, which draws others each time, than in `make test-long`."""
+"""How many examples a test looks at in `make test`, and how many in `make test-long`.
+
+Of random examples `make test` looks at fewer, and draws others each time. Of many parameters it looks at few, which differ in kind.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from typing import Any
+
+import pytest
 from hypothesis import HealthCheck, settings
 
 USUAL = 100
@@ -23,3 +30,18 @@ def register_profiles() -> None:
 def examples(many: int) -> int:
     """As many in the profile `full`, and in another profile the same part of them as of the usual number."""
     return max(1, many * settings().max_examples // USUAL)
+
+
+def mostly_long(every: Iterable[Any], usual: Iterable[Any]) -> list[Any]:
+    """Parameters of a test: `make test` looks only at those that are also in `usual`, `make test-long` at all others.
+
+    Raises ValueError if one of `usual` is not there.
+    """
+    few = list(usual)
+    params = list(every)
+    if missing := [one for one in few if one not in params]:
+        raise ValueError(f"no parameter is {missing[0]!r}")
+    return [
+        pytest.param(*(one if isinstance(one, tuple) else (one,)), marks=[] if one in few else pytest.mark.long)
+        for one in params
+    ]

@@ -18,6 +18,7 @@ import pytest
 from evedrop.cli.commands import MODULES, ROLES
 from evedrop.output import Output, print_json, standard_streams
 from tests.conftest import Evedrop
+from tests.examples import mostly_long
 
 WIRE = Path(__file__).parents[2] / "docs" / "examples" / "wire" / "radio.toml"
 SMALL = ("--slots", "20", "--trials", "2")
@@ -30,14 +31,14 @@ COMMANDS = {
     "check a class": ("check", "--scheme", "innovation"),
     "run": ("run", "eavesdroppers", "--slots", "20", "--view", "off", *FAILS, "--out", "out"),
     "montecarlo": ("montecarlo", "eavesdroppers", *SMALL, *FAILS, "--out", "out"),
-    "test": ("test", "fails.toml", "eavesdroppers", "--in-memory", "--trials", "2", "--junit", "junit.xml", "--out", "out"),
+    "test": ("test", "fails.toml", "holds.toml", "--in-memory", "--trials", "2", "--junit", "junit.xml", "--out", "out"),
     "wire": ("wire", str(WIRE), "--for", "1", "--out", "out"),
     "compare": ("compare", "eavesdroppers", *SMALL, "--schemes", "plain", "--adversaries", "smart", "--out", "out"),
     "sweep": ("sweep", "eavesdroppers", *SMALL, "--over", "seed=1,2", "--out", "out"),
     "design": ("design", "numerical"),
-    "design a schedule": ("design", "numerical", "--schedule", "5", "--max-trace", "0.1"),
+    "design a schedule": ("design", "numerical", "--schedule", "3", "--max-trace", "0.1"),
     "cost": ("cost", "microgrid", "--slots", "130", "--trials", "2"),
-    "learned": ("learned", "learning", "--slots", "64", "--trials", "2", "--set", "expect=[]"),
+    "learned": ("learned", "learning", "--slots", "9", "--trials", "2", "--set", "expect=[]"),
     "figures": ("figures", "figures"),
     "paper": ("paper", "crimson2023", "--quick", "--out", "papers"),
     "links": ("links", "fit", "link.csv"),
@@ -56,18 +57,23 @@ LEFT_OUT = {"demo", "link", "partition", "heal", "pause", "resume", "step", "hea
 """Commands that do what another one does, or that need a run in progress, and compute nothing."""
 FAILS_WITH = {"check": 2, "run": 1, "montecarlo": 1, "test": 1, "diff": 1, "status": 2, "wire": 1}
 """Command → its status, if it is not 0."""
-SLOW = {"figures"}
+USUAL = {
+    *("list", "show", "new", "check", "run", "montecarlo", "test", "links", "process", "status", "view", "export"),
+    *("report", "diff", "docs", "completion", "brief"),
+}
+"""Commands that `make test` tries; the studies among the others print and write as `montecarlo` does."""
 
 
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with two studies that differ, a scenario that fails, and recordings of a link and of states."""
+    """A folder with two studies that differ, scenarios that fail and hold, and recordings of a link and of states."""
     folder = tmp_path_factory.mktemp("inputs")
     for name, seed in (("study", "1"), ("other", "2")):
         assert Evedrop(folder)("montecarlo", "eavesdroppers", *SMALL, "--seed", seed, "--out", name).status == 0
         (folder / name / "report.html").unlink()
     (folder / "other" / "report.html").unlink(missing_ok=True)
-    shown = Evedrop(folder)("show", "eavesdroppers").out
+    shown = Evedrop(folder)("show", "eavesdroppers").out.replace("slots = 5000", "slots = 20")
+    (folder / "holds.toml").write_text(shown.replace("below = 0.01", "below = 1e9"), encoding="utf-8")
     (folder / "fails.toml").write_text(shown.replace("below = 0.01", "below = 1e-9"), encoding="utf-8")
     random = np.random.default_rng(1)
     np.savetxt(folder / "link.csv", random.integers(0, 2, 200), "%d", header="received", comments="")
@@ -105,7 +111,7 @@ def nobody() -> Iterator[io.TextIOWrapper]:
         yield file
 
 
-@pytest.mark.parametrize("name", [pytest.param(one, marks=[pytest.mark.long] * (one in SLOW)) for one in COMMANDS])
+@pytest.mark.parametrize("name", mostly_long(COMMANDS, USUAL))
 def test_the_output_changes_neither_status_nor_files(name: str, inputs: Path, tmp_path: Path) -> None:
     """Whether all of it is read, none of it, or in an encoding that has no Greek letters."""
     ordinary, unread, narrow = (copied(inputs, tmp_path / one) for one in ("ordinary", "unread", "narrow"))
@@ -129,17 +135,20 @@ def test_the_output_changes_neither_status_nor_files(name: str, inputs: Path, tm
     assert len(printed.splitlines()) >= len(done.out.splitlines())
 
 
-def test_an_output_in_latin_1_ends_no_run(inputs: Path, tmp_path: Path) -> None:
+SETTINGS = {
+    "latin-1": {"PYTHONIOENCODING": "latin-1"},
+    "no locale": {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+}
+
+
+@pytest.mark.parametrize("name", mostly_long(SETTINGS, ["latin-1"]))
+def test_an_output_in_latin_1_ends_no_run(name: str, inputs: Path, tmp_path: Path) -> None:
     """With the processes of a run, which inherit the setting, and with a locale without any encoding."""
-    for name, settings in {
-        "latin-1": {"PYTHONIOENCODING": "latin-1"},
-        "no locale": {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
-    }.items():
-        evedrop = copied(inputs, tmp_path / name)
-        done = evedrop.begun(*COMMANDS["run"], env={**evedrop.environment, **settings}, encoding="latin-1").end()
-        assert (done.status, done.err) == (1, "")
-        assert "|x-x_hat|" in done.out
-        assert (evedrop.folder / "out" / "report.html").read_text(encoding="utf-8").endswith("</html>\n")
+    evedrop = copied(inputs, tmp_path / name)
+    done = evedrop.begun(*COMMANDS["run"], env={**evedrop.environment, **SETTINGS[name]}, encoding="latin-1").end()
+    assert (done.status, done.err) == (1, "")
+    assert "|x-x_hat|" in done.out
+    assert (evedrop.folder / "out" / "report.html").read_text(encoding="utf-8").endswith("</html>\n")
 
 
 def test_json_in_any_encoding_has_the_same_content(tmp_path: Path) -> None:
@@ -200,7 +209,7 @@ def test_a_full_disk_behind_the_output_is_named_and_costs_no_file(
     assert name == "list" or (evedrop.folder / "out" / "report.html").exists()
 
 
-@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-"])
+@pytest.mark.parametrize("closed", mostly_long(["<&-", ">&-", "2>&-"], [">&-"]))
 def test_a_stream_that_the_shell_closed_does_no_harm(closed: str, inputs: Path, tmp_path: Path) -> None:
     """A run has the status and the files that it always has."""
     evedrop = copied(inputs, tmp_path / "here")

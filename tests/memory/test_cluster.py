@@ -23,6 +23,7 @@ from evedrop.errors import RunError, UsageError
 from evedrop.loading import shipped
 from evedrop.memory.cluster import Cluster
 from evedrop.memory.montecarlo import Plan
+from evedrop.memory.tasks import Task
 from evedrop.ports import free_port
 from evedrop.results.writer import load_results
 from tests.conftest import LIMIT, Evedrop, Live, wait_until
@@ -158,13 +159,13 @@ def test_a_sweep_on_the_cluster_is_the_local_one(evedrop: Evedrop, scheduler: st
         "sweep",
         "eavesdroppers",
         "--slots",
-        "30",
+        "9",
         "--trials",
         "600",
         "--over",
         "encoding.state_probability=0.2:0.8:0.2",
     )
-    here, there = evedrop(*base, "--out", "here"), evedrop.process(*base, "--out", "there", "--scheduler", scheduler)
+    here, there = evedrop(*base, "--out", "here"), evedrop(*base, "--out", "there", "--scheduler", scheduler)
     assert (here.status, there.status, there.err) == (0, 0, "")
     ours, theirs = (pq.read_table(evedrop.folder / name / "sweep.parquet") for name in ("here", "there"))
     assert ours.num_rows == 4 * 4
@@ -173,8 +174,9 @@ def test_a_sweep_on_the_cluster_is_the_local_one(evedrop: Evedrop, scheduler: st
 
 def test_a_comparison_on_the_cluster_is_the_local_one(evedrop: Evedrop, scheduler: str) -> None:
     """The same compare.json, byte for byte."""
-    base = ("compare", "acknowledged", "--slots", "40", "--trials", "30", "--schemes", "acknowledged,innovation")
-    here, there = evedrop(*base, "--out", "here"), evedrop.process(*base, "--out", "there", "--scheduler", scheduler)
+    schemes = ("--schemes", "plain,innovation", "--adversaries", "naive,smart")
+    base = ("compare", "eavesdroppers", "--slots", "20", "--trials", "30", *schemes)
+    here, there = evedrop(*base, "--out", "here"), evedrop(*base, "--out", "there", "--scheduler", scheduler)
     assert (here.status, there.status, there.err) == (0, 0, "")
     ours, theirs = ((evedrop.folder / name / "compare.json").read_text() for name in ("here", "there"))
     assert ours == theirs
@@ -184,28 +186,35 @@ def test_a_comparison_on_the_cluster_is_the_local_one(evedrop: Evedrop, schedule
 @pytest.mark.parametrize(
     "study",
     [
-        ("cost", "microgrid", "--trials", "51", "--slots", "60"),
-        ("learned", "learning", "--trials", "101", "--slots", "12", "--set", "expect=[]"),
+        ("cost", "microgrid", "--trials", "51", "--slots", "4"),
+        ("learned", "learning", "--trials", "101", "--slots", "9", "--set", "expect=[]"),
     ],
     ids=["cost", "learned"],
 )
 def test_a_table_on_the_cluster_is_the_local_one(evedrop: Evedrop, scheduler: str, study: tuple[str, ...]) -> None:
     """The same JSON from two tasks, and from two processes of this machine."""
-    here, there = evedrop(*study, "--json"), evedrop.process(*study, "--json", "--scheduler", scheduler)
+    here, there = evedrop(*study, "--json"), evedrop(*study, "--json", "--scheduler", scheduler)
     assert (here.status, there.status, there.err) == (0, 0, "")
     assert json.loads(here.out) == json.loads(there.out)
     assert here.out == evedrop(*study, "--json", "--workers", "2").out
 
 
+def write_short(file: Path) -> None:
+    """A scenario of a few slots whose expectation holds."""
+    text = shipped()["eavesdroppers"].read_text(encoding="utf-8")
+    file.write_text(text.replace("slots = 5000", "slots = 20").replace("below = 0.01", "below = 1e9"), encoding="utf-8")
+
+
 def test_a_test_in_memory_on_the_cluster_is_the_local_one(evedrop: Evedrop, scheduler: str) -> None:
     """Both pass, with the same digests; live, a scheduler is refused."""
-    base = ("test", "bursts", "--in-memory", "--trials", "600", "--out")
-    here, there = evedrop(*base, "here"), evedrop.process(*base, "there", "--scheduler", scheduler)
+    write_short(evedrop.folder / "mine.toml")
+    base = ("test", "mine.toml", "--in-memory", "--trials", "600", "--out")
+    here, there = evedrop(*base, "here"), evedrop(*base, "there", "--scheduler", scheduler)
     assert (here.status, there.status) == (0, 0)
-    ours, theirs = (load_results(evedrop.folder / name / "bursts") for name in ("here", "there"))
+    ours, theirs = (load_results(evedrop.folder / name / "mine") for name in ("here", "there"))
     assert ours.digests.num_rows > 0
     assert ours.digests.equals(theirs.digests)
-    live = evedrop("test", "bursts", "--scheduler", scheduler)
+    live = evedrop("test", "mine.toml", "--scheduler", scheduler)
     assert (live.status, live.err) == (
         2,
         "evedrop: --scheduler computes trials in memory; add --in-memory, or leave it out\n",
@@ -214,7 +223,7 @@ def test_a_test_in_memory_on_the_cluster_is_the_local_one(evedrop: Evedrop, sche
 
 def test_pytest_computes_in_memory_on_the_cluster(evedrop: Evedrop, scheduler: str) -> None:
     """A scenario passes as a test of pytest; live, a scheduler is refused."""
-    (evedrop.folder / "mine.toml").write_text(shipped()["bursts"].read_text(encoding="utf-8"), encoding="utf-8")
+    write_short(evedrop.folder / "mine.toml")
     (evedrop.folder / "pyproject.toml").write_text("[project]\n", encoding="utf-8")
     command = [
         sys.executable,
@@ -261,6 +270,7 @@ def test_a_scheduler_that_is_no_address_is_refused() -> None:
         montecarlo("eavesdroppers", slots=9, trials=5, scheduler=cast(str, object()))
 
 
+@pytest.mark.long
 def test_a_scheduler_without_workers_is_said_and_its_first_worker_begins(evedrop: Evedrop, lonely: Dask) -> None:
     """One line that has the command which starts a worker, and once there is one, the study runs to its end."""
     study = ("montecarlo", "eavesdroppers", "--slots", "9", "--trials", "5")
@@ -273,6 +283,7 @@ def test_a_scheduler_without_workers_is_said_and_its_first_worker_begins(evedrop
     assert (done.status, done.err) == (0, "")
 
 
+@pytest.mark.long
 def test_waiting_for_workers_ends_upon_ctrl_c(evedrop: Evedrop, lonely: Dask) -> None:
     """Status 130, and no folder."""
     study = ("montecarlo", "eavesdroppers", "--slots", "9", "--trials", "5")
@@ -281,6 +292,46 @@ def test_waiting_for_workers_ends_upon_ctrl_c(evedrop: Evedrop, lonely: Dask) ->
     live.process.send_signal(signal.SIGINT)
     assert live.end().status == 130
     assert not live.folder.exists()
+
+
+def test_a_stop_ends_the_wait_for_workers() -> None:
+    """Also of a scheduler that answers and has none. No task is sent."""
+    looks: list[str] = []
+
+    def nobody() -> dict[str, int]:
+        looks.append("again")
+        return {}
+
+    cluster = Cluster("tcp://scheduler", SimpleNamespace(nthreads=nobody))
+    assert list(cluster.results(cast(list[Task[Any]], [None]), lambda: bool(looks))) == []
+    assert looks
+
+
+def test_a_lack_of_workers_is_said_and_the_first_worker_begins(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One line with the command that starts a worker, once; the task waits for it."""
+    for name in ("LONELY", "WORKERS", "LOOK"):
+        monkeypatch.setattr(f"evedrop.memory.cluster._{name}_SECONDS", 0.01)
+    told: list[str] = []
+
+    def workers() -> dict[str, int]:
+        told.append(capsys.readouterr().err)
+        return {"tcp://worker": 1} if sum(map(bool, told)) and not told[-1] else {}
+
+    future = SimpleNamespace(done=lambda: True, result=lambda: "result")
+    client = SimpleNamespace(
+        nthreads=workers,
+        get_versions=lambda **_: {"workers": {}},
+        submit=lambda *_, **__: future,
+        cancel=lambda _: None,
+    )
+    cluster = Cluster("tcp://scheduler", client)
+    assert list(cluster.results(cast(list[Task[Any]], [None]), lambda: False)) == [(0, "result")]
+    assert "".join(told) == (
+        "evedrop: the scheduler tcp://scheduler has no workers; waiting for one: start it with "
+        "`dask worker tcp://scheduler --nthreads 1`\n"
+    )
 
 
 @pytest.mark.parametrize("silent", ["nthreads", "get_versions"])
@@ -308,6 +359,7 @@ def test_a_scheduler_that_does_not_answer_keeps_nothing_waiting(
     assert asked.is_set()
 
 
+@pytest.mark.long
 def test_a_suspended_scheduler_keeps_no_study_from_ending(evedrop: Evedrop, lonely: Dask) -> None:
     """Ctrl-C ends it, with status 130."""
     study = ("montecarlo", "eavesdroppers", "--slots", "9", "--trials", "5")
@@ -339,13 +391,14 @@ def test_a_folder_that_is_not_empty_is_refused_there_too(evedrop: Evedrop, sched
     """One line, and the connection is closed."""
     (evedrop.folder / "full").mkdir()
     (evedrop.folder / "full" / "file").touch()
-    done = evedrop.process(
+    done = evedrop(
         "montecarlo", "eavesdroppers", "--slots", "9", "--trials", "5", "--scheduler", scheduler, "--out", "full"
     )
     assert (done.status, done.err) == (2, "evedrop: full is not empty; give another folder, or empty it\n")
 
 
-@pytest.mark.parametrize("command", ["montecarlo", pytest.param("sweep", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("command", ["montecarlo", "sweep"])
 def test_an_unreachable_scheduler_is_refused(evedrop: Evedrop, command: str) -> None:
     """Nobody listens: one line, exit 2, nothing left on disk."""
     over = ("--over", "seed=1,2") if command == "sweep" else ()
@@ -359,10 +412,11 @@ def test_an_unreachable_scheduler_is_refused(evedrop: Evedrop, command: str) -> 
     assert not (evedrop.folder / "run").exists()
 
 
-@pytest.mark.parametrize("address", ["nonsense", "foo://127.0.0.1:8786"])
+@pytest.mark.parametrize("address", ["nonsense", "foo://127.0.0.1:8786", ""])
 def test_an_address_that_is_none_is_refused(tmp_path: Path, address: str) -> None:
-    """Without a port, of an unknown protocol."""
-    with pytest.raises(UsageError, match="no Dask scheduler answers there"):
+    """Without a port, of an unknown protocol, or where nobody listens; nothing is left on disk."""
+    address = address or f"tcp://127.0.0.1:{free_port()}"
+    with pytest.raises(UsageError, match=f"the scheduler {address}: no Dask scheduler answers there"):
         montecarlo("eavesdroppers", slots=9, trials=5, plan=Plan(scheduler=address, patience=0.5), out=tmp_path / "run")
     assert not (tmp_path / "run").exists()
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import re
 import shlex
+import shutil
 import signal
 import threading
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +28,11 @@ from evedrop.memory.simulation import Mode
 from evedrop.memory.trials import tasks_of
 from evedrop.results.writer import load_results
 from evedrop.signals import stop_on_signals
-from tests.conftest import LIMIT, Evedrop, wait_until
+from tests.conftest import LIMIT, Evedrop
+from tests.examples import mostly_long
 
 STUDY = (
-    *("montecarlo", "eavesdroppers", "--trials", "4700", "--slots", "30"),
+    *("montecarlo", "eavesdroppers", "--trials", "4700", "--slots", "8"),
     *("--record-trials", "2100", "--workers", "1", "--set", "expect=[]"),
 )
 """Three tasks."""
@@ -36,12 +40,16 @@ _TIMES = re.compile(r'"(wall_seconds|slots_per_second)": [^,\n]*|[0-9,]+ trial-s
 
 
 def files(folder: Path, name: str = "") -> dict[str, bytes | str]:
-    """The files of a results folder; texts without times and without the folder's name, by default its last two parts."""
+    """The files of a results folder; texts without times and without where it is.
+
+    name: of the folder, by default its last two parts.
+    """
     found: dict[str, bytes | str] = {}
     for path in sorted(folder.rglob("*")):
         if path.suffix in {".json", ".html", ".toml"}:
             text = _TIMES.sub("", path.read_text())
-            found[str(path.relative_to(folder))] = text.replace(name or f"{folder.parent.name}/{folder.name}", "FOLDER")
+            text = text.replace(name or f"{folder.parent.name}/{folder.name}", "FOLDER")
+            found[str(path.relative_to(folder))] = text.replace(str(folder.parents[1]), "ROOT")
         elif path.is_file():
             found[str(path.relative_to(folder))] = path.read_bytes()
     return found
@@ -69,14 +77,36 @@ def interrupted_after(monkeypatch: pytest.MonkeyPatch, tasks: int) -> None:
         monkeypatch.setattr(f"evedrop.{module}.stop_on_signals", told)
 
 
-@pytest.fixture
-def cut(evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of a study that was interrupted when one task was kept."""
-    with monkeypatch.context() as patched:
+Whole = Callable[[tuple[str, ...]], dict[str, bytes | str]]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
+    """The files of a study that nothing interrupted, by the words of its command; each is run once for all tests."""
+
+    @cache
+    def made(study: tuple[str, ...]) -> dict[str, bytes | str]:
+        folder = tmp_path_factory.mktemp("study")
+        assert Evedrop(folder)(*study, "--out", "whole/run").status == 0
+        return files(folder / "whole/run")
+
+    return made
+
+
+@pytest.fixture(scope="module")
+def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the study `cut/run`, which was interrupted when one task was kept."""
+    folder = tmp_path_factory.mktemp("interrupted")
+    with pytest.MonkeyPatch.context() as patched:
         interrupted_after(patched, 1)
-        done = evedrop(*STUDY, "--out", "cut/run")
-    assert done.status == 130
-    return evedrop.folder / "cut/run"
+        assert Evedrop(folder)(*STUDY, "--out", "cut/run").status == 130
+    return folder
+
+
+@pytest.fixture
+def cut(interrupted: Path, evedrop: Evedrop) -> Path:
+    """A copy of the folder of a study that was interrupted when one task was kept."""
+    return Path(shutil.copytree(interrupted / "cut/run", evedrop.folder / "cut/run"))
 
 
 def kept_in(folder: Path) -> list[Path]:
@@ -84,14 +114,18 @@ def kept_in(folder: Path) -> list[Path]:
     return sorted(path for path in (folder / "kept").glob("*") if path.suffix != ".json")
 
 
-@pytest.mark.parametrize("workers", ["1", "2"])
-@pytest.mark.parametrize("mode", [(), ("--covariance-only",), ("--error-coordinates",)], ids=["exact", "cov", "err"])
+MODES = {"exact": (), "cov": ("--covariance-only",), "err": ("--error-coordinates",)}
+
+
+@pytest.mark.parametrize(
+    ("name", "workers"), mostly_long(itertools.product(MODES, "12"), [("exact", "2"), ("cov", "1")])
+)
 def test_an_interrupted_study_ends_like_a_whole_one(
-    workers: str, mode: tuple[str, ...], evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch
+    name: str, workers: str, evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch, whole: Whole
 ) -> None:
     """Every file is the same to the byte but for times, with another number of workers too, and nothing is left of the parts."""
+    mode = MODES[name]
     study = (*STUDY, "--record-trials", "1", *mode) if mode else STUDY
-    assert evedrop(*study, "--out", "whole/run").status == 0
     with monkeypatch.context() as patched:
         interrupted_after(patched, 1)
         done = evedrop(*study, "--out", "cut/run")
@@ -102,21 +136,32 @@ def test_an_interrupted_study_ends_like_a_whole_one(
     words = shlex.split(command.partition("go on with: ")[2])
     assert words == ["evedrop", *study, "--out", "cut/run", "--resume"]
     assert evedrop(*words[1:], "--workers", workers).status == 0
-    assert files(evedrop.folder / "cut/run") == files(evedrop.folder / "whole/run")
+    assert files(evedrop.folder / "cut/run") == whole(study)
 
 
-def test_a_killed_study_goes_on(evedrop: Evedrop) -> None:
+KILLED = """
+import os, signal, sys
+from evedrop.cli.main import main
+from evedrop.memory.kept_tasks import KeptTasks
+keep = KeptTasks.keep
+def then(kept, *given):
+    keep(kept, *given)
+    os.kill(os.getpid(), signal.SIGKILL)
+KeptTasks.keep = then
+main(sys.argv[1:])
+"""
+"""A command that is killed when the first task is kept."""
+
+
+def test_a_killed_study_goes_on(evedrop: Evedrop, whole: Whole) -> None:
     """After kill -9, which leaves no summary, the study goes on from the tasks that were finished."""
-    study = (*STUDY, "--trials", "6000", "--slots", "1000", "--record-trials", "1")
-    assert evedrop(*study, "--out", "whole/run").status == 0
-    live = evedrop.started(*study, out="cut/run")
+    live = evedrop.start(["-c", KILLED], (*STUDY, "--out", "cut/run"), {})
+    assert (live.wait(LIMIT), live.communicate()[1]) == (-signal.SIGKILL, "")
     folder = evedrop.folder / "cut/run"
-    wait_until(lambda: kept_in(folder), "a finished task")
-    live.process.kill()
-    live.process.wait()
+    assert len(kept_in(folder)) == 1
     assert not (folder / "summary.json").exists()
-    assert evedrop(*study, "--out", "cut/run", "--resume").status == 0
-    assert files(folder) == files(evedrop.folder / "whole/run")
+    assert evedrop(*STUDY, "--out", "cut/run", "--resume").status == 0
+    assert files(folder) == whole(STUDY)
 
 
 def test_only_what_is_missing_is_computed(cut: Path, evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -157,26 +202,24 @@ def renamed(path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", [flip, cut_short, renamed])
-def test_a_damaged_part_is_not_used(damage: Callable[[Path], None], cut: Path, evedrop: Evedrop) -> None:
+def test_a_damaged_part_is_not_used(damage: Callable[[Path], None], cut: Path, evedrop: Evedrop, whole: Whole) -> None:
     """Its trials are computed again, which a line on standard error says."""
-    assert evedrop(*STUDY, "--out", "whole/run").status == 0
     damage(kept_in(cut)[0])
     done = evedrop(*STUDY, "--out", "cut/run", "--resume")
     assert done.status == 0
     assert "is damaged; its trials are computed again" in done.err
-    assert files(cut) == files(evedrop.folder / "whole/run")
+    assert files(cut) == whole(STUDY)
 
 
-def test_a_part_of_another_study_is_not_used(cut: Path, evedrop: Evedrop) -> None:
+def test_a_part_of_another_study_is_not_used(cut: Path, evedrop: Evedrop, whole: Whole) -> None:
     """A file with the right name from a study with another seed is as good as damaged."""
     other = evedrop.folder / "other/run"
-    assert evedrop(*STUDY, "--out", "whole/run").status == 0
     with pytest.MonkeyPatch.context() as patched:
         interrupted_after(patched, 1)
         assert evedrop(*STUDY, "--seed", "5", "--out", "other/run").status == 130
     kept_in(cut)[0].write_bytes(kept_in(other)[0].read_bytes())
     assert "is damaged" in evedrop(*STUDY, "--out", "cut/run", "--resume").err
-    assert files(cut) == files(evedrop.folder / "whole/run")
+    assert files(cut) == whole(STUDY)
 
 
 @pytest.mark.parametrize(
@@ -257,7 +300,7 @@ def test_order_of_recorded_rows_does_not_depend_on_the_tasks(tmp_path: Path) -> 
 
 STUDIES = {
     "sweep": (
-        *("sweep", "eavesdroppers", "--over", "encoding.state_probability=0.3,0.6", "--over", "slots=20,30"),
+        *("sweep", "eavesdroppers", "--over", "encoding.state_probability=0.3,0.6", "--over", "slots=5,8"),
         *("--trials", "600", "--workers", "1", "--set", "expect=[]"),
     ),
     "compare": (
@@ -269,23 +312,24 @@ STUDIES = {
 }
 
 
-@pytest.mark.parametrize("tasks", [1, 2])
+@pytest.mark.parametrize("tasks", mostly_long([1, 2], [2]))
 @pytest.mark.parametrize("name", STUDIES)
-def test_other_studies_go_on_too(name: str, tasks: int, evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_studies_go_on_too(
+    name: str, tasks: int, evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch, whole: Whole
+) -> None:
     """Interrupted after one and after two tasks; tables and pictures are the same too."""
     study = STUDIES[name]
-    assert evedrop(*study, "--out", "whole/run").status == 0
     with monkeypatch.context() as patched:
         interrupted_after(patched, tasks)
         done = evedrop(*study, "--out", "cut/run")
     assert done.status == 130
     assert f"go on with: evedrop {name} " in done.err
     assert evedrop(*study, "--out", "cut/run", "--resume", "--workers", "2").status == 0
-    whole, cut = (
-        {path: data for path, data in files(evedrop.folder / place / "run").items() if not path.endswith(".pdf")}
-        for place in ("whole", "cut")
+    cut, uninterrupted = (
+        {path: data for path, data in every.items() if not path.endswith(".pdf")}
+        for every in (files(evedrop.folder / "cut/run"), whole(study))
     )
-    assert cut == whole
+    assert cut == uninterrupted
 
 
 @pytest.mark.parametrize(

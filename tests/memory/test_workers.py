@@ -79,6 +79,7 @@ def test_interrupting_keeps_what_is_done(evedrop: Evedrop, workers: int, number:
     assert summary["links"]["smart"]["unexplained"] == 0
 
 
+@pytest.mark.long
 def test_a_ctrl_c_in_the_terminal_reaches_the_workers_too(evedrop: Evedrop) -> None:
     """The whole group gets the signal, including workers that have just started; no process prints a traceback."""
     live = evedrop.started("montecarlo", "eavesdroppers", *ENDLESS, "--workers", "2", start_new_session=True)
@@ -117,6 +118,7 @@ def test_workers_end_with_who_started_them(evedrop: Evedrop) -> None:
     no_process_left(live)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_suspended_workers_keep_no_study_from_ending(evedrop: Evedrop, number: signal.Signals) -> None:
     """They are continued, and hand over what they have done."""
@@ -131,6 +133,7 @@ def test_suspended_workers_keep_no_study_from_ending(evedrop: Evedrop, number: s
     assert live.results.summary["trials"] in {500, 1000}  # a machine may be so busy that one worker has not begun
 
 
+@pytest.mark.long
 def test_suspended_workers_do_not_outlive_a_killed_study(evedrop: Evedrop) -> None:
     """The system continues them when their parent dies; they then find their pipes closed."""
     live, crew = started(evedrop, 2)
@@ -170,6 +173,7 @@ def outcome(of: Sequence[Task[Any]], tell: Tell = lambda _: None, until_first: b
     return came[0]
 
 
+@pytest.mark.long
 def test_a_worker_that_stays_suspended_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """By its process id and its trials; one that is continued in time is not."""
     monkeypatch.setattr("evedrop.processes.SUSPENDED_SECONDS", 3.0)
@@ -187,6 +191,7 @@ def test_a_worker_that_stays_suspended_is_named(monkeypatch: pytest.MonkeyPatch)
     assert "has been suspended for " in str(error)
 
 
+@pytest.mark.long
 def test_a_worker_that_is_continued_is_not_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """It only slows the study."""
     monkeypatch.setattr("evedrop.processes.SUSPENDED_SECONDS", 1000.0)
@@ -227,6 +232,7 @@ class Hangs(Task[Result]):
         raise NotImplementedError
 
 
+@pytest.mark.long
 def test_a_stop_waits_for_no_worker_that_hangs_within_a_message(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is killed; what others did is there."""
     monkeypatch.setattr("evedrop.memory.workers._LAST_SECONDS", 0.5)
@@ -315,6 +321,7 @@ def test_a_full_disk_is_said(evedrop: Evedrop) -> None:
     assert line.startswith("evedrop: run cannot be written (")
 
 
+@pytest.mark.long
 def test_an_interrupted_sweep_keeps_finished_points(evedrop: Evedrop) -> None:
     """The points that were done are in the table, the plot is drawn, exit 130."""
     points = ("--over", f"slots=20,{SLOTS}")

@@ -14,6 +14,7 @@ from evedrop.api import montecarlo, run
 from evedrop.loading import load, shipped
 from evedrop.results.writer import Results, load_results
 from tests.builders import digests_of
+from tests.examples import mostly_long
 
 SLOTS = 300
 """Enough for a whole block of digests and a part of one."""
@@ -51,18 +52,21 @@ def blocks(results: Results) -> set[tuple[str, int, int, bytes]]:
     return set(zip(*(results.digests[name].to_pylist() for name in ("peer", "trial", "block", "digest")), strict=True))
 
 
-ALONE = {"acknowledged", "eavesdroppers", "learning", "microgrid-mpc", "vehicle"}
-"""By `make test` these run with one trial, and all others with forty; the other way round it takes `make test-long`."""
-
-
-def marks_of(name: str, batch: str) -> list[pytest.MarkDecorator]:
-    """Whether a batch of a scenario has to wait for `make test-long`."""
-    return [] if (name in ALONE) == (batch == "a later trial") else [pytest.mark.long]
-
+USUAL = [
+    ("acknowledged", "a later trial"),
+    ("eavesdroppers", "a later trial"),
+    ("bursts", "forty trials"),
+    ("colluding", "forty trials"),
+    ("cut", "forty trials"),
+    ("heated-room", "forty trials"),
+    ("late", "forty trials"),
+    ("replay-attack-before", "forty trials"),
+    ("twin-track", "forty trials"),
+]
+"""What differs in kind: schemes, losses with a memory, pools of links, events, closed loops, delays, attacks, and one trial."""
 
 every_batch = pytest.mark.parametrize(
-    ("name", "batch"),
-    [pytest.param(name, batch, marks=marks_of(name, batch)) for name in sorted(shipped()) for batch in BATCHES],
+    ("name", "batch"), mostly_long([(name, batch) for name in sorted(shipped()) for batch in BATCHES], USUAL)
 )
 
 

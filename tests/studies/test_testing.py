@@ -112,11 +112,11 @@ def test_shipped_names_and_expectations_that_nobody_can_tell(evedrop: Evedrop) -
     """A shipped scenario by its name; a figure that the run does not have has failed. A reason that did not occur counts 0."""
     expected = [f'[[expect]]\nfigure = "links.smart.lost_by.{reason}"\nbelow = 1\n' for reason in ("gremlins", "down")]
     written(evedrop.folder, unknown=SCENARIO + "".join(expected))
-    done = evedrop("test", "bursts", "unknown.toml", "--in-memory", "--trials", "2")
+    done = evedrop("test", "stable-mode", "unknown.toml", "--in-memory", "--trials", "2")
     assert "lost_by.down" not in done.out  # it held
     assert done.status == 1
     assert "expected links.smart.lost_by.gremlins below 1: FAILED, the run has no value for it" in done.out
-    assert re.search(r"^passed .* bursts$", done.out, re.MULTILINE)
+    assert re.search(r"^passed .* stable-mode$", done.out, re.MULTILINE)
 
 
 def test_where_there_is_no_scenario_there_is_no_test(evedrop: Evedrop) -> None:
@@ -206,6 +206,7 @@ def test_an_interrupt_ends_the_tests_and_leaves_no_process(evedrop: Evedrop, job
     assert case.get("name") == "a"
 
 
+@pytest.mark.long
 def test_an_interrupt_ends_tests_whose_processes_are_suspended(evedrop: Evedrop) -> None:
     """They are continued, so that they end their runs."""
     written(evedrop.folder / "cases", a=HOLDS, b=ENDLESS)
@@ -219,6 +220,7 @@ def test_an_interrupt_ends_tests_whose_processes_are_suspended(evedrop: Evedrop)
     live.nothing_left()
 
 
+@pytest.mark.long
 def test_a_test_whose_process_stays_suspended_is_broken(evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch) -> None:
     """And named; the others are carried out."""
     monkeypatch.setattr("evedrop.processes.SUSPENDED_SECONDS", 3.0)
@@ -245,6 +247,7 @@ def test_a_test_whose_process_stays_suspended_is_broken(evedrop: Evedrop, monkey
     wait_until(lambda: not with_mark(str(evedrop.temporary)), "no process left")
 
 
+@pytest.mark.long
 def test_tests_end_with_the_process_that_started_them(evedrop: Evedrop) -> None:
     """Kill -9 of `evedrop test` while two run: their processes end too."""
     written(evedrop.folder / "cases", a=ENDLESS, b=HOLDS)
