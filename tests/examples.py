@@ -1,6 +1,7 @@
 """How many examples a test looks at in `make test`, and how many in `make test-long`.
 
-Of random examples `make test` looks at fewer, and draws others each time. Of many parameters it looks at few, which differ in kind.
+Of random examples `make test` looks at fewer, and draws others each time. Of many parameters it looks at the few that
+differ in kind.
 """
 
 from __future__ import annotations

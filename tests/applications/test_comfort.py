@@ -47,7 +47,7 @@ def test_its_figures_are_sums_over_slots(tmp_path: Path) -> None:
 
 def test_totals_of_parts_are_the_totals(tmp_path: Path) -> None:
     """Two workers or one: the same bits. And they are the means of the trials' parts, weighted by their trials."""
-    scenario = load("heated-room", SHORT)
+    scenario = load("heated-room", {**SHORT, "slots": 90})
     one = montecarlo(scenario, trials=600, out=tmp_path / "one", plan=Plan(workers=1)).summary["comfort"]
     assert montecarlo(scenario, trials=600, out=tmp_path / "two", plan=Plan(workers=2)).summary["comfort"] == one
     first, rest = (

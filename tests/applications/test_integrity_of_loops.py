@@ -17,6 +17,7 @@ from evedrop.model.integrity.monitor import MonitoredSlots
 from evedrop.scenario.controlled import controlled_plant, monitor_of
 from evedrop.view.plant_slots import Showing, driven_scene
 from evedrop.view.replay import replay
+from tests.examples import mostly_long
 from tests.view.read_back import rows
 
 ALONE = Plan(workers=1)
@@ -68,7 +69,7 @@ def test_totals_of_parts_are_the_totals(tmp_path: Path) -> None:
     assert (first["attack_from"], first["detected_fraction"], first["expected_delay"]) == (None, None, None)
 
 
-@pytest.mark.parametrize("policy", ["always", "parsimonious"])
+@pytest.mark.parametrize("policy", mostly_long(["always", "parsimonious"], ["parsimonious"]))
 def test_live_and_memory_have_the_same_digest(policy: str, tmp_path: Path) -> None:
     """With an attack that begins and ends, over links that lose packets, and limits that clip the inputs."""
     table = {"policy": "always", "threshold": 4.0} if policy == "always" else dict(PARSIMONIOUS)

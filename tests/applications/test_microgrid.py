@@ -12,6 +12,7 @@ from evedrop.loading import checked, load
 from evedrop.memory.montecarlo import Plan
 from evedrop.memory.simulation import Mode
 from evedrop.results.writer import Results
+from tests.examples import mostly_long
 
 PAPER = 0.0158
 """The change of grid power flow that the paper keeps below, at μ_d = 0.1."""
@@ -37,7 +38,7 @@ def energies(results: Results) -> dict[str, float]:
     return {name: house[f"{name}_difference"] for name in ("net", "total", "summed")}
 
 
-@pytest.mark.parametrize("name", ["microgrid", "microgrid-mpc"])
+@pytest.mark.parametrize("name", mostly_long(["microgrid", "microgrid-mpc"], ["microgrid-mpc"]))
 def test_secrecy_costs_little_energy(name: str, tmp_path: Path) -> None:
     """Forty minutes before noon at μ_d = 0.1: net and total energy differ from perfect knowledge by less than the paper says."""
     if name == "microgrid-mpc":
@@ -49,6 +50,7 @@ def test_secrecy_costs_little_energy(name: str, tmp_path: Path) -> None:
     assert found["summed"] > max(found["net"], found["total"])
 
 
+@pytest.mark.long
 def test_what_is_summed_slot_by_slot_depends_on_the_weights(tmp_path: Path) -> None:
     """The same minutes with a grid power that may change at will: the third measure is beyond what the paper says."""
     eager = {

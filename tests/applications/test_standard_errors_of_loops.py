@@ -17,6 +17,7 @@ from evedrop.memory.montecarlo import Plan
 from evedrop.scenario.application import APPLICATIONS, STANDARD_ERRORS, ApplicationTally
 from evedrop.score.acknowledging import Detection
 from evedrop.studies.sweep import sweep_over
+from tests.examples import mostly_long
 
 ALONE = Plan(workers=1)
 TRIALS = 4
@@ -56,7 +57,10 @@ def check(together: Mapping[str, Any], alone: list[Mapping[str, Any]], ignored: 
         assert error == pytest.approx(np.std(values.astype(float), ddof=1) / math.sqrt(TRIALS), rel=1e-9), place
 
 
-@pytest.mark.parametrize(("scenario", "application"), [("heated-room", "comfort"), ("microgrid", "household")])
+@pytest.mark.parametrize(
+    ("scenario", "application"),
+    mostly_long([("heated-room", "comfort"), ("microgrid", "household")], [("heated-room", "comfort")]),
+)
 def test_applications_have_the_standard_errors_of_single_trials(
     scenario: str, application: str, tmp_path: Path
 ) -> None:

@@ -18,6 +18,7 @@ import pytest
 from evedrop.loading import load, shipped
 from evedrop.results.writer import load_results
 from tests.conftest import Done, Evedrop
+from tests.examples import mostly_long
 
 QUICK = ("--slots", "40", "--view", "off")
 
@@ -227,11 +228,18 @@ def test_diff_says_where_and_tells_by_its_status(evedrop: Evedrop) -> None:
     refused(evedrop("diff", "a", "nowhere"), "nowhere is not a results folder")
 
 
-def test_check_reports_every_scenario(evedrop: Evedrop) -> None:
+@pytest.mark.parametrize(
+    "names",
+    [
+        pytest.param(["acknowledged", "heated-room", "late"], id="three"),
+        pytest.param(sorted(shipped()), id="all", marks=pytest.mark.long),
+    ],
+)
+def test_check_reports_every_scenario(evedrop: Evedrop, names: list[str]) -> None:
     """All shipped ones are right; a wrong one among right ones is exit 2."""
-    done = evedrop("check", *sorted(shipped()))
+    done = evedrop("check", *names)
     assert (done.status, done.err) == (0, "")
-    assert done.out.count("no mistakes") == len(shipped())
+    assert done.out.count("no mistakes") == len(names)
     done = evedrop("check", "numerical", "nothing", "eavesdroppers")
     assert done.status == 2
     assert done.out.count("no mistakes") == 2
@@ -334,7 +342,7 @@ def test_other_errors_of_the_system_are_not_blamed_on_the_output(
     assert done.err == "evedrop: [Errno 24] Too many open files; free system resources and try again\n"
 
 
-@pytest.mark.parametrize("reader", ["/dev/full", "gone"])
+@pytest.mark.parametrize("reader", mostly_long(["/dev/full", "gone"], ["gone"]))
 def test_an_interrupt_stays_one_for_every_reader(evedrop: Evedrop, reader: str) -> None:
     """Ctrl-C also ends the reader of the pipe; that our closing table cannot be written changes nothing."""
     ends = os.pipe()

@@ -240,17 +240,22 @@ def test_a_ratio_that_is_no_ratio_is_refused(evedrop: Evedrop, wanted: str) -> N
     ("scenario", "entries"),
     [
         ("numerical", {"legitimate__link": '{loss = {model = "gilbert-elliott", p = 0.01, r = 0.3}}'}),
-        ("numerical", {"eavesdroppers": '{clever = {strategy = "bayesian", link = {quality = 0.9}}}'}),
+        pytest.param(
+            "numerical",
+            {"eavesdroppers": '{clever = {strategy = "bayesian", link = {quality = 0.9}}}'},
+            marks=pytest.mark.long,
+        ),
         ("twin-track", {}),
-        ("noise", {}),
+        pytest.param("noise", {}, marks=pytest.mark.long),
         ("acknowledged", {}),
         ("numerical", {"slots": 4, "encoding__state_probability": [1.0, 0.5, 0.5, 0.5]}),
-        (
+        pytest.param(
             "numerical",
             {
                 "title": '"it\'s  a \\"title\\""',
                 "eavesdroppers__clever": '{strategy = "bayesian", link = {quality = 0.9}}',
             },
+            marks=pytest.mark.long,
         ),
     ],
     ids=["bursts", "bayesian", "twin-track", "noise", "acknowledged", "list", "left out"],

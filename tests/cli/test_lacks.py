@@ -19,6 +19,7 @@ from evedrop.memory import montecarlo, workers
 from evedrop.memory.montecarlo import Plan
 from evedrop.memory.tasks import Result, Stopped, Task, Tell
 from tests.conftest import Evedrop
+from tests.examples import mostly_long
 
 
 class PanicException(BaseException):
@@ -105,7 +106,7 @@ def test_a_worker_without_memory_says_so() -> None:
     assert str(workers._outcome(task, lambda _: None, lambda: False)).startswith("there is not enough memory; ")
 
 
-@pytest.mark.parametrize("megabytes", [400, 500, 800])
+@pytest.mark.parametrize("megabytes", mostly_long([400, 500, 800], [500]))
 def test_a_command_with_little_memory_never_ends_with_status_1(evedrop: Evedrop, megabytes: int) -> None:
     """Whatever fails first, our code or a library: it ends, and not with a failed expectation."""
 
@@ -117,7 +118,7 @@ def test_a_command_with_little_memory_never_ends_with_status_1(evedrop: Evedrop,
     assert "Traceback" not in done.err
 
 
-@pytest.mark.parametrize("megabytes", [450, 560])
+@pytest.mark.parametrize("megabytes", mostly_long([450, 560], [450]))
 def test_a_command_without_room_for_scipy_says_so(evedrop: Evedrop, megabytes: int) -> None:
     """It used to hang for ever, and no signal but SIGKILL ended it."""
 

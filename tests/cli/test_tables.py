@@ -33,7 +33,7 @@ COMMANDS = {
     "design": "design eavesdroppers",
     "cost": "cost microgrid --trials 3 --slots 130 --set expect=[]",
     "learned": "learned learning --trials 4 --slots 9 --set expect=[]",
-    "paper": "paper luecke2022 --quick",
+    "paper": "paper kennedy2022 --quick",
     "view": "view run --table",
 }
 

@@ -25,6 +25,7 @@ from evedrop.model.registry import asked
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.schemes.innovation import Innovation
 from tests.conformance.breaking import broken
+from tests.examples import mostly_long
 
 EVERY = [
     (option, name)
@@ -55,16 +56,21 @@ def keeps_every_rule(option: str, name: str) -> None:
         assert len(one.verdicts) >= 4
 
 
-@pytest.mark.parametrize(
-    ("option", "name"),
-    [pytest.param(*one, marks=[pytest.mark.long] if one[1] in SLOW else []) for one in EVERY],
-)
+USUAL = [
+    *(one for one in EVERY if one[0] in {"link", "delay"}),
+    *(("scheme", name) for name in ("innovation", "encrypted-schedule", "twin-track")),
+    *(("eavesdropper", name) for name in ("bayesian", "colluding", "suspicious")),
+]
+"""Schemes with and without acknowledgements and with an initial state of their own; readers of packets, and of losses."""
+
+
+@pytest.mark.parametrize(("option", "name"), mostly_long(EVERY, USUAL))
 def test_built_in_classes_keep_every_rule(option: str, name: str) -> None:
     """On the same small problems as anybody's own."""
     keeps_every_rule(option, name)
 
 
-@pytest.mark.parametrize("name", SLOW)
+@pytest.mark.parametrize("name", mostly_long(SLOW, ["tracker"]))
 def test_slow_eavesdroppers_keep_every_rule_for_a_while(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """On the same problems with fewer slots."""
 

@@ -8,6 +8,7 @@ import pytest
 
 from tests.conformance.own_classes import ENTRY, HEAD, SCENARIO
 from tests.conftest import Evedrop
+from tests.examples import mostly_long
 
 pytestmark = pytest.mark.usefixtures("imports_forgotten")
 
@@ -128,7 +129,11 @@ def later(evedrop: Evedrop, case: str) -> tuple[str, ...]:
     return ("--set", f"{entry}=later_{case}:Mine")
 
 
-@pytest.mark.parametrize("case", LATER)
+OFTEN = ("packet", "uses", "block", "follow")
+"""One case for each way into a class; the other cases use the same code."""
+
+
+@pytest.mark.parametrize("case", mostly_long(LATER, [*OFTEN, "fates"]))
 def test_what_breaks_in_a_later_slot_ends_a_study_in_memory(case: str, evedrop: Evedrop) -> None:
     """Status 3, as live, with class, slot and trials; and never an exit as if all were well."""
     changes = later(evedrop, case)
@@ -165,14 +170,7 @@ def test_every_command_in_memory_names_class_slot_and_trials(
     assert "Traceback" not in done.err
 
 
-OFTEN = ("packet", "uses", "block", "follow")
-"""One case for each way into a class; the other cases use the same code, and only `make test-long` runs them live."""
-
-
-@pytest.mark.parametrize(
-    "case",
-    [pytest.param(case, marks=[] if case in OFTEN else [pytest.mark.long]) for case in LATER if case != "fates"],
-)
+@pytest.mark.parametrize("case", mostly_long([case for case in LATER if case != "fates"], ["packet", "follow"]))
 def test_what_breaks_in_a_later_slot_ends_a_live_run(case: str, evedrop: Evedrop) -> None:
     """Its process says the same as a study in memory; the slots of a block depend on how many packets had arrived."""
     changes = later(evedrop, case)

@@ -59,6 +59,7 @@ def test_the_tutorial_works_as_it_is_typed(tutorial: Evedrop) -> None:
     assert peers["legitimate"]["expected_trace_covariance"] == pytest.approx(0.00059, rel=0.02)
 
 
+@pytest.mark.long
 def test_workers_import_it_too(tutorial: Evedrop) -> None:
     """Trials by worker processes are the trials of this one."""
     for workers in "12":

@@ -28,6 +28,7 @@ from evedrop.model.links.link import Fate
 from evedrop.recordings.link_recording import Outcomes
 from tests.builders import scalar_tables
 from tests.conftest import Evedrop
+from tests.examples import mostly_long
 
 BERNOULLI = {"model": "bernoulli", "quality": 0.9}
 GILBERT = {"model": "gilbert-elliott", "p": 0.01, "r": 0.1}
@@ -103,14 +104,16 @@ def test_steps_climb() -> None:
         before = likelihood
 
 
-@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (2, 3))])
+@pytest.mark.parametrize("seed", mostly_long([1, 2, 3], [1]))
 @pytest.mark.parametrize(
     ("spec", "name", "bounds"),
     [
-        (BERNOULLI, "bernoulli", {"quality": 0.006}),
-        (GILBERT, "gilbert", {"p": 0.0015, "r": 0.015}),
+        pytest.param(BERNOULLI, "bernoulli", {"quality": 0.006}, marks=pytest.mark.long),
+        pytest.param(GILBERT, "gilbert", {"p": 0.0015, "r": 0.015}, marks=pytest.mark.long),
         (SOFT, "gilbert-elliott", {"p": 0.0035, "r": 0.017, "good": 0.0035, "bad": 0.04}),
-        (SLOW, "gilbert-elliott", {"p": 0.0012, "r": 0.0024, "good": 0.008, "bad": 0.035}),
+        pytest.param(
+            SLOW, "gilbert-elliott", {"p": 0.0012, "r": 0.0024, "good": 0.008, "bad": 0.035}, marks=pytest.mark.long
+        ),
     ],
 )
 def test_the_model_is_found_again(
@@ -125,7 +128,7 @@ def test_the_model_is_found_again(
     assert found.bursts.mean == pytest.approx(found.bursts.fitted, rel=0.15)
 
 
-@pytest.mark.parametrize("spec", [GILBERT, SOFT])
+@pytest.mark.parametrize("spec", mostly_long([GILBERT, SOFT], [SOFT]))
 def test_no_parameters_are_more_likely(spec: dict[str, Any]) -> None:
     """Around the maximum that is found the likelihood is less, by more than where the search stopped short of it."""
     outcomes = recorded(spec, 20_000, 4)

@@ -38,6 +38,7 @@ def test_the_selftest_passes_in_numpy_and_says_so() -> None:
     assert "kernels         numpy, as EVEDROP_KERNELS says" in done.stdout
 
 
+@pytest.mark.long
 def test_the_selftest_says_that_nothing_was_built() -> None:
     """The same where the extension module is missing."""
     done = python(MISSING + SELFTEST)

@@ -14,6 +14,7 @@ from evedrop.memory.simulation import Mode
 from evedrop.model.process import Floats
 from evedrop.score.verdict import ERROR_RATE, SignTest, SignTestOf, sign_of_mean, sign_of_median
 from tests.conftest import Evedrop
+from tests.examples import mostly_long
 
 TRIES = 4000
 
@@ -71,7 +72,7 @@ HIGHEST = 0.01 + 4.5 * math.sqrt(0.01 * 0.99 / TRIES)
 """Of TRIES tests at 1 %, the share that may be wrong, at 4.5 standard errors."""
 
 
-@pytest.mark.parametrize("count", [2, 10, 60, 500])
+@pytest.mark.parametrize("count", mostly_long([2, 10, 60, 500], [10]))
 def test_signs_of_means_are_right(count: int) -> None:
     """Either test of a normal is wrong in one of a hundred, at any number of trials."""
     samples = np.random.default_rng(8).normal(3.0, 2.0, (TRIES, count))

@@ -271,13 +271,16 @@ def test_who_reads_packets_is_refused(plan: Plan, strategy: str, tmp_path: Path)
 @pytest.mark.parametrize(
     ("name", "option"),
     [
-        *((name, "--covariance-only") for name in ("acknowledged", "bayesian", "late", "restart", "twin-track")),
-        *((name, "--error-coordinates") for name in ("bayesian", "heated-room")),
+        *((name, "--covariance-only") for name in ("acknowledged", "restart", "twin-track")),
+        ("heated-room", "--error-coordinates"),
+        *(
+            pytest.param(name, "--covariance-only", marks=pytest.mark.long)
+            for name in ("bayesian", "heated-room", "late")
+        ),
         *(
             pytest.param(name, "--error-coordinates", marks=pytest.mark.long)
-            for name in ("acknowledged", "late", "restart", "twin-track")
+            for name in ("acknowledged", "bayesian", "late", "restart", "twin-track")
         ),
-        pytest.param("heated-room", "--covariance-only", marks=pytest.mark.long),
     ],
 )
 def test_a_refused_study_runs_as_advised(name: str, option: str, evedrop: Evedrop) -> None:

@@ -6,6 +6,7 @@ import re
 import shlex
 from collections.abc import Callable
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,10 @@ from evedrop.memory.montecarlo import Plan
 from evedrop.memory.simulation import Mode
 from evedrop.results.writer import Results, load_results
 from tests.conftest import Evedrop
+from tests.examples import mostly_long
 
 CASES: dict[str, dict[str, Any]] = {
-    "two blocks and a part": {"trials": 1037, "slots": 150},
+    "two blocks and a part": {"trials": 1037, "slots": 50},
     "whole blocks, later trials": {"trials": 1000, "slots": 40, "first_trial": 77, "record_trials": 3},
 }
 TABLES = ("slots", "trials", "digests")
@@ -45,12 +47,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Study:
 
 @pytest.mark.parametrize(
     ("case", "workers"),
-    [
-        ("two blocks and a part", 3),
-        ("whole blocks, later trials", 2),
-        pytest.param("two blocks and a part", 2, marks=pytest.mark.long),
-        pytest.param("whole blocks, later trials", 3, marks=pytest.mark.long),
-    ],
+    mostly_long(product(CASES, [2, 3]), [("two blocks and a part", 3), ("whole blocks, later trials", 2)]),
 )
 def test_results_do_not_depend_on_the_number_of_workers(case: str, workers: int, study: Study) -> None:
     """Digests, tables to the last bit, and the whole summary but its times."""
@@ -67,7 +64,7 @@ def test_results_do_not_depend_on_the_number_of_workers(case: str, workers: int,
 
 def test_later_trials_are_those_of_the_whole(tmp_path: Path, study: Study) -> None:
     """Trials 700 to 719 alone, from the middle of a block, have the digests they have among 1037."""
-    few = montecarlo("eavesdroppers", slots=150, trials=20, first_trial=700, out=tmp_path / "few")
+    few = montecarlo("eavesdroppers", slots=50, trials=20, first_trial=700, out=tmp_path / "few")
     whole = study("two blocks and a part", 1).digests
     some = pc.and_(pc.greater_equal(whole["trial"], 700), pc.less(whole["trial"], 720))
     assert few.digests.num_rows == 20 * 4
@@ -141,13 +138,13 @@ def test_the_largest_error_is_not_the_most_surprising_trial(tmp_path: Path) -> N
     assert found["trial"] == least_probable(results)[0][0]
 
 
-def test_the_most_surprising_trial_is_the_same_live_and_in_memory(tmp_path: Path) -> None:
+@pytest.mark.parametrize("shards", mostly_long([1, 2], [2]))
+def test_the_most_surprising_trial_is_the_same_live_and_in_memory(shards: int, tmp_path: Path) -> None:
     """To the bit, for any division of the trials into shards."""
     with preloaded():
-        for shards in (1, 2):
-            live = run("eavesdroppers", trials=12, slots=70, shards=shards, out=tmp_path / f"live {shards}")
-            memory = montecarlo(live.folder, trials=12, out=tmp_path / f"memory {shards}")
-            assert live.summary["surprising"] == memory.summary["surprising"]
+        live = run("eavesdroppers", trials=12, slots=70, shards=shards, out=tmp_path / "live")
+    memory = montecarlo(live.folder, trials=12, out=tmp_path / "memory")
+    assert live.summary["surprising"] == memory.summary["surprising"]
 
 
 @pytest.mark.parametrize(

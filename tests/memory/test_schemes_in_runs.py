@@ -23,6 +23,7 @@ from evedrop.scenario import Scenario
 from evedrop.score.acknowledging import Detection, chart_of
 from evedrop.score.summary import DetectionSummary
 from tests.builders import digests_of, part_of
+from tests.examples import mostly_long
 
 STABLE = [[0.9, 0.3], [0.0, 0.8]]
 UNSTABLE = [[1.0, 0.3], [0.5, 1.001]]
@@ -56,8 +57,8 @@ RUNS: dict[str, dict[str, Any]] = {
 }
 NEEDS = ("acknowledged", "encrypted-schedule", "open-loop", "quantised-schedule", "scheduled")
 SILENT = ("scheduled", "withholding")
-BUILT_IN = ("noise", "twin-track")
-"""Schemes without acknowledgements in built-in scenarios, whose live runs `tests/scenarios` compares with memory."""
+USUAL = ("acknowledged", "quantised-schedule", "withholding")
+"""With references, with packets of few bits, and with slots in which nothing is sent."""
 
 
 def tables_of(scheme: str, **more: Any) -> dict[str, Any]:
@@ -97,10 +98,7 @@ def mistakes(scheme: str, **more: Any) -> list[str]:
     return str(caught.value).splitlines()
 
 
-@pytest.mark.parametrize(
-    "scheme",
-    [pytest.param(scheme, marks=[pytest.mark.long] if scheme in BUILT_IN else []) for scheme in RUNS],
-)
+@pytest.mark.parametrize("scheme", mostly_long(RUNS, USUAL))
 def test_live_and_memory_are_the_same_bits(scheme: str, tmp_path: Path) -> None:
     """Equal digests and accounts of every receiver, the same alarms, and no packet unaccounted for."""
     scenario = scenario_of(scheme)

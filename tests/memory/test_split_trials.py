@@ -139,6 +139,7 @@ def test_the_exact_mode_estimates_the_same() -> None:
         assert abs(found.z) < SURE, name
 
 
+@pytest.mark.long
 def test_flipped_acknowledgements_agree_with_many_trials() -> None:
     """Where packets depend on acknowledgements, in a run that is short enough for plain trials to contain what matters."""
     scenario = scenario_of(**ACKNOWLEDGED, slots=7)
@@ -165,6 +166,7 @@ def test_results_depend_on_the_seed_alone(tmp_path: Path) -> None:
     assert load_results(tmp_path / "one").typed_summary.peers["naive"].rare_estimate is not None
 
 
+@pytest.mark.long
 def test_more_trials_make_it_more_exact() -> None:
     """The populations together have at least the trials of the study."""
     made = {

@@ -22,7 +22,9 @@ CODES = pytest.mark.parametrize("scheme", [Acknowledged, OpenLoop])
 
 
 @CODES
-@pytest.mark.parametrize("process", [UNSTABLE, DRIFTING, STABLE, MIXED, SINGULAR])
+@pytest.mark.parametrize(
+    "process", [UNSTABLE, DRIFTING, *(pytest.param(one, marks=pytest.mark.long) for one in (STABLE, MIXED)), SINGULAR]
+)
 def test_packets_are_the_codes(process: Process, scheme: type[Scheme]) -> None:
     """Z is x_k − L_{t,k} x_t with t the last acknowledged slot, as the header says; x_k with −1 before the first."""
     rng = np.random.default_rng(5)
@@ -90,7 +92,9 @@ def conditioned(
 
 
 @CODES
-@pytest.mark.parametrize("process", [UNSTABLE, STABLE, MIXED, SINGULAR])
+@pytest.mark.parametrize(
+    "process", [UNSTABLE, *(pytest.param(one, marks=pytest.mark.long) for one in (STABLE, MIXED)), SINGULAR]
+)
 def test_the_eavesdropper_of_references_is_optimal(process: Process, scheme: type[Scheme]) -> None:
     """Its estimate and covariance are those of the state given all that it heard, in courses of five slots, for either code."""
     gamma, gamma_e, link = all_events(5)

@@ -200,7 +200,7 @@ def test_certain_types(mu_d: float) -> None:
         assert np.allclose(beliefs["bayesian"].P, beliefs[twin].P, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.thorough
+@pytest.mark.long
 def test_it_may_come_late_and_stays_itself() -> None:
     """Slots 28 600 to 30 000 of the microgrid, for a receiver that heard nothing before: it finds the state.
 

@@ -17,6 +17,7 @@ from evedrop.model.process import Process
 from evedrop.model.receiver import Action, Belief, Receiver, Reception
 from evedrop.streams import Batch, Stream, uniforms
 from tests.builders import stream_keys
+from tests.examples import mostly_long
 
 KEYS = stream_keys(12, ("schedule", "coin"))
 PROCESS = Process(
@@ -90,6 +91,10 @@ def uses(name: str, k: int, r: int) -> bool:
     return uniform("coin", k, r) < (USE_INNOVATION if nu else USE_STATE)
 
 
+TESTED_ELSEWHERE = {"learning-em", "learning-particle", "tracker"}
+"""Slow strategies whose own tests have a trial alone, too."""
+
+
 @pytest.mark.parametrize("name", TAKERS)
 @settings(deadline=None)
 @given(seed=st.integers(0, 2**31), first=st.integers(0, 10_000))
@@ -113,7 +118,7 @@ def test_estimate_and_believed_covariance_are_the_papers(name: str, seed: int, f
             assert np.allclose(found[k].P[:, :, r], P, rtol=1e-12, atol=1e-15)
 
 
-@pytest.mark.parametrize("name", PARAMETERS)
+@pytest.mark.parametrize("name", mostly_long(PARAMETERS, {*PARAMETERS} - TESTED_ELSEWHERE))
 @pytest.mark.thorough
 def test_a_trial_alone_is_the_same_trial(name: str) -> None:
     """Beliefs of a trial are the same bits alone, among 6 and among 400; of a learner, which is slow, among 40."""
@@ -129,7 +134,7 @@ def test_a_trial_alone_is_the_same_trial(name: str) -> None:
             assert np.array_equal(one.action, other.action[part])
 
 
-@pytest.mark.parametrize("name", PARAMETERS)
+@pytest.mark.parametrize("name", mostly_long(PARAMETERS, {*PARAMETERS} - {"learning-em"}))
 def test_what_is_lost_does_not_matter(name: str) -> None:
     """Of a packet that was lost not a bit enters the belief, not even NaN."""
     gamma, z = events(40, 30)

@@ -24,6 +24,7 @@ from evedrop.model.theory.closed_forms import reference_covariances, reference_l
 from evedrop.model.theory.covariances import Outcomes, expected_covariances
 from evedrop.streams import Batch
 from tests.builders import UNSTABLE, digests_of
+from tests.examples import mostly_long
 from tests.model.acknowledged_runs import MIXED, carried
 from tests.model.mixed_runs import covariances
 from tests.model.slot_loop import STABLE, Played, play
@@ -241,7 +242,7 @@ def traces_of(
     return blocks.mean(axis=1), blocks.std(axis=1, ddof=1) / np.sqrt(blocks.shape[1])
 
 
-@pytest.mark.parametrize(("mu_e", "policy", "user", "eve"), [PUBLISHED[1], PUBLISHED[4]])
+@pytest.mark.parametrize(("mu_e", "policy", "user", "eve"), mostly_long([PUBLISHED[1], PUBLISHED[4]], [PUBLISHED[1]]))
 def test_the_published_figures(mu_e: float, policy: dict[str, float], user: float, eve: float, tmp_path: Path) -> None:
     """40,000 slots, within 4.5 standard errors, and 1 % for the standard error of the published figures."""
     found, error = traces_of(mu_e, policy, 550, 80, tmp_path)

@@ -129,7 +129,13 @@ def test_it_learns_nothing_from_masked_packets() -> None:
     assert np.median(relative(learned_by(one, belief)[0], STABLE.A)) > 0.5
 
 
-@pytest.mark.parametrize("process", [MARGINAL, Process(np.array([[0.9]]), np.array([[0.1]]), np.array([[1.0]]))])
+@pytest.mark.parametrize(
+    "process",
+    [
+        MARGINAL,
+        pytest.param(Process(np.array([[0.9]]), np.array([[0.1]]), np.array([[1.0]])), marks=pytest.mark.long),
+    ],
+)
 def test_a_trial_has_the_same_bits_alone_and_among_others(process: Process) -> None:
     """x̂, P, the action and what was learned, over climbs and the steps after them."""
     whole, K = Batch(24, 6), 24
@@ -144,7 +150,14 @@ def test_a_trial_has_the_same_bits_alone_and_among_others(process: Process) -> N
         assert all(one[..., part].tobytes() == two.tobytes() for one, two in zip(*sets, strict=True))
 
 
-@pytest.mark.parametrize(("process", "mu_e"), [(EXAMPLE, 0.9), (EXAMPLE, 0.2), (MARGINAL, 0.02)])
+@pytest.mark.parametrize(
+    ("process", "mu_e"),
+    [
+        pytest.param(EXAMPLE, 0.9, marks=pytest.mark.long),
+        pytest.param(EXAMPLE, 0.2, marks=pytest.mark.long),
+        (MARGINAL, 0.02),
+    ],
+)
 @pytest.mark.filterwarnings("error")
 def test_it_stays_finite(process: Process, mu_e: float) -> None:
     """With a process that grows, and with hardly a packet, whatever it believes the process to be."""

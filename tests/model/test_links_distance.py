@@ -123,8 +123,13 @@ def test_the_quality_is_exact(deviation: float) -> None:
 
 @pytest.mark.parametrize(
     "more",
-    [{}, {"fading_block": 7}, SHADOWED, {**SHADOWED, "fading_block": 3}, {**SHADOWED, "shadowing_block": 500}],
-    ids=["memoryless", "slow fading", "shadowed", "both", "one block"],
+    [
+        pytest.param({}, id="memoryless", marks=pytest.mark.long),
+        pytest.param({"fading_block": 7}, id="slow fading", marks=pytest.mark.long),
+        pytest.param(SHADOWED, id="shadowed", marks=pytest.mark.long),
+        pytest.param({**SHADOWED, "fading_block": 3}, id="both"),
+        pytest.param({**SHADOWED, "shadowing_block": 500}, id="one block", marks=pytest.mark.long),
+    ],
 )
 @pytest.mark.parametrize("spec", [STANDS, WALKS], ids=["stands", "walks"])
 @pytest.mark.thorough

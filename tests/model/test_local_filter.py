@@ -13,6 +13,7 @@ from evedrop.model.plant import Drive, Plant
 from evedrop.model.process import Process, Trajectory, mistakes_of
 from evedrop.streams import Batch
 from tests.builders import stream_keys
+from tests.examples import mostly_long
 
 A = np.array([[1.0, 0.1], [0.0, 0.95]])
 W = np.array([[1e-4, 0.0], [0.0, 4e-4]])
@@ -90,8 +91,12 @@ def test_it_is_the_kalman_filter_slot_by_slot() -> None:
         pytest.param(np.array([[1.0, 0.0]]), np.zeros((2, 2)), id="no noise", marks=pytest.mark.long),
     ],
 )
-def test_a_filter_without_an_end_is_refused(C: np.ndarray, noise: np.ndarray) -> None:
-    """Its covariance grows forever, or it trusts no measurement any more."""
+@pytest.mark.parametrize("judged", mostly_long([1024, 32_768], [1024]))
+def test_a_filter_without_an_end_is_refused(
+    C: np.ndarray, noise: np.ndarray, judged: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its covariance grows forever, or it trusts no measurement any more, after fewer slots than usual or after as many."""
+    monkeypatch.setattr("evedrop.model.local_filter._JUDGED", judged)
     with pytest.raises(ValueError, match="does not settle"):
         settled(PROCESS, plant(C, np.array([[0.01]]), noise))
 

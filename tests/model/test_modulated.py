@@ -144,7 +144,15 @@ THREE = chain_of(
 
 @every_receiver
 @every_process
-@pytest.mark.parametrize("chain", [bursts(0.05, 0.7), bursts(0.3, 0.5, 0.1, 0.6), bursts(0.02, 0.05), THREE])
+@pytest.mark.parametrize(
+    "chain",
+    [
+        bursts(0.05, 0.7),
+        pytest.param(bursts(0.3, 0.5, 0.1, 0.6), marks=pytest.mark.long),
+        pytest.param(bursts(0.02, 0.05), marks=pytest.mark.long),
+        pytest.param(THREE, marks=pytest.mark.long),
+    ],
+)
 def test_the_limit_is_that_of_the_recursion(
     process: Process, chain: Chain, outcomes_at: Callable[[float], Outcomes]
 ) -> None:
@@ -284,7 +292,12 @@ def late(process: Process, law: LinkLaw, outcomes_at: Callable[[float], Outcomes
 
 
 @pytest.mark.parametrize(
-    ("process", "receiver"), [*((MARGINAL, one) for one in RECEIVERS), (UNSTABLE, "naive"), (STABLE, "legitimate")]
+    ("process", "receiver"),
+    [
+        *(pytest.param(MARGINAL, one, marks=[] if one == "smart" else pytest.mark.long) for one in RECEIVERS),
+        (UNSTABLE, "naive"),
+        pytest.param(STABLE, "legitimate", marks=pytest.mark.long),
+    ],
 )
 def test_blocks_of_slots_with_late_packets_are_what_slot_by_slot_gives(process: Process, receiver: str) -> None:
     """Over several blocks, around a change of the link and before an outage, to 1e-12; in any pieces to the bit."""

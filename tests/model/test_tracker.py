@@ -18,6 +18,7 @@ from evedrop.model.schemes.twin_track import TwinTrack, TwinTracks
 from evedrop.model.theory.closed_forms import twin_track_bound
 from evedrop.streams import Batch, stream_key
 from tests.builders import DRIFTING, UNSTABLE
+from tests.examples import mostly_long
 from tests.model.slot_loop import ROOT, STABLE, coins, keys_of
 
 KEYS = keys_of(("start", "track"))
@@ -138,7 +139,7 @@ def test_it_is_the_exact_posterior(process: Process, learns_at: int) -> None:
     assert len(states) == 6
 
 
-@pytest.mark.parametrize("lossless", [True, False])
+@pytest.mark.parametrize("lossless", mostly_long([True, False], [True]))
 @pytest.mark.parametrize("process", [CLOSE, RESTLESS, STABLE], ids=["close", "restless", "stable"])
 def test_its_room_is_enough_for_as_many_packets_as_the_documents_say(process: Process, lossless: bool) -> None:
     """Exact up to the fifth packet by default, and up to the sixth with room for 16; beyond that 2 % off at most.
@@ -169,7 +170,7 @@ def test_its_room_is_enough_for_as_many_packets_as_the_documents_say(process: Pr
 
 
 @pytest.mark.parametrize("process", [UNSTABLE, DRIFTING], ids=["unstable", "drifting"])
-@pytest.mark.thorough
+@pytest.mark.long
 def test_before_the_leak_it_is_half_way_between_the_tracks(process: Process) -> None:
     """At least ½ tr A^k Σ0 A^kᵀ in the mean and, as soon as it has heard both tracks, no more; at five standard errors."""
     batch = Batch(15, 4000)
@@ -180,7 +181,7 @@ def test_before_the_leak_it_is_half_way_between_the_tracks(process: Process) -> 
     assert not found[14].any()
 
 
-@pytest.mark.thorough
+@pytest.mark.long
 def test_one_betrayed_state_breaks_twin_tracks() -> None:
     """With a drifting process its mean error is below 1.5 times the user's after the leak, at five standard errors.
 
@@ -241,7 +242,14 @@ def test_it_does_not_say_that_it_knows_before_it_does() -> None:
         assert np.array_equal(belief.action, np.where(slot.gamma, np.uint8(read), np.uint8(Action.LOST)))
 
 
-@pytest.mark.parametrize("process", [UNSTABLE, CLOSE, RESTLESS], ids=["unstable", "close", "restless"])
+@pytest.mark.parametrize(
+    "process",
+    [
+        pytest.param(UNSTABLE, id="unstable", marks=pytest.mark.long),
+        pytest.param(CLOSE, id="close"),
+        pytest.param(RESTLESS, id="restless", marks=pytest.mark.long),
+    ],
+)
 def test_a_trial_alone_and_a_shorter_run_are_the_same(process: Process) -> None:
     """The same bits among 300 trials, among 6 and alone, and in a run that ends earlier, also where histories are merged."""
     gamma = coins(0.8, 40, 300)
@@ -255,7 +263,7 @@ def test_a_trial_alone_and_a_shorter_run_are_the_same(process: Process) -> None:
             assert np.array_equal(one.action, other.action[part])
 
 
-@pytest.mark.thorough
+@pytest.mark.long
 def test_more_room_changes_little() -> None:
     """Where the tracks stay within a slot's noise, 16 times the room changes its mean error by less than 2 %."""
     batch, gamma, means = Batch(40, 30), coins(0.9, 40, 30), []

@@ -65,7 +65,7 @@ def test_errors_are_the_closed_form() -> None:
         assert (np.abs(found.mean(1) - expected) <= 5.0 * found.std(1) / np.sqrt(trials) + 1e-25).all()
 
 
-@pytest.mark.parametrize("process", [STABLE, UNSTABLE])
+@pytest.mark.parametrize("process", [pytest.param(STABLE, marks=pytest.mark.long), UNSTABLE])
 @pytest.mark.parametrize("quality", [1.0, 0.8])
 def test_no_strategy_is_below_the_bound(process: Process, quality: float) -> None:
     """Every strategy but the slow learners, even with a schedule's key, has a mean squared error of at least ½ tr A^k Σ0 A^kᵀ."""

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import fields, replace
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -28,13 +29,14 @@ from evedrop.results.growing_tables import UNFINISHED, goes_on, last_round
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.summary_file import unwritten
 from evedrop.results.writer import Results, ResultsWriter, load_results
+from evedrop.scenario import Scenario
 from evedrop.score.scorekeeper import Ending, summary_of
 from evedrop.score.summary import Summary
 from evedrop.score.sums import SlotSums
 from evedrop.score.totals import Totals
 from evedrop.view.replay import replay
 from tests.conftest import Evedrop, Live, wait_until
-from tests.examples import examples
+from tests.examples import examples, mostly_long
 from tests.rogue import with_rogue
 from tests.steps import stepping
 
@@ -127,9 +129,7 @@ MOMENTS: dict[str, Callable[[Live], object]] = {
 }
 
 
-@pytest.mark.parametrize(
-    "what", [pytest.param(what, marks=[] if what == "parquet" else [pytest.mark.long]) for what in MOMENTS]
-)
+@pytest.mark.parametrize("what", mostly_long(MOMENTS, ["parquet"]))
 def test_a_run_may_be_killed_at_any_moment(evedrop: Evedrop, what: str) -> None:
     """From its first file to its last: the folder opens with whole tables, or says in a line why there is nothing."""
     slots = 20000 if what == "figures" else 3000
@@ -198,7 +198,7 @@ sys.exit(status)
 """
 
 
-@pytest.mark.parametrize("size", ["256k", pytest.param("1m", marks=pytest.mark.long)])
+@pytest.mark.parametrize("size", mostly_long(["256k", "1m"], ["256k"]))
 def test_a_full_disk_ends_the_run_and_what_fitted_can_be_read(evedrop: Evedrop, size: str) -> None:
     """On a disk that is really full: a clear line, exit 3, nothing left, and the tables hold what there was room for."""
     if os.geteuid() != 0 or shutil.which("unshare") is None:
@@ -248,7 +248,7 @@ def test_a_killed_study_can_be_read(evedrop: Evedrop) -> None:
 
 def test_the_points_of_a_killed_sweep_are_on_disk(evedrop: Evedrop) -> None:
     """The table is there while the sweep goes on, whole at any moment."""
-    over = ("--over", "encoding.state_probability=0.1:0.9:0.001", "--trials", "100", "--slots", "200", "--workers", "1")
+    over = ("--over", "encoding.state_probability=0.1:0.9:0.01", "--trials", "100", "--slots", "200", "--workers", "1")
     live = evedrop.started("sweep", "eavesdroppers", *over)
     wait_until((live.folder / "sweep.parquet").exists, "a table")
     kill_all(live)
@@ -299,9 +299,15 @@ def test_a_writer_may_stop_at_any_byte(rounds: list[int], data: st.DataObject) -
         assert [row["slot"] for row in rows if row["peer"] == "smart"] == list(range(slots))
 
 
+@cache
+def microgrid() -> Scenario:
+    """A part of a day in a house: a scenario whose figures are those of an application."""
+    return load("microgrid", {"slots": 200, "expect": []})
+
+
 def test_no_rows_are_on_disk_before_the_first_figures(tmp_path: Path) -> None:
     """Or a run that is killed just then could not be looked at: only its own classes could make figures of nothing."""
-    scenario = load("microgrid")
+    scenario = microgrid()
     nothing = summary_of(
         scenario, Totals.nothing(scenario, 1), dict.fromkeys(scenario.digested), Ending(0.0, "slot 10")
     )
@@ -325,7 +331,7 @@ def test_no_rows_are_on_disk_before_the_first_figures(tmp_path: Path) -> None:
 
 def test_a_score_is_saved_only_with_rows(tmp_path: Path) -> None:
     """What a shard saves together with its figures: if it is killed before, it has neither score nor rows."""
-    scenario = load("microgrid")
+    scenario = microgrid()
     nothing = summary_of(
         scenario, Totals.nothing(scenario, 1), dict.fromkeys(scenario.digested), Ending(0.0, "slot 10")
     )
@@ -355,7 +361,7 @@ def test_a_score_is_saved_only_with_rows(tmp_path: Path) -> None:
 
 def test_the_end_of_a_run_without_figures_keeps_its_rows(tmp_path: Path) -> None:
     """The launcher notes why the run ended, and takes nothing from what was measured."""
-    scenario = load("microgrid")
+    scenario = microgrid()
     write_resolved(tmp_path, scenario)
     writer = ResultsWriter.of(tmp_path, scenario)
     for receiver in scenario.receivers:
@@ -369,7 +375,7 @@ def test_the_end_of_a_run_without_figures_keeps_its_rows(tmp_path: Path) -> None
 
 def test_the_end_of_a_killed_run_says_which_slot_its_figures_are_of(tmp_path: Path) -> None:
     """They were written when fewer slots were done; an excerpt of a log follows in lines of its own."""
-    scenario = load("microgrid")
+    scenario = microgrid()
     write_resolved(tmp_path, scenario)
     empty = summary_of(scenario, Totals.nothing(scenario, 1), dict.fromkeys(scenario.digested), Ending(0.0, ""))
     writer = ResultsWriter.of(tmp_path, scenario)

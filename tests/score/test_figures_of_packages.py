@@ -17,10 +17,10 @@ from tests.conftest import Evedrop
 from tests.packages import install
 
 DOCS = Path(__file__).parents[2] / "docs"
-RUN = ("--slots", "40", "--trials", "510")
+RUN = ("--slots", "20", "--trials", "510")
 EXPECT = (
     "--set", "expect.0={figure = 'smart.largest_error', above = 0.0}",
-    "--set", "expect.1={figure = 'smart.largest_error', below = 0.0, slots = [10, 30]}",
+    "--set", "expect.1={figure = 'smart.largest_error', below = 0.0, slots = [5, 15]}",
     "--set", "expect.2={figure = 'smart.largest_error', above = 0.0, quantile = 0.5}",
 )  # fmt: skip
 
@@ -55,23 +55,24 @@ def test_a_figure_of_a_package_needs_nothing_here(evedrop: Evedrop) -> None:
     assert found["live"] == found["memory"] == found["shards"]
     assert judged["live"] == judged["memory"] == judged["shards"]
     rows = [row for row in load_results(evedrop.folder / "memory").trials.to_pylist() if row["peer"] == "smart"]
-    errors = np.empty((40, 510))
+    errors = np.empty((20, 510))
     for row in rows:
         errors[row["slot"], row["trial"]] = row["squared_error"]
     assert found["live"]["smart"] == errors.max()
     assert judged["live"] == [
-        (True, errors.max()), (False, errors[10:30].max()), (True, np.quantile(errors.max(axis=0), 0.5)),
+        (True, errors.max()), (False, errors[5:15].max()), (True, np.quantile(errors.max(axis=0), 0.5)),
     ]  # fmt: skip
     done = evedrop.process(
-        "sweep", "eavesdroppers", "--over", "slots=20,40", "--trials", "510", "--out", "swept", env=environment
+        "sweep", "eavesdroppers", "--over", "slots=10,20", "--trials", "510", "--out", "swept", env=environment
     )
     assert done.status == 0, done.err
     assert "largest error" in done.out
     table = pq.read_table(evedrop.folder / "swept" / "sweep.parquet").to_pylist()
-    assert {row["peer"]: row["largest_error"] for row in table if row["slots"] == 40} == found["memory"]
+    assert {row["peer"]: row["largest_error"] for row in table if row["slots"] == 20} == found["memory"]
     assert "largest_error" not in FIGURES.names
 
 
+@pytest.mark.long
 def test_a_tally_that_is_not_data_fails_alone_in_shards(evedrop: Evedrop) -> None:
     """An instance where a new tally has none could be of any class; the run and its other figures are not concerned."""
     becomes = "    def add(self, slots):\n        self.last = type('Last', (), {})()\n        self.last.k = 1\n"

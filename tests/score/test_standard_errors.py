@@ -35,6 +35,7 @@ from evedrop.score.scorekeeper import Ending
 from evedrop.score.summary import RARE_SHARE, Summary
 from evedrop.score.sums import Tally
 from tests.builders import scalar_tables
+from tests.examples import mostly_long
 
 ALONE = Plan(workers=1)
 
@@ -431,12 +432,7 @@ def check_calibration(z: Floats) -> None:
         assert low <= outside <= high, outside
 
 
-def test_z_is_calibrated() -> None:
-    """Over 200 small studies of a process with light tails."""
-    check_calibration(z_of_studies(200))
-
-
-@pytest.mark.long
-def test_z_is_calibrated_over_a_thousand_studies() -> None:
-    """Over 1000 small studies of a process with light tails."""
-    check_calibration(z_of_studies(1000))
+@pytest.mark.parametrize("studies", mostly_long([50, 200, 1000], [50]))
+def test_z_is_calibrated(studies: int) -> None:
+    """Over many small studies of a process with light tails."""
+    check_calibration(z_of_studies(studies))

@@ -26,7 +26,7 @@ from evedrop.score.verdict import SecrecyKept
 from evedrop.studies.matchups import ATTACKERS, usual_adversaries
 from tests.pages import checked
 
-MARGINAL: dict[str, Any] = {"slots": 150, "trials": 60, "process__initial_covariance": [[1e-3, 0.0], [0.0, 1e-4]]}
+MARGINAL: dict[str, Any] = {"slots": 100, "trials": 30, "process__initial_covariance": [[1e-3, 0.0], [0.0, 1e-4]]}
 """Changes of `bayesian`: long enough for verdicts, and trials that lose the first slot do not dominate the mean."""
 
 VERDICTS = {
@@ -59,7 +59,7 @@ def everything(tmp_path_factory: pytest.TempPathFactory) -> Everything:
 def literature(tmp_path_factory: pytest.TempPathFactory) -> Comparison:
     """The scenario `acknowledged`, whose last slot is k = 40, with the schemes of its paper and of ours, and their bounds."""
     schemes = ["acknowledged", "open-loop", "innovation", "plain", "cipher"]
-    return compare("acknowledged", schemes=schemes, trials=300, out=tmp_path_factory.mktemp("compare") / "run")
+    return compare("acknowledged", schemes=schemes, trials=100, out=tmp_path_factory.mktemp("compare") / "run")
 
 
 def last(found: Comparison, scheme: str, adversary: str) -> tuple[float, float]:

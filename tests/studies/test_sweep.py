@@ -96,7 +96,7 @@ def test_what_is_no_grid_is_refused(texts: list[str], said: str) -> None:
 
 
 GRID = {"encoding.state_probability": [0.3, 0.6, 0.9], "eavesdroppers.smart.link.quality": [0.5, 0.9]}
-CHANGES = {"slots": 40, "trials": 620}
+CHANGES = {"slots": 12, "trials": 620}
 
 
 @pytest.fixture(scope="module")
