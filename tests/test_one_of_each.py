@@ -8,6 +8,7 @@ from evedrop.results.writer import load_results
 from tests.builders import digests_of
 from tests.conformance.own_classes import BLOCK, PAGE
 from tests.conftest import Evedrop
+from tests.examples import mostly_long
 from tests.packages import install
 from tests.view.read_back import rows
 
@@ -89,11 +90,19 @@ def test_a_package_with_one_of_each_runs(evedrop: Evedrop, environment: dict[str
     assert "say hello" in evedrop.process("--help", env=environment).out
 
 
-def test_studies_and_checks_take_them_too(evedrop: Evedrop, environment: dict[str, str]) -> None:
-    """`check` with its options for classes, `compare` and `sweep`, by their short names."""
-    for kind, name in (("scheme", "flipped"), ("eavesdropper", "chaser"), ("link", "shifts"), ("delay", "steady")):
-        done = evedrop.process("check", f"--{kind}", name, env=environment)
-        assert done.status == 0, done.out
+CHECKED = [("scheme", "flipped"), ("eavesdropper", "chaser"), ("link", "shifts"), ("delay", "steady")]
+
+
+@pytest.mark.parametrize(("kind", "name"), mostly_long(CHECKED, [("link", "shifts"), ("delay", "steady")]))
+def test_checks_take_them_too(kind: str, name: str, evedrop: Evedrop, environment: dict[str, str]) -> None:
+    """`check` with its options for classes, by their short names."""
+    done = evedrop.process("check", f"--{kind}", name, env=environment)
+    assert done.status == 0, done.out
+
+
+@pytest.mark.long
+def test_studies_take_them_too(evedrop: Evedrop, environment: dict[str, str]) -> None:
+    """`design`, `compare` and `sweep`, by their short names."""
     (evedrop.folder / "each.toml").write_text(SCENARIO)
     done = evedrop.process("design", "each.toml", env=environment)
     assert done.status == 2

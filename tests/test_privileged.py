@@ -7,12 +7,15 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.privileged import BANNER
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("tests/containers", "tests/fresh", "tests/hosts")
 
 
+@pytest.mark.long
 def test_what_cannot_be_tested_is_said_loudly(tmp_path: Path) -> None:
     """The reason is that the user is not root or, for root, that the commands and apt-get are missing."""
     command = (sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-m", "hosts or containers or fresh", *FOLDERS)

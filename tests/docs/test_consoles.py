@@ -11,8 +11,6 @@ from tests.docs.consoles import ROOT, blocks, carry_out, matches
 PAGES = {
     path.relative_to(ROOT).as_posix(): path for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 }
-QUICK = {"docs/links.md"}
-"""Pages whose commands take few seconds; `make docs` runs those of the others."""
 RUN = [name for name, path in PAGES.items() if any(block.is_run for block in blocks(path))]
 NOT_RUN = {
     "README.md": 2,
@@ -35,9 +33,8 @@ NOT_RUN = {
 """The number of command blocks of each page that are not run; those of other pages need a reason."""
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.long]) for name in RUN]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("name", RUN)
 def test_the_commands_of_a_page_print_what_it_shows(name: str, tmp_path: Path) -> None:
     """In order, in one folder. `python -m tests.docs.consoles PAGE` writes what they print into the page."""
     wrong = [str(one) for _, done in carry_out(PAGES[name], tmp_path) for one in done if not one.is_right]

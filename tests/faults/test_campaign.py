@@ -36,19 +36,19 @@ WORDS = {
 """Case → its disturbance, on which its end depends."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "ends",
     [
         {FAILED: "failed by name"},
-        pytest.param({ENDURED: "as if undisturbed", INTERRUPTED: "interrupted"}, marks=pytest.mark.long),
-        # Whichever end: their results are looked at.
-        pytest.param({FULL: "", FULL_EARLY: "", EARLY: "failed by name", LITTLE: ""}, marks=pytest.mark.long),
-        pytest.param({WIRE: "as if undisturbed", STUDY: "as if undisturbed"}, marks=pytest.mark.long),
+        {ENDURED: "as if undisturbed", INTERRUPTED: "interrupted"},
+        {FULL: "", FULL_EARLY: "", EARLY: "failed by name", LITTLE: ""},  # whichever end: their results are looked at
+        {WIRE: "as if undisturbed", STUDY: "as if undisturbed"},
     ],
     ids=["failed", "endured and interrupted", "full disks, before the first figures, little memory", "wire and study"],
 )
 def test_cases_of_the_campaign_keep_what_is_promised(ends: dict[str, str]) -> None:
-    """One of each end, as `make test-faults` runs them. `tests/live` endures and interrupts runs in every `make test`."""
+    """One of each end, as `make test-faults` runs them. `tests/live` does the same to runs in every `make test`."""
     command = [sys.executable, "-m", "tests.faults.campaign", "--seed", *ends]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -20,6 +20,7 @@ import pytest
 
 from evedrop.results.writer import load_results
 from tests.conftest import wait_until
+from tests.examples import mostly_long
 from tests.faults import ours
 from tests.faults.disturbed import CONFUSED_FILE
 from tests.faults.ended import Ended
@@ -124,7 +125,9 @@ def test_the_judge_has_nothing_to_say_of_early_ends_that_are_whole(early: Ended,
     assert early.misses(reference, KILL) == []
 
 
-@pytest.mark.parametrize("what", LACKING)
+@pytest.mark.parametrize(
+    "what", mostly_long(LACKING, ["one slot of the journal", "the last row of the trials", "one slot of the slots"])
+)
 def test_missing_rows_of_a_run_that_ended_early_are_seen(what: str, early: Ended, reference: Reference) -> None:
     """All tables are counted up to the slot of the summary."""
     name, change = LACKING[what]
@@ -153,8 +156,17 @@ def test_missing_digests_are_seen(ended: Ended, reference: Reference) -> None:
     assert [line for line in ended.misses(reference) if line.startswith("digests lacks 1 of 8 rows")]
 
 
-@pytest.mark.parametrize("figure", ["mean_squared_error", "mean_trace_covariance", "received_fraction"])
-@pytest.mark.parametrize("when", ["ended", "early"])
+@pytest.mark.parametrize(
+    ("when", "figure"),
+    mostly_long(
+        [
+            (when, figure)
+            for when in ("ended", "early")
+            for figure in ("mean_squared_error", "mean_trace_covariance", "received_fraction")
+        ],
+        [("ended", "mean_trace_covariance"), ("early", "mean_squared_error")],
+    ),
+)
 def test_swapped_figures_are_seen(when: str, figure: str, request: pytest.FixtureRequest, reference: Reference) -> None:
     """Figures of two receivers exchanged in the summary, of a complete run and of one that ended early."""
     run: Ended = request.getfixturevalue(when)
@@ -327,6 +339,7 @@ print(missed, len(ours.none_left(frozenset(), 120.0)))
 """
 
 
+@pytest.mark.long
 def test_a_leftover_that_moves_to_a_new_parent_is_found(tmp_path: Path) -> None:
     """Every time, by a campaign that adopts orphans: it asks the system whether there is any child."""
     command = [sys.executable, "-c", LOOK, str(tmp_path), MOVING]

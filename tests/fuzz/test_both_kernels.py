@@ -56,6 +56,7 @@ def said_with(kernels: str) -> list[str]:
     return done.stdout.splitlines()
 
 
+@pytest.mark.long
 def test_the_corpus_is_read_the_same_with_either_kernels() -> None:
     """Every file is read or refused in our words in numpy, and in the same words as in C where that is built."""
     numpy = said_with("numpy")

@@ -28,9 +28,9 @@ from tests.fuzz.readers import FILES, READERS
 CHEAP = {"change", "disturbances", "disturbances-gz", "trace", "trace-parquet", "brief", "control"}
 CHEAP |= {"states", "state-message", "state-bytes"}
 """Readers of files that take less than a millisecond or two."""
-QUICK = {**dict.fromkeys(READERS, 50), **dict.fromkeys(CHEAP, 100), "scenario": 30, "wire": 50, "summary": 15}
-QUICK |= {name: 8 for name in FILES if name.startswith(("results-", "unfinished-", "view-"))}
-QUICK |= {name: 5 for name in FILES if name.startswith("wire-")}
+QUICK = {**dict.fromkeys(READERS, 25), **dict.fromkeys(CHEAP, 50), "scenario": 15, "wire": 25, "summary": 8}
+QUICK |= {name: 4 for name in FILES if name.startswith(("results-", "unfinished-", "view-"))}
+QUICK |= {name: 3 for name in FILES if name.startswith("wire-")}
 """How many changed examples `make test` has each reader read."""
 LONG_FILES = {"scenario": 10_000, "wire": 10_000, "change": 20_000, "summary": 5_000}
 LONG_FILES |= {name: 2_000 for name in FILES if name.startswith(("results-", "unfinished-", "view-", "wire-"))}
@@ -59,7 +59,7 @@ def test_examples_are_read(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", READERS)
 def test_changed_bytes_are_read_or_refused(name: str) -> None:
-    """Some of each reader, up to a hundred, by what one costs; always the same ones."""
+    """Some of each reader, up to fifty, by what one costs; always the same ones."""
     failures = campaign(name, seed=0, count=QUICK[name])
     assert not failures, f"{failures[0].data!r:.2000}\n{failures[0].how}"
 

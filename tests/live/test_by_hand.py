@@ -19,6 +19,7 @@ from evedrop.results.writer import load_results
 from tests.builders import digests_of
 from tests.commands import ForkedCommand
 from tests.conftest import LIMIT, Done, Evedrop, Live, wait_until
+from tests.examples import mostly_long
 
 ROLES = ("router", "relay", "sensor", "legitimate", "observer")
 SOON = 5.0
@@ -65,7 +66,7 @@ TWO_CLEAR = ("--set", "network.routers=2", "--listen", "tcp/127.0.0.2:{port}", "
 @pytest.mark.parametrize(
     ("options", "backwards"),
     [
-        (TLS, False),
+        pytest.param(TLS, False, marks=pytest.mark.long),
         pytest.param(TLS, True, marks=pytest.mark.long),
         pytest.param(NAMED, False, marks=pytest.mark.long),
         (CLEAR, True),
@@ -132,6 +133,7 @@ def test_a_reader_that_leaves_early_changes_no_exit_status(evedrop: Evedrop) -> 
     assert {live.end().status for live in running.values()} == {0}
 
 
+@pytest.mark.long
 def test_a_run_on_loopback_takes_certificates_too(evedrop: Evedrop) -> None:
     """`evedrop run --listen tls/127.0.0.1:PORT`: the same digests, and a control file with which it can be steered."""
     endpoint = f"tls/127.0.0.1:{free_port()}"
@@ -156,7 +158,8 @@ def test_a_run_on_loopback_takes_certificates_too(evedrop: Evedrop) -> None:
     assert digests_of(evedrop.folder / "a") == digests_of(evedrop.folder / "b")
 
 
-@pytest.mark.parametrize("scenario", [pytest.param("acknowledged", marks=pytest.mark.long), "restart"])
+@pytest.mark.long
+@pytest.mark.parametrize("scenario", ["acknowledged", "restart"])
 def test_with_two_routers_a_run_is_the_same(scenario: str, evedrop: Evedrop) -> None:
     """Acknowledgements that cross, processes that are started again: the digests of one router, and of memory."""
     small = ("--trials", "1", "--record-trials", "1", "--pace", "0", "--set", "expect=[]")
@@ -192,7 +195,7 @@ def told(done: Done, status: int, *words: str) -> None:
         assert word in line
 
 
-@pytest.mark.parametrize("protocol", ["tcp", "tls"])
+@pytest.mark.parametrize("protocol", mostly_long(["tcp", "tls"], ["tls"]))
 def test_a_brief_of_another_run_is_told_apart(protocol: str, evedrop: Evedrop) -> None:
     """Of a process, and of the observer, which leaves no results: long before anybody's patience ends."""
     endpoint = f"{protocol}/127.0.0.1:{free_port()}"
@@ -249,11 +252,11 @@ def test_an_address_of_another_host_is_said(evedrop: Evedrop) -> None:
     )
 
 
-def test_a_host_that_is_not_known_is_said(evedrop: Evedrop) -> None:
+@pytest.mark.parametrize("name", mostly_long(["sensor", "observer", "router"], ["sensor", "router"]))
+def test_a_host_that_is_not_known_is_said(name: str, evedrop: Evedrop) -> None:
     """A name that does not resolve, for processes that connect and for the one that listens."""
     briefs = written(evedrop, "--listen", "tls/nowhere.invalid:7447")
-    for name in ("sensor", "observer", "router"):
-        told(begun(evedrop, name, briefs[name]).end(), 2, f"briefs/{name}.json: ", "nowhere.invalid", "/etc/hosts")
+    told(begun(evedrop, name, briefs[name]).end(), 2, f"briefs/{name}.json: ", "nowhere.invalid", "/etc/hosts")
 
 
 def test_a_certificate_of_another_process_is_said(evedrop: Evedrop) -> None:
@@ -265,6 +268,7 @@ def test_a_certificate_of_another_process_is_said(evedrop: Evedrop) -> None:
         told(begun(evedrop, name, briefs[name]).end(), 2, f"briefs/{name}.json: ", f"is that of {other}, not of {name}")
 
 
+@pytest.mark.long
 def test_who_does_not_come_is_named(evedrop: Evedrop) -> None:
     """After the time that `--wait` gives, the observer names who is missing; exit 3, and a folder that says so."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
@@ -333,6 +337,7 @@ def test_what_is_refused_leaves_no_folder(evedrop: Evedrop) -> None:
     assert not (evedrop.folder / "b").exists()
 
 
+@pytest.mark.long
 def test_when_one_is_killed_nobody_is_left(evedrop: Evedrop) -> None:
     """There is no launcher: the observer tells the others why the run has failed, and they end, whatever they wait for."""
     briefs = written(

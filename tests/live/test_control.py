@@ -17,6 +17,7 @@ from evedrop.errors import UsageError
 from evedrop.live.network.control_file import Control, read_control
 from tests.builders import digests_of
 from tests.conftest import Done, Evedrop, Live, wait_until
+from tests.examples import mostly_long
 from tests.steps import stepping
 
 SCENARIO = """
@@ -196,6 +197,7 @@ def test_mistakes_are_told_and_change_nothing(steered: Start) -> None:
     assert [one["event"] for one in run.end().summary["events"]] == ["pause the run", "resume the run"]
 
 
+@pytest.mark.long
 def test_a_step_beyond_the_end_ends_the_run(steered: Start) -> None:
     """It is answered with the last slot, and the run is complete."""
     run = steered()
@@ -213,7 +215,7 @@ def test_a_long_slot_is_not_waited_for(steered: Start) -> None:
     assert run.end().status == 130
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("number", mostly_long([signal.SIGINT, signal.SIGKILL], [signal.SIGINT]))
 def test_an_interrupted_pause_leaves_nothing(number: signal.Signals, steered: Start) -> None:
     """Ctrl-C, or the launcher killed, while the run is held: what was measured and done is on disk, the password is not."""
     run = steered()
@@ -228,7 +230,7 @@ def test_an_interrupted_pause_leaves_nothing(number: signal.Signals, steered: St
     assert [one["event"] for one in summary["events"]] == ["pause the run", "step 40 slots", "cut smart"]
 
 
-@pytest.mark.parametrize("name", [pytest.param("sensor", marks=pytest.mark.long), "observer", "router"])
+@pytest.mark.parametrize("name", mostly_long(["sensor", "observer", "router"], ["router"]))
 def test_who_waits_is_told_of_the_end(name: str, steered: Start, evedrop: Evedrop) -> None:
     """A process that is killed while a step goes on ends the step's command too, with status 2; a router comes back."""
     run = steered(slots=100_000, pace=0.005)

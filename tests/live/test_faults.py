@@ -14,6 +14,7 @@ import pytest
 
 from evedrop.results.growing_tables import last_round
 from tests.conftest import Evedrop, Live, wait_until, with_mark
+from tests.examples import mostly_long
 from tests.rogue import with_rogue
 from tests.steps import stepping
 
@@ -69,7 +70,7 @@ ROGUES = {
 """What is wrong → the process at fault, how, and the expected message: for each pair of a sender and a process that notices."""
 
 
-@pytest.mark.parametrize("what", ROGUES)
+@pytest.mark.parametrize("what", mostly_long(ROGUES, ["NaN estimate", "skipped slot", "journal without a link"]))
 def test_a_process_that_breaks_the_protocol_is_named(evedrop: Evedrop, what: str) -> None:
     """Whichever process notices it, the sender is named, with the mistake and the last lines of its log."""
     name, does, said = ROGUES[what]
@@ -120,7 +121,7 @@ def test_a_router_that_lies_is_found_out(evedrop: Evedrop) -> None:
 @pytest.mark.parametrize(
     ("when", "number"),
     [
-        ("folder", signal.SIGTERM),
+        pytest.param("folder", signal.SIGTERM, marks=pytest.mark.long),
         ("first child", signal.SIGHUP),
         ("running", signal.SIGINT),
     ],
@@ -147,6 +148,7 @@ def test_an_interrupted_run_leaves_results_and_no_process(evedrop: Evedrop, when
         assert slots > 0
 
 
+@pytest.mark.long
 def test_an_interrupted_run_has_no_digest(evedrop: Evedrop) -> None:
     """A digest is of a whole run or null, and --json prints the summary of an interrupted run too."""
     live = evedrop.live("eavesdroppers", *ENDLESS, "--json")
@@ -170,6 +172,7 @@ def test_nothing_outlives_a_killed_launcher(evedrop: Evedrop) -> None:
     assert tables_whole(live) > 0
 
 
+@pytest.mark.long
 def test_a_paused_process_does_not_outlive_its_launcher(evedrop: Evedrop) -> None:
     """Paused by an event, it cannot notice that the launcher is killed: the system continues it, and it ends."""
     pause = "event.0={from = 5, to = 900000, pause = 'smart'}"
@@ -288,7 +291,8 @@ class Stillness:
         return self._looks
 
 
-@pytest.mark.parametrize("name", [pytest.param("naive", marks=pytest.mark.long), "router"])
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["naive", "router"])
 def test_a_process_that_stays_stopped_ends_the_run(evedrop: Evedrop, name: str) -> None:
     """When its connection is lost and does not come back for as long as the scenario waits, it is named, not its victims."""
     live = evedrop.live("eavesdroppers", *ENDLESS, "--set", "longest_outage=2")

@@ -124,7 +124,7 @@ in_parts = given(
 )
 
 
-@settings(max_examples=examples(32))
+@settings(max_examples=examples(16))
 @in_parts
 def test_two_shards_are_the_whole(cut: int, first: list[int], second: list[int], at_once: int, seed: int) -> None:
     """Wherever the trials are cut, in whatever parts their slots came, and however many slots fit into memory."""

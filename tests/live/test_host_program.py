@@ -21,6 +21,7 @@ from evedrop.live.launch.host_program import HostProcesses
 from evedrop.live.launch.starter import FORK_SERVER_LOST, StartedProcess
 from evedrop.live.protocol.brief import brief_from
 from tests.conftest import LIMIT, Evedrop, wait_until
+from tests.examples import mostly_long
 from tests.live.network.bench import brief_of_eve
 
 ORDER = StartProcess(7, brief_of_eve(), {})
@@ -148,7 +149,7 @@ def test_a_process_whose_fork_server_is_gone_is_reported_as_lost_with_it(number:
 MALFORMED = (b"no order", b'{"kind": "start"}', b"[" * 100_000, b'{"kind": "signal", "number": -1, "signal": 9}')
 
 
-@pytest.mark.parametrize("order", MALFORMED)
+@pytest.mark.parametrize("order", mostly_long(MALFORMED, MALFORMED[-1:]))
 def test_a_malformed_order_ends_the_program_with_a_sentence(evedrop: Evedrop, order: bytes) -> None:
     """With the status of a run that failed, and without a traceback; nothing is left."""
     words = [sys.executable, "-m", "evedrop", "host"]

@@ -21,6 +21,7 @@ from evedrop.results.growing_tables import UNFINISHED, last_round
 from evedrop.results.writer import load_results
 from tests.by_hand import by_hand
 from tests.conftest import LIMIT, Done, Evedrop, Live, wait_until
+from tests.examples import mostly_long
 from tests.processes import catches
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -116,7 +117,7 @@ def test_a_signal_ends_a_command_in_order(evedrop: Evedrop, command: str, moment
     interrupted(live, done)
 
 
-@pytest.mark.parametrize("command", ["run", "shards", "montecarlo"])
+@pytest.mark.parametrize("command", mostly_long(["run", "shards", "montecarlo"], ["shards", "montecarlo"]))
 def test_a_command_that_is_killed_in_its_first_moments_can_be_repeated(evedrop: Evedrop, command: str) -> None:
     """The scenario is in the folder before any process is started and any trial is computed."""
     live = evedrop.started(*COMMANDS[command])
@@ -128,6 +129,7 @@ def test_a_command_that_is_killed_in_its_first_moments_can_be_repeated(evedrop: 
     assert (again.status, again.err) == (0, "")
 
 
+@pytest.mark.long
 def test_a_folder_that_is_still_empty_is_removed(evedrop: Evedrop) -> None:
     """A command that is interrupted while it still checks its scenarios leaves nothing."""
     live = evedrop.begun(*COMMANDS["sweep"])
@@ -160,6 +162,7 @@ def test_a_signal_may_come_at_any_time(evedrop: Evedrop, command: str, number: s
             interrupted(live, done)
 
 
+@pytest.mark.long
 def test_a_second_signal_changes_nothing(evedrop: Evedrop) -> None:
     """An impatient user, or a system that shuts down, sends another while the first is heeded."""
     live = evedrop.live("eavesdroppers", *ENDLESS)
@@ -177,7 +180,8 @@ def test_a_second_signal_changes_nothing(evedrop: Evedrop) -> None:
     assert live.results.slots.num_rows == 4 * live.results.summary["slots"] > 0
 
 
-@pytest.mark.parametrize("first", ["command", pytest.param("children", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("first", ["command", "children"])
 def test_a_hang_up_of_everybody_is_one_of_the_run(evedrop: Evedrop, first: str) -> None:
     """Every process of a run gets it, in whatever order: 130, and the results are written."""
     live = evedrop.live("eavesdroppers", *ENDLESS)
@@ -199,6 +203,7 @@ os.execv(sys.executable, [sys.executable, "-m", "evedrop", *sys.argv[1:]])
 """The command, as what a terminal was opened for."""
 
 
+@pytest.mark.long
 def test_a_terminal_that_closes_ends_the_run(evedrop: Evedrop) -> None:
     """The terminal hangs up, and the output goes nowhere: the status is still 130, and the results are whole."""
     ours, theirs = pty.openpty()
@@ -234,7 +239,8 @@ def test_nohup_keeps_a_run_from_hanging_up(evedrop: Evedrop) -> None:
     assert live.results.summary["slots"] == 300
 
 
-@pytest.mark.parametrize("number", [signal.SIGHUP, *(pytest.param(one, marks=pytest.mark.long) for one in SIGNALS[:2])])
+@pytest.mark.long
+@pytest.mark.parametrize("number", SIGNALS)
 def test_a_process_by_hand_ends_with_130_too(tmp_path: Path, number: signal.Signals) -> None:
     """A receiver, the sensor and the router at once, and the observer with its results, whatever they wait for."""
     with by_hand(load("eavesdroppers", {"slots": 1_000_000}), tmp_path, f"tcp/127.0.0.1:{free_port()}") as run:
@@ -256,7 +262,8 @@ def test_a_process_by_hand_ends_with_130_too(tmp_path: Path, number: signal.Sign
             assert run.processes[name].wait(LIMIT) == 130
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_waits_until_a_process_of_a_run_heeds_it(evedrop: Evedrop, number: signal.Signals) -> None:
     """Sent as soon as it is forked, before any line of ours: it ends with 130, without a traceback, and is named."""
     begin = (

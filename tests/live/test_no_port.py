@@ -30,6 +30,7 @@ from evedrop.news import silent
 from evedrop.ports import free_port
 from evedrop.scenario import Scenario
 from tests.conftest import LIMIT, Evedrop, Live, with_mark
+from tests.examples import mostly_long
 from tests.live.network.bench import scenario_of
 from tests.live.test_children import Ended
 from tests.privileged import CannotRun, skip
@@ -80,7 +81,7 @@ def router_of(live: Live, where: str = "control.json") -> str:
     return endpoint
 
 
-@pytest.mark.parametrize("shards", [1, 2])
+@pytest.mark.parametrize("shards", mostly_long([1, 2], [1]))
 def test_a_run_opens_no_port(shards: int, evedrop: Evedrop) -> None:
     """No process of it, launcher and fork servers included, has a TCP socket that listens, from the first slot to the last."""
     changes = ("--slots", "100000", "--trials", "4", "--set", f"shards={shards}", "--set", "pace=0.002")
@@ -236,13 +237,19 @@ TWO = "tls/127.0.0.1:1", None, "tls/127.0.0.1:2"
 
 @pytest.mark.parametrize(
     ("lines", "started"),
-    [
-        ({}, ["router"]),
-        ({"router": b"noise\n"}, ["router"]),
-        ({"router": RouterListens("relay").line}, ["router"]),
-        ({"router": b'{"event": "over"}\n'}, ["router"]),
-        ({"router": RouterListens("router").line}, ["router", "relay"]),
-    ],
+    mostly_long(
+        [
+            ({}, ["router"]),
+            ({"router": b"noise\n"}, ["router"]),
+            ({"router": RouterListens("relay").line}, ["router"]),
+            ({"router": b'{"event": "over"}\n'}, ["router"]),
+            ({"router": RouterListens("router").line}, ["router", "relay"]),
+        ],
+        [
+            ({"router": RouterListens("relay").line}, ["router"]),
+            ({"router": RouterListens("router").line}, ["router", "relay"]),
+        ],
+    ),
 )
 def test_no_process_starts_before_the_routers_say_that_they_listen(
     lines: Mapping[str, bytes], started: list[str], tmp_path: Path
@@ -302,6 +309,7 @@ def test_a_long_or_odd_temporary_folder_has_its_sockets_elsewhere(
     assert not sockets.exists()
 
 
+@pytest.mark.long
 def test_a_run_with_a_long_temporary_folder(evedrop: Evedrop) -> None:
     """It runs, and leaves nothing in either folder."""
     folder = evedrop.folder / ("x" * 120)

@@ -9,6 +9,7 @@ import sys
 
 import pytest
 
+from evedrop.live.launch.starter import GRACE_SECONDS
 from evedrop.results.growing_tables import UNFINISHED, last_round
 from evedrop.results.writer import load_results
 from tests.conftest import Evedrop, Live, wait_until
@@ -17,6 +18,7 @@ SLOW = """
 import time
 import evedrop.live.launch.children as children
 import evedrop.live.launch.process_set as process_set
+import evedrop.live.launch.starter as starter
 import evedrop.live.network.launcher_news as heartbeat
 import evedrop.results.writer as results
 
@@ -30,22 +32,24 @@ def news(self, seconds, honest=children.Children.news):
     return honest(self, seconds)
 
 results.finish = finish
+children.GRACE_SECONDS = starter.GRACE_SECONDS = {grace}
 heartbeat.Heartbeat.__init__.__defaults__ = (0.1,)
 children.Children.news = news
 """
-"""How long an observer takes to make Parquet files, and after how long a silence in a run its launcher gives it up."""
+"""How long an observer takes to make Parquet files, after how long a silence in a run its launcher gives it up, and how long
+processes that are told to end may take."""
 
 
-def slow(evedrop: Evedrop, finish: float, silence: float, *arguments: str) -> Live:
+def slow(evedrop: Evedrop, finish: float, silence: float, *arguments: str, grace: float = GRACE_SECONDS) -> Live:
     """A run that finishes slowly."""
-    (evedrop.folder / "sitecustomize.py").write_text(SLOW.format(finish=finish, silence=silence))
+    (evedrop.folder / "sitecustomize.py").write_text(SLOW.format(finish=finish, silence=silence, grace=grace))
     environment = {**evedrop.environment, "PYTHONPATH": str(evedrop.folder)}
     return evedrop.live("eavesdroppers", "--slots", "300", *arguments, env=environment)
 
 
 def test_a_run_that_takes_long_to_finish_is_not_given_up(evedrop: Evedrop) -> None:
     """More than twice as long as a silence may last: the observer says that it lives, and the run is complete."""
-    live = slow(evedrop, 13.0, 6.0)
+    live = slow(evedrop, 6.5, 3.0)
     done = live.end()
     assert done.status == 0, done.err
     live.nothing_left()
@@ -53,9 +57,10 @@ def test_a_run_that_takes_long_to_finish_is_not_given_up(evedrop: Evedrop) -> No
     assert live.results.trials.num_rows == 4 * 300
 
 
+@pytest.mark.long
 def test_a_run_that_is_interrupted_while_it_finishes_is_complete(evedrop: Evedrop) -> None:
     """The launcher waits as long as the observer says that it lives; all slots were done before the signal."""
-    live = slow(evedrop, 12.0, 6.0)
+    live = slow(evedrop, 6.5, 3.0)
     wait_until(lambda: last_round(live.folder).slots == 300, "all slots on disk")
     live.process.send_signal(signal.SIGINT)
     done = live.end()
@@ -68,7 +73,7 @@ def test_a_run_that_is_interrupted_while_it_finishes_is_complete(evedrop: Evedro
 
 def test_an_observer_that_stands_still_is_named_and_its_rows_are_kept(evedrop: Evedrop) -> None:
     """Stopped, it says nothing; the launcher ends the run and makes tables of what it had written."""
-    live = slow(evedrop, 0.0, 6.0, "--slots", "1000000")
+    live = slow(evedrop, 0.0, 2.0, "--slots", "1000000", grace=0.5)
     wait_until(lambda: last_round(live.folder).slots > 0, "slots on disk")
     os.kill(live.child("observer"), signal.SIGSTOP)
     done = live.end()

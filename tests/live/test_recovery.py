@@ -59,13 +59,6 @@ RUNS: dict[str, dict[str, Any]] = {
     "in a loop over the truth": {"slots": 3000, "more": LOOP.format('period = 7\nacts_on = "truth"')},
     "paced, with events": {"slots": 2000, "more": CHANGING},
 }  # fmt: skip
-RARER = (
-    "as fast as it goes",
-    "silent and acknowledged",
-    "coded and acknowledged",
-    "in a loop over the truth",
-    "paced, with events",
-)
 
 
 def has_told(live: Live, event: str, times: int) -> bool:
@@ -78,7 +71,8 @@ def has_ended(process: StartedProcess, status: int) -> bool:
     return process.poll() == status
 
 
-@pytest.mark.parametrize("what", [pytest.param(what, marks=[long] if what in RARER else []) for what in RUNS])
+@long
+@pytest.mark.parametrize("what", RUNS)
 def test_a_killed_router_costs_nothing_but_time(what: str, evedrop: Evedrop, tmp_path: Path) -> None:
     """Killed twice in a run and started again by the launcher: digests and links are those in memory, and it is listed."""
     path, scenario = scenario_in(tmp_path, **RUNS[what])
@@ -119,6 +113,7 @@ def test_either_of_two_linked_routers_may_be_killed(name: str, evedrop: Evedrop,
     assert [one["process"] for one in done.summary["outages"]] == [name]
 
 
+@long
 def test_a_relay_gives_up_an_attempt_that_is_not_answered(evedrop: Evedrop, tmp_path: Path) -> None:
     """Whose connection was lost while it was being opened. Zenoh's own limit, ten seconds, is longer than this outage may be."""
     scenario = scenario_in(tmp_path, longest_outage=8.0, more="[network]\nrouters = 2")[1]
@@ -175,6 +170,7 @@ def test_a_router_that_dies_too_often_is_named(evedrop: Evedrop, tmp_path: Path)
     assert live.results.slots.num_rows > 0
 
 
+@long
 def test_a_router_that_never_comes_back_ends_the_run(tmp_path: Path) -> None:
     """Of processes that were started by hand each gives up by itself, says why, and ends with status 3."""
     _, scenario = scenario_in(tmp_path, slots=1_000_000, longest_outage=2.0)
@@ -193,6 +189,7 @@ def test_a_router_that_never_comes_back_ends_the_run(tmp_path: Path) -> None:
         assert (outage["process"], outage["until"]) == ("router", None)
 
 
+@long
 def test_a_router_that_is_started_again_by_hand(evedrop: Evedrop, tmp_path: Path) -> None:
     """The same command again, a second later: the run goes on, and all end with status 0."""
     _, scenario = scenario_in(tmp_path)
@@ -233,17 +230,9 @@ def is_taken_up(
         assert [one["process"] for one in run.summary["outages"]] == [name]
 
 
-@pytest.mark.parametrize(
-    ("name", "how"),
-    [
-        ("sensor", "closed"),
-        ("legitimate", "silent"),
-        pytest.param("observer", "closed", marks=long),
-        pytest.param("sensor", "silent", marks=long),
-        pytest.param("legitimate", "closed", marks=long),
-        pytest.param("observer", "silent", marks=long),
-    ],
-)
+@long
+@pytest.mark.parametrize("how", ["closed", "silent"])
+@pytest.mark.parametrize("name", ["sensor", "legitimate", "observer"])
 def test_a_cut_connection_costs_nothing_but_time(name: str, how: str, evedrop: Evedrop, tmp_path: Path) -> None:
     """Closed for a second, or without a word for longer than its lease: the outage is listed, and all else is as ever."""
     _, scenario = scenario_in(tmp_path, encoding=SCHEDULED, strategy="naive", more=ACKNOWLEDGED)
@@ -259,7 +248,8 @@ def test_a_cut_connection_costs_nothing_but_time(name: str, how: str, evedrop: E
     is_taken_up(name, cut_off, scenario, evedrop, tmp_path)
 
 
-@pytest.mark.parametrize("name", [pytest.param("controller", marks=long), "legitimate"])
+@long
+@pytest.mark.parametrize("name", ["controller", "legitimate"])
 def test_a_loop_is_taken_up_where_it_was_cut(name: str, evedrop: Evedrop, tmp_path: Path) -> None:
     """Estimates and inputs that were lost on the way are sent again: no process waits forever, and no input changes."""
     _, scenario = scenario_in(tmp_path, more=LOOP.format("period = 5"), more_of_legitimate="knows_input = true")

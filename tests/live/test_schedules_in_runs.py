@@ -58,6 +58,7 @@ def test_live_and_memory_agree(tmp_path: Path) -> None:
     assert digests_of(again) == digests_of(live)
 
 
+@pytest.mark.long
 def test_means_agree_with_theory(tmp_path: Path) -> None:
     """Mean errors over many trials are within 4.5 standard errors of theory, in a mode that only follows events too."""
     tables = tables_of(

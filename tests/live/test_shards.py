@@ -25,6 +25,7 @@ from evedrop.results.reading import age_of_figures
 from evedrop.results.writer import Results
 from tests.builders import digests_of
 from tests.conftest import Evedrop, Live, wait_until, with_mark
+from tests.examples import mostly_long
 
 TRIALS = 7
 ENDLESS = ("--trials", "5", "--slots", "1000000", "--set", "shards=2")
@@ -81,7 +82,7 @@ def in_order(table: pa.Table) -> dict[str, list[Any]]:
     return columns
 
 
-two_or_three = pytest.mark.parametrize("shards", [2, pytest.param(3, marks=pytest.mark.long)])
+two_or_three = pytest.mark.parametrize("shards", mostly_long([2, 3], [2]))
 
 
 @two_or_three
@@ -128,6 +129,7 @@ def close(found: Any, wanted: Any, where: str) -> None:
         assert found == wanted, where
 
 
+@pytest.mark.long
 def test_every_shard_may_have_two_routers(ran: Ran, tmp_path: Path) -> None:
     """At places of its own; the trials are the same."""
     found = run("eavesdroppers", out=tmp_path / "run", shards=2, network={"routers": 2}, **EVENTFUL)
@@ -136,7 +138,7 @@ def test_every_shard_may_have_two_routers(ran: Ran, tmp_path: Path) -> None:
         assert (found.folder / "logs" / f"shard-{number}" / "relay.log").is_file()
 
 
-@pytest.mark.parametrize("shards", [1, 2, 3])
+@pytest.mark.parametrize("shards", mostly_long([1, 2, 3], [1, 2]))
 def test_digests_are_those_of_memory(ran: Ran, shards: int) -> None:
     """However many processes carry a trial's packets, it is that trial."""
     digests = digests_of(ran(shards))
@@ -146,13 +148,13 @@ def test_digests_are_those_of_memory(ran: Ran, shards: int) -> None:
 
 def test_nothing_is_left_of_the_shards_but_their_logs(ran: Ran) -> None:
     """One folder, as of any run, whose scenario says that it was in shards and runs again."""
-    folder = ran(3).folder
+    folder = ran(2).folder
     left = {path.name for path in folder.iterdir()}
     tables = {f"{name}.parquet" for name in ("slots", "trials", "journal", "digests")}
     assert left == {"scenario.toml", "summary.json", "logs", *tables}
-    assert {path.name for path in (folder / "logs").iterdir()} == {"shard-1", "shard-2", "shard-3"}
+    assert {path.name for path in (folder / "logs").iterdir()} == {"shard-1", "shard-2"}
     assert (folder / "logs" / "shard-2" / "smart.log").is_file()
-    assert load(folder).shards == 3
+    assert load(folder).shards == 2
     assert load(folder).trials == TRIALS
 
 
@@ -255,6 +257,7 @@ def test_a_killed_process_of_a_shard_ends_all(evedrop: Evedrop, name: str) -> No
     assert live.results.summary["slots"] > 0
 
 
+@pytest.mark.long
 def test_a_killed_observer_costs_no_slot_that_is_on_disk(evedrop: Evedrop) -> None:
     """The slots of both shards are in the folder, up to those that the observer had written when it was killed.
 
@@ -287,6 +290,7 @@ def test_an_interrupted_run_leaves_one_folder_and_no_process(evedrop: Evedrop) -
     assert whole(live) > 0
 
 
+@pytest.mark.long
 def test_an_interrupt_before_anything_has_begun_leaves_a_whole_folder_too(evedrop: Evedrop) -> None:
     """With processes that are just being started: empty tables, and a summary that says so."""
     live = evedrop.live("eavesdroppers", *ENDLESS)

@@ -14,6 +14,7 @@ from evedrop.errors import Interrupted
 from evedrop.live.launch.preloading import ForkServer, PreloadedStarter, fork_servers
 from evedrop.live.launch.starter import FORK_SERVER_LOST
 from tests.conftest import LIMIT, Evedrop, Live, wait_until
+from tests.examples import mostly_long
 from tests.processes import parent_of
 
 ENDLESS = ("--slots", "1000000")
@@ -29,6 +30,7 @@ def suspend(live: Live, which: str) -> list[int]:
     return servers
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("which", "number"), [*((one, signal.SIGINT) for one in WHICH), ("both", signal.SIGTERM)])
 def test_a_signal_ends_a_run_whose_fork_servers_are_suspended(
     evedrop: Evedrop, which: str, number: signal.Signals
@@ -45,6 +47,7 @@ def test_a_signal_ends_a_run_whose_fork_servers_are_suspended(
     assert live.results.slots.num_rows > 0
 
 
+@pytest.mark.long
 def test_a_run_whose_fork_servers_are_suspended_completes(evedrop: Evedrop) -> None:
     """Nobody asks for its end: all its processes end by themselves, and it is complete."""
     live = evedrop.live("eavesdroppers", "--slots", "200", "--paused")
@@ -65,6 +68,7 @@ def lives(pid: int) -> bool:
         return False
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("which", WHICH)
 def test_a_suspended_fork_server_does_not_outlive_a_killed_launcher(evedrop: Evedrop, which: str) -> None:
     """The system continues it when its parent dies; it then finds its channel closed."""
@@ -78,7 +82,7 @@ def test_a_suspended_fork_server_does_not_outlive_a_killed_launcher(evedrop: Eve
     assert list(live.temporary.iterdir()) == []
 
 
-@pytest.mark.parametrize("which", ["that of observers", "that of others"])
+@pytest.mark.parametrize("which", mostly_long(["that of observers", "that of others"], ["that of others"]))
 def test_a_killed_fork_server_is_named_and_no_victim(evedrop: Evedrop, which: str) -> None:
     """Its processes are ended by the launcher: none of them is at fault."""
     live = evedrop.live("eavesdroppers", *ENDLESS)
@@ -113,7 +117,7 @@ def cleaners(live: Live) -> dict[int, Path]:
     return {pid: Path(words[-1]) for pid, words in commands.items()}
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("how", mostly_long([signal.SIGINT, signal.SIGTERM, signal.SIGKILL], [signal.SIGKILL]))
 def test_a_suspended_cleaner_keeps_nothing_from_ending_and_leaves_no_folder(
     evedrop: Evedrop, how: signal.Signals
 ) -> None:
@@ -134,6 +138,7 @@ def test_a_suspended_cleaner_keeps_nothing_from_ending_and_leaves_no_folder(
     assert list(live.temporary.iterdir()) == []
 
 
+@pytest.mark.long
 def test_a_run_that_is_to_end_waits_for_no_fork_server(tmp_path: Path) -> None:
     """A suspended one starts nothing, and ends with the block."""
     stop = threading.Event()
@@ -155,6 +160,7 @@ def test_a_fork_server_that_starts_nothing_is_given_up(tmp_path: Path, monkeypat
             servers[0].start("sensor", tmp_path / "no.json", log, own_environment())
 
 
+@pytest.mark.long
 def test_an_end_that_no_fork_server_reports_is_seen(tmp_path: Path) -> None:
     """The system says that the process has ended; how, only its parent could say."""
     with fork_servers(["evedrop.cli.main"]) as (server,):

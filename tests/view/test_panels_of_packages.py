@@ -70,6 +70,7 @@ def by_slot(row: dict[str, int]) -> int:
     return row["slot"]
 
 
+@pytest.mark.long
 def test_a_package_adds_a_panel_to_the_recording_of_a_live_run(tutorial: Path, evedrop: Evedrop) -> None:
     """The tutorial's file and line are enough."""
     environment = {**evedrop.environment, "PYTHONPATH": str(tutorial)}
@@ -167,6 +168,7 @@ def test_a_broken_panel_is_left_out_of_a_recording(
     assert sorted(curve(rrd, "sound")) == list(range(SLOTS))
 
 
+@pytest.mark.long
 def test_a_broken_panel_changes_nothing_of_a_live_run(site: Path, evedrop: Evedrop) -> None:
     """Status and digests are those without it, and the warnings are told while the run goes on."""
     words = ("run", "eavesdroppers", "--slots", str(SLOTS), "--set", "trials=2")

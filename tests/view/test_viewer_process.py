@@ -104,8 +104,9 @@ def test_a_viewer_is_given_the_screen_and_no_tokens(server: subprocess.Popen[byt
 
 
 @LINUX
-def test_hung_viewer_is_stopped(server: subprocess.Popen[bytes]) -> None:
+def test_hung_viewer_is_stopped(server: subprocess.Popen[bytes], monkeypatch: pytest.MonkeyPatch) -> None:
     """A viewer that does not react is killed."""
+    monkeypatch.setattr(viewer_process, "_STOP_SECONDS", 0.3)
     os.kill(server.pid, signal.SIGSTOP)
     end(server)
     assert server.poll() is not None

@@ -16,7 +16,7 @@ from evedrop.wire.side import SideSession
 from evedrop.wire.view import WireView
 from evedrop.wire.watchdog import Watchdog
 
-SOON = 2.0
+SOON = 1.0
 """Seconds after which the watchdog ends such a wire."""
 
 

@@ -89,6 +89,7 @@ def test_the_models_of_a_link_are_found_again(tmp_path: Path) -> None:
     assert found.slot == pytest.approx(0.1)
 
 
+@pytest.mark.long
 def test_a_fitted_link_in_a_wire_loses_as_the_recorded_one(tmp_path: Path) -> None:
     """The printed [[link]] in a wire file: rate and bursts of 20 000 other messages are within 10 % of the recording's."""
     carried(tmp_path, plan_of(SETTINGS), {"0/scan/a": 20_000})

@@ -22,6 +22,7 @@ ASKED, DECLARED, CROSSED = 300, 2000, 100
 """Without a closed administration space a side stopped after some 40 questions and 4000 declarations."""
 
 
+@pytest.mark.long
 def test_asking_for_the_administration_while_others_declare_stops_no_side(tmp_path: Path) -> None:
     """Three programs behind a tap ask, three declare: nobody answers them, and messages of other sides go on crossing.
 

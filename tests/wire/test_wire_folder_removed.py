@@ -15,6 +15,7 @@ from evedrop.wire.crossing import Crossing, Kind
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.running import RunningWire
 from tests.conftest import wait_until
+from tests.examples import mostly_long
 from tests.wire.wire_at_work import program
 from tests.wire.wire_plans import wire_plan
 
@@ -51,7 +52,7 @@ def removed_while_it_runs(running: RunningWire, remove: Callable[[Path], object]
             wait_until(lambda: robot.put("after", b"") or "after" in got, "messages go on crossing")
 
 
-@pytest.mark.parametrize("what", LOST)
+@pytest.mark.parametrize("what", mostly_long(LOST, ["all", "unfinished"]))
 def test_a_wire_without_its_folder_says_so_at_once(what: str, tmp_path: Path) -> None:
     """Messages still cross; the last sentence says what is left, and the status is 3."""
     remove, folder, summed_up = LOST[what]

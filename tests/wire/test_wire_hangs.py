@@ -22,6 +22,7 @@ from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_on_disk import summary_of_wire
 from evedrop.wire.watchdog import Duty, Watchdog
 from tests.conftest import LIMIT, wait_until
+from tests.examples import mostly_long
 from tests.wire.wire_at_work import program
 
 WIRE = """
@@ -109,9 +110,9 @@ def is_on_disk(wire: Wire) -> None:
 @pytest.mark.parametrize(
     ("how", "where"),
     [
-        ("a_side", "at the side base"),
+        pytest.param("a_side", "at the side base", marks=pytest.mark.long),
         ("a_message", "among the messages from the side robot"),
-        ("a_journal", "in the journal"),
+        pytest.param("a_journal", "in the journal", marks=pytest.mark.long),
     ],
 )
 def test_a_watchdog_ends_a_wire_of_which_a_part_hangs(how: str, where: str, tmp_path: Path) -> None:
@@ -125,10 +126,11 @@ def test_a_watchdog_ends_a_wire_of_which_a_part_hangs(how: str, where: str, tmp_
                 time.sleep(0.01)
         status, errors = wire.ended()
     assert status == RunError.exit_status
-    assert f"the wire no longer answers: nothing has moved {where} for 2 s" in errors
+    assert f"the wire no longer answers: nothing has moved {where} for 1 s" in errors
     is_on_disk(wire)
 
 
+@pytest.mark.long
 def test_a_watchdog_ends_a_wire_in_which_zenoh_itself_hangs(tmp_path: Path) -> None:
     """As it does if programs ask a router for what it has while others declare: Zenoh 1.10."""
     over = threading.Event()
@@ -162,10 +164,11 @@ def test_a_watchdog_ends_a_wire_in_which_zenoh_itself_hangs(tmp_path: Path) -> N
             for thread in threads:
                 thread.join(LIMIT)
     assert status == RunError.exit_status
-    assert "the wire no longer answers: nothing has moved at the side base for 2 s" in errors
+    assert "the wire no longer answers: nothing has moved at the side base for 1 s" in errors
     is_on_disk(wire)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_one_signal_ends_a_wire_whose_side_cannot_be_closed(number: int, tmp_path: Path) -> None:
     """The watchdog ends it."""
@@ -174,11 +177,11 @@ def test_one_signal_ends_a_wire_whose_side_cannot_be_closed(number: int, tmp_pat
         wire.signal(number)
         status, errors = wire.ended()
     assert status == RunError.exit_status
-    assert "the wire no longer answers: nothing has moved at the side base for 2 s" in errors
+    assert "the wire no longer answers: nothing has moved at the side base for 1 s" in errors
     is_on_disk(wire)
 
 
-@pytest.mark.parametrize("how", ["an_end", "a_start"])
+@pytest.mark.parametrize("how", mostly_long(["an_end", "a_start"], ["an_end"]))
 def test_a_second_signal_ends_a_wire_at_once(how: str, tmp_path: Path) -> None:
     """Whatever the main thread waits for: the end of a session, or a side that cannot be opened."""
     with hanging(how, tmp_path) as wire:
@@ -196,7 +199,7 @@ def test_a_second_signal_ends_a_wire_at_once(how: str, tmp_path: Path) -> None:
 
 def test_a_view_that_hangs_does_not_change_the_status(tmp_path: Path) -> None:
     """Nor does it keep the process from ending: the wire itself has done all that it should."""
-    with hanging("a_view", tmp_path, "--for", "1 s", "--view", str(tmp_path / "wire.rrd")) as wire:
+    with hanging("a_view", tmp_path, "--for", "0.2 s", "--view", str(tmp_path / "wire.rrd")) as wire:
         status, errors = wire.ended()
     assert status == 0, errors
     assert summary_of_wire(wire.out).state == "ended"

@@ -25,6 +25,7 @@ from evedrop.wire.journal_part import STORED, JournalPart, Records, records_in
 from evedrop.wire.journal_reader import journal_tables, part_names
 from evedrop.wire.lanes import LinkState
 from tests.conftest import LIMIT, wait_until
+from tests.examples import mostly_long
 from tests.wire.wire_plans import wire_plan
 
 LOSSY = {"loss": {"model": "bernoulli", "quality": 0.6}}
@@ -332,7 +333,7 @@ def write(first):
 
 
 total = 0
-for turn in range(8):
+for turn in range(int(sys.argv[2])):
     child = os.fork()
     if child == 0:
         write(total)
@@ -357,12 +358,13 @@ print(total)
 """
 
 
-def test_a_wire_may_be_killed_at_any_moment(tmp_path: Path) -> None:
-    """Kill -9, 8 times in one folder: every recorded row is in the journal once, and the numbers of messages go on.
+@pytest.mark.parametrize("times", mostly_long([3, 8], [3]))
+def test_a_wire_may_be_killed_at_any_moment(times: int, tmp_path: Path) -> None:
+    """Kill -9, so many times in one folder: every recorded row is in the journal once, and the numbers of messages go on.
 
     A message that was still delayed when its wire was killed is under way, not delivered.
     """
-    command = [sys.executable, "-c", KILLED, str(tmp_path)]
+    command = [sys.executable, "-c", KILLED, str(tmp_path), str(times)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT, check=False)
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) > 5000

@@ -194,6 +194,7 @@ def test_a_process_that_is_alive_and_silent_is_named(evedrop: Evedrop, what: str
     live.nothing_left()
 
 
+@pytest.mark.long
 def test_a_process_that_heeds_no_signal_is_killed_and_its_log_says_what_it_did(evedrop: Evedrop) -> None:
     """Native code that holds Python's lock keeps all of Python waiting; the stacks are written all the same.
 
@@ -247,6 +248,7 @@ def test_malformed_progress_is_its_senders(evedrop: Evedrop, what: str) -> None:
     assert "logs/naive.log" in done.err
 
 
+@pytest.mark.long
 def test_the_sender_is_named_where_everybody_is_started_by_hand(
     evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -102,7 +102,7 @@ report("imported")
 
 SCENARIO = f"""
 title = "An eavesdropper that spies"
-slots = 600
+slots = 300
 seed = {SEED}
 
 [process]
@@ -122,7 +122,7 @@ strategy = "spy:Spy"
 link = {{ quality = 0.8 }}
 
 [[event]]
-at = 300
+at = 150
 link = "eve"
 set = {{ quality = 0.5 }}
 """

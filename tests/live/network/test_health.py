@@ -15,6 +15,13 @@ from tests.live.network.bench import Bench, bench_of, scenario_of
 EVE = "eve"
 
 
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who is not let in gives up soon."""
+    monkeypatch.setattr("evedrop.live.network.health._CONNECT_SECONDS", 0.3)
+
+
+@pytest.mark.usefixtures("impatient")
 def test_who_is_ready_is_there_and_who_left_is_not(bench: Callable[..., Bench]) -> None:
     """By its token at the router, not by its process or its connection."""
     stage = bench()
@@ -42,6 +49,7 @@ def test_behind_certificates_it_is_no_different(tmp_path: Path) -> None:
         assert not is_there(stage.briefs[EVE])
 
 
+@pytest.mark.usefixtures("impatient")
 def test_the_command_says_so(bench: Callable[..., Bench], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """In words, and by its status."""
     stage = bench()

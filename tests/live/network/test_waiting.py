@@ -59,6 +59,7 @@ def listener(lasting: float | None) -> Iterator[RouterAddress]:
         server.shutdown(socket.SHUT_RDWR)
 
 
+@pytest.mark.long
 def test_a_network_that_cuts_connections_is_no_refusal() -> None:
     """Connections that flap are lost in the middle of a handshake, as of a router that refuses; an idle one is lost as well."""
     with listener(0.3) as address, pytest.raises(RunError, match="no router answered"):
