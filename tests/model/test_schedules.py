@@ -13,6 +13,7 @@ from scipy.optimize import differential_evolution
 
 from evedrop.errors import UsageError
 from evedrop.model.process import Process
+from evedrop.model.theory import schedule_climb
 from evedrop.model.theory.adversary import Adversary
 from evedrop.model.theory.covariances import Outcomes, expected_traces, misled_covariances
 from evedrop.model.theory.schedule_problem import ScheduleProblem, SlotRecursion
@@ -224,6 +225,16 @@ def test_it_is_better_to_recover_than_to_be_kept_at_the_bound() -> None:
     assert len(set(found.constant.mu_d[1:])) == 1
     assert max(found.constant.user) <= 0.005 * (1 + 1e-9)
     assert not found.exact
+
+
+def test_where_no_states_exceed_the_bound_all_slots_have_as_few_as_keep_it() -> None:
+    """Where only a state in a slot without one keeps Ω, μ_d is raised in all slots at once, until the largest error is Ω."""
+    problem = problem_of(SETTLED, "smart", 16, 0.005)
+    nothing = np.array([1.0] + [0.0] * 15)
+    assert not math.isfinite(problem.sum_of(nothing))
+    mu_d = schedule_climb._repaired(problem, nothing)
+    assert len({*mu_d[1:]}) == 1
+    assert problem.user.traces(mu_d[None]).max() == pytest.approx(0.005, rel=1e-9)
 
 
 def test_a_design_as_json() -> None:
