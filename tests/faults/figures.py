@@ -5,6 +5,7 @@ Source: docs/results.md, summary.json.
 
 from __future__ import annotations
 
+import hashlib
 import math
 import re
 from collections import Counter, defaultdict
@@ -105,6 +106,23 @@ def unlike_rows(summary: Mapping[str, Any], tables: Mapping[str, pa.Table], shar
             yield f"losses of {name}'s link are {link['lost_by']}, and by the rows of the journal {lost_by}"
         if sum(link["lost_by"].values()) != link["lost"] or link["delivered"] + link["lost"] != offered:
             yield f"the account of {name}'s link does not add up: {link}"
+
+
+def unlike_digests(summary: Mapping[str, Any], digests: pa.Table) -> Iterator[str]:
+    """The receivers whose digest in a summary is not that of the rows of digests, which must be complete then."""
+    for name, peer in summary["peers"].items():
+        if peer["digest"] is None:
+            continue
+        blocks: dict[int, list[bytes]] = defaultdict(list)
+        for row in sorted(digests.to_pylist(), key=lambda row: (row["block"], row["trial"])):
+            if row["peer"] == name:
+                blocks[row["block"]].append(row["digest"])
+        whole = b"".join(
+            b"".join(of_trial) for of_trial in zip(*(blocks[start] for start in sorted(blocks)), strict=False)
+        )
+        found = hashlib.sha256(whole).hexdigest()
+        if found != peer["digest"]:
+            yield f"the digest of {name} is {peer['digest'][:12]}, and by the rows of digests {found[:12]}"
 
 
 def _means(slots: pa.Table, end: int) -> dict[str, dict[str, float]]:

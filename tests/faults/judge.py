@@ -12,7 +12,7 @@ from evedrop.errors import UsageError
 from evedrop.results.writer import load_results
 from tests.faults import ours
 from tests.faults.disturbed import CLEANER, CONFUSED_FILE, FORK_SERVERS
-from tests.faults.figures import unlike_rows
+from tests.faults.figures import unlike_digests, unlike_rows
 from tests.faults.hosts import HOST_CLEANER, PROGRAM, host_of, target_on
 from tests.faults.kinds import KILLING, LIMITS, RESULTS, SIGNALS, Fault
 from tests.faults.looks import failed_looks
@@ -237,6 +237,7 @@ def _of_results(status: int, run: Run, hits: Mapping[Fault, float], reference: R
         for name, table in tables.items():
             yield from reference.wrong_rows(name, table, int(summary["slots"]) if len(folders) == 1 else 0)
         yield from missing_rows(tables, summary, reference, status == 0)
+        yield from unlike_digests(summary, tables["digests"])
         yield from unlike_rows(summary, tables, run.variant.shards if len(folders) == 1 else 1)
         if not disk:
             yield from _of_summary(status, run, hits, summary, reference)

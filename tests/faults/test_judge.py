@@ -24,7 +24,7 @@ from tests.examples import mostly_long
 from tests.faults import ours
 from tests.faults.disturbed import CONFUSED_FILE
 from tests.faults.ended import Ended
-from tests.faults.figures import unlike_rows
+from tests.faults.figures import unlike_digests, unlike_rows
 from tests.faults.kinds import CONFUSED, EVERYBODY, Fault
 from tests.faults.moments import Moment
 from tests.faults.outages import wrong_outages
@@ -282,6 +282,21 @@ def test_a_panic_of_zenoh_is_no_mistake_where_threads_are_few(ended: Ended, refe
     few = Fault("few processes", EVERYBODY, Moment("start", 0.0), count=30)
     assert not [line for line in ended.misses(reference, few) if "traceback" in line]
     assert [line for line in ended.misses(reference, KILL) if "smart.log has a traceback" in line]
+
+
+@pytest.mark.parametrize("without", ["a row", "a receiver", "a block"])
+def test_digests_that_are_not_those_of_the_rows_are_seen(without: str, ended: Ended) -> None:
+    """The reference is computed by the same code, so that a mistake in the rows would be in both."""
+    results = load_results(ended.out)
+    table = results.digests
+    assert list(unlike_digests(results.summary, table)) == []
+    last = pc.field("block") < pc.scalar(max(table["block"].to_pylist()))
+    changed = {
+        "a row": table.slice(1),
+        "a receiver": table.filter(pc.field("peer") != "smart"),
+        "a block": table.filter(last),
+    }[without]
+    assert list(unlike_digests(results.summary, changed))
 
 
 def test_figures_of_shards_cover_all_rows(ended: Ended, reference: Reference) -> None:

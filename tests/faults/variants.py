@@ -29,7 +29,7 @@ kill = "smart"
 state = "last"
 [[event]]
 from = 180
-to = 240
+to = 244
 pause = "naive"
 [[event]]
 from = 250
