@@ -8,7 +8,7 @@ import pytest
 
 from evedrop import montecarlo
 from tests.faults import judge
-from tests.faults.ended import EARLY, Ended, ended_run
+from tests.faults.ended import EARLY, Ended, copy_of, ended_run
 from tests.faults.reference import Reference, in_memory
 from tests.faults.variants import VARIANTS
 
@@ -25,20 +25,33 @@ def reference(memory: Path) -> Reference:
     return in_memory(VARIANTS["plain"].scenario(memory.parent), memory)
 
 
-@pytest.fixture
-def ended(tmp_path: Path, memory: Path, reference: Reference) -> Ended:
-    """A run for the judge, which ended as if nothing had happened."""
+@pytest.fixture(scope="module")
+def first_ended(tmp_path_factory: pytest.TempPathFactory, memory: Path, reference: Reference) -> Ended:
+    """A run for the judge, which ended as if nothing had happened; no test changes it."""
     del reference
-    return ended_run(tmp_path, memory, 400, "complete")
+    return ended_run(tmp_path_factory.mktemp("ended"), memory, 400, "complete")
 
 
 @pytest.fixture
-def early(tmp_path: Path) -> Ended:
-    """A run for the judge that a killed process ended early, as it should."""
-    scenario = VARIANTS["plain"].scenario(tmp_path)
-    montecarlo(scenario, trials=1, slots=EARLY, out=tmp_path / "short")
-    run = ended_run(tmp_path, tmp_path / "short", EARLY, "smart was ended by signal 9")
+def ended(tmp_path: Path, first_ended: Ended) -> Ended:
+    """One as that."""
+    return copy_of(first_ended, tmp_path)
+
+
+@pytest.fixture(scope="module")
+def first_early(tmp_path_factory: pytest.TempPathFactory) -> Ended:
+    """A run for the judge that a killed process ended early, as it should; no test changes it."""
+    folder = tmp_path_factory.mktemp("early")
+    scenario = VARIANTS["plain"].scenario(folder)
+    montecarlo(scenario, trials=1, slots=EARLY, out=folder / "short")
+    run = ended_run(folder, folder / "short", EARLY, "smart was ended by signal 9")
     run.change("digests", lambda table: table.slice(0, 0))  # its only block was cut short
-    (tmp_path / "stderr").write_text("evedrop: smart was ended by signal 9\n")
+    (folder / "stderr").write_text("evedrop: smart was ended by signal 9\n")
     run.launcher.returncode = judge.FAILED
     return run
+
+
+@pytest.fixture
+def early(tmp_path: Path, first_early: Ended) -> Ended:
+    """One as that."""
+    return copy_of(first_early, tmp_path)

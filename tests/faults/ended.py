@@ -83,6 +83,12 @@ class Ended:
         return judge.misses(self, dict.fromkeys(hits, 1.0), PATIENT_SECONDS, reference, before)
 
 
+def copy_of(run: Ended, folder: Path) -> Ended:
+    """The same run in another folder, which may be there."""
+    shutil.copytree(run.folder, folder, dirs_exist_ok=True)
+    return Ended(folder, folder / "run", Status(run.launcher.returncode), done=run.done)
+
+
 def ended_run(folder: Path, results: Path, slots: int, how: str) -> Ended:
     """A run for the judge, from results in memory: as a live run writes them, with its journal and its own entries."""
     out = folder / "run"

@@ -89,10 +89,15 @@ def test_the_judge_has_nothing_to_say_of_a_run_that_its_connection_ended(
             [KILL, Fault("kill", "legitimate", Moment("run", 0.5))],
             "the failure names host alpha, which nothing disturbed",
         ),
-        (LOST, [fault("stop", SESSION, seconds=1.0)], "although nothing of this may end a run"),
+        pytest.param(
+            LOST,
+            [fault("stop", SESSION, seconds=1.0)],
+            "although nothing of this may end a run",
+            marks=pytest.mark.long,
+        ),
         (LOST, [fault("silence", CONNECTION, seconds=1.0)], "although nothing of this may end a run"),
-        (LOST, [HANGS], "although nothing of this may end a run"),
-        (LOST, [fault("stop", SSH)], "although nothing of this may end a run"),
+        pytest.param(LOST, [HANGS], "although nothing of this may end a run", marks=pytest.mark.long),
+        pytest.param(LOST, [fault("stop", SSH)], "although nothing of this may end a run", marks=pytest.mark.long),
         (LOST, [fault("kill", HOST_CLEANER)], "although nothing of this may end a run"),
     ],
 )
@@ -204,6 +209,7 @@ def run(tmp_path: Path) -> Iterator[Disturbed]:
         skip(error)
 
 
+@pytest.mark.long
 def test_each_part_of_each_host_is_found(run: Disturbed) -> None:
     """They are all different processes, and so are those of this machine; a host's connection, and a process's, have cables."""
     assert run.launcher.poll() is None, run.text("stderr")

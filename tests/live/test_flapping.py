@@ -134,6 +134,7 @@ def test_connections_that_are_reset_change_nothing(seed: int, evedrop: Evedrop) 
     disturbed(seed, evedrop, "reset" if may_reset() else "proxy")
 
 
+@pytest.mark.long
 def test_a_message_of_another_key_is_dropped_counted_and_sent_again(evedrop: Evedrop, tmp_path: Path) -> None:
     """A delivery that arrives on another receiver's key changes no figure: the summary says who dropped how many."""
     scenario = scenario_of(tmp_path, PLAIN)

@@ -32,7 +32,7 @@ def news(self, seconds, honest=children.Children.news):
     return honest(self, seconds)
 
 results.finish = finish
-children.GRACE_SECONDS = starter.GRACE_SECONDS = {grace}
+children.GRACE_SECONDS = children._GONE_SECONDS = starter.GRACE_SECONDS = {grace}
 heartbeat.Heartbeat.__init__.__defaults__ = (0.1,)
 children.Children.news = news
 """

@@ -153,6 +153,7 @@ def test_what_an_operator_changed_survives_the_router(evedrop: Evedrop, tmp_path
     as_if_undisturbed(done.summary, load(live.folder / "scenario.toml"), tmp_path / "memory")
 
 
+@long
 def test_a_router_that_dies_too_often_is_named(evedrop: Evedrop, tmp_path: Path) -> None:
     """The fourth time it is not started again: the run ends with status 3, with what was measured, and nothing is left."""
     path, _ = scenario_in(tmp_path, slots=1_000_000)

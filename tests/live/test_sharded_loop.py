@@ -119,7 +119,8 @@ def test_a_loop_with_a_solver_is_made_one(tmp_path: Path) -> None:
     assert sharded["household"] == memory["household"]
 
 
-@pytest.mark.parametrize("name", ["controller", pytest.param("observer", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["controller", "observer"])
 def test_a_loop_that_is_cut_short_is_made_one(evedrop: Evedrop, name: str) -> None:
     """Inputs, and the figures of controller and house, as far as each shard came, or as its observer had written them."""
     words = ("--trials", "5", "--set", "shards=2", "--set", "expect=[]", "--set", f"record_trials={RECORDED}")

@@ -302,6 +302,7 @@ def test_an_interrupt_before_anything_has_begun_leaves_a_whole_folder_too(evedro
     whole(live)
 
 
+@pytest.mark.long
 def test_of_a_killed_launcher_the_shards_are_left(evedrop: Evedrop) -> None:
     """Nobody makes them one, but each is a results folder of its trials, and the run's says so."""
     live = evedrop.live("eavesdroppers", *ENDLESS)

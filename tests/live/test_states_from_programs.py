@@ -156,6 +156,7 @@ def test_a_silent_program_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
             states.take(range(7, 8))
 
 
+@pytest.mark.long
 def test_a_message_that_is_no_state_ends_the_run(tmp_path: Path) -> None:
     """The message names key, endpoint, slot and value; the slots so far can be repeated."""
     source = program()

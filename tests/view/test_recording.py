@@ -184,9 +184,9 @@ sys.path.insert(0, sys.argv[1])
 from tests.view.simulated_run import orbit, simulate
 from pathlib import Path
 from evedrop.view.recording import ViewRecording
-run = simulate(orbit(), 3000)
+run = simulate(orbit(), 900)
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, 150_000))
+resource.setrlimit(resource.RLIMIT_FSIZE, (45_000, 45_000))
 recording = ViewRecording(Path(sys.argv[2]), run.scene)
 for slots in run.chunks(300):
     recording.add(slots)

@@ -346,6 +346,7 @@ def test_the_table_grants_nothing_twice_and_no_wildcard() -> None:
     assert access_control(table)["default_permission"] == "deny"
 
 
+@pytest.mark.long
 def test_a_process_with_a_wrong_brief_says_so(stage: Bench, tmp_path: Path) -> None:
     """An eavesdropper's program whose password is not of this run ends with status 2 and one line."""
     path = replace(stage.briefs[EVE], password="of another run").write(tmp_path)  # noqa: S106 - that is the point

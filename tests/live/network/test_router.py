@@ -181,6 +181,7 @@ def test_bad_packet_is_refused(name: str) -> None:
     assert found.value.exit_status == 3
 
 
+@pytest.mark.long
 def test_bad_packet_ends_the_router(bench: Callable[..., Bench]) -> None:
     """A malformed packet ends the process with status 3, a line that says which, and no traceback."""
     messages, line = BAD["too short"]

@@ -19,6 +19,7 @@ from evedrop.live.protocol.brief import has_part, read_brief
 from evedrop.live.protocol.brief_parts import EavesdropperPart, ObserverPart, RouterPart, SensorPart
 from evedrop.scenario.stream_keys import StreamKeys
 from tests.conftest import Evedrop
+from tests.examples import mostly_long
 from tests.live.protocol.made_briefs import BRIEF, BRIEFS, made, refusal, scenario_of
 
 PLAIN: dict[str, Any] = json.loads(BRIEF.text)
@@ -282,7 +283,18 @@ def entries(table: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any], s
                 yield from entries(inner, f"{path}{name}.")
 
 
-@pytest.mark.parametrize("name", BRIEFS)
+USUAL = [
+    *(f"replay-attack/{process}" for process in ("router", "sensor", "legitimate", "controller")),
+    *(f"acknowledged/{process}" for process in ("router", "sensor")),
+    *(f"colluding/{process}" for process in ("router", "legitimate", "equal")),
+    *(f"twin-track/{process}" for process in ("late", "observer")),
+    "eavesdroppers/suspicious",
+    "noise-before/deaf",
+]
+"""Briefs that have between them every entry that a brief of each role has, and one of a strategy with parameters."""
+
+
+@pytest.mark.parametrize("name", mostly_long(BRIEFS, USUAL))
 def test_every_brief_lacks_nothing_unnoticed(name: str, tmp_path: Path) -> None:
     """Each of its entries and keys, left out or of another type, is refused and named; the whole brief can be used."""
     found = BRIEFS[name]
