@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -27,8 +28,9 @@ UNUSABLE, FAILED, INTERRUPTED, KILLED = 2, 3, 130, -9
 OUTCOMES = ("as if undisturbed", "failed by name", "interrupted", "launcher killed", "MISS")
 _HEEDED_SECONDS = 1.0
 """After a signal to the launcher a run that has slots to come does not complete."""
-_LEAVE_SECONDS = 25.0
-"""For processes whose launcher was killed to write the results and end; and for all others."""
+_LEAVE_SECONDS = 40.0
+"""For processes whose launcher was killed to write the results and end; and for all others. An observer takes 30 at most."""
+_OF_ZENOH = re.compile(r"panicked at \S*/zenoh[^\s/]*/\S+\.rs")
 
 
 def outcome_of(status: int) -> str:
@@ -189,8 +191,9 @@ def _of_what_is_said(run: Run, limited: bool) -> Iterator[str]:
             text = path.read_text(errors="replace")
         except OSError:  # its disk is broken
             continue
-        # Where no thread can be started, Zenoh panics in its own.
+        # Where no thread can be started, Zenoh panics in its own; and elsewhere by a mistake of its own, which must cost nothing.
         panic = limited and "OS can't spawn worker thread" in text
+        panic |= run.launcher.returncode == 0 and "Traceback" not in text and bool(_OF_ZENOH.search(text))
         if not panic and ("Traceback (most recent call last)" in text or "panicked at" in text):
             yield f"{path.relative_to(run.folder)} has a traceback: {text.strip().splitlines()[-1]}"
 

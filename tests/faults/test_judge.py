@@ -299,6 +299,23 @@ def test_digests_that_are_not_those_of_the_rows_are_seen(without: str, ended: En
     assert list(unlike_digests(results.summary, changed))
 
 
+def test_a_panic_in_zenohs_code_must_cost_nothing(ended: Ended, reference: Reference) -> None:
+    """A run that it ends has not kept its promises; and one in other code is ours."""
+    log = ended.out / "logs" / "relay.log"
+    log.parent.mkdir(exist_ok=True, mode=0o700)
+    log.touch(mode=0o600)
+
+    def complaints(place: str, status: int) -> list[str]:
+        log.write_text(f"thread 'rx-0' (1) panicked at {place}:491:27:\ncalled `Option::unwrap()` on a `None` value\n")
+        ended.launcher.returncode = status
+        return [line for line in ended.misses(reference, KILL) if "traceback" in line]
+
+    zenohs = "/root/.cargo/git/checkouts/zenoh-9c599d5ef3e0480e/cc83980/zenoh/src/net/routing/dispatcher/resource.rs"
+    assert complaints(zenohs, 0) == []
+    assert complaints(zenohs, 3)
+    assert complaints("src/kernels.rs", 0)
+
+
 def test_figures_of_shards_cover_all_rows(ended: Ended, reference: Reference) -> None:
     """However far each shard came; unless the run says that some are of an earlier slot."""
     results = load_results(ended.out)

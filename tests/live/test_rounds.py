@@ -92,6 +92,21 @@ def test_losses_that_overlap_are_one_outage() -> None:
     assert said == recovery.outages
 
 
+@pytest.mark.parametrize(("complete", "until"), [(True, 20), (False, None)])
+def test_an_outage_that_is_open_at_the_end_lasts_to_the_last_slot_of_a_complete_run(
+    complete: bool, until: int | None
+) -> None:
+    """A process that has reported all slots holds up nothing; otherwise the run did not go on."""
+    conducted = Conducted()
+    recovery = recovery_of(conducted, TestClock(), 30.0)
+    recovery.look(10)
+    conducted.lose("smart")
+    recovery.look(10)
+    recovery.look(20)
+    recovery.give_up(20, complete)
+    assert [(one.process, one.slot, one.until) for one in recovery.outages] == [("smart", 10, until)]
+
+
 def recovery_of(conducted: Conducted, clock: TestClock, longest_outage: float, pace: float = 0.0) -> Recovery:
     """With batches of 8 slots."""
     conducted.clock = clock

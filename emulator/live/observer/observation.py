@@ -164,7 +164,7 @@ class ObservedRun:
                 raise
             finally:
                 self._dismiss(conductor)
-                self._recovery.give_up(self._joiner.done)
+                self._recovery.give_up(self._joiner.done, complete=self._joiner.done == self._scenario.slots)
                 self._outages = self._recovery.outages
                 self._ended = time.monotonic()
             tell(RunOver())

@@ -150,11 +150,15 @@ class Recovery:
         self._steering.remind()
         self._conductor.report_progress(self._done)
 
-    def give_up(self, done: int) -> None:
-        """Record the outages that are open when the run ends; all slots below `done` are joined."""
+    def give_up(self, done: int, complete: bool = False) -> None:
+        """Record the outages that are open when the run ends; all slots below `done` are joined.
+
+        complete: whether these are all slots, so that none was waited for: the outages lasted to the end.
+        """
         now = self._clock.monotonic()
         self._close(done, now)
         found = self._missing
         found = next(({name: found[name]} for name in (RELAY, ROUTER) if name in found), found)
-        self.outages += [ConnectionOutage(name, slot, None, now - since) for name, (slot, since) in found.items()]
+        until = done if complete else None
+        self.outages += [ConnectionOutage(name, slot, until, now - since) for name, (slot, since) in found.items()]
         self._missing = {}
