@@ -31,6 +31,7 @@ from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.scenario.tables import NetworkTable
 from tests.builders import digests_of
 from tests.conftest import LIMIT, Evedrop, Live, wait_until, with_mark
+from tests.examples import mostly_long
 from tests.privileged import CannotRun, skip
 from tests.processes import parent_of
 from tests.sshd import Sshd, sshd
@@ -125,6 +126,7 @@ def struck(evedrop: Evedrop, what: str, number: signal.Signals) -> None:
     os.kill(pid, number)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("what", ["evedrop host", "ssh"])
 def test_ctrl_c_ends_a_run_whose_connection_hangs(what: str, evedrop: Evedrop, server: Sshd) -> None:
     """The host reports no end; once the connection is closed, the system continues it, and it ends its processes."""
@@ -137,6 +139,7 @@ def test_ctrl_c_ends_a_run_whose_connection_hangs(what: str, evedrop: Evedrop, s
     assert live.results.slots.num_rows > 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("what", ["evedrop host", "ssh"])
 def test_a_killed_launcher_leaves_nothing_where_a_connection_hangs(what: str, evedrop: Evedrop, server: Sshd) -> None:
     """The system ends ssh with the launcher; it would wait for a suspended host, or is suspended itself."""
@@ -157,6 +160,7 @@ def test_a_killed_launcher_leaves_nothing_on_any_host(evedrop: Evedrop, server: 
     nothing_left(evedrop)
 
 
+@pytest.mark.long
 def test_a_host_that_dies_in_the_middle_is_named(evedrop: Evedrop, server: Sshd) -> None:
     """After kill -9 of its connection's server, the run ends, the message names process and host, and the results are kept."""
     live = running(evedrop, server)
@@ -185,7 +189,7 @@ ENDS = {
 }
 
 
-@pytest.mark.parametrize("what", ENDS)
+@pytest.mark.parametrize("what", mostly_long(ENDS, ["evedrop host"]))
 def test_a_host_whose_program_ends_is_named(what: str, evedrop: Evedrop, server: Sshd) -> None:
     """And no process there is said to have been ended by a signal."""
     live = running(evedrop, server, direct=True)
@@ -227,7 +231,7 @@ def other_version(evedrop: Evedrop, server: Sshd) -> Path:
     [
         (nobody_listens, "Connection refused"),
         (no_such_key, "Permission denied"),
-        (no_program, "/nowhere/evedrop"),
+        pytest.param(no_program, "/nowhere/evedrop", marks=pytest.mark.long),
         (other_version, "evedrop 0.0.9 is installed there"),
     ],
 )
@@ -370,6 +374,7 @@ def test_what_ssh_is_given_never_asks_and_has_no_secret(tmp_path: Path) -> None:
     assert words[-7:] == ["-l", "lab", "-p", "2222", "--", "beta.lan", "cd '/a b' && exec '/opt/my env/evedrop' host"]
 
 
+@pytest.mark.long
 def test_ctrl_c_while_a_host_does_not_answer_ends_at_once(evedrop: Evedrop, server: Sshd) -> None:
     """A host that accepts the connection and says nothing: status 130, and no ssh is left."""
     with socket.create_server(("127.0.0.1", 0)) as silent:

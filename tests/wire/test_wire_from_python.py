@@ -166,6 +166,7 @@ def test_the_fixture_ends_the_wires_of_a_test_that_fails(tmp_path: Path) -> None
         assert not (folder / "control.json").exists()
 
 
+@pytest.mark.long
 def test_the_error_of_the_with_block_comes_first(tmp_path: Path) -> None:
     """An expectation that failed as well does not hide it."""
     expectation = {"figure": "scan.delivery", "above": 0.9}

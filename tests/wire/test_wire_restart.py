@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pyarrow as pa
+import pytest
 
 from evedrop.live.network.control_file import read_control
 from evedrop.live.network.operator import ask
@@ -116,6 +117,7 @@ delay = { model = "normal", mean = "100 ms", deviation = "30 ms" }
 """
 
 
+@pytest.mark.long
 def test_a_killed_wire_calls_delivered_what_it_had_sent(evedrop: Evedrop) -> None:
     """Kill -9 while delayed messages pass: what arrived is delivered, but for one that may have been in its hands."""
     path = evedrop.folder / "robot.toml"

@@ -97,7 +97,7 @@ def _patient_zenoh(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("evedrop.wire.side.side_config", patient)
 
 
-@pytest.mark.parametrize("tap", [True, False])
+@pytest.mark.parametrize("tap", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_a_stopped_reader_at_a_third_side_holds_up_nobody(tap: bool, tmp_path: Path) -> None:
     """The base has all messages although Zenoh waits for the readers."""
     plan = plan_of(link("robot", "base"), link("robot", "third", tap=tap), link("base", "robot"))
@@ -244,6 +244,7 @@ with at_work(plan_of(link("a", "b"), link("c", "d")), Path(sys.argv[1])) as wire
 """
 
 
+@pytest.mark.long
 def test_many_senders_that_wait_hold_up_no_other_side(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each holds a thread of Zenoh, which has two by default, and starts them with the first session of a process."""
     monkeypatch.delenv("ZENOH_RUNTIME", raising=False)
