@@ -175,6 +175,7 @@ def test_a_plug_in_needs_one_module(tutorial: Evedrop) -> None:
     assert tutorial("check", "three.toml").status == 0
 
 
+@pytest.mark.long
 def test_classes_of_a_plug_in_are_compared(tutorial: Evedrop) -> None:
     """A comparison takes a scheme and an eavesdropper of one's own among the built-in ones."""
     words = (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 from typing import Any, final
 from unittest.mock import patch
@@ -36,11 +37,17 @@ def judged(found: Reproduction) -> None:
             assert len(row.reason) > 20, row
 
 
+@cache
+def reproduced_quickly(name: str) -> tuple[Reproduction, list[str]]:
+    """A paper with small sizes, computed once for all tests, and the progress that was told."""
+    told: list[str] = []
+    return reproduce(name, quick=True, progress=told.append), told
+
+
 @pytest.mark.parametrize("name", mostly_long(PAPERS, {*PAPERS} - {"luecke2022"}))
 def test_every_paper_is_reproduced_quickly(name: str) -> None:
     """With small sizes; progress is reported; the JSON is strict."""
-    told: list[str] = []
-    found = reproduce(name, quick=True, progress=told.append)
+    found, told = reproduced_quickly(name)
     judged(found)
     errata = [row for row in found.rows if row.verdict is NumberVerdict.ERRATUM]
     assert not errata or PAPERS[name].text_read
@@ -127,12 +134,12 @@ def test_a_paper_is_printed_and_written(evedrop: Evedrop, tmp_path: Path) -> Non
 
 def test_a_paper_of_which_no_number_is_known_agrees_with_nothing() -> None:
     """Our simulations of its formulas have a verdict of their own, and the count of its own numbers is 0."""
-    found = reproduce("naha2021", quick=True)
+    found, _ = reproduced_quickly("naha2021")
     assert found.printed_compared == 0
     assert found.scope == "No published number was compared: none was available."
     assert set(found.counts) == {"formula", "not public", "not comparable"}
     assert {row["printed"] for row in found.as_dict()["rows"] if row["verdict"] == "formula"} == {False}
-    assert reproduce("crimson2023", quick=True).printed_compared == 1
+    assert reproduced_quickly("crimson2023")[0].printed_compared == 1
 
 
 @final

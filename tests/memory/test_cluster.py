@@ -186,10 +186,9 @@ def test_a_comparison_on_the_cluster_is_the_local_one(evedrop: Evedrop, schedule
 @pytest.mark.parametrize(
     "study",
     [
-        ("cost", "microgrid", "--trials", "51", "--slots", "4"),
-        ("learned", "learning", "--trials", "101", "--slots", "9", "--set", "expect=[]"),
+        pytest.param(("cost", "microgrid", "--trials", "51", "--slots", "4"), id="cost", marks=pytest.mark.long),
+        pytest.param(("learned", "learning", "--trials", "101", "--slots", "9", "--set", "expect=[]"), id="learned"),
     ],
-    ids=["cost", "learned"],
 )
 def test_a_table_on_the_cluster_is_the_local_one(evedrop: Evedrop, scheduler: str, study: tuple[str, ...]) -> None:
     """The same JSON from two tasks, and from two processes of this machine."""

@@ -300,7 +300,7 @@ def test_order_of_recorded_rows_does_not_depend_on_the_tasks(tmp_path: Path) -> 
 
 STUDIES = {
     "sweep": (
-        *("sweep", "eavesdroppers", "--over", "encoding.state_probability=0.3,0.6", "--over", "slots=5,8"),
+        *("sweep", "eavesdroppers", "--over", "encoding.state_probability=0.3,0.5,0.7", "--slots", "8"),
         *("--trials", "600", "--workers", "1", "--set", "expect=[]"),
     ),
     "compare": (

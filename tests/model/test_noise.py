@@ -27,6 +27,7 @@ from evedrop.model.theory.leak import Leaks
 from evedrop.model.theory.noise_taken import NoiseTaken, TakesNoise
 from evedrop.streams import Batch
 from tests.builders import UNSTABLE
+from tests.examples import mostly_long
 from tests.model.slot_loop import STABLE, Played, coins, keys_of, play
 
 SMALL = [[0.02, 0.004], [0.004, 0.03]]
@@ -263,7 +264,7 @@ def test_kernels_agree_on_mixtures_of_states_and_noise(given: Any) -> None:
 
 
 @LAWS
-@pytest.mark.parametrize("name", ["likelihood", "power-test"])
+@pytest.mark.parametrize("name", mostly_long(["likelihood", "power-test"], ["likelihood"]))
 def test_detectors_decide_by_the_ratio_of_densities(name: str, given: Any) -> None:
     """The power test by the density of states at any time, `likelihood` by that of a state after its own estimate."""
     batch = Batch(12, 40)

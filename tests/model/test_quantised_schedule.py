@@ -115,7 +115,7 @@ def test_packets_go_by_the_holding_time_and_a_coin(threshold: float) -> None:
         assert abs(np.mean(early) - share) < 4.0 * np.sqrt(share * (1.0 - share) / len(early))
 
 
-@pytest.mark.parametrize("process", [STABLE, UNSTABLE])
+@pytest.mark.parametrize("process", [pytest.param(STABLE, marks=pytest.mark.long), UNSTABLE])
 @pytest.mark.parametrize("threshold", [1.0, 1.3, 2.0, 2.6])
 def test_expectations_are_those_of_all_courses(process: Process, threshold: float) -> None:
     """E P over every course of links, acknowledgements and coins in four slots, for user and eavesdropper."""

@@ -225,7 +225,7 @@ def test_values_on_the_command_line_are_toml_or_text(value: Any) -> None:
 @pytest.mark.parametrize("name", sorted(shipped()))
 def test_the_resolved_scenario_is_the_same_scenario(name: str, tmp_path: Path) -> None:
     """The scenario in a results folder reads back as the one that was run, with the versions next to it."""
-    scenario = load(name, {"slots": 7200} if name.startswith("microgrid") else None)
+    scenario = load(name, {"slots": 600} if name.startswith("microgrid") else None)
     write_resolved(tmp_path, scenario)
     text = (tmp_path / "scenario.toml").read_text(encoding="utf-8")
     again = parse(text, "resolved", folder=tmp_path)

@@ -124,6 +124,7 @@ def test_other_expectations_are_those_of_tables_and_summary(made: Runs) -> None:
     assert late["held"] is False
 
 
+@pytest.mark.long
 def test_expectations_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
     """Two blocks and a part: the same to the last bit."""
     options = {**OPTIONS, "trials": 1037, "record_trials": 1}

@@ -24,17 +24,21 @@ from evedrop.results.writer import load_results
 from evedrop.score.scorekeeper import Ending, summary_of
 from evedrop.score.summary import Summary
 from evedrop.score.totals import Totals
+from tests.examples import mostly_long
 
 
 @pytest.mark.parametrize(
     ("scenario", "mode"),
-    [
-        *(
-            (name, Mode.EXACT)
-            for name in ("acknowledged", "driving-away", "heated-room", "late", "microgrid", "vehicle")
-        ),
-        ("numerical", Mode.COVARIANCE_ONLY),
-    ],
+    mostly_long(
+        [
+            *(
+                (name, Mode.EXACT)
+                for name in ("acknowledged", "driving-away", "heated-room", "late", "microgrid", "vehicle")
+            ),
+            ("numerical", Mode.COVARIANCE_ONLY),
+        ],
+        [("acknowledged", Mode.EXACT), ("heated-room", Mode.EXACT), ("numerical", Mode.COVARIANCE_ONLY)],
+    ),
 )
 def test_a_summary_that_was_read_is_written_to_the_byte(tmp_path: Path, scenario: str, mode: Mode) -> None:
     """With filter, controller, applications, events, detection, delays, and the figure of one mode."""

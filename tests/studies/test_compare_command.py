@@ -14,6 +14,7 @@ from evedrop.loading import load
 from evedrop.model.schemes import SCHEMES
 from evedrop.studies.matchups import adversaries_of, matchups_of
 from tests.conftest import Evedrop
+from tests.examples import mostly_long
 
 
 def test_the_scenario_says_what_it_says_and_the_rest_is_documented() -> None:
@@ -56,7 +57,13 @@ def test_flips_have_the_probability_of_the_scenario() -> None:
         assert {match.adversary for match in matchups.undefined if match.scheme == "plain"} == {"flips", "forges"}
 
 
-@pytest.mark.parametrize("name", ["numerical", "vehicle", "fading", "colluding", "restart", "late", "driving-away"])
+@pytest.mark.parametrize(
+    "name",
+    mostly_long(
+        ["numerical", "vehicle", "fading", "colluding", "restart", "late", "driving-away"],
+        ["colluding", "late", "restart"],
+    ),
+)
 def test_shipped_scenarios_can_be_compared(name: str) -> None:
     """For any links, events and eavesdroppers."""
     assert len(matchups_of(load(name)).groups) >= len(SCHEMES)

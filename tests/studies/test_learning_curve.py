@@ -51,6 +51,7 @@ def test_before_it_has_learned_the_errors_are_those_of_its_start() -> None:
     assert off["Q"].standard_error is not None
 
 
+@pytest.mark.long
 def test_sets_of_trials_side_by_side_change_nothing() -> None:
     """The same rows with two trials at a time."""
     scenario = load("learning", SMALL)
