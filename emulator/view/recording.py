@@ -40,7 +40,7 @@ Note = TypeVar("Note")
 class RecordingThread(ABC, Generic[Chunk, Note]):
     """A thread that writes a recording to `path`. Neither disk nor panels can make any method raise: see `failure`.
 
-    A subclass says what is recorded. The constructor calls `_layout` and `_style`, the thread calls `_send`.
+    A subclass says what is recorded. The thread calls `_layout` and `_style` before the constructor returns, and `_send` later.
     """
 
     def __init__(self, path: Path, name: str, notes: Sequence[Note]) -> None:
@@ -55,13 +55,11 @@ class RecordingThread(ABC, Generic[Chunk, Note]):
         """Whether the present call of `_send` is the last one."""
         self._changed = threading.Condition()
         self._file = rr.RecordingStream(_APPLICATION, recording_id=name)
-        try:
-            self._file.save(private_file(path), default_blueprint=self._layout())
-            self._style(self._file)
-        except Exception as error:
-            self._give_up(str(error))
-        self._writer = threading.Thread(target=self._write, name="recording", daemon=True)
+        begun = threading.Event()
+        self._writer = threading.Thread(target=self._record, args=(path, begun), name="recording", daemon=True)
         self._writer.start()
+        if not begun.wait(FILE_TIMEOUT):
+            self._give_up("the file could not be written")
 
     @abstractmethod
     def _layout(self) -> rrb.Blueprint:
@@ -103,6 +101,16 @@ class RecordingThread(ABC, Generic[Chunk, Note]):
     def _give_up(self, why: str) -> None:
         if self.failure is None:
             self.failure = f"the recording is incomplete: {why}; free some space, or choose another folder"
+
+    def _record(self, path: Path, begun: threading.Event) -> None:
+        """Begin the file and write it to its end. Rerun never returns from a file that cannot even be begun."""
+        try:
+            self._file.save(private_file(path), default_blueprint=self._layout())
+            self._style(self._file)
+        except Exception as error:
+            self._give_up(str(error))
+        begun.set()
+        self._write()
 
     def _write(self) -> None:
         while True:

@@ -186,7 +186,7 @@ from pathlib import Path
 from evedrop.view.recording import ViewRecording
 run = simulate(orbit(), 900)
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (45_000, 45_000))
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]),) * 2)
 recording = ViewRecording(Path(sys.argv[2]), run.scene)
 for slots in run.chunks(300):
     recording.add(slots)
@@ -196,9 +196,13 @@ os._exit(0)
 """
 
 
-def test_full_disk_ends_the_recording_and_not_the_run(tmp_path: Path) -> None:
-    """When the file can grow no more, adding and closing still end in time, and the reason is kept."""
-    command = [sys.executable, "-B", "-c", FULL_DISK, str(Path(__file__).parent), str(tmp_path / "r.rrd")]
+@pytest.mark.parametrize("most", [100, 30_000, 80_000])
+def test_full_disk_ends_the_recording_and_not_the_run(most: int, tmp_path: Path) -> None:
+    """When the file can grow no more, beginning, adding and closing still end in time, and the reason is kept.
+
+    most: its size, which the layout, the styles, or the slots exceed.
+    """
+    command = [sys.executable, "-B", "-c", FULL_DISK, str(Path(__file__).parent), str(tmp_path / "r.rrd"), str(most)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT, check=True)
     assert done.stdout.startswith("unsafe the recording is incomplete")
 
