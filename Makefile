@@ -15,7 +15,7 @@ demo: $(READY)
 
 # What needs more than processors and a disk has a target of its own, below: packages to install, a driver that draws, root.
 test: $(READY)
-	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder -m "not (long or hosts or containers or fresh or notebooks or wheel or pictures)"
+	$(BIN)/python -m pytest -n 6 --dist loadfile --no-loadscope-reorder -m "not (long or hosts or containers or fresh or notebooks or wheel or pictures)"
 
 # The wheel, built and installed into environments of its own.
 test-wheel: $(READY)

@@ -137,6 +137,7 @@ def test_options_of_policies_alone_are_refused(evedrop: Evedrop) -> None:
     assert "--weight is for --policy and --schedule; leave it out" in done.err
 
 
+@pytest.mark.long
 def test_another_scheme_is_refused_with_a_command_that_works(evedrop: Evedrop, tmp_path: Path) -> None:
     """The advised command writes a scenario that can be designed."""
     done = evedrop("design", "numerical", "--policy")

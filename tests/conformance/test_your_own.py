@@ -128,6 +128,7 @@ def test_an_installed_package_gives_short_names(tutorial: Evedrop, monkeypatch: 
     assert "did you mean flip?" in done.err
 
 
+@pytest.mark.long
 def test_a_link_of_a_run_that_goes_on_can_be_one_of_its_modules(tutorial: Evedrop) -> None:
     """The router knows where the run's modules are; a run that was started without any gets none on the way."""
     shifts = {"link": "legitimate", "set": {"loss": {"model": "shifts:Shifts", "period": 10, "good": 0.9, "bad": 0.1}}}

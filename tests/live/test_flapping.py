@@ -122,6 +122,7 @@ def may_reset() -> bool:
     return True
 
 
+@pytest.mark.long
 def test_connections_that_flap_change_nothing(evedrop: Evedrop) -> None:
     """Cut by a proxy between the router and everybody else: digests and links are those in memory."""
     disturbed(0, evedrop, "proxy")

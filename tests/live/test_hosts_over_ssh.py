@@ -150,6 +150,7 @@ def test_a_killed_launcher_leaves_nothing_where_a_connection_hangs(what: str, ev
     nothing_left(evedrop)
 
 
+@pytest.mark.long
 def test_a_killed_launcher_leaves_nothing_on_any_host(evedrop: Evedrop, server: Sshd) -> None:
     """Its connections close, and the hosts end their processes; even one that is paused."""
     live = running(evedrop, server)
@@ -189,6 +190,7 @@ ENDS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("what", mostly_long(ENDS, ["evedrop host"]))
 def test_a_host_whose_program_ends_is_named(what: str, evedrop: Evedrop, server: Sshd) -> None:
     """And no process there is said to have been ended by a signal."""

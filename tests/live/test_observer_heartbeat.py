@@ -47,6 +47,7 @@ def slow(evedrop: Evedrop, finish: float, silence: float, *arguments: str, grace
     return evedrop.live("eavesdroppers", "--slots", "300", *arguments, env=environment)
 
 
+@pytest.mark.long
 def test_a_run_that_takes_long_to_finish_is_not_given_up(evedrop: Evedrop) -> None:
     """More than twice as long as a silence may last: the observer says that it lives, and the run is complete."""
     live = slow(evedrop, 6.5, 3.0)

@@ -64,6 +64,7 @@ def inputs_of(results: Results) -> pa.Table:
     return results.inputs.sort_by([("slot", "ascending"), ("trial", "ascending")])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("other", [0, 1])
 def test_what_is_kept_by_trial_is_the_same_to_the_bit(ran: Ran, other: int) -> None:
     """Inputs and recorded trials, the digests of everybody and the controller, and the house."""
@@ -143,6 +144,7 @@ def test_a_loop_that_is_cut_short_is_made_one(evedrop: Evedrop, name: str) -> No
     assert summary["household"]["bought_energy"] > 0.0
 
 
+@pytest.mark.long
 def test_a_killed_router_of_a_shard_is_started_again(evedrop: Evedrop, tmp_path: Path) -> None:
     """The run ends with the digests of an undisturbed one, and says which shard was cut off, as it goes on and at the end."""
     options = {"trials": 5, "slots": 1500, "pace": 0.001, "shards": 2, "expect": []}

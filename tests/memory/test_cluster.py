@@ -247,6 +247,7 @@ def test_pytest_computes_in_memory_on_the_cluster(evedrop: Evedrop, scheduler: s
     assert "--evedrop-scheduler computes trials in memory; add --evedrop-in-memory, or leave it out" in live.stderr
 
 
+@pytest.mark.long
 def test_python_takes_a_scheduler_by_its_address(scheduler: str) -> None:
     """Every function that simulates in memory gives what it gives here."""
     small: dict[str, Any] = {"slots": 20, "trials": 30}

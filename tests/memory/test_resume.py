@@ -351,6 +351,7 @@ def test_another_sweep_or_comparison_is_refused(
     assert (done.status, "has another study: " in done.err, what in done.err) == (2, True, True), done.err
 
 
+@pytest.mark.long
 def test_tests_go_on_too(evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of two scenarios that are tested in memory, one has ended when the other is interrupted: it is not run again."""
     text = evedrop("show", "eavesdroppers").out.replace("slots = 5000", "slots = 30")

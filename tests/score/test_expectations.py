@@ -228,6 +228,7 @@ def test_a_link_must_be_within_its_interval(account: dict[str, Any], found: floa
     assert (one.found, one.held) == (found, held)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("command", ["run", "montecarlo"])
 def test_the_printed_command_shows_the_failure_again(evedrop: Evedrop, command: str) -> None:
     """From the results folder, whose name has a blank in it, and with everything that was changed for the run: exit 1."""

@@ -105,6 +105,7 @@ def test_late_packets_count_in_the_trials_too() -> None:
     assert any(tally.late for tally in totals.tallies.values())
 
 
+@pytest.mark.long
 def test_a_live_run_has_the_standard_errors_of_memory(recorded: Results, tmp_path: Path) -> None:
     """In shards too, and to the bit for the believed covariance, whether all trials are recorded or not."""
     some: dict[str, Any] = {"slots": 300, "trials": 7, "expect": [], "view": "off"}

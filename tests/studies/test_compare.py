@@ -199,6 +199,7 @@ def test_simulation_agrees_with_theory(everything: Everything) -> None:
     assert judged > 40
 
 
+@pytest.mark.long
 def test_the_cipher_dominates(everything: Everything, literature: Comparison) -> None:
     """Nothing is cheaper for the user in the long run, and nothing keeps every adversary further off."""
     assert everything[0].dominant == literature.dominant == ("cipher",)

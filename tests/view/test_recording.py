@@ -13,6 +13,7 @@ from evedrop.view.panels.error import SquaredError
 from evedrop.view.panels.state_plane import frames, stride
 from evedrop.view.recording import Scene, ViewRecording
 from tests.conftest import LIMIT
+from tests.examples import mostly_long
 from tests.view.read_back import lane, rows
 from tests.view.simulated_run import Simulated
 
@@ -196,7 +197,7 @@ os._exit(0)
 """
 
 
-@pytest.mark.parametrize("most", [100, 30_000, 80_000])
+@pytest.mark.parametrize("most", mostly_long([100, 30_000, 80_000], [30_000]))
 def test_full_disk_ends_the_recording_and_not_the_run(most: int, tmp_path: Path) -> None:
     """When the file can grow no more, beginning, adding and closing still end in time, and the reason is kept.
 

@@ -293,6 +293,7 @@ BeliefReporter.add_slots = add_slots
 """
 
 
+@pytest.mark.long
 def test_messages_of_megabytes_harm_nobody(evedrop: Evedrop) -> None:
     """The router drops messages larger than any of the run; the run goes on to its end, and no process takes more memory."""
     live = evedrop.live("eavesdroppers", "--slots", "1200", "--json", env=with_rogue(evedrop, "naive", BOMB))
