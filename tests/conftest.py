@@ -9,6 +9,7 @@ import contextlib
 import gc
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -110,6 +111,11 @@ class Done:
         """What --json printed: one object and nothing else."""
         found: dict[str, Any] = json.loads(self.out)
         return found
+
+
+def cause_of(ended: str) -> str:
+    """Why a run ended, by its summary, without the moment of its figures, which a killed observer's summary may add."""
+    return re.sub(r" \(the figures are as of [^)]*\)", "", ended)
 
 
 class Live:

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from evedrop.results.growing_tables import last_round
-from tests.conftest import Evedrop, Live, wait_until, with_mark
+from tests.conftest import Evedrop, Live, cause_of, wait_until, with_mark
 from tests.examples import mostly_long
 from tests.rogue import with_rogue
 from tests.steps import stepping
@@ -26,7 +26,7 @@ def ended_by_fault(live: Live) -> str:
     done = live.end()
     assert done.status == 3, done.err
     live.nothing_left()
-    assert live.results.summary["ended"] in done.err
+    assert cause_of(live.results.summary["ended"]) in done.err
     return done.err
 
 

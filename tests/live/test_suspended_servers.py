@@ -13,7 +13,7 @@ from evedrop.environment import own_environment
 from evedrop.errors import Interrupted
 from evedrop.live.launch.preloading import ForkServer, PreloadedStarter, fork_servers
 from evedrop.live.launch.starter import FORK_SERVER_LOST
-from tests.conftest import LIMIT, Evedrop, Live, wait_until
+from tests.conftest import LIMIT, Evedrop, Live, cause_of, wait_until
 from tests.examples import mostly_long
 from tests.processes import parent_of
 
@@ -95,7 +95,7 @@ def test_a_killed_fork_server_is_named_and_no_victim(evedrop: Evedrop, which: st
     assert ("observer" in done.err.splitlines()[0]) == (which == "that of observers")
     assert "was ended by signal" not in done.err
     live.nothing_left()
-    assert live.results.summary["ended"] in done.err
+    assert cause_of(live.results.summary["ended"]) in done.err
 
 
 def suspended(server: ForkServer, folder: Path) -> int:
