@@ -18,7 +18,7 @@ _MOST_THREADS = 64
 _WITHOUT_ROOM = ("failed to map segment", "cannot allocate memory")
 """What the system says in an ImportError about a library that found no memory."""
 _WITHOUT_THREAD = ("can't start new thread", "can't spawn worker thread", "Failed to launch worker thread")
-"""What Python, Zenoh (in a PanicException, which is no Exception) and Arrow say."""
+"""What Python, Zenoh (in a PanicException, which does not derive from Exception) and Arrow say."""
 _LACKS = {
     errno.EAGAIN: "no further process or thread can be started",
     errno.ENOMEM: "there is not enough memory",

@@ -38,11 +38,10 @@ def mostly_long(every: Iterable[Any], usual: Iterable[Any]) -> list[Any]:
 
     Raises ValueError if one of `usual` is not there.
     """
-    few = list(usual)
-    params = list(every)
-    if missing := [one for one in few if one not in params]:
+    few, values = list(usual), list(every)
+    if missing := [value for value in few if value not in values]:
         raise ValueError(f"no parameter is {missing[0]!r}")
     return [
-        pytest.param(*(one if isinstance(one, tuple) else (one,)), marks=[] if one in few else pytest.mark.long)
-        for one in params
+        pytest.param(*(value if isinstance(value, tuple) else (value,)), marks=[] if value in few else pytest.mark.long)
+        for value in values
     ]

@@ -48,7 +48,7 @@ def _status(given: list[str]) -> int:
     refuse_scipy_without_room()
     try:
         return _status_of(given)
-    except BaseException as error:  # also a panic of Zenoh, which is no Exception
+    except BaseException as error:  # a panic of Zenoh is not an Exception
         if (lack := lack_of(error)) is None:
             raise
     say(lack)  # after the error has been let go of, and the memory that it holds

@@ -29,10 +29,9 @@ def note_end(folder: Path, scenario: Scenario, how: str) -> Summary:
     """
     left_behind = is_unfinished(folder)
     rows = last_round(folder)
+    how = noted(how, age_of_figures(folder))
     try:
-        summary = load_results(folder).typed_summary
-        first, *excerpt = how.splitlines()  # of a log
-        summary = replace(summary, ended="\n".join([first + age_of_figures(folder), *excerpt]))
+        summary = replace(load_results(folder).typed_summary, ended=how)
     except UsageError:  # there are no figures
         totals = Totals.nothing(scenario, scenario.trials)
         summary = summary_of(scenario, totals, dict.fromkeys(scenario.digested), Ending(0.0, how))
@@ -50,3 +49,9 @@ def note_end(folder: Path, scenario: Scenario, how: str) -> Summary:
             finish(folder)
     write_summary(folder, summary)
     return summary
+
+
+def noted(how: str, note: str) -> str:
+    """The reason for a run's end, with a note at the end of its first line: an excerpt of a log may follow."""
+    first, *excerpt = how.split("\n")
+    return "\n".join([first + note, *excerpt])

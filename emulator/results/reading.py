@@ -269,15 +269,19 @@ def _cut_short(folder: Path) -> dict[str, Any]:
 
 
 def age_of_figures(folder: Path) -> str:
-    """Of an unfinished results folder: which moment its figures are of, in brackets, if it is not that of its rows."""
+    """What `ended` of an unfinished results folder adds if its figures are of an earlier moment than its rows."""
     rows = last_round(folder)
     try:
         figures = _read_summary(figures_path(folder))
-    except UsageError:
-        return ""
-    if figures["ended"] == rows.at:
-        return ""
-    return f" (the figures are as of {figures['ended']}{'; the tables have more' if figures['slots'] < rows.slots else ''})"
+        at, slots = figures["ended"], figures["slots"]
+    except UsageError:  # no figures have been written
+        at, slots = "slot 0", 0
+    return as_of(at, slots < rows.slots) if rows.at and at != rows.at else ""
+
+
+def as_of(moment: str, more: bool = True) -> str:
+    """What `ended` adds if figures are of an earlier moment. more: whether the tables have slots that the figures lack."""
+    return f" (the figures are as of {moment}{'; the tables have more' if more else ''})"
 
 
 def _no_figures(folder: Path) -> dict[str, Any]:

@@ -40,7 +40,7 @@ Note = TypeVar("Note")
 class RecordingThread(ABC, Generic[Chunk, Note]):
     """A thread that writes a recording to `path`. Neither disk nor panels can make any method raise: see `failure`.
 
-    A subclass says what is recorded. The thread calls `_layout` and `_style` before the constructor returns, and `_send` later.
+    A subclass says what is recorded. The constructor calls `_layout`, the thread `_style` and then `_send`.
     """
 
     def __init__(self, path: Path, name: str, notes: Sequence[Note]) -> None:
@@ -57,6 +57,11 @@ class RecordingThread(ABC, Generic[Chunk, Note]):
         self._file = rr.RecordingStream(_APPLICATION, recording_id=name)
         begun = threading.Event()
         self._writer = threading.Thread(target=self._record, args=(path, begun), name="recording", daemon=True)
+        try:
+            self._blueprint = self._layout()
+        except Exception as error:
+            self._give_up(str(error))
+            begun.set()
         self._writer.start()
         if not begun.wait(FILE_TIMEOUT):
             self._give_up("the file could not be written")
@@ -104,11 +109,12 @@ class RecordingThread(ABC, Generic[Chunk, Note]):
 
     def _record(self, path: Path, begun: threading.Event) -> None:
         """Begin the file and write it to its end. Rerun never returns from a file that cannot even be begun."""
-        try:
-            self._file.save(private_file(path), default_blueprint=self._layout())
-            self._style(self._file)
-        except Exception as error:
-            self._give_up(str(error))
+        if self.failure is None:
+            try:
+                self._file.save(private_file(path), default_blueprint=self._blueprint)
+                self._style(self._file)
+            except Exception as error:
+                self._give_up(str(error))
         begun.set()
         self._write()
 

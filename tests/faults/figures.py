@@ -120,9 +120,9 @@ def unlike_digests(summary: Mapping[str, Any], digests: pa.Table) -> Iterator[st
         whole = b"".join(
             b"".join(of_trial) for of_trial in zip(*(blocks[start] for start in sorted(blocks)), strict=False)
         )
-        found = hashlib.sha256(whole).hexdigest()
-        if found != peer["digest"]:
-            yield f"the digest of {name} is {peer['digest'][:12]}, and by the rows of digests {found[:12]}"
+        of_rows = hashlib.sha256(whole).hexdigest()
+        if of_rows != peer["digest"]:
+            yield f"the digest of {name} is {peer['digest'][:12]}, and by the rows of digests {of_rows[:12]}"
 
 
 def _means(slots: pa.Table, end: int) -> dict[str, dict[str, float]]:

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from evedrop.results.writer import load_results
 from tests.faults.campaign import SKIPPED, Campaign
 from tests.faults.cases import HASTY_SECONDS, PATIENT_SECONDS, Case, case_of
-from tests.faults.disturbed import CLEANER, FORK_SERVERS
+from tests.faults.disturbed import CLEANER, CONFUSED_FILE, FORK_SERVERS, disturbed
 from tests.faults.facilities import Facilities
 from tests.faults.kinds import EVERYBODY, KINDS, LIMITS
 from tests.faults.moments import PHASES
@@ -56,6 +57,15 @@ def test_cases_of_the_campaign_keep_what_is_promised(ends: dict[str, str]) -> No
     for case, end in ends.items():
         assert end in outcomes[case]
     assert f" in {len(ends)} runs, 0 with a miss" in done.stdout
+
+
+@pytest.mark.long
+def test_a_run_whose_router_confuses_keys_leaves_word_of_it(tmp_path: Path) -> None:
+    """Otherwise the judge would not ask for the messages that were dropped."""
+    with disturbed(VARIANTS["plain"], tmp_path, limits={"confused": 20}) as run:
+        assert run.launcher.wait() == 0, run.text("stderr")
+        assert (tmp_path / CONFUSED_FILE).exists()
+        assert load_results(run.out).summary["misdelivered"]
 
 
 def test_a_number_is_always_the_same_case() -> None:

@@ -47,12 +47,12 @@ def reproduced_quickly(name: str) -> tuple[Reproduction, list[str]]:
 @pytest.mark.parametrize("name", mostly_long(PAPERS, {*PAPERS} - {"luecke2022"}))
 def test_every_paper_is_reproduced_quickly(name: str) -> None:
     """With small sizes; progress is reported; the JSON is strict."""
-    found, told = reproduced_quickly(name)
-    judged(found)
-    errata = [row for row in found.rows if row.verdict is NumberVerdict.ERRATUM]
+    reproduction, progress = reproduced_quickly(name)
+    judged(reproduction)
+    errata = [row for row in reproduction.rows if row.verdict is NumberVerdict.ERRATUM]
     assert not errata or PAPERS[name].text_read
-    assert told
-    assert json.dumps(found.as_dict(), allow_nan=False)
+    assert progress
+    assert json.dumps(reproduction.as_dict(), allow_nan=False)
 
 
 @pytest.mark.long
@@ -134,11 +134,11 @@ def test_a_paper_is_printed_and_written(evedrop: Evedrop, tmp_path: Path) -> Non
 
 def test_a_paper_of_which_no_number_is_known_agrees_with_nothing() -> None:
     """Our simulations of its formulas have a verdict of their own, and the count of its own numbers is 0."""
-    found, _ = reproduced_quickly("naha2021")
-    assert found.printed_compared == 0
-    assert found.scope == "No published number was compared: none was available."
-    assert set(found.counts) == {"formula", "not public", "not comparable"}
-    assert {row["printed"] for row in found.as_dict()["rows"] if row["verdict"] == "formula"} == {False}
+    reproduction, _ = reproduced_quickly("naha2021")
+    assert reproduction.printed_compared == 0
+    assert reproduction.scope == "No published number was compared: none was available."
+    assert set(reproduction.counts) == {"formula", "not public", "not comparable"}
+    assert {row["printed"] for row in reproduction.as_dict()["rows"] if row["verdict"] == "formula"} == {False}
     assert reproduced_quickly("crimson2023")[0].printed_compared == 1
 
 

@@ -275,7 +275,8 @@ def test_a_killed_observer_costs_no_slot_that_is_on_disk(evedrop: Evedrop) -> No
     results = live.results
     assert results.slots.num_rows == results.journal.num_rows
     assert {3, 5} & set(results.slots["trials"].to_pylist())
-    assert re.search(r"\(the figures are as of slot \d+ in shard 2; the tables have more\)$", results.summary["ended"])
+    reason = results.summary["ended"].splitlines()[0]
+    assert re.search(r"\(the figures are as of slot \d+ in shard 2; the tables have more\)$", reason)
 
 
 def test_an_interrupted_run_leaves_one_folder_and_no_process(evedrop: Evedrop) -> None:

@@ -23,7 +23,8 @@ CODES = pytest.mark.parametrize("scheme", [Acknowledged, OpenLoop])
 
 @CODES
 @pytest.mark.parametrize(
-    "process", [UNSTABLE, DRIFTING, *(pytest.param(one, marks=pytest.mark.long) for one in (STABLE, MIXED)), SINGULAR]
+    "process",
+    [UNSTABLE, DRIFTING, *(pytest.param(stable, marks=pytest.mark.long) for stable in (STABLE, MIXED)), SINGULAR],
 )
 def test_packets_are_the_codes(process: Process, scheme: type[Scheme]) -> None:
     """Z is x_k − L_{t,k} x_t with t the last acknowledged slot, as the header says; x_k with −1 before the first."""
@@ -93,7 +94,7 @@ def conditioned(
 
 @CODES
 @pytest.mark.parametrize(
-    "process", [UNSTABLE, *(pytest.param(one, marks=pytest.mark.long) for one in (STABLE, MIXED)), SINGULAR]
+    "process", [UNSTABLE, *(pytest.param(stable, marks=pytest.mark.long) for stable in (STABLE, MIXED)), SINGULAR]
 )
 def test_the_eavesdropper_of_references_is_optimal(process: Process, scheme: type[Scheme]) -> None:
     """Its estimate and covariance are those of the state given all that it heard, in courses of five slots, for either code."""

@@ -44,7 +44,9 @@ def test_expectations_are_the_recursion(process: Process, rule: str) -> None:
             assert np.allclose(belief.P @ chances, expected[k], rtol=1e-9, atol=1e-13)
 
 
-@pytest.mark.parametrize("process", [UNSTABLE, *(pytest.param(one, marks=pytest.mark.long) for one in (STABLE, MIXED))])
+@pytest.mark.parametrize(
+    "process", [UNSTABLE, *(pytest.param(stable, marks=pytest.mark.long) for stable in (STABLE, MIXED))]
+)
 @pytest.mark.parametrize("back", [0.0, 0.8])
 def test_the_floor_is_below_the_exact_expectation(process: Process, back: float) -> None:
     """Over every course of five slots: a bound in each slot, exact without critical slots, and close to what it bounds."""

@@ -294,7 +294,7 @@ def late(process: Process, law: LinkLaw, outcomes_at: Callable[[float], Outcomes
 @pytest.mark.parametrize(
     ("process", "receiver"),
     [
-        *(pytest.param(MARGINAL, one, marks=[] if one == "smart" else pytest.mark.long) for one in RECEIVERS),
+        *(pytest.param(MARGINAL, name, marks=[] if name == "smart" else pytest.mark.long) for name in RECEIVERS),
         (UNSTABLE, "naive"),
         pytest.param(STABLE, "legitimate", marks=pytest.mark.long),
     ],

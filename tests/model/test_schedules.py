@@ -239,24 +239,24 @@ def test_where_no_states_exceed_the_bound_all_slots_have_as_few_as_keep_it() -> 
 
 def test_a_design_as_json() -> None:
     """The schedules against each eavesdropper; who is left out is there only if somebody is."""
-    found = best_schedule(STABLE, MU, EAVESDROPPERS["smart"].outcomes, 3, levels=3)
-    assert list(found.as_dict()) == ["best", "constant", "grid", "exact"]
-    assert ScheduleDesign({"smart": found}, {}).as_dict() == {"eavesdroppers": {"smart": found.as_dict()}}
+    design = best_schedule(STABLE, MU, EAVESDROPPERS["smart"].outcomes, 3, levels=3)
+    assert list(design.as_dict()) == ["best", "constant", "grid", "exact"]
+    assert ScheduleDesign({"smart": design}, {}).as_dict() == {"eavesdroppers": {"smart": design.as_dict()}}
     assert ScheduleDesign({}, {"wise": "bayesian"}).as_dict()["left_out"] == {"wise": "bayesian"}
 
 
 def test_blocks_share_their_probability() -> None:
     """With blocks of three slots μ_d changes at slots 1, 4 and 7 alone; one block is the best constant."""
 
-    def found(block: int) -> BestSchedule:
+    def of_blocks(block: int) -> BestSchedule:
         return best_schedule(SETTLED, MU, EAVESDROPPERS["smart"].outcomes, 9, 0.005, block=block, levels=5, capacity=50)
 
-    thirds, whole = found(3), found(8)
+    thirds, whole = of_blocks(3), of_blocks(8)
     mu_d = thirds.best.mu_d
     assert [mu_d[k] for k in (2, 3, 5, 6, 8)] == [mu_d[k] for k in (1, 1, 4, 4, 7)]
     assert len(set(mu_d[1:])) > 1
     assert whole.best.value == pytest.approx(whole.constant.value, rel=1e-6)
-    assert whole.best.value <= thirds.best.value <= found(1).best.value
+    assert whole.best.value <= thirds.best.value <= of_blocks(1).best.value
 
 
 def test_the_weight_of_the_user_raises_the_probabilities() -> None:

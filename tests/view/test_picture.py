@@ -186,6 +186,7 @@ BROKEN: dict[str, Callable[[bytes], bytes]] = {
     "not a recording": lambda _: b"nonsense" * 100,
     "cut short": lambda whole: whole[: _end_of_a_message(whole) - 1],  # between two messages it would be no mistake
     "zeros between two messages": lambda whole: _zeros(whole, _end_of_a_message(whole)),  # they look like its end
+    "nonsense between two messages": lambda whole: whole[: _end_of_a_message(whole)] + b"\xff" * 500,
     "zeros after its end": lambda whole: whole + bytes(40),
     "damaged": lambda whole: _zeros(whole, _end_of_a_message(whole) - 100),
 }

@@ -28,8 +28,10 @@ from evedrop.live.launch.shard import Shard
 from evedrop.model.digest import DIGEST_BYTES, Digests, RunDigest, block_starts
 from evedrop.names import LEGITIMATE
 from evedrop.news import ConnectionOutage, RunEvent
+from evedrop.results.ending import noted
 from evedrop.results.folder import make_private
 from evedrop.results.growing_tables import parquet_or_stream
+from evedrop.results.reading import as_of
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.shard_score import load_score
 from evedrop.results.writer import DIGESTS, ResultsWriter, load_results, write_summary
@@ -60,7 +62,7 @@ def gather(scenario: Scenario, folder: Path, shards: Sequence[Shard], started: f
     parts = _summaries(shards)
     ending = Ending(
         wall,
-        how + _age_of_figures(shards, scores, parts),
+        noted(how, _age_of_figures(shards, scores, parts)),
         replay,
         events=_events(parts),
         outages=_outages(parts),
@@ -112,13 +114,13 @@ def _blocks(shard: Shard, name: str) -> dict[int, Digests]:
 
 
 def _age_of_figures(shards: Sequence[Shard], scores: Sequence[Totals], summaries: Mapping[int, Summary]) -> str:
-    """Which shards' figures are of an earlier slot than their rows, in brackets, because their observers were killed."""
+    """What `ended` adds about shards whose observers were killed after their last figures."""
     earlier = [
         f"slot {score.tallies[LEGITIMATE].done} in shard {shard.number}"
         for shard, score in zip(shards, scores, strict=True)
         if shard.number in summaries and score.tallies[LEGITIMATE].done < summaries[shard.number].slots
     ]
-    return f" (the figures are as of {', '.join(earlier)}; the tables have more)" if earlier else ""
+    return as_of(", ".join(earlier)) if earlier else ""
 
 
 def _events(summaries: Mapping[int, Summary]) -> list[RunEvent]:
