@@ -55,6 +55,7 @@ def test_its_figures_are_those_of_the_recorded_trials(tmp_path: Path) -> None:
     assert found["expected_delay"] == pytest.approx(8.0 / found["divergence"])
 
 
+@pytest.mark.long
 def test_totals_of_parts_are_the_totals(tmp_path: Path) -> None:
     """600 trials are two blocks; whichever worker has them, the entry is the same, and the digest that of all trials."""
     first, second = (

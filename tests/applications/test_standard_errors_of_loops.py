@@ -89,6 +89,7 @@ def test_a_delay_has_the_standard_error_of_its_alarms() -> None:
     assert summary.standard_errors == {"mean_delay": None}
 
 
+@pytest.mark.long
 def test_a_sweep_has_the_standard_errors_of_an_application(tmp_path: Path) -> None:
     """In columns of their own; pictures are drawn with them."""
     changes: dict[str, Any] = {"trials": 3, "slots": 200, "expect": []}

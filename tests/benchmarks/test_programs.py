@@ -23,6 +23,7 @@ def quick(name: str, *words: str) -> str:
     return done.stdout
 
 
+@pytest.mark.long
 def test_the_kernels_are_compared_with_numpy() -> None:
     """Two lines for each of four cases, and how much faster the first is."""
     said = quick("kernels")

@@ -79,7 +79,7 @@ MISTAKES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", MISTAKES)
+@pytest.mark.parametrize("case", mostly_long(MISTAKES, ["shape", "raises", "absent"]))
 def test_a_mistake_in_a_class_is_named_before_anything_starts(case: str, evedrop: Evedrop) -> None:
     """With the entry that names the class, what was found and what was expected; status 2, and no results."""
     kind, body, said = MISTAKES[case]

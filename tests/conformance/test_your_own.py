@@ -76,6 +76,7 @@ def test_a_module_that_has_changed_since_is_warned_of(tutorial: Evedrop) -> None
     assert "warning: the module shifts is not the one these results were made with" in tutorial("check", "run").out
 
 
+@pytest.mark.long
 def test_the_folder_of_modules_can_be_another(tutorial: Evedrop) -> None:
     """`modules` is relative to the scenario, wherever the command is typed; every process is told what it needs, and no more."""
     lib, home = tutorial.folder / "home" / "lib", tutorial.folder / "home"

@@ -132,6 +132,7 @@ def test_a_relay_gives_up_an_attempt_that_is_not_answered(evedrop: Evedrop, tmp_
         assert [one["process"] for one in run.summary["outages"]] == ["router"]
 
 
+@pytest.mark.long
 def test_what_an_operator_changed_survives_the_router(evedrop: Evedrop, tmp_path: Path) -> None:
     """A router that is started while the run is paused knows the changes that were made; the folder gives the same again."""
     path, _ = scenario_in(tmp_path, slots=1000, more=CHANGING)

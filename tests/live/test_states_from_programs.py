@@ -104,6 +104,7 @@ def test_a_run_over_a_program_can_be_repeated(tmp_path: Path) -> None:
     assert (tmp_path / "live" / "states.csv").read_text() == (tmp_path / "again" / "states.csv").read_text()
 
 
+@pytest.mark.long
 def test_a_paced_run_takes_the_newest_state(tmp_path: Path) -> None:
     """Of a program that sends faster than slots go by: never a state twice, never an older one; and the run can be repeated."""
     source = program()

@@ -151,6 +151,7 @@ def test_flipped_acknowledgements_agree_with_many_trials() -> None:
         assert spread < 0.1 * plain.mean()
 
 
+@pytest.mark.long
 def test_results_depend_on_the_seed_alone(tmp_path: Path) -> None:
     """The same estimates for any number of workers and any trials of the study; others for another seed."""
     scenario = scenario_of(slots=10)

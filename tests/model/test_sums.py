@@ -17,6 +17,7 @@ from evedrop.expected.estimates import warnings_of
 from evedrop.kernels.elementary import sum_in_order
 from evedrop.loading import load, shipped
 from evedrop.wire.law import expected
+from tests.examples import mostly_long
 
 PLAIN = builtins.sum
 SHADOWED = {"receiver": [120.0, 0.0], "sender": [0.0, 0.0], "reference_snr": 72.0, "exponent": 3.0, "threshold": 10.0}
@@ -50,7 +51,9 @@ def test_numbers_are_added_in_order() -> None:
 
 
 @pytest.mark.usefixtures("sums")
-@pytest.mark.parametrize("name", sorted(shipped()))
+@pytest.mark.parametrize(
+    "name", mostly_long(sorted(shipped()), ["eavesdroppers", "heated-room", "microgrid", "nemesis"])
+)
 def test_no_figure_of_a_study_is_a_compensated_sum(name: str, tmp_path: Path) -> None:
     """Warnings, trials, theory and summary of every built-in scenario, cut to a few slots."""
     scenario = load(name)

@@ -182,6 +182,7 @@ def peak_of_report(folder: Path) -> int:
     return 1024 * int(status.partition("VmHWM:")[2].split()[0])
 
 
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells the largest memory of a program alone")
 def test_the_memory_of_a_report_does_not_grow_with_the_slots(study: Path, tmp_path: Path) -> None:
     """It used to read whole tables: 0.7 kB a slot, that is 70 MB for the further slots here."""

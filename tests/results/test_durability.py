@@ -246,6 +246,7 @@ def test_a_killed_study_can_be_read(evedrop: Evedrop) -> None:
     assert f"{trials:,} trials" in evedrop("view", "run", "--table").out
 
 
+@pytest.mark.long
 def test_the_points_of_a_killed_sweep_are_on_disk(evedrop: Evedrop) -> None:
     """The table is there while the sweep goes on, whole at any moment."""
     over = ("--over", "encoding.state_probability=0.1:0.9:0.01", "--trials", "100", "--slots", "200", "--workers", "1")

@@ -55,15 +55,13 @@ def blocks(results: Results) -> set[tuple[str, int, int, bytes]]:
 USUAL = [
     ("acknowledged", "a later trial"),
     ("eavesdroppers", "a later trial"),
-    ("bursts", "forty trials"),
     ("colluding", "forty trials"),
     ("cut", "forty trials"),
     ("heated-room", "forty trials"),
     ("late", "forty trials"),
     ("replay-attack-before", "forty trials"),
-    ("twin-track", "forty trials"),
 ]
-"""What differs in kind: schemes, losses with a memory, pools of links, events, closed loops, delays, attacks, and one trial."""
+"""What differs in kind: schemes, pools of links, events, closed loops, delays, attacks, and one trial."""
 
 every_batch = pytest.mark.parametrize(
     ("name", "batch"), mostly_long([(name, batch) for name in sorted(shipped()) for batch in BATCHES], USUAL)

@@ -70,6 +70,7 @@ def of_trials(results: Results, receiver: str) -> dict[str, Any]:
     return {name: np.array([row[name] for row in rows]).reshape(SLOTS, TRIALS) for name in ("action", "squared_error")}
 
 
+@pytest.mark.long
 def test_live_and_memory_agree_on_every_expectation(made: Runs) -> None:
     """To the last bit, except for sums over all slots, and for the believed trace, which a live run sums over trials."""
     live, memory = (made(where).summary["expectations"] for where in ("live", "memory"))

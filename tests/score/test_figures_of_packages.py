@@ -36,6 +36,7 @@ def of_the_docs() -> str:
     return (DOCS / "your-own.md").read_text(encoding="utf-8").partition("# largest.py\n")[2].partition("```")[0]
 
 
+@pytest.mark.long
 def test_a_figure_of_a_package_needs_nothing_here(evedrop: Evedrop) -> None:
     """One file and one line of metadata: the same number live, in memory with two workers, and in shards; judged and shown."""
     environment = installed(evedrop, of_the_docs())

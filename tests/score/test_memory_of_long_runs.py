@@ -6,6 +6,8 @@ import tracemalloc
 from collections.abc import Callable
 from typing import Any
 
+import pytest
+
 from evedrop.loading import load
 from evedrop.score.scorekeeper import Ending, Scorekeeper, summary_of
 
@@ -31,6 +33,7 @@ def test_what_is_expected_of_a_long_run_is_not_stored() -> None:
     assert peak_of(lambda: Scorekeeper(scenario, 1)) < 1.0
 
 
+@pytest.mark.long
 def test_a_summary_does_not_take_more_memory_the_longer_the_run() -> None:
     """An observer makes one every few seconds, and what it has taken it may never give back."""
     scenario = load("eavesdroppers", {"slots": 10 * SLOTS, **SCENARIO})

@@ -89,6 +89,7 @@ def test_a_folder_of_scenarios_is_tested_in_memory(evedrop: Evedrop) -> None:
     assert str(suite[2][0].text).splitlines() == [line.strip() for line in lines[6:-1]]
 
 
+@pytest.mark.long
 def test_a_live_test_that_fails_says_how_to_see_it_again(evedrop: Evedrop) -> None:
     """Two at a time, live: one passes, one fails with exit 1, and its command gives the same failure; nothing is left."""
     written(evedrop.folder / "cases", fails=FAILS, holds=HOLDS)

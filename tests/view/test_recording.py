@@ -197,6 +197,7 @@ os._exit(0)
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("most", mostly_long([100, 30_000, 80_000], [30_000]))
 def test_full_disk_ends_the_recording_and_not_the_run(most: int, tmp_path: Path) -> None:
     """When the file can grow no more, beginning, adding and closing still end in time, and the reason is kept.

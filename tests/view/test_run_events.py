@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from evedrop import load_results, montecarlo
 from evedrop.cli.main import main
 from evedrop.news import RunEvent
@@ -34,6 +36,7 @@ def test_what_comes_after_the_last_slot_did_not_happen(tmp_path: Path) -> None:
     assert [one["slot"] for one in results.summary["events"]] == [3, 5]
 
 
+@pytest.mark.long
 def test_a_live_run_shows_what_was_done_to_it(evedrop: Any) -> None:
     """The scenario's events and the operator's, at their slots, in the recording that was made while it went on."""
     scenario = evedrop.folder / "shown.toml"

@@ -181,6 +181,7 @@ def test_no_process_finds_it_where_it_only_asks(evedrop: Evedrop) -> None:
     assert any('"use_probabilities"' in question for question in told)
 
 
+@pytest.mark.long
 def test_what_a_class_says_of_itself_is_checked(evedrop: Evedrop) -> None:
     """Invalid answers, and processes that end without an answer, are mistakes of the scenario, with the entry or the question."""
     (evedrop.folder / "spy.toml").write_text(SCENARIO)
