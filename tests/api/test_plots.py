@@ -138,6 +138,7 @@ def test_what_cannot_be_drawn_is_refused(results: RunResults) -> None:
     assert len(covariances.plot("errors", slots=range(10)).axes) == 1
 
 
+@pytest.mark.long
 def test_a_sweep_is_drawn_as_its_file_is() -> None:
     """Errors against the first entry, a panel for each value of the second."""
     found: SweepResults = sweep(SCENARIO, {"encoding.state_probability": [0.3, 0.7], "slots": [4, 6]}, trials=3)

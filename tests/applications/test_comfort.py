@@ -45,6 +45,7 @@ def test_its_figures_are_sums_over_slots(tmp_path: Path) -> None:
         assert found["receivers"][name]["known_fraction"] == pytest.approx(np.mean(known))
 
 
+@pytest.mark.long
 def test_totals_of_parts_are_the_totals(tmp_path: Path) -> None:
     """Two workers or one: the same bits. And they are the means of the trials' parts, weighted by their trials."""
     scenario = load("heated-room", {**SHORT, "slots": 90})
@@ -129,6 +130,7 @@ expect = [{ figure = "platoon.smallest_gap", below = 0.0 }]
 PLATOON = {"evedrop.applications": {"platoon": "platooning:Platoon"}}
 
 
+@pytest.mark.long
 def test_an_application_of_another_package_needs_nothing_here(evedrop: Evedrop) -> None:
     """The one of the docs, a file and a line of metadata: in memory, live and in a sweep, with expectation and closing line."""
     page = (Path(__file__).parents[2] / "docs" / "your-own.md").read_text(encoding="utf-8")

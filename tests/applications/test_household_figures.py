@@ -145,6 +145,7 @@ def test_the_figures_are_those_of_the_tables(tmp_path: Path) -> None:
     assert found["summed_difference"] > 1e-4
 
 
+@pytest.mark.long
 def test_active_windows_are_the_days(tmp_path: Path) -> None:
     """A receiver without information has an area near ½, the legitimate one nearly 1; the windows are those of the load."""
     scenario = part_of_day("microgrid", 25_200, 4800, eavesdroppers__bayesian__strategy="smart")

@@ -38,6 +38,7 @@ def energies(results: Results) -> dict[str, float]:
     return {name: house[f"{name}_difference"] for name in ("net", "total", "summed")}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", mostly_long(["microgrid", "microgrid-mpc"], ["microgrid-mpc"]))
 def test_secrecy_costs_little_energy(name: str, tmp_path: Path) -> None:
     """Forty minutes before noon at μ_d = 0.1: net and total energy differ from perfect knowledge by less than the paper says."""

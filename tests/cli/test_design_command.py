@@ -138,6 +138,7 @@ def test_a_run_of_any_length_can_be_designed(evedrop: Evedrop) -> None:
     assert designed(evedrop, "numerical", *changes(slots=20000))["rho"] == pytest.approx(1.387799, abs=1e-6)
 
 
+@pytest.mark.long
 def test_who_has_no_closed_form_is_left_out_and_said(evedrop: Evedrop) -> None:
     """One line for people, an entry in the JSON; a genie, a pool of links and a constant one are designed against."""
     extra = changes(

@@ -114,6 +114,7 @@ def test_tables_are_written(name: str, evedrop: Evedrop) -> None:
         assert not re.search(r"[#%]|(?<!\\)_(?![{])", re.sub(r"\$[^$]*\$", "", plain)), line
 
 
+@pytest.mark.long
 def test_numbers_are_at_full_precision(evedrop: Evedrop) -> None:
     """The CSV of a sweep has the very numbers of sweep.parquet, and their standard errors in columns of their own."""
     assert evedrop(*shlex.split(COMMANDS["sweep"]), "--out", "swept", "--csv", "a.csv").status == 0

@@ -138,6 +138,7 @@ def test_a_module_called_like_an_installed_one_is_refused(name: str, entry: str,
     assert re.search(f"has a module {name} .*another one of this name is (loaded already|installed)", done.err)
 
 
+@pytest.mark.long
 def test_a_scheme_that_needs_acknowledgements_must_have_them(evedrop: Evedrop) -> None:
     """The scenario is refused without the table, with what to write, and runs with it."""
     body = "from evedrop.model.schemes.acknowledged import Acknowledged\n\n\nclass Mine(Acknowledged):\n    pass\n"

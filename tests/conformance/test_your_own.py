@@ -100,6 +100,7 @@ def test_the_folder_of_modules_can_be_another(tutorial: Evedrop) -> None:
     assert f'modules: is "{tutorial.folder}/nowhere", which is not a folder' in done.err
 
 
+@pytest.mark.long
 def test_an_installed_package_gives_short_names(tutorial: Evedrop, monkeypatch: pytest.MonkeyPatch) -> None:
     """Entry points of a package on the path are names like any other, in every process; the built-in ones stay."""
     site = tutorial.folder / "site"

@@ -100,6 +100,7 @@ def test_started_by_hand_it_is_the_same_run(options: tuple[str, ...], backwards:
     assert digests_of(hosts[1] / "results") == digests_of(evedrop.folder / "memory")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "below", [pytest.param(1.0, marks=pytest.mark.long, id="held"), pytest.param(0.0, id="failed")]
 )
@@ -174,6 +175,7 @@ def test_with_two_routers_a_run_is_the_same(scenario: str, evedrop: Evedrop) -> 
     )
 
 
+@pytest.mark.long
 def test_a_run_of_two_routers_is_steered_and_ended_as_any(evedrop: Evedrop) -> None:
     """The operator gets at the observer through the relay; a signal ends everybody, the relay too."""
     live = evedrop.live("eavesdroppers", "--slots", "100000", "--pace", "0.002", "--set", "network.routers=2")
@@ -252,6 +254,7 @@ def test_an_address_of_another_host_is_said(evedrop: Evedrop) -> None:
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", mostly_long(["sensor", "observer", "router"], ["sensor", "router"]))
 def test_a_host_that_is_not_known_is_said(name: str, evedrop: Evedrop) -> None:
     """A name that does not resolve, for processes that connect and for the one that listens."""
@@ -285,6 +288,7 @@ def test_who_does_not_come_is_named(evedrop: Evedrop) -> None:
         assert one.err.startswith(f"evedrop: {name}: the observer gave the run up: smart did not appear")
 
 
+@pytest.mark.long
 def test_who_ends_the_observer_ends_the_run(evedrop: Evedrop) -> None:
     """Ctrl-C on its host: what was measured is on disk, and everybody else ends, saying why."""
     endpoint = f"tls/127.0.0.1:{free_port()}"

@@ -253,6 +253,7 @@ def test_a_private_folder_is_removed_with_its_launcher_or_by_the_next(tmp_path: 
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.long
 def test_a_stopped_process_only_slows_the_run(evedrop: Evedrop) -> None:
     """A receiver that stands still loses nothing: everybody waits."""
     live = evedrop.live("eavesdroppers", "--slots", "3000", "--json", "--paused")

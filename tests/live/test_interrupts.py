@@ -223,6 +223,7 @@ def test_a_terminal_that_closes_ends_the_run(evedrop: Evedrop) -> None:
     assert live.results.slots.num_rows == 4 * live.results.summary["slots"] > 0
 
 
+@pytest.mark.long
 def test_nohup_keeps_a_run_from_hanging_up(evedrop: Evedrop) -> None:
     """A signal that was ignored when the command was started stays ignored, in all its processes."""
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)

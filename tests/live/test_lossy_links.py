@@ -156,6 +156,7 @@ def test_bursts_that_last_too_long_are_a_warning() -> None:
     assert warnings_of(Scenario.model_validate(scenario())) == []
 
 
+@pytest.mark.long
 def test_the_view_survives_where_there_is_no_theory(live: Results) -> None:
     """A replayed recording of a run in which one receiver's expected trace is nowhere."""
     from rerun.chunk import RrdReader

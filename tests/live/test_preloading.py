@@ -194,6 +194,7 @@ def test_a_process_has_the_environment_it_was_given_and_no_more(
     assert json.loads((tmp_path / "log").read_text().splitlines()[0]) == given
 
 
+@pytest.mark.long
 def test_a_further_server_has_modules_that_the_first_has_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Those of an observer have no place in other processes; both end with the block."""
     (tmp_path / "spy.py").write_text(SPY)

@@ -240,6 +240,7 @@ def whole(live: Live) -> int:
     return rows
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [pytest.param("smart", marks=pytest.mark.long), "sensor"])
 def test_a_killed_process_of_a_shard_ends_all(evedrop: Evedrop, name: str) -> None:
     """The shard and the process are named, with the log where it is, and no slot that was scored is lost."""

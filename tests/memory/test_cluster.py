@@ -172,6 +172,7 @@ def test_a_sweep_on_the_cluster_is_the_local_one(evedrop: Evedrop, scheduler: st
     assert ours.equals(theirs)
 
 
+@pytest.mark.long
 def test_a_comparison_on_the_cluster_is_the_local_one(evedrop: Evedrop, scheduler: str) -> None:
     """The same compare.json, byte for byte."""
     schemes = ("--schemes", "plain,innovation", "--adversaries", "naive,smart")
@@ -183,6 +184,7 @@ def test_a_comparison_on_the_cluster_is_the_local_one(evedrop: Evedrop, schedule
     assert len(json.loads(ours)["schemes"]) == 2
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "study",
     [
@@ -220,6 +222,7 @@ def test_a_test_in_memory_on_the_cluster_is_the_local_one(evedrop: Evedrop, sche
     )
 
 
+@pytest.mark.long
 def test_pytest_computes_in_memory_on_the_cluster(evedrop: Evedrop, scheduler: str) -> None:
     """A scenario passes as a test of pytest; live, a scheduler is refused."""
     write_short(evedrop.folder / "mine.toml")
@@ -370,6 +373,7 @@ def test_a_suspended_scheduler_keeps_no_study_from_ending(evedrop: Evedrop, lone
     assert live.end().status == 130
 
 
+@pytest.mark.long
 def test_a_worker_of_another_version_is_said(evedrop: Evedrop, lonely: Dask, tmp_path: Path) -> None:
     """The worker's address, its version, ours, and what to do; nothing is kept."""
     folder = tmp_path / "other" / "evedrop-0.0.1.dist-info"

@@ -48,6 +48,7 @@ def test_a_marginally_stable_process_has_no_heavy_tails(tmp_path: Path) -> None:
     assert {verdict["judged_by"] for verdict in summary["secrecy"].values()} == {"mean"}
 
 
+@pytest.mark.long
 def test_the_report_says_so(evedrop: Evedrop) -> None:
     """In words, with the quantiles it goes by; and not where the variance is finite."""
     done = evedrop("montecarlo", "numerical", "--trials", "40", "--out", "run")

@@ -209,7 +209,7 @@ def test_a_singular_noise_runs_and_is_warned_of(evedrop: Evedrop) -> None:
     assert np.linalg.matrix_rank(Q, tol=1e-12) == 1
 
 
-OFTEN = ("twenty trials", "late and held", "filtered and betrayed")
+OFTEN = ("twenty trials", "filtered and betrayed")
 
 
 @pytest.mark.parametrize(

@@ -125,6 +125,7 @@ def test_the_most_surprising_trial_is_the_least_probable_one(tmp_path: Path) -> 
     assert found["mean_error"] == pytest.approx(np.mean(errors), rel=1e-9)
 
 
+@pytest.mark.long
 def test_the_largest_error_is_not_the_most_surprising_trial(tmp_path: Path) -> None:
     """A trial that lost its first packets has an error that is far from the median, and as expected."""
     results = montecarlo("vehicle", slots=200, trials=50, record_trials=50, out=tmp_path / "run")

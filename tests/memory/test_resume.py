@@ -332,6 +332,7 @@ def test_other_studies_go_on_too(
     assert cut == uninterrupted
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "more", "what"),
     [

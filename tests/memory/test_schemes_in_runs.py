@@ -262,6 +262,7 @@ def test_whose_reference_is_kept_and_whose_is_lost() -> None:
     assert expectations_of(jammed_later)["legitimate"].known
 
 
+@pytest.mark.long
 def test_a_betrayed_state_opens_twin_tracks(tmp_path: Path) -> None:
     """Live as in memory: slots after it the spy's error is below a millionth of that of the same reader without the leak.
 

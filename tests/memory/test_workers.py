@@ -260,6 +260,7 @@ def test_a_crew_of_which_one_cannot_be_started_is_ended(monkeypatch: pytest.Monk
     assert own_crew() == []
 
 
+@pytest.mark.long
 def test_a_worker_is_given_no_tokens(monkeypatch: pytest.MonkeyPatch) -> None:
     """It gets only those variables of the command's environment that it needs to run."""
     monkeypatch.setenv("ACCESS_TOKEN", "only the command has this")

@@ -112,6 +112,7 @@ def test_it_learns() -> None:
     assert np.median(errors["learner"]) < 2.0 * np.median(errors["bayesian"]) < 0.5 * np.median(errors["constant"])
 
 
+@pytest.mark.long
 def test_it_learns_nothing_from_masked_packets() -> None:
     """Against the cipher it does not come nearer to A, and it errs more than an eavesdropper that does not listen."""
     batch = Batch(40, 20)

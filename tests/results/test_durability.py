@@ -330,6 +330,7 @@ def test_no_rows_are_on_disk_before_the_first_figures(tmp_path: Path) -> None:
         assert load_results(tmp_path).summary["ended"] == "the run goes on, at slot 10"
 
 
+@pytest.mark.long
 def test_a_score_is_saved_only_with_rows(tmp_path: Path) -> None:
     """What a shard saves together with its figures: if it is killed before, it has neither score nor rows."""
     scenario = microgrid()

@@ -129,6 +129,7 @@ def test_mistakes_are_said(live: Results, tmp_path: Path, evedrop: Evedrop) -> N
     assert not list(evedrop.folder.glob("*.mcap"))
 
 
+@pytest.mark.long
 def test_a_missing_package_is_named(live: Results, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The message names the extra that installs it."""
     monkeypatch.setitem(__import__("sys").modules, "mcap.writer", None)

@@ -101,6 +101,7 @@ def journal(folder: Path, parts: list[list[np.ndarray]]) -> pq.ParquetFile:
     return pq.ParquetFile(folder / "journal.parquet")
 
 
+@pytest.mark.long
 def test_wide_rows_are_not_held_back_by_their_number(tmp_path: Path) -> None:
     """A journal of 300 000 trials: no row group is larger than it should be."""
     file = journal(tmp_path, [masks(100, 37_500) for _ in range(20)])

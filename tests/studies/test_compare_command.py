@@ -129,6 +129,7 @@ def test_mistakes_of_a_scheme_name_it() -> None:
         matchups_of(scenario, schemes=[])
 
 
+@pytest.mark.long
 def test_a_scheme_that_cannot_be_used_is_left_out_with_its_reason(evedrop: Evedrop) -> None:
     """Of μ_d = 0 `withholding` makes a sensor that sends nothing; where its name is given, nothing is compared."""
     silent = ("--set", "encoding.state_probability=0.0", "--adversaries", "naive", "--slots", "5", "--trials", "2")

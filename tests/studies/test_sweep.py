@@ -115,6 +115,7 @@ def test_every_combination_has_a_row_for_every_peer(swept: tuple[pa.Table, Path]
     assert {row["trials"] for row in rows} == {620}
 
 
+@pytest.mark.long
 def test_a_sweep_without_a_house_has_none_of_its_figures(swept: tuple[pa.Table, Path]) -> None:
     """Neither columns nor a plot."""
     table, folder = swept

@@ -289,6 +289,7 @@ def test_pytest_collects_scenarios_as_tests(evedrop: Evedrop) -> None:
         assert said in (evedrop.folder / "r.xml").read_text()
 
 
+@pytest.mark.long
 def test_pytest_runs_a_named_scenario_live(evedrop: Evedrop) -> None:
     """Without options: live, with the trials of the file, results below runs/."""
     written(evedrop.folder, holds=HOLDS.replace("slots = 60", "trials = 2\nslots = 60"))

@@ -144,6 +144,7 @@ def test_a_program_cannot_say_that_sides_are_joined(tmp_path: Path) -> None:
             assert not wire.told
 
 
+@pytest.mark.long
 def test_a_program_that_passes_probes_on_joins_no_side_without_a_router(tmp_path: Path) -> None:
     """Even if it does so at once: routers join sides, and there is none."""
     with router() as (_, first), router() as (_, second):

@@ -197,6 +197,7 @@ def test_a_second_signal_ends_a_wire_at_once(how: str, tmp_path: Path) -> None:
         is_on_disk(wire)
 
 
+@pytest.mark.long
 def test_a_view_that_hangs_does_not_change_the_status(tmp_path: Path) -> None:
     """Nor does it keep the process from ending: the wire itself has done all that it should."""
     with hanging("a_view", tmp_path, "--for", "0.2 s", "--view", str(tmp_path / "wire.rrd")) as wire:

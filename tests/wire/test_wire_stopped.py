@@ -186,6 +186,7 @@ def test_each_message_to_a_side_that_has_stopped_has_a_fate(tmp_path: Path, monk
         assert links["robot-third"].rate == 1.0
 
 
+@pytest.mark.long
 def test_a_wire_ends_although_programs_have_stopped_reading(evedrop: Evedrop) -> None:
     """Upon SIGTERM; each message has a fate."""
     (evedrop.folder / "robot.toml").write_text(THREE_SIDES)
