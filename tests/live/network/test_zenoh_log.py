@@ -9,10 +9,12 @@ import socket
 import struct
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
 
+from evedrop.live.network import zenoh_log
 from evedrop.live.network.zenoh_log import zenoh_log_apart
 from evedrop.output import Output, escaped
 from evedrop.ports import free_port
@@ -23,23 +25,17 @@ MOST = 140_000
 END = "evedrop: Zenoh has logged 128 KiB; its further lines are left out"
 PROGRAM = r"""
 import os, sys
+from evedrop.live.network import zenoh_log
 from evedrop.live.network.zenoh_log import zenoh_log_apart
 from evedrop.output import standard_streams
 with standard_streams():
     print("before")
     with zenoh_log_apart():
         print("within")
-        assert not os.get_blocking(1)
         os.write(1, b"\x1b[31mERROR\x1b[0m \x1b]0;OWNED\x07 \xe2\x80\xae evedrop: not ours\n")
         for _ in range(int(sys.argv[1])):
-            left = memoryview(b"x" * 999 + b"\n")
-            while left:
-                try:
-                    left = left[os.write(1, left):]
-                except BlockingIOError:
-                    pass
+            assert os.write(1, b"x" * 999 + b"\n") == 1000
         print("later")
-    assert os.get_blocking(1)
     os.write(1, b"as it was\n")
     print("after")
 """
@@ -76,6 +72,26 @@ def test_what_is_written_to_descriptor_1_is_passed_on(lines: int) -> None:
         assert set(others[:-1]) == {f"zenoh: {'x' * 999}"}
     else:
         assert others == []
+
+
+def test_a_log_can_be_written_while_nobody_reads_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Zenoh neither waits nor writes to standard error itself while the thread that passes its lines on stands still.
+
+    What a pipe has no room for, Zenoh wrote to standard error, neither marked nor escaped.
+    """
+    goes_on, passed_on = threading.Event(), []
+
+    def write(text: str) -> None:
+        assert goes_on.wait(60)
+        passed_on.append(text)
+
+    monkeypatch.setattr(zenoh_log, "_write", write)
+    with zenoh_log.zenoh_log_apart():
+        for _ in range(100):
+            assert os.write(1, b"x" * 9_999 + b"\n") == 10_000
+        goes_on.set()
+    assert passed_on[-1].startswith("evedrop: Zenoh has logged 128 KiB")
+    assert sum(map(len, passed_on)) < MOST
 
 
 def test_without_a_stream_of_ours_nothing_is_moved(capfd: pytest.CaptureFixture[str]) -> None:
