@@ -9,17 +9,15 @@ from __future__ import annotations
 
 import contextlib
 import json
-import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, final
 
 import zenoh
 
+from evedrop.wire.few_lines import FewLines
 from evedrop.wire.side import SideSession
 
-MOST = 20
-"""The bypasses that are told one by one: programs that connect again and again must not fill the history."""
 _MULTICAST: Mapping[str, Any] = {"enabled": True}
 _SCOUT_SECONDS = 4.0  # Zenoh asks at once, after one second, and after two more
 
@@ -30,14 +28,14 @@ class Bypasses:
 
     def __init__(self, tell: Callable[[str], None]) -> None:
         """tell: for a line about each bypass."""
-        self._tell = tell
-        self._told = 0
+        self._lines = FewLines(tell, "ways past the wire")
+        self.add = self._lines.add
+        """Tells a bypass; of many, only that there are more."""
         self._programs: set[tuple[str, str]] = set()
         self._allowed: dict[str, str] = {}  # program that may be a peer, and has not been heard by multicast → its side
         self._new = False  # whether one has come since the last scouting began
         self._scout: zenoh.Scout[None] | None = None
         self._until = 0.0
-        self._lock = threading.Lock()
         self._listeners: list[object] = []  # Zenoh undeclares those that nobody holds
 
     def watch(self, sides: Iterable[SideSession]) -> None:
@@ -67,22 +65,12 @@ class Bypasses:
             self._scout.stop()
             self._scout = None
 
-    def add(self, line: str) -> None:
-        """Tell a bypass; of more than MOST, only that there are more."""
-        with self._lock:
-            self._told += 1
-            at = self._told
-        if at <= MOST:
-            self._tell(line)
-        elif at == MOST + 1:
-            self._tell(f"there were more than {MOST} ways past the wire; further ones are not listed")
-
     def _listener(self, side: str) -> Callable[[zenoh.TransportEvent], None]:
         def changed(event: zenoh.TransportEvent) -> None:
             program = (side, str(event.transport.zid))
             if event.kind != zenoh.SampleKind.PUT or event.transport.whatami != zenoh.WhatAmI.PEER:
                 return
-            if program not in self._programs and self._told <= MOST:  # each once, however often it connects
+            if program not in self._programs and not self._lines.is_full:  # each once, however often it connects
                 self._programs.add(program)
                 self.add(
                     f"the program {program[1]} at side {side} is in mode peer: such programs find each other past the wire, so "

@@ -109,6 +109,11 @@ class SideOutlet:
         """Whether a message may be sent past the queue: nothing waits in it or is being sent, and the side is not slow."""
         return not (self._queue or self._is_slow)
 
+    @property
+    def waiting(self) -> int:
+        """How many messages wait for their turn, with the one that is being sent."""
+        return len(self._queue)
+
     def took(self, seconds: float, alone: bool) -> None:
         """Note that a message took longer than `LONG_SECONDS` past the queue. alone: whether no third side waited meanwhile."""
         now = time.monotonic()

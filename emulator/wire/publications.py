@@ -17,6 +17,7 @@ from typing import Any, final
 import zenoh
 
 from evedrop.threads import wait_for_thread
+from evedrop.wire.backlog import Backlog
 from evedrop.wire.crossing import AGAIN, HELD, UNLINKED, Crossing, Kind
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.lanes import Lane, LinkState
@@ -138,6 +139,8 @@ class PublicationRelay:
         )
         self._side, self._name, self._tell = side, side.name, tell
         self.duties: list[Duty] = []
+        self.backlogs: list[Backlog] = []
+        """The messages of each subscription that wait for the wire."""
         self._until = math.inf
         expressions = [zenoh.KeyExpr(one) for one in expressions_of(side.side, plan.links)]
         self._subscribers = []
@@ -148,7 +151,8 @@ class PublicationRelay:
             earlier = tuple(one for one in expressions[:at] if one.intersects(expression))
             self._subscribers.append(subscriber)
             self.duties.append(Duty(f"among the messages from the side {side.name}"))
-            arguments = (subscriber, earlier, self.duties[-1])
+            self.backlogs.append(Backlog(subscriber.handler, WAITING))
+            arguments = (self.backlogs[-1], earlier, self.duties[-1])
             self._threads.append(
                 threading.Thread(target=self._run, args=arguments, name=f"from {side.name}", daemon=True)
             )
@@ -170,20 +174,21 @@ class PublicationRelay:
         for thread in self._threads:
             wait_for_thread(thread)
 
-    def _run(self, samples: Any, earlier: tuple[zenoh.KeyExpr, ...], duty: Duty) -> None:
+    def _run(self, backlog: Backlog, earlier: tuple[zenoh.KeyExpr, ...], duty: Duty) -> None:
         try:
-            self._take_all(samples, earlier, duty)
+            self._take_all(backlog, earlier, duty)
         except Exception as error:  # whatever it is: nothing may silently stop crossing
             self._tell(f"messages from the side {self._name} no longer cross ({error!r}); end the wire and report this")
 
-    def _take_all(self, samples: Any, earlier: tuple[zenoh.KeyExpr, ...], duty: Duty) -> None:
+    def _take_all(self, backlog: Backlog, earlier: tuple[zenoh.KeyExpr, ...], duty: Duty) -> None:
         take = self._taker()
-        for sample in samples:
-            duty.in_hand = sample
+
+        def take_own(sample: zenoh.Sample) -> None:
             # A message that several subscriptions hear belongs to the first.
-            if not earlier or not any(expression.intersects(sample.key_expr) for expression in earlier):
+            if not any(expression.intersects(sample.key_expr) for expression in earlier):
                 take(sample)
-            duty.in_hand = None
+
+        backlog.take_all(take_own if earlier else take, duty)
 
     def _taker(self) -> Callable[[zenoh.Sample], None]:
         """The function that is called for every message: it looks up as little as possible."""

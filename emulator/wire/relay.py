@@ -19,6 +19,7 @@ from evedrop.live.network.zenoh_log import LOGGED
 from evedrop.output import warn
 from evedrop.threads import wait_for_thread
 from evedrop.wire.bypasses import Bypasses
+from evedrop.wire.departures import Departures
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.lanes import LinkState
 from evedrop.wire.liveliness import LivelinessRelay
@@ -48,14 +49,23 @@ class WireRelay:
     `apply` may be called by any thread.
     """
 
-    def __init__(self, plan: WirePlan, journal: WireJournal, tell: Callable[[str], None] = warn) -> None:
-        """tell: for what the user must know while the wire runs. Raises UsageError if a side cannot be opened."""
+    def __init__(
+        self,
+        plan: WirePlan,
+        journal: WireJournal,
+        tell: Callable[[str], None] = warn,
+        happened: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        """tell: for what the user must know while the wire runs; happened: for lines about programs that lost their connection.
+
+        These begin with the seconds since the wire started. Raises UsageError if a side cannot be opened.
+        """
         self.plan = plan
         self.duties: Sequence[Duty] = ()
         """What its threads do, once it is open."""
         self.links: Mapping[str, LinkState] = {link.name: LinkState(link, plan, journal) for link in plan.links}
         """By their names."""
-        self._journal, self._tell = journal, tell
+        self._journal, self._tell, self._happened = journal, tell, happened
         self._stack = contextlib.ExitStack()
         self._duty = Duty("in the list of what programs declare")
         self._ended = threading.Event()
@@ -123,16 +133,23 @@ class WireRelay:
             relay.start()
         self._bypasses.watch(self.sides.values())
         stack.callback(self._bypasses.close)
+        backlogs = {name: relay.backlogs for name, relay in zip(self.sides, relays, strict=True)}
+        departures = Departures(backlogs, lambda side: outlets[side].waiting, self._note_departure)
+        departures.watch(self.sides.values())
         thread = threading.Thread(target=self._keep_up, name="wire", daemon=True)
         thread.start()
         stack.callback(wait_for_thread, thread)
         stack.callback(self._woken.set)
         stack.callback(self._ended.set)
+        stack.callback(departures.close)
 
     def _note_bypass(self, line: str) -> None:
         """Tell a way past the wire, and note it in the journal."""
         self._journal.note(line, bypass=True)
         self._tell(line)
+
+    def _note_departure(self, line: str) -> None:
+        self._happened(f"{self._journal.seconds:.1f} s: {line}")
 
     def _leave(self, relays: Sequence[PublicationRelay]) -> None:
         """Limit the time in which messages that wait still cross."""

@@ -81,7 +81,7 @@ def run_wire(
                 say(continuation(journal.start, journal.counts))
             with ExitStack() as stack:
                 with watchdog.doing(Duty("while the sides were opened", ANSWER_SECONDS)):
-                    relay = stack.enter_context(WireRelay(plan, journal, warn))
+                    relay = stack.enter_context(WireRelay(plan, journal, warn, happened))
                 for name, endpoints in relay.endpoints.items():
                     say(f"{name} {' '.join(endpoints)}")
                 conductor = stack.enter_context(WireConductor(plan, relay, happened))

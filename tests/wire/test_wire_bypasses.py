@@ -15,8 +15,9 @@ from evedrop import wire
 from evedrop.ports import free_port
 from evedrop.report.wire import wire_outcome
 from evedrop.wire import bypasses as bypasses_module
-from evedrop.wire.bypasses import MOST, Bypasses
+from evedrop.wire.bypasses import Bypasses
 from evedrop.wire.check import wire_lines
+from evedrop.wire.few_lines import MOST
 from evedrop.wire.file import resolved_wire, wire_of
 from evedrop.wire.plan import Side
 from evedrop.wire.running import ExpectationFailed

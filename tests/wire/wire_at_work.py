@@ -47,8 +47,10 @@ def both_ways(settings: Mapping[str, Any] = PERFECT, back: Mapping[str, Any] = P
 class WireAtWork:
     """A wire that runs in this process."""
 
-    def __init__(self, relay: WireRelay, journal: WireJournal, told: list[str], rows: list[Records]) -> None:
-        self.relay, self.journal, self.told = relay, journal, told
+    def __init__(
+        self, relay: WireRelay, journal: WireJournal, told: list[str], happened: list[str], rows: list[Records]
+    ) -> None:
+        self.relay, self.journal, self.told, self.happened = relay, journal, told, happened
         self.amended: list[Crossing] = []
         """Fates that rows were given after they had been handed to listeners."""
         journal.amendment_listeners.append(lambda _, fate: self.amended.append(fate))
@@ -91,8 +93,9 @@ def at_work(plan: WirePlan, folder: Path) -> Iterator[WireAtWork]:
     rows: list[Records] = []
     with WireJournal(folder, plan, tell=told.append) as journal:
         journal.listeners.append(lambda block: rows.append(block.copy()))
-        with WireRelay(plan, journal, told.append) as relay:
-            yield WireAtWork(relay, journal, told, rows)
+        happened: list[str] = []
+        with WireRelay(plan, journal, told.append, happened.append) as relay:
+            yield WireAtWork(relay, journal, told, happened, rows)
 
 
 @contextlib.contextmanager
