@@ -59,7 +59,7 @@ def program() -> NoReturn:
     from evedrop.cli.main import is_role, main  # noqa: PLC0415 - the handlers come first
 
     status = main()
-    if is_role(sys.argv[1:]) or sys.argv[1:2] == ["wire"]:
+    if is_role(sys.argv[1:]) or sys.argv[1:2] in (["wire"], ["view"]):
         # Threads may still be in Zenoh, or in Rerun: an interpreter that exits meanwhile aborts (Python 3.11), or hangs.
         os._exit(status)
     for number in heeded():  # the command is over: ignore signals while the interpreter exits

@@ -12,7 +12,6 @@ ROOT = Path(__file__).parents[1]
 WORK = "a daemon thread that waits for its next work; nobody waits for the thread without a limit"
 PROCESS = "a process of a run: SIGTERM ends it at once, and so do the observer, the launcher's end and a lost router"
 END = "a daemon thread that waits for the end of a process; nobody waits for the thread"
-COMMAND = "the main thread of a command waits for its own child, and a signal ends it"
 EXCEPTIONS = {
     "emulator/fork_server.py serve select.select": "the end of its channel wakes it, and the launcher's end closes the channel",
     "emulator/live/launch/children.py _follow process.wait": END,
@@ -35,9 +34,6 @@ EXCEPTIONS = {
     "emulator/memory/workers.py work pipe.recv": "the end of the study closes the pipe",
     "emulator/studies/scenario_test_jobs.py results one.result": "the future is done",
     "emulator/studies/scenario_test_jobs.py carry_out process.wait": "the process has closed its output, or is killed",
-    "emulator/view/picture.py _why process.wait": COMMAND,
-    "emulator/view/video.py add self._process.wait": COMMAND,
-    "emulator/view/video.py finish self._process.wait": COMMAND,
     "emulator/wire/outlet.py _wait self._bell.acquire": WORK,
     "emulator/wire/queries.py _run self._heard.get": WORK,
     "peers/closed_loop.py of self._inbox.recv": PROCESS,

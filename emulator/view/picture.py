@@ -15,6 +15,7 @@ from evedrop.environment import viewer_environment
 from evedrop.errors import UsageError
 from evedrop.files import whole_file
 from evedrop.signals import raise_on_signals
+from evedrop.view.bounded_pipe import ended, give, received
 from evedrop.view.headless import check, opened
 from evedrop.view.viewer_process import end, guarded
 
@@ -23,6 +24,7 @@ __all__ = ["SIZE", "check_picture_name", "frames_apart", "opened", "picture_apar
 SIZE = (1600, 950)
 """Width and height of a picture in pixels."""
 _LENGTH_BYTES = 8
+_MOST_COMPLAINTS = 2**20
 _LAST = "last"
 
 
@@ -42,7 +44,8 @@ def picture_apart(rrd: Path, png: Path, moment: float | None = None, size: tuple
 
     moment: a slot of a run, or seconds since the start of a wire. The file appears when it is complete.
 
-    Raises UsageError if there is no Vulkan driver, the recording cannot be loaded, or the file cannot be written.
+    Raises UsageError if there is no Vulkan driver, the recording cannot be loaded, or the file cannot be written, and RunError if
+    the process that draws hangs.
     """
     complaints: list[str] = []
     with whole_file(png) as temporary:
@@ -59,13 +62,14 @@ def frames_apart(
     A separate process draws them, one at a time; in a separate network, too, if the system allows that. Otherwise anybody who
     finds the port of the headless viewer could control it.
 
-    Raises UsageError as `picture_apart` does.
+    Raises UsageError as `picture_apart` does, and RunError if the process hangs.
     """
     check(rrd)
     command = [sys.executable, "-P", "-m", "evedrop.view.picture", str(rrd), *map(str, size)]
     with tempfile.TemporaryFile() as told:
         process = subprocess.Popen(
             guarded(command, apart=True),
+            bufsize=0,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=told,
@@ -79,7 +83,7 @@ def frames_apart(
                     raise UsageError(_why(process, told))
                 yield frame
             process.stdin.close()
-            complaints += process.stdout.read().decode().splitlines()
+            complaints += received(process.stdout, _MOST_COMPLAINTS).decode().splitlines()
         finally:
             end(process)
             process.stdout.close()
@@ -90,17 +94,16 @@ def frames_apart(
 def _asked(to: IO[bytes], back: IO[bytes], moment: float | None) -> bytes | None:
     """The picture of a moment; None if the process ended."""
     try:
-        to.write(f"{_LAST if moment is None else repr(moment)}\n".encode())
-        to.flush()
+        give(to, f"{_LAST if moment is None else repr(moment)}\n".encode())
     except BrokenPipeError:
         return None
-    length = int.from_bytes(back.read(_LENGTH_BYTES))
-    frame = back.read(length)
+    length = int.from_bytes(received(back, _LENGTH_BYTES))
+    frame = received(back, length)
     return frame if length and len(frame) == length else None
 
 
 def _why(process: subprocess.Popen[bytes], told: IO[bytes]) -> str:
-    status = process.wait()
+    status = ended(process)
     told.seek(0)
     return told.read().decode(errors="replace").strip() or f"the process that draws ended with status {status}"
 

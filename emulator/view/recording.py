@@ -43,8 +43,12 @@ class RecordingThread(ABC, Generic[Chunk, Note]):
     A subclass says what is recorded. The constructor calls `_layout`, the thread `_style` and then `_send`.
     """
 
-    def __init__(self, path: Path, name: str, notes: Sequence[Note]) -> None:
-        """name: identifies the recording: recordings of the same name are shown as one. notes: the first lines."""
+    def __init__(self, path: Path, name: str, notes: Sequence[Note], patience: float | None = None) -> None:
+        """name: identifies the recording: recordings of the same name are shown as one. notes: the first lines.
+
+        patience: how long the file may take to begin, for a batch, and to end, in seconds; by default `FILE_TIMEOUT`.
+        """
+        self._patience = FILE_TIMEOUT if patience is None else patience
         self.failure: str | None = None
         """Why there is no recording on disk, or an incomplete one."""
         self._waiting: list[Chunk] = []
@@ -63,7 +67,7 @@ class RecordingThread(ABC, Generic[Chunk, Note]):
             self._give_up(str(error))
             begun.set()
         self._writer.start()
-        if not begun.wait(FILE_TIMEOUT):
+        if not begun.wait(self._patience):
             self._give_up("the file could not be written")
 
     @abstractmethod
@@ -98,7 +102,7 @@ class RecordingThread(ABC, Generic[Chunk, Note]):
         with self._changed:
             self._closing = True
             self._changed.notify_all()
-        self._writer.join(FILE_TIMEOUT)
+        self._writer.join(self._patience)
         if self._writer.is_alive():
             self._give_up("the disk did not keep up with the run")
         return self.failure is None
@@ -140,7 +144,7 @@ class RecordingThread(ABC, Generic[Chunk, Note]):
             return
         try:
             # When Rerun cannot write a file any more, the only sign is that it never finishes.
-            self._file.flush(timeout_sec=FILE_TIMEOUT)
+            self._file.flush(timeout_sec=self._patience)
         except RuntimeError:
             self._give_up("the file could not be written")
 
@@ -157,7 +161,7 @@ class ViewRecording(RecordingThread[SceneSlots, Event]):
     def add(self, slots: SceneSlots) -> None:
         """Record the next slots. Waits only for a disk that is thousands of slots behind, and for a few seconds at most."""
         if slots.count:
-            self._append(slots, slots.count, _MOST_WAITING, FILE_TIMEOUT)
+            self._append(slots, slots.count, _MOST_WAITING, self._patience)
 
     def note(self, k: int, level: str, text: str) -> None:
         """Add a line to the events: level is INFO, WARN or ERROR."""

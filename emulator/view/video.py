@@ -21,6 +21,7 @@ from PIL import GifImagePlugin, Image
 
 from evedrop.errors import UsageError
 from evedrop.files import whole_file
+from evedrop.view.bounded_pipe import ended, give
 from evedrop.view.picture import frames_apart
 from evedrop.view.viewer_process import end, guarded
 
@@ -38,11 +39,11 @@ class VideoFile(ABC):
 
     @abstractmethod
     def add(self, png: bytes) -> None:
-        """Append a frame. Raises OSError if the file cannot be written."""
+        """Append a frame. Raises OSError if the file cannot be written, and RunError if what writes it hangs."""
 
     @abstractmethod
     def finish(self) -> None:
-        """Complete the file. Raises OSError if it cannot be written."""
+        """Complete the file. Raises OSError if it cannot be written, and RunError if what writes it hangs."""
 
     @abstractmethod
     def stop(self) -> None:
@@ -71,6 +72,7 @@ class Mp4File(VideoFile):
         coded = ["-codec:v", "libx264", "-crf", "20", "-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4"]
         self._process = subprocess.Popen(
             guarded([ffmpeg(), *words, *coded, str(path)]),
+            bufsize=0,
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=self._told,
@@ -80,16 +82,16 @@ class Mp4File(VideoFile):
     def add(self, png: bytes) -> None:
         """See `VideoFile`."""
         try:
-            self._input.write(png)
+            give(self._input, png)
         except BrokenPipeError as error:
-            self._process.wait()
+            ended(self._process)
             raise self._failure from error
 
     def finish(self) -> None:
         """See `VideoFile`."""
         with suppress(BrokenPipeError):
             self._input.close()
-        if self._process.wait():
+        if ended(self._process):
             raise self._failure
 
     def stop(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -9,17 +10,20 @@ from typing import Any
 import matplotlib.image
 import numpy as np
 import pytest
+import rerun as rr
 from numpy.typing import NDArray
 from PIL import Image
 
 from evedrop.cli.main import main
 from evedrop.errors import UsageError
 from evedrop.results.wire_folder import WIRE_FILE
+from evedrop.wire import replay
 from evedrop.wire.crossing import UNLINKED, Crossing, Kind
 from evedrop.wire.file import resolved_wire
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.lane_states import LaneState
 from evedrop.wire.replay import PICTURE_SIZE, replay_wire
+from tests.conftest import LIMIT
 from tests.privileged import CannotRun, skip
 from tests.wire.wire_recordings import CUT, RATES, SECONDS, shown, texts
 from tests.wire.wire_rows import START, robot_plan, traffic
@@ -59,6 +63,19 @@ def test_a_replay_shows_the_whole_journal_of_the_latest_start(folder: Path, rows
     assert lines[0] == "a wire of 3 sides and 3 links, seed 7; start 2 in this folder"
     assert [line for line in lines if line.endswith("robot, base")] == ["partition robot, base", "heal robot, base"]
     assert 11.5 < shown(rrd, "rates", "Scalars:scalars")[-1][0] < 13.0
+
+
+@pytest.mark.parametrize("call", ["save", "flush", "disconnect"])
+def test_a_view_on_a_full_disk_ends(
+    call: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Rerun may never return from such a disk."""
+    ended = threading.Event()
+    monkeypatch.setattr(replay, "_WRITE_SECONDS", 0.2)
+    monkeypatch.setattr(rr.RecordingStream, call, lambda *_, **__: ended.wait(LIMIT))
+    assert main(["view", str(folder), "--picture", str(folder / "w.png")]) == UsageError.exit_status
+    assert "the recording is incomplete: " in capfd.readouterr().err
+    ended.set()
 
 
 @pytest.mark.long
