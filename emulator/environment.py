@@ -6,8 +6,11 @@ A token in the launcher's environment must not reach other processes, least of a
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
+from itertools import groupby
 
+from evedrop.errors import UsageError
 from evedrop.names import KERNELS_VARIABLE
 
 _NEEDED = frozenset(
@@ -65,6 +68,29 @@ _ROUTER = (
 def lock_step_environment(role: str) -> dict[str, str]:
     """For a process whose messages come one by one: few threads of Zenoh, since each message must wake each of them."""
     return {"ZENOH_RUNTIME": _ROUTER if role == "router" else _CLIENT}
+
+
+_THREADS = "(?:(?:worker|max_blocking)_threads *: *[0-9]{1,9}|handover *: *(?:rx|tx|net|acc|app))"
+_PART = rf"(?:rx|tx|net|acc|app) *: *\( *(?:{_THREADS} *, *)*(?:{_THREADS} *)?\)"
+_RUNTIME = re.compile(rf" *\( *(?:{_PART} *, *)*(?:{_PART} *)?\) *")
+
+
+def check_zenoh_runtime() -> None:
+    """Raise UsageError if `ZENOH_RUNTIME`, with which users give Zenoh more threads, is malformed: Zenoh itself would panic."""
+    given = os.environ.get("ZENOH_RUNTIME")
+    if given is None or (_RUNTIME.fullmatch(given) and not _names_twice(given)):
+        return
+    raise UsageError(
+        f'the environment variable ZENOH_RUNTIME is "{given}", which Zenoh cannot read; unset it, or give parts of rx, tx, net, '
+        'acc and app, such as "(rx: (worker_threads: 32))"'
+    )
+
+
+def _names_twice(given: str) -> bool:
+    """Whether a well-formed value names a part twice, or an entry of a part."""
+    parts = re.findall(r"(\w+) *: *\(([^)]*)\)", given)
+    names = [sorted(name for name, _ in parts), *(sorted(re.findall(r"(\w+) *:", inside)) for _, inside in parts)]
+    return any(len([*same]) > 1 for some in names for _, same in groupby(some))
 
 
 def viewer_environment() -> Mapping[str, str]:

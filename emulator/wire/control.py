@@ -20,6 +20,7 @@ import zenoh
 from evedrop.errors import MalformedMessage, ScenarioError
 from evedrop.live.network.access import Grant, access_control
 from evedrop.live.network.control_file import Control, remove_control
+from evedrop.live.network.opening import open_session
 from evedrop.live.network.operator import Answer
 from evedrop.live.network.router_users import users_file
 from evedrop.live.protocol.envelope import enclosed, payload_of
@@ -83,7 +84,7 @@ class WireControl:
             with users_file({OPERATOR: password}) as users:
                 config = _router_config(self._key, router, users)
                 try:
-                    return zenoh.open(zenoh.Config.from_json5(json.dumps(config))), router
+                    return open_session(zenoh.Config.from_json5(json.dumps(config))), router
                 except zenoh.ZError:
                     if attempt == _ATTEMPTS - 1:
                         raise

@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import NoReturn
 
+from evedrop.environment import check_zenoh_runtime
 from evedrop.errors import Interrupted, RunError
 from evedrop.live.network.control_file import remove_control
 from evedrop.output import warn
@@ -47,8 +48,10 @@ def run_wire(
     out: its results folder, empty or that of an earlier start; say: for a line about each side and each event, and for the
     summary; complain: for what went wrong, by default as `say`; view: as `live_view` takes it.
 
-    Raises UsageError if the folder or a side cannot be used, and RunError if the folder was removed while the wire ran.
+    Raises UsageError if the folder, a side or `ZENOH_RUNTIME` cannot be used, and RunError if the folder was removed while the
+    wire ran, or if the machine lacks threads.
     """
+    check_zenoh_runtime()
     if (out / JOURNAL_FOLDER).is_dir():
         make_private(out)
     else:

@@ -19,6 +19,7 @@ from typing import Any, Self, final
 import zenoh
 
 from evedrop.errors import UsageError
+from evedrop.live.network.opening import open_session
 from evedrop.ports import free_port
 from evedrop.wire.plan import Side, SideTls, WireLink
 from evedrop.wire.watchdog import ANSWER_SECONDS, Duty
@@ -85,7 +86,7 @@ def _opened(side: Side, largest: int, users_file: str | None) -> tuple[zenoh.Ses
         endpoints = tuple(_with_port(endpoint) for endpoint in side.listen)
         config = side_config(replace(side, listen=endpoints), largest, users_file)
         try:
-            return zenoh.open(zenoh.Config.from_json5(json.dumps(config))), endpoints
+            return open_session(zenoh.Config.from_json5(json.dumps(config))), endpoints
         except zenoh.ZError as error:
             fixed = endpoints == side.listen or "in use" not in str(error)
             if fixed or attempt == _ATTEMPTS - 1:

@@ -13,7 +13,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import final
 
-from evedrop.environment import SINGLE_THREADED, lock_step_environment, own_environment
+from evedrop.environment import SINGLE_THREADED, check_zenoh_runtime, lock_step_environment, own_environment
 from evedrop.errors import RunError
 from evedrop.interrupts import INTERRUPTED
 from evedrop.live.launch.starter import (
@@ -116,8 +116,9 @@ class Children:
         """Start the process of a brief, or restart it (`again`).
 
         Its output goes to its log, the news of an observer or a router to the launcher. Raises
-        RunError if the system cannot start it.
+        RunError if the system cannot start it, and UsageError if it could not open a session with this environment.
         """
+        check_zenoh_runtime()
         self._briefs[brief.process] = brief
         self._listening.discard(brief.process)
         if isinstance(brief.part, ReceiverPart) and brief.part.outages:

@@ -19,6 +19,7 @@ import zenoh
 from evedrop.errors import BriefError, RunError
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.network.endpoint import AnyEndpoint, Endpoint, endpoint_in
+from evedrop.live.network.opening import open_session
 from evedrop.live.protocol.brief_parts import Identity
 from evedrop.live.protocol.keys import ZenohConfig
 
@@ -114,7 +115,7 @@ def connected(
     patience: float,
     meanwhile: Callable[[], None] = lambda: None,
     clock: Clock = SYSTEM_CLOCK,
-    opened: Callable[[zenoh.Config], zenoh.Session] = zenoh.open,
+    opened: Callable[[zenoh.Config], zenoh.Session] = open_session,
 ) -> zenoh.Session:
     """Open a session with the router; `meanwhile` is called before each attempt, `opened` opens it.
 

@@ -7,6 +7,7 @@ import json
 import zenoh
 
 from evedrop.live.network.endpoint import endpoint_in
+from evedrop.live.network.opening import open_session
 from evedrop.live.network.session import client_config
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.brief_parts import RelayPart, RoutingPart
@@ -30,7 +31,7 @@ def is_there(brief: AnyBrief) -> bool:
         config["connect"]["endpoints"] = [str(endpoint_in(listens).nearby)]
         config["transport"]["link"].get("tls", {})["verify_name_on_connect"] = False
     try:
-        with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
+        with open_session(zenoh.Config.from_json5(json.dumps(config))) as session:
             answers = session.liveliness().get(RunKeys(brief.run).alive(brief.process), timeout=_ANSWER_SECONDS)
             return any(answer.ok is not None for answer in answers)
     except zenoh.ZError:

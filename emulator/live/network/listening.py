@@ -10,6 +10,7 @@ import zenoh
 from evedrop.errors import BriefError
 from evedrop.live.network.connecting import endpoint_of
 from evedrop.live.network.endpoint import AnyEndpoint, SocketEndpoint
+from evedrop.live.network.opening import open_session
 from evedrop.live.protocol.brief_parts import Identity
 from evedrop.live.protocol.keys import ZenohConfig
 
@@ -19,7 +20,7 @@ def listening(listen: str, identity: Identity | None, config: ZenohConfig) -> ze
     endpoint = endpoint_of(listen, identity)
     try:
         endpoint.try_to_listen()
-        return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+        return open_session(zenoh.Config.from_json5(json.dumps(config)))
     except (OSError, zenoh.ZError) as error:
         raise _cannot_listen(endpoint, error) from error
 

@@ -13,6 +13,7 @@ import zenoh
 
 from evedrop.entries import expect, read, table_of
 from evedrop.live.network.control_file import Control
+from evedrop.live.network.opening import open_session
 from evedrop.live.network.session import client_config
 from evedrop.live.protocol.codec import Reader, pack
 from evedrop.live.protocol.envelope import enclosed, payload_of
@@ -71,7 +72,7 @@ def ask(control: Control, request: OperatorRequest, patience: float) -> Answer |
     zenoh.init_log_from_env_or("off")
     key = RunKeys(control.run).control(OBSERVER)
     # A run in progress has a router: one attempt is enough.
-    with zenoh.open(zenoh.Config.from_json5(json.dumps(client_config(control)))) as session:
+    with open_session(zenoh.Config.from_json5(json.dumps(client_config(control)))) as session:
         for reply in session.get(key, payload=enclosed(key, request.pack()), timeout=patience):
             answer = None if reply.ok is None else payload_of(key, reply.ok.payload.to_bytes())
             if answer is not None:

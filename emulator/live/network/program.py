@@ -15,6 +15,7 @@ import zenoh
 
 from evedrop.errors import BriefError, RunError
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
+from evedrop.live.network.opening import open_session
 from evedrop.live.protocol.brief_parts import ProgramEntry
 from evedrop.live.protocol.keys import ZenohConfig
 from evedrop.live.protocol.state_message import MOST_BYTES, read_state
@@ -59,7 +60,7 @@ class ProgramStates:
         self._waited = 0.0
         where = entry.listen or entry.connect
         try:
-            self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(program_config(entry))))
+            self._session = open_session(zenoh.Config.from_json5(json.dumps(program_config(entry))))
         except zenoh.ZError as error:
             what = (
                 "cannot listen at" if entry.listen is not None else f"cannot connect within {_CONNECT_SECONDS:.0f} s to"

@@ -34,6 +34,7 @@ from evedrop.live.network.launcher_watch import when_launcher_is_gone
 from evedrop.live.network.lifeline import Lifeline
 from evedrop.live.network.listening import listening
 from evedrop.live.network.mailbox import allowance
+from evedrop.live.network.opening import open_session
 from evedrop.live.network.resending import ReplayBuffer
 from evedrop.live.network.zenoh_log import LOGGED
 from evedrop.live.protocol.brief import AnyBrief, Brief
@@ -145,7 +146,7 @@ class Session:
         listen: str | None = None,
         meanwhile: Callable[[], None] = lambda: None,
         clock: Clock = SYSTEM_CLOCK,
-        opened: Callable[[zenoh.Config], zenoh.Session] = zenoh.open,
+        opened: Callable[[zenoh.Config], zenoh.Session] = open_session,
     ) -> None:
         """config, listen: a router's configuration, and its address; meanwhile: called while waiting for the router.
 
