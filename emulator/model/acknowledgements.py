@@ -119,6 +119,12 @@ class AckChannelSpec:
     overheard: float = 1.0
     """The probability that the jammer hears a packet, for the attack `hijack`."""
 
+    @property
+    def memory(self) -> int:
+        """How many packets before its own decide on an acknowledgement: those that the jammer may have missed in a row."""
+        heeding = heeding_of(self.attack, self.quality, self.overheard)
+        return 0 if heeding is None else heeding.patience
+
 
 @final
 class AckChannel:
@@ -165,14 +171,17 @@ class AckChannel:
         on_the_air = self._attack(gamma, gamma_e, flips) if attacked else gamma
         arrived: Flags = on_the_air & through
         if self._heeding is not None:
-            self._count(k, sent, gamma_e)
+            self.count(k, sent, gamma_e)
             if attacked:
                 few, as_many = self._missed < self._heeding.patience, self._missed == self._heeding.patience
                 arrived = on_the_air & (few | (as_many & shared))
         return arrived if sent is None else arrived & sent
 
-    def _count(self, k: int, sent: Flags | None, gamma_e: Flags) -> None:
-        """Count the packets in a row that the jammer has missed; a slot counts once."""
+    def count(self, k: int, sent: Flags | None, gamma_e: Flags) -> None:
+        """Count the packets in a row that the jammer has missed; arguments as for `arrived`, which counts, too.
+
+        A slot counts once, so this is for slots whose acknowledgements another channel has passed on.
+        """
         if k > self._counted:
             self._counted = k
             missed = np.where(gamma_e, 0, self._missed + 1)

@@ -83,11 +83,16 @@ def history_of(scenario: Scenario) -> int:
     """How many slots before the first that is not done a restarted router must receive again.
 
     Packets may be under way for the longest window of the receivers. If the scheme may be silent, the router must also see
-    the bursts of losses that are not over, which are counted up to a maximal length: a slot without a packet ends them.
+    the bursts of losses that are not over, which are counted up to a maximal length: a slot without a packet ends them. And on
+    some acknowledgements, the packets decide that the jammer has missed in a row: if the scheme may be silent, any number of
+    slots may be between them.
     """
     window = max(scenario.window(name) for name in scenario.receivers)
-    scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
-    return max(window, COUNTED_BURSTS) if scheme.may_be_silent else window
+    scheme, channel = scheme_of(scenario.process.process, scenario.encoding.spec), ack_channel_of(scenario)
+    memory = 0 if channel is None else min(channel.memory, scenario.slots)
+    if not scheme.may_be_silent:
+        return max(window, memory)
+    return scenario.slots if memory else max(window, COUNTED_BURSTS)
 
 
 @dataclass(frozen=True)

@@ -191,11 +191,15 @@ class AckLink:
 
         An absent receiver acknowledges nothing. Raises the errors of `Commands.check`.
         """
-        gamma = np.zeros(self._trials, np.bool_)
-        if downlinks[LEGITIMATE].present(k):
-            gamma = self._acknowledged(k, commands)
+        there = downlinks[LEGITIMATE].present(k)
+        gamma = self._acknowledged(k, commands) if there else np.zeros(self._trials, np.bool_)
         gamma_e = gamma if self._jammer is None else downlinks[self._jammer].gamma(k)
         self._put(acknowledgement(k, self._channel.arrived(k, sent, gamma, gamma_e)))
+
+    def count(self, k: int, sent: Flags | None, downlinks: Mapping[str, Downlink]) -> None:
+        """Count slot k, whose acknowledgements have reached the sensor, for those of later slots; sent as for `carry`."""
+        if self._jammer is not None:
+            self._channel.count(k, sent, downlinks[self._jammer].gamma(k))
 
     def _acknowledged(self, k: int, commands: Commands) -> Flags:
         while True:
@@ -335,9 +339,12 @@ class Routing:
         slots, known = range(first, first + len(messages)), first < self._done
         for downlink in self._downlinks.values():
             downlink.deliver(slots, packets, known)
-        if self._ack_link is not None and not known:
+        if self._ack_link is not None:
             sent = None if packets.sent is None else packets.sent[0]
-            self._ack_link.carry(first, sent, self._downlinks, self._commands)
+            if known:
+                self._ack_link.count(first, sent, self._downlinks)
+            else:
+                self._ack_link.carry(first, sent, self._downlinks, self._commands)
         self._k = self._session.place.slot = slots.stop
 
     def _flush(self) -> None:

@@ -1,0 +1,267 @@
+"""A router on a session in memory: barriers, changed links, absent receivers, acknowledgements, and rounds of resending."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evedrop.live.launch.briefs import history_of
+from evedrop.live.protocol import packets, telemetry
+from evedrop.live.protocol.codec import Reader
+from evedrop.live.protocol.commands import Again, Go, LinkChange
+from evedrop.model.links.link import REASONS
+from evedrop.model.slot.link import Change
+from tests.live.network.test_router import Ear, MemoryBench
+
+SLOTS, BATCH = 96, 8
+SHAPE = (2, 5)
+LATE: dict[str, Any] = {
+    "slots": SLOTS,
+    "legitimate": {
+        "window": 3,
+        "link": {"quality": 0.7, "duplicate": 0.3, "delay": {"model": "normal", "mean": 0.5, "deviation": 1.5}},
+    },
+    "eavesdroppers": {"eve": {"strategy": "smart", "link": {"quality": 0.05}}},
+}
+"""Packets that come late, twice and too late on one link; on the other, losses in longer runs than a batch."""
+WINDOWS = {"legitimate": 3, "eve": 0}
+
+
+def send(bench: MemoryBench, slots: range) -> None:
+    """Have the sensor send the packets of these slots."""
+    for k in slots:
+        bench.put("sensor", bench.keys.uplink, packets.uplink(k, bench.packet(k)))
+
+
+def announce(bench: MemoryBench, number: int, done: int, first: int) -> None:
+    """Have the sensor announce that it sends its packets again."""
+    bench.put("sensor", bench.keys.uplink, packets.resend(number, done, first))
+
+
+def deliveries(bench: MemoryBench, slots: range) -> dict[str, list[bytes]]:
+    """The next deliveries to each receiver, which must be of these slots."""
+    found = {name: [ear.hear()[1] for _ in slots] for name, ear in bench.downlinks.items()}
+    for name, payloads in found.items():
+        assert [Reader(name, payload).integer("k") for payload in payloads] == [*slots]
+    return found
+
+
+def journals(bench: MemoryBench, start: int, stop: int, windows: Mapping[str, int]) -> dict[int, telemetry.Journal]:
+    """First slot → journal, of the next journals, which must cover these slots."""
+    found = {}
+    while start < stop:
+        message = Reader(*bench.journal.hear())
+        one = telemetry.read_journal(message, start, windows, telemetry.Extent(SLOTS, BATCH, *SHAPE))
+        found[start] = one
+        start += one.count
+    assert start == stop
+    return found
+
+
+def same_fates(journal: telemetry.Journal, other: telemetry.Journal, rows: slice) -> None:
+    """Check that a journal has some rows of another one."""
+    for name, link in journal.links.items():
+        whole = other.links[name]
+        assert np.array_equal(link.delivered, whole.delivered[rows])
+        for reason in REASONS:
+            assert np.array_equal(link.lost[reason], whole.lost[reason][rows]), reason
+        assert (link.late is None) == (whole.late is None)
+        if link.late is not None and whole.late is not None:
+            assert np.array_equal(link.late, whole.late[rows])
+
+
+@pytest.mark.parametrize("restarted", [False, True])
+@pytest.mark.parametrize("done", [40, 45])
+def test_packets_that_are_sent_again_have_the_same_fates(done: int, restarted: bool) -> None:
+    """Late and second copies, runs of losses and delays are counted as before, and no slot that is done is told again.
+
+    Whether the router had these slots before, or was started in the place of one that had.
+    """
+    with MemoryBench(**LATE) as bench:
+        send(bench, range(SLOTS))
+        before = deliveries(bench, range(SLOTS))
+        wanted = journals(bench, 0, SLOTS, WINDOWS)
+        assert any(packets.read_delivery(Reader("d", one), k, SHAPE).late for k, one in enumerate(before["legitimate"]))
+        if not restarted:
+            check_round(bench, done, before, wanted)
+    if restarted:
+        with MemoryBench(**LATE) as other:
+            check_round(other, done, before, wanted)
+
+
+def check_round(
+    bench: MemoryBench, done: int, before: Mapping[str, list[bytes]], wanted: Mapping[int, telemetry.Journal]
+) -> None:
+    """Check what a router delivers and journals in a round, against what it did the first time."""
+    bench.stage.commands.put(Again(1, done, {}).pack())
+    first = done - WINDOWS["legitimate"]
+    announce(bench, 1, done, first)
+    send(bench, range(first, SLOTS))
+    assert deliveries(bench, range(done, SLOTS)) == {name: all_of[done:] for name, all_of in before.items()}
+    found = journals(bench, done, SLOTS, WINDOWS)
+    for start, journal in found.items():
+        if start in wanted:
+            assert journal.pack() == wanted[start].pack()
+        else:  # the first slot that is not done is in the middle of a batch
+            batch = start - start % BATCH
+            same_fates(journal, wanted[batch], slice(start - batch, BATCH))
+    assert any(link.bursts[BATCH:].any() for journal in found.values() for link in journal.links.values())
+
+
+def test_packets_before_a_round_that_the_conductor_wants_are_ignored() -> None:
+    """The sensor's answer to an earlier request comes first: nothing of it is delivered, not even the slot that is due."""
+    with MemoryBench(**LATE) as bench:
+        send(bench, range(20))
+        before = deliveries(bench, range(20))
+        bench.stage.commands.put(Again(2, 16, {}).pack())
+        announce(bench, 1, 8, 5)
+        send(bench, range(20, 24))
+        announce(bench, 2, 16, 13)
+        send(bench, range(13, 20))
+        assert deliveries(bench, range(16, 20)) == {name: some[16:] for name, some in before.items()}
+        send(bench, range(20, 21))
+        deliveries(bench, range(20, 21))
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_barrier_is_passed_on_and_a_changed_link_is_changed_from_there_on(kept: bool) -> None:
+    """All slots before it are delivered and journaled first; nothing follows until the conductor lets the router continue.
+
+    The change holds in a later round, too. kept: for the same router, which knows it; else for one that the conductor tells.
+    """
+    at, done = 12, 20
+    cut = (Change(at, cut=True),)
+    with MemoryBench(**LATE) as plain:
+        send(plain, range(SLOTS))
+        unchanged = deliveries(plain, range(SLOTS))
+    with MemoryBench(**LATE) as bench:
+        send(bench, range(at))
+        bench.put("sensor", bench.keys.uplink, packets.barrier(at))
+        send(bench, range(at, 40))
+        assert deliveries(bench, range(at)) == {name: some[:at] for name, some in unchanged.items()}
+        for name, ear in bench.downlinks.items():
+            message = Reader(*ear.hear())
+            assert packets.is_barrier(message), name
+            assert message.integer("k") == at
+        assert [*journals(bench, 0, at, WINDOWS)] == [0, 8]
+        assert all(not kept_back for kept_back in bench.heard.values())
+        assert bench.stage.put.empty()
+        for command in (LinkChange("eve", cut), Go(at - 1), Go(at)):
+            bench.stage.commands.put(command.pack())
+        after = deliveries(bench, range(at, 40))
+        assert after["legitimate"] == unchanged["legitimate"][at:40]
+        for k, payload in enumerate(after["eve"], at):
+            assert not packets.read_delivery(Reader("d", payload), k, SHAPE).heard.gamma.any()
+        wanted = journals(bench, at, 40, WINDOWS)
+        assert {int(one.links["eve"].lost["cut"].min()) for one in wanted.values()} == {5}
+        if kept:
+            check_later(bench, done, {}, after)
+    if not kept:
+        with MemoryBench(**LATE) as other:
+            check_later(other, done, {"eve": cut}, after)
+
+
+def check_later(
+    bench: MemoryBench, done: int, links: dict[str, tuple[Change, ...]], after: Mapping[str, list[bytes]]
+) -> None:
+    """Check that a round after the change brings the same deliveries."""
+    bench.stage.commands.put(Again(1, done, links).pack())
+    announce(bench, 1, done, done - 3)
+    send(bench, range(done - 3, 40))
+    assert deliveries(bench, range(done, 40)) == {name: some[done - 12 :] for name, some in after.items()}
+
+
+def test_who_is_away_gets_neither_deliveries_nor_barriers() -> None:
+    """From the slot in which it leaves to the one in which it is back; its packets are journaled as lost for this reason."""
+    away = range(10, 20)
+    events = [{"from": away.start, "to": away.stop, "kill": "eve", "state": "last"}]
+    eve = {"strategy": "smart", "link": {"quality": 1.0}}
+    with MemoryBench(**{**LATE, "eavesdroppers": {"eve": eve}}, event=events) as bench:
+        for first, stop in pairwise((0, 10, 15, 20, 24)):
+            send(bench, range(first, stop))
+            bench.put("sensor", bench.keys.uplink, packets.barrier(stop))
+            bench.stage.commands.put(Go(stop).pack())
+        heard: dict[str, list[tuple[bool, int]]] = {name: [] for name in bench.downlinks}
+        for name, count in (("legitimate", 24 + 4), ("eve", 14 + 2)):
+            for _ in range(count):
+                message = Reader(*bench.downlinks[name].hear())
+                heard[name].append((packets.is_barrier(message), message.integer("k")))
+        found = journals(bench, 0, 24, WINDOWS)
+    marks = {name: [k for barrier, k in all_of if barrier] for name, all_of in heard.items()}
+    assert marks == {"legitimate": [10, 15, 20, 24], "eve": [10, 24]}
+    slots = {name: [k for barrier, k in all_of if not barrier] for name, all_of in heard.items()}
+    assert slots == {"legitimate": [*range(24)], "eve": [*range(10), *range(20, 24)]}
+    down = np.concatenate([one.links["eve"].lost["down"] for one in found.values()])
+    assert down.tolist() == [5 if k in away else 0 for k in range(24)]
+
+
+ACKNOWLEDGED: dict[str, Any] = {
+    "slots": SLOTS,
+    "legitimate": {"link": {"quality": 0.8}},
+    "eavesdroppers": {"eve": {"strategy": "naive", "link": {"quality": 0.4}}},
+}
+SCHEMES: dict[str, dict[str, Any]] = {
+    "never silent": {"scheme": "acknowledged"},
+    "silent in some slots": {"scheme": "scheduled", "threshold": 3},
+}
+
+
+def acknowledged(
+    bench: MemoryBench, slots: range, done: int = 0
+) -> dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Send packets one by one, and acknowledge those that arrive; the slots below `done` are known.
+
+    A scheme without a header is silent in some trials of each slot. Returns slot → the trials in which the legitimate estimator
+    received, those in which eve did, and the acknowledgements that come.
+    """
+    rows, found = bench.brief.model.header, {}
+    for k in slots:
+        sent = None if rows else (np.arange(5) + k) % 3 > 0
+        header = np.zeros((rows, 5), np.int64) if rows else None
+        bench.put("sensor", bench.keys.uplink, packets.uplink(k, bench.packet(k), header, sent))
+        if k < done:
+            continue
+        gammas = []
+        for name in ("legitimate", "eve"):
+            gammas.append(packets.read_delivery(Reader(*bench.downlinks[name].hear()), k, SHAPE, rows).heard.gamma)
+        for slot in (max(k - 1, 0), k):  # one that comes twice is ignored
+            bench.stage.funnels[bench.keys.acknowledged](packets.acknowledgement(slot, gammas[0]))
+        arrived = Reader(*Ear(bench, bench.keys.acknowledgements).hear())
+        found[k] = (*gammas, packets.read_acknowledgement(arrived, k, 5))
+    return found
+
+
+def channel(attack: str, quality: float) -> dict[str, Any]:
+    """The acknowledgements of a scenario, with eve as the jammer where an attack has one."""
+    return {"link": {"quality": quality}, "attack": attack, **({} if attack == "none" else {"jammer": "eve"})}
+
+
+@pytest.mark.parametrize("attack", ["none", "critical"])
+def test_acknowledgements_reach_the_sensor_unless_they_are_attacked(attack: str) -> None:
+    """Slot by slot those of the legitimate estimator, and under the attack only those of packets that the jammer has, too."""
+    tables = {"encoding": SCHEMES["never silent"], "acknowledgements": channel(attack, 1.0)}
+    with MemoryBench(**ACKNOWLEDGED, **tables) as bench:
+        for legitimate, eve, arrived in acknowledged(bench, range(2 * BATCH)).values():
+            assert np.array_equal(arrived, legitimate & (eve | (attack == "none")))
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_a_restarted_router_lets_the_same_acknowledgements_through(scheme: str) -> None:
+    """Under a hijack they depend on the packets that the jammer has missed before, which another router has counted."""
+    tables = {"encoding": SCHEMES[scheme], "acknowledgements": channel("hijack", 0.8)}
+    with MemoryBench(**ACKNOWLEDGED, **tables) as bench:
+        before = acknowledged(bench, range(40))
+    history = history_of(bench.scenario)
+    assert history == (SLOTS if "some" in scheme else 3)
+    for done in (9, 20, 32):
+        with MemoryBench(**ACKNOWLEDGED, **tables) as other:
+            other.stage.commands.put(Again(1, done, {}).pack())
+            first = max(0, done - history)
+            announce(other, 1, done, first)
+            again = acknowledged(other, range(first, 40), done)
+        for k, found in again.items():
+            assert all(np.array_equal(one, wanted) for one, wanted in zip(found, before[k], strict=True)), (done, k)

@@ -1,0 +1,247 @@
+"""The observer joins the messages of all processes into slots: nothing is lost, moved or counted twice, however they are cut."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from evedrop.live.observer.joiner import Joiner
+from evedrop.live.protocol.closed_loop import Decisions
+from evedrop.live.protocol.codec import Reader
+from evedrop.live.protocol.telemetry import Extent, Journal, Report, Truth
+from evedrop.model.digest import Blocks
+from evedrop.model.links.link import REASONS
+from evedrop.model.slot.account import COUNTED_BURSTS, Account
+from evedrop.score.slots import ReceiverSlots
+from tests.builders import mirrored
+
+SLOTS, N, TRIALS, RECORDED = 300, 2, 5, 2
+EXTENT = Extent(SLOTS, 300, N, TRIALS, RECORDED, inputs=1, measures=True, monitored=True)
+WINDOWS = {"legitimate": 2, "eve": 0}
+BLOCKS = Blocks(SLOTS)
+BARE = 40
+"""A message that begins with this slot has no optional counts: there were none."""
+
+RNG = np.random.default_rng(28)
+TRUTH = Truth(
+    0,
+    RNG.normal(size=(SLOTS, N, TRIALS)),
+    RNG.random((SLOTS, TRIALS)) < 0.5,
+    RNG.random((SLOTS, TRIALS)) < 0.5,
+    RNG.random((SLOTS, TRIALS)) < 0.5,
+    RNG.normal(size=(SLOTS, 1, TRIALS)),
+    RNG.random((SLOTS, TRIALS)) < 0.5,
+    RNG.normal(size=(SLOTS, N, TRIALS)),
+    RNG.random((SLOTS, TRIALS)),
+    RNG.normal(size=(SLOTS, 1, TRIALS)),
+)
+
+
+def report_of(window: int) -> Report:
+    """What a receiver reports of all slots."""
+    late = RNG.integers(0, window + 1, (SLOTS, TRIALS)).astype(np.uint16) if window else None
+    return Report(
+        0,
+        RNG.normal(size=(SLOTS, N, TRIALS)),
+        RNG.integers(0, 4, (SLOTS, TRIALS)).astype(np.uint8),
+        mirrored(RNG.normal(size=(SLOTS, N, N, RECORDED))),
+        RNG.random((SLOTS, 2)),
+        late,
+        {block: RNG.integers(0, 256, (TRIALS, 16)).astype(np.uint8) for block in BLOCKS.ended(0, SLOTS)},
+        None if late is None else late // 2,
+        {block: RNG.random(TRIALS) for block in BLOCKS.ended(0, SLOTS)},
+    )
+
+
+def account_of(window: int) -> Account:
+    """What the router journals of all slots of a link; a different number of packets is lost for each reason."""
+    delivered = RNG.random((SLOTS, TRIALS)) < 0.5
+    unsent = (RNG.random(SLOTS) < 0.5).astype(np.uint32) * (~delivered).any(axis=1)
+    missing = np.count_nonzero(~delivered, axis=1) - unsent
+    kind = RNG.integers(0, len(REASONS), SLOTS)
+    lost = {reason: np.where(kind == i, missing, 0).astype(np.uint32) for i, reason in enumerate(REASONS)}
+    late = RNG.integers(0, window + 1, (SLOTS, TRIALS)).astype(np.uint16) if window else None
+    nothing = np.zeros(COUNTED_BURSTS, np.uint32), np.zeros(window + 2, np.uint32)
+    return Account(delivered, lost, late, *nothing, unsent.astype(np.uint32))
+
+
+REPORTS = {name: report_of(window) for name, window in WINDOWS.items()}
+ACCOUNTS = {name: account_of(window) for name, window in WINDOWS.items()}
+
+
+def truth(start: int, stop: int) -> bytes:
+    """The sensor's telemetry of some slots."""
+    names = ("x", "nu", "sent", "alarms", "u", "failed", "true", "statistic", "watermark")
+    return replace(TRUTH, first=start, **{name: getattr(TRUTH, name)[start:stop] for name in names}).pack()
+
+
+def report(name: str, start: int, stop: int) -> bytes:
+    """A receiver's telemetry of some slots."""
+    whole, ended = REPORTS[name], BLOCKS.ended(start, stop)
+    rows = slice(start, stop)
+    late = None if whole.late is None or whole.late_used is None or start == BARE else whole.late[rows]
+    used = None if late is None or whole.late_used is None else whole.late_used[rows]
+    digests = {block: whole.digests[block] for block in ended}
+    sums = {block: whole.trace_sums[block] for block in ended}
+    numbers = whole.x_hat[rows], whole.action[rows], whole.P[rows], whole.trace[rows]
+    return Report(start, *numbers, late, digests, used, sums).pack()
+
+
+def journal(start: int, stop: int) -> bytes:
+    """The router's journal of some slots."""
+    links = {}
+    for name, whole in ACCOUNTS.items():
+        rows = slice(start, stop)
+        lost = {reason: counts[rows] for reason, counts in whole.lost.items()}
+        unsent = None if whole.unsent is None else whole.unsent[rows]
+        if start == BARE:  # its packets that were not sent count as lost
+            lost["lost"], unsent = lost["lost"] + (0 if unsent is None else unsent), None
+        late = None if whole.late is None or start == BARE else whole.late[rows]
+        links[name] = Account(whole.delivered[rows], lost, late, whole.bursts, whole.delays, unsent)
+    return Journal(start, stop - start, links).pack()
+
+
+CUTS = {
+    "truth": (0, 7, 8, 40, 100, 256, 300),
+    "legitimate": (0, 8, 40, 48, 256, 300),
+    "eve": (0, 40, 60, 256, 299, 300),
+    "journal": (0, 3, 40, 90, 120, 300),
+}
+"""Sender → where its messages begin and end."""
+
+
+def joiner_of() -> Joiner:
+    """A joiner of that run, with a controller."""
+    return Joiner(EXTENT, WINDOWS, dict.fromkeys((*WINDOWS, "controller"), BLOCKS), period=2)
+
+
+def feed(joiner: Joiner, sender: str, start: int, stop: int) -> None:
+    """Give the joiner one message."""
+    if sender == "truth":
+        joiner.add_truth(Reader("evedrop/r/telemetry/sensor", truth(start, stop)))
+    elif sender == "journal":
+        assert joiner.add_journal(Reader("evedrop/r/journal", journal(start, stop))).keys() == WINDOWS.keys()
+    else:
+        joiner.add_report(sender, Reader(f"evedrop/r/telemetry/{sender}", report(sender, start, stop)))
+
+
+def in_turns(order: tuple[str, ...]) -> Iterator[tuple[str, int, int]]:
+    """All messages: one of each sender, then the second of each, and so on."""
+    pairs = {sender: list(pairwise(CUTS[sender])) for sender in order}
+    for turn in range(max(len(one) for one in pairs.values())):
+        for sender in order:
+            if turn < len(pairs[sender]):
+                yield (sender, *pairs[sender][turn])
+
+
+@pytest.mark.parametrize(
+    "messages",
+    [
+        list(in_turns(("truth", "journal", "legitimate", "eve"))),
+        list(in_turns(("eve", "legitimate", "truth", "journal"))),
+        [(sender, *pair) for sender in ("journal", "eve", "truth", "legitimate") for pair in pairwise(CUTS[sender])],
+    ],
+    ids=["in turns", "receivers first", "one after the other"],
+)
+def test_every_number_is_joined_in_its_place(messages: list[tuple[str, int, int]]) -> None:
+    """The joined slots, one after the other, are what each process said of them; what nobody counted is 0."""
+    joiner, joined = joiner_of(), []
+    ends = dict.fromkeys(CUTS, 0)
+    for sender, start, stop in messages:
+        feed(joiner, sender, start, stop)
+        ends[sender] = stop
+        while (slots := joiner.take_slots()) is not None:
+            assert slots.first == sum(one.count for one in joined)
+            joined.append(slots)
+        assert joiner.done == min(ends.values()) == sum(one.count for one in joined)
+        assert (joiner.sent, joiner.journaled) == (ends["truth"], ends["journal"])
+        assert joiner.places(["eve", "legitimate"]) == {
+            "sensor": ends["truth"],
+            "router": ends["journal"],
+            "eve": ends["eve"],
+            "legitimate": ends["legitimate"],
+        }
+    for name in ("x", "nu", "sent", "alarms", "true"):
+        assert np.array_equal(np.concatenate([getattr(one, name) for one in joined]), getattr(TRUTH, name)), name
+    inputs = [one.inputs for one in joined if one.inputs is not None]
+    monitored = [one.monitored for one in inputs if one.monitored is not None]
+    for name, parts in (("u", inputs), ("failed", inputs), ("statistic", monitored), ("watermark", monitored)):
+        assert np.array_equal(np.concatenate([getattr(one, name) for one in parts]), getattr(TRUTH, name)), name
+    for name in WINDOWS:
+        check_receiver(name, [one.receivers[name] for one in joined])
+
+
+def check_receiver(name: str, joined: list[ReceiverSlots]) -> None:
+    """Check one receiver's columns against its report and the journal."""
+    said, account = REPORTS[name], ACCOUNTS[name]
+
+    def whole(column: str) -> np.ndarray:
+        return np.concatenate([getattr(one, column) for one in joined])
+
+    for column in ("x_hat", "action", "P", "trace"):
+        assert np.array_equal(whole(column), getattr(said, column)), column
+    assert np.array_equal(whole("delivered"), account.delivered)
+    bare = {"report": slice(BARE, 48 if name == "legitimate" else 60), "journal": slice(BARE, 90)}
+    unsent = account.unsent
+    assert unsent is not None
+    for reason in REASONS:
+        counts = account.lost[reason].copy()
+        if reason == "lost":
+            counts[bare["journal"]] += unsent[bare["journal"]]
+        assert np.array_equal(np.concatenate([one.lost[reason] for one in joined]), counts), reason
+    for column, source, of in (
+        ("late", said.late, "report"),
+        ("late_used", said.late_used, "report"),
+        ("late_delivered", account.late, "journal"),
+    ):
+        if source is None:
+            assert {getattr(one, column) for one in joined} == {None}, column
+            continue
+        wanted = source.copy()
+        wanted[bare[of]] = 0
+        assert np.array_equal(whole(column), wanted), column
+    counted = unsent.copy()
+    counted[bare["journal"]] = 0
+    parts = [np.zeros(len(one.x_hat), np.uint32) if one.unsent is None else one.unsent for one in joined]
+    assert np.array_equal(np.concatenate(parts), counted)
+
+
+def test_digests_and_sums_are_those_of_all_blocks() -> None:
+    """Of each receiver, whichever message brings them; the sums of tr P are added in the order of the blocks."""
+    joiner = joiner_of()
+    for name in WINDOWS:
+        for start, stop in pairwise(CUTS[name]):
+            feed(joiner, name, start, stop)
+        said = REPORTS[name]
+        assert {block: one.tobytes() for block, one in joiner.digests[name].items()} == {
+            block: one.tobytes() for block, one in said.digests.items()
+        }
+        assert np.array_equal(joiner.trace_sums[name], said.trace_sums[0] + said.trace_sums[256])
+    assert set(joiner.trace_sums) == set(WINDOWS)
+
+
+def test_a_run_is_complete_when_its_controller_has_reported_too() -> None:
+    """Its decisions come in the order of their slots, one every two of them."""
+    joiner = joiner_of()
+    digests = {block: np.zeros((TRIALS, 16), np.uint8) for block in BLOCKS.ended(0, SLOTS)}
+    assert joiner.reported("controller") == 0
+    for sender, cuts in CUTS.items():
+        for start, stop in pairwise(cuts):
+            feed(joiner, sender, start, stop)
+    while joiner.take_slots() is not None:
+        pass
+    assert joiner.done == SLOTS
+    assert not joiner.complete(SLOTS)
+    for start, stop in ((0, 200), (200, SLOTS)):
+        seconds = np.arange(start, stop, 2) / 1000.0
+        ended = {block: digests[block] for block in BLOCKS.ended(start, stop)}
+        message = Reader("evedrop/r/telemetry/controller", Decisions(start, stop - start, seconds, ended).pack())
+        assert np.array_equal(joiner.add_decisions(message), seconds)
+        assert joiner.reported("controller") == stop
+    assert joiner.complete(SLOTS)
+    assert not joiner.complete(SLOTS + 1)
+    assert sorted(joiner.digests["controller"]) == [0, 256]
