@@ -16,7 +16,7 @@ from evedrop.live.protocol.telemetry import Extent, Journal, Report, Truth
 from evedrop.model.digest import Blocks
 from evedrop.model.links.link import REASONS
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
-from evedrop.score.slots import ReceiverSlots
+from evedrop.score.slots import ReceiverSlots, Slots
 from tests.builders import mirrored
 
 SLOTS, N, TRIALS, RECORDED = 300, 2, 5, 2
@@ -99,7 +99,7 @@ def journal(start: int, stop: int) -> bytes:
         lost = {reason: counts[rows] for reason, counts in whole.lost.items()}
         unsent = None if whole.unsent is None else whole.unsent[rows]
         if start == BARE:  # its packets that were not sent count as lost
-            lost["lost"], unsent = lost["lost"] + (0 if unsent is None else unsent), None
+            lost["lost"], unsent = lost["lost"] + (np.uint32(0) if unsent is None else unsent), None
         late = None if whole.late is None or start == BARE else whole.late[rows]
         links[name] = Account(whole.delivered[rows], lost, late, whole.bursts, whole.delays, unsent)
     return Journal(start, stop - start, links).pack()
@@ -149,7 +149,7 @@ def in_turns(order: tuple[str, ...]) -> Iterator[tuple[str, int, int]]:
 )
 def test_every_number_is_joined_in_its_place(messages: list[tuple[str, int, int]]) -> None:
     """The joined slots, one after the other, are what each process said of them; what nobody counted is 0."""
-    joiner, joined = joiner_of(), []
+    joiner, joined = joiner_of(), list[Slots]()
     ends = dict.fromkeys(CUTS, 0)
     for sender, start, stop in messages:
         feed(joiner, sender, start, stop)

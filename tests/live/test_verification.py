@@ -70,7 +70,7 @@ def verified(given: list[Report], recorded: int = RECORDED) -> None:
         verifier.report("eve", report)
 
 
-@pytest.mark.parametrize("recorded", [1, 2, TRIALS])
+@pytest.mark.parametrize("recorded", [1, 2, TRIALS - 1, TRIALS])
 @pytest.mark.parametrize("batch", [1, 7, 256, 600])
 def test_an_honest_receiver_passes(batch: int, recorded: int) -> None:
     """However its slots are batched, with blocks that an outage cuts, and whether some or all trials are recorded."""
@@ -148,15 +148,25 @@ def test_any_sums_are_judged(first: float, second: float) -> None:
     assert abs(first) <= np.sqrt(TRIALS * second) * (1.0 + 1e-6)
 
 
-def test_a_receiver_leaves_with_what_it_reported() -> None:
-    """Its last word before an outage, from which it is carried on, is what its report of the slot before says."""
-    verifier, found = Verifier({"eve": Blocks(SLOTS, CUTS)}, RECORDED, 0), beliefs()
+@pytest.mark.parametrize(
+    ("column", "place", "said"),
+    [("x_hat", (1, 3), "its x_hat of trial 13 is"), ("P", (0, 0, 1), "its P of trial 11 is"), ("P", (0, 0, 3), None)],
+)
+def test_a_receiver_leaves_with_what_it_reported(column: str, place: tuple[int, ...], said: str | None) -> None:
+    """Its last word before an outage, from which it is carried on, is what its report of the slot before says.
+
+    The covariance of a trial that is not recorded is not in the report.
+    """
+    verifier, found = Verifier({"eve": Blocks(SLOTS, CUTS)}, RECORDED, 10), beliefs()
     last = found[299]
-    verifier.left("eve", 300, last._replace(x_hat=at((1, 3), lambda x: x + 1.0)(last.x_hat)))
+    verifier.left("eve", 300, last._replace(**{column: at(place, lambda x: x + 1.0)(getattr(last, column))}))
     *before, of_last = [report for report in reports(100) if report.first < 300]
     for report in before:
         verifier.report("eve", report)
-    with pytest.raises(Contradiction, match=r"before slot 300, with which it goes away, its x_hat of trial 3 is"):
+    if said is None:
+        verifier.report("eve", of_last)
+        return
+    with pytest.raises(Contradiction, match=f"before slot 300, with which it goes away, {said}"):
         verifier.report("eve", of_last)
 
 
@@ -187,6 +197,8 @@ CLAIMS: dict[str, tuple[dict[str, Any], str]] = {
              "packets arrived, but the journal says 0"),
     "sent": ({"sent": np.ones((2, TRIALS), bool) & (np.arange(TRIALS) > 0)}, "sensor contradicts router: in slot 8 it says that "
              "1 trials sent nothing, but the journal says 0"),
+    "delivered": ({"sent": np.ones((2, TRIALS), bool) & (np.arange(TRIALS) > 0), "unsent": np.ones(2, np.uint32)}, "in slot 8 it "
+                  "says that 1 trials sent nothing, but the journal says 1, or that a packet of one of them was delivered"),
 }  # fmt: skip
 """What a process claims against the journal → the columns, and the expected message."""
 
@@ -195,6 +207,9 @@ def test_slots_in_which_all_say_the_same_pass() -> None:
     """Nobody is accused."""
     Verifier({}, 1, 10).joined(slots_of())
     Verifier({}, 1, 10).joined(slots_of(sent=np.ones((2, TRIALS), bool)))
+    Verifier({}, 1, 10).joined(slots_of(late=None, late_used=None, late_delivered=None))
+    silent = np.array([[True, False, True, True], [False, True, True, True]])
+    Verifier({}, 1, 10).joined(slots_of(sent=silent, unsent=np.ones(2, np.uint32)))
 
 
 @pytest.mark.parametrize("what", CLAIMS)

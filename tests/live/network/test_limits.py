@@ -18,6 +18,7 @@ from evedrop.live.protocol.commands import Again
 from evedrop.live.protocol.envelope import head_of
 from evedrop.live.protocol.message_limits import Sizes
 from evedrop.live.protocol.whereabouts import Whereabouts
+from evedrop.model.digest import BLOCK_SLOTS
 from evedrop.model.links.link import REASONS
 from evedrop.model.receiver import Belief, Reception
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
@@ -40,6 +41,11 @@ SIZES = st.builds(
 )
 
 
+def digests_of(blocks: int, trials: int) -> dict[int, np.ndarray]:
+    """Digests of this many blocks."""
+    return {2**40 + block: np.ones((trials, 16), np.uint8) for block in range(blocks)}
+
+
 def largest(sizes: Sizes) -> dict[str, bytes]:
     """Kind of key → the largest message on it."""
     n, R, c, recorded = sizes.n, sizes.trials, sizes.batch, sizes.recorded
@@ -48,7 +54,7 @@ def largest(sizes: Sizes) -> dict[str, bytes]:
     heard = Reception(all_of, z, header)
     late = tuple(Late(k, heard) for _ in range(2 * (sizes.window + 1)))
     packed = b"" if header is None else packets.packed_header(header, all_of)
-    digests = {k: np.ones((R, 16), np.uint8), k + 1: np.ones((R, 16), np.uint8)}
+    digests = digests_of(c // BLOCK_SLOTS + 2, R)
     u = np.ones((c, sizes.inputs, R)) if sizes.inputs else None
     flags, counts = np.ones((c, R), bool), np.ones((c, R), np.uint16)
     lost = {reason: np.ones(c, np.uint32) for reason in REASONS}
@@ -74,7 +80,7 @@ def largest(sizes: Sizes) -> dict[str, bytes]:
         truth.pack(),
         report.pack(),
         telemetry.leaving(k, Belief(z, np.ones((n, n, R)), np.ones(R, np.uint8))),
-        loop_wire.Decisions(k, c, seconds, digests).pack(),
+        loop_wire.Decisions(k, c, seconds, digests_of((c + sizes.period) // BLOCK_SLOTS + 1, R)).pack(),
         Whereabouts(k, tuple("evedrop/r0123abcd/progress/" + "n" * 32 for _ in range(sizes.receivers + 1))).pack(),
         wire.refusal("evedrop/r0123abcd/progress/" + "n" * 32, "x" * 1000),
     ]
@@ -97,6 +103,20 @@ def largest(sizes: Sizes) -> dict[str, bytes]:
 @given(SIZES)
 def test_whatever_a_run_sends_fits(sizes: Sizes) -> None:
     """The largest message of every kind is within its limit, and the limit is not far above it where messages are large."""
+    expect_that_all_fit(sizes)
+
+
+@pytest.mark.parametrize("rest", [(0, 1), (40, 5, 2, 3, 900, True), (0, 3, 0, 1)])
+@pytest.mark.parametrize(
+    "shape", [(1, 1, 1, 1024), (4, 200, 1, 1), (4, 40, 40, 300), (1, 200, 1, 600), (2, 1000, 1, 1)]
+)
+def test_whatever_a_run_sends_fits_at_the_extremes(shape: tuple[int, int, int, int], rest: tuple[int, ...]) -> None:
+    """Where each kind of report is the largest: with many slots in one, or with many trials, all of them recorded or one."""
+    expect_that_all_fit(Sizes(*shape, *rest))  # type: ignore[arg-type]  # the last is a flag
+
+
+def expect_that_all_fit(sizes: Sizes) -> None:
+    """Check the largest message of every kind against its limit."""
     for kind, message in largest(sizes).items():
         limit = sizes.of_kinds[kind]
         assert len(head_of("evedrop/r0123abcd/telemetry/" + "n" * 32)) + len(message) <= limit, kind

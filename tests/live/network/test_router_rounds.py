@@ -9,12 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from evedrop.errors import MalformedMessage
 from evedrop.live.launch.briefs import history_of
+from evedrop.live.network.router import Routing
 from evedrop.live.protocol import packets, telemetry
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import Again, Go, LinkChange
 from evedrop.model.links.link import REASONS
 from evedrop.model.slot.link import Change
+from tests.conftest import LIMIT, wait_until
 from tests.live.network.test_router import Ear, MemoryBench
 
 SLOTS, BATCH = 96, 8
@@ -127,6 +130,27 @@ def test_packets_before_a_round_that_the_conductor_wants_are_ignored() -> None:
         deliveries(bench, range(20, 21))
 
 
+def test_a_round_that_the_sensor_announces_first_begins_as_soon_as_the_conductor_asks_for_it() -> None:
+    """The router waits for the command, and no longer than it takes to come."""
+    with MemoryBench(**LATE, longest_outage=100.0 * LIMIT) as bench:
+        send(bench, range(16))
+        before = deliveries(bench, range(16))
+        announce(bench, 1, 8, 5)
+        wait_until(bench.stage.inboxes[bench.keys.uplink].empty, "a router that has read the announcement")
+        bench.stage.commands.put(Again(1, 8, {}).pack())
+        send(bench, range(5, 16))
+        assert deliveries(bench, range(8, 16)) == {name: some[8:] for name, some in before.items()}
+
+
+def test_a_malformed_command_ends_the_router() -> None:
+    """With the error that says so, although its thread for packets has nothing to do."""
+    bench = MemoryBench(**LATE)
+    routing = Routing(bench.brief, bench.stage.session(bench.brief))
+    bench.stage.commands.put(b"\xc1")
+    with pytest.raises(MalformedMessage, match="control/router: not msgpack"):
+        routing.carry_on()
+
+
 @pytest.mark.parametrize("kept", [True, False])
 def test_a_barrier_is_passed_on_and_a_changed_link_is_changed_from_there_on(kept: bool) -> None:
     """All slots before it are delivered and journaled first; nothing follows until the conductor lets the router continue.
@@ -231,7 +255,7 @@ def acknowledged(
         for slot in (max(k - 1, 0), k):  # one that comes twice is ignored
             bench.stage.funnels[bench.keys.acknowledged](packets.acknowledgement(slot, gammas[0]))
         arrived = Reader(*Ear(bench, bench.keys.acknowledgements).hear())
-        found[k] = (*gammas, packets.read_acknowledgement(arrived, k, 5))
+        found[k] = (gammas[0], gammas[1], packets.read_acknowledgement(arrived, k, 5))
     return found
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from evedrop.errors import MalformedMessage
 from evedrop.live.protocol.codec import Reader, pack, read_refusal, refusal
-from evedrop.live.protocol.packets import delivery, read_delivery, read_uplink
+from evedrop.live.protocol.packets import delivery, read_delivery, read_extras, read_uplink, uplink
 from evedrop.live.protocol.telemetry import Extent, Truth, read_truth
 from tests.live.network.readers import EXAMPLES, READERS, TRIALS, fields_of
 
@@ -127,3 +127,26 @@ def test_infinite_numbers_are_refused_wherever_finite_ones_are_expected() -> Non
         payload = pack({"k": 4, "z": np.full((2, 3), value).tobytes()})
         with pytest.raises(MalformedMessage, match="z with a NaN or infinity; expected finite numbers"):
             read_uplink(Reader(KEY, payload), 4, (2, 3))
+
+
+@pytest.mark.parametrize("lists", [4094, 4095])
+def test_a_large_message_may_have_4096_lists_and_maps(lists: int) -> None:
+    """With the message itself, and the list of them; one more is refused, and not only with many more."""
+    payload = pack({"room": bytes(70_000), "many": [[]] * lists})
+    if lists == 4094:
+        assert len(Reader(KEY, payload).fields["many"]) == lists
+        return
+    with pytest.raises(MalformedMessage, match="not msgpack"):
+        Reader(KEY, payload)
+
+
+def test_what_a_packet_carries_besides_its_payload_is_read_as_sent() -> None:
+    """Header, flags and the state that a receiver learns; a payload that is not sent is 0."""
+    z, header, sent = np.arange(1.0, 7.0).reshape(2, 3), np.array([[4, -1, 2**40]]), np.array([True, False, True])
+    message = Reader(KEY, uplink(4, z, header, sent, z + 1.0))
+    assert np.array_equal(read_uplink(message, 4, (2, 3)), np.where(sent, z, 0.0))
+    extras = read_extras(message, (2, 3), 1)
+    for found, given in zip(extras, (header, sent, z + 1.0), strict=True):
+        assert found is not None
+        assert np.array_equal(found, given)
+    assert read_extras(Reader(KEY, uplink(4, z)), (2, 3)) == (None, None, None)

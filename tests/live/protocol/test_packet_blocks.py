@@ -171,3 +171,11 @@ def test_the_malformed_delivery_among_many_is_refused(what: str, place: int) -> 
     with pytest.raises((MalformedMessage, Gap)) as among:
         read_deliveries(messages, FIRST, (2, 3))
     assert str(among.value) == str(alone.value)
+
+
+def test_the_headers_of_slots_in_which_nothing_arrives_are_0() -> None:
+    """The messages have no header then, like those of a scheme without one."""
+    messages = readers(DOWN, [pack({"k": FIRST + row, "gamma": b"\x00"}) for row in range(3)])
+    found = read_deliveries(messages, FIRST, (2, 3), 1)
+    assert found.header is not None
+    assert np.array_equal(found.header, np.zeros((3, 1, 3)))
