@@ -25,6 +25,8 @@ class Conducted:
     def __init__(self) -> None:
         self.lost: dict[str, float] = {}
         self.rounds: list[int] = []
+        self.repeated: list[str | int] = []
+        """What was said again in rounds: the progress, as a number, and other commands."""
         self.processes = dict.fromkeys(("router", "sensor", "smart"), True)
         self.changes: dict[str, Any] = {}
         self.another_router = False
@@ -50,13 +52,16 @@ class Conducted:
             self.rounds.append(command.slot)
 
     def start(self) -> None:
-        """Nothing to start."""
+        """Note it."""
+        self.repeated.append("start")
 
     def report_progress(self, done: int) -> None:
-        """Nobody to tell."""
+        """Note it."""
+        self.repeated.append(done)
 
     def remind(self) -> None:
-        """Nothing to say again."""
+        """Note it."""
+        self.repeated.append("the operator's commands")
 
 
 def test_losses_that_overlap_are_one_outage() -> None:
@@ -140,6 +145,22 @@ def test_a_round_waits_for_processes_that_are_back_and_cannot_be_told_yet() -> N
         recovery.look(10)
         assert conducted.rounds == [10]
         conducted.unreached = []
+
+
+@pytest.mark.parametrize("done", [0, 10])
+def test_a_round_repeats_the_commands_that_may_have_been_lost(done: int) -> None:
+    """The start of a run of which nothing is joined yet, what the operator ordered, and how far the observer is."""
+    conducted = Conducted()
+    recovery = recovery_of(conducted, TestClock(), 30.0)
+    if done:
+        recovery.look(done)
+    conducted.lose("sensor")
+    recovery.look(done)
+    assert conducted.repeated == []
+    conducted.lost = {}
+    recovery.look(done)
+    assert conducted.rounds == [done]
+    assert conducted.repeated == [*(() if done else ("start",)), "the operator's commands", done]
 
 
 @pytest.mark.parametrize(("longest_outage", "pace"), [(1.0, 0.0), (8.0, 0.25), (60.0, 0.0), (60.0, 2.0)])

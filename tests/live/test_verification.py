@@ -159,7 +159,8 @@ def test_a_receiver_leaves_with_what_it_reported(column: str, place: tuple[int, 
     """
     verifier, found = Verifier({"eve": Blocks(SLOTS, CUTS)}, RECORDED, 10), beliefs()
     last = found[299]
-    verifier.left("eve", 300, last._replace(**{column: at(place, lambda x: x + 1.0)(getattr(last, column))}))
+    other = at(place, lambda x: x + 1.0)(getattr(last, column))
+    verifier.left("eve", 300, last._replace(x_hat=other) if column == "x_hat" else last._replace(P=other))
     *before, of_last = [report for report in reports(100) if report.first < 300]
     for report in before:
         verifier.report("eve", report)
