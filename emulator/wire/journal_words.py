@@ -36,7 +36,7 @@ class JournalWords:
         self._file = os.open(_path(unfinished, start), os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600)
         self._size = os.fstat(self._file).st_size
         self._miss, self._admits = miss, admits
-        self._naming = threading.Lock()
+        self._naming, self._admitting = threading.Lock(), threading.Lock()
         self._codes: dict[str, dict[str, int]] = {"key": {"": 0}, "source": {"": 0}}
         self._texts: dict[str, list[str]] = {"key": [""], "source": [""]}
 
@@ -45,7 +45,10 @@ class JournalWords:
         code = self._codes["key"].get(key)
         if code:
             return code
-        return self._new_code("key", key) if self._admits(key, side) else 0
+        with self._admitting:  # another thread may ask for the same key, whose place counts once
+            if code := self._codes["key"].get(key):
+                return code
+            return self._new_code("key", key) if self._admits(key, side) else 0
 
     def source_code(self, source: str) -> int:
         """The code of a sender; 0 for "", a sender that is not known."""

@@ -11,6 +11,7 @@ import threading
 from collections.abc import Callable, Iterable
 from typing import final
 
+from evedrop.wire.advanced import numbered_as
 from evedrop.wire.history import Numbered
 from evedrop.wire.plan import WireLink
 
@@ -25,7 +26,10 @@ class KeyLimit:
     """The keys of a wire that are new, counted for each side. Threads may call its methods at the same time."""
 
     def __init__(self, links: Iterable[WireLink], earlier: Iterable[Numbered], tell: Callable[[str], None]) -> None:
-        """earlier: the streams that earlier starts numbered; their keys count, too. tell: for warnings."""
+        """earlier: the streams that earlier starts numbered; their keys count, too. tell: for warnings.
+
+        The stream of `KEY/@adv/…` counts as a key until one of these comes, for there is no telling how many there were.
+        """
         self._tell = tell
         self._used: dict[str, tuple[int, int]] = {}  # side → keys, characters
         self._full: set[str] = set()
@@ -41,6 +45,9 @@ class KeyLimit:
         """Whether there is room for a new key that a program of a side uses; then it has its place from now on."""
         with self._lock:
             if key in self._earlier:
+                return True
+            if (numbered := numbered_as(key)) in self._earlier:  # the first such key has the place of its stream
+                self._earlier.remove(numbered)
                 return True
             keys, characters = self._used.get(side, (0, 0))
             if keys < MOST_KEYS and characters + len(key) <= MOST_CHARACTERS:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from evedrop.wire.journal_part import Words
 from evedrop.wire.journal_words import JournalWords, words_in
@@ -17,6 +19,37 @@ def test_words_are_read_as_they_were_given(tmp_path: Path) -> None:
     sources = {words.source_code(source): source for source in SOURCES}
     assert words_in(tmp_path, 3, LINKS) == Words(LINKS, keys, sources)
     assert words.words(LINKS) == Words(LINKS, {0: "", **keys}, {0: "", **sources})
+    words.close()
+
+
+class Overtaken(dict[str, int]):
+    """Codes of keys. When one is looked up for the first time, another thread names it right after that."""
+
+    def __init__(self, codes: Mapping[str, int]) -> None:
+        super().__init__(codes)
+        self.then: Callable[[], object] | None = None
+
+    def get(self, key: str, default: Any = None) -> Any:
+        """As of any dictionary."""
+        found, then, self.then = super().get(key, default), self.then, None
+        if then is not None:
+            then()
+        return found
+
+
+def test_a_key_that_two_threads_name_at_once_is_admitted_once(tmp_path: Path) -> None:
+    """Or else it would take two places of the limit, and be refused by one of the two at its end."""
+    asked: list[tuple[str, str]] = []
+
+    def admits(key: str, side: str) -> bool:
+        asked.append((key, side))
+        return len(asked) == 1
+
+    words = JournalWords(tmp_path, 1, lambda _: None, admits)
+    codes = words._codes["key"] = Overtaken(words._codes["key"])
+    codes.then = lambda: words.key_code("scan", "base")
+    assert words.key_code("scan", "robot") == words.key_code("scan", "base") == 1
+    assert asked == [("scan", "base")]
     words.close()
 
 

@@ -196,6 +196,15 @@ def test_long_keys_need_more_room(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("few_keys")
+def test_a_key_with_a_sessions_id_counts_once_after_a_restart() -> None:
+    """An earlier start numbered the keys of all sessions as those of one stream, which needs no place of its own then."""
+    links = plan_of(link("robot", "base")).links
+    limit = KeyLimit(links, [("robot-base", "scan/@adv", "put"), ("robot-base", "scan", "put")], lambda _: None)
+    asked = {"scan/@adv/pub/a1": True, "scan/@adv/pub/b2": True, "scan": True, "x": True, "y": True, "z": False}
+    assert {key: limit.admits(key, "robot") for key in asked} == asked
+
+
+@pytest.mark.usefixtures("few_keys")
 def test_a_query_with_a_new_key_beyond_the_limit_is_not_asked(tmp_path: Path) -> None:
     """Its asker waits, as for every query that is dropped."""
     plan = both_ways(query_seconds=0.3)

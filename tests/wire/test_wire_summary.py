@@ -23,6 +23,7 @@ from evedrop.wire.fates import KeyFates
 from evedrop.wire.figures import WIRE_FIGURES
 from evedrop.wire.file import resolved_wire, wire_of
 from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal_on_disk import scorekeeper_on_disk
 from evedrop.wire.plan import Side, WirePlan
 from evedrop.wire.scorekeeper import WireScorekeeper
 from evedrop.wire.tallies import LinkTally
@@ -119,6 +120,30 @@ def test_changes_and_cuts_are_part_of_the_law(tmp_path: Path) -> None:
     assert link.expected_rate == pytest.approx((1500 * 0.2 / 0.22 + 2000 * 0.3) / 3500)
     assert link.within_bounds is True
     assert link.lost_by["cut"] == link.gap_messages == 500
+
+
+def test_gaps_of_a_wire_have_first_fates_and_those_of_its_journal_the_last_ones(tmp_path: Path) -> None:
+    """As docs/wire.md says of the summary; counts and rate are the same in both."""
+    plan = wire_plan(link=BURSTS)
+    (tmp_path / WIRE_FILE).write_text(resolved_wire(plan))
+    with WireJournal(tmp_path, plan) as journal:
+        keeper = WireScorekeeper(plan, journal)
+        key = journal.key_code("scan")
+        rows = [journal.record(journal_time(n), n, -1, 0.1, key, 0, 1, 0, Kind.PUT, 0) for n in range(9)]
+        journal.flush()
+        for row in rows[4:]:
+            journal.amend(row, Crossing.UNDERWAY)
+    keeper.finish(tmp_path)
+    written, later = read(tmp_path).links["link"], scorekeeper_on_disk(tmp_path, plan).summary().links["link"]
+    for link in (written, later):
+        assert (link.delivered, link.dropped_by, link.rate) == (4, {"underway": 5}, 1.0)
+    assert (written.gap_messages, later.gap_messages) == (0, 5)
+    assert (written.gap_seconds, later.gap_seconds > 0) == (0.0, True)
+
+
+def journal_time(n: int) -> float:
+    """When message n is heard, in seconds since 1970."""
+    return time.time() + n
 
 
 def test_what_no_model_decides_is_named_apart(tmp_path: Path) -> None:
