@@ -59,15 +59,15 @@ SINGLE_THREADED: Mapping[str, str] = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THRE
 """For a process of a run, or a worker: one thread for linear algebra, and output that is written at once."""
 
 _CLIENT = "(rx: (worker_threads: 1), tx: (handover: rx), net: (handover: rx), acc: (handover: rx), app: (handover: rx))"
-# A router's receiving must never wait for its sending threads.
-_ROUTER = (
+# A process that passes messages on must not receive on the thread that sends: the full queue it waits for would never empty.
+_PASSES_ON = (
     "(rx: (worker_threads: 1), tx: (worker_threads: 1), net: (handover: tx), acc: (handover: tx), app: (handover: tx))"
 )
 
 
 def lock_step_environment(role: str) -> dict[str, str]:
     """For a process whose messages come one by one: few threads of Zenoh, since each message must wake each of them."""
-    return {"ZENOH_RUNTIME": _ROUTER if role == "router" else _CLIENT}
+    return {"ZENOH_RUNTIME": _PASSES_ON if role in {"router", "relay"} else _CLIENT}
 
 
 _THREADS = "(?:(?:worker|max_blocking)_threads *: *[0-9]{1,9}|handover *: *(?:rx|tx|net|acc|app))"
