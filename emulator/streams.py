@@ -13,13 +13,15 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import lru_cache
 from hashlib import blake2b
-from typing import Generic, TypeVar, final
+from typing import Generic, Protocol, TypeVar, final
 
 import numpy as np
 from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
 from numpy.typing import NDArray
 
+from evedrop.kernels import reference
 from evedrop.kernels.current import kernels
 
 Words = NDArray[np.uint64]
@@ -30,6 +32,8 @@ MOST_SLOTS = 100_000_000
 """The most slots of a run."""
 KEY_BYTES = 32
 _AES_BLOCK = 16
+_ECB = modes.ECB()  # noqa: S305 - counter mode, see `Stream`
+_WORD = np.dtype("<u8")
 _BLOCK_WORDS = 16_384  # words drawn ahead at once: large enough to hide the cost of a call, small enough for the cache
 
 
@@ -40,7 +44,19 @@ def root_of_seed(seed: int) -> bytes:
 
 def stream_key(root: bytes, name: str) -> bytes:
     """Key (32 bytes) of the stream `name` under a root: the seed's, or a secret's."""
-    return blake2b(name.encode(), key=blake2b(root, digest_size=KEY_BYTES).digest(), digest_size=KEY_BYTES).digest()
+    return stream_keys(root)(name)
+
+
+def stream_keys(root: bytes) -> Callable[[str], bytes]:
+    """`stream_key` for many names under a root: what does not depend on the name is computed once."""
+    begun = blake2b(key=blake2b(root, digest_size=KEY_BYTES).digest(), digest_size=KEY_BYTES)
+
+    def key_of(name: str) -> bytes:
+        hashed = begun.copy()
+        hashed.update(name.encode())
+        return hashed.digest()
+
+    return key_of
 
 
 class Stream:
@@ -50,7 +66,7 @@ class Stream:
     """
 
     def __init__(self, key: bytes, trials: range, per_trial: int) -> None:
-        self._encryptor = Cipher(algorithms.AES(key), modes.ECB()).encryptor()  # noqa: S305 - counter mode, see above
+        self._encryptor = Cipher(algorithms.AES(key), _ECB).encryptor()
         self._blocks = (per_trial + 1) // 2
         self._trials = trials
         self._per_trial = per_trial
@@ -132,6 +148,54 @@ class Batch:
     def trial_range(self) -> range:
         """The trials' numbers."""
         return range(self.first_trial, self.first_trial + self.trials)
+
+
+class Reader(Protocol):
+    """Reads the numbers of a stream."""
+
+    def uniforms(self, slots: range) -> Floats:
+        """Uniforms, shape (slots, per_trial, trials)."""
+
+    def normals(self, slots: range) -> Floats:
+        """Standard normals, shape (slots, per_trial, trials)."""
+
+
+@final
+class ShortReader:
+    """The numbers of a stream for the one trial of a batch, made as quickly as possible for a few slots.
+
+    A compiled kernel lets other threads run meanwhile, which takes longer than some numbers do.
+    """
+
+    __slots__ = ("_encryptor", "_per_trial")
+
+    def __init__(self, key: bytes, batch: Batch, per_trial: int) -> None:
+        """Raises ValueError unless the batch is trial 0 alone."""
+        if batch.trial_range != range(1):
+            raise ValueError(batch)
+        self._encryptor = Cipher(algorithms.AES(key), _ECB).encryptor()
+        self._per_trial = per_trial
+
+    def uniforms(self, slots: range) -> Floats:
+        """Uniforms, shape (slots, per_trial, 1)."""
+        return reference.fractions(self._words(slots).swapaxes(1, 2)[:, : self._per_trial])
+
+    def normals(self, slots: range) -> Floats:
+        """Standard normals, shape (slots, per_trial, 1)."""
+        return kernels.normals(self._words(slots), self._per_trial)
+
+    def _words(self, slots: range) -> Words:
+        blocks = (self._per_trial + 1) // 2
+        drawn = self._encryptor.update(_counters(slots.start, slots.stop, blocks))
+        return np.frombuffer(drawn, _WORD).reshape(len(slots), 1, 2 * blocks)
+
+
+@lru_cache(maxsize=256)
+def _counters(start: int, stop: int, blocks: int) -> bytes:
+    """The AES counters of trial 0 in slots start ≤ k < stop, as `kernels.fill_counters` makes them."""
+    return b"".join(
+        (k << 64 | block).to_bytes(_AES_BLOCK, "big") for k in range(start, stop) for block in range(blocks)
+    )
 
 
 @final

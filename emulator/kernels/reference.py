@@ -32,6 +32,7 @@ Words = NDArray[np.uint64]
 Codes = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 
+_UNUSED_BITS = np.uint64(11)  # of a word for a uniform number
 _STATE, _INNOVATION = 1, 2  # `Action` of evedrop.model.receiver
 
 
@@ -46,7 +47,12 @@ def fill_counters(counters: NDArray[np.uint64], slot: int, first: int) -> None:
 
 def uniforms(words: Words, width: int) -> Floats:
     """Uniform numbers in [0, 1), multiples of 2⁻⁵³, (c, width, R), from words (c, R, m), m ≥ width."""
-    numbers = (_ordered(words, width) >> np.uint64(11)).view(np.int64).astype(np.float64)
+    return fractions(_ordered(words, width))
+
+
+def fractions(words: Words) -> Floats:
+    """A uniform number in [0, 1), a multiple of 2⁻⁵³, for each word."""
+    numbers = (words >> _UNUSED_BITS).view(np.int64).astype(np.float64)
     numbers *= 2.0**-53
     return numbers
 

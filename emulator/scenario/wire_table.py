@@ -17,12 +17,17 @@ PUT = "put"
 """The kind of a published message, among the kinds that draw numbers of their own."""
 
 
-def wire_stream_key(root: bytes, stream: str, kind: str, key: str) -> bytes:
-    """The key of the random numbers of a Zenoh key's messages on a link of a wire.
+def wire_stream(stream: str, kind: str, key: str) -> str:
+    """The name of the random stream of a Zenoh key's messages on a link of a wire, under the root of the wire's seed.
 
-    root: of the wire's seed; stream: as in `streams_of`, with the name of the link; kind: of the messages.
+    stream: as in `streams_of`, with the name of the link; kind: of the messages.
     """
-    return stream_key(root, f"wire/{stream}/{kind}/{key}")
+    return f"wire/{stream}/{kind}/{key}"
+
+
+def wire_stream_key(root: bytes, stream: str, kind: str, key: str) -> bytes:
+    """The key of the random numbers of `wire_stream`."""
+    return stream_key(root, wire_stream(stream, kind, key))
 
 
 class WireTable(Table):

@@ -10,14 +10,14 @@ from __future__ import annotations
 from typing import Final
 
 _MARK = "/@adv"
+_HISTORY = f"{_MARK}/"
 LOST_HISTORY_SECONDS: Final = 0.5
 """How long the asker of a history waits for a lost question or answer: an advanced subscriber holds back new messages."""
 
 
 def published_key(key: str) -> str | None:
     """KEY, if a key is `KEY/@adv/…`; None for all other keys."""
-    published, history, _ = key.partition(f"{_MARK}/")
-    return published if history else None
+    return key.partition(_HISTORY)[0] if _HISTORY in key else None
 
 
 def numbered_as(key: str) -> str:

@@ -9,13 +9,13 @@ Source: docs/wire.md, the same traffic, the same losses.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from itertools import repeat
 from typing import Any, final
 
 from evedrop.model.slot.link import NEVER, Change, Fates, Link, LinkSchedule
-from evedrop.scenario.wire_table import wire_stream_key
-from evedrop.streams import Batch, root_of_seed
+from evedrop.scenario.wire_table import wire_stream
+from evedrop.streams import Batch, ShortReader, root_of_seed, stream_keys
 from evedrop.wire.advanced import numbered_as
 from evedrop.wire.plan import WireLink
 
@@ -37,12 +37,12 @@ class KeyFates:
     kind: `put` (deletes are puts), `query` or `reply`; start: the number of the first message to decide; changes: earlier
     changes of the settings, each at the number of the first message that had them.
 
-    schedule: `schedule_of` the link and the changes, which keys may share.
+    law: of the link, the seed and the changes; keys may share it.
 
     Only one thread may call its methods at a time: `LinkState` holds its lock.
     """
 
-    __slots__ = ("_block", "_link", "_name", "_of", "_ready", "_schedule", "_stop")
+    __slots__ = ("_block", "_key", "_kind", "_law", "_link", "_ready", "_stop")
 
     def __init__(
         self,
@@ -52,10 +52,10 @@ class KeyFates:
         seed: int,
         start: int = 0,
         changes: Iterable[Change] = (),
-        schedule: LinkSchedule | None = None,
+        law: KeyLaw | None = None,
     ) -> None:
-        self._schedule, self._name = schedule or schedule_of(link, changes), link.name
-        self._of = (root_of_seed(seed), kind, numbered_as(key))
+        self._law = law or KeyLaw(link, seed, changes)
+        self._kind, self._key = kind, numbered_as(key)
         self._link: Link | None = None
         self._stop = start  # the end of the fates in `_ready`
         self._block = 0
@@ -89,46 +89,64 @@ class KeyFates:
         self._block = _FIRST_BLOCK
         slots = range(self._stop, self._stop + self._block)
         self._stop = slots.stop
-        return _rows(self._begun(slots.start).fates(slots))
+        return _rows(self._law.link(self._kind, self._key, slots.start, short=True).fates(slots))
 
     def _planned(self) -> list[MessageFate]:
         """The fates of the next block, the last one first."""
         if self._link is None:
-            self._link = self._begun(self._stop)
+            self._link = self._law.link(self._kind, self._key, self._stop)
         self._block = min(8 * self._block or _FIRST_BLOCK, _LARGEST_BLOCK)
         slots = range(self._stop, self._stop + self._block)
         self._stop = slots.stop
         return _rows(self._link.planned(slots))
 
-    def _begun(self, start: int) -> Link:
-        """The link, which decides on message `start` next: the memory of a loss model is that of all messages before."""
-        link = Link(self._schedule, self._name, _StreamKeys(*self._of), _MESSAGES)
+
+@final
+class KeyLaw:
+    """How a link decides on the messages of each key: what does not depend on the key is made once."""
+
+    def __init__(self, link: WireLink, seed: int, changes: Iterable[Change]) -> None:
+        """changes: as for `KeyFates`."""
+        schedule = _schedule_of(link, changes)
+        self._long = Link(schedule, link.name, {}, _MESSAGES)
+        self._short = Link(schedule, link.name, {}, _MESSAGES, ShortReader)
+        self._stream_key = stream_keys(root_of_seed(seed))
+
+    def link(self, kind: str, key: str, start: int, *, short: bool = False) -> Link:
+        """The link, which decides on message `start` next: the memory of a loss model is that of all messages before.
+
+        short: whether it decides on few messages in all.
+        """
+        link = (self._short if short else self._long).like(_StreamKeys(self._stream_key, kind, key))
         for first in range(0, start, _PASSED_AT_ONCE):
             link.fates(range(first, min(first + _PASSED_AT_ONCE, start)))
         return link
 
 
-def schedule_of(link: WireLink, changes: Iterable[Change]) -> LinkSchedule:
+def _schedule_of(link: WireLink, changes: Iterable[Change]) -> LinkSchedule:
     """The schedule of a link for the messages of a key. changes: as for `KeyFates`."""
     # Of several changes at one message the last one counts, as with `KeyFates.change`.
     last = {change.at: change for change in sorted(changes, key=lambda change: change.at)}
+    first = last.pop(0, Change(0))  # most keys have no other: a schedule without changes is quicker
     made = tuple(
         Change(at, None if change.settings is None else _timeless(change.settings)) for at, change in last.items()
     )
-    return LinkSchedule(_timeless(link.settings), _LATEST, made, correlation=link.correlation)
+    settings = link.settings if first.settings is None else first.settings
+    return LinkSchedule(_timeless(settings), _LATEST, made, correlation=link.correlation)
 
 
 @final
 class _StreamKeys(dict[str, bytes]):
     """The keys of the random streams of a key's messages, each made when it is asked for: a new key needs few of them."""
 
-    def __init__(self, root: bytes, kind: str, key: str) -> None:
-        super().__init__()
-        self._of = (root, kind, key)
+    __slots__ = ("_of",)
+
+    def __init__(self, stream_key: Callable[[str], bytes], kind: str, key: str) -> None:
+        self._of = (stream_key, kind, key)
 
     def __missing__(self, stream: str) -> bytes:
-        root, kind, key = self._of
-        return wire_stream_key(root, stream, kind, key)
+        stream_key, kind, key = self._of
+        return stream_key(wire_stream(stream, kind, key))
 
 
 def _timeless(settings: Mapping[str, Any]) -> Mapping[str, Any]:

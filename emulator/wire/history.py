@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, final
@@ -67,6 +67,8 @@ class WireHistory:
     """The events since the latest start."""
     _seed: int | None = None
     _settings: dict[str, list[_Settings]] = field(default_factory=dict)
+    _of_new_keys: dict[str, tuple[Change, ...]] = field(default_factory=dict)
+    """Link → the changes of all streams that had no message at any of them."""
 
     @classmethod
     def read(cls, folder: Path) -> WireHistory:
@@ -113,10 +115,12 @@ class WireHistory:
 
     def changes_of(self, link: str, key: str, kind: str) -> tuple[Change, ...]:
         """The settings of a stream's messages: the first from message 0 on, then the changes. For `KeyFates`."""
-        stream, changes = (numbered_as(key), kind), dict[int, Mapping[str, Any]]()
-        for one in self._settings.get(link, []):
-            changes[one.since.get(stream, 0)] = one.settings
-        return tuple(Change(at, settings) for at, settings in sorted(changes.items()))
+        stream, known = (numbered_as(key), kind), self._settings.get(link, [])
+        if any(stream in one.since for one in known):
+            return _changes((one.since.get(stream, 0), one.settings) for one in known)
+        if link not in self._of_new_keys:
+            self._of_new_keys[link] = _changes((0, one.settings) for one in known)
+        return self._of_new_keys[link]
 
     def expect_laws(self) -> None:
         """Raise UsageError unless each link had settings from which the fates of its messages, and their law, can be computed."""
@@ -174,6 +178,13 @@ class WireHistory:
         counted = {(key, kind): n for (name, key, kind), n in self.counts.items() if name == link}
         if not known or known[-1].settings != settings:
             known.append(_Settings(settings, {**counted, **since}))
+            self._of_new_keys.pop(link, None)
+
+
+def _changes(settings: Iterable[tuple[int, Mapping[str, Any]]]) -> tuple[Change, ...]:
+    """Settings as changes, from the numbers of the first messages that had them; of several at one message the last counts."""
+    last = dict(settings)
+    return tuple(Change(at, last[at]) for at in sorted(last))
 
 
 def _number(found: Any) -> int:

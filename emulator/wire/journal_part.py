@@ -137,12 +137,21 @@ class JournalPart:
 def _mapped(path: Path, size: int) -> mmap.mmap:
     """A new file, complete at once under its name. Raises OSError if the disk is full."""
     with private_replacement(path) as unfinished, unfinished.open("r+b") as file:
-        if hasattr(os, "posix_fallocate"):  # not on macOS
-            os.posix_fallocate(file.fileno(), 0, size)
-        else:
-            file.write(bytes(size))
-            file.flush()
-        return mmap.mmap(file.fileno(), size, flags=mmap.MAP_SHARED | _POPULATE)
+        return mapped_end(file.fileno(), 0, size, populate=True)
+
+
+def mapped_end(file: int, start: int, length: int, *, populate: bool = False) -> mmap.mmap:
+    """The last bytes of an open file, from a start where a mapping may begin, with zeros for those that it does not have yet.
+
+    populate: whether to have all of them in memory at once. Raises OSError if the disk has no room for them.
+    """
+    if hasattr(os, "posix_fallocate"):  # not on macOS
+        os.posix_fallocate(file, start, length)
+    else:
+        lacking = start + length - os.fstat(file).st_size
+        if lacking > 0 and os.pwrite(file, bytes(lacking), start + length - lacking) != lacking:
+            raise OSError(28, os.strerror(28))  # ENOSPC: only a full disk accepts part of it
+    return mmap.mmap(file, length, flags=mmap.MAP_SHARED | (_POPULATE if populate else 0), offset=start)
 
 
 def _whole(stored: Records) -> Records:

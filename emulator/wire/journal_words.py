@@ -1,6 +1,8 @@
 """The keys and senders of a wire's messages, each with the code that stands for it in records.
 
-A line of the file `NNN.words` has a code and its text, so the records of a wire that was killed can be read.
+A line of the file `NNN.words` has a code and its text, so the records of a wire that was killed can be read. The end of the
+file is mapped into memory, as records are: a call of the system for each word costs many times as much, above all since other
+threads run meanwhile. Until it is closed, zeros follow the last line.
 
 Source: docs/wire.md, the journal.
 """
@@ -9,13 +11,16 @@ from __future__ import annotations
 
 import contextlib
 import json
+import mmap
 import os
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import final
 
-from evedrop.wire.journal_part import Words
+from evedrop.wire.journal_part import Words, mapped_end
+
+_ROOM = 2**18  # bytes of the file that are mapped at once, unless a word is longer
 
 
 @final
@@ -35,6 +40,8 @@ class JournalWords:
         """
         self._file = os.open(_path(unfinished, start), os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600)
         self._size = os.fstat(self._file).st_size
+        self._map: mmap.mmap | None = None
+        self._start = self._end = 0  # of the bytes of the file that are mapped
         self._miss, self._admits = miss, admits
         self._naming, self._admitting = threading.Lock(), threading.Lock()
         self._codes: dict[str, dict[str, int]] = {"key": {"": 0}, "source": {"": 0}}
@@ -69,26 +76,47 @@ class JournalWords:
 
     def close(self) -> None:
         """Close the file."""
+        self._unmap()
         os.close(self._file)
 
     def _new_code(self, what: str, text: str) -> int:
         with self._naming:
             codes, texts = self._codes[what], self._texts[what]
-            if text not in codes:
+            code = codes.get(text)
+            if code is None:
+                code = len(texts)
                 texts.append(text)
-                self._write(json.dumps([what, len(texts) - 1, text]).encode() + b"\n")
-                codes[text] = len(texts) - 1  # last, because other threads read it without the lock
-            return codes[text]
+                self._write(f'["{what}", {code}, {json.dumps(text)}]\n'.encode())
+                codes[text] = code  # last, because other threads read it without the lock
+            return code
 
     def _write(self, line: bytes) -> None:
-        try:
-            if os.write(self._file, line) == len(line):
-                self._size += len(line)
-            else:
-                os.ftruncate(self._file, self._size)
-                raise OSError(28, os.strerror(28))  # ENOSPC: only a full disk accepts part of a line
-        except OSError as error:
-            self._miss(error)
+        size = self._size + len(line)
+        if size > self._end:
+            try:
+                self._make_room(len(line))
+            except OSError as error:
+                self._miss(error)
+                return
+        assert self._map is not None  # noqa: S101 - it ends at `_end`
+        self._map[self._size - self._start : size - self._start] = line
+        self._size = size
+
+    def _make_room(self, least: int) -> None:
+        """Map the rest of the file, and room for some bytes at least. Raises OSError if the disk is full."""
+        start = self._size - self._size % mmap.ALLOCATIONGRANULARITY
+        length = max(_ROOM, self._size - start + least)
+        made = mapped_end(self._file, start, length)
+        if self._map is not None:
+            self._map.close()
+        self._map, self._start, self._end = made, start, start + length
+
+    def _unmap(self) -> None:
+        """Let the file end with its last line."""
+        if self._map is not None:
+            self._map.close()
+            self._map, self._start, self._end = None, 0, 0
+            os.ftruncate(self._file, self._size)
 
 
 def words_in(unfinished: Path, start: int, links: list[str]) -> Words:

@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any, final
 
-from evedrop.model.slot.link import Change, LinkSchedule
+from evedrop.model.slot.link import Change
 from evedrop.wire.advanced import numbered_as
 from evedrop.wire.crossing import Crossing
-from evedrop.wire.fates import KeyFates, schedule_of
+from evedrop.wire.fates import KeyFates, KeyLaw
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.plan import WireLink, WirePlan
 from evedrop.wire.scheduler import KeyOrder
@@ -27,6 +26,8 @@ _LOOPED = int(Crossing.LOOPED)
 
 Decision = tuple[int, int, float, bool]
 """Number of the message, `Crossing` code, delay in seconds, whether it is delivered twice."""
+_Stream = tuple[str, str]
+"""Kind and key, as in `numbered_as`."""
 Lane = Callable[[float, int], Decision]
 """Decides on the next message of a key, from the present time in seconds and the message's bytes."""
 
@@ -43,12 +44,12 @@ class LinkState:
         """Whether its sides are joined outside the wire, so that its messages would go round."""
         self._seed, self._largest = plan.seed, plan.largest
         self._journal = journal
-        self._fates: dict[tuple[str, str], KeyFates] = {}
-        self._lanes: Counter[tuple[str, str]] = Counter()
+        self._fates: dict[_Stream, KeyFates] = {}
+        self._lanes: dict[_Stream, int] = {}
         """How many keys share each stream: several for the history of an advanced publisher."""
-        self._numbers: dict[tuple[str, str], int] = {}
-        self._schedule: tuple[tuple[Change, ...], LinkSchedule] | None = None  # the latest, which new keys share
-        self._orders: dict[tuple[str, str], KeyOrder] = {}
+        self._numbers: dict[_Stream, int] = {}
+        self._law: tuple[tuple[Change, ...], KeyLaw] | None = None  # the latest, which new keys share
+        self._orders: dict[_Stream, KeyOrder] = {}
         self._lock = threading.Lock()
         self._free = 0.0  # when the queue will have sent all its messages
         self._set(link.settings)
@@ -68,34 +69,37 @@ class LinkState:
     def lane(self, kind: str, key: str, lossless: bool) -> Lane:
         """What decides on the messages of a key and kind."""
         stream = (kind, numbered_as(key))
-        return self._never(*stream) if lossless else self._decide(*stream)
+        return self._never(stream) if lossless else self._decide(stream)
 
     def order(self, kind: str, key: str) -> KeyOrder | None:
         """The order that messages of a key and kind keep; None if they may overtake each other."""
-        return self._orders.get((kind, numbered_as(key)))
+        return self._orders.get((kind, numbered_as(key))) if self._orders else None
 
     def forget(self, kind: str, key: str) -> None:
         """Keep only the number of the next message of a key and kind, until there is one: the journal's, if it has it."""
         stream = (kind, numbered_as(key))
         with self._lock:
+            if stream not in self._lanes:
+                return
             self._lanes[stream] -= 1
-            if self._lanes[stream] <= 0:
-                del self._lanes[stream]
-                fates = self._fates.pop(stream, None)
-                n = self._numbers.pop(stream, None) if fates is None else fates.n
-                if n is not None and n != self._counted(*stream):
-                    self._numbers[stream] = n
-                order = self._orders.get(stream)
-                if order is not None and order.due <= time.monotonic():
-                    del self._orders[stream]
+            if self._lanes[stream]:
+                return
+            del self._lanes[stream]
+            fates = self._fates.pop(stream, None)
+            n = self._numbers.pop(stream, None) if fates is None else fates.n
+            if n is not None and n != self._counted(stream):
+                self._numbers[stream] = n
+            order = self._orders.get(stream)
+            if order is not None and order.due <= time.monotonic():
+                del self._orders[stream]
 
-    def _decide(self, kind: str, key: str) -> Lane:
+    def _decide(self, stream: _Stream) -> Lane:
         lock, largest = self._lock, self._largest
         with lock:
-            fates = self._fates_of(kind, key)
+            fates = self._fates_of(stream)
             after = fates.next
-            order = self._orders.setdefault((kind, key), KeyOrder()) if self.link.ordered else None
-            self._lanes[kind, key] += 1
+            order = self._orders.setdefault(stream, KeyOrder()) if self.link.ordered else None
+            self._lanes[stream] = self._lanes.get(stream, 0) + 1
 
         def decide(now: float, size: int) -> Decision:
             with lock:
@@ -118,12 +122,12 @@ class LinkState:
 
         return decide
 
-    def _never(self, kind: str, key: str) -> Lane:
+    def _never(self, stream: _Stream) -> Lane:
         """For messages that are never lost: they take no fates, but they are numbered, and must not go round."""
-        lock, largest, numbers, stream = self._lock, self._largest, self._numbers, (kind, key)
+        lock, largest, numbers = self._lock, self._largest, self._numbers
         with lock:
-            numbers.setdefault(stream, self._counted(kind, key))
-            self._lanes[stream] += 1
+            numbers.setdefault(stream, self._counted(stream))
+            self._lanes[stream] = self._lanes.get(stream, 0) + 1
 
         def decide(_now: float, size: int) -> Decision:
             with lock:
@@ -135,21 +139,21 @@ class LinkState:
 
         return decide
 
-    def _fates_of(self, kind: str, key: str) -> KeyFates:
+    def _fates_of(self, stream: _Stream) -> KeyFates:
         """The fates of a key and kind. The lock is held."""
-        fates = self._fates.get((kind, key))
+        fates = self._fates.get(stream)
         if fates is None:
-            start = self._numbers.pop((kind, key), self._counted(kind, key))
+            kind, key = stream
+            start = self._numbers.pop(stream) if stream in self._numbers else self._counted(stream)
             changes = self._journal.changes_of(self.link.name, key, kind)
-            if self._schedule is None or self._schedule[0] != changes:
-                self._schedule = (changes, schedule_of(self.link, changes))
-            fates = self._fates[kind, key] = KeyFates(
-                self.link, key, kind, self._seed, start, schedule=self._schedule[1]
-            )
+            if self._law is None or self._law[0] != changes:
+                self._law = (changes, KeyLaw(self.link, self._seed, changes))
+            fates = self._fates[stream] = KeyFates(self.link, key, kind, self._seed, start, law=self._law[1])
         return fates
 
-    def _counted(self, kind: str, key: str) -> int:
+    def _counted(self, stream: _Stream) -> int:
         """How many messages of a key and kind were numbered, as of the records that the journal has handed over."""
+        kind, key = stream
         return self._journal.counts.get((self.link.name, key, kind), 0)
 
     def _set(self, settings: Mapping[str, Any]) -> None:

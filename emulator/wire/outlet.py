@@ -24,7 +24,9 @@ from evedrop.wire.watchdog import Duty
 MOST_WAITING: Final = 8192
 """Messages that may wait for their turn at a side."""
 MOST_BYTES: Final = 2**26
-"""Their bytes, unless it is a single message."""
+"""Their bytes, as `waiting_bytes`, unless it is a single message."""
+MESSAGE_BYTES: Final = 1024
+"""Bytes that a message takes besides its key, payload and attachment."""
 PATIENCE: Final = 2.0
 """Seconds in which a side must take some of a full queue, or else nobody waits for it any more; each time half as many."""
 LONG_SECONDS: Final = 2e-4
@@ -40,6 +42,11 @@ _PART = 32  # of a full queue: so much of it must become free before those who w
 _NO_ROW = -1
 
 Task = Callable[[], object]
+
+
+def waiting_bytes(size: int, key: str) -> int:
+    """How many bytes a message takes while it waits. size: of its payload and attachment, in bytes."""
+    return size + len(key) + MESSAGE_BYTES
 
 
 @final
@@ -90,9 +97,10 @@ class SideOutlet:
         order: KeyOrder | None = None,
         lost: Callable[[], None] | None = None,
     ) -> None:
-        """Send a message of some bytes, by a task, after some seconds. Its row in the journal is `HELD`.
+        """Send a message, by a task, after some seconds. Its row in the journal is `HELD`.
 
-        patient: whether to wait for room; order: that it must keep; lost: is called if there is no room.
+        size: as `waiting_bytes`; patient: whether to wait for room; order: that it must keep; lost: is called if there is no
+        room.
 
         A message for which there is no room becomes `HELD_UP` if it is delayed, or else `CONGESTED`; one whose task raises an
         error becomes `REFUSED`.

@@ -77,7 +77,10 @@ class WireLink:
 
         The history of an advanced publisher, `KEY/@adv/…`, goes where its key goes.
         """
-        return any(self.expression.intersects(one) for one in _with_published(key))
+        if self.expression.intersects(key):
+            return True
+        published = published_key(str(key))
+        return published is not None and self.expression.intersects(zenoh.KeyExpr(published))
 
     def takes_all(self, key: zenoh.KeyExpr) -> bool:
         """Whether all messages with this key, which may contain wildcards, are this link's."""
@@ -128,8 +131,10 @@ class WirePlan:
 
         query: whether they are queries or replies, which no tap carries.
         """
-        links = (link for link in self.links if (link.source, link.target) == (source, target))
-        return next((link for link in links if link.takes(key) and not (query and link.tap)), None)
+        for link in self._between.get((source, target), ()):
+            if link.takes(key) and not (query and link.tap):
+                return link
+        return None
 
     def named(self, name: str) -> WireLink:
         """The link with this name. Raises KeyError if no link has it."""
@@ -137,7 +142,19 @@ class WirePlan:
 
     def is_lossless(self, key: zenoh.KeyExpr) -> bool:
         """Whether messages with this key are never lost: it is named, or it is `KEY/@adv/…` and KEY is named."""
-        return any(zenoh.KeyExpr(one).includes(each) for one in self.lossless for each in _with_published(key))
+        if not self.lossless:
+            return False
+        return any(one.includes(each) for one in self._never_lost for each in _with_published(key))
+
+    @cached_property
+    def _between(self) -> Mapping[tuple[str, str], tuple[WireLink, ...]]:
+        """(source, target) → the links between these sides, in the order of the file."""
+        ways = {(link.source, link.target) for link in self.links}
+        return {way: tuple(link for link in self.links if (link.source, link.target) == way) for way in ways}
+
+    @cached_property
+    def _never_lost(self) -> tuple[zenoh.KeyExpr, ...]:
+        return tuple(map(zenoh.KeyExpr, self.lossless))
 
 
 def _with_published(key: zenoh.KeyExpr) -> tuple[zenoh.KeyExpr, ...]:

@@ -21,7 +21,7 @@ from evedrop.wire.backlog import Backlog
 from evedrop.wire.crossing import AGAIN, HELD, UNLINKED, Crossing, Kind
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.lanes import Lane, LinkState
-from evedrop.wire.outlet import LONG_SECONDS, SideOutlet
+from evedrop.wire.outlet import LONG_SECONDS, SideOutlet, waiting_bytes
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.publishers import OFTEN, REMOTE, Message, Publishers
 from evedrop.wire.ros2 import SourceReader
@@ -134,9 +134,9 @@ class PublicationRelay:
         """links, publishers, outlets: by the names of links and of sides; tell: for what the user must know."""
         self._links, self._publishers, self._outlets = links, publishers, outlets
         self._plan, self._journal = plan, journal
-        self._has_one_target = (
-            len({link.target for link in plan.links if link.source == side.name and not link.tap}) == 1
-        )
+        links_away = [link for link in plan.links if link.source == side.name]
+        self._targets = [name for name in publishers if name in {link.target for link in links_away}]
+        self._has_one_target = len({link.target for link in links_away if not link.tap}) == 1
         self._side, self._name, self._tell = side, side.name, tell
         self.duties: list[Duty] = []
         self.backlogs: list[Backlog] = []
@@ -243,7 +243,8 @@ class PublicationRelay:
                     publisher = way.publisher(sample) if frequent else None
                     message = way.message(sample, 2 if again else 1, publisher)
                     if not at_once:
-                        outlet.send(delay, size, row, message, patient=way.patient, order=way.order)
+                        room = waiting_bytes(size, key)
+                        outlet.send(delay, room, row, message, patient=way.patient, order=way.order)
                         continue
                     begun = clock()
                     message()
@@ -267,7 +268,7 @@ class PublicationRelay:
                 for way in ready[0]:
                     way.forget()
         code = self._journal.key_code(key, self._name)
-        taken = (self._plan.link_of(self._name, target, expression) for target in self._publishers)
+        taken = [self._plan.link_of(self._name, target, expression) for target in self._targets]
         states = [self._links[link.name] for link in taken if link is not None]
         ended = time.time() > self._until
         if code and not ended:

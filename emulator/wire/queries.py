@@ -23,7 +23,7 @@ from evedrop.wire.advanced import LOST_HISTORY_SECONDS, published_key
 from evedrop.wire.crossing import AGAIN, HELD, UNLINKED, Crossing, Kind
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.lanes import Decision, Lane, LinkState
-from evedrop.wire.outlet import SideOutlet
+from evedrop.wire.outlet import SideOutlet, waiting_bytes
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.publications import READY_KEYS
 from evedrop.wire.ros2 import SourceReader, reply_seconds
@@ -281,7 +281,8 @@ class QueryRelay:
 
         # Replies wait for room: one query may have many.
         order = state.order(kind.stream, key)
-        self._outlets[way[1]].send(delay, size, row, send, patient=kind == Kind.REPLY, order=order, lost=lost)
+        room = waiting_bytes(size, key)
+        self._outlets[way[1]].send(delay, room, row, send, patient=kind == Kind.REPLY, order=order, lost=lost)
 
     def _wait_in_vain(self, asked: _Asked) -> None:
         """Let an asker wait for its query, or for a reply, that is lost: nothing tells it so."""

@@ -134,6 +134,8 @@ class WireScorekeeper:
         return self._unlinked if code == UNLINKED else self._links[code]
 
     def _is_lossless(self, key: int) -> bool:
+        if not self._plan.lossless:
+            return False
         if key not in self._lossless:
             self._lossless[key] = self._plan.is_lossless(zenoh.KeyExpr(self._journal.key_of(key)))
         return self._lossless[key]

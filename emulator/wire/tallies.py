@@ -27,7 +27,9 @@ for _fate in Crossing:
 class StreamTally:
     """The messages of one key and kind on one link."""
 
-    __slots__ = ("_missing", "_since", "longest", "passed", "ranges", "scattered", "silence", "tried")
+    __slots__ = (
+        "_earlier", "_missing", "_since", "_start", "_stop", "longest", "passed", "scattered", "silence", "tried",
+    )  # fmt: skip
 
     def __init__(self) -> None:
         self.tried = 0
@@ -38,19 +40,25 @@ class StreamTally:
         """The most messages in a row that were not delivered."""
         self.silence = 0.0
         """The longest time, in seconds, from a delivered message to the next one, if messages between them were not delivered."""
-        self.ranges: list[tuple[int, int]] = []
-        """The numbers of the messages in `tried`: first, and first after; in no particular order."""
         self.scattered = False
-        """Whether they are too scattered to be kept: then `ranges` is one that contains all of them."""
+        """Whether their numbers are too scattered to be kept: then `ranges` is one that contains all of them."""
+        self._start = self._stop = 0
+        self._earlier: list[tuple[int, int]] | None = None  # most streams have one range, and no need for a list
         self._missing = 0
         self._since: float | None = None  # when the latest delivered message was heard, or else the first message
+
+    @property
+    def ranges(self) -> list[tuple[int, int]]:
+        """The numbers of the messages in `tried`: first, and first after; in no particular order."""
+        latest = [(self._start, self._stop)] if self._stop else []
+        return [*(self._earlier or ()), *latest]
 
     def add_one(self, time: float, n: int, fate: int, decided: bool) -> None:
         """Add a message, as `add` does: for few messages, which are most of all where keys are many, arrays cost more."""
         if decided and n >= 0 and _TRIED[fate]:
             self.tried += 1
             self.passed += int(_PASSED[fate])
-            self._add_ranges([(n, n + 1)])
+            self._add_range(n, n + 1)
         since = time if self._since is None else self._since
         delivered = fate == Crossing.DELIVERED
         if self._missing or not delivered:
@@ -88,15 +96,24 @@ class StreamTally:
             return
         breaks = np.flatnonzero(np.diff(numbers) != 1) + 1
         starts, stops = numbers[np.r_[0, breaks]].tolist(), (numbers[np.r_[breaks - 1, -1]] + 1).tolist()
-        self._add_ranges(list(zip(starts, stops, strict=True)))
+        for start, stop in zip(starts, stops, strict=True):
+            self._add_range(start, stop)
 
-    def _add_ranges(self, ranges: list[tuple[int, int]]) -> None:
-        if self.ranges and self.ranges[-1][1] == ranges[0][0]:
-            ranges[0] = (self.ranges.pop()[0], ranges[0][1])
-        self.ranges += ranges
-        if self.scattered or len(self.ranges) > _MOST_RANGES:
-            self.scattered = True
-            self.ranges = [(min(start for start, _ in self.ranges), max(stop for _, stop in self.ranges))]
+    def _add_range(self, start: int, stop: int) -> None:
+        if not self._stop:
+            self._start, self._stop = start, stop
+        elif self.scattered:
+            self._start, self._stop = min(start, self._start), max(stop, self._stop)
+        elif start == self._stop:
+            self._stop = stop
+        else:
+            earlier = self._earlier = self._earlier or []
+            earlier.append((self._start, self._stop))
+            self._start, self._stop = start, stop
+            if len(earlier) == _MOST_RANGES:
+                self.scattered, self._earlier = True, None
+                self._start = min(start, *(first for first, _ in earlier))
+                self._stop = max(stop, *(last for _, last in earlier))
 
 
 @final

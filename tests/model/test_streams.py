@@ -12,7 +12,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from evedrop.streams import Ahead, Batch, BlockReader, Stream, normals, root_of_seed, stream_key, uniforms
+from evedrop.streams import (
+    Ahead,
+    Batch,
+    BlockReader,
+    ShortReader,
+    Stream,
+    normals,
+    root_of_seed,
+    stream_key,
+    stream_keys,
+    uniforms,
+)
 
 KEY = bytes(range(32))
 SLOTS = st.integers(0, 2**45)
@@ -138,3 +149,33 @@ def test_numbers_have_their_distributions(per_trial: int) -> None:
     for left, right in pairs:
         correlation = np.mean(left * right)
         assert abs(correlation) < 4.9 / np.sqrt(left.size)
+
+
+@pytest.mark.parametrize("per_trial", [1, 2, 3])
+@pytest.mark.parametrize("slots", [range(8), range(5, 6), range(64, 72)])
+def test_a_short_reader_has_the_numbers_of_the_stream(per_trial: int, slots: range) -> None:
+    """In any order, to the bit."""
+    batch = Batch(100, 1)
+    short, block = ShortReader(KEY, batch, per_trial), BlockReader(KEY, batch, per_trial)
+    for _ in range(2):
+        for made, expected in (
+            (short.normals(slots), block.normals(slots)),
+            (short.uniforms(slots), block.uniforms(slots)),
+        ):
+            assert made.dtype == np.float64
+            assert made.shape == (len(slots), per_trial, 1)
+            assert made.tolist() == expected.tolist()
+
+
+@pytest.mark.parametrize("batch", [Batch(100, 2), Batch(100, 1, first_trial=1)])
+def test_a_short_reader_reads_the_first_trial_alone(batch: Batch) -> None:
+    """Others are refused."""
+    with pytest.raises(ValueError, match="Batch"):
+        ShortReader(KEY, batch, 1)
+
+
+def test_many_keys_under_one_root_are_those_of_each_name() -> None:
+    """Names do not add up."""
+    root = root_of_seed(7)
+    key_of = stream_keys(root)
+    assert [key_of(name) for name in ("a", "b", "a")] == [stream_key(root, name) for name in ("a", "b", "a")]

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import mmap
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from evedrop.wire.journal_part import Words
 from evedrop.wire.journal_words import JournalWords, words_in
@@ -50,6 +53,38 @@ def test_a_key_that_two_threads_name_at_once_is_admitted_once(tmp_path: Path) ->
     codes.then = lambda: words.key_code("scan", "base")
     assert words.key_code("scan", "robot") == words.key_code("scan", "base") == 1
     assert asked == [("scan", "base")]
+    words.close()
+
+
+def test_words_of_any_length_and_number_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The file grows with them, and ends with the last one when it is closed."""
+    monkeypatch.setattr("evedrop.wire.journal_words._ROOM", mmap.ALLOCATIONGRANULARITY)
+    words = JournalWords(tmp_path, 1, lambda _: None)
+    keys = {words.key_code(key): key for n in range(300) for key in (f"key/{n}", f"{n}/{'ö' * 40 * n}")}
+    assert len(keys) == 600
+    assert words_in(tmp_path, 1, LINKS) == Words(LINKS, keys, {})
+    words.close()
+    assert words_in(tmp_path, 1, LINKS) == Words(LINKS, keys, {})
+    assert (tmp_path / "001.words").read_bytes().endswith(b'"]\n')
+
+
+def test_a_word_for_which_the_disk_has_no_room_has_its_code_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The file lacks it, and goes on with those after it once there is room."""
+    missed: list[OSError] = []
+    words = JournalWords(tmp_path, 1, missed.append)
+
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("evedrop.wire.journal_words.mapped_end", full)
+        assert [words.key_code(key) for key in ("a", "b", "a")] == [1, 2, 1]
+    assert [error.errno for error in missed] == [28, 28]
+    assert words.key_code("c") == 3
+    assert words_in(tmp_path, 1, LINKS) == Words(LINKS, {3: "c"}, {})
+    assert words.words(LINKS).keys == {0: "", 1: "a", 2: "b", 3: "c"}
     words.close()
 
 

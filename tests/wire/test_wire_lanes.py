@@ -118,6 +118,16 @@ def test_other_settings_hold_from_the_next_message_on(tmp_path: Path) -> None:
     assert [at[-2:] for at in messages] == [[3, 4], [0, 1]]
 
 
+def test_a_key_that_comes_after_a_change_has_the_new_settings_alone(lossy: LinkState) -> None:
+    """From its first message on, each time that the settings change; the keys before it had others."""
+    expected = []
+    for n, settings in enumerate([lossy.link.settings, DEAD, PERFECT]):
+        lossy.change(settings)
+        expected.append(KeyFates(link("robot", "base", settings), f"key/{n}", "put", 7).next()[0])
+        assert lossy.lane("put", f"key/{n}", lossless=False)(float(n), 1)[1] == expected[-1]
+    assert expected[1:] == [Crossing.LOST, Crossing.DELIVERED]
+
+
 def test_two_who_ask_for_a_key_share_its_messages(lossy: LinkState) -> None:
     """They have one sequence of numbers, with one sequence of fates."""
     fates = KeyFates(lossy.link, "scan", "put", 7)

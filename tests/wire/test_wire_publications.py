@@ -184,6 +184,17 @@ def test_why_a_message_does_not_cross(
         wait_until(lambda: sender.put("a", b"x" * 11) or fate in [*wire.fates(), *wire.amended], "the wire hears")
 
 
+@pytest.mark.parametrize(("key", "held"), [("a", 2), ("a" * 1500, 1)])
+def test_a_message_that_waits_takes_more_room_than_its_payload(tmp_path: Path, key: str, held: int) -> None:
+    """Its key, and what the wire keeps for every message: empty messages do not fill the memory."""
+    delayed = {**PERFECT, "delay": {"model": "constant", "value": 1000.0}}
+    with at_work(both_ways(delayed, held_bytes=3000), tmp_path) as wire, wire.program("robot") as sender:
+        for _ in range(4):
+            sender.put(key, b"", congestion_control=zenoh.CongestionControl.BLOCK)
+        wait_until(lambda: [*wire.fates(), *wire.amended].count(Crossing.HELD_UP) == 4 - held, "those beyond it")
+        assert len(wire.rows) == 4
+
+
 def test_a_key_that_was_forgotten_goes_on_with_its_next_fate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With room for two keys, three in turns have the fates that each would have alone, with the settings of their link."""
     monkeypatch.setattr("evedrop.wire.publications.READY_KEYS", 2)

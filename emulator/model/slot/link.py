@@ -10,7 +10,7 @@ Source: docs/mathematics.md, links; docs/links.md.
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, NamedTuple, final
@@ -23,7 +23,7 @@ from evedrop.model.links import loss_of
 from evedrop.model.links.link import Fate, LossModel
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes, Flags
-from evedrop.streams import Batch, BlockReader
+from evedrop.streams import Batch, BlockReader, Reader
 
 NEVER = 2**62
 """A slot that no run reaches."""
@@ -129,21 +129,28 @@ class _State:
 class Link:
     """One receiver's link. Slots must be read in order, any number at a time.
 
-    keys: the keys of `streams_of`.
+    keys: the keys of `streams_of`; reader: what reads their numbers, from a key, the batch and the numbers of a trial.
     """
 
     schedule: LinkSchedule
     receiver: str
     keys: Mapping[str, bytes]
     batch: Batch
+    reader: Callable[[bytes, Batch, int], Reader] = BlockReader
     _state: _State = field(init=False)
     _before: tuple[_State, range] | None = field(init=False, default=None)
     _changes: list[Change] = field(init=False)
-    _readers: dict[tuple[str, int], BlockReader] = field(init=False, default_factory=dict)
+    _readers: dict[tuple[str, int], Reader] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         self._state = _State(self.schedule.settings, loss_of(self.schedule.settings["loss"]))
         self._changes = sorted(self.schedule.changes, key=lambda change: change.at)
+
+    def like(self, keys: Mapping[str, bytes]) -> Link:
+        """The same link with other keys, which is quicker than to make it. This link must not have begun."""
+        link = Link.__new__(Link)
+        vars(link).update(vars(self), keys=keys, _state=self._state.copied(), _readers={})
+        return link
 
     def planned(self, slots: range) -> Fates:
         """The fates of the next slots, which may still be amended."""
@@ -262,13 +269,14 @@ class Link:
     def _uniforms(self, stream: str, slots: range, width: int) -> Floats:
         return self._reader(stream, width).uniforms(slots)
 
-    def _reader(self, stream: str, width: int) -> BlockReader:
+    def _reader(self, stream: str, width: int) -> Reader:
         return self._reader_of(f"{stream}/{self.receiver}", width)
 
-    def _reader_of(self, name: str, width: int) -> BlockReader:
-        if (name, width) not in self._readers:
-            self._readers[name, width] = BlockReader(self.keys[name], self.batch, width)
-        return self._readers[name, width]
+    def _reader_of(self, name: str, width: int) -> Reader:
+        reader = self._readers.get((name, width))
+        if reader is None:
+            reader = self._readers[name, width] = self.reader(self.keys[name], self.batch, width)
+        return reader
 
 
 def _joined(parts: list[Fates]) -> Fates:
