@@ -128,10 +128,12 @@ def test_what_is_not_recorded_rests_on_its_own_word() -> None:
     )
 
 
-def test_traces_of_recorded_trials_are_theirs() -> None:
-    """Where all trials are recorded the sums are known to within rounding."""
+@pytest.mark.parametrize("factor", [[1.0 + 1e-6, 1.0], [1.0, 1.0 + 1e-6]])
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_traces_of_recorded_trials_are_theirs(scale: float, factor: list[float]) -> None:
+    """Where all trials are recorded the sums are known to within rounding, however large they are."""
     made = reports(100, TRIALS)
-    made[0] = replace(made[0], trace=made[0].trace * [1.0 + 1e-6, 1.0])
+    made[0] = replace(made[0], P=scale * made[0].P, trace=made[0].trace * [scale, scale**2] * factor)
     with pytest.raises(Contradiction, match="its sums of tr P"):
         verified(made, TRIALS)
 

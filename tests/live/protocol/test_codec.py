@@ -11,8 +11,10 @@ import pytest
 
 from evedrop.errors import MalformedMessage
 from evedrop.live.protocol.codec import Reader, pack, read_refusal, refusal
-from evedrop.live.protocol.packets import delivery, read_delivery, read_extras, read_uplink, uplink
+from evedrop.live.protocol.packets import delivery, packed_header, read_delivery, read_extras, read_uplink, uplink
 from evedrop.live.protocol.telemetry import Extent, Truth, read_truth
+from evedrop.model.receiver import Reception
+from evedrop.model.slot.transit import Late
 from tests.live.network.readers import EXAMPLES, READERS, TRIALS, fields_of
 
 KEY = "evedrop/r1/telemetry/eve"
@@ -150,3 +152,14 @@ def test_what_a_packet_carries_besides_its_payload_is_read_as_sent() -> None:
         assert found is not None
         assert np.array_equal(found, given)
     assert read_extras(Reader(KEY, uplink(4, z)), (2, 3)) == (None, None, None)
+
+
+def test_the_header_of_a_delivery_is_read_for_the_trials_that_received() -> None:
+    """Of the slot's own packet, and of a late one; 0 elsewhere."""
+    header, received = np.array([[4, -1, 2**40]]), np.array([True, False, True])
+    late = (Late(3, Reception(~received, np.ones((2, 3)), header)),)
+    payload = delivery(4, b"\x05", np.ones((2, 2)).tobytes(), late, packed_header(header, received))
+    heard, found = read_delivery(Reader(KEY, payload), 4, (2, 3), header=1)
+    for one, gamma in ((heard, received), (found[0].heard, ~received)):
+        assert one.header is not None
+        assert np.array_equal(one.header, np.where(gamma, header, 0))
