@@ -7,11 +7,11 @@ FROM ${EVEDROP_BASE:-${PINNED}} AS build
 # pip stays behind with this stage: it installs from the outside into an environment that has none.
 RUN python3 -m venv /build && python3 -m venv --without-pip /opt/evedrop
 # build/wheels is there where packages were fetched beforehand, for a build that reaches no index (docs/containers.md).
-COPY constraints.txt build/wheels* /wheels/
+COPY tools/constraints/project.txt build/wheels* /wheels/
 # Every locked package, checked against its hash; of them what a run needs is installed, and what builds the wheel is used.
 RUN if ls /wheels/*.whl >/dev/null 2>&1; then index=--no-index; fi; \
     /build/bin/pip download --quiet --disable-pip-version-check --no-cache-dir $index --find-links /wheels \
-      --require-hashes --no-deps --requirement /wheels/constraints.txt --dest /packages
+      --require-hashes --no-deps --requirement /wheels/project.txt --dest /packages
 COPY pyproject.toml hatch_build.py README.md LICENSE /source/
 COPY docs /source/docs
 COPY emulator /source/emulator

@@ -23,7 +23,7 @@ test-wheel: $(READY)
 
 # Pictures and videos, drawn by Rerun's viewer without a screen. Without a Vulkan driver they are skipped.
 test-pictures: $(READY)
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "pictures and not long" tests/view
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "pictures and not long" tests/show/view
 
 COVERING := $(addprefix tests/,model live/protocol live/network/test_protocol.py live/network/test_wire.py)
 
@@ -100,21 +100,21 @@ setup: $(READY)
 # The locked versions, each checked against its hash; then this project itself, which needs no download. Its C kernels are
 # compiled with the machine's compiler, or that of the package ziglang if it is in the environment; without either, pip succeeds
 # all the same, and numpy does their work.
-$(READY): constraints.txt pyproject.toml hatch_build.py $(wildcard emulator/kernels/binding.py emulator/kernels/source/*)
+$(READY): tools/constraints/project.txt pyproject.toml hatch_build.py $(wildcard emulator/evedrop/model/kernels/binding.py emulator/evedrop/model/kernels/source/*)
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python tools/install.py constraints.txt
+	$(BIN)/python tools/install.py tools/constraints/project.txt
 	$(BIN)/python tools/install.py --project .
 	touch $(READY)
 
 # Versions of the packages that build the site, each checked against its hash.
-$(DOCS_READY): $(READY) constraints-docs.txt
-	$(BIN)/python tools/install.py constraints-docs.txt
+$(DOCS_READY): $(READY) tools/constraints/docs.txt
+	$(BIN)/python tools/install.py tools/constraints/docs.txt
 	touch $(DOCS_READY)
 
 # Versions of the packages that run notebooks, each checked against its hash.
-$(NOTEBOOKS_READY): $(READY) constraints-notebooks.txt
-	$(BIN)/python tools/install.py constraints-notebooks.txt
+$(NOTEBOOKS_READY): $(READY) tools/constraints/notebooks.txt
+	$(BIN)/python tools/install.py tools/constraints/notebooks.txt
 	touch $(NOTEBOOKS_READY)
 
 clean:
-	rm -rf $(VENV) build/site build/gallery emulator/kernels/_compiled.* .mypy_cache .ruff_cache .pytest_cache .hypothesis build/test-base-*.tar*
+	rm -rf $(VENV) build/site build/gallery emulator/evedrop/model/kernels/_compiled.* .mypy_cache .ruff_cache .pytest_cache .hypothesis build/test-base-*.tar*

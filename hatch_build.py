@@ -14,7 +14,7 @@ from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
-_ROOM = Path("emulator/kernels")
+_KERNELS = Path("emulator/evedrop/model/kernels")
 _REQUIRED = "EVEDROP_KERNELS_REQUIRED"
 
 
@@ -31,7 +31,7 @@ class KernelsHook(BuildHookInterface):
         required = os.environ.get(_REQUIRED, "0")
         if required not in {"0", "1"}:
             raise ValueError(f"{_REQUIRED} is {required!r}; expected 1 or 0, or leave it out")
-        folder = Path(self.root) / (_ROOM if version == "editable" else "build/kernels")
+        folder = Path(self.root) / (_KERNELS if version == "editable" else "build/kernels")
         folder.mkdir(parents=True, exist_ok=True)
         # Only this Python's own: environments of several Pythons may share a checkout.
         for old in folder.glob(f"_compiled.{sys.implementation.cache_tag}-*"):
@@ -47,16 +47,16 @@ class KernelsHook(BuildHookInterface):
             self.app.display_warning(f"the C kernels were not built, numpy will be used: {error}")
             return
         if version != "editable":
-            build_data["force_include"][str(built)] = f"evedrop/kernels/{built.name}"
+            build_data["force_include"][str(built)] = f"evedrop/model/kernels/{built.name}"
             build_data["pure_python"] = False
             build_data["infer_tag"] = True
 
 
 def _binding(root: Path) -> Any:
-    """The module `evedrop.kernels.binding`, of a package that is not installed yet."""
-    spec = importlib.util.spec_from_file_location("kernels_binding", root / _ROOM / "binding.py")
+    """The module `evedrop.model.kernels.binding`, of a package that is not installed yet."""
+    spec = importlib.util.spec_from_file_location("kernels_binding", root / _KERNELS / "binding.py")
     if spec is None or spec.loader is None:
-        raise RuntimeError(f"{root / _ROOM} has no binding.py")
+        raise RuntimeError(f"{root / _KERNELS} has no binding.py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)

@@ -14,19 +14,19 @@ import time
 from pathlib import Path
 
 from evedrop import compare
-from evedrop.expected.expectations import expectations_of
-from evedrop.loading import load
-from evedrop.memory.montecarlo import Plan
-from evedrop.memory.workers import usable_cores
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.process import Trajectory
 from evedrop.model.receiver import Reception
 from evedrop.model.schemes import scheme_of
 from evedrop.model.slot.link import Link
-from evedrop.scenario import Scenario
+from evedrop.model.streams import Batch
+from evedrop.scenario.expected.expectations import expectations_of
+from evedrop.scenario.loading import load
 from evedrop.scenario.stream_keys import StreamKeys
-from evedrop.streams import Batch
+from evedrop.scenario.tables import Scenario
+from evedrop.simulate.montecarlo import Plan
+from evedrop.simulate.workers import usable_cores
 
 MARGINAL = "bayesian"
 """The shipped scenario that all of it is measured on: two states, marginally stable."""

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 from live_run import rate
 
-from evedrop.ports import free_port
+from evedrop.system.ports import free_port
 
 WAYS: dict[str, Callable[[], tuple[str, ...]]] = {
     "in clear": lambda: (),

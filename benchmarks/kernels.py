@@ -27,12 +27,12 @@ from typing import Any
 import numpy as np
 from table import Row, judged, load, run_alone
 
-from evedrop.kernels.choice import KERNELS
-from evedrop.loading import checked
-from evedrop.memory.simulation import Mode, Simulation
-from evedrop.memory.trials import TrialsTask, carry_out
+from evedrop.model.kernels.choice import KERNELS
 from evedrop.names import KERNELS_VARIABLE
-from evedrop.scenario import Scenario
+from evedrop.scenario.loading import checked
+from evedrop.scenario.tables import Scenario
+from evedrop.simulate.simulation import Mode, Simulation
+from evedrop.simulate.trials import TrialsTask, carry_out
 
 ROUNDS = 5
 Case = tuple[str, int, int, int]

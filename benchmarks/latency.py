@@ -24,7 +24,7 @@ from table import Row, judged, run_alone
 from zenoh_peers import Load, Peer, Present, Times, carry, envelope, session_of
 
 from evedrop.names import LEGITIMATE, OBSERVER, ROUTER, SENSOR
-from evedrop.ports import free_port
+from evedrop.system.ports import free_port
 
 RATE = 1000.0
 _NOT_RECEIVERS = (ROUTER, SENSOR, OBSERVER)

@@ -18,7 +18,7 @@ from live_run import measured, scenario_file
 from processes import watch_cpu
 
 from evedrop.model.links import LOSS_MODELS, loss_of
-from evedrop.streams import Batch, BlockReader, root_of_seed, stream_key
+from evedrop.model.streams import Batch, BlockReader, root_of_seed, stream_key
 
 WALK = [[0, 120.0, 0.0], [100_000, -60.0, 200.0]]
 RADIO = {"model": "distance", "sender": [0, 0], "reference_snr": 80.0, "exponent": 3.0, "threshold": 10.0}

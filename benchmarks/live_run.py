@@ -14,7 +14,7 @@ from typing import Any
 
 import tomli_w
 
-from evedrop.loading import shipped
+from evedrop.scenario.loading import shipped
 
 _COMMAND = (sys.executable, "-m", "evedrop", "run")
 _MEASURED = (0, 1)  # 1: the scenario did not meet an expectation of its own, but its figures of speed are right

@@ -26,10 +26,10 @@ from typing import Any
 import numpy as np
 from table import Row, judged, load, run_alone
 
-from evedrop.loading import checked
-from evedrop.memory.montecarlo import Plan, simulate
-from evedrop.memory.simulation import Mode, Simulation
-from evedrop.scenario import Scenario
+from evedrop.scenario.loading import checked
+from evedrop.scenario.tables import Scenario
+from evedrop.simulate.montecarlo import Plan, simulate
+from evedrop.simulate.simulation import Mode, Simulation
 from evedrop.studies.sweep import sweep_over
 
 TRIALS = 2000  # side by side, as many as a worker takes at once

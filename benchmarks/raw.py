@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from zenoh_peers import Load, Peer, Times, carry, session_of
 
-from evedrop.ports import free_port
+from evedrop.system.ports import free_port
 
 _KEY = "evedrop/raw/uplink"
 BYTES_PER_TRIAL = 16

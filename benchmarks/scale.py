@@ -25,7 +25,7 @@ import numpy as np
 from live_run import measured, scenario_file, slots_on_disk
 from processes import processes_of
 
-from evedrop.view.figure_style import BLUE, GREEN, GREY, ORANGE, RED, panels
+from evedrop.show.view.figure_style import BLUE, GREEN, GREY, ORANGE, RED, panels
 
 _LOOK_SECONDS = 0.03
 _STEADY = 0.2  # from this part of the slots on

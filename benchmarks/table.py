@@ -13,7 +13,7 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from evedrop.kernels.choice import KERNELS
+from evedrop.model.kernels.choice import KERNELS
 
 COLUMNS = ("what", "measured", "yardstick", "at least", "aim", "holds?")
 FAILED = "failed"

@@ -20,7 +20,7 @@ from pathlib import Path
 import zenoh
 from zenoh.handlers import FifoChannel
 
-from evedrop.ports import free_port
+from evedrop.system.ports import free_port
 
 KEY = "transport/message"
 SIZES = {"packet, 16 KB": (16_500, 20_000), "report of 100 slots, 1.7 MB": (1_700_000, 400)}

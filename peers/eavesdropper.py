@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from evedrop.conformance.checked import checked_eavesdropper
-from evedrop.conformance.problems import Problem
 from evedrop.live.network.process_session import ProcessSession
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import AnyBrief, Brief
@@ -13,6 +11,8 @@ from evedrop.live.protocol.brief_parts import EavesdropperPart
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.peers.following import follow
+from evedrop.scenario.conformance.checked import checked_eavesdropper
+from evedrop.scenario.conformance.problems import Problem
 
 
 def eavesdrop(brief: Brief[EavesdropperPart], connect: Callable[[AnyBrief], ProcessSession] = Session) -> None:

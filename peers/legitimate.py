@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from evedrop.conformance.checked import checked_estimator
-from evedrop.conformance.problems import Problem
 from evedrop.live.network.process_session import ProcessSession
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import AnyBrief, Brief
@@ -15,6 +13,8 @@ from evedrop.model.input_aware import InputAwareEstimator
 from evedrop.model.schemes import scheme_of
 from evedrop.peers.closed_loop import Consultation
 from evedrop.peers.following import follow
+from evedrop.scenario.conformance.checked import checked_estimator
+from evedrop.scenario.conformance.problems import Problem
 
 
 def estimate(brief: Brief[LegitimatePart], connect: Callable[[AnyBrief], ProcessSession] = Session) -> None:

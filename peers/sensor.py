@@ -8,8 +8,6 @@ from functools import partial
 from queue import Empty
 from typing import final
 
-from evedrop.conformance.checked import checked_encoder
-from evedrop.conformance.problems import Problem
 from evedrop.errors import RunError
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.network.mailbox import Mailbox
@@ -38,6 +36,8 @@ from evedrop.model.slot.plant import PlantCore
 from evedrop.model.slot.sensor import SensorCore, Sent
 from evedrop.names import OBSERVER, SENSOR
 from evedrop.peers.closed_loop import Steered
+from evedrop.scenario.conformance.checked import checked_encoder
+from evedrop.scenario.conformance.problems import Problem
 
 _PROGRESS_BYTES = 16 * 2**20  # for one follower: far more than are ever under way
 _SETTLE_SECONDS = 2.0

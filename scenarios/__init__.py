@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from evedrop.errors import UsageError
-from evedrop.hints import near
+from evedrop.system.hints import near
 
 _FOLDER = Path(__file__).parent
 

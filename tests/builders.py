@@ -12,8 +12,8 @@ from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.brief_parts import Part
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Belief, Beliefs
+from evedrop.model.streams import root_of_seed, stream_key
 from evedrop.results.writer import Results, load_results
-from evedrop.streams import root_of_seed, stream_key
 
 P = TypeVar("P", bound=Part)
 

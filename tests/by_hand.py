@@ -23,7 +23,7 @@ from evedrop.live.network.endpoint import Endpoint
 from evedrop.live.protocol.brief import read_brief
 from evedrop.names import OBSERVER
 from evedrop.results.writer import load_results
-from evedrop.scenario import Scenario
+from evedrop.scenario.tables import Scenario
 from tests.conftest import wait_until
 
 LONG = 90.0

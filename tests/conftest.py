@@ -25,7 +25,7 @@ import pytest
 
 from evedrop import preloaded
 from evedrop.cli import main as cli
-from evedrop.kernels import choice
+from evedrop.model.kernels import choice
 from evedrop.names import KERNELS_VARIABLE
 from evedrop.results.writer import Results, load_results
 from tests.commands import LARGEST_FILE, NEWS, TELLING, CommandProcess, ForkedCommand

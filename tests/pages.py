@@ -7,7 +7,7 @@ from collections import Counter
 from html.parser import HTMLParser
 from pathlib import Path
 
-from evedrop.report.writing import REPORT
+from evedrop.show.report.writing import REPORT
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from evedrop.ports import free_port
+from evedrop.system.ports import free_port
 from tests.conftest import wait_until
 from tests.privileged import CannotRun, run
 

@@ -6,7 +6,7 @@ size of the command's files in bytes (0: no limit). A fork finds the modules of 
 
 from __future__ import annotations
 
-from evedrop.interrupts import heed_signals
+from evedrop.system.interrupts import heed_signals
 
 if __name__ == "__main__":
     heed_signals()
@@ -24,10 +24,10 @@ from evedrop import __main__ as command
 from evedrop.cli.progress_line import ProgressLine
 from evedrop.fork_server import serve
 from evedrop.live.launch import preloading
-from evedrop.news import Held
+from evedrop.scenario.news import Held
 
 if TYPE_CHECKING:
-    from evedrop.news import News
+    from evedrop.scenario.news import News
 
 show = ProgressLine.tell
 

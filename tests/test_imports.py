@@ -1,4 +1,4 @@
-"""What a fresh process has loaded after each import. `make lint` checks which room may import which."""
+"""What a fresh process has loaded after each import. `make lint` checks which package may import which."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SCIPY = "evedrop.model.theory."
 
 def modules_of(room: str) -> list[str]:
     """The modules of a room. Raises AssertionError if there is no such room, so that no check becomes void."""
-    folder = ROOMS.get(room, ROOT / "emulator" / room.replace(".", "/"))
+    folder = ROOMS.get(room, ROOT / "emulator" / "evedrop" / room.replace(".", "/"))
     paths = sorted(folder.rglob("*.py"))
     assert paths, f"there is no room {room}"
     names = (path.relative_to(folder).with_suffix("").parts for path in paths)
@@ -51,7 +51,7 @@ def packages(names: set[str]) -> set[str]:
 
 
 def ours(names: set[str]) -> set[str]:
-    """Our own rooms among modules: such as evedrop.live."""
+    """Our own packages among modules: such as evedrop.live."""
     return {".".join(name.split(".")[:2]) for name in names if name.startswith("evedrop.")}
 
 
@@ -62,7 +62,7 @@ def loaded() -> dict[str, set[str]]:
     What comes before a module can only make a check of it stricter.
     """
     peers = (*modules_of("peers"), *modules_of("live.network"), *modules_of("live.protocol"))
-    rooms = ("live", "memory", "scenario", "score", "results", "expected")
+    rooms = ("live", "simulate", "scenario", "score", "results")
     rest = (module for room in rooms for module in modules_of(room))
     return loaded_by("evedrop.model.controllers", *model(), *peers, "evedrop.live.observer.observer", *rest)
 
@@ -70,16 +70,20 @@ def loaded() -> dict[str, set[str]]:
 @pytest.fixture(scope="module")
 def loaded_without_network() -> dict[str, set[str]]:
     """The same for what loads no Zenoh."""
-    return loaded_by("evedrop.live.launch.launcher", "evedrop.memory.montecarlo", "evedrop.api")
+    return loaded_by("evedrop.live.launch.launcher", "evedrop.simulate.montecarlo", "evedrop.cli.api")
 
 
 def test_peers_and_network_stay_light(loaded: dict[str, set[str]]) -> None:
-    """Peers, network and protocol load five packages and their own, and neither view nor results nor scenarios."""
+    """Peers, network and protocol load five packages and their own, and neither results nor the tables of scenarios."""
     modules = (*modules_of("peers"), *modules_of("live.network"), *modules_of("live.protocol"))
     for module in modules:
         names = loaded[module]
         assert packages(names) <= {"zenoh", "msgpack", "numpy", "cryptography", "xxhash", "_cffi_backend"}, module
-        assert not ours(names) & {"evedrop.view", "evedrop.results", "evedrop.score", "evedrop.scenario", "evedrop.api"}
+        assert ours(names) <= {
+            f"evedrop.{name}" for name in ("live", "model", "peers", "scenario", "system", "names", "errors")
+        }
+        of_scenarios = {".".join(name.split(".")[:3]) for name in names if name.startswith("evedrop.scenario.")}
+        assert of_scenarios <= {f"evedrop.scenario.{name}" for name in ("conformance", "plugins", "news")}, module
 
 
 def test_a_solver_is_loaded_only_when_a_controller_is_made(loaded: dict[str, set[str]]) -> None:
@@ -89,13 +93,13 @@ def test_a_solver_is_loaded_only_when_a_controller_is_made(loaded: dict[str, set
     assert not packages(names) & {"osqp", "scipy"}
 
 
-MATHEMATICS = {f"evedrop.{room}" for room in ("model", "streams", "kernels", "names", "errors", "hints", "processes")}
+MATHEMATICS = {f"evedrop.{room}" for room in ("model", "system", "names", "errors")}
 """What the model may import."""
 
 
 def model() -> list[str]:
-    """The modules of the model that do without scipy."""
-    return [name for name in modules_of("model") if not name.startswith(SCIPY)]
+    """The modules of the model that do without scipy, and without kernels that may not be built."""
+    return [name for name in modules_of("model") if not name.startswith((SCIPY, "evedrop.model.kernels.compiled"))]
 
 
 def test_model_is_mathematics(loaded: dict[str, set[str]]) -> None:
@@ -114,7 +118,7 @@ def test_theory_may_use_scipy_and_no_more() -> None:
         assert ours(names) <= MATHEMATICS, module
 
 
-@pytest.mark.parametrize("module", ["evedrop.live.launch.launcher", "evedrop.memory.montecarlo", "evedrop.api"])
+@pytest.mark.parametrize("module", ["evedrop.live.launch.launcher", "evedrop.simulate.montecarlo", "evedrop.cli.api"])
 def test_launcher_and_memory_load_neither_zenoh_nor_rerun(
     module: str, loaded_without_network: dict[str, set[str]]
 ) -> None:
@@ -158,10 +162,10 @@ def test_the_command_line_loads_nothing_to_print_help() -> None:
 
 def test_the_pytest_plugin_loads_nothing_but_pytest() -> None:
     """The plugin is loaded in every project whose environment contains Evedrop."""
-    found = loaded_by("pytest", "evedrop.pytest_plugin")
-    more = found["evedrop.pytest_plugin"] - found["pytest"]
+    found = loaded_by("pytest", "evedrop.cli.pytest_plugin")
+    more = found["evedrop.cli.pytest_plugin"] - found["pytest"]
     assert packages(more) == set()
-    assert ours(more) == {"evedrop.pytest_plugin"}
+    assert {name for name in more if name.startswith("evedrop.")} == {"evedrop.cli", "evedrop.cli.pytest_plugin"}
 
 
 def test_only_view_and_paper_load_rerun_and_matplotlib(loaded: dict[str, set[str]]) -> None:

@@ -91,13 +91,13 @@ def test_pips_words_are_shown_if_it_fails(tmp_path: Path) -> None:
 LINES = """\
 Looking in indexes: https://index.invalid/simple
 Ignoring colorama: markers 'sys_platform == "win32"' don't match your environment
-Collecting numpy==2.5.5 (from -r constraints.txt (line 1770))
+Collecting numpy==2.5.5 (from -r tools/constraints/project.txt (line 1770))
   Downloading numpy-2.5.5-cp313-cp313-manylinux_2_27_x86_64.whl.metadata (6.6 kB)
 Collecting click==8.5.1
   Downloading click-8.5.1-py3-none-any.whl (126 kB)
      126.0/126.0 kB 5.6 MB/s eta 0:00:00
   Using cached rerun_sdk-0.30.0-cp310-abi3-manylinux_2_28_x86_64.whl (170.2 MB)
-Requirement already satisfied: ruff==0.16.0 in ./lib (from -r constraints.txt (line 9)) (0.16.0)
+Requirement already satisfied: ruff==0.16.0 in ./lib (from -r tools/constraints/project.txt (line 9)) (0.16.0)
 Downloading numpy-2.5.5-cp313-cp313-manylinux_2_27_x86_64.whl (16.9 MB)
 """
 
@@ -160,4 +160,4 @@ def test_the_kernels_are_said(
 def test_documents_say_how_much_is_downloaded(install: Any) -> None:
     """README and CONTRIBUTING name the size that setting up announces."""
     for page in ("README.md", "CONTRIBUTING.md"):
-        assert f"{install.MEGABYTES['constraints.txt']} MB" in (ROOT / page).read_text(encoding="utf-8"), page
+        assert f"{install.MEGABYTES['project.txt']} MB" in (ROOT / page).read_text(encoding="utf-8"), page

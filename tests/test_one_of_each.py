@@ -6,11 +6,11 @@ import pytest
 
 from evedrop.results.writer import load_results
 from tests.builders import digests_of
-from tests.conformance.own_classes import BLOCK, PAGE
 from tests.conftest import Evedrop
 from tests.examples import mostly_long
 from tests.packages import install
-from tests.view.read_back import rows
+from tests.scenario.conformance.own_classes import BLOCK, PAGE
+from tests.show.view.read_back import rows
 
 COMMAND = """
 from evedrop.extend import Command

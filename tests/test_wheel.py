@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from evedrop.kernels import choice
+from evedrop.model.kernels import choice
 
 pytestmark = pytest.mark.wheel
 ROOT = Path(__file__).parents[1]
@@ -117,7 +117,10 @@ import emulator, peers, scenarios
 def test_names_are_theirs_and_little_is_loaded():
     assert [one.NAME for one in (emulator, peers, scenarios)] == ["their emulator", "their peers", "their scenarios"]
     loaded = {name for name in sys.modules if name.partition(".")[0] in {"evedrop", "numpy", "zenoh", "pydantic"}}
-    assert loaded <= {"evedrop", "evedrop.pytest_plugin", "evedrop.discovery", "evedrop.errors", "evedrop.files"}, loaded
+    assert loaded <= {
+        *("evedrop", "evedrop.cli", "evedrop.cli.pytest_plugin", "evedrop.scenario", "evedrop.scenario.discovery"),
+        *("evedrop.errors", "evedrop.system", "evedrop.system.files"),
+    }, loaded
 
 
 def test_a_wire(evedrop_wire, tmp_path):

@@ -1,9 +1,9 @@
-"""Draws the floor plan in docs/architecture.md from the imports, or checks that it is up to date.
+"""Draws the packages in docs/architecture.md from the imports, or checks that the drawing is up to date.
 
-    python tools/floor_plan.py            # writes the plan
+    python tools/floor_plan.py            # writes the drawing
     python tools/floor_plan.py --check    # exits with 1 if it is out of date
 
-The floors come from the layers contract in pyproject.toml, the arrows from the imports themselves.
+The order comes from the layers contract in pyproject.toml, the arrows from the imports themselves.
 """
 
 from __future__ import annotations
@@ -16,31 +16,31 @@ import grimp
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "architecture.md"
-BEGIN, END = "<!-- floor plan: made by tools/floor_plan.py -->", "<!-- end of the floor plan -->"
+BEGIN, END = "<!-- packages: drawn by tools/floor_plan.py -->", "<!-- end of the drawing -->"
 PACKAGE = "evedrop"
 
 
-def floors() -> list[list[str]]:
-    """The rooms of each floor, from the top floor down, as the contract lists them."""
+def layers() -> list[list[str]]:
+    """The packages of each layer, from the top down, as the contract lists them; without loose modules."""
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]
-    contract = next(one for one in settings["contracts"] if one["name"] == "Floors")
-    return [[room.strip() for room in layer.split("|")] for layer in contract["layers"]]
+    contract = next(contract for contract in settings["contracts"] if contract["name"] == "Packages")
+    return [[package.strip() for package in layer.split("|")] for layer in contract["layers"] if ":" not in layer]
 
 
-def arrows(rooms: list[str]) -> set[tuple[str, str]]:
-    """Pairs of rooms, the first of which imports the second."""
+def arrows(packages: list[str]) -> set[tuple[str, str]]:
+    """Pairs of packages, the first of which imports the second."""
     graph = grimp.build_graph(PACKAGE, cache_dir=None)
-    found = set()
+    pairs = set()
     for module in graph.modules:
         for imported in graph.find_modules_directly_imported_by(module):
-            pair = room_of(module), room_of(imported)
-            if pair[0] != pair[1] and all(room in rooms for room in pair):
-                found.add(pair)
-    return found
+            pair = package_of(module), package_of(imported)
+            if pair[0] != pair[1] and all(package in packages for package in pair):
+                pairs.add(pair)
+    return pairs
 
 
-def room_of(module: str) -> str:
-    """The room that a module is in; empty for the package itself."""
+def package_of(module: str) -> str:
+    """The package that a module is in; empty for `evedrop` itself."""
     return module.removeprefix(PACKAGE).lstrip(".").partition(".")[0]
 
 
@@ -51,41 +51,40 @@ def direct(pairs: set[tuple[str, str]]) -> set[tuple[str, str]]:
         below.setdefault(upper, set()).add(lower)
 
     def reaches(start: str, goal: str) -> bool:
-        return goal in below.get(start, ()) or any(reaches(room, goal) for room in below.get(start, ()))
+        return goal in below.get(start, ()) or any(reaches(package, goal) for package in below.get(start, ()))
 
     return {
-        (upper, lower) for upper, lower in pairs if not any(reaches(room, lower) for room in below[upper] - {lower})
+        (upper, lower)
+        for upper, lower in pairs
+        if not any(reaches(package, lower) for package in below[upper] - {lower})
     }
 
 
-def plan() -> str:
-    """The floor plan as a Mermaid diagram."""
-    listed = floors()
-    rooms = [room for floor in listed for room in floor]
-    lines = ["```mermaid", "flowchart TD"]
-    for number, floor in enumerate(listed):
-        lines.append(f'  subgraph floor{len(listed) - number}[" "]')
-        lines += [f"    {node(room)}[{room}]" for room in floor]
-        lines.append("  end")
-    lines += [f"  {node(upper)} --> {node(lower)}" for upper, lower in sorted(direct(arrows(rooms)))]
-    return "\n".join([*lines, "```"])
-
-
-def node(room: str) -> str:
-    """The name of a room's node in the diagram."""
-    return f"room_{room.strip('_')}"
+def drawing() -> str:
+    """The packages as a Mermaid diagram: a line for each layer, then the arrows."""
+    listed = layers()
+    packages = [package for layer in listed for package in layer]
+    lines = [
+        "```mermaid",
+        '%%{init: {"flowchart": {"nodeSpacing": 24, "rankSpacing": 18, "padding": 6}}}%%',
+        "flowchart TD",
+        *("  " + "; ".join(f"{package}[{package}]" for package in layer) for layer in listed),
+        *(f"  {upper} --> {lower}" for upper, lower in sorted(direct(arrows(packages)))),
+        "```",
+    ]
+    return "\n".join(lines)
 
 
 def main(arguments: list[str]) -> int:
-    """Write the plan into the page, or check the one that is there; the exit status."""
+    """Write the drawing into the page, or check the one that is there; the exit status."""
     text = PAGE.read_text(encoding="utf-8")
     before, _, rest = text.partition(BEGIN)
     _, _, after = rest.partition(END)
-    drawn = f"{before}{BEGIN}\n{plan()}\n{END}{after}"
+    drawn = f"{before}{BEGIN}\n{drawing()}\n{END}{after}"
     if "--check" not in arguments:
         PAGE.write_text(drawn, encoding="utf-8")
     elif drawn != text:
-        sys.stderr.write(f"{PAGE.relative_to(ROOT)}: the floor plan is out of date; run: python tools/floor_plan.py\n")
+        sys.stderr.write(f"{PAGE.relative_to(ROOT)}: the drawing is out of date; run: python tools/floor_plan.py\n")
         return 1
     return 0
 

@@ -1,7 +1,7 @@
 """Installs a locked list of packages into the environment that runs this file, and says how far it is.
 
-    .venv/bin/python tools/install.py constraints.txt      # the list
-    .venv/bin/python tools/install.py --project .          # this project itself, and which kernels it has then
+    .venv/bin/python tools/install.py tools/constraints/project.txt    # the list
+    .venv/bin/python tools/install.py --project .                      # this project itself, and which kernels it has then
 
 pip alone is silent for minutes, or prints several lines for each package. This prints how much there is to download, and then a
 line every few seconds, the same in a terminal and in a log. If pip fails, it prints all that pip said. It imports nothing but pip
@@ -24,7 +24,7 @@ from pathlib import Path
 
 from pip._vendor.packaging.requirements import Requirement
 
-MEGABYTES = {"constraints.txt": 450, "constraints-docs.txt": 28, "constraints-notebooks.txt": 15}
+MEGABYTES = {"project.txt": 450, "docs.txt": 28, "notebooks.txt": 15}
 """What each list downloads on Linux, about: it depends on the processor and on the version of Python."""
 SECONDS = 5.0
 """How long nothing is said at most."""
@@ -106,7 +106,10 @@ def install_project(project: Path) -> int:
     _say("this project, and its C kernels if there is a C compiler")
     status = _pip(Progress(set()), "--no-deps", "--no-build-isolation", "--editable", str(project))
     if status == 0:
-        script = "from evedrop.kernels.choice import FALLBACK, KERNELS; print(KERNELS); raise SystemExit(KERNELS == FALLBACK)"
+        script = (
+            "from evedrop.model.kernels.choice import FALLBACK, KERNELS; "
+            "print(KERNELS); raise SystemExit(KERNELS == FALLBACK)"
+        )
         asked = subprocess.run([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, check=False)
         _say(f"done; the kernels are {asked.stdout.strip()}")
         if asked.returncode:

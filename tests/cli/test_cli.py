@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from evedrop.loading import load, shipped
 from evedrop.results.writer import load_results
+from evedrop.scenario.loading import load, shipped
 from tests.conftest import Done, Evedrop
 from tests.examples import mostly_long
 
@@ -331,7 +331,7 @@ def test_other_errors_of_the_system_are_not_blamed_on_the_output(
     evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An error within a study is reported as it is, exit 3."""
-    from evedrop.memory import kept_tasks
+    from evedrop.simulate import kept_tasks
 
     def fail(_: object) -> None:
         raise OSError(errno.EMFILE, "Too many open files")

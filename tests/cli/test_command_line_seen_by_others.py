@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from evedrop.__main__ import without_values
-from evedrop.environment import own_environment
+from evedrop.system.environment import own_environment
 from tests.conftest import Evedrop, wait_until
 
 needs_proc = pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="only Linux has /proc")

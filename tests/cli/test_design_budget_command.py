@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from evedrop.api import design_budget, montecarlo
+from evedrop.cli.api import design_budget, montecarlo
 from evedrop.errors import UsageError
-from evedrop.loading import load
-from evedrop.memory.simulation import Simulation
+from evedrop.scenario.loading import load
+from evedrop.simulate.simulation import Simulation
 from tests.conftest import Evedrop
 
 PAGE = Path(__file__).parents[2] / "docs" / "schemes" / "quantised-schedule.md"

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from evedrop.api import design_policy
+from evedrop.cli.api import design_policy
 from tests.conftest import Evedrop
 
 SCENARIO = """

@@ -8,10 +8,10 @@ import tomllib
 import numpy as np
 import pytest
 
-from evedrop.api import design_schedule
-from evedrop.loading import load
+from evedrop.cli.api import design_schedule
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.model.theory.schedule_problem import SlotRecursion
+from evedrop.scenario.loading import load
 from tests.builders import UNSTABLE
 from tests.conftest import Evedrop
 

@@ -14,10 +14,10 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
-from evedrop.lacks import lack_of, preload_within_limit, refuse_scipy_without_room
-from evedrop.memory import montecarlo, workers
-from evedrop.memory.montecarlo import Plan
-from evedrop.memory.tasks import Result, Stopped, Task, Tell
+from evedrop.simulate import montecarlo, workers
+from evedrop.simulate.montecarlo import Plan
+from evedrop.simulate.tasks import Result, Stopped, Task, Tell
+from evedrop.system.lacks import lack_of, preload_within_limit, refuse_scipy_without_room
 from tests.conftest import Evedrop
 from tests.examples import mostly_long
 

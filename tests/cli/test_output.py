@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from evedrop.cli.commands import MODULES, ROLES
-from evedrop.output import Output, print_json, standard_streams
+from evedrop.system.output import Output, print_json, standard_streams
 from tests.conftest import Evedrop
 from tests.examples import mostly_long
 

@@ -10,7 +10,7 @@ from rich.cells import cell_len
 from rich.text import Text
 
 from evedrop.cli.progress_line import ProgressLine
-from evedrop.news import Held, RunProgress, Started
+from evedrop.scenario.news import Held, RunProgress, Started
 
 
 class Terminal(io.StringIO):

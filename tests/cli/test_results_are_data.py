@@ -14,17 +14,17 @@ import pytest
 from evedrop import load_results
 from evedrop.cli.commands import MODULES
 from evedrop.errors import NotRegistered
-from evedrop.loading import load
-from evedrop.loading.recorded import recorded
-from evedrop.memory.montecarlo import simulate
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.registry import no_modules
 from evedrop.model.schemes import SCHEMES
-from evedrop.news import silent
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.writer import ResultsWriter
+from evedrop.scenario.loading import load
+from evedrop.scenario.loading.recorded import recorded
+from evedrop.scenario.news import silent
 from evedrop.score.sums import SlotSums
-from evedrop.view.replay import replay
+from evedrop.show.view.replay import replay
+from evedrop.simulate.montecarlo import simulate
 from tests.conftest import Evedrop
 from tests.examples import mostly_long
 

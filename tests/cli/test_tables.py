@@ -15,12 +15,12 @@ import pyarrow.parquet as pq
 import pytest
 
 import evedrop.cli
-from evedrop.api import montecarlo, sweep
+from evedrop.cli.api import montecarlo, sweep
 from evedrop.cli.commands import MODULES, ROLES
 from evedrop.cli.tables import tables
-from evedrop.figures.text import estimate, figure_text, finite_text
-from evedrop.report.table_files import csv_text, latex_escaped, latex_text
-from evedrop.report.text_table import TextTable
+from evedrop.model.figures.text import estimate, figure_text, finite_text
+from evedrop.show.report.table_files import csv_text, latex_escaped, latex_text
+from evedrop.show.report.text_table import TextTable
 from tests.conftest import Evedrop
 
 CLI = Path(evedrop.cli.__file__).parent

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from evedrop.cli.console import StyledConsole
 from evedrop.errors import ScenarioError
-from evedrop.loading import load
-from evedrop.memory.montecarlo import simulate
-from evedrop.news import silent
-from evedrop.output import Output, escaped, print_json
+from evedrop.scenario.loading import load
+from evedrop.scenario.news import silent
+from evedrop.simulate.montecarlo import simulate
+from evedrop.system.output import Output, escaped, print_json
 from tests.conftest import Evedrop
 
 STEERING = [chr(one) for one in (*range(9), *range(11, 32), *range(127, 160))]

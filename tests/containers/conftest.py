@@ -49,7 +49,12 @@ def _image(daemon: Docker, folder: Path, times: dict[str, float]) -> None:
         [
             *(sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check"),
             *("--require-hashes", "--no-deps", "--only-binary", ":all:"),
-            *("--requirement", str(copy / "constraints.txt"), "--dest", str(copy / "build" / "wheels")),
+            *(
+                "--requirement",
+                str(copy / "tools" / "constraints" / "project.txt"),
+                "--dest",
+                str(copy / "build" / "wheels"),
+            ),
         ],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
@@ -61,13 +66,13 @@ def _image(daemon: Docker, folder: Path, times: dict[str, float]) -> None:
         said, _ = fetching.communicate(timeout=_FETCH_SECONDS)
     except subprocess.TimeoutExpired as error:
         raise CannotRun(
-            f"the packages of constraints.txt were not fetched within {_FETCH_SECONDS:g} s of the base image"
+            f"the packages of tools/constraints/project.txt were not fetched within {_FETCH_SECONDS:g} s of the base image"
         ) from error
     finally:
         fetching.kill()
         fetching.wait()
     if fetching.returncode:
-        raise CannotRun(f"the packages of constraints.txt cannot be fetched: {said[-2000:]}")
+        raise CannotRun(f"the packages of tools/constraints/project.txt cannot be fetched: {said[-2000:]}")
     times["base image and packages"], begun = time.monotonic() - begun, time.monotonic()
     environment = {**os.environ, "DOCKER_HOST": daemon.address, "EVEDROP_BASE": BASE, "DOCKER_BUILDKIT": "0"}
     run("docker-compose", "build", cwd=copy, env=environment)

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from evedrop.api import montecarlo
+from evedrop.cli.api import montecarlo
 from evedrop.live.launch.compose import write_compose
-from evedrop.loading import load
+from evedrop.scenario.loading import load
 from tests.builders import digests_of
 from tests.conftest import wait_until
 from tests.containers.project import ENDLESS, ROLES, Project

@@ -14,7 +14,7 @@ from ruamel.yaml import YAML
 
 from evedrop.errors import UsageError
 from evedrop.live.launch.compose import write_compose
-from evedrop.loading import load
+from evedrop.scenario.loading import load
 from tests.conftest import Evedrop
 from tests.debian import ROOT
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import yaml
 
-from evedrop.literature import PAPERS
 from evedrop.model.schemes import SCHEMES
+from evedrop.studies.papers import PAPERS
 
 ROOT = Path(__file__).parents[2]
 FILE: dict[str, Any] = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))

@@ -9,7 +9,7 @@ from PIL import Image
 
 from evedrop.cli import main as cli
 from evedrop.cli.options import changes_of
-from evedrop.loading import load
+from evedrop.scenario.loading import load
 from evedrop.studies.matchups import matchups_of
 
 DOCS = Path(__file__).parents[2] / "docs"

@@ -41,14 +41,14 @@ def test_every_command_of_the_documents_is_one(page: str) -> None:
 
 
 OTHER_OPTIONS = {
-    "emulator/applications/microgrid/day.py",  # a program of its own
-    "emulator/live/launch/compose.py",  # those of docker compose
-    "emulator/memory/cluster.py",  # those of dask worker
-    "emulator/pytest_plugin.py",
-    "emulator/report/page.py",  # names in its style sheet
-    "emulator/view/headless.py",  # the viewer's
-    "emulator/view/viewer.py",
-    "emulator/view/viewer_process.py",  # the sandbox's
+    "emulator/evedrop/studies/applications/microgrid/day.py",  # a program of its own
+    "emulator/evedrop/live/launch/compose.py",  # those of docker compose
+    "emulator/evedrop/simulate/cluster.py",  # those of dask worker
+    "emulator/evedrop/cli/pytest_plugin.py",
+    "emulator/evedrop/show/report/page.py",  # names in its style sheet
+    "emulator/evedrop/show/view/headless.py",  # the viewer's
+    "emulator/evedrop/show/view/viewer.py",
+    "emulator/evedrop/show/view/viewer_process.py",  # the sandbox's
 }
 """Modules that name the options of other programs."""
 _PIP = {"--force-reinstall"}

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from evedrop.cli import main as cli
-from evedrop.loading import load, parse
+from evedrop.scenario.loading import load, parse
 from evedrop.wire.file import example_wire
 
 ROOT = Path(__file__).parents[2]

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from evedrop.loading import load
+from evedrop.scenario.loading import load
 from evedrop.score.track import FACTOR
-from evedrop.view.palette import KNOWLEDGE, RECEIVERS, Colour
+from evedrop.show.view.palette import KNOWLEDGE, RECEIVERS, Colour
 
 ROOT = Path(__file__).parents[2]
 HUES = {"red": (345, 380), "yellow": (35, 60), "green": (120, 165), "violet": (260, 290)}

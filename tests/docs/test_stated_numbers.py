@@ -12,13 +12,13 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 
 from evedrop.errors import MOST_MISTAKES
-from evedrop.loading import file as scenario_file
 from evedrop.model.checks import as_toml
 from evedrop.model.schemes import SCHEMES
 from evedrop.names import RESERVED
-from evedrop.recordings import disturbance_file, message_numbers
 from evedrop.scenario import values
 from evedrop.scenario.expect import Quantile
+from evedrop.scenario.loading import file as scenario_file
+from evedrop.scenario.recordings import disturbance_file, message_numbers
 from tests.privileged import CannotRun, skip
 
 ROOT = Path(__file__).parents[2]

@@ -51,11 +51,11 @@ def test_the_ci_jobs_test_and_keep_the_report() -> None:
 def test_every_option_of_the_plugin_is_on_the_page(option: str) -> None:
     """In its table, and in the plugin."""
     assert f"| `{option}" in PAGE
-    assert f'"{option}"' in (ROOT / "emulator" / "pytest_plugin.py").read_text(encoding="utf-8")
+    assert f'"{option}"' in (ROOT / "emulator" / "evedrop" / "cli" / "pytest_plugin.py").read_text(encoding="utf-8")
 
 
 def test_pytest_finds_the_plugin_where_the_package_is_installed() -> None:
     """By its entry point, which names a module that is there."""
     points = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["entry-points"]
-    assert points["pytest11"] == {"evedrop": "evedrop.pytest_plugin"}
-    assert (ROOT / "emulator" / "pytest_plugin.py").is_file()
+    assert points["pytest11"] == {"evedrop": "evedrop.cli.pytest_plugin"}
+    assert (ROOT / "emulator" / "evedrop" / "cli" / "pytest_plugin.py").is_file()

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from evedrop.cli import main as cli
-from evedrop.loading import load
+from evedrop.scenario.loading import load
 from evedrop.score.acknowledging import chart_of
 from evedrop.score.summary import Judged
 from evedrop.studies.scenario_tests import _reasons

@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from evedrop.memory.simulation import Simulation
 from evedrop.model.links.link import Fate
 from evedrop.model.slot.link import Fates
-from evedrop.scenario import Scenario
+from evedrop.scenario.tables import Scenario
+from evedrop.simulate.simulation import Simulation
 
 _LOSSES = ("lost", "corrupted", "overflow", "cut", "late", "down", "paused", "underway")
 _DELIVERED, _UNSENT = Fate.DELIVERED.value, Fate.UNSENT.value

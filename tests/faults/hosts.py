@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import final
 
 from evedrop.names import RELAY, ROUTER
-from evedrop.ports import free_port
+from evedrop.system.ports import free_port
 from tests.faults import ours
 from tests.processes import parent_of
 from tests.proxy import Cable

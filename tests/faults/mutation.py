@@ -25,7 +25,7 @@ from tests.faults import ours
 
 _ROOT = Path(__file__).parents[2]
 _MUTANTS = Path(__file__).with_name("mutants.toml")
-_PACKAGE = _ROOT / "emulator"
+_PACKAGE = _ROOT / "emulator" / "evedrop"
 _LIMIT_SECONDS = 900.0
 _SHOWN = 200
 
@@ -37,7 +37,7 @@ class Mutant:
     breaks: str
     """What it breaks, in words."""
     file: str
-    """Below `emulator/`."""
+    """Below `emulator/evedrop/`."""
     seeds: list[int]
     """The campaign's cases that are run against it."""
     old: str

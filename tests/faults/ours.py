@@ -17,7 +17,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from evedrop.signals import SHOW_STACKS
+from evedrop.system.signals import SHOW_STACKS
 from tests.processes import words_of
 
 _STACKS_SECONDS = 1.0

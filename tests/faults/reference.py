@@ -13,7 +13,7 @@ import pyarrow as pa
 from evedrop import montecarlo
 from evedrop.model.digest import block_starts
 from evedrop.results.writer import Results
-from evedrop.scenario import Scenario
+from evedrop.scenario.tables import Scenario
 from tests.faults.fates import journal_rows
 from tests.faults.figures import unlike_memory
 

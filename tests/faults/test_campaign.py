@@ -110,7 +110,7 @@ def test_a_case_whose_facility_is_missing_is_skipped_loudly(tmp_path: Path) -> N
 @pytest.mark.parametrize("mutant", mutants(), ids=lambda mutant: mutant.breaks)
 def test_every_mutant_fits_the_code(mutant: Mutant) -> None:
     """Its old text is in its file exactly once, and with its new text the file is still Python."""
-    text = (ROOT / "emulator" / mutant.file).read_text(encoding="utf-8")
+    text = (ROOT / "emulator" / "evedrop" / mutant.file).read_text(encoding="utf-8")
     compile(mutated(mutant, text), mutant.file, "exec")
     assert mutant.seeds
     with pytest.raises(ValueError, match="2 times, not once"):

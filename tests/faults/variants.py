@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from evedrop.loading import load
-from evedrop.scenario import Scenario
+from evedrop.scenario.loading import load
+from evedrop.scenario.tables import Scenario
 from tests.disturbed import ACKNOWLEDGED, LOOP, SCHEDULED, disturbed
 
 _NAIVE = """

@@ -17,17 +17,17 @@ from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.network.control_file import Control, read_controls
 from evedrop.live.protocol.brief import read_brief
 from evedrop.live.protocol.brief_use import expect_usable
-from evedrop.loading import load
-from evedrop.memory.montecarlo import simulate
-from evedrop.news import silent
-from evedrop.plugins import named_in
-from evedrop.report.wire import wire_failures
 from evedrop.results.diff import difference
 from evedrop.results.reading import load_results
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.writer import ResultsWriter
+from evedrop.scenario.loading import load
+from evedrop.scenario.news import silent
+from evedrop.scenario.plugins import named_in
 from evedrop.score.sums import SlotSums
-from evedrop.view.replay import replay
+from evedrop.show.report.wire import wire_failures
+from evedrop.show.view.replay import replay
+from evedrop.simulate.montecarlo import simulate
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_on_disk import scorekeeper_on_disk
 from evedrop.wire.journal_reader import journal_tables

@@ -13,14 +13,14 @@ import pyarrow as pa
 import tomli_w
 
 from evedrop.errors import RunError
-from evedrop.expected.estimates import warnings_of
-from evedrop.fitting.process_fit import fit_process
 from evedrop.live.protocol.brief_parts import ProgramEntry
 from evedrop.live.protocol.state_message import read_state
-from evedrop.loading import load, parse, shipped, value_of
-from evedrop.plugins import named_in
-from evedrop.recordings.disturbance_file import read_disturbances
-from evedrop.recordings.link_recording import LinkRecording
+from evedrop.scenario.expected.estimates import warnings_of
+from evedrop.scenario.fitting.process_fit import fit_process
+from evedrop.scenario.loading import load, parse, shipped, value_of
+from evedrop.scenario.plugins import named_in
+from evedrop.scenario.recordings.disturbance_file import read_disturbances
+from evedrop.scenario.recordings.link_recording import LinkRecording
 from evedrop.wire.check import key_lines, warnings_of_wire, wire_lines
 from evedrop.wire.fates import KeyFates
 from evedrop.wire.file import example_wire, load_wire, resolved_wire, wire_of

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from evedrop.kernels.choice import EXTENSION
+from evedrop.model.kernels.choice import EXTENSION
 from evedrop.names import KERNELS_VARIABLE
 
 ROOT = Path(__file__).parents[2]

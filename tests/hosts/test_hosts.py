@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 
 from evedrop.live.protocol.brief import read_brief
-from evedrop.loading import checked
 from evedrop.results.writer import load_results
-from evedrop.scenario import Scenario
+from evedrop.scenario.loading import checked
+from evedrop.scenario.tables import Scenario
 from tests.builders import MARGINAL, process_table
 from tests.by_hand import ByHand, as_if_undisturbed, by_hand
 from tests.conftest import wait_until

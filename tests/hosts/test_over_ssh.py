@@ -15,7 +15,7 @@ from pathlib import Path
 from evedrop.results.growing_tables import last_round
 from evedrop.results.resolved_scenario import resolved
 from evedrop.results.writer import load_results
-from evedrop.scenario import Scenario
+from evedrop.scenario.tables import Scenario
 from tests.by_hand import as_if_undisturbed
 from tests.conftest import wait_until, with_mark
 from tests.hosts.lan import Lan, lan

@@ -14,8 +14,8 @@ from typing import final
 
 import pytest
 
-from evedrop.ports import free_port
 from evedrop.results.writer import load_results
+from evedrop.system.ports import free_port
 from tests.builders import digests_of
 from tests.commands import ForkedCommand
 from tests.conftest import LIMIT, Done, Evedrop, Live, wait_until

@@ -19,8 +19,8 @@ from evedrop.live.launch.children import Children, Exit
 from evedrop.live.launch.process_set import follow_to_end
 from evedrop.live.protocol.news import ProcessRequest, RouterListens, read_news
 from evedrop.names import ProcessAction
-from evedrop.news import ConnectionOutage, News, RunEnded, RunProgress, Started, silent
 from evedrop.results.folder import HeldFolder, new_folder
+from evedrop.scenario.news import ConnectionOutage, News, RunEnded, RunProgress, Started, silent
 from tests.conftest import wait_until
 from tests.live.network.bench import scenario_of
 

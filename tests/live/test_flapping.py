@@ -19,9 +19,9 @@ from evedrop.live.protocol.brief import read_brief
 from evedrop.live.protocol.commands import End
 from evedrop.live.protocol.envelope import enclosed
 from evedrop.live.protocol.keys import RunKeys
-from evedrop.loading import load
-from evedrop.ports import free_port
-from evedrop.scenario import Scenario
+from evedrop.scenario.loading import load
+from evedrop.scenario.tables import Scenario
+from evedrop.system.ports import free_port
 from tests.by_hand import as_if_undisturbed, by_hand
 from tests.conftest import Evedrop, wait_until
 from tests.disturbed import ACKNOWLEDGED, INNOVATION, LOOP

@@ -25,10 +25,10 @@ from evedrop.errors import ScenarioError
 from evedrop.live.launch.host_messages import LauncherHeartbeat, StartProcess, greeting_in, line_of, order_in
 from evedrop.live.launch.hosts_file import load_hosts
 from evedrop.live.launch.ssh_starter import ssh_command
-from evedrop.loading import load
-from evedrop.ports import free_port
+from evedrop.scenario.loading import load
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.scenario.tables import NetworkTable
+from evedrop.system.ports import free_port
 from tests.builders import digests_of
 from tests.conftest import LIMIT, Evedrop, Live, wait_until, with_mark
 from tests.examples import mostly_long

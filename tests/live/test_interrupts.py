@@ -15,10 +15,10 @@ from pathlib import Path
 
 import pytest
 
-from evedrop.loading import load
-from evedrop.ports import free_port
 from evedrop.results.growing_tables import UNFINISHED, last_round
 from evedrop.results.writer import load_results
+from evedrop.scenario.loading import load
+from evedrop.system.ports import free_port
 from tests.by_hand import by_hand
 from tests.conftest import LIMIT, Done, Evedrop, Live, wait_until
 from tests.examples import mostly_long

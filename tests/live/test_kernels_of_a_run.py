@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from evedrop.kernels import choice
+from evedrop.model.kernels import choice
 from evedrop.names import KERNELS_VARIABLE
 from tests.builders import digests_of
 from tests.conftest import Evedrop
 
 MODULE = '''
 from evedrop.extend import Innovation, Naive
-from evedrop.kernels.choice import KERNELS
+from evedrop.model.kernels.choice import KERNELS
 
 print("the kernels are", KERNELS)
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from evedrop.environment import lock_step_environment
 from evedrop.live.network.router import Burst
+from evedrop.system.environment import lock_step_environment
 
 
 def test_a_burst_passes_on_everything_in_order() -> None:

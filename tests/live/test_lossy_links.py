@@ -10,13 +10,13 @@ import pyarrow.compute as pc
 import pytest
 import tomli_w
 
-from evedrop.api import design, montecarlo, run
+from evedrop.cli.api import design, montecarlo, run
 from evedrop.errors import UsageError
-from evedrop.expected.estimates import warnings_of
-from evedrop.loading import load
 from evedrop.model.links import LOSS_MODELS
 from evedrop.results.writer import Results
-from evedrop.scenario import Scenario
+from evedrop.scenario.expected.estimates import warnings_of
+from evedrop.scenario.loading import load
+from evedrop.scenario.tables import Scenario
 from tests.builders import MARGINAL, digests_of, process_table
 from tests.conftest import Evedrop
 
@@ -161,7 +161,7 @@ def test_the_view_survives_where_there_is_no_theory(live: Results) -> None:
     """A replayed recording of a run in which one receiver's expected trace is nowhere."""
     from rerun.chunk import RrdReader
 
-    from evedrop.view.replay import replay
+    from evedrop.show.view.replay import replay
 
     shown = {str(chunk.entity_path) for chunk in RrdReader(replay(live.folder)).stream().filter(is_static=False)}
     assert {"/error/pattern", "/trace/pattern", "/theory/legitimate"} <= shown

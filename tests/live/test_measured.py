@@ -5,12 +5,12 @@ from __future__ import annotations
 import tomllib
 from pathlib import Path
 
-from evedrop.api import run
-from evedrop.loading import checked, shipped
-from evedrop.memory.montecarlo import Plan, simulate
-from evedrop.news import silent
+from evedrop.cli.api import run
 from evedrop.results.diff import difference
 from evedrop.results.writer import load_results
+from evedrop.scenario.loading import checked, shipped
+from evedrop.scenario.news import silent
+from evedrop.simulate.montecarlo import Plan, simulate
 from tests.builders import digests_of
 
 

@@ -11,9 +11,9 @@ import pytest
 from evedrop import montecarlo, run
 from evedrop.errors import UsageError
 from evedrop.live.launch.metrics import MetricsAddress, RunMetrics, metrics_served
-from evedrop.loading import load
-from evedrop.news import ConnectionOutage, FolderMoved, Held, News, RunProgress, Started, silent
 from evedrop.results.reading import load_results
+from evedrop.scenario.loading import load
+from evedrop.scenario.news import ConnectionOutage, FolderMoved, Held, News, RunProgress, Started, silent
 from tests.conftest import LIMIT, Evedrop, wait_until
 
 pytest.importorskip("prometheus_client")

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evedrop.api import montecarlo, run
+from evedrop.cli.api import montecarlo, run
 from evedrop.errors import ScenarioError
-from evedrop.loading import checked, load
 from evedrop.model.slot.link import NEVER
 from evedrop.results.resolved_scenario import write_resolved
-from evedrop.scenario import Scenario
+from evedrop.scenario.loading import checked, load
+from evedrop.scenario.tables import Scenario
 from tests.builders import scalar_tables
 from tests.examples import examples
 

@@ -26,9 +26,9 @@ from evedrop.live.launch.process_set import launch_one
 from evedrop.live.launch.starter import StartedProcess, Starter
 from evedrop.live.network.endpoint import Endpoint, SocketEndpoint, endpoint_in
 from evedrop.live.protocol.news import RouterListens
-from evedrop.news import silent
-from evedrop.ports import free_port
-from evedrop.scenario import Scenario
+from evedrop.scenario.news import silent
+from evedrop.scenario.tables import Scenario
+from evedrop.system.ports import free_port
 from tests.conftest import LIMIT, Evedrop, Live, with_mark
 from tests.examples import mostly_long
 from tests.live.network.bench import scenario_of

@@ -15,12 +15,12 @@ from tempfile import mkdtemp
 import pytest
 
 from evedrop import preloaded
-from evedrop.environment import own_environment
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.launch.ports import loopback_endpoints
 from evedrop.live.launch.preloading import fork_servers, process_starter
 from evedrop.live.launch.starter import FORK_SERVER_LOST, StartedProcess, Starter, start_process
 from evedrop.names import KERNELS_VARIABLE
+from evedrop.system.environment import own_environment
 from tests.conftest import LIMIT, wait_until
 from tests.live.network.bench import scenario_of
 from tests.processes import parent_of, words_of

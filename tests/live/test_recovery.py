@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 
 from evedrop.live.launch.starter import StartedProcess
-from evedrop.loading import load
-from evedrop.ports import free_port
-from evedrop.scenario import Scenario
+from evedrop.scenario.loading import load
+from evedrop.scenario.tables import Scenario
+from evedrop.system.ports import free_port
 from tests.by_hand import as_if_undisturbed, by_hand
 from tests.conftest import Evedrop, Live, wait_until
 from tests.disturbed import ACKNOWLEDGED, LOOP, SCHEDULED, disturbed

@@ -12,7 +12,7 @@ from evedrop.live.observer.recovery import Recovery
 from evedrop.live.observer.stall import patience_of
 from evedrop.live.protocol.brief import Flow
 from evedrop.live.protocol.commands import Again, ControlCommand
-from evedrop.news import News
+from evedrop.scenario.news import News
 from tests.clock import TestClock
 from tests.live.test_ending import Network
 

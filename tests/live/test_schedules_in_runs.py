@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from evedrop import montecarlo, run
-from evedrop.api import design, design_schedule
+from evedrop.cli.api import design, design_schedule
 from evedrop.errors import BriefError, ScenarioError, UsageError
-from evedrop.expected.expectations import expectations_of
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.protocol.brief import read_brief
-from evedrop.loading import checked
+from evedrop.scenario.expected.expectations import expectations_of
+from evedrop.scenario.loading import checked
 from evedrop.score.verdict import Verdict
 from tests.builders import UNSTABLE, digests_of, process_table
 

@@ -14,14 +14,14 @@ import pyarrow as pa
 import pytest
 
 from evedrop import montecarlo, run
-from evedrop.loading import load
 from evedrop.results.growing_tables import last_round
 from evedrop.results.writer import Results
-from tests.applications.test_microgrid import part_of_day
+from evedrop.scenario.loading import load
 from tests.builders import digests_of
 from tests.by_hand import as_if_undisturbed
 from tests.conftest import Evedrop, wait_until
 from tests.live.test_shards import child, close, in_order
+from tests.studies.applications.test_microgrid import part_of_day
 
 TIMED = {"decisions", "mean_solve_seconds", "longest_solve_seconds"}
 """The controller's figures that depend on its own process."""

@@ -18,11 +18,11 @@ from evedrop import load_results, montecarlo, run
 from evedrop.errors import RunError, UsageError
 from evedrop.live.launch.shard import shards_of
 from evedrop.live.launch.shards import OneProgress
-from evedrop.loading import load
-from evedrop.news import News, RunEnded, RunProgress, Started, silent
 from evedrop.results.growing_tables import last_round
 from evedrop.results.reading import age_of_figures
 from evedrop.results.writer import Results
+from evedrop.scenario.loading import load
+from evedrop.scenario.news import News, RunEnded, RunProgress, Started, silent
 from tests.builders import digests_of
 from tests.conftest import Evedrop, Live, wait_until, with_mark
 from tests.examples import mostly_long

@@ -8,7 +8,7 @@ import pytest
 
 from evedrop.errors import Interrupted
 from evedrop.live.observer.conductor import Stop
-from evedrop.signals import stop_on_signals
+from evedrop.system.signals import stop_on_signals
 from tests.conftest import LIMIT
 
 
@@ -20,7 +20,7 @@ def test_what_is_ignored_from_birth_stays_ignored() -> None:
             assert stop.wait(LIMIT)
     code = (
         "import signal\nsignal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
-        "from evedrop.signals import stop_on_signals\n"
+        "from evedrop.system.signals import stop_on_signals\n"
         "with stop_on_signals() as stop:\n"
         "    signal.raise_signal(signal.SIGHUP)\n    print(stop.wait(0.5))\n"
         "    signal.raise_signal(signal.SIGTERM)\n    print(stop.wait(60))\n"
@@ -33,7 +33,7 @@ def test_what_is_ignored_from_birth_stays_ignored() -> None:
 def test_a_signal_may_come_while_the_lock_of_the_event_is_held() -> None:
     """The main thread is stopped inside `Event.wait`: it must not wait for itself, and a hundred signals are as good as one."""
     code = (
-        "import signal\nfrom evedrop.signals import stop_on_signals\n"
+        "import signal\nfrom evedrop.system.signals import stop_on_signals\n"
         "before = signal.getsignal(signal.SIGINT)\n"
         "with stop_on_signals() as stop:\n"
         "    with stop._cond:\n        for _ in range(100):\n            signal.raise_signal(signal.SIGINT)\n"

@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 
-from evedrop.environment import own_environment
 from evedrop.errors import RunError, UsageError
 from evedrop.live.launch.host_messages import (
     MOST_NOISE,
@@ -29,6 +28,7 @@ from evedrop.live.launch.host_messages import (
 from evedrop.live.launch.hosts_file import HostTable
 from evedrop.live.launch.ssh_starter import SshHost
 from evedrop.live.launch.starter import CONNECTION_LOST, FORK_SERVER_LOST
+from evedrop.system.environment import own_environment
 from tests.conftest import LIMIT, wait_until
 from tests.live.network.bench import brief_of_eve
 

@@ -9,8 +9,8 @@ from io import BytesIO
 import pytest
 
 from evedrop.live.launch.starter import GRACE_SECONDS, ReportedProcess, end_all
-from evedrop.processes import KILLED_SECONDS, kill, wait_for
-from evedrop.signals import SHOW_STACKS
+from evedrop.system.processes import KILLED_SECONDS, kill, wait_for
+from evedrop.system.signals import SHOW_STACKS
 
 
 class Stubborn:

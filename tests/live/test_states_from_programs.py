@@ -14,18 +14,18 @@ import numpy as np
 import pytest
 import zenoh
 
-from evedrop.api import montecarlo, run
+from evedrop.cli.api import montecarlo, run
 from evedrop.errors import RunError
 from evedrop.live.launch.preloading import preloaded
 from evedrop.live.network.program import ProgramStates
 from evedrop.live.protocol.brief_parts import ProgramEntry
-from evedrop.loading import checked
-from evedrop.memory.montecarlo import Plan
-from evedrop.ports import free_port
-from evedrop.recordings.disturbance_file import table_text
 from evedrop.results.diff import difference
 from evedrop.results.writer import Results, load_results
-from evedrop.scenario import Scenario
+from evedrop.scenario.loading import checked
+from evedrop.scenario.recordings.disturbance_file import table_text
+from evedrop.scenario.tables import Scenario
+from evedrop.simulate.montecarlo import Plan
+from evedrop.system.ports import free_port
 from tests.builders import MARGINAL, digests_of, process_table
 from tests.conftest import wait_until
 

@@ -12,10 +12,10 @@ from evedrop.live.observer.operator_orders import Order
 from evedrop.live.observer.steering import Steering
 from evedrop.live.protocol.commands import ControlCommand, Go, Hold, LinkChange
 from evedrop.live.protocol.requests import REQUESTS
-from evedrop.loading import checked
 from evedrop.model.slot.link import Change
-from evedrop.news import Held, News
-from evedrop.scenario import Scenario
+from evedrop.scenario.loading import checked
+from evedrop.scenario.news import Held, News
+from evedrop.scenario.tables import Scenario
 from tests.builders import scalar_tables
 
 SLOTS = 100

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from evedrop.environment import own_environment
 from evedrop.errors import Interrupted
 from evedrop.live.launch.preloading import ForkServer, PreloadedStarter, fork_servers
 from evedrop.live.launch.starter import FORK_SERVER_LOST
+from evedrop.system.environment import own_environment
 from tests.conftest import LIMIT, Evedrop, Live, cause_of, wait_until
 from tests.examples import mostly_long
 from tests.processes import parent_of

@@ -14,7 +14,7 @@ from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.process import Process
 from evedrop.model.schemes.acknowledged import Acknowledged
 from evedrop.model.schemes.scheme import Scheme
-from evedrop.streams import Batch
+from evedrop.model.streams import Batch
 from tests.model.rationals import Matrix, exact, identity, inverted, state_covariances, times, transposed
 from tests.model.slot_loop import Played, play
 

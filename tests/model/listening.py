@@ -8,7 +8,7 @@ from typing import NamedTuple
 from evedrop.model.process import Floats, Process, Trajectory
 from evedrop.model.receiver import Belief, Flags, Receiver, Reception
 from evedrop.model.schemes.innovation import Innovation
-from evedrop.streams import Batch, Stream, uniforms
+from evedrop.model.streams import Batch, Stream, uniforms
 from tests.builders import UNSTABLE, stream_keys
 
 EXAMPLE = Process(UNSTABLE.A, UNSTABLE.Q, UNSTABLE.Q)

@@ -11,7 +11,7 @@ import numpy as np
 from evedrop.model.process import Process, Trajectory
 from evedrop.model.receiver import Belief, Receiver, Reception
 from evedrop.model.schemes.scheme import Packet, Scheme
-from evedrop.streams import Batch, root_of_seed, stream_key
+from evedrop.model.streams import Batch, root_of_seed, stream_key
 
 ROOT = root_of_seed(4)
 STABLE = Process(

@@ -13,7 +13,7 @@ from evedrop.model.reference import ReferenceReceiver
 from evedrop.model.schemes.acknowledged import Acknowledged
 from evedrop.model.schemes.open_loop import OpenLoop
 from evedrop.model.schemes.scheme import Scheme
-from evedrop.streams import Batch
+from evedrop.model.streams import Batch
 from tests.builders import DRIFTING, UNSTABLE
 from tests.model.acknowledged_runs import MIXED, SINGULAR, all_events, carried, played_over
 from tests.model.slot_loop import STABLE, Played

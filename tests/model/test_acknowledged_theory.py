@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop.expected.expectations import expectations_of
-from evedrop.loading import checked
 from evedrop.model.process import Process
 from evedrop.model.reference_floor import reference_floor
 from evedrop.model.schemes.acknowledged import Acknowledged
 from evedrop.model.schemes.open_loop import OpenLoop
 from evedrop.model.theory.closed_forms import reference_covariances
 from evedrop.model.theory.covariances import expected_covariances
+from evedrop.scenario.expected.expectations import expectations_of
+from evedrop.scenario.loading import checked
 from tests.builders import DRIFTING, UNSTABLE
 from tests.model.acknowledged_runs import MIXED, all_events, exact_sigmas, played_over
 from tests.model.slot_loop import STABLE

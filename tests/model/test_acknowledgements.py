@@ -16,8 +16,8 @@ from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.numeric.detection import Chart, CusumBatch, chart_for
 from evedrop.model.schemes.acknowledged import Acknowledged
+from evedrop.model.streams import Batch, stream_key
 from evedrop.model.theory.closed_forms import reference_covariances
-from evedrop.streams import Batch, stream_key
 from tests.builders import UNSTABLE
 from tests.examples import examples, mostly_long
 from tests.model.slot_loop import ROOT, coins, play

@@ -15,8 +15,8 @@ from evedrop.model.links.pooled import pooled
 from evedrop.model.process import Floats, Process, Trajectory
 from evedrop.model.receiver import Reception
 from evedrop.model.slot.link import link_of
+from evedrop.model.streams import Batch, Stream, uniforms
 from evedrop.model.theory.covariances import Outcomes, expected_traces, state_covariances
-from evedrop.streams import Batch, Stream, uniforms
 from tests.builders import MARGINAL, MICROGRID
 from tests.model.listening import EXAMPLE, Slot, followed, keys, slots
 

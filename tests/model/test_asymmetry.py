@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evedrop.kernels import reference
+from evedrop.model.kernels import reference
 from evedrop.model.receiver import Action, asymmetry, trace_of
 from tests.builders import mirrored
 from tests.examples import examples

@@ -14,8 +14,8 @@ from evedrop.model.eavesdroppers.bayesian import CAPACITY, Bayesian
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Action, Receiver, Reception
+from evedrop.model.streams import Batch
 from evedrop.model.theory.covariances import Outcomes, expected_traces
-from evedrop.streams import Batch
 from tests.builders import MARGINAL, MICROGRID
 from tests.examples import examples
 from tests.model.listening import EXAMPLE, followed, keys, slots

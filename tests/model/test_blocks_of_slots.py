@@ -20,7 +20,7 @@ from evedrop.model.receiver import Action, Belief, Beliefs, Flags, Receiver, Rec
 from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.innovation import InnovationEncoder, InnovationEstimator, SharedSecret
 from evedrop.model.schemes.scheme import Packet, Scheme
-from evedrop.streams import Batch, stream_key
+from evedrop.model.streams import Batch, stream_key
 from tests.builders import DRIFTING, MARGINAL, one_slot
 from tests.model.slot_loop import ROOT, coins, keys_of, play
 

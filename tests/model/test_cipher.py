@@ -13,8 +13,8 @@ from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.numeric.masking import Mask
 from evedrop.model.process import Process
 from evedrop.model.schemes.cipher import Cipher
+from evedrop.model.streams import Batch, Stream, stream_key
 from evedrop.model.theory.covariances import expected_covariances, state_covariances
-from evedrop.streams import Batch, Stream, stream_key
 from tests.builders import DRIFTING, UNSTABLE
 from tests.model.slot_loop import ROOT, STABLE, coins, play
 

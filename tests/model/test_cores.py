@@ -25,7 +25,7 @@ from evedrop.model.slot.plant import PlantCore
 from evedrop.model.slot.receiver import FollowedSlots, ReceiverCore
 from evedrop.model.slot.sensor import SensorCore, Sent
 from evedrop.model.slot.transit import Arrivals
-from evedrop.streams import Batch, stream_key
+from evedrop.model.streams import Batch, stream_key
 from tests.builders import MARGINAL, stream_keys
 from tests.model.slot_loop import ROOT, keys_of
 

@@ -15,7 +15,7 @@ from evedrop.model.eavesdroppers import READERS, STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketTaker
 from evedrop.model.process import Process
 from evedrop.model.receiver import Action, Belief, Receiver, Reception
-from evedrop.streams import Batch, Stream, uniforms
+from evedrop.model.streams import Batch, Stream, uniforms
 from tests.builders import stream_keys
 from tests.examples import mostly_long
 

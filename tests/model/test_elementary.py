@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import ndtri
 
-from evedrop.kernels.elementary import cholesky, exp, inverse, log, normal_quantile, polynomial, triangular_factor
+from evedrop.model.kernels.elementary import cholesky, exp, inverse, log, normal_quantile, polynomial, triangular_factor
 
 POSITIVE = st.floats(min_value=2.3e-308, max_value=1.7e308, allow_subnormal=False)
 PROBABILITIES = st.integers(1, 2**53 - 1).map(lambda i: i * 2.0**-53)

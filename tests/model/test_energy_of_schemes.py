@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from evedrop.memory.packet_counts import PacketCounts
 from evedrop.model.energy import EnergyModel
 from evedrop.model.process import Process
 from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.plain import Plain
 from evedrop.model.schemes.scheme import PacketBlock
-from evedrop.streams import Batch
+from evedrop.model.streams import Batch
+from evedrop.simulate.packet_counts import PacketCounts
 from tests.model.slot_loop import coins, play
 
 PROCESS = Process(np.eye(2), np.eye(2), np.eye(2))

@@ -5,6 +5,7 @@ import pytest
 
 from evedrop.model.process import Floats, Process, Trajectory, mistakes_of
 from evedrop.model.schemes.innovation import Innovation
+from evedrop.model.streams import Batch
 from evedrop.model.theory.adversary import Adversary
 from evedrop.model.theory.covariances import (
     Outcomes,
@@ -14,8 +15,7 @@ from evedrop.model.theory.covariances import (
     state_covariances,
 )
 from evedrop.model.theory.design import best_difference, design, relative_secrecy
-from evedrop.paper import microgrid
-from evedrop.streams import Batch
+from evedrop.studies.papers import microgrid
 from tests.builders import stream_keys
 
 A = np.array([[1.0, 0.3], [0.5, 1.001]])

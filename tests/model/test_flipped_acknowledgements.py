@@ -11,8 +11,6 @@ import pytest
 
 from evedrop import montecarlo
 from evedrop.errors import ScenarioError
-from evedrop.literature.luecke2022 import TransmissionPolicy, mean_traces
-from evedrop.loading import checked
 from evedrop.model.acknowledgements import AckChannel, rates_of
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
@@ -20,9 +18,11 @@ from evedrop.model.process import Process
 from evedrop.model.reference_code import ReferenceCode
 from evedrop.model.schemes import scheme_of
 from evedrop.model.schemes.threshold_code import forged_share
+from evedrop.model.streams import Batch
 from evedrop.model.theory.closed_forms import reference_covariances, reference_limit
 from evedrop.model.theory.covariances import Outcomes, expected_covariances
-from evedrop.streams import Batch
+from evedrop.scenario.loading import checked
+from evedrop.studies.papers.luecke2022 import TransmissionPolicy, mean_traces
 from tests.builders import UNSTABLE, digests_of
 from tests.examples import mostly_long
 from tests.model.acknowledged_runs import MIXED, carried

@@ -16,6 +16,7 @@ from evedrop.model.links import loss_of
 from evedrop.model.process import Floats, Process, StateFactors
 from evedrop.model.receiver import Action
 from evedrop.model.slot.link_law import LinkLaw
+from evedrop.model.streams import Batch
 from evedrop.model.theory.covariances import (
     Outcomes,
     expected_covariances,
@@ -27,7 +28,6 @@ from evedrop.model.theory.covariances import (
     tail_index,
 )
 from evedrop.model.theory.leak import Leaks, RemainingCovariances, remaining_limit
-from evedrop.streams import Batch
 from tests.builders import MARGINAL
 from tests.examples import examples
 from tests.model.listening import EXAMPLE, followed, keys, slots

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from evedrop.model.given_states import GivenStates, deviations, recorded
 from evedrop.model.process import product
 from evedrop.model.slot.plant import PlantCore
-from evedrop.streams import Batch
+from evedrop.model.streams import Batch
 from tests.builders import MARGINAL
 
 level = st.floats(-1e12, 1e12)

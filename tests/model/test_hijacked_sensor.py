@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evedrop.expected.expectations import expectations_of
-from evedrop.loading import checked
-from evedrop.memory.simulation import Simulation
 from evedrop.model.acknowledgements import AckChannel, Heeding, heeding_of, rates_of
+from evedrop.model.streams import Batch, stream_key
 from evedrop.model.theory.closed_form import Hears
 from evedrop.model.theory.closed_forms import hijacked_schedule, scheduled
+from evedrop.scenario.expected.expectations import expectations_of
+from evedrop.scenario.loading import checked
 from evedrop.score.acknowledging import chart_of
-from evedrop.streams import Batch, stream_key
+from evedrop.simulate.simulation import Simulation
 from tests.builders import UNSTABLE
 from tests.model.slot_loop import ROOT, coins
 

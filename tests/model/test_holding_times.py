@@ -15,9 +15,9 @@ from evedrop.model.receiver import Action
 from evedrop.model.schemes import scheme_of
 from evedrop.model.schemes.encrypted_schedule import EncryptedSchedule
 from evedrop.model.schemes.scheduled import Scheduled
+from evedrop.model.streams import Batch, stream_key
 from evedrop.model.theory import closed_forms
 from evedrop.model.theory.covariances import limit
-from evedrop.streams import Batch, stream_key
 from tests.builders import DRIFTING, UNSTABLE
 from tests.model.slot_loop import ROOT, STABLE, Played, coins, play
 

@@ -17,7 +17,7 @@ from evedrop.model.schemes.plain import PlainEncoder
 from evedrop.model.schemes.scheme import PacketBlock
 from evedrop.model.slot.plant import PlantCore
 from evedrop.model.slot.sensor import SensorCore, Sent
-from evedrop.streams import Batch
+from evedrop.model.streams import Batch
 from tests.builders import stream_keys
 from tests.model.integrity_loop import ALWAYS, ONE, PLANAR, REPLACED, SCALAR, simulated
 

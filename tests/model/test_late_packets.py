@@ -21,7 +21,7 @@ from evedrop.model.slot.account import COUNTED_BURSTS, Accountant
 from evedrop.model.slot.link import Fates, Link, LinkSchedule, streams_of
 from evedrop.model.slot.receiver import Absence, ReceiverCore
 from evedrop.model.slot.transit import Arrival, Arrivals, Late, Transit
-from evedrop.streams import Batch
+from evedrop.model.streams import Batch
 from tests.builders import stream_keys
 from tests.examples import examples
 

@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop.kernels.factored import Factor, Factors, covariance
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.bayesian import Bayesian
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
 from evedrop.model.eavesdroppers.learning_em import LearningEm, climbing_slots
+from evedrop.model.kernels.factored import Factor, Factors, covariance
 from evedrop.model.learning.learner_posterior import CAPACITY
 from evedrop.model.learning.moments import RIDGE, divided, factored
 from evedrop.model.process import Floats, Process, Trajectory
 from evedrop.model.receiver import Belief, Receiver, Reception
 from evedrop.model.schemes.cipher import Cipher
-from evedrop.streams import Batch
+from evedrop.model.streams import Batch
 from tests.builders import MARGINAL, stream_keys
 from tests.model.listening import EXAMPLE, Slot, followed, keys, slots
 

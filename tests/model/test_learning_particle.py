@@ -8,19 +8,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop.kernels.factored import Factors, covariance
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.bayesian import Bayesian
 from evedrop.model.eavesdroppers.delegate import Delegate
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.eavesdroppers.learning_particle import LearningParticle
+from evedrop.model.kernels.factored import Factors, covariance
 from evedrop.model.learning.draws import drawn, lattice, numbers_of
 from evedrop.model.learning.known import known
 from evedrop.model.learning.learner_posterior import CAPACITY
 from evedrop.model.learning.moments import Moments
 from evedrop.model.process import Process
 from evedrop.model.receiver import Reception
-from evedrop.streams import Batch
+from evedrop.model.streams import Batch
 from tests.builders import MARGINAL
 from tests.model.listening import EXAMPLE, followed, keys, slots
 from tests.model.test_learning import EVERYTHING, STABLE, last_of, learned_by, relative

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from evedrop.model.slot.link import Change, Fates, Link, LinkSchedule, streams_of
-from evedrop.streams import Batch
+from evedrop.model.streams import Batch
 
 BURSTS = {"model": "gilbert-elliott", "p": 0.2, "r": 0.4}
 COINS = {"model": "bernoulli", "quality": 0.6}

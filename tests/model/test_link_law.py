@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop.expected.expectations import Expectation
 from evedrop.model.delays import delay_of
 from evedrop.model.links import loss_of
 from evedrop.model.links.link import Fate
@@ -18,6 +17,7 @@ from evedrop.model.process import Process
 from evedrop.model.slot.link import NEVER, Change, LinkSchedule, ReceiverOutage
 from evedrop.model.slot.link_law import law_of
 from evedrop.model.theory.covariances import Outcomes
+from evedrop.scenario.expected.expectations import Expectation
 from evedrop.scenario.timeline import Away
 
 WALK = Process(np.eye(1), np.array([[0.3]]), np.array([[2.0]]))

@@ -16,7 +16,7 @@ from evedrop.model.links.link import Fate
 from evedrop.model.links.markov import stationary
 from evedrop.model.process import Floats
 from evedrop.model.slot.link import link_of
-from evedrop.streams import Batch, Stream, root_of_seed, stream_key, uniforms
+from evedrop.model.streams import Batch, Stream, root_of_seed, stream_key, uniforms
 
 KEY = stream_key(root_of_seed(21), "link/eve")
 BURSTS: dict[str, Any] = {"model": "gilbert-elliott", "p": 0.02, "r": 0.25}

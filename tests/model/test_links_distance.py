@@ -17,7 +17,7 @@ from evedrop.model.links.distance import Distance
 from evedrop.model.links.fading import delivery_probability
 from evedrop.model.links.link import Fate
 from evedrop.model.links.way import Way
-from evedrop.streams import Stream, root_of_seed, stream_key, uniforms
+from evedrop.model.streams import Stream, root_of_seed, stream_key, uniforms
 from tests.examples import examples
 
 KEY = stream_key(root_of_seed(31), "link/eve")

@@ -10,7 +10,7 @@ import pytest
 
 from evedrop.model.links import LOSS_MODELS, loss_of
 from evedrop.model.links.link import Fate
-from evedrop.streams import Stream, root_of_seed, stream_key, uniforms
+from evedrop.model.streams import Stream, root_of_seed, stream_key, uniforms
 
 KEY = stream_key(root_of_seed(77), "link/eve")
 SLOTS, TRIALS = 500, 2000

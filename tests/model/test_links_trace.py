@@ -16,7 +16,7 @@ from evedrop.model.links.link import Fate, count_variance
 from evedrop.model.links.markov import stationary
 from evedrop.model.links.trace import MOST_OUTCOMES, RecordedLoss
 from evedrop.model.process import Floats
-from evedrop.streams import Stream, root_of_seed, stream_key, uniforms
+from evedrop.model.streams import Stream, root_of_seed, stream_key, uniforms
 
 KEY = stream_key(root_of_seed(5), "link/eve")
 

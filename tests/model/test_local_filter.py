@@ -11,7 +11,7 @@ from scipy.linalg import solve_discrete_are
 from evedrop.model.local_filter import LocalFilter, Steps, settled
 from evedrop.model.plant import Drive, Plant
 from evedrop.model.process import Process, Trajectory, mistakes_of
-from evedrop.streams import Batch
+from evedrop.model.streams import Batch
 from tests.builders import stream_keys
 from tests.examples import mostly_long
 

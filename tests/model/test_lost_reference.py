@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop.expected.estimates import warnings_of
-from evedrop.loading import checked
 from evedrop.model.process import Process
 from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.theory.lost_reference import growth_by_coin, growth_by_phases, most_coded
+from evedrop.scenario.expected.estimates import warnings_of
+from evedrop.scenario.loading import checked
 from tests.builders import DRIFTING, UNSTABLE
 from tests.model.acknowledged_runs import MIXED
 from tests.model.mixed_runs import covariances

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from evedrop.model.process import Process
 from evedrop.model.theory.closed_forms import in_sync_probability, step_probabilities, word_probability
 from evedrop.model.theory.covariances import Outcomes, limit
-from evedrop.paper import chain
+from evedrop.studies.papers import chain
 
 inner = st.floats(0.05, 0.95)
 

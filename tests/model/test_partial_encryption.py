@@ -19,9 +19,9 @@ from evedrop.model.receiver import Action, Belief, Receiver, Reception
 from evedrop.model.schemes import scheme_of
 from evedrop.model.schemes.partial_encryption import INNOVATION_IN_CLEAR, PartialEncryption
 from evedrop.model.schemes.scheme import Packet
+from evedrop.model.streams import Batch
 from evedrop.model.theory.clear_states import ClearStatesForm
 from evedrop.model.theory.covariances import Outcomes, expected_traces, state_covariances
-from evedrop.streams import Batch
 from tests.builders import DRIFTING, MARGINAL, MICROGRID, UNSTABLE, stream_keys
 from tests.examples import examples
 from tests.model import rationals

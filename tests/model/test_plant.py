@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from evedrop.kernels.elementary import semidefinite_factor
 from evedrop.live.protocol.brief_closed_loop import AssignmentEntry, PlantEntry
 from evedrop.model.controllers import CONTROLLERS, Assignment
 from evedrop.model.controllers.lqr import Lqr, gain, held
 from evedrop.model.input_aware import InputAwareEstimator, Offset
+from evedrop.model.kernels.elementary import semidefinite_factor
 from evedrop.model.plant import Drive, Plant
 from evedrop.model.process import Process, Trajectory
 from evedrop.model.receiver import Action, Reception
 from evedrop.model.schemes import scheme_of
 from evedrop.model.slot.controller import ControllerCore
-from evedrop.streams import Batch, root_of_seed, stream_key
+from evedrop.model.streams import Batch, root_of_seed, stream_key
 from tests.builders import stream_keys
 
 B = 1e-3 * np.array([[1.56, 1.56], [-5.66, 0.0]])

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from evedrop.model.process import MOST_STATES, Floats, Process, StateFactors, Trajectory, mistakes_of, product
+from evedrop.model.streams import Batch, root_of_seed, stream_key
 from evedrop.model.theory.covariances import state_covariances
 from evedrop.model.theory.horizon import horizon
-from evedrop.streams import Batch, root_of_seed, stream_key
 from tests.builders import DRIFTING, UNSTABLE
 
 KEY = stream_key(root_of_seed(1), "process")

@@ -16,6 +16,7 @@ from evedrop.model.numeric.quantiser import DitheredQuantiser, LevelPad
 from evedrop.model.process import Process
 from evedrop.model.receiver import Action
 from evedrop.model.schemes.quantised_schedule import QuantisedSchedule
+from evedrop.model.streams import Batch, Stream, stream_key
 from evedrop.model.theory.closed_forms import (
     SensorChain,
     always_sent,
@@ -25,7 +26,6 @@ from evedrop.model.theory.closed_forms import (
 )
 from evedrop.model.theory.covariances import state_covariances
 from evedrop.model.theory.quantisation import QuantisationError
-from evedrop.streams import Batch, Stream, stream_key
 from tests.builders import DRIFTING, UNSTABLE
 from tests.model.slot_loop import ROOT, STABLE, coins, play
 

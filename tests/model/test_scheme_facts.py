@@ -12,7 +12,7 @@ from evedrop.model.schemes.cipher import Cipher
 from evedrop.model.schemes.plain import Plain
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.schemes.twin_track import TwinTrack
-from evedrop.streams import Batch
+from evedrop.model.streams import Batch
 
 PROCESS = Process(np.eye(2), np.eye(2), np.eye(2))
 

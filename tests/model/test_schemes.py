@@ -14,8 +14,8 @@ from evedrop.model.process import Floats, Process, Trajectory
 from evedrop.model.receiver import Action, Belief, Reception
 from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.scheme import Scheme
+from evedrop.model.streams import Batch, Stream, normals, uniforms
 from evedrop.model.theory.covariances import state_covariances
-from evedrop.streams import Batch, Stream, normals, uniforms
 from tests.builders import DRIFTING, UNSTABLE, stream_keys
 from tests.examples import examples
 

@@ -11,7 +11,7 @@ from evedrop.model.process import Process, Trajectory
 from evedrop.model.receiver import Reception
 from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.scheme import Scheme
-from evedrop.streams import Batch
+from evedrop.model.streams import Batch
 from tests.builders import UNSTABLE
 from tests.model.slot_loop import STABLE, Played, coins, keys_of, play
 

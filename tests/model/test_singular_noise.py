@@ -15,18 +15,18 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from evedrop.kernels.elementary import Floats
 from evedrop.model.eavesdroppers.bayesian import Bayesian
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.eavesdroppers.genie import Genie
 from evedrop.model.eavesdroppers.likelihood import Likelihood
+from evedrop.model.kernels.elementary import Floats
 from evedrop.model.noise_law import PACKETS, NoiseLaw
 from evedrop.model.process import Process, StateFactors
 from evedrop.model.receiver import Action, Belief, Reception
 from evedrop.model.schedule import Schedule
+from evedrop.model.streams import Batch
 from evedrop.model.theory.covariances import Outcomes, expected_traces, limit_trace
 from evedrop.model.theory.leak import Leaks, RemainingCovariances, remaining_limit
-from evedrop.streams import Batch
 from tests.examples import mostly_long
 from tests.model.rationals import Matrix, combined, congruent, exact, remaining, times, transposed
 from tests.model.singular_processes import PROCESSES, sigmas

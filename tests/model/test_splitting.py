@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from evedrop.model.numeric.splitting import SplitPopulations, importance_floor
 from evedrop.model.process import Floats
-from evedrop.streams import OWN, Batch, BlockReader, Lineage, stream_key
+from evedrop.model.streams import OWN, Batch, BlockReader, Lineage, stream_key
 
 KEY = stream_key(b"any", "splitting")
 GROWTH, KEPT, SLOTS = 1.9, 0.5, 12

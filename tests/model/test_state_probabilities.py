@@ -20,8 +20,8 @@ from evedrop.model.receiver import Belief, Reception
 from evedrop.model.schedule import Schedule, equal_slots, in_slot, in_slots, mean_of
 from evedrop.model.schemes.innovation import Innovation
 from evedrop.model.slot.link_law import LinkLaw
+from evedrop.model.streams import Batch
 from evedrop.model.theory.schedule_problem import SlotRecursion
-from evedrop.streams import Batch
 from tests.builders import MARGINAL, UNSTABLE, stream_keys
 
 MU_D = (1.0, 0.0, 0.0, 0.3, 0.3, 0.9, 1.0, 0.2)

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from evedrop.streams import (
+from evedrop.model.streams import (
     Ahead,
     Batch,
     BlockReader,

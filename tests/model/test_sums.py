@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from evedrop import montecarlo
-from evedrop.expected.estimates import warnings_of
-from evedrop.kernels.elementary import sum_in_order
-from evedrop.loading import load, shipped
+from evedrop.model.kernels.elementary import sum_in_order
+from evedrop.scenario.expected.estimates import warnings_of
+from evedrop.scenario.loading import load, shipped
 from evedrop.wire.law import expected
 from tests.examples import mostly_long
 

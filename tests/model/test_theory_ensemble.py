@@ -8,7 +8,7 @@ from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Action
 from evedrop.model.theory.covariances import Outcomes, expected_traces, misled_covariances
 from evedrop.model.update import actual_covariance
-from evedrop.paper import strategies
+from evedrop.studies.papers import strategies
 
 TRIALS = 20_000
 SLOTS = 25

@@ -15,8 +15,8 @@ from evedrop.model.eavesdroppers.tracker import CAPACITY, Tracker
 from evedrop.model.process import Process, Trajectory
 from evedrop.model.receiver import Action, Belief, Reception
 from evedrop.model.schemes.twin_track import TwinTrack, TwinTracks
+from evedrop.model.streams import Batch, stream_key
 from evedrop.model.theory.closed_forms import twin_track_bound
-from evedrop.streams import Batch, stream_key
 from tests.builders import DRIFTING, UNSTABLE
 from tests.examples import mostly_long
 from tests.model.slot_loop import ROOT, STABLE, coins, keys_of

@@ -10,9 +10,9 @@ from evedrop.model.eavesdroppers import READERS
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.process import Floats, Process
 from evedrop.model.schemes.twin_track import TwinTrack, TwinTracks
+from evedrop.model.streams import Batch
 from evedrop.model.theory.closed_forms import twin_track_bound
 from evedrop.model.theory.covariances import expected_covariances
-from evedrop.streams import Batch
 from tests.builders import DRIFTING, UNSTABLE
 from tests.model.slot_loop import STABLE, coins, keys_of, play
 

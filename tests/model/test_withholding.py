@@ -9,8 +9,8 @@ from scipy import stats
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.schemes.withholding import Withholding
+from evedrop.model.streams import Batch
 from evedrop.model.theory.covariances import expected_covariances, limit, lyapunov
-from evedrop.streams import Batch
 from tests.builders import DRIFTING, UNSTABLE
 from tests.model.slot_loop import coins, play
 

@@ -15,16 +15,16 @@ from evedrop import montecarlo
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
-from evedrop.loading import load
 from evedrop.model.digest import BlockDigests, Blocks, Digests, RunDigest
 from evedrop.model.process import Trajectory
 from evedrop.model.receiver import Reception
 from evedrop.model.schemes import SCHEMES
-from evedrop.ports import free_port
+from evedrop.model.streams import Batch
 from evedrop.results.writer import load_results
-from evedrop.scenario import Scenario
+from evedrop.scenario.loading import load
 from evedrop.scenario.stream_keys import StreamKeys
-from evedrop.streams import Batch
+from evedrop.scenario.tables import Scenario
+from evedrop.system.ports import free_port
 from tests.builders import DRIFTING, one_slot, process_table
 from tests.conftest import LIMIT
 from tests.peers.independent_legitimate import Estimator

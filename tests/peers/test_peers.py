@@ -28,7 +28,7 @@ from evedrop.model.flag_bits import packed_flags
 from evedrop.peers.eavesdropper import eavesdrop
 from evedrop.peers.legitimate import estimate
 from evedrop.peers.sensor import Window, sense
-from evedrop.scenario import Scenario
+from evedrop.scenario.tables import Scenario
 from tests.builders import part_of
 from tests.clock import T, TestClock
 from tests.conftest import LIMIT

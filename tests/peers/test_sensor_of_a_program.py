@@ -13,9 +13,9 @@ import pytest
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.protocol.brief import Flow
 from evedrop.live.protocol.commands import End, Start
-from evedrop.loading import checked
 from evedrop.model.process import Floats
 from evedrop.peers.sensor import sense
+from evedrop.scenario.loading import checked
 from tests.builders import MARGINAL, process_table
 from tests.clock import TestClock
 from tests.conftest import LIMIT, wait_until

@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from evedrop.api import montecarlo
+from evedrop.cli.api import montecarlo
 from evedrop.errors import UsageError
 from evedrop.results.diff import difference
 from evedrop.results.writer import Results, load_results

@@ -23,18 +23,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evedrop.errors import UsageError
-from evedrop.loading import load
 from evedrop.results.ending import note_end
 from evedrop.results.growing_tables import UNFINISHED, goes_on, last_round
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.summary_file import unwritten
 from evedrop.results.writer import Results, ResultsWriter, load_results
-from evedrop.scenario import Scenario
+from evedrop.scenario.loading import load
+from evedrop.scenario.tables import Scenario
 from evedrop.score.scorekeeper import Ending, summary_of
 from evedrop.score.summary import Summary
 from evedrop.score.sums import SlotSums
 from evedrop.score.totals import Totals
-from evedrop.view.replay import replay
+from evedrop.show.view.replay import replay
 from tests.conftest import Evedrop, Live, wait_until
 from tests.examples import examples, mostly_long
 from tests.rogue import with_rogue

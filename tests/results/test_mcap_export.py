@@ -7,9 +7,9 @@ import pytest
 
 from evedrop import montecarlo, run
 from evedrop.errors import UsageError
-from evedrop.loading import load
 from evedrop.results.mcap_export import export_mcap
 from evedrop.results.reading import Results, load_results
+from evedrop.scenario.loading import load
 from tests.conftest import Evedrop
 
 pytest.importorskip("mcap")

@@ -13,11 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evedrop.errors import ScenarioError, UsageError
-from evedrop.loading import load, shipped
-from evedrop.memory.montecarlo import check_mode
-from evedrop.memory.simulation import Mode
-from evedrop.memory.trials import tasks_of
 from evedrop.results.object_data import NotData, packed, unpacked
+from evedrop.scenario.loading import load, shipped
+from evedrop.simulate.montecarlo import check_mode
+from evedrop.simulate.simulation import Mode
+from evedrop.simulate.trials import tasks_of
 
 
 class Place(NamedTuple):

@@ -14,10 +14,10 @@ from typing import Any
 import pytest
 
 from evedrop.errors import UsageError
-from evedrop.loading import load
 from evedrop.results.folder import new_folder, private_file
 from evedrop.results.resolved_scenario import resolved
-from evedrop.view.replay import replay
+from evedrop.scenario.loading import load
+from evedrop.show.view.replay import replay
 from tests.conftest import Evedrop, Live, wait_until
 
 OPEN: dict[str, Any] = {"umask": 0o000}

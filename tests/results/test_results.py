@@ -11,12 +11,12 @@ import pytest
 from pydantic import BaseModel
 
 from evedrop import scenario
-from evedrop.api import montecarlo
-from evedrop.loading import parse
+from evedrop.cli.api import montecarlo
 from evedrop.model.packet_words import ACTIONS
 from evedrop.results import growing_tables as growing
 from evedrop.results.growing_tables import BATCH_BYTES, UNFINISHED, TableStream, Unfinished, finish
 from evedrop.results.writer import DIGESTS, JOURNAL, Results, load_results
+from evedrop.scenario.loading import parse
 
 DOCS = Path(__file__).parents[2] / "docs"
 TABLES = [

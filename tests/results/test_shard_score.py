@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 
 from evedrop.errors import RunError
-from evedrop.loading import load
-from evedrop.memory.simulation import Mode
-from evedrop.memory.trials import tasks_of
 from evedrop.results.object_data import packed
 from evedrop.results.shard_score import dump_score, load_score
-from evedrop.scenario import Scenario
+from evedrop.scenario.loading import load
+from evedrop.scenario.tables import Scenario
 from evedrop.score.totals import Totals
+from evedrop.simulate.simulation import Mode
+from evedrop.simulate.trials import tasks_of
 
 
 class Evil:

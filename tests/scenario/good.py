@@ -9,7 +9,7 @@ import pytest
 import tomli_w
 
 from evedrop.errors import ScenarioError
-from evedrop.loading import parse
+from evedrop.scenario.loading import parse
 
 GOOD: dict[str, Any] = {
     "title": "A vehicle",

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from evedrop.discovery import is_scenario, scenarios_in
-from evedrop.loading import shipped
+from evedrop.scenario.discovery import is_scenario, scenarios_in
+from evedrop.scenario.loading import shipped
 from evedrop.studies.scenario_tests import scenarios_of
 
 SCENARIO = shipped()["eavesdroppers"].read_text(encoding="utf-8")

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 
 from evedrop.errors import ScenarioError
-from evedrop.loading import checked
 from evedrop.model.links.link import Fate
 from evedrop.model.slot.link import NEVER
-from evedrop.scenario import Scenario
+from evedrop.scenario.loading import checked
+from evedrop.scenario.tables import Scenario
 from tests.builders import scalar_tables
 
 

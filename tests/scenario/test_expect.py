@@ -9,8 +9,8 @@ import pytest
 import tomli_w
 
 from evedrop.errors import ScenarioError
-from evedrop.loading import parse
-from evedrop.scenario import Scenario
+from evedrop.scenario.loading import parse
+from evedrop.scenario.tables import Scenario
 from tests.builders import scalar_tables
 
 GOOD = scalar_tables(

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop.api import compare, montecarlo
+from evedrop.cli.api import compare, montecarlo
 from evedrop.errors import ScenarioError, UsageError
-from evedrop.expected.expectations import expectations_of
-from evedrop.loading import checked, load
-from evedrop.memory.montecarlo import Plan
-from evedrop.memory.simulation import Mode
 from evedrop.results.diff import difference
 from evedrop.results.resolved_scenario import write_resolved
+from evedrop.scenario.expected.expectations import expectations_of
 from evedrop.scenario.input_files import states_of
+from evedrop.scenario.loading import checked, load
+from evedrop.simulate.montecarlo import Plan
+from evedrop.simulate.simulation import Mode
 from evedrop.studies.matchups import matchups_of
 from tests.builders import MARGINAL, process_table
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from evedrop.errors import ScenarioError
-from evedrop.loading import checked, shipped
 from evedrop.model.local_filter import settled
-from evedrop.scenario import Scenario
+from evedrop.scenario.loading import checked, shipped
+from evedrop.scenario.tables import Scenario
 
 MEASURED = {**tomllib.loads(shipped()["measured"].read_text(encoding="utf-8")), "expect": []}
 FORCE = [[2.5e-5, 5e-4], [5e-4, 1e-2]]

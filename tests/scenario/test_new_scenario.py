@@ -12,20 +12,20 @@ from typing import Any
 import pytest
 
 from evedrop.errors import ScenarioError
-from evedrop.figures import FIGURES
 from evedrop.live.launch.hosts_file import HostsFile
-from evedrop.loading import parse
 from evedrop.model.acknowledgements import ATTACKS
 from evedrop.model.controllers import CONTROLLERS
 from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.figures import FIGURES
 from evedrop.model.integrity import POLICIES, SENSOR_ATTACKS
 from evedrop.model.links import LOSS_MODELS
 from evedrop.model.schemes import SCHEMES
-from evedrop.scenario import Scenario
 from evedrop.scenario.application import APPLICATIONS
 from evedrop.scenario.events import EVENTS
+from evedrop.scenario.loading import parse
 from evedrop.scenario.table import Table
+from evedrop.scenario.tables import Scenario
 from evedrop.wire.tables import WireFile
 from tests.conftest import LIMIT
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from evedrop.errors import ScenarioError
-from evedrop.expected.expectations import expectations_of
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.protocol.brief_parts import EavesdropperPart
-from evedrop.loading import checked, load
 from evedrop.model.local_filter import settled
 from evedrop.model.noise_law import PACKETS, NoiseLaw
-from evedrop.scenario import Scenario
+from evedrop.scenario.expected.expectations import expectations_of
+from evedrop.scenario.loading import checked, load
+from evedrop.scenario.tables import Scenario
 from tests.builders import part_of
 
 _TASK = ObserverTask(Path("nowhere"), False)

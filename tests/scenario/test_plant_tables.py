@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from evedrop.errors import ScenarioError
-from evedrop.loading import checked, load
 from evedrop.results.resolved_scenario import write_resolved
-from evedrop.scenario import Scenario
 from evedrop.scenario.input_files import disturbances_of
+from evedrop.scenario.loading import checked, load
+from evedrop.scenario.tables import Scenario
 
 LOOP: dict[str, Any] = {
     "title": "Loop",

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 import tomli_w
 
-from evedrop.loading import parse
 from evedrop.results.resolved_scenario import resolved
-from evedrop.scenario import Scenario
+from evedrop.scenario.loading import parse
+from evedrop.scenario.tables import Scenario
 from tests.scenario.good import GOOD, mistakes
 
 POOL = {"strategy": "colluding", "links": [{"quality": 0.6}, {"quality": 0.5}], "reads_as": "smart"}

@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evedrop.errors import ScenarioError, UsageError
-from evedrop.expected.estimates import warnings_of
-from evedrop.loading import load, parse, shipped, value_of
 from evedrop.results.resolved_scenario import write_resolved
-from evedrop.scenario import Scenario
+from evedrop.scenario.expected.estimates import warnings_of
+from evedrop.scenario.loading import load, parse, shipped, value_of
+from evedrop.scenario.tables import Scenario
 from evedrop.scenarios import write_new
 from tests.scenario.good import GOOD, mistakes
 

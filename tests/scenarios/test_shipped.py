@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop.api import montecarlo, run
-from evedrop.loading import load, shipped
+from evedrop.cli.api import montecarlo, run
 from evedrop.results.writer import Results, load_results
+from evedrop.scenario.loading import load, shipped
 from tests.builders import digests_of
 from tests.examples import mostly_long
 

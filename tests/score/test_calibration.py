@@ -15,18 +15,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop.expected.expectations import Expectation, expectations_of
-from evedrop.loading import checked, load
-from evedrop.memory.simulation import Mode
-from evedrop.memory.trials import carry_out, tasks_of
 from evedrop.model.process import Floats
 from evedrop.names import LEGITIMATE
-from evedrop.scenario import Scenario
+from evedrop.scenario.expected.expectations import Expectation, expectations_of
+from evedrop.scenario.loading import checked, load
+from evedrop.scenario.tables import Scenario
 from evedrop.score.rare_events import z_of_error
 from evedrop.score.scorekeeper import verdicts
 from evedrop.score.summary import RARE_SHARE, RareEvents
 from evedrop.score.totals import Totals
 from evedrop.score.verdict import Verdict
+from evedrop.simulate.simulation import Mode
+from evedrop.simulate.trials import carry_out, tasks_of
 
 SEED = 2718
 REPOSITORY = Path(__file__).parents[2]

@@ -9,11 +9,11 @@ import pytest
 
 from evedrop.model.slot.account import Accountant
 from evedrop.model.slot.link import Link
-from evedrop.scenario import Scenario
+from evedrop.model.streams import Batch
 from evedrop.scenario.stream_keys import StreamKeys
+from evedrop.scenario.tables import Scenario
 from evedrop.score.channel import RATE_CONFIDENCE, interval, link_summary_of
 from evedrop.score.sums import Tally
-from evedrop.streams import Batch
 from tests.builders import scalar_tables
 
 LINKS: dict[str, dict[str, Any]] = {

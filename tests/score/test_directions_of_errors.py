@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop.api import montecarlo
+from evedrop.cli.api import montecarlo
 from evedrop.cli.report import print_summary
-from evedrop.loading import load
-from evedrop.memory.montecarlo import Plan
-from evedrop.memory.simulation import Mode
 from evedrop.model.process import Process
 from evedrop.model.schemes.innovation import Innovation
 from evedrop.model.theory.covariances import expected_covariances
 from evedrop.results.reading import Results
+from evedrop.scenario.loading import load
 from evedrop.score.summary import Summary
 from evedrop.score.sums import DirectionErrors
+from evedrop.simulate.montecarlo import Plan
+from evedrop.simulate.simulation import Mode
 from tests.scenario.good import mistakes
 
 SOME: dict[str, Any] = {"slots": 150, "trials": 40, "record_trials": 40}

@@ -15,17 +15,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evedrop.api import montecarlo, run
-from evedrop.figures.figure import ScoredSlots
-from evedrop.loading import load
-from evedrop.memory.montecarlo import Plan
+from evedrop.cli.api import montecarlo, run
+from evedrop.model.figures.figure import ScoredSlots
 from evedrop.model.receiver import Action
 from evedrop.results.writer import Results, load_results
+from evedrop.scenario.loading import load
 from evedrop.score.expectations_held import Evidence
 from evedrop.score.summary import Judged, LinkSummary, PeerSummary
 from evedrop.score.sums import Tally
 from evedrop.score.verdict import Secrecy, Verdict
 from evedrop.score.watched import IN_STEP, Watched, WatchedSlots
+from evedrop.simulate.montecarlo import Plan
 from tests.conftest import Evedrop
 
 SLOTS, TRIALS, FIRST = 90, 12, 30

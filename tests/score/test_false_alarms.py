@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.stats import binom, binomtest
 
-from evedrop.loading import checked
-from evedrop.memory.simulation import Mode
-from evedrop.memory.trials import TrialsTask, carry_out
 from evedrop.model.process import Floats
+from evedrop.scenario.loading import checked
 from evedrop.score.sums import WINDOWS, merged, window_means
 from evedrop.score.verdict import ERROR_RATE, SignTestOf, Verdict, relative_verdict, sign_of_mean, sign_of_median
+from evedrop.simulate.simulation import Mode
+from evedrop.simulate.trials import TrialsTask, carry_out
 from tests.builders import MARGINAL, process_table
 
 TRIALS, SLOTS = 200, 81

@@ -10,8 +10,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from evedrop.figures import FIGURES, figure, figures_of
-from evedrop.figures.figure import ScoredSlots
+from evedrop.model.figures import FIGURES, figure, figures_of
+from evedrop.model.figures.figure import ScoredSlots
 from evedrop.results.writer import load_results
 from tests.conftest import Evedrop
 from tests.packages import install

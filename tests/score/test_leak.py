@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop.api import compare, montecarlo
-from evedrop.figures.standard_error import z_of
-from evedrop.loading import load
-from evedrop.memory.montecarlo import Plan
-from evedrop.memory.simulation import Mode
+from evedrop.cli.api import compare, montecarlo
+from evedrop.model.figures.standard_error import z_of
 from evedrop.model.receiver import Action
 from evedrop.model.theory.leaked_bits import LeakedBits
+from evedrop.scenario.loading import load
 from evedrop.score.leak import HeardBits, HeardBitsStream, LeakTally, leak_is_known
+from evedrop.simulate.montecarlo import Plan
+from evedrop.simulate.simulation import Mode
 
 ALONE = Plan(workers=1)
 

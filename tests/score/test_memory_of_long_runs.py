@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from evedrop.loading import load
+from evedrop.scenario.loading import load
 from evedrop.score.scorekeeper import Ending, Scorekeeper, summary_of
 
 SCENARIO: dict[str, Any] = {"process.directions": {"position": [1.0, 0.0]}, "expect": []}

@@ -17,23 +17,23 @@ from rich.console import Console
 from scipy.stats import kurtosis, norm, skew
 from scipy.stats import t as student
 
-from evedrop.api import montecarlo, run
+from evedrop.cli.api import montecarlo, run
 from evedrop.cli.report import closing_table, print_summary
-from evedrop.expected.expectations import expectations_of
-from evedrop.figures.figure import MeanFigure, ScoredSlots, TotalsFigure
-from evedrop.figures.packets import UsedFraction
-from evedrop.figures.standard_error import ratio_error, standard_error, z_of
-from evedrop.figures.text import estimate
-from evedrop.loading import load
-from evedrop.memory.montecarlo import Merger, Plan
-from evedrop.memory.simulation import Mode
-from evedrop.memory.trials import carry_out, tasks_of
+from evedrop.model.figures.figure import MeanFigure, ScoredSlots, TotalsFigure
+from evedrop.model.figures.packets import UsedFraction
+from evedrop.model.figures.standard_error import ratio_error, standard_error, z_of
+from evedrop.model.figures.text import estimate
 from evedrop.model.process import Floats
 from evedrop.results.reading import Results
-from evedrop.scenario import Scenario
+from evedrop.scenario.expected.expectations import expectations_of
+from evedrop.scenario.loading import load
+from evedrop.scenario.tables import Scenario
 from evedrop.score.scorekeeper import Ending
 from evedrop.score.summary import RARE_SHARE, Summary
 from evedrop.score.sums import Tally
+from evedrop.simulate.montecarlo import Merger, Plan
+from evedrop.simulate.simulation import Mode
+from evedrop.simulate.trials import carry_out, tasks_of
 from tests.builders import scalar_tables
 from tests.examples import mostly_long
 

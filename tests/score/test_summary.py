@@ -9,21 +9,21 @@ from typing import Any
 
 import pytest
 
-from evedrop.api import montecarlo
+from evedrop.cli.api import montecarlo
 from evedrop.errors import UsageError
-from evedrop.figures import FIGURES, figure
-from evedrop.loading import load
-from evedrop.memory.montecarlo import Merger, Plan
-from evedrop.memory.simulation import Mode
-from evedrop.memory.trials import tasks_of
-from evedrop.memory.workers import in_this_process
-from evedrop.news import ConnectionOutage
+from evedrop.model.figures import FIGURES, figure
 from evedrop.results.reading import Results
 from evedrop.results.summary_file import summary_text, write_summary
 from evedrop.results.writer import load_results
+from evedrop.scenario.loading import load
+from evedrop.scenario.news import ConnectionOutage
 from evedrop.score.scorekeeper import Ending, summary_of
 from evedrop.score.summary import Summary
 from evedrop.score.totals import Totals
+from evedrop.simulate.montecarlo import Merger, Plan
+from evedrop.simulate.simulation import Mode
+from evedrop.simulate.trials import tasks_of
+from evedrop.simulate.workers import in_this_process
 from tests.examples import mostly_long
 
 

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop.expected.expectations import Expectation
 from evedrop.model.process import Floats, Process
 from evedrop.model.slot.link import LinkSchedule
 from evedrop.model.slot.link_law import law_of
 from evedrop.model.theory.covariances import Outcomes
+from evedrop.scenario.expected.expectations import Expectation
 from evedrop.score.sums import WINDOWS, Tally, window_means, window_of
 from evedrop.score.verdict import Secrecy, Verdict, rejected, secrecy
 

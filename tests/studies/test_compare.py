@@ -11,18 +11,18 @@ import pytest
 
 from evedrop import compare, montecarlo
 from evedrop.errors import UsageError
-from evedrop.loading import load
-from evedrop.memory.montecarlo import Plan
-from evedrop.memory.simulation import Mode
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.theory.closed_forms import encrypted_fraction
-from evedrop.report.comparison import verdict
-from evedrop.report.writing import write_report
 from evedrop.results.comparison import Comparison
 from evedrop.results.comparison_file import read_comparison
 from evedrop.results.summary_file import plain
+from evedrop.scenario.loading import load
 from evedrop.score.verdict import SecrecyKept
+from evedrop.show.report.comparison import verdict
+from evedrop.show.report.writing import write_report
+from evedrop.simulate.montecarlo import Plan
+from evedrop.simulate.simulation import Mode
 from evedrop.studies.matchups import ATTACKERS, usual_adversaries
 from tests.pages import checked
 

@@ -9,9 +9,9 @@ import pytest
 from PIL import Image
 
 from evedrop.errors import ScenarioError, UsageError
-from evedrop.figures.text import share_text
-from evedrop.loading import load
+from evedrop.model.figures.text import share_text
 from evedrop.model.schemes import SCHEMES
+from evedrop.scenario.loading import load
 from evedrop.studies.matchups import adversaries_of, matchups_of
 from tests.conftest import Evedrop
 from tests.examples import mostly_long

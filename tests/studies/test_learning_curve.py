@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop.api import montecarlo
+from evedrop.cli.api import montecarlo
 from evedrop.errors import UsageError
-from evedrop.loading import load
-from evedrop.memory.montecarlo import Plan
+from evedrop.scenario.loading import load
+from evedrop.simulate.montecarlo import Plan
 from evedrop.studies.learning_curve import learning_curve
 from tests.conftest import Evedrop
 

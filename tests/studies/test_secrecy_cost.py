@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_rel
 
-from evedrop.api import montecarlo
-from evedrop.loading import load
-from evedrop.memory.montecarlo import Plan
+from evedrop.cli.api import montecarlo
 from evedrop.model.process import Floats
+from evedrop.scenario.loading import load
+from evedrop.simulate.montecarlo import Plan
 from evedrop.studies.secrecy_cost import MeanEstimate, secrecy_cost
 from tests.conftest import Evedrop
 

@@ -16,14 +16,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evedrop.api import montecarlo
+from evedrop.cli.api import montecarlo
 from evedrop.errors import UsageError
-from evedrop.figures import expectable_figures
-from evedrop.loading import load
-from evedrop.memory.montecarlo import Plan
-from evedrop.memory.simulation import Mode, Simulation
-from evedrop.report.sweep import sweep_table
-from evedrop.report.writing import write_report
+from evedrop.model.figures import expectable_figures
+from evedrop.scenario.loading import load
+from evedrop.show.report.sweep import sweep_table
+from evedrop.show.report.writing import write_report
+from evedrop.simulate.montecarlo import Plan
+from evedrop.simulate.simulation import Mode, Simulation
 from evedrop.studies.sweep import grid_of, sweep_over
 from tests.conftest import Evedrop
 from tests.examples import examples

@@ -17,8 +17,8 @@ import pytest
 
 from evedrop.cli import main as cli
 from evedrop.errors import RunError
-from evedrop.loading import shipped
 from evedrop.results.writer import load_results
+from evedrop.scenario.loading import shipped
 from evedrop.studies import scenario_tests as testing
 from evedrop.studies.junit import junit_of
 from evedrop.studies.scenario_tests import Finding, Manner, Outcome
@@ -46,7 +46,17 @@ def written(folder: Path, **texts: str) -> None:
 
 def pytest_in(evedrop: Evedrop, *arguments: str) -> Done:
     """Run pytest with the plugin, found as it is in an environment with it, and with warnings as errors."""
-    command = [sys.executable, "-m", "pytest", "-p", "evedrop.pytest_plugin", "-W", "error", "--color=no", *arguments]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-p",
+        "evedrop.cli.pytest_plugin",
+        "-W",
+        "error",
+        "--color=no",
+        *arguments,
+    ]
     environment = {**evedrop.environment, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
     done = subprocess.run(command, cwd=evedrop.folder, env=environment, capture_output=True, text=True, check=False)
     return Done(done.returncode, done.stdout, done.stderr)
@@ -224,7 +234,7 @@ def test_an_interrupt_ends_tests_whose_processes_are_suspended(evedrop: Evedrop)
 @pytest.mark.long
 def test_a_test_whose_process_stays_suspended_is_broken(evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch) -> None:
     """And named; the others are carried out."""
-    monkeypatch.setattr("evedrop.processes.SUSPENDED_SECONDS", 3.0)
+    monkeypatch.setattr("evedrop.system.processes.SUSPENDED_SECONDS", 3.0)
     written(evedrop.folder / "cases", a=ENDLESS, b=HOLDS)
     over = threading.Event()
     suspended: list[int] = []
@@ -277,7 +287,7 @@ def test_pytest_collects_scenarios_as_tests(evedrop: Evedrop) -> None:
     assert "1 passed" in done.out
     assert "2 failed" in done.out
     assert "Traceback" not in done.out + done.err
-    assert "emulator/" not in done.out.replace("emulator/pytest_plugin", "")
+    assert "emulator/" not in done.out.replace("emulator/evedrop/cli/pytest_plugin", "")
     kept = evedrop.folder / "kept" / "fails"
     failed = next(line for line in done.out.splitlines() if line.startswith("expected smart.received_fraction"))
     assert "over slots 10 to 59 above 2: FAILED, found 0." in failed

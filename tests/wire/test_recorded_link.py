@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from evedrop.errors import TraceError, UsageError
-from evedrop.fitting.message_fit import fit_messages
+from evedrop.scenario.fitting.message_fit import fit_messages
 from evedrop.wire.crossing import AGAIN, Crossing, Kind
 from evedrop.wire.fates import KeyFates
 from evedrop.wire.file import resolved_wire, wire_of

@@ -10,7 +10,7 @@ import zenoh
 
 from evedrop import wire
 from evedrop.errors import UsageError
-from evedrop.ports import free_port
+from evedrop.system.ports import free_port
 from evedrop.wire.plan import Side
 from evedrop.wire.side import SideSession
 from tests.conftest import LIMIT, wait_until

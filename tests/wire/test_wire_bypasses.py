@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from evedrop import wire
-from evedrop.ports import free_port
-from evedrop.report.wire import wire_outcome
+from evedrop.show.report.wire import wire_outcome
+from evedrop.system.ports import free_port
 from evedrop.wire import bypasses as bypasses_module
 from evedrop.wire.bypasses import Bypasses
 from evedrop.wire.check import wire_lines

@@ -141,7 +141,7 @@ def test_the_fixture_ends_the_wires_of_a_test_that_fails(tmp_path: Path) -> None
     (tmp_path / "test_radio.py").write_text(FAILING)
     options = [
         "-p",
-        "evedrop.pytest_plugin",
+        "evedrop.cli.pytest_plugin",
         "-p",
         "no:cacheprovider",
         "--basetemp",

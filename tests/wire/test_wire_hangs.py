@@ -16,7 +16,7 @@ import pytest
 import zenoh
 
 from evedrop.errors import Interrupted, RunError
-from evedrop.signals import stop_or_leave_on_signals
+from evedrop.system.signals import stop_or_leave_on_signals
 from evedrop.wire.file import load_wire
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_on_disk import summary_of_wire
@@ -244,7 +244,7 @@ def test_signals_in_quick_succession_are_one(monkeypatch: pytest.MonkeyPatch) ->
         for _ in range(3):
             os.kill(os.getpid(), signal.SIGTERM)
         wait_until(stop.is_set, "it stops")
-        monkeypatch.setattr("evedrop.signals.AGAIN_SECONDS", 0.0)
+        monkeypatch.setattr("evedrop.system.signals.AGAIN_SECONDS", 0.0)
         os.kill(os.getpid(), signal.SIGTERM)
         wait_until(lambda: left, "it leaves")
     assert signal.getsignal(signal.SIGTERM) == before

@@ -12,15 +12,15 @@ from typing import Any
 import pytest
 import zenoh
 
-from evedrop.api import montecarlo, run
+from evedrop.cli.api import montecarlo, run
 from evedrop.cli.main import main
 from evedrop.errors import ScenarioError, UsageError
-from evedrop.loading import checked, load
-from evedrop.memory.montecarlo import Plan
 from evedrop.model.links.link import Fate
 from evedrop.results.diff import difference
 from evedrop.results.writer import Results
-from evedrop.scenario import Scenario
+from evedrop.scenario.loading import checked, load
+from evedrop.scenario.tables import Scenario
+from evedrop.simulate.montecarlo import Plan
 from evedrop.wire.fates import KeyFates
 from evedrop.wire.file import wire_of
 from evedrop.wire.network import over_wire

@@ -12,9 +12,9 @@ import pytest
 import zenoh
 
 from evedrop.errors import UsageError
-from evedrop.lacks import lack_of
 from evedrop.live.launch.authority import Authority
-from evedrop.ports import free_port
+from evedrop.system.lacks import lack_of
+from evedrop.system.ports import free_port
 from evedrop.wire.crossing import Crossing
 from evedrop.wire.plan import Side, SideTls
 from evedrop.wire.side import PROBES, SideSession, side_config

@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 from evedrop.errors import ScenarioError, UsageError
-from evedrop.report.wire import WITHOUT_MODEL, wire_failures, wire_sentences, wire_table
-from evedrop.report.writing import write_report
 from evedrop.results.wire_folder import WIRE_FILE
 from evedrop.results.wire_summary import WireLinkSummary, WireSummary
+from evedrop.show.report.wire import WITHOUT_MODEL, wire_failures, wire_sentences, wire_table
+from evedrop.show.report.writing import write_report
 from evedrop.wire.closing import closing_lines
 from evedrop.wire.crossing import AGAIN, UNLINKED, Crossing, Kind
 from evedrop.wire.expect import WireExpectTable

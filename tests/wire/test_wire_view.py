@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from evedrop.cli.main import main
 from evedrop.errors import UsageError
-from evedrop.view import recording
+from evedrop.show.view import recording
 from evedrop.wire.crossing import Crossing
 from evedrop.wire.live_view import live_view
 from evedrop.wire.panels import Pace

@@ -7,7 +7,7 @@ from typing import Any
 
 from rerun.chunk import RrdReader
 
-from evedrop.view.column import ELAPSED
+from evedrop.show.view.column import ELAPSED
 
 RATES = {"scan": 100.0, "command": 20.0, "listener": 100.0}
 SECONDS = 12.0

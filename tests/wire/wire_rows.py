@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.model.slot.link import NEVER, Link, LinkSchedule, streams_of
-from evedrop.streams import Batch, root_of_seed, stream_key
+from evedrop.model.streams import Batch, root_of_seed, stream_key
 from evedrop.wire.crossing import RECORD, Crossing
 from evedrop.wire.plan import Side, WireLink, WirePlan
 

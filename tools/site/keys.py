@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from evedrop.figures import FIGURES
 from evedrop.model.controllers import CONTROLLERS
 from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.figures import FIGURES
 from evedrop.model.integrity import POLICIES, SENSOR_ATTACKS
 from evedrop.model.links import LOSS_MODELS
 from evedrop.model.schemes import SCHEMES
-from evedrop.scenario import Scenario
 from evedrop.scenario.events import EVENTS
+from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import as_toml
 
 Schema = Mapping[str, Any]

@@ -78,12 +78,13 @@ def _formula(found: re.Match[str]) -> str:
     return f'<{found[1]} class="formula">{convert(html.unescape(found[3]), display=display)}</{found[1]}>'
 
 
-def floors(source: str, *_: Any, **__: Any) -> str:
-    """The floor plan's drawing as rows of rooms: the script that draws Mermaid's would come from another host."""
-    rows = re.findall(r"subgraph \w+.*?\n(.*?)\n\s*end", source, re.DOTALL)
-    rooms = (re.findall(r"\[(\w+)\]", row) for row in rows)
-    return '<div class="floors">{}</div><p>The site shows the floors without the arrows.</p>'.format(
-        "".join("<p>{}</p>".format(" ".join(f"<code>{html.escape(room)}</code>" for room in row)) for row in rooms)
+def layers(source: str, *_: Any, **__: Any) -> str:
+    """The drawing of the packages as rows of packages: the script that draws Mermaid's would come from another host."""
+    rows = (re.findall(r"\[(\w+)\]", line) for line in source.splitlines() if "-->" not in line)
+    return '<div class="layers">{}</div><p>The site shows the layers without the arrows.</p>'.format(
+        "".join(
+            "<p>{}</p>".format(" ".join(f"<code>{html.escape(name)}</code>" for name in row)) for row in rows if row
+        )
     )
 
 

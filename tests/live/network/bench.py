@@ -23,8 +23,8 @@ from evedrop.live.network.session import client_config
 from evedrop.live.protocol.brief import AnyBrief, Flow, brief_from
 from evedrop.live.protocol.envelope import enclosed, payload_of
 from evedrop.live.protocol.keys import RunKeys
-from evedrop.ports import free_port
-from evedrop.scenario import Scenario
+from evedrop.scenario.tables import Scenario
+from evedrop.system.ports import free_port
 from tests.builders import MARGINAL, process_table
 from tests.conftest import LIMIT
 

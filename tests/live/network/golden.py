@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from evedrop.entries import read
 from evedrop.live.network import operator
 from evedrop.live.protocol import closed_loop as loop_wire
 from evedrop.live.protocol import codec as wire
@@ -20,6 +19,7 @@ from evedrop.live.protocol.requests import REQUESTS, read_request
 from evedrop.live.protocol.status import RunStatus
 from evedrop.live.protocol.whereabouts import Whereabouts, read_whereabouts
 from evedrop.model.digest import Blocks
+from evedrop.model.entries import read
 from evedrop.model.flag_bits import packed_flags
 from evedrop.model.receiver import Belief, Reception
 from evedrop.model.slot.account import COUNTED_BURSTS, Account

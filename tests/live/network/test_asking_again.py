@@ -14,7 +14,7 @@ from evedrop.live.network.operator import Answer
 from evedrop.live.protocol.envelope import enclosed
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.names import OBSERVER
-from evedrop.ports import free_port
+from evedrop.system.ports import free_port
 
 KEY = RunKeys("one").control(OBSERVER)
 

@@ -15,8 +15,8 @@ import pytest
 
 from evedrop.errors import MalformedMessage
 from evedrop.live.protocol.codec import Reader, read_refusal, refusal
-from evedrop.loading import load
-from evedrop.ports import free_port
+from evedrop.scenario.loading import load
+from evedrop.system.ports import free_port
 from tests.by_hand import by_hand
 from tests.conftest import Evedrop, Live
 from tests.rogue import with_rogue

@@ -18,22 +18,23 @@ from evedrop.model.eavesdroppers import ANSWERS
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.eavesdroppers.stand_in import StandIns
 from evedrop.model.process import Process
+from evedrop.model.streams import Batch
 from evedrop.results.writer import load_results
-from evedrop.streams import Batch
 from tests.conftest import Evedrop, Live, wait_until
 
 SEED = 7318529640182736451
 """That no process knows but the launcher and the observer, and that nothing holds by chance."""
 
 OURS = tuple(
-    f"evedrop.{room}"
-    for room in (
+    f"evedrop.{module}"
+    for module in (
         "live.launch",
         "live.observer",
         "live.network.router",
-        "memory",
+        "simulate",
         "results",
-        "scenario",
+        "scenario.loading",
+        "scenario.tables",
         "score",
         "peers.sensor",
     )

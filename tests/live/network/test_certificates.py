@@ -30,7 +30,7 @@ from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets
 from evedrop.live.protocol.brief import AnyBrief, read_brief
 from evedrop.live.protocol.brief_parts import Identity, ObserverPart
-from evedrop.ports import free_port
+from evedrop.system.ports import free_port
 from tests.live.network.bench import Bench, Ear, bench_of, connect, scenario_of, until
 
 EVE, MALLORY = "eve", "mallory"

@@ -25,12 +25,12 @@ from evedrop.live.protocol.brief import AnyBrief, read_brief
 from evedrop.live.protocol.commands import End
 from evedrop.live.protocol.envelope import enclosed
 from evedrop.live.protocol.keys import RunKeys
-from evedrop.loading import load
+from evedrop.model.streams import stream_key
 from evedrop.names import OBSERVER
 from evedrop.results.writer import load_results
-from evedrop.scenario import Scenario
+from evedrop.scenario.loading import load
 from evedrop.scenario.stream_keys import StreamKeys
-from evedrop.streams import stream_key
+from evedrop.scenario.tables import Scenario
 from tests.conftest import LIMIT
 from tests.live.network.bench import Ear, connect, until
 from tests.processes import descendants, parent_of, words_of

@@ -26,7 +26,7 @@ from evedrop.live.protocol.commands import End, Start
 from evedrop.live.protocol.envelope import enclosed, head_of, named_in
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.requests import StatusRequest
-from evedrop.ports import free_port
+from evedrop.system.ports import free_port
 from tests.conftest import LIMIT
 from tests.live.network.bench import is_matched, scenario_of, until
 from tests.proxy import Cable, cable

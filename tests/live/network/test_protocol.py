@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from evedrop.errors import MalformedMessage
-from evedrop.kernels.elementary import normal_quantile
 from evedrop.live.network.access import grants
 from evedrop.live.protocol.brief import read_brief
 from evedrop.live.protocol.brief_closed_loop import Wiring
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.model.digest import BlockDigests, RunDigest
+from evedrop.model.kernels.elementary import normal_quantile
 from evedrop.model.receiver import Beliefs
-from evedrop.streams import Stream, normals, root_of_seed, stream_key, uniforms
+from evedrop.model.streams import Stream, normals, root_of_seed, stream_key, uniforms
 from tests.live.network.golden import CODECS, GOLDEN, KEY, MESSAGES, TEXT, parts_of
 
 

@@ -18,7 +18,7 @@ from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.network import connecting
 from evedrop.live.network.connecting import Failures, RouterAddress
 from evedrop.live.network.session import Session
-from evedrop.ports import free_port
+from evedrop.system.ports import free_port
 from tests.clock import TestClock
 from tests.live.network.bench import scenario_of
 

@@ -16,8 +16,8 @@ import pytest
 
 from evedrop.live.network import zenoh_log
 from evedrop.live.network.zenoh_log import zenoh_log_apart
-from evedrop.output import Output, escaped
-from evedrop.ports import free_port
+from evedrop.system.output import Output, escaped
+from evedrop.system.ports import free_port
 from tests.conftest import Evedrop, wait_until
 
 MOST = 140_000
@@ -27,7 +27,7 @@ PROGRAM = r"""
 import os, sys
 from evedrop.live.network import zenoh_log
 from evedrop.live.network.zenoh_log import zenoh_log_apart
-from evedrop.output import standard_streams
+from evedrop.system.output import standard_streams
 with standard_streams():
     print("before")
     with zenoh_log_apart():

@@ -12,8 +12,8 @@ from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.protocol.brief import AnyBrief, Brief, Flow, Model, read_brief
 from evedrop.live.protocol.brief_parts import EavesdropperPart
 from evedrop.live.protocol.brief_use import expect_usable
-from evedrop.loading import load
-from evedrop.scenario import Scenario
+from evedrop.scenario.loading import load
+from evedrop.scenario.tables import Scenario
 
 BRIEF = Brief(
     run="r01",

@@ -10,7 +10,7 @@ import pytest
 
 from evedrop.live.protocol.news import Alive, Finishing, ProcessRequest, RunOver, read_news
 from evedrop.names import ProcessAction
-from evedrop.news import (
+from evedrop.scenario.news import (
     ConnectionOutage,
     FolderMoved,
     Held,

@@ -17,7 +17,7 @@ from evedrop.live.protocol.brief_closed_loop import decoded, encoded
 from evedrop.live.protocol.brief_parts import ProgramEntry, SensorPart
 from evedrop.live.protocol.brief_use import expect_usable
 from evedrop.live.protocol.state_message import MOST_BYTES, read_state
-from evedrop.loading import checked
+from evedrop.scenario.loading import checked
 from tests.builders import part_of
 from tests.live.protocol.made_briefs import made
 

@@ -1,0 +1,61 @@
+"""Evedrop: a network emulator for secrecy in remote state estimation.
+
+    from evedrop import Scenario, run, preloaded, montecarlo, sweep, compare, cost, learned, design, load_results, wire
+
+These names are loaded when they are used: a peer imports this package, too, and needs none of them.
+"""
+
+from __future__ import annotations
+
+# Not from typing, whose import would take longer than all else before a command handles signals; type checkers know the name.
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from typing import Any
+
+    from evedrop.cli.api import (
+        compare,
+        cost,
+        design,
+        design_budget,
+        design_policy,
+        design_schedule,
+        learned,
+        load_results,
+        montecarlo,
+        run,
+        sweep,
+    )
+    from evedrop.live.launch.preloading import preloaded
+    from evedrop.scenario.loading import Scenario
+    from evedrop.wire.running import wire  # the package `wire`, which can be called: see there
+
+__all__ = [
+    "Scenario", "compare", "cost", "design", "design_budget", "design_policy", "design_schedule", "learned", "load_results",
+    "montecarlo", "preloaded", "run", "sweep", "wire",
+]  # fmt: skip
+
+_HOMES = {
+    "Scenario": "evedrop.scenario.loading",
+    "compare": "evedrop.cli.api",
+    "cost": "evedrop.cli.api",
+    "design": "evedrop.cli.api",
+    "design_budget": "evedrop.cli.api",
+    "design_policy": "evedrop.cli.api",
+    "design_schedule": "evedrop.cli.api",
+    "learned": "evedrop.cli.api",
+    "load_results": "evedrop.cli.api",
+    "montecarlo": "evedrop.cli.api",
+    "preloaded": "evedrop.live.launch.preloading",
+    "run": "evedrop.cli.api",
+    "sweep": "evedrop.cli.api",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name in __all__:
+        import importlib  # noqa: PLC0415 - as above
+
+        if name == "wire":
+            return importlib.import_module("evedrop.wire")
+        return getattr(importlib.import_module(_HOMES[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

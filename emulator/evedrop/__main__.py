@@ -1,0 +1,71 @@
+"""The command `evedrop`, also available as `python -m evedrop`."""
+
+from __future__ import annotations
+
+# The C module under `signal`; see `evedrop.system.interrupts`.
+import _signal as signal  # type: ignore[import-not-found]
+import os
+import sys
+
+from evedrop.system.interrupts import heed_signals, heeded
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from typing import NoReturn
+
+_WITH_VALUES = ("--seed", "--set", "--over")
+_HIDDEN = "..."
+
+
+def without_values(words: Sequence[str]) -> list[str]:
+    """A command line for all users to read: without the values of options that may be a seed or a password."""
+    shown: list[str] = []
+    for word in words:
+        name, equals, value = word.partition("=")
+        before = shown[-1] if shown else ""
+        if before in _WITH_VALUES:
+            shown.append(_hidden(before, word))
+        elif name in _WITH_VALUES and equals:
+            shown.append(f"{name}={_hidden(name, value)}")
+        else:
+            shown.append(word)
+    return shown
+
+
+def _hidden(option: str, value: str) -> str:
+    """The value of an option without what it says; the key of an entry stays."""
+    key, equals, _ = value.partition("=")
+    return f"{key}={_HIDDEN}" if equals and option != "--seed" else _HIDDEN
+
+
+def hide_values() -> None:
+    """Replace this process's command line, which all users of the machine can read, if it has values to hide."""
+    words = without_values(sys.orig_argv)
+    if words == sys.orig_argv:
+        return
+    from setproctitle import setproctitle  # noqa: PLC0415 - most commands need not wait for it
+
+    os.environ["SPT_NOENV"] = "1"  # keep to the place of the command line: behind it is the environment
+    setproctitle(" ".join(words))
+    del os.environ["SPT_NOENV"]
+
+
+def program() -> NoReturn:
+    """Run the command line, and exit."""
+    heed_signals()
+    hide_values()
+
+    from evedrop.cli.main import is_role, main  # noqa: PLC0415 - the handlers come first
+
+    status = main()
+    if is_role(sys.argv[1:]) or sys.argv[1:2] in (["wire"], ["view"]):
+        # Threads may still be in Zenoh, or in Rerun: an interpreter that exits meanwhile aborts (Python 3.11), or hangs.
+        os._exit(status)
+    for number in heeded():  # the command is over: ignore signals while the interpreter exits
+        signal.signal(number, signal.SIG_IGN)
+    sys.exit(status)
+
+
+if __name__ == "__main__":
+    program()

@@ -1,0 +1,63 @@
+"""What Evedrop shows in a notebook: a progress bar, and tables in HTML. Needs no notebook to be imported."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from importlib import import_module
+
+from evedrop.scenario.arguments import refuse_unless
+from evedrop.scenario.news import News, RunProgress, Tell, silent
+from evedrop.show.report.markup import element, fragment, paragraphs, printable
+from evedrop.show.report.tables import html_table
+from evedrop.show.report.text_table import TextTable
+
+_TELL_SECONDS = 0.2
+
+
+def in_notebook() -> bool:
+    """Whether this program is the kernel of a notebook."""
+    ipython = sys.modules.get("IPython")
+    return ipython is not None and hasattr(ipython.get_ipython(), "kernel")
+
+
+@contextlib.contextmanager
+def progress(tell: Tell | None, total: int) -> Iterator[Tell]:
+    """The function that takes the news of a call: `tell` if one is given, else a progress bar in a notebook.
+
+    total: the progress at the end, unless the news gives it. The bar vanishes at the end.
+    """
+    refuse_unless(tell is None or callable(tell), "tell", tell, "a function that takes an item of news")
+    if tell is not None or not in_notebook():
+        yield tell or silent
+        return
+    shown = import_module("IPython.display")
+    handle = shown.display(shown.HTML(bar_text(0, total, "starting")), display_id=True)
+    due = time.monotonic()
+
+    def take(news: News) -> None:
+        nonlocal due
+        if isinstance(news, RunProgress) and time.monotonic() >= due:
+            due = time.monotonic() + _TELL_SECONDS
+            rate = f"{news.rate:,.0f} {news.rate_unit}"
+            handle.update(shown.HTML(bar_text(news.done, news.total or total, rate)))
+
+    try:
+        yield take
+    finally:
+        handle.update(shown.HTML(""))
+
+
+def bar_text(done: int, total: int, label: str) -> str:
+    """A progress bar in HTML."""
+    share = min(1.0, done / total) if total else 0.0
+    bar = element("progress", max="1", value=f"{share:.4f}")
+    bar.tail = printable(f" {share:.0%} · {label}")
+    return fragment(bar)
+
+
+def table_text(title: str, table: TextTable, notes: Iterable[str] = ()) -> str:
+    """A table in HTML, as the page of a report has it, with notes below it."""
+    return fragment(element("div", html_table(table, title), *paragraphs(notes)))

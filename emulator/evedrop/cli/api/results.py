@@ -1,0 +1,239 @@
+"""The results of calls, read from their folder: typed entries, a short text when printed, and tables in a notebook."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, Protocol, Self
+
+import pyarrow as pa
+
+from evedrop.cli.api.notebook import table_text
+from evedrop.model.figures import shown_figure
+from evedrop.model.figures.text import figure_text
+from evedrop.results.by_name import ByName
+from evedrop.results.comparison import Comparison
+from evedrop.results.reading import Results
+from evedrop.results.reading import load_results as read_results
+from evedrop.score.summary import Judged, LinkSummary, PeerSummary, SecrecySummary, Summary
+from evedrop.show.report import closing
+from evedrop.show.report.comparison import pairs_table, schemes_table
+from evedrop.show.report.sweep import sweep_table
+from evedrop.show.report.text_table import TextTable
+
+if TYPE_CHECKING:
+    from evedrop.show.view.shown_figure import ShownFigure
+
+Panels = Literal["errors", "lanes", "plane"]
+_MOST_ROWS = 40  # of a table in a notebook
+
+
+class _InFolder(Protocol):
+    @property
+    def folder(self) -> Path: ...
+
+
+class ReportedResults:
+    """Results in a folder, which can be shown on one page and whose tables can be written for other programs."""
+
+    def to_csv(self, path: str | Path) -> list[Path]:
+        """Write the tables that the command prints as CSV, with every number at full precision, and return the files' paths.
+
+        The first table goes to `path`, a second one to NAME-2.csv. Source: docs/results.md, tables in other programs.
+
+        Raises UsageError if a file cannot be written.
+        """
+        from evedrop.show.report.table_files import write_csv  # no other method needs it
+
+        return write_csv(self._tables(), Path(path))
+
+    def to_latex(self, path: str | Path) -> Path:
+        """Write the tables that the command prints as LaTeX, and return the file's path; it needs no package.
+
+        Raises UsageError if the file cannot be written.
+        """
+        from evedrop.show.report.table_files import write_latex  # no other method needs it
+
+        return write_latex(self._tables(), Path(path))
+
+    def _tables(self) -> list[TextTable]:
+        raise NotImplementedError
+
+    def report(self: _InFolder) -> Path:
+        """Write report.html into the folder, and return its path. Source: docs/results.md, report.html.
+
+        Raises UsageError if the results cannot be read, and OSError if the page cannot be written.
+        """
+        from evedrop.show.report.writing import write_report  # no other method needs it
+
+        return write_report(self.folder)
+
+
+@dataclass(frozen=True, repr=False)
+class RunResults(Results, ReportedResults):
+    """The results of a run or of trials in memory: typed figures, and tables as Arrow.
+
+    Results in a temporary folder are removed with this object, or when the program ends.
+    """
+
+    @classmethod
+    def read(cls, folder: str | Path) -> Self:
+        """Read a results folder. Raises UsageError if it is not one."""
+        found = read_results(folder)
+        return cls(found.folder, found.summary)
+
+    @cached_property
+    def _typed(self) -> Summary:
+        return self.typed_summary
+
+    @cached_property
+    def peers(self) -> Mapping[str, PeerSummary]:
+        """Receiver → its figures, the legitimate estimator first."""
+        return ByName("receiver", self._typed.peers)
+
+    @cached_property
+    def links(self) -> Mapping[str, LinkSummary]:
+        """Receiver → the account of its link."""
+        return ByName("link", self._typed.links)
+
+    @cached_property
+    def secrecy(self) -> Mapping[str, SecrecySummary]:
+        """Eavesdropper → the verdict."""
+        return ByName("verdict on", self._typed.secrecy)
+
+    @property
+    def expectations(self) -> list[Judged]:
+        """The expectations of the scenario, and whether each held."""
+        return list(self._typed.expectations)
+
+    @property
+    def _facts(self) -> str:
+        one = self._typed
+        trials = "1 trial" if one.trials == 1 else f"{one.trials:,} trials"
+        return f"{one.slots:,} slots, {trials}, {'live' if one.mode == 'live' else f'in memory ({one.mode})'}"
+
+    def _notes(self) -> Iterator[str]:
+        if self.remark is not None:
+            yield self.remark
+        for lines in (closing.remarks, closing.verdicts, closing.doubts, closing.application_lines):
+            yield from lines(self._typed)
+        yield from (one.sentence for one in self.expectations)
+
+    def plot(self, *panels: Panels, slots: range | None = None, trial: int | None = None) -> ShownFigure:
+        """A figure: the errors of all trials with bands, and the lanes and the plane of one recorded trial.
+
+        panels: some of `errors`, `lanes` and `plane`, by default all; slots: those shown, by default all errors and at most the
+        last 300 slots of lanes and plane; trial: by default the first recorded one. The figure is one of matplotlib:
+        `savefig` writes it to a file. Source: docs/python.md.
+
+        Raises UsageError if there is no such panel, slot or recorded trial.
+        """
+        from evedrop.show.view.run_picture import run_figure  # matplotlib takes half a second
+
+        return run_figure(self, panels, slots, trial)
+
+    def __repr__(self) -> str:
+        error = ("mean_squared_error", "mean_actual_trace_covariance")
+        errors = [
+            f"{name} {figure_text(shown_figure(one.all_figures, error), '.3g')}" for name, one in self.peers.items()
+        ]
+        remark = "" if self.remark is None else "; incomplete"
+        return f"<RunResults of {self._typed.scenario!r}: {self._facts}; mean error: {', '.join(errors)}{remark}>"
+
+    def _tables(self) -> list[TextTable]:
+        directions = self._typed.directions
+        return [
+            closing.receivers_table(self._typed),
+            *([closing.directions_table(directions)] if directions else []),
+        ]
+
+    def _repr_html_(self) -> str:
+        title = f"{self._typed.scenario} · {self._facts}"
+        return table_text(title, closing.receivers_table(self._typed), self._notes())
+
+
+@dataclass(frozen=True, repr=False)
+class SweepResults(ReportedResults):
+    """The results of a sweep: `table` has a row for each point and receiver, with every figure and its standard error."""
+
+    folder: Path
+    table: pa.Table
+    keys: tuple[str, ...]
+    """The entries that were swept, by dotted key."""
+
+    @property
+    def points(self) -> int:
+        """The number of combinations of values."""
+        return len({tuple(row[key] for key in self.keys) for row in self.table.to_pylist()})
+
+    def plot(self) -> ShownFigure:
+        """A figure of matplotlib: each receiver's error against the first entry, with a panel for each value of the others."""
+        from evedrop.show.view.sweep_picture import sweep_figure  # matplotlib takes half a second
+
+        return sweep_figure(self.table, self.keys)
+
+    def __repr__(self) -> str:
+        return f"<SweepResults over {self._facts}, a table of {self.table.num_rows} rows>"
+
+    @property
+    def _facts(self) -> str:
+        return f"{', '.join(self.keys)}: {self.points} point{'' if self.points == 1 else 's'}"
+
+    def _tables(self) -> list[TextTable]:
+        return [sweep_table(self.table.to_pylist(), self.keys)]
+
+    def _repr_html_(self) -> str:
+        more = self.table.num_rows - _MOST_ROWS
+        notes = [f"and {more} more row{'' if more == 1 else 's'}: .table has all of them"] if more > 0 else []
+        rows = self.table.slice(0, _MOST_ROWS).to_pylist()
+        return table_text(f"Sweep over {self._facts}", sweep_table(rows, self.keys), notes)
+
+
+@dataclass(frozen=True, repr=False)
+class ComparisonResults(Comparison, ReportedResults):
+    """The results of a comparison, and their folder."""
+
+    folder: Path = field(kw_only=True)
+
+    @classmethod
+    def of(cls, found: Comparison, folder: Path) -> Self:
+        """A comparison whose files are in a folder."""
+        return cls(**{one.name: getattr(found, one.name) for one in fields(found)}, folder=folder)
+
+    def plot(self) -> ShownFigure:
+        """A figure of matplotlib: the matrix of schemes and adversaries, with a mark, a colour and a ratio in every cell."""
+        from evedrop.show.view.comparison_picture import comparison_figure  # matplotlib takes half a second
+
+        return comparison_figure(self)
+
+    @property
+    def _facts(self) -> str:
+        schemes = "1 scheme" if len(self.schemes) == 1 else f"{len(self.schemes)} schemes"
+        adversaries = "1 adversary" if len(self.adversaries) == 1 else f"{len(self.adversaries)} adversaries"
+        return f"{self.slots:,} slots, {self.trials:,} trials, {schemes}, {adversaries}"
+
+    def __repr__(self) -> str:
+        return f"<ComparisonResults of {self.title!r}: {self._facts}>"
+
+    def _tables(self) -> list[TextTable]:
+        return [schemes_table(self), pairs_table(self)]
+
+    def _repr_html_(self) -> str:
+        numbers = ["largest legitimate error", "error of the closest adversary"]
+        table = TextTable.headed(["scheme"], numbers, ["beaten by another scheme"])
+        for one in self.schemes.values():
+            price, kept = (None if math.isnan(error) else error for error in (one.price, one.kept))
+            beaten = "–" if kept is None else "no" if one.name in self.dominant else "yes"
+            table.add(one.name, figure_text(price, ".3g"), figure_text(kept, ".3g"), beaten)
+        return table_text(f"{self.title} · {self._facts}", table)
+
+
+def load_results(folder: str | Path) -> RunResults:
+    """Read a results folder, including that of a run in progress or killed: `ended` in its summary says so.
+
+    Raises UsageError naming the missing or broken file if it is not a results folder.
+    """
+    return RunResults.read(folder)

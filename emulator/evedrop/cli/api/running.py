@@ -1,0 +1,248 @@
+"""The functions that simulate: a run, thousands of trials, a grid, a comparison."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from evedrop.cli.api.given import place_for, place_in, plan_of, scenario_of
+from evedrop.cli.api.notebook import progress
+from evedrop.cli.api.results import ComparisonResults, RunResults, SweepResults
+from evedrop.errors import UsageError
+from evedrop.scenario.arguments import refuse_unless, table_argument
+from evedrop.scenario.loading.python_values import plain_tables
+from evedrop.scenario.news import Tell
+from evedrop.scenario.tables import Scenario
+from evedrop.scenario.words import dotted
+from evedrop.simulate.montecarlo import Plan
+from evedrop.simulate.simulation import Mode
+
+if TYPE_CHECKING:
+    from evedrop.studies.learning_curve import LearningRow
+    from evedrop.studies.secrecy_cost import SecrecyCost
+
+
+def run(
+    scenario: str | Path | Scenario,
+    *,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+    view: str = "off",
+    listen: str | None = None,
+    tell: Tell | None = None,
+    **changes: Any,
+) -> RunResults:
+    """Run a scenario live, with sensor, router, estimators and observer in separate processes.
+
+    scenario: a built-in name, a file, or a `Scenario`; out: the results folder, new or empty, by default a temporary one that is
+    removed with the results; overwrite: replace the results in `out`; view: auto, native, web or off; listen: the router's
+    loopback endpoint, tls/127.0.0.1:PORT, by default a socket; tell: called with each item of news, by default a progress bar
+    in a notebook; changes: entries of the scenario by dotted key, with `__` for the dot, such as `slots=500` or
+    `legitimate__link__quality=0.5`.
+
+    Raises ScenarioError with every mistake of the scenario, UsageError for an unusable folder or port, RunError if a
+    process failed, Interrupted on Ctrl-C; after the last two the folder holds the results so far.
+
+    >>> results = run("eavesdroppers", slots=1000, out="my-run")        # doctest: +SKIP
+    >>> results.peers["smart"].mean_squared_error                       # doctest: +SKIP
+    >>> results.slots.to_pandas()                                       # doctest: +SKIP
+    """
+    from evedrop.live.launch.launcher import launch  # Monte Carlo does not need it
+
+    made = scenario_of(scenario, changes)
+    refuse_unless(
+        listen is None or isinstance(listen, str), "listen", listen, "an endpoint such as tls/127.0.0.1:17460"
+    )
+    with place_for(out, overwrite) as place, progress(tell, made.slots) as told:
+        ended = launch(made, place.folder, view, listen, told)
+        if ended.viewer is not None:
+            ended.viewer.stop()
+        results = RunResults.read(ended.folder)
+        place.keep_for(results)
+        return results
+
+
+def montecarlo(
+    scenario: str | Path | Scenario,
+    *,
+    trials: int = 1000,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+    resume: bool = False,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    plan: Plan | None = None,
+    tell: Tell | None = None,
+    **changes: Any,
+) -> RunResults:
+    """Run the trials of a scenario in memory; in the exact mode, the default, to the same bits as a live run.
+
+    Arguments and errors as for `run`; trials: how many, from `first_trial` on; resume: go on with the study in `out` if it was
+    interrupted, and begin it otherwise; workers: processes, by default chosen for this
+    machine and the amount of work; scheduler: the address of a Dask scheduler, such as "tcp://127.0.0.1:8786", whose workers
+    then compute the trials; plan: the mode.
+    """
+    from evedrop.simulate.montecarlo import simulate  # a live run does not need it
+
+    plan = plan_of(plan, workers, scheduler)
+    made = scenario_of(scenario, {**changes, "trials": trials}, plan.mode is not Mode.EXACT)
+    with place_for(out, overwrite, resume) as place, progress(tell, made.trials * made.slots) as told:
+        simulate(made, place.folder, told, plan, resume=resume)
+        results = RunResults.read(place.folder)
+        place.keep_for(results)
+        return results
+
+
+def sweep(
+    scenario: str | Path | Scenario,
+    over: Mapping[str, Any],
+    *,
+    trials: int = 1000,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+    resume: bool = False,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    plan: Plan | None = None,
+    tell: Tell | None = None,
+    **changes: Any,
+) -> SweepResults:
+    """Run the trials of a scenario in memory for every combination of values of some entries.
+
+    over: dotted key → its values, a list or a numpy array; all else as for `montecarlo`. Source: docs/montecarlo.md, sweeps.
+
+    Raises ScenarioError with the mistakes of all points, before any is run; UsageError, RunError and Interrupted as `run` does.
+
+    >>> sweep("numerical", {"encoding.state_probability": [0.4, 0.6, 0.8]}, trials=200).table.to_pandas()  # doctest: +SKIP
+    """
+    from evedrop.studies.sweep import MOST_POINTS, sweep_over  # no other call needs it
+
+    given = {**dotted(changes), "trials": trials}
+    wanted = 'a dict of lists by dotted key, such as {"encoding.state_probability": [0.2, 0.4]}'
+    refuse_unless(over is not None, "over", over, wanted)
+    values = _named(dotted(table_argument("over", over, wanted)), "over", scenario, given)
+    for key, found in values.items():
+        if not isinstance(found, list) or not found:
+            raise UsageError(f"over: {key} is {found!r}; expected a list of values, such as [0.2, 0.4]")
+    if not values or math.prod(map(len, values.values())) > MOST_POINTS:
+        raise UsageError(f"over: expected 1 to {MOST_POINTS} points, such as {{'slots': [100, 200]}}")
+    with place_for(out, overwrite, resume) as place, progress(tell, 0) as told:
+        table = sweep_over(
+            scenario, given, values, place.folder, told, plan_of(plan, workers, scheduler), resume=resume
+        )
+        results = SweepResults(place.folder, table, tuple(values))
+        place.keep_for(results)
+        return results
+
+
+def compare(
+    scenario: str | Path | Scenario,
+    *,
+    schemes: Sequence[str | type] | None = None,
+    adversaries: Sequence[str | type] | None = None,
+    parameters: Mapping[str, Any] | None = None,
+    trials: int = 200,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+    resume: bool = False,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    plan: Plan | None = None,
+    tell: Tell | None = None,
+    **changes: Any,
+) -> ComparisonResults:
+    """Compare schemes against adversaries, on a scenario's process and links.
+
+    schemes, adversaries: names or classes, by default all; parameters: of schemes other than the scenario's own, such as
+    `{"innovation.state_probability": 0.7}`; all else as for `montecarlo`. Source: docs/compare.md.
+
+    Raises UsageError with every unknown name, ScenarioError with every mistake of the scenario, RunError if a worker
+    fails, Interrupted on Ctrl-C; after the last two the folder holds the completed schemes.
+
+    >>> found = compare("acknowledged", schemes=["acknowledged", "innovation"])        # doctest: +SKIP
+    >>> found.cell("acknowledged", "blocks-critical").eavesdropper.theory.last         # doctest: +SKIP
+    >>> found.table.to_pandas()                                                        # doctest: +SKIP
+    """
+    from evedrop.studies.compare import compare_all  # no other call needs it
+    from evedrop.studies.matchups import matchups_of  # the same
+
+    given = {**dotted(changes), "trials": trials}
+    for name, names in (("schemes", schemes), ("adversaries", adversaries)):
+        fits = names is None or (isinstance(names, Iterable) and not isinstance(names, str))
+        refuse_unless(fits, name, names, "a list of names or classes")
+    table_argument("parameters", parameters, 'a dict such as {"innovation.state_probability": 0.7}')
+    chosen = _named({"schemes": schemes, "adversaries": adversaries}, "compare", scenario, given)
+    made = scenario_of(scenario, given)
+    matchups = matchups_of(made, chosen.get("schemes"), chosen.get("adversaries"), parameters)
+    with place_for(out, overwrite, resume) as place, progress(tell, 0) as told:
+        found = compare_all(matchups, place.folder, told, plan_of(plan, workers, scheduler), resume=resume)
+        results = ComparisonResults.of(found, place.folder)
+        place.keep_for(results)
+        return results
+
+
+def cost(
+    scenario: str | Path | Scenario,
+    *,
+    trials: int = 100,
+    out: str | Path | None = None,
+    resume: bool = False,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    tell: Tell | None = None,
+    **changes: Any,
+) -> SecrecyCost:
+    """The energy that secrecy costs an application: the scenario's scheme against `plain`, trial by trial.
+
+    Arguments as for `montecarlo`; out: by default no folder, otherwise one for cost.json, in which finished trials are kept for
+    `resume`. Source: docs/microgrid.md, what does secrecy cost in energy.
+
+    Raises ScenarioError with every mistake of the scenario, UsageError without an application that has a power, RunError if a
+    worker fails, Interrupted on Ctrl-C.
+    """
+    from evedrop.simulate.montecarlo import teller  # a live run does not need it
+    from evedrop.studies.secrecy_cost import secrecy_cost  # no other call needs it
+
+    made = scenario_of(scenario, {**changes, "trials": trials})
+    with place_in(out, resume) as place, progress(tell, total := made.trials * made.slots) as told:
+        return secrecy_cost(made, teller(told, total), plan_of(None, workers, scheduler), place)
+
+
+def learned(
+    scenario: str | Path | Scenario,
+    *,
+    trials: int = 100,
+    out: str | Path | None = None,
+    resume: bool = False,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    tell: Tell | None = None,
+    **changes: Any,
+) -> list[LearningRow]:
+    """What eavesdroppers that learn know of the process after 8, 16, 32, … slots, and how that affects their error.
+
+    Arguments as for `montecarlo`; out: by default no folder, otherwise one for learned.json, in which finished trials are kept
+    for `resume`. Source: docs/learning.md.
+
+    Raises ScenarioError with every mistake of the scenario, UsageError if no eavesdropper learns, RunError if a worker fails,
+    Interrupted on Ctrl-C.
+    """
+    from evedrop.simulate.montecarlo import teller  # a live run does not need it
+    from evedrop.studies.learning_curve import learning_curve  # no other call needs it
+
+    made = scenario_of(scenario, {**changes, "trials": trials})
+    with place_in(out, resume) as place, progress(tell, total := made.trials * made.slots) as told:
+        return learning_curve(made, teller(told, total), plan_of(None, workers, scheduler), place)
+
+
+def _named(
+    values: Mapping[str, Any], source: str, scenario: str | Path | Scenario, given: dict[str, Any]
+) -> dict[str, Any]:
+    """The values as plain tables, with the names of classes. The folder of their modules is added to the changes `given`."""
+    modules = given.get("modules", scenario.modules if isinstance(scenario, Scenario) else None)
+    tables = plain_tables(values, source, modules)
+    if isinstance(tables.get("modules"), str):
+        given["modules"] = tables.pop("modules")
+    return tables

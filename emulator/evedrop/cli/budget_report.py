@@ -1,0 +1,41 @@
+"""The terminal output of `evedrop design --budget`: thresholds with their energy and errors."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from evedrop.cli.report import left_out_line, terminal
+from evedrop.model.figures.text import figure_text, finite_text
+
+if TYPE_CHECKING:
+    from evedrop.scenario.expected.energy_budget import BudgetDesign
+
+
+def print_budget(design: BudgetDesign) -> None:
+    """Print the thresholds as a table, the one for the budget among them."""
+    console = terminal()
+    console.print(
+        f"a packet in clear costs {design.in_clear:g}, an encrypted one {design.encrypted:g}; errors are traces in the limit; "
+        f"the user's is {finite_text(design.user)}"
+    )
+    shown = Table(box=SIMPLE_HEAD)
+    names = list(design.best.eavesdroppers)
+    for head in ("threshold θ", "encrypted", "energy", *(f"error of {name}" for name in names)):
+        shown.add_column(head, justify="right", no_wrap=True)
+    shown.add_column("")
+    for one in sorted({round(each.threshold, 9): each for each in (*design.others, design.best)}.items()):
+        figures = one[1]
+        shown.add_row(
+            figure_text(figures.threshold, ".6g"),
+            figure_text(figures.encrypted_fraction, ".4f"),
+            figure_text(figures.energy, ".6g"),
+            *(finite_text(figures.eavesdroppers[name]) for name in names),
+            "the budget's" if figures is design.best else "",
+        )
+    console.print(shown)
+    if design.left_out:
+        console.print(left_out_line(design.left_out, "no closed form of its error is known under this scheme"))
+    console.print(f"threshold = {design.best.threshold!r}")

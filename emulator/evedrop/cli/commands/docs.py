@@ -1,0 +1,76 @@
+"""`evedrop docs` and `evedrop completion`: the pages of the documentation, and completion for shells."""
+
+from __future__ import annotations
+
+import argparse
+from importlib import resources
+from pathlib import Path
+
+from evedrop.cli.command import Command
+from evedrop.cli.names import print_names
+from evedrop.errors import UsageError
+from evedrop.system.hints import near
+
+_SHELLS = ("bash", "zsh", "fish")
+
+
+def docs(options: argparse.Namespace) -> int:
+    """Print a page of the documentation; list the pages if none is named."""
+    pages = _pages()
+    if options.page is None:
+        print_names({name: _title(path) for name, path in pages.items()})
+        return 0
+    name = str(options.page).removesuffix(".md")
+    if name not in pages:
+        raise UsageError(f"there is no page {name}{near(name, pages) or '; evedrop docs lists them'}")
+    print(pages[name].read_text(encoding="utf-8"), end="")
+    return 0
+
+
+def completion(options: argparse.Namespace) -> int:
+    """Print the lines that make a shell complete commands and options."""
+    from argcomplete.shell_integration import shellcode
+
+    print(shellcode(["evedrop"], shell=options.shell))
+    return 0
+
+
+def _pages() -> dict[str, Path]:
+    """Name → file of each page, those of subfolders after the rest."""
+    folder = Path(str(resources.files("evedrop"))) / "docs"
+    found = {str(path.relative_to(folder).with_suffix("")): path for path in folder.rglob("*.md")}
+    return dict(sorted(found.items(), key=lambda one: (one[0].count("/"), one[0])))
+
+
+def _title(path: Path) -> str:
+    first = path.read_text(encoding="utf-8").partition("\n")[0]
+    return first.lstrip("# ")
+
+
+def _page(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("page", nargs="?", metavar="PAGE", help="the page, as evedrop docs lists it")
+
+
+def _shell(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("shell", choices=_SHELLS, metavar="SHELL", help="bash, zsh or fish")
+
+
+COMMANDS = (
+    Command(
+        "docs",
+        docs,
+        "print a page of the documentation, or list the pages",
+        (_page,),
+        section="inspect",
+        example="docs view",
+        page="",
+    ),
+    Command(
+        "completion",
+        completion,
+        "print what makes a shell complete commands and options",
+        (_shell,),
+        section="inspect",
+        example="completion bash >> ~/.bashrc",
+    ),
+)

@@ -1,0 +1,155 @@
+"""`evedrop links fit`: the loss model and delays of a recorded link."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from evedrop.cli.command import Command
+from evedrop.cli.options import argument, as_json
+from evedrop.errors import UsageError
+from evedrop.system.output import print_json
+
+if TYPE_CHECKING:
+    from evedrop.scenario.recordings.message_recording import MessageRecording
+
+
+def fit_link(options: argparse.Namespace) -> int:
+    """Fit loss and delay models to a recorded link."""
+    from evedrop.scenario.recordings.mcap_recording import is_mcap
+
+    if is_mcap(options.trace):
+        told, lines = _mcap(options)
+    elif options.trace.is_dir():
+        told, lines = _journal(options)
+    else:
+        told, lines = _table(options)
+    if options.json:
+        print_json(told)
+    else:
+        print("\n".join(lines))
+    return 0
+
+
+def _table(options: argparse.Namespace) -> tuple[dict[str, Any], Sequence[str]]:
+    """The fit of a table of outcomes."""
+    from evedrop.scenario.fitting.fit import fit, lines
+
+    _refuse_others(options, "a table of outcomes", ("column", "lost", "delay_column"))
+    found = fit(options.trace, options.column, options.delay_column, options.lost)
+    return found.as_dict(), lines(found)
+
+
+def _mcap(options: argparse.Namespace) -> tuple[dict[str, Any], Sequence[str]]:
+    """The fit of a topic of an MCAP recording."""
+    from evedrop.scenario.recordings.mcap_recording import mcap_recording
+
+    _refuse_others(options, "an MCAP recording", ("topic", "period", "outage", "slot", "save"))
+    return _messages(mcap_recording(options.trace, options.topic, options.period, options.outage), options)
+
+
+def _journal(options: argparse.Namespace) -> tuple[dict[str, Any], Sequence[str]]:
+    """The fit of a link of a wire."""
+    from evedrop.wire.recorded_link import journal_recording
+
+    _refuse_others(options, "a folder", ("link", "key", "gaps", "outage", "slot", "save"))
+    if options.outage is not None and not options.gaps:
+        raise UsageError("--outage: expected --gaps with it; losses by the wire itself are never counted")
+    recording = journal_recording(options.trace, options.link, options.key, gaps=options.gaps, longest=options.outage)
+    return _messages(recording, options)
+
+
+def _messages(recording: MessageRecording, options: argparse.Namespace) -> tuple[dict[str, Any], Sequence[str]]:
+    """The fit of messages that were recorded."""
+    from evedrop.scenario.fitting.message_fit import fit_messages, message_lines
+    from evedrop.scenario.recordings.message_recording import save_outcomes
+
+    if options.save is not None:
+        save_outcomes(recording, options.save)
+    found = fit_messages(recording, options.slot)
+    return found.as_dict(), message_lines(found)
+
+
+_ONLY = {
+    "column": "a table of outcomes",
+    "lost": "a table of outcomes",
+    "delay_column": "a table of outcomes",
+    "topic": "an MCAP recording",
+    "period": "an MCAP recording",
+    "link": "the folder of a wire",
+    "key": "the folder of a wire",
+    "gaps": "the folder of a wire",
+    "outage": "a recording of messages",
+    "slot": "a recording of messages",
+    "save": "a recording of messages",
+}
+"""Option → the recordings that it is for."""
+
+
+def _refuse_others(options: argparse.Namespace, what: str, names: Sequence[str]) -> None:
+    """Raise UsageError for options that this kind of recording does not have, and for times that are not positive."""
+    for name, whose in _ONLY.items():
+        if name not in names and getattr(options, name) not in {None, False}:
+            raise UsageError(f"--{name.replace('_', '-')} is for {whose}, and {options.trace} is {what}; leave it out")
+    for name in ("period", "outage", "slot"):
+        value = getattr(options, name)
+        if value is not None and not 0.0 < value < float("inf"):
+            raise UsageError(f"--{name} {value:g}: expected seconds, more than 0")
+
+
+def _fits(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--column",
+        metavar="C",
+        help="the column of outcomes, in which 1 means delivered; default received, or the only one",
+    )
+    parser.add_argument("--lost", metavar="C", help="in place of --column: the column in which 1 means lost")
+    parser.add_argument(
+        "--delay-column",
+        metavar="C",
+        help="the column of delays in slots; default the column named delay, if there is one",
+    )
+    parser.add_argument(
+        "--topic", metavar="T", help="the topic of an MCAP recording; default the only one with numbers"
+    )
+    parser.add_argument(
+        "--period", type=float, metavar="S", help="seconds between two messages of a sender that does not number them"
+    )
+    parser.add_argument("--link", metavar="NAME", help="the link of a wire; default the only one with messages")
+    parser.add_argument("--key", metavar="K", help="only messages of a wire with keys that this key expression takes")
+    parser.add_argument(
+        "--gaps",
+        action="store_true",
+        help="fit what was lost before the wire: the numbers that are missing in its journal",
+    )
+    parser.add_argument(
+        "--outage",
+        type=float,
+        metavar="S",
+        help="do not count silences longer than this many seconds as losses",
+    )
+    parser.add_argument(
+        "--slot", type=float, metavar="S", help="seconds of a scenario's slot; default the median time between messages"
+    )
+    parser.add_argument(
+        "--save",
+        type=Path,
+        metavar="FILE",
+        help="write the outcomes of messages to a CSV file, for the loss model trace",
+    )
+
+
+COMMANDS = (
+    Command(
+        "fit",
+        fit_link,
+        "find the loss model and delays of a recorded link: a table, an MCAP recording or the folder of a wire",
+        (argument("trace", "RECORDING"), _fits, as_json),
+        group="links",
+        section="study",
+        example="links fit walk.csv",
+        page="links",
+    ),
+)

@@ -1,0 +1,123 @@
+"""`evedrop paper`: the numbers of a paper, next to ours."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from evedrop.cli.command import Command
+from evedrop.cli.names import print_names
+from evedrop.cli.options import as_json
+from evedrop.cli.tables import tables
+from evedrop.errors import UsageError
+from evedrop.system.output import print_json
+
+if TYPE_CHECKING:
+    from evedrop.studies.papers.reproduction import Reproduction
+
+
+def paper(options: argparse.Namespace) -> int:
+    """Compute the numbers of a paper; list the papers if none is named. 1 if a number differs and nothing explains it."""
+    from evedrop.studies.papers import paper as paper_of
+    from evedrop.studies.papers import reproduce
+
+    if options.name is None:
+        _list(options.json)
+        return 0
+    paper_of(options.name)
+    if options.out is not None:
+        _made(options.out)
+    found = reproduce(options.name, options.quick, lambda text: print(text, file=sys.stderr))
+    if options.out is not None:
+        _write(found, options.out)
+    if options.json:
+        print_json(found.as_dict())
+    else:
+        _print(found)
+    return 1 if found.differing else 0
+
+
+def _list(as_json: bool) -> None:
+    from evedrop.studies.papers import PAPERS
+
+    if as_json:
+        papers = {
+            name: {"title": one.title, "authors": one.authors, "published": one.published}
+            for name, one in PAPERS.items()
+        }
+        print_json(papers)
+        return
+    print_names({name: f"{one.authors}: {one.title}. {one.published}" for name, one in PAPERS.items()})
+
+
+def _made(folder: Path) -> None:
+    """Create the folder, if necessary, before the numbers are computed."""
+    with _writable(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+
+
+def _write(found: Reproduction, folder: Path) -> None:
+    text = json.dumps(found.as_dict(), indent=2, ensure_ascii=False)
+    with _writable(folder):
+        (folder / f"{found.name}.json").write_text(f"{text}\n", encoding="utf-8")
+        (folder / f"{found.name}.md").write_text(found.as_markdown(), encoding="utf-8")
+
+
+@contextmanager
+def _writable(folder: Path) -> Iterator[None]:
+    """Raise UsageError where the folder cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise UsageError(f"{folder} cannot be written ({error.strerror}); give another folder") from error
+
+
+def _print(found: Reproduction) -> None:
+    """Print the table, and below it a line for each reason."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    from evedrop.cli.report import terminal
+
+    console = terminal()
+    console.print(f"{found.title} · {found.authors} · {found.published}")
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
+    for heading in ("where", "what"):
+        table.add_column(heading)
+    for heading in ("theirs", "ours", "tolerance"):
+        table.add_column(heading, justify="right")
+    table.add_column("verdict", no_wrap=True)
+    reasons: dict[str, int] = {}
+    for row in found.rows:
+        note = f" [{reasons.setdefault(row.reason, len(reasons) + 1)}]" if row.reason else ""
+        table.add_row(row.where, row.what, row.their_text, row.our_text, row.tolerance or "–", f"{row.verdict}{note}")
+    console.print(table)
+    for reason, number in reasons.items():
+        console.print(f"[{number}] {reason}")
+    console.print(f"{', '.join(f'{verdict}: {count}' for verdict, count in found.counts.items())}. {found.scope}")
+    if found.quick:
+        console.print("these are quick estimates: without --quick the standard errors are smaller")
+
+
+def _papers(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", nargs="?", metavar="NAME", help="the paper; without it, a list of all papers")
+    parser.add_argument("--quick", action="store_true", help="simulate little: seconds, and larger standard errors")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="also write NAME.json and NAME.md there")
+
+
+COMMANDS = (
+    Command(
+        "paper",
+        paper,
+        "compare the numbers of a published paper with ours",
+        (_papers, as_json, tables),
+        section="study",
+        example="paper luecke2022",
+        page="papers",
+    ),
+)

@@ -1,0 +1,285 @@
+"""The commands for single processes of a run: write briefs, run one process, and ask whether it is present.
+
+Slow imports are made only by the command that needs them, so that a peer starts quickly.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from evedrop.cli.command import Command, Option
+from evedrop.cli.commands import ROLES
+from evedrop.cli.options import argument, changes_of, entries, loaded, scenario, served
+from evedrop.errors import BriefError, UsageError
+
+if TYPE_CHECKING:
+    from evedrop.live.protocol.brief import AnyBrief, Brief
+    from evedrop.live.protocol.brief_parts import ObserverPart
+
+
+_BY_HAND = ("results", "listen", "connect", "relay", "relay_connect", "wait", "insecure", "paused")
+"""Options that determine the briefs of processes that are started by hand."""
+_MOST_TOLD = 5  # mistakes of a scenario in a brief, which is not written by hand
+
+
+def brief(options: argparse.Namespace) -> int:
+    """Write the briefs of a scenario's processes, or the files of their containers."""
+    from evedrop.live.launch.briefs import write_briefs
+    from evedrop.live.launch.ports import endpoints_at, warn_if_exposed
+
+    if options.compose is not None:
+        return _compose(options)
+    if options.overwrite:
+        raise UsageError("--overwrite belongs to --compose; leave it out, or give another --out")
+    if not 1 <= options.wait <= 30 * 86_400:
+        raise UsageError(f"--wait {options.wait}: expected 1 or more seconds, and 2592000 at most")
+    scenario = loaded(options)
+    endpoints = endpoints_at(options.listen, options.connect, options.relay, options.relay_connect, options.insecure)
+    for path in write_briefs(scenario, endpoints, options.results, options.out, options.wait, paused=options.paused):
+        print(path)
+    warn_if_exposed(endpoints)
+    return 0
+
+
+def _compose(options: argparse.Namespace) -> int:
+    """Write the files with which Docker Compose starts a run."""
+    from evedrop.live.launch.compose import MOST_NETWORKS, network_count, write_compose
+
+    for name in _BY_HAND:
+        if getattr(options, name) != options.parser.get_default(name):
+            option = f"--{name.replace('_', '-')}"
+            raise UsageError(
+                f"{option} belongs to briefs for processes that are started by hand; leave it out, or give --out instead of "
+                "--compose"
+            )
+    scenario = loaded(options)
+    for path in write_compose(
+        scenario, options.scenario, bool(changes_of(options)), options.compose, options.overwrite
+    ):
+        print(path)
+    if (networks := network_count(scenario)) > MOST_NETWORKS:
+        print(
+            f"evedrop: warning: the containers have {networks} networks, and Docker's default address pools have room for "
+            f"about {MOST_NETWORKS}; enlarge them (evedrop docs containers)",
+            file=sys.stderr,
+        )
+    return 0
+
+
+def process(options: argparse.Namespace) -> int:
+    """Run one process of a run."""
+    from evedrop.live.protocol.brief import read_brief
+    from evedrop.live.protocol.brief_parts import ImportingPart, ObserverPart, RoutingPart
+    from evedrop.scenario.plugins import look_in
+    from evedrop.system.processes import continue_when_parent_dies
+
+    os.umask(0o077)  # only this user may read its files
+    from evedrop.system.signals import leave_on_signals, show_stacks_on_request
+
+    show_stacks_on_request()
+    if options.role != "observer":  # the observer ends the run in order
+        leave_on_signals()
+    brief = read_brief(options.brief, options.role)
+    if brief.ends_with_stdin:  # started by a launcher, which writes another brief if it restarts the process
+        options.brief.unlink(missing_ok=True)  # its keys should not stay on disk
+        continue_when_parent_dies()
+        if isinstance(brief.part, RoutingPart):
+            from evedrop.live.network.launcher_news import set_news_apart
+
+            set_news_apart(launched=True)  # before the modules of link classes print anything
+    if isinstance(brief.part, ObserverPart) and getattr(options, "out", None) is not None:
+        brief = replace(brief, part=replace(brief.part, results=str(options.out)))
+    if isinstance(brief.part, ImportingPart) and brief.part.modules is not None:
+        look_in(brief.part.modules)
+    try:
+        return _play(brief, getattr(options, "serve", None))
+    except BriefError as error:
+        raise BriefError(f"{options.brief}: {error}") from error
+
+
+def _play(brief: AnyBrief, serve: str | None) -> int:
+    """Run the process of a brief; returns its exit status. serve: where an observer shows the run to browsers."""
+    from evedrop.live.protocol.brief import has_part
+    from evedrop.live.protocol.brief_parts import ObserverPart
+    from evedrop.live.protocol.brief_use import classes_known, expect_usable
+
+    if brief.identity is not None:
+        from evedrop.live.network.certificates import check_identity
+
+        check_identity(brief.identity, brief.process)
+    if has_part(brief, ObserverPart):
+        from evedrop.live.network.launcher_news import Heartbeat
+
+        with Heartbeat() if brief.ends_with_stdin else contextlib.nullcontext():
+            return _observe(brief, serve)
+    expect_usable(brief)
+    from evedrop.live.network.zenoh_log import zenoh_log_apart
+
+    with classes_known(), zenoh_log_apart() if _listens(brief) else contextlib.nullcontext():
+        _take_part(brief)
+    return 0
+
+
+def _listens(brief: AnyBrief) -> bool:
+    """Whether strangers may connect to the process: to a router, or a sensor that takes states from programs."""
+    from evedrop.live.protocol.brief_parts import RoutingPart, SensorPart
+
+    part = brief.part
+    program = part.program if isinstance(part, SensorPart) else None
+    return isinstance(part, RoutingPart) or (program is not None and program.listen is not None)
+
+
+def _take_part(brief: AnyBrief) -> None:
+    """Run the process of a brief that is not the observer's."""
+    from evedrop.live.protocol import brief_parts as parts
+    from evedrop.live.protocol.brief import has_part
+
+    if has_part(brief, parts.RouterPart):
+        from evedrop.live.network.router import route
+
+        route(brief)
+    elif has_part(brief, parts.RelayPart):
+        from evedrop.live.network.relay import relay
+
+        relay(brief)
+    elif has_part(brief, parts.SensorPart):
+        from evedrop.peers.sensor import sense
+
+        sense(brief)
+    elif has_part(brief, parts.LegitimatePart):
+        from evedrop.peers.legitimate import estimate
+
+        estimate(brief)
+    elif has_part(brief, parts.EavesdropperPart):
+        from evedrop.peers.eavesdropper import eavesdrop
+
+        eavesdrop(brief)
+    elif has_part(brief, parts.ControllerPart):
+        from evedrop.peers.controller import steer
+
+        steer(brief)
+
+
+def _observe(brief: Brief[ObserverPart], serve: str | None) -> int:
+    from pydantic import ValidationError
+
+    from evedrop.live.observer.observer import observe
+    from evedrop.live.protocol.brief import WRITE_AGAIN
+    from evedrop.scenario.sentences import sentences
+    from evedrop.scenario.tables import Scenario
+
+    try:
+        return observe(brief, _report, serve)
+    except ValidationError as error:
+        lines = "; ".join(sentences(error, Scenario)[:_MOST_TOLD])
+        raise BriefError(f"part.scenario has mistakes: {lines}; {WRITE_AGAIN}") from None
+
+
+def _report(folder: Path, status: int, how: str) -> None:
+    """Print the end of a run that was started by hand."""
+    from evedrop.cli.closing_report import print_ending
+
+    print_ending(folder, status, how)
+
+
+def health(options: argparse.Namespace) -> int:
+    """Print whether the process of a brief is on the network."""
+    from evedrop.live.network.health import is_there
+    from evedrop.live.protocol.brief import read_brief
+
+    brief = read_brief(options.brief)
+    there = is_there(brief)
+    print(f"{brief.process} is {'' if there else 'not '}on the network of {brief.run}")
+    return 0 if there else 1
+
+
+def _observed(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", type=Path, metavar="DIR", help="results folder, new or empty; default the brief's")
+
+
+def _briefs(parser: argparse.ArgumentParser) -> None:
+    where = parser.add_mutually_exclusive_group(required=True)
+    where.add_argument("--out", type=Path, metavar="DIR", help="folder for the briefs")
+    where.add_argument("--compose", type=Path, metavar="DIR", help="write the files for Docker Compose instead")
+    parser.add_argument(
+        "--overwrite",
+        action="store_true",
+        help="with --compose: DIR may contain files; replace those with the same names",
+    )
+    parser.add_argument(
+        "--results",
+        type=Path,
+        default=Path("results"),
+        metavar="DIR",
+        help="the observer's results folder, on its host; relative to its working directory",
+    )
+    parser.add_argument(
+        "--listen",
+        default="tls/127.0.0.1:17447",
+        metavar="ENDPOINT",
+        help="the endpoint where the router listens, such as tls/router.lan:7447",
+    )
+    parser.add_argument(
+        "--connect", metavar="ENDPOINT", help="the endpoint that the others connect to; default that of --listen"
+    )
+    parser.add_argument("--relay", metavar="ENDPOINT", help="where the second router listens, if the scenario has two")
+    parser.add_argument(
+        "--relay-connect",
+        metavar="ENDPOINT",
+        help="the endpoint that its processes connect to; default that of --relay",
+    )
+    parser.add_argument(
+        "--wait", type=int, default=600, metavar="SECONDS", help="how long processes wait for each other; default 600"
+    )
+    parser.add_argument(
+        "--insecure", action="store_true", help="listen without encryption although other machines can reach it"
+    )
+    parser.add_argument(
+        "--paused", action="store_true", help="hold the run before slot 0, until `evedrop resume` or `evedrop step`"
+    )
+
+
+def _role(role: str) -> Option:
+    return lambda parser: parser.set_defaults(role=role)
+
+
+_BRIEF = argument("brief", "BRIEF")
+
+COMMANDS = (
+    Command(
+        "brief",
+        brief,
+        "write the files with which each process of a run is started by hand, or by Docker Compose",
+        (scenario, entries, _briefs),
+        section="processes",
+        example="brief vehicle --out briefs",
+        page="hosts",
+    ),
+    Command(
+        "health",
+        health,
+        "check that the process of a brief is on the network",
+        (_BRIEF,),
+        section="processes",
+        example="health briefs/smart.json",
+        page="containers",
+    ),
+    *(
+        Command(
+            role,
+            process,
+            f"run only the {role}",
+            (_BRIEF, _role(role), *((_observed, served) if role == "observer" else ())),
+            section="processes",
+            example=f"{role} briefs/{role}.json",
+            page="hosts",
+        )
+        for role in ROLES
+    ),
+)

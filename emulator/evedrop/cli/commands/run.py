@@ -1,0 +1,159 @@
+"""`evedrop run` and `evedrop demo`: live runs."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from evedrop.cli.command import Command
+from evedrop.cli.holding import hold
+from evedrop.cli.options import entries, loaded, output, over_wire, print_so_far, scenario
+from evedrop.cli.tables import tables
+from evedrop.errors import Interrupted, RunError, UsageError
+
+if TYPE_CHECKING:
+    from evedrop.cli.progress_line import ProgressLine
+    from evedrop.live.launch.hosts_file import HostsPlan
+    from evedrop.live.launch.process_set import Ended
+    from evedrop.scenario.news import Tell
+    from evedrop.scenario.tables import Scenario
+    from evedrop.show.view.viewer import Viewer
+
+
+def demo(options: argparse.Namespace) -> int:
+    """Run the built-in scenario `vehicle` live."""
+    options.scenario = "vehicle"
+    return run(options)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run a scenario live."""
+    from evedrop.live.launch.preloading import process_starter
+
+    with process_starter():  # the servers make their imports while the scenario is read
+        ended = _run(options)
+    if ended.viewer is not None:
+        _keep_open(ended.viewer)
+    return ended.status
+
+
+def _run(options: argparse.Namespace) -> Ended:
+    from evedrop.cli.progress_line import ProgressLine
+    from evedrop.live.launch.launcher import launch
+    from evedrop.results.folder import results_folder
+
+    scenario = loaded(options)
+    hosts = _hosts_of(options, scenario)
+    with results_folder(options.out, options.scenario) as folder:
+        with (
+            ProgressLine(scenario.slots, "slots", options.json) as line,
+            _metrics(options, scenario, folder, line) as tell,
+        ):
+            try:
+                ended = launch(
+                    scenario,
+                    folder,
+                    options.view,
+                    options.listen,
+                    tell,
+                    options.relay,
+                    paused=options.paused,
+                    hosts=hosts,
+                )
+            except (RunError, Interrupted):
+                print_so_far(line.moved or folder, options.json)
+                raise
+        print_so_far(ended.folder, options.json)
+    return ended
+
+
+@contextlib.contextmanager
+def _metrics(options: argparse.Namespace, scenario: Scenario, folder: Path, line: ProgressLine) -> Iterator[Tell]:
+    """Serve the metrics of `--metrics` during the block; gives what takes the news."""
+    if options.metrics is None:
+        yield line.tell
+        return
+    from evedrop.live.launch.metrics import MetricsAddress, RunMetrics, metrics_served
+    from evedrop.system.output import warn
+
+    address = MetricsAddress.of(options.metrics)
+    metrics = RunMetrics(scenario, folder, line.tell)
+    with metrics_served(address, metrics) as page:
+        if not options.json:
+            line.console.print(f"metrics are served at {page}", soft_wrap=True)
+        if address.warning is not None:
+            warn(address.warning)
+        yield metrics.tell
+
+
+def _hosts_of(options: argparse.Namespace, scenario: Scenario) -> HostsPlan | None:
+    """The hosts of `--hosts`; None without it."""
+    path: Path | None = getattr(options, "hosts", None)
+    if path is None:
+        return None
+    if options.listen is not None or options.relay is not None:
+        raise UsageError(f"--listen and --relay: {path} says where the routers listen; leave them out")
+    from evedrop.live.launch.hosts_file import load_hosts
+
+    return load_hosts(path, scenario)
+
+
+def _keep_open(viewer: Viewer) -> None:
+    """Keep the view open until it is closed or Ctrl-C, if started from a terminal; otherwise end it with the command."""
+    if sys.stdin is not None and sys.stdin.isatty() and sys.stderr.isatty() and viewer.alive():
+        where = f" at {viewer.address}" if viewer.address else ""
+        print(f"the view stays open{where}; Ctrl-C ends it", file=sys.stderr)
+        hold(viewer)
+    else:
+        viewer.stop()
+
+
+def _live(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--view", choices=("auto", "native", "web", "off"), default="auto", help="default auto")
+    parser.add_argument(
+        "--listen", metavar="ENDPOINT", help="the router's endpoint, such as tls/127.0.0.1:PORT; by default no port"
+    )
+    parser.add_argument("--relay", metavar="ENDPOINT", help="the second router's endpoint, if the scenario has two")
+    parser.add_argument(
+        "--metrics",
+        metavar="HOST:PORT",
+        help="serve metrics for Prometheus while the run goes on, such as 127.0.0.1:9464",
+    )
+    parser.add_argument(
+        "--paused", action="store_true", help="hold the run before slot 0, until `evedrop resume` or `evedrop step`"
+    )
+
+
+def _over_ssh(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--hosts", type=Path, metavar="FILE", help="start processes on other hosts, over ssh, as FILE says"
+    )
+
+
+_LIVE = (entries, output, _live, tables)
+
+
+COMMANDS = (
+    Command(
+        "demo",
+        demo,
+        "run the built-in scenario `vehicle` live, with the view",
+        _LIVE,
+        section="run",
+        example="demo",
+        page="view",
+    ),
+    Command(
+        "run",
+        run,
+        "run a scenario live: separate processes over a network, with a view and results",
+        (scenario, over_wire, *_LIVE, _over_ssh),
+        section="run",
+        example="run vehicle --view web",
+        page="scenario",
+    ),
+)

@@ -1,0 +1,35 @@
+"""`evedrop selftest`: whether this machine computes the golden digests."""
+
+from __future__ import annotations
+
+import argparse
+
+from evedrop.cli.command import Command
+from evedrop.errors import RunError
+
+
+def selftest(_: argparse.Namespace) -> int:
+    """Check that this machine computes the golden digests."""
+    from evedrop.cli.selftest import GOLDEN, selftest
+
+    check = selftest()
+    for name, value in check.machine.items():
+        print(f"{name:<16}{value}")
+    for name, digest in check.digests.items():
+        print(f"{name:<16}{digest}  {'golden' if GOLDEN.get(name) == digest else 'NOT the golden digest'}")
+    if not check.passed:
+        raise RunError("this machine does not compute the golden digests; please report the lines above")
+    print("passed: this machine computes the expected digests")
+    return 0
+
+
+COMMANDS = (
+    Command(
+        "selftest",
+        selftest,
+        "check this machine against reference digests",
+        section="inspect",
+        example="selftest",
+        page="testing",
+    ),
+)

@@ -1,0 +1,264 @@
+"""The commands for a run or wire in progress: each asks the run's observer, or the wire, prints the answer, and ends.
+
+Slow imports are made only by the command that needs them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from evedrop.cli.command import Command
+from evedrop.cli.options import as_json
+from evedrop.errors import BriefError, UsageError
+from evedrop.system.output import print_json
+
+if TYPE_CHECKING:
+    from evedrop.live.network.control_file import Control
+    from evedrop.live.network.operator import Answer
+    from evedrop.live.protocol.requests import OperatorRequest
+
+_PATIENCE = 60.0  # seconds; a hold may wait for a process that the scenario has restarted
+_AWAY_SECONDS = 5.0  # for which a run may have no observer at its router
+_AGAIN_SECONDS = 0.2
+_STEP_PATIENCE = 30 * 86_400.0  # a step takes as long as its slots do
+
+
+def link(options: argparse.Namespace) -> int:
+    """Change, cut or heal a link."""
+    from evedrop.live.protocol.requests import LinkRequest
+
+    event = _event(options.name, options.changes)
+    return _ask(options.run, LinkRequest(event), f"link {options.name}")
+
+
+def partition(options: argparse.Namespace) -> int:
+    """Let nothing pass between two sides of a wire."""
+    from evedrop.live.protocol.requests import LinkRequest
+
+    event = {"partition": [options.one, options.other]}
+    return _ask(options.run, LinkRequest(event), f"partition {options.one} {options.other}")
+
+
+def heal(options: argparse.Namespace) -> int:
+    """End the partition of two sides of a wire."""
+    from evedrop.live.protocol.requests import LinkRequest
+
+    event = {"join": [options.one, options.other]}
+    return _ask(options.run, LinkRequest(event), f"heal {options.one} {options.other}")
+
+
+def pause(options: argparse.Namespace) -> int:
+    """Hold the run before its next slot."""
+    from evedrop.live.protocol.requests import PauseRequest
+
+    return _ask(options.run, PauseRequest(), "pause")
+
+
+def resume(options: argparse.Namespace) -> int:
+    """Let a held run continue."""
+    from evedrop.live.protocol.requests import ResumeRequest
+
+    return _ask(options.run, ResumeRequest(), "resume")
+
+
+def step(options: argparse.Namespace) -> int:
+    """Let the run continue for some slots, and hold it again."""
+    from evedrop.live.protocol.requests import StepRequest
+    from evedrop.model.streams import MOST_SLOTS
+
+    if not 1 <= options.slots <= MOST_SLOTS:
+        raise UsageError(f"step {options.slots}: expected 1 or more slots, and {MOST_SLOTS} at most")
+    return _ask(options.run, StepRequest(options.slots), f"step {options.slots}", _STEP_PATIENCE)
+
+
+def status(options: argparse.Namespace) -> int:
+    """Print the run's status."""
+    from evedrop.live.network.control_file import read_controls
+    from evedrop.live.protocol.requests import StatusRequest
+    from evedrop.live.protocol.status import RunStatus, status_of_shards
+
+    answers = [
+        _answer(options.run, control, StatusRequest(), "status", _PATIENCE).status
+        for control in read_controls(options.run)
+    ]
+    of_runs = [answer for answer in answers if isinstance(answer, RunStatus)]
+    of_wires = [answer for answer in answers if answer is not None and not isinstance(answer, RunStatus)]
+    found = of_wires[0] if of_wires else status_of_shards(of_runs)
+    if options.json:
+        print_json(asdict(found))
+    else:
+        print("\n".join(found.lines))
+    return 0
+
+
+def _ask(run: Path, request: OperatorRequest, what: str, patience: float = _PATIENCE) -> int:
+    from evedrop.live.network.control_file import read_controls
+
+    control = read_controls(run)[0]  # in a run in shards, any of them refuses
+    print(_answer(run, control, request, what, patience).said)
+    return 0
+
+
+def _answer(run: Path, control: Control, request: OperatorRequest, what: str, patience: float) -> Answer:
+    """The answer of the observer of a run or a shard. Raises UsageError if it does not answer, or refuses."""
+    import zenoh
+
+    from evedrop.live.network.control_file import no_run, read_controls
+    from evedrop.live.network.operator import ask
+
+    began = time.monotonic()
+    if control.identity is not None:
+        from evedrop.live.network.certificates import check_identity
+
+        try:
+            check_identity(control.identity, control.user)
+        except BriefError as error:
+            raise UsageError(f"{run / 'control.json'}: {error}") from error
+    try:
+        found = ask(control, request, patience)
+        # An observer that has lost its connection is back in a moment; these requests may be carried out twice.
+        while found is None and request.repeatable and time.monotonic() - began < _AWAY_SECONDS:
+            read_controls(run)  # raises UsageError when the run is over
+            time.sleep(_AGAIN_SECONDS)
+            found = ask(control, request, patience)
+    except zenoh.ZError as error:
+        raise no_run(
+            run, f"no router answers at {control.router}: it was killed, or it lost its router and is restarting it"
+        ) from error
+    if found is None and time.monotonic() - began >= patience:
+        raise UsageError(f"{what}: no answer from the run in {run}; look at its logs, or end it")
+    if found is None:
+        raise no_run(run, "it ended before it answered, or its router did, which is then restarted")
+    if found.refused:
+        count = "1 mistake" if len(found.refused) == 1 else f"{len(found.refused)} mistakes"
+        raise UsageError("\n".join([f"{what}: {count}, nothing was changed", *(f"  {one}" for one in found.refused)]))
+    return found
+
+
+def _event(name: str, words: list[str]) -> dict[str, Any]:
+    """The change as an event of a scenario, without its time."""
+    from evedrop.scenario.events import EVENTS
+
+    alone = {kind for kind, event in EVENTS.items() if event.by_operator and event.names_in == kind}
+    if len(words) == 1 and words[0] in alone:
+        return {words[0]: name}
+    changes: dict[str, Any] = {}
+    for word in words:
+        key, equals, value = word.partition("=")
+        if not equals or not all(key.split(".")):
+            raise UsageError(f"link {name} {word}: expected KEY=VALUE, such as quality=0.2; or cut, or heal, alone")
+        _put(changes, name, key, value)
+    return {"link": name, "set": changes}
+
+
+def _put(changes: dict[str, Any], name: str, dotted: str, text: str) -> None:
+    """Put a value at a dotted key in `changes`; makes the tables in between."""
+    from evedrop.scenario.loading import value_of
+
+    *tables, last = dotted.split(".")
+    inner = changes
+    for table in tables:
+        inner = inner.setdefault(table, {})
+        if not isinstance(inner, dict):
+            raise UsageError(f"link {name} {dotted}={text}: {table} already has a value; give it once")
+    value = value_of(text)
+    try:
+        json.dumps(value)
+    except TypeError:  # a date cannot be in a message, and no entry of a link is a date
+        value = text
+    inner[last] = value
+
+
+def _going_on(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", type=Path, metavar="RUN", help="the results folder of a run or wire in progress")
+
+
+def _changed_link(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", metavar="NAME", help="the receiver whose link it is; of a wire, the link")
+    parser.add_argument(
+        "changes",
+        nargs="+",
+        metavar="KEY=VALUE",
+        help="an entry of the link, such as quality=0.2, with a dotted key for an entry of a table; or the word cut or heal",
+    )
+
+
+def _two_sides(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("one", metavar="A", help="a side of the wire")
+    parser.add_argument("other", metavar="B", help="another side of the wire")
+
+
+def _slots(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("slots", type=int, metavar="N", help="number of slots")
+
+
+COMMANDS = (
+    Command(
+        "link",
+        link,
+        "change, cut or heal a link of a running simulation or wire",
+        (_going_on, _changed_link),
+        section="steer",
+        example="link runs/vehicle smart quality=0.2",
+        page="control",
+    ),
+    Command(
+        "partition",
+        partition,
+        "let nothing pass between two sides of a running wire",
+        (_going_on, _two_sides),
+        section="steer",
+        example="partition runs/wire robot base",
+        page="wire",
+    ),
+    Command(
+        "heal",
+        heal,
+        "end the partition of two sides of a running wire",
+        (_going_on, _two_sides),
+        section="steer",
+        example="heal runs/wire robot base",
+        page="wire",
+    ),
+    Command(
+        "pause",
+        pause,
+        "pause a running simulation",
+        (_going_on,),
+        section="steer",
+        example="pause runs/vehicle",
+        page="control",
+    ),
+    Command(
+        "resume",
+        resume,
+        "resume a paused run",
+        (_going_on,),
+        section="steer",
+        example="resume runs/vehicle",
+        page="control",
+    ),
+    Command(
+        "step",
+        step,
+        "advance a paused run by N slots",
+        (_going_on, _slots),
+        section="steer",
+        example="step runs/vehicle 10",
+        page="control",
+    ),
+    Command(
+        "status",
+        status,
+        "show the status of a running simulation or wire",
+        (_going_on, as_json),
+        section="steer",
+        example="status runs/vehicle",
+        page="control",
+    ),
+)

@@ -1,0 +1,75 @@
+"""`evedrop test`: runs scenarios as tests, by their expectations."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import Counter
+from pathlib import Path
+
+from evedrop.cli.command import Command
+from evedrop.cli.in_memory import check_resuming, resuming, scheduler
+from evedrop.errors import UsageError
+
+
+def test(options: argparse.Namespace) -> int:
+    """Run scenarios as tests; returns the worst of their exit statuses."""
+    from evedrop.studies.junit import write_junit
+    from evedrop.studies.scenario_test_jobs import results
+    from evedrop.studies.scenario_tests import Finding, Manner, scenarios_of
+
+    if options.jobs < 1:
+        raise UsageError(f"--jobs {options.jobs}: expected 1 or more")
+    if options.scheduler is not None and not options.in_memory:
+        raise UsageError("--scheduler computes trials in memory; add --in-memory, or leave it out")
+    if options.resume and not options.in_memory:
+        raise UsageError("--resume goes on with tests in memory; add --in-memory, or leave it out")
+    check_resuming(options)
+    scenarios = scenarios_of(options.places)
+    manner = Manner(options.in_memory, options.trials, options.out, scheduler=options.scheduler, resume=options.resume)
+    started, tested = time.time(), list[Finding]()
+    try:
+        for one in results(scenarios, manner, options.jobs):
+            tested.append(one)
+            print(f"{one.outcome.word:<9}{one.seconds:7.1f} s  {one.scenario}", flush=True)
+            for line in one.lines:
+                print(f"    {line}", flush=True)
+    finally:
+        if options.junit is not None:
+            write_junit(options.junit, tested, started)
+    counts = Counter(one.outcome for one in tested)
+    said = ", ".join(f"{count} {outcome.word}" for outcome, count in sorted(counts.items(), key=lambda at: at[0].value))
+    print(f"{said}, in {time.time() - started:.1f} s")
+    return max(outcome.value for outcome in counts)
+
+
+def _places(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "places",
+        nargs="+",
+        metavar="PATH",
+        help="a scenario, a folder that contains scenarios, or the name of a built-in one",
+    )
+
+
+def _tests(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--in-memory", action="store_true", help="in memory instead of live")
+    parser.add_argument("--trials", type=int, metavar="N", help="number of trials; default the scenario's")
+    parser.add_argument("--junit", type=Path, metavar="FILE", help="write a report in JUnit XML")
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder for the results, with a folder for each scenario; default runs/"
+    )
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="how many to run at the same time; default 1")
+
+
+COMMANDS = (
+    Command(
+        "test",
+        test,
+        "run scenarios as tests, with a report for CI",
+        (_places, _tests, resuming, scheduler),
+        section="run",
+        example="test scenarios/ --junit report.xml",
+        page="testing",
+    ),
+)

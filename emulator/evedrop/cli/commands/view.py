@@ -1,0 +1,258 @@
+"""`evedrop view`: a finished run or wire, on the screen, in a picture or as a table."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from evedrop.cli.command import Command
+from evedrop.cli.holding import hold
+from evedrop.cli.options import argument, number_type, served
+from evedrop.cli.tables import tables
+from evedrop.errors import UsageError
+
+if TYPE_CHECKING:
+    from evedrop.show.view.viewer import Viewer
+
+_MOST_RATE = 60
+_BEFORE, _AFTER = 60, 20  # slots of a video around the most telling one
+_MOST_TIMES = 1_000_000  # frames of a video of a wire: eighteen hours at 15 a second
+_LEAST, _MOST = 320, 3840  # pixels; the viewer takes more than its time limit for larger pictures
+
+
+def view(options: argparse.Namespace) -> int:
+    """Open a finished run or wire, draw it, or print its closing report again."""
+    from evedrop.results.wire_folder import is_wire
+
+    if is_wire(options.run):
+        return _view_wire(options)
+    if options.time is not None:
+        raise UsageError("--time is for wires; a run has slots, so give --slot")
+    _check_names(options)
+    if options.table:
+        from evedrop.cli.closing_report import print_report_line, print_results
+        from evedrop.results.reading import results_of_this_version
+
+        with results_of_this_version(options.run):
+            print_results(options.run)
+        print_report_line(options.run)
+        return 0
+    from evedrop.results.writer import load_results
+    from evedrop.show.view.viewer import WebAddress, open_run
+    from evedrop.system.signals import raise_on_signals
+
+    web_address = None if options.serve is None else WebAddress.of(options.serve)
+    results = load_results(options.run) if not (options.run / "summary.json").is_file() else None
+    if results is not None:
+        print(f"evedrop: {results.remark}", file=sys.stderr)
+    with raise_on_signals(), tempfile.TemporaryDirectory(prefix="evedrop-view-") as temporary:
+        recording = options.run / "recording.rrd"
+        if results is not None or not recording.is_file():
+            from evedrop.show.view.replay import replay
+        if results is not None:  # a run in progress, or a killed one, has no complete recording
+            recording = replay(options.run, Path(temporary) / "recording.rrd")
+        elif not recording.is_file():
+            recording = replay(options.run)
+        if options.video is not None:
+            return _film(recording, options, _slots_of(options))
+        if options.picture is None:
+            _hold("run", open_run(options.run, options.view, web_address, recording))
+            return 0
+        from evedrop.show.view.picture import SIZE, picture_apart
+
+        slot = _chosen_slot(options.run) if options.slot is None else options.slot
+        for complaint in picture_apart(recording, options.picture, slot, options.size or SIZE):
+            print(complaint, file=sys.stderr)
+    return 0
+
+
+def _check_names(options: argparse.Namespace) -> None:
+    """Raise UsageError for a picture or a video that cannot be made, before anything is drawn."""
+    if options.picture is not None:
+        from evedrop.show.view.picture import check_picture_name
+
+        check_picture_name(options.picture)
+    if options.video is not None:
+        from evedrop.show.view.video import FRAME_RATE, VIDEO_SIZE, check_video
+
+        check_video(options.video, options.size or VIDEO_SIZE, options.fps or FRAME_RATE)
+        if options.slot is not None or options.time is not None:
+            raise UsageError("a video shows more than one moment; give --slots for a run, and --times for a wire")
+    elif options.slots is not None or options.times is not None:
+        raise UsageError("--slots and --times are for a video; give --video, or --slot or --time for a picture")
+
+
+def _slots_of(options: argparse.Namespace) -> Sequence[int]:
+    """The slots of a video."""
+    if options.times is not None:
+        raise UsageError("--times is for wires; a run has slots, so give --slots")
+    if options.slots is None:
+        from evedrop.results.writer import load_results
+
+        last = int(load_results(options.run).summary["slots"]) - 1
+        slot = _chosen_slot(options.run)
+        middle = last if slot is None else slot
+        return range(max(0, middle - _BEFORE), min(last, middle + _AFTER) + 1)
+    first, last, step = options.slots
+    if not all(float(part).is_integer() for part in options.slots if part is not None):
+        raise UsageError("--slots has a fraction of a slot; give whole numbers")
+    return range(int(first), int(last) + 1, int(step or 1))
+
+
+def _times_of(options: argparse.Namespace) -> Sequence[float]:
+    """The times of a video of a wire: by default in real time."""
+    from evedrop.show.view.video import FRAME_RATE
+
+    if options.slots is not None:
+        raise UsageError(f"--slots is for runs, and {options.run} is the folder of a wire; give --times")
+    if options.times is None:
+        raise UsageError("a video of a wire needs --times FIRST:LAST, in seconds, such as --times 0:10")
+    first, last, step = options.times
+    step = 1.0 / (options.fps or FRAME_RATE) if step is None else step
+    if (last - first) / step >= _MOST_TIMES:
+        raise UsageError(
+            f"--times gives more than {_MOST_TIMES:,} frames; give a shorter time, or a larger step as in 0:60:0.1"
+        )
+    return [first + number * step for number in range(int((last - first) / step + 1e-9) + 1)]
+
+
+def _film(recording: Path, options: argparse.Namespace, moments: Sequence[float]) -> int:
+    """Draw some moments as a video."""
+    from evedrop.cli.progress_line import ProgressLine
+    from evedrop.scenario.news import RunProgress
+    from evedrop.show.view.video import FRAME_RATE, VIDEO_SIZE, video_apart
+
+    start = time.monotonic()
+    with ProgressLine(len(moments), "frames") as line:
+
+        def tell(done: int) -> None:
+            line.tell(RunProgress(done, done / (time.monotonic() - start), "frames/s", {}))
+
+        size, rate = options.size or VIDEO_SIZE, options.fps or FRAME_RATE
+        complaints = video_apart(recording, options.video, moments, size, rate, tell)
+    frames = f"{len(moments)} frames are" if len(moments) > 1 else "1 frame is"
+    print("\n".join([*complaints, f"{frames} in {options.video}"]))
+    return 0
+
+
+def _chosen_slot(run: Path) -> int | None:
+    """Choose the most telling slot, and print it; None for the last slot."""
+    from evedrop.results.writer import load_results
+    from evedrop.show.view.telling_slot import telling_slot
+
+    slot = telling_slot(load_results(run))
+    if slot is not None:
+        print(f"chose slot {slot}, the most telling one")
+    return slot
+
+
+def _view_wire(options: argparse.Namespace) -> int:
+    """Show or draw a wire, from its journal, or print its table."""
+    from evedrop.show.report.wire import wire_failures
+    from evedrop.show.view.picture import picture_apart
+    from evedrop.show.view.viewer import WebAddress, open_run
+    from evedrop.system.signals import raise_on_signals
+    from evedrop.wire.closing import closing_lines
+    from evedrop.wire.journal_on_disk import summary_of_wire
+    from evedrop.wire.replay import PICTURE_SIZE, replay_wire
+
+    _check_names(options)
+    if options.slot is not None:
+        raise UsageError(f"--slot is for runs, and {options.run} is the folder of a wire; give --time")
+    if options.table:
+        summary = summary_of_wire(options.run)
+        print("\n".join([*closing_lines(summary), *wire_failures(summary)]))
+        return 0
+    web_address = None if options.serve is None else WebAddress.of(options.serve)
+    with raise_on_signals(), tempfile.TemporaryDirectory(prefix="evedrop-view-") as temporary:
+        recording = replay_wire(options.run, Path(temporary) / "recording.rrd")
+        if options.video is not None:
+            return _film(recording, options, _times_of(options))
+        if options.picture is None:
+            _hold("wire", open_run(options.run, options.view, web_address, recording))
+            return 0
+        for complaint in picture_apart(recording, options.picture, options.time, options.size or PICTURE_SIZE):
+            print(complaint, file=sys.stderr)
+    return 0
+
+
+def _hold(what: str, viewer: Viewer) -> None:
+    """Say where a viewer is, and wait until it is closed."""
+    where = f" at {viewer.address}, to anybody who has this address" if viewer.address else ""
+    print(f"the {what} is shown{where}; Ctrl-C ends it", flush=True)
+    if viewer.warning is not None:
+        print(f"evedrop: warning: {viewer.warning}", file=sys.stderr)
+    hold(viewer)
+
+
+def _size(text: str) -> tuple[int, int]:
+    """A width and a height. Raises ArgumentTypeError."""
+    width, _, height = text.partition("x")
+    try:
+        size = int(width), int(height)
+    except ValueError:
+        size = 0, 0
+    if not (_LEAST <= size[0] <= _MOST and _LEAST <= size[1] <= _MOST):
+        raise argparse.ArgumentTypeError(
+            f"{text} is not a width and a height from {_LEAST} to {_MOST} pixels, such as 1200x720"
+        )
+    return size
+
+
+def _moments(text: str) -> tuple[float, float, float | None]:
+    """First, last and step of slots or times; the step is None if it is not given. Raises ArgumentTypeError."""
+    try:
+        first, last, *step = (float(part) for part in text.split(":"))
+    except ValueError:
+        first, last, step = 0.0, -1.0, []
+    if not (0 <= first <= last < math.inf and len(step) <= 1 and all(0 < one < math.inf for one in step)):
+        raise argparse.ArgumentTypeError(f"{text} is not FIRST:LAST or FIRST:LAST:STEP, such as 100:200 or 100:200:2")
+    return first, last, step[0] if step else None
+
+
+def _shown(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--view", choices=("auto", "native", "web"), default="auto", help="default auto")
+    instead = parser.add_mutually_exclusive_group()
+    instead.add_argument(
+        "--picture", type=Path, metavar="FILE.png", help="draw the run into a file instead; needs no screen"
+    )
+    instead.add_argument(
+        "--video", type=Path, metavar="FILE.mp4|gif", help="draw some slots as a video instead; needs no screen"
+    )
+    instead.add_argument("--table", action="store_true", help="print its table and sentences instead")
+    moment = parser.add_mutually_exclusive_group()
+    moment.add_argument("--slot", type=int, metavar="K", help="the slot to draw; default the most telling one")
+    moment.add_argument("--time", type=float, metavar="SECONDS", help="for a wire: the time to draw; default the end")
+    moment.add_argument(
+        "--slots",
+        type=_moments,
+        metavar="A:B[:STEP]",
+        help="the slots of a video; default 81 around the most telling one",
+    )
+    moment.add_argument(
+        "--times", type=_moments, metavar="A:B[:STEP]", help="for a wire: the times of a video, in seconds"
+    )
+    rate = number_type(1, _MOST_RATE, f"a number of frames per second from 1 to {_MOST_RATE}")
+    parser.add_argument("--fps", type=rate, metavar="F", help="frames per second of a video; default 15")
+    parser.add_argument(
+        "--size", type=_size, metavar="WxH", help="in pixels; default 1600x950 for a picture, 1200x720 for a video"
+    )
+
+
+COMMANDS = (
+    Command(
+        "view",
+        view,
+        "open a finished run or wire, draw it, or print its report again",
+        (argument("run", "RUN"), _shown, served, tables),
+        section="inspect",
+        example="view runs/vehicle --picture vehicle.png",
+        page="view",
+    ),
+)

@@ -1,0 +1,117 @@
+"""`evedrop wire`: links with faults between programs that know nothing of Evedrop, over Zenoh."""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import sys
+from pathlib import Path
+
+from evedrop.cli.command import Command
+from evedrop.cli.options import changes_of
+from evedrop.errors import UsageError
+from evedrop.system.output import say as complain
+
+
+def wire(options: argparse.Namespace) -> int:
+    """Run the wire that a file describes; or say what the file means, or print an example."""
+    from evedrop.wire.file import example_wire, load_wire
+
+    if options.example:
+        if options.file is not None:
+            raise UsageError("wire --example: expected no FILE; it prints an example of one")
+        print(example_wire(), end="")
+        return 0
+    if options.file is None:
+        raise UsageError("wire: expected a FILE; `evedrop wire --example` prints one")
+    if options.keys and not options.check:
+        raise UsageError(
+            f"wire {options.file} {options.keys[0]}: keys are for --check, which says which link a key takes"
+        )
+    from evedrop.wire.check import key_lines, warnings_of_wire, wire_lines
+
+    seconds = None if options.seconds is None else _seconds(options.seconds)
+    plan = load_wire(options.file, changes_of(options))
+    if options.check:
+        lines = [*wire_lines(plan), *key_lines(plan, options.keys)]
+        links, events = len(plan.links), len(plan.events)
+        print(f"{options.file}: {len(plan.sides)} sides, {links} links, {events} events: no mistakes")
+        print("\n".join(f"  {line}" for line in lines))
+    for warning in warnings_of_wire(plan):
+        print(f"evedrop: warning: {warning}", file=sys.stderr)
+    if options.check:
+        return 0
+    from evedrop.cli.closing_report import report_page
+    from evedrop.live.network.zenoh_log import zenoh_log_apart
+    from evedrop.results.folder import results_folder
+    from evedrop.wire.run import run_wire
+
+    gc.freeze()  # imported modules stay: the collections that new keys cause need not look at them
+    with results_folder(options.out, f"wire-{options.file.stem}") as folder:
+        said = {"say": _hush, "complain": complain} if options.quiet else {"say": _say}
+        with zenoh_log_apart():
+            status = run_wire(plan, folder, seconds=seconds, view=options.view, **said)
+        report_page(folder, options.quiet)
+        return status
+
+
+def _say(line: str) -> None:
+    """Print a line at once, for programs that wait for the endpoints."""
+    print(line, flush=True)
+
+
+def _hush(line: str) -> None:
+    """Print nothing."""
+
+
+def _seconds(text: str) -> float:
+    """The length of time of `--for`. Raises UsageError."""
+    from evedrop.wire.units import seconds_of
+
+    found = seconds_of(text)
+    if found is None or found == 0.0:
+        raise UsageError(f'wire --for {text}: expected seconds, or a length of time such as "60 s"')
+    return found
+
+
+def _file(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("file", nargs="?", type=Path, metavar="FILE", help="a wire file")
+    parser.add_argument("keys", nargs="*", metavar="KEY", help="with --check: a key, or key expression, of messages")
+    parser.add_argument(
+        "--check", action="store_true", help="say what the file means, and which link each KEY takes; start nothing"
+    )
+    parser.add_argument("--example", action="store_true", help="print an example of a wire file")
+
+
+def _changes(parser: argparse.ArgumentParser) -> None:
+    what = "change an entry of the file by its dotted key, such as link.1.quality=0.5; repeatable"
+    parser.add_argument("--set", dest="changes", action="append", default=[], metavar="KEY=VALUE", help=what)
+
+
+def _course(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="results folder; that of an earlier wire, to go on with its fates"
+    )
+    parser.add_argument(
+        "--view",
+        default="off",
+        metavar="VIEW",
+        help="auto, native or web: show the wire; FILE.rrd: write the view to a file; default off",
+    )
+    parser.add_argument("--quiet", action="store_true", help="print only warnings and errors")
+    parser.add_argument(
+        "--for", dest="seconds", metavar="TIME", help='end after this time, such as "60 s"; default: at Ctrl-C'
+    )
+
+
+COMMANDS = (
+    Command(
+        "wire",
+        wire,
+        "run links with faults between programs that use Zenoh or ROS 2",
+        (_file, _changes, _course),
+        section="run",
+        example="wire robot.toml --out runs/wire",
+        page="wire",
+    ),
+)

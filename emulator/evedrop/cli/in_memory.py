@@ -1,0 +1,106 @@
+"""Shared by commands that simulate in memory: their options, and studies of one scenario."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+from evedrop.cli.options import entries, loaded, output
+from evedrop.errors import UsageError
+
+if TYPE_CHECKING:
+    from evedrop.scenario.tables import Scenario
+    from evedrop.simulate.montecarlo import Plan
+    from evedrop.studies.parts import StudyPlace
+
+T = TypeVar("T")
+
+
+def crew(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say where trials are computed."""
+    what = "number of worker processes; does not affect the results"
+    parser.add_argument("--workers", type=int, metavar="N", help=what)
+    scheduler(parser)
+
+
+def scheduler(parser: argparse.ArgumentParser) -> None:
+    """Add `--scheduler`, the address of a Dask scheduler."""
+    what = "let the workers of this Dask scheduler compute the trials, tcp://HOST:PORT (docs/montecarlo.md)"
+    parser.add_argument("--scheduler", metavar="ADDRESS", help=what)
+
+
+def resuming(parser: argparse.ArgumentParser) -> None:
+    """Add `--resume`, to go on with a study that was interrupted."""
+    what = (
+        "go on with the interrupted study in the folder of --out; all but --workers and --scheduler must be as it was"
+    )
+    parser.add_argument("--resume", action="store_true", help=what)
+
+
+def check_resuming(options: argparse.Namespace) -> None:
+    """Raise UsageError for `--resume` without a folder."""
+    if options.resume and options.out is None:
+        raise UsageError("--resume goes on with the study in a folder: give the folder with --out DIR")
+
+
+def keeping(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a study that needs no results folder: one that keeps finished trials, and `--resume`."""
+    what = "write the result there, new or empty, and keep finished trials for --resume until it is complete"
+    parser.add_argument("--out", type=Path, metavar="DIR", help=what)
+    resuming(parser)
+
+
+def memory(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say how trials are computed."""
+    crew(parser)
+    mode = parser.add_mutually_exclusive_group()
+    mode.add_argument(
+        "--covariance-only",
+        dest="mode",
+        action="store_const",
+        const="covariance-only",
+        help="simulate covariances given the events; draws no noise",
+    )
+    mode.add_argument(
+        "--error-coordinates",
+        dest="mode",
+        action="store_const",
+        const="error-coordinates",
+        help="simulate the errors themselves: any number of slots, no digest",
+    )
+    parser.set_defaults(mode="exact")
+
+
+def studied(
+    options: argparse.Namespace, study: Callable[[Scenario, Callable[[int], None], Plan, StudyPlace | None], T]
+) -> tuple[Scenario, T]:
+    """Run a study of a command's scenario, with 100 trials by default, and show its progress.
+
+    Returns the scenario and what the study found.
+    """
+    from evedrop.cli.progress_line import ProgressLine
+    from evedrop.simulate.montecarlo import teller
+    from evedrop.studies.parts import StudyPlace
+
+    check_resuming(options)
+    options.trials = 100 if options.trials is None else options.trials
+    plan = plan_of(options)
+    scenario = loaded(options)
+    total = scenario.trials * scenario.slots
+    with ProgressLine(total, "trial-slots", options.json) as line:
+        place = None if options.out is None else StudyPlace(options.out, options.resume)
+        return scenario, study(scenario, teller(line.tell, total), plan, place)
+
+
+MEMORY = (entries, output, memory, resuming)
+
+
+def plan_of(options: argparse.Namespace) -> Plan:
+    """The plan, how and where trials are computed, from the options of `memory` or `crew`."""
+    from evedrop.simulate.montecarlo import Plan
+    from evedrop.simulate.simulation import Mode
+
+    mode = Mode(getattr(options, "mode", Mode.EXACT))
+    return Plan(mode, options.workers, options.scheduler, rare=getattr(options, "rare", False))

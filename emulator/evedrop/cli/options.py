@@ -1,0 +1,164 @@
+"""Shared by several commands: options, the scenario with its changes, and the report of a run.
+
+Slow imports are made only when they are needed, so that `evedrop --help` and a peer start quickly.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from evedrop.cli.command import Option
+from evedrop.errors import UsageError
+
+if TYPE_CHECKING:
+    from evedrop.scenario.tables import Scenario
+
+_SET_HELP = "change an entry of the scenario by its dotted key; the value is read as TOML, else as a string; repeatable"
+
+
+def argument(name: str, shown: str) -> Option:
+    """An option that adds a positional argument, a path; shown: its name in the help."""
+
+    def add(parser: argparse.ArgumentParser) -> None:
+        parser.add_argument(name, type=Path, metavar=shown)
+
+    return add
+
+
+def number_type(least: float, most: float, words: str) -> Callable[[str], float]:
+    """The type of an option that is a number from `least` to `most`; words: what it must be, for the message."""
+
+    def number(text: str) -> float:
+        try:
+            found = float(text)
+        except ValueError:
+            found = math.nan
+        if not least <= found <= most:
+            raise argparse.ArgumentTypeError(f"{text} is not {words}")
+        return found
+
+    return number
+
+
+def scenario(parser: argparse.ArgumentParser) -> None:
+    """Add the argument for the scenario."""
+    parser.add_argument("scenario", metavar="SCENARIO", help="a built-in scenario, a file, or a results folder")
+
+
+def changes(parser: argparse.ArgumentParser) -> None:
+    """Add `--set`, which changes an entry of the scenario by its dotted key."""
+    parser.add_argument("--set", dest="changes", action="append", default=[], metavar="KEY=VALUE", help=_SET_HELP)
+
+
+def entries(parser: argparse.ArgumentParser) -> None:
+    """Add `--set`, and an option for each of the entries that are changed most often."""
+    changes(parser)
+    for name, what in (
+        ("seed", "seed of all random numbers"),
+        ("slots", "number of slots"),
+        ("trials", "number of trials"),
+        ("first-trial", "number of the first trial"),
+        ("record-trials", "how many trials are recorded in full"),
+    ):
+        parser.add_argument(f"--{name}", type=int, metavar="N", help=what)
+    parser.add_argument("--pace", type=float, metavar="SECONDS", help="seconds per slot; 0 = as fast as possible")
+    parser.add_argument("--secret", type=Path, metavar="FILE", help="a secret that is not derived from the seed")
+
+
+def output(parser: argparse.ArgumentParser) -> None:
+    """Add the options for the results folder and for JSON."""
+    parser.add_argument("--out", type=Path, metavar="DIR", help="results folder, new or empty")
+    as_json(parser, "print only the summary, as JSON, on standard output")
+
+
+def as_json(parser: argparse.ArgumentParser, what: str = "print JSON") -> None:
+    """Add `--json`, for JSON instead of text; what: the help."""
+    parser.add_argument("--json", action="store_true", help=what)
+
+
+def served(parser: argparse.ArgumentParser) -> None:
+    """Add `--serve`, the address where a run is shown to browsers."""
+    parser.add_argument(
+        "--serve", metavar="HOST:PORT", help="show the run to browsers, at this address and port (and the next port)"
+    )
+
+
+def changes_of(options: argparse.Namespace) -> dict[str, Any]:
+    """The changes of the scenario that `changes` or `entries` took. Raises UsageError for one that is not KEY=VALUE."""
+    from evedrop.scenario.loading import value_of
+
+    changes: dict[str, Any] = {}
+    for change in options.changes:
+        key, equals, value = change.partition("=")
+        if not equals or not key:
+            raise UsageError(f"--set {change}: expected KEY=VALUE, such as --set seed=3")
+        changes[key] = value_of(value)
+    for name in ("seed", "slots", "trials", "first_trial", "record_trials", "pace"):
+        value = getattr(options, name, None)
+        if value is not None:
+            changes[name] = value
+    if getattr(options, "secret", None) is not None:
+        changes["secret_file"] = str(options.secret.absolute())
+    return changes
+
+
+def over_wire(parser: argparse.ArgumentParser) -> None:
+    """Add the options for a wire as the network."""
+    parser.add_argument("--wire", type=Path, metavar="FILE", help="take links and events from this wire file")
+    parser.add_argument(
+        "--wire-key",
+        metavar="KEY",
+        help="the key that the packets have on the wire; default the key of the program that gives the states",
+    )
+    parser.add_argument(
+        "--wire-side",
+        action="append",
+        default=[],
+        metavar="PROCESS=SIDE",
+        help="the side of the wire that the sensor or a receiver is on; default the side of its name; repeatable",
+    )
+
+
+def _of_wire(options: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
+    """The changes that give a scenario the network of `--wire`; none without it."""
+    sides = [one.partition("=") for one in getattr(options, "wire_side", ())]
+    if getattr(options, "wire", None) is None:
+        if sides or getattr(options, "wire_key", None) is not None:
+            raise UsageError("--wire-key and --wire-side belong to a wire; give --wire FILE as well")
+        return {}
+    if wrong := next((name for name, equals, side in sides if not (name and equals and side)), None):
+        raise UsageError(f"--wire-side {wrong}: expected PROCESS=SIDE, such as --wire-side sensor=robot")
+    from evedrop.wire.file import load_wire
+    from evedrop.wire.network import over_wire
+
+    return over_wire(scenario, load_wire(options.wire), options.wire_key, {name: side for name, _, side in sides})
+
+
+def loaded(options: argparse.Namespace, beyond_horizon: bool = False) -> Scenario:
+    """Load the scenario of a command, with its changes; prints warnings."""
+    from evedrop.scenario.expected.estimates import warnings_of
+    from evedrop.scenario.loading import checked, load
+
+    scenario = load(options.scenario, changes_of(options), beyond_horizon=beyond_horizon)
+    if network := _of_wire(options, scenario):
+        tables = scenario.model_dump(mode="json", exclude_none=True)
+        scenario = checked(tables, str(options.wire), network, beyond_horizon=beyond_horizon)
+    for warning in warnings_of(scenario):
+        print(f"evedrop: warning: {warning}", file=sys.stderr)
+    return scenario
+
+
+def print_so_far(folder: Path, as_json: bool) -> None:
+    """Print the closing report of a run, if it has results, and write its page."""
+    from evedrop.cli.closing_report import print_results, report_page
+
+    with contextlib.suppress(UsageError):
+        print_results(folder, as_json)
+        sys.stdout.flush()  # the words first: the page takes a tenth of a second
+        report_page(folder, as_json)

@@ -1,0 +1,82 @@
+"""The terminal output of `evedrop design --policy`: a table of thresholds and one of policies for each eavesdropper."""
+
+from __future__ import annotations
+
+from itertools import groupby
+from typing import TYPE_CHECKING
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from evedrop.cli.report import left_out_line, terminal
+from evedrop.model.figures.text import figure_text, finite_text
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from evedrop.model.theory.policy_front import Front, PolicyFigures
+    from evedrop.scenario.expected.policies import PolicyDesign
+
+_FIGURES = ("user's error", "its error", "sent")
+
+
+def print_policies(design: PolicyDesign) -> None:
+    """Print the fronts as text."""
+    console = terminal()
+    console.print(
+        f"legitimate link quality μ = {design.mu:g}; errors are traces in the limit; sent: the fraction of slots with a packet"
+    )
+    for name, front in design.fronts.items():
+        console.print(f"\nagainst {name}, the scheme with its threshold:")
+        console.print(_thresholds(front))
+        console.print(f"the best policy if the sensor also knew how long ago {name} heard a packet, which it does not:")
+        console.print(_policies(front, design.states))
+        if front.never:
+            for price in sorted({price for _, price in front.never}):
+                weights = ", ".join(f"{weight:g}" for weight, one in front.never if one == price)
+                console.print(
+                    f"left out, because the best policy never sends: with λ = {price:g} the weights {weights}"
+                )
+        if front.dominated:
+            policies = "policy" if front.dominated == 1 else "policies"
+            console.print(f"left out: {front.dominated} {policies} that another one dominates")
+    if design.left_out:
+        console.print(left_out_line(design.left_out, "no closed form of its error is known under this scheme"))
+
+
+def _thresholds(front: Front) -> Table:
+    shown = Table(box=SIMPLE_HEAD)
+    for head in ("threshold θ", *_FIGURES):
+        shown.add_column(head, justify="right", no_wrap=True)
+    for i, figures in enumerate(front.thresholds):
+        shown.add_row(str(i + 1), *_figures(figures))
+    return shown
+
+
+def _policies(front: Front, states: int) -> Table:
+    shown = Table(box=SIMPLE_HEAD)
+    for head in ("weight", "λ", *_FIGURES, "best θ"):
+        shown.add_column(head, justify="right", no_wrap=True)
+    shown.add_column("send from h ≥, by its holding time 1, 2 …")
+    for point in front.points:
+        low, high = point.weights
+        shown.add_row(
+            f"{low:g}" if low == high else f"{low:g} … {high:g}",
+            figure_text(point.price, "g"),
+            *_figures(point.figures),
+            str(point.scheduled),
+            _by_holding_time(point.thresholds, states),
+        )
+    return shown
+
+
+def _by_holding_time(thresholds: Sequence[int], states: int) -> str:
+    """The thresholds, equal ones in a row as a count."""
+    stretches = [(one, len(list(equal))) for one, equal in groupby(thresholds)]
+    return " ".join(
+        ("never" if one > states else str(one)) + (f" ×{count}" if count > 1 else "") for one, count in stretches
+    )
+
+
+def _figures(figures: PolicyFigures) -> tuple[str, ...]:
+    return (*map(finite_text, (figures.user, figures.eavesdropper)), figure_text(figures.transmissions, ".4f"))

@@ -1,0 +1,51 @@
+"""The terminal output of `evedrop design --schedule`: for each eavesdropper the schedule, and what it gains."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from evedrop.cli.report import left_out_line, terminal
+from evedrop.model.checks import toml_of
+from evedrop.model.figures.text import figure_text
+
+if TYPE_CHECKING:
+    from evedrop.model.theory.schedules import MeanSchedule, ScheduleDesign
+
+
+def print_schedules(design: ScheduleDesign) -> None:
+    """Print the schedules as text."""
+    console = terminal()
+    for name, found in design.schedules.items():
+        console.print(
+            f"against {name}: the sum is {found.best.value:.6g} with this schedule, "
+            f"and {found.constant.value:.6g} with the best constant μ_d, {found.constant.mu_d[1]:.6g}"
+        )
+        console.print(_slots(found.best))
+        on_grid = (
+            "the best schedule of the grid"
+            if found.exact
+            else "the best schedule found on the part of the grid that was searched"
+        )
+        console.print(
+            f"{on_grid} has {found.grid.value:.6g}; "
+            "none of the changes tried, of one μ_d or of two neighbouring ones, improves this schedule"
+        )
+        numbers = list(found.best.mu_d)
+        console.print(f"to run it, with slots = {len(numbers)}, write in [encoding]:")
+        console.print(f"state_probability = {toml_of(numbers)}\n", soft_wrap=True, highlight=False, markup=False)
+    if design.left_out:
+        console.print(left_out_line(design.left_out, "no closed form of its error is known"))
+
+
+def _slots(schedule: MeanSchedule) -> Table:
+    """One row for each slot."""
+    shown = Table(box=SIMPLE_HEAD)
+    for head in ("slot", "μ_d", "user's error", "its error"):
+        shown.add_column(head, justify="right", no_wrap=True)
+    for k, row in enumerate(zip(schedule.mu_d, schedule.user, schedule.eavesdropper, strict=True)):
+        mu_d, ours, theirs = row
+        shown.add_row(str(k), figure_text(mu_d, ".6g"), figure_text(ours), figure_text(theirs))
+    return shown

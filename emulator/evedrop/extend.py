@@ -1,0 +1,184 @@
+"""The names that authors of schemes, eavesdroppers, links, events, figures, panels, applications and commands import.
+
+A plug-in needs nothing else of Evedrop. Every name here keeps its meaning within a major version.
+
+Source: docs/your-own.md.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from evedrop.cli.command import Command
+from evedrop.errors import EvedropError, UsageError
+from evedrop.model import update
+from evedrop.model.checks import probability_mistakes
+from evedrop.model.delays.constant import ConstantDelay
+from evedrop.model.delays.delay import DelayModel
+from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge, PacketReader, PacketTaker
+from evedrop.model.eavesdroppers.naive import Naive
+from evedrop.model.figures.figure import Figure, FigureColumn, FigureTally, MeanFigure, ScoredSlots
+from evedrop.model.kernels import elementary
+from evedrop.model.links.bernoulli import Bernoulli
+from evedrop.model.links.link import Chain, Fate, LossModel, fates_of
+from evedrop.model.process import Floats, Process
+from evedrop.model.receiver import Action, Belief, Beliefs, Codes, Flags, Receiver, Reception, prior, trace_of
+from evedrop.model.schemes.innovation import Innovation
+from evedrop.model.schemes.plain import Plain, PlainEncoder, PlainEstimator
+from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, PacketBlock, Scheme, Shared
+from evedrop.model.streams import Batch, BlockReader
+from evedrop.model.theory.closed_form import ClosedForm, ReceiverConditions
+from evedrop.model.theory.covariances import Outcomes, OutcomesAt
+from evedrop.names import ProcessAction
+
+if TYPE_CHECKING:
+    from evedrop.scenario.application import (
+        Application,
+        ApplicationTally,
+        ControlledPlant,
+        Panel,
+        PanelCurve,
+        PanelFeed,
+        PowerFeed,
+    )
+    from evedrop.scenario.events.effects import (
+        Jamming,
+        Leave,
+        LinkCut,
+        LinkHealed,
+        LinkSettings,
+        Nothing,
+        Return,
+        Spoofing,
+    )
+    from evedrop.scenario.events.event import Act, EventKind
+    from evedrop.scenario.table import Table
+    from evedrop.show.view.column import Column, scalars
+    from evedrop.show.view.palette import colour
+    from evedrop.show.view.panels.curves import curves_view, line_style, recent_slots, whole_run
+    from evedrop.show.view.panels.panel import PlacedView, ViewPanel
+    from evedrop.show.view.scene import PeerSlots, Scene, SceneSlots, Shown
+
+__all__ = [
+    "Act",
+    "Action",
+    "Application",
+    "ApplicationTally",
+    "Batch",
+    "Belief",
+    "Beliefs",
+    "Bernoulli",
+    "BlockReader",
+    "Chain",
+    "ClosedForm",
+    "Codes",
+    "Column",
+    "Command",
+    "ConstantDelay",
+    "ControlledPlant",
+    "DelayModel",
+    "Eavesdropper",
+    "Encoder",
+    "EvedropError",
+    "EventKind",
+    "Fate",
+    "Figure",
+    "FigureColumn",
+    "FigureTally",
+    "Flags",
+    "Floats",
+    "Innovation",
+    "Jamming",
+    "Knowledge",
+    "Leave",
+    "LinkCut",
+    "LinkHealed",
+    "LinkSettings",
+    "LossModel",
+    "MeanFigure",
+    "Naive",
+    "NoInnovations",
+    "Nothing",
+    "Outcomes",
+    "OutcomesAt",
+    "Packet",
+    "PacketBlock",
+    "PacketReader",
+    "PacketTaker",
+    "Panel",
+    "PanelCurve",
+    "PanelFeed",
+    "PeerSlots",
+    "PlacedView",
+    "Plain",
+    "PlainEncoder",
+    "PlainEstimator",
+    "PowerFeed",
+    "Process",
+    "ProcessAction",
+    "Receiver",
+    "ReceiverConditions",
+    "Reception",
+    "Return",
+    "Scene",
+    "SceneSlots",
+    "Scheme",
+    "ScoredSlots",
+    "Shared",
+    "Shown",
+    "Spoofing",
+    "Table",
+    "UsageError",
+    "ViewPanel",
+    "colour",
+    "curves_view",
+    "elementary",
+    "fates_of",
+    "line_style",
+    "prior",
+    "probability_mistakes",
+    "recent_slots",
+    "scalars",
+    "trace_of",
+    "update",
+    "whole_run",
+]
+
+_LATER = {
+    "evedrop.scenario.application": (
+        "Application",
+        "ApplicationTally",
+        "ControlledPlant",
+        "Panel",
+        "PanelCurve",
+        "PanelFeed",
+        "PowerFeed",
+    ),
+    "evedrop.scenario.events.effects": (
+        "Jamming",
+        "Leave",
+        "LinkCut",
+        "LinkHealed",
+        "LinkSettings",
+        "Nothing",
+        "Return",
+        "Spoofing",
+    ),
+    "evedrop.scenario.events.event": ("Act", "EventKind"),
+    "evedrop.scenario.table": ("Table",),
+    "evedrop.show.view.column": ("Column", "scalars"),
+    "evedrop.show.view.palette": ("colour",),
+    "evedrop.show.view.panels.curves": ("curves_view", "line_style", "recent_slots", "whole_run"),
+    "evedrop.show.view.panels.panel": ("PlacedView", "ViewPanel"),
+    "evedrop.show.view.scene": ("PeerSlots", "Scene", "SceneSlots", "Shown"),
+}
+_MODULES = {name: module for module, names in _LATER.items() for name in names}
+"""Name → the module it is imported from when it is first used. Pydantic and Rerun, which these modules import, are slow to load,
+and a receiver whose class is not built in does not need them."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_MODULES[name]), name)

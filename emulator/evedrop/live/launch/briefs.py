@@ -1,0 +1,294 @@
+"""Makes the briefs of a scenario's processes: the knowledge and the keys of each process."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from evedrop.errors import NoAnswer, UsageError
+from evedrop.live.launch.closed_loop_briefs import LoopBriefs
+from evedrop.live.launch.ports import RouterEndpoints, Routers, endpoints_at, identities_of
+from evedrop.live.protocol.brief import AnyBrief, Brief, Flow, Model
+from evedrop.live.protocol.brief_closed_loop import encoded
+from evedrop.live.protocol.brief_parts import (
+    EavesdropperPart,
+    LegitimatePart,
+    LinkEntry,
+    ObserverPart,
+    Part,
+    ProgramEntry,
+    RelayPart,
+    RouterPart,
+    SensorPart,
+)
+from evedrop.live.protocol.message_limits import Sizes
+from evedrop.model.eavesdroppers import ANSWERS, STRATEGIES
+from evedrop.model.schemes import scheme_of
+from evedrop.model.slot.account import COUNTED_BURSTS
+from evedrop.names import ACKNOWLEDGEMENTS, CONTROLLER, LEGITIMATE, OBSERVER, OPERATOR, RELAY, ROUTER, SENSOR
+from evedrop.results.folder import new_folder
+from evedrop.scenario.controlled import monitor_of
+from evedrop.scenario.input_files import states_of
+from evedrop.scenario.plugins import named_in
+from evedrop.scenario.process import ProcessTable
+from evedrop.scenario.stream_keys import StreamKeys
+from evedrop.scenario.tables import Scenario
+from evedrop.score.acknowledging import ack_channel_of, chart_of
+
+_WINDOW_BYTES = 64 * 2**20
+_MOST_SLOTS_AHEAD = 4096
+_REPORT_SECONDS = 0.04
+LAUNCHED_PATIENCE = 30  # seconds
+
+
+def flow_of(scenario: Scenario) -> Flow:
+    """The flow control: a window of at most 4096 slots and 64 MiB, and four reports per window; with a pace, one every 40 ms.
+
+    A program that gives the states may be slow: at its own pace there is a report for each slot.
+    """
+    receivers = len(scenario.receivers)
+    slot_bytes = 8 * len(scenario.process.A) * scenario.trials * (2 * receivers + 2)
+    window = max(2, min(_MOST_SLOTS_AHEAD, _WINDOW_BYTES // slot_bytes))
+    batch = max(1, window // 4)
+    if scenario.pace:
+        batch = max(1, min(batch, round(_REPORT_SECONDS / scenario.pace)))
+    elif scenario.process.source == "zenoh":
+        batch = 1  # the program's pace is not known, and its messages should be on disk when it falls silent
+    sizes = sizes_of(scenario, batch)
+    return Flow(window, batch, scenario.longest_outage, max(sizes.of_kinds.values()))
+
+
+def sizes_of(scenario: Scenario, batch: int) -> Sizes:
+    """The dimensions that determine the sizes of messages; batch: slots of a report."""
+    plant, table = scenario.driven, scenario.controller
+    scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
+    return Sizes(
+        len(scenario.process.A),
+        scenario.trials,
+        scenario.record_trials,
+        batch,
+        max(scenario.window(name) for name in scenario.receivers),
+        len(scenario.receivers),
+        len(scheme.header),
+        0 if plant is None or table is None else plant.inputs,
+        1 if table is None else table.period,
+        monitor_of(scenario) is not None,
+    )
+
+
+def history_of(scenario: Scenario) -> int:
+    """How many slots before the first that is not done a restarted router must receive again.
+
+    Packets may be under way for the longest window of the receivers. If the scheme may be silent, the router must also see
+    the bursts of losses that are not over, which are counted up to a maximal length: a slot without a packet ends them. And on
+    some acknowledgements, the packets decide that the jammer has missed in a row: if the scheme may be silent, any number of
+    slots may be between them.
+    """
+    window = max(scenario.window(name) for name in scenario.receivers)
+    scheme, channel = scheme_of(scenario.process.process, scenario.encoding.spec), ack_channel_of(scenario)
+    memory = 0 if channel is None else min(channel.memory, scenario.slots)
+    if not scheme.may_be_silent:
+        return max(window, memory)
+    return scenario.slots if memory else max(window, COUNTED_BURSTS)
+
+
+@dataclass(frozen=True)
+class ObserverTask:
+    """The observer's task, in addition to the scenario: the results folder, and whether to record the run for the view."""
+
+    results: Path
+    recording: bool
+    shard: bool = False
+    """Whether the run is a shard of a larger one: its score will be merged, and it cannot be steered."""
+    paused: bool = False
+    """Whether the run is held before slot 0, until the operator lets it continue."""
+
+
+def briefs_of(
+    scenario: Scenario,
+    endpoints: RouterEndpoints | str,
+    observation: ObserverTask,
+    ends_with_stdin: bool = True,
+    patience: int = LAUNCHED_PATIENCE,
+) -> dict[str, AnyBrief]:
+    """Process name → brief, with a new run name, new passwords and, if the router takes them, new certificates.
+
+    endpoints: a string is the endpoint of one router, both to listen on and to connect to. Raises UsageError if their number
+    differs from the scenario's number of routers.
+    """
+    run = f"r{secrets.token_hex(4)}"
+    if isinstance(endpoints, str):
+        endpoints = endpoints_at(endpoints)
+    endpoints.check(scenario.relayed)
+    keys = StreamKeys.from_scenario(scenario)
+    steered = () if scenario.controller is None else (CONTROLLER,)
+    users = {
+        name: secrets.token_urlsafe(24) for name in (ROUTER, SENSOR, *scenario.receivers, *steered, OBSERVER, OPERATOR)
+    }
+    routers = Routers.for_users(users, endpoints)
+    spec = scenario.encoding.spec
+    scheme = scheme_of(scenario.process.process, spec)
+    public, mu_d = scenario.process, scenario.encoding.mu_d
+    matrices, header = (public.A, public.Q, public.initial_covariance), len(scheme.header)
+    model = Model(*matrices, mu_d, header, public.singular_noise, scenario.encoding.state_probabilities)
+    leaks, channel, chart = scenario.leaks, ack_channel_of(scenario), chart_of(scenario)
+    identities = identities_of(run, endpoints, tuple(users))
+    loop, flow = LoopBriefs(scenario), flow_of(scenario)
+    states = None if public.source == "zenoh" else states_of(scenario)
+    limits = sizes_of(scenario, flow.batch).of_kinds
+
+    def modules(**named: Any) -> str | None:
+        """The folder of own classes for a process whose part names one."""
+        return scenario.modules if any(named_in(named)) else None
+
+    def brief(process: str, owned: Mapping[str, bytes], part: Part) -> AnyBrief:
+        return Brief(
+            run=run,
+            process=process,
+            role=part.role,
+            router=str(endpoints.router.listen if process == ROUTER else routers.endpoint(process)),
+            user=process,
+            password=routers.password(process),
+            slots=scenario.slots,
+            trials=scenario.trials,
+            first_trial=scenario.first_trial,
+            recorded=scenario.record_trials,
+            flow=flow,
+            model=model,
+            keys={name: key.hex() for name, key in owned.items()},
+            part=part,
+            ends_with_stdin=ends_with_stdin,
+            patience=patience,
+            identity=identities.get(process),
+        )
+
+    schedules = {name: scenario.schedule(name) for name in scenario.receivers}
+    link_keys = keys.links(schedules)
+    if channel is not None:
+        link_keys[f"link/{ACKNOWLEDGEMENTS}"] = keys.acknowledgements
+    router = RouterPart(
+        links={name: LinkEntry.of(schedule) for name, schedule in schedules.items()},
+        pace=scenario.pace,
+        users=routers.at_router,
+        leaks=leaks,
+        acknowledgements=channel,
+        controller=loop.wiring,
+        zid=routers.zid,
+        limits=limits,
+        modules=scenario.modules,  # even if no link names a class: an operator can set another link model
+    )
+    made = [brief(ROUTER, link_keys, router)]
+    if endpoints.relay is not None and routers.zid is not None:
+        listen = str(endpoints.relay.listen)
+        relay = RelayPart(routers.at_relay, scenario.receivers, listen, routers.zid, loop.wiring, limits)
+        made.append(brief(RELAY, {}, relay))
+    sensor = SensorPart(
+        scheme=spec,
+        pace=scenario.pace,
+        receivers=scenario.receivers,
+        holds=sorted(
+            {slot for slot in scenario.timeline.holds if slot < scenario.slots} | ({0} if observation.paused else set())
+        ),
+        history=history_of(scenario),
+        leaks=leaks,
+        chart=chart,
+        plant=loop.plant,
+        controller=loop.of_sensor,
+        modules=modules(scheme=spec),
+        monitor=loop.monitor,
+        states=None if states is None else encoded(states),
+        program=_program_of(public),
+    )
+    made.append(brief(SENSOR, {**loop.sensor_keys(keys), **keys.secret(scheme.secret_streams)}, sensor))
+    legitimate = LegitimatePart(
+        scheme=spec,
+        window=scenario.window(LEGITIMATE),
+        outages=_outages(scenario, LEGITIMATE),
+        controller=loop.of_legitimate,
+        modules=modules(scheme=spec),
+    )
+    made.append(brief(LEGITIMATE, keys.secret(scheme.estimator_streams), legitimate))
+    observer = ObserverPart(
+        scenario=scenario.model_dump(mode="json"),
+        results=str(observation.results),
+        recording=observation.recording,
+        operator=users[OPERATOR],
+        shard=observation.shard,
+        paused=observation.paused,
+        operator_identity=identities.get(OPERATOR),
+        classes=_answers(scenario),
+    )
+    made.append(brief(OBSERVER, {}, observer))
+    if loop.of_controller is not None:
+        made.append(brief(CONTROLLER, {}, loop.of_controller))
+    for name, table in scenario.eavesdroppers.items():
+        eavesdropper = EavesdropperPart(
+            strategy=table.strategy,
+            parameters=table.parameters,
+            window=scenario.window(name),
+            outages=_outages(scenario, name),
+            noise_covariance=None if scheme.noise_law is None else scheme.noise_law.given,
+            modules=modules(strategy=table.strategy, parameters=table.parameters),
+        )
+        made.append(brief(name, keys.eavesdropper(name, table.strategy, table.parameters), eavesdropper))
+    return {one.process: one for one in made}
+
+
+def _program_of(process: ProcessTable) -> ProgramEntry | None:
+    """The program that publishes the states; None if none does."""
+    program = process.zenoh
+    if process.source != "zenoh" or program is None:
+        return None
+    return ProgramEntry(
+        program.key, process.states or (), process.around, program.connect, program.listen, program.offsets
+    )
+
+
+def _answers(scenario: Scenario) -> dict[str, Any]:
+    """The answers of eavesdroppers' classes that are not built in to all questions that the observer will ask."""
+    tables = scenario.eavesdroppers
+    names = {one for table in tables.values() for one in (table.strategy, table.reads_as) if one is not None}
+    foreign = {name for name in names if STRATEGIES.foreign(name)}
+    if foreign:
+        from evedrop.scenario.expected.expectations import expectations_of  # noqa: PLC0415 - slow to import, and seldom needed
+
+        for name, expectation in expectations_of(scenario).items():
+            if name in tables and foreign & {tables[name].strategy, tables[name].reads_as}:
+                try:
+                    expectation.traces(scenario.slots)
+                    _ = expectation.limit, expectation.infinite_variance
+                except NoAnswer as error:
+                    raise UsageError(f"eavesdroppers.{name}: its class cannot give its theory ({error})") from error
+    return ANSWERS.of(foreign)
+
+
+def _outages(scenario: Scenario, receiver: str) -> list[tuple[int, int, bool]]:
+    """A receiver's outages: first slot, first slot after, and whether it keeps its state."""
+    return [(one.start, one.stop, one.keeps_state) for one in scenario.timeline.outages[receiver]]
+
+
+def write_briefs(
+    scenario: Scenario, endpoints: RouterEndpoints, results: Path, folder: Path, patience: int, *, paused: bool = False
+) -> list[Path]:
+    """Write the briefs into a folder, for processes that are started by hand, on any hosts.
+
+    results: the observer's folder, on its host, relative to its working directory. patience: how many seconds processes
+    wait for each other. paused: as in `ObserverTask`. Raises UsageError if the folder is not empty or cannot be
+    written, and for a scenario in shards.
+    """
+    if scenario.shards > 1:
+        raise UsageError(
+            f"shards = {scenario.shards}: briefs belong to one run; give --set shards=1, or write the briefs of each shard "
+            "separately, with its own --first-trial and --trials"
+        )
+    made = briefs_of(
+        scenario, endpoints, ObserverTask(results, True, paused=paused), ends_with_stdin=False, patience=patience
+    )
+    try:
+        new_folder(folder)
+        return [brief.write(folder) for brief in made.values()]
+    except OSError as error:
+        raise UsageError(f"{folder} cannot be written ({error.strerror}); give another --out") from error

@@ -1,0 +1,378 @@
+"""The launcher's child processes: starts, watches and ends them, and finds the cause of a failure."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import signal
+import subprocess
+import threading
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import final
+
+from evedrop.errors import RunError
+from evedrop.live.launch.starter import (
+    CONNECTION_LOST,
+    FORK_SERVER_LOST,
+    GRACE_SECONDS,
+    StartedProcess,
+    Starter,
+    end_all,
+    start_process,
+)
+from evedrop.live.protocol.brief import AnyBrief
+from evedrop.live.protocol.brief_parts import ReceiverPart, RoutingPart
+from evedrop.live.protocol.keys import writer_of
+from evedrop.live.protocol.news import Alive, Finishing, ProcessRequest, RouterListens, RunOver, read_news
+from evedrop.names import OBSERVER, RELAY, ROUTER, SENSOR, ProcessAction
+from evedrop.results.folder import HeldFolder, private_opener
+from evedrop.scenario.news import News, RunEnded, Started, Tell
+from evedrop.system.environment import SINGLE_THREADED, check_zenoh_runtime, lock_step_environment, own_environment
+from evedrop.system.interrupts import INTERRUPTED
+from evedrop.system.processes import wait_for
+
+ROUTER_RESTARTS = 3  # how often routers that were ended by a signal are restarted in a run
+SILENCE_SECONDS = 30.0  # after which the launcher gives up on a silent observer, which sends a heartbeat every second
+_BEGIN_SECONDS = 30.0  # for a living observer to begin to write its results
+_FINISH_SECONDS = 600.0  # for it to write them: 10⁶ slots take some seconds
+_GONE_SECONDS = 5.0  # for a process that has left the network to end, and to say why in its log
+_AGAIN_SECONDS = 0.02  # until a request that cannot be carried out yet is looked at again
+_LOG_LINES = 12
+_COMPLAINT = "evedrop: "
+_HUBS = frozenset({ROUTER, RELAY, OBSERVER})
+_ROUTER_LOST = "has had no connection with the router"
+_NOT_THERE = re.compile(rf"evedrop: \S+: .*\b{OBSERVER}\b.* did not appear within")
+_FRAME = re.compile(r"stack backtrace:$|\s+\d+: |\s+at \S+:\d+")
+"""A line of a stack that Zenoh shows when it panics; the line before them says why."""
+_COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+_ZENOH_CLOSES = "Received Data for unknown expr_id"
+_REFUSED = re.compile(r"(?:malformed message|gap) on (evedrop/[^/\s]+/[a-z0-9_/-]+)")
+
+
+def _sender(complaint: str) -> str | None:
+    """The sender of the message that a complaint is about, by its key."""
+    found = _REFUSED.search(complaint)
+    return None if found is None else writer_of(found[1])
+
+
+@dataclass(frozen=True)
+class Exit:
+    """The end of a child process."""
+
+    process: str
+    status: int
+
+    @property
+    def manner(self) -> str:
+        """How it ended, as the end of a sentence that begins with the process's name."""
+        if self.status < 0:
+            return f"was ended by signal {-self.status}"
+        if self.status == INTERRUPTED:
+            return "was interrupted by a signal"
+        if self.status == CONNECTION_LOST:
+            return "was lost with its host"
+        if self.status == FORK_SERVER_LOST:
+            return "was ended with its fork server"
+        return f"ended with status {self.status}" if self.status else "left before the run ended"
+
+
+@final
+class Children:
+    """The processes of a run; all are ended on leaving the block."""
+
+    def __init__(
+        self, folder: HeldFolder, private: Path, lock_step: bool = False, starter: Starter = start_process
+    ) -> None:
+        """folder: of the results; private: of the briefs; lock_step: whether processes wait for each other every few slots."""
+        self._folder, self._starter = folder, starter
+        self._lock_step = lock_step
+        self._private = private
+        self._processes: dict[str, StartedProcess] = {}
+        self._news: SimpleQueue[News | Exit] = SimpleQueue()
+        self.silent_seconds = 0.0
+        """How many seconds the observer has been silent for."""
+        self.started = False
+        """Whether the conductor has started the run."""
+        self.over = False
+        """Whether the run is over, and all processes have been told to leave."""
+        self._finishing = False
+        self._listening = set[str]()
+        """The routers that have said that they listen."""
+        self._restarts = 0
+        self._briefs: dict[str, AnyBrief] = {}
+        self._killed: set[int] = set()
+        """Ids of processes whose end is not a failure: those killed by the scenario, and routers that were restarted."""
+
+    def __enter__(self) -> Children:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        end_all(self._processes.values())
+
+    def start(self, brief: AnyBrief, again: bool = False) -> None:
+        """Start the process of a brief, or restart it (`again`).
+
+        Its output goes to its log, the news of an observer or a router to the launcher. Raises
+        RunError if the system cannot start it, and UsageError if it could not open a session with this environment.
+        """
+        check_zenoh_runtime()
+        self._briefs[brief.process] = brief
+        self._listening.discard(brief.process)
+        if isinstance(brief.part, ReceiverPart) and brief.part.outages:
+            state_file = str((self._private / f"{brief.process}.state").absolute())
+            brief = replace(brief, part=replace(brief.part, state_file=state_file))
+        environment = {
+            **(lock_step_environment(brief.role) if self._lock_step else {}),
+            **own_environment(),
+            **SINGLE_THREADED,
+        }
+        if isinstance(brief.part, RoutingPart):
+            environment["TMPDIR"] = str(self._private)  # their password files are removed with the briefs
+        try:
+            path = brief.write(self._private)
+            log_file = self._folder.now / "logs" / f"{brief.process}.log"
+            with open(log_file, "ab" if again else "wb", opener=private_opener) as log:
+                process = self._starter(brief.role, path, log, environment)
+        except OSError as error:
+            why = error.strerror or str(error)
+            raise RunError(f"{brief.process} cannot be started ({why}); free system resources and run again") from error
+        before = self._processes.get(brief.process)
+        if before is not None and before.stdin is not None:
+            before.stdin.close()
+        self._processes[brief.process] = process
+        try:
+            threading.Thread(target=self._follow, args=(brief.process, process), daemon=True).start()
+        except RuntimeError:  # no thread can be started: nobody will read what the process tells
+            if process.stdout is not None:
+                process.stdout.close()
+            raise
+
+    def _follow(self, name: str, process: StartedProcess) -> None:
+        if process.stdout is not None:
+            with process.stdout as lines:
+                for line in lines:
+                    try:
+                        news = read_news(line)
+                        if name != OBSERVER and news != RouterListens(name):
+                            raise ValueError("only the observer sends such news")
+                        self._news.put(news)
+                    except ValueError as error:
+                        self._refuse(name, error)
+        status = process.wait()  # without a limit: nobody waits for this thread
+        if process.pid not in self._killed:
+            self._news.put(Exit(name, status))
+
+    def _refuse(self, name: str, error: ValueError) -> None:
+        """Write into a process's log that the launcher cannot read its news."""
+        with (
+            contextlib.suppress(OSError),
+            (self._folder.now / "logs" / f"{name}.log").open("a", encoding="utf-8") as log,
+        ):
+            log.write(f"{_COMPLAINT}the launcher refused malformed news: {error}\n")
+
+    def listens(self, router: str) -> bool:
+        """Whether a router or relay has said that it listens; true for one that cannot say so, or is not there."""
+        process = self._processes.get(router)
+        return process is None or process.stdout is None or router in self._listening
+
+    def restart_router(self, ended: Exit) -> bool:
+        """Restart a router or relay if a signal ended it, a few times per run; returns whether it was restarted."""
+        signalled = ended.status < 0 or ended.status == INTERRUPTED
+        if ended.process not in {ROUTER, RELAY} or not signalled or self._restarts == ROUTER_RESTARTS:
+            return False
+        self._restarts += 1
+        self._killed.add(self._processes[ended.process].pid)
+        self.start(self._briefs[ended.process], again=True)
+        return True
+
+    def act(self, request: ProcessRequest) -> None:
+        """Carry out the observer's request on a process, and confirm it as soon as it is carried out.
+
+        Raises RunError if a process cannot be restarted.
+        """
+        name, process = request.process, self._processes[request.process]
+        if request.do == ProcessAction.END:
+            self._killed.add(process.pid)
+            process.kill()
+            threading.Thread(target=self._confirm_end, args=(process, request), daemon=True).start()
+            return
+        if request.do == ProcessAction.START:
+            self.start(replace(self._briefs[name], first=request.first), again=True)
+        else:
+            with contextlib.suppress(ProcessLookupError):
+                process.send_signal(signal.SIGSTOP if request.do == ProcessAction.STOP else signal.SIGCONT)
+        self._confirm(request)
+
+    def _confirm_end(self, process: StartedProcess, request: ProcessRequest) -> None:
+        """Confirm that a process has ended, whenever its fork server or its host says so."""
+        process.wait()  # without a limit: nobody waits for this thread
+        if process.stdin is not None:
+            process.stdin.close()
+        self._confirm(request)
+
+    def _confirm(self, request: ProcessRequest) -> None:
+        observer = self._processes[OBSERVER].stdin
+        if observer is not None:
+            with contextlib.suppress(OSError):
+                observer.write(b"%d\n" % request.number)
+                observer.flush()
+
+    def news(self, seconds: float) -> News | Exit | None:
+        """The next news or exit that concerns the caller, or None; waits for `seconds` at most.
+
+        A process that is to be started again waits, as the others did, until its router listens.
+        """
+        try:
+            news = self._news.get(timeout=seconds)
+        except Empty:
+            self.silent_seconds += seconds
+            return None
+        if isinstance(news, Exit):
+            return news
+        self.silent_seconds = 0.0
+        match news:
+            case Started():
+                self.started = True
+            case RouterListens(process):
+                self._listening.add(process)
+            case ProcessRequest(ProcessAction.START) if not all(self.listens(name) for name in (ROUTER, RELAY)):
+                self._news.put(news)
+                time.sleep(_AGAIN_SECONDS)
+            case ProcessRequest():
+                self.act(news)
+            case RunOver():
+                self.over = True
+            case Finishing():
+                self._finishing = True
+        return None if isinstance(news, Alive | RouterListens | ProcessRequest | RunOver | Finishing) else news
+
+    def conclude(self, tell: Tell, patience: float = 0.0) -> RunEnded | None:
+        """End the observer, at once or after `patience` seconds; returns its `RunEnded`, or None if it sent none.
+
+        Once it has begun to write the results, it may take `_FINISH_SECONDS`, as long as it sends heartbeats.
+        """
+        self.terminate(OBSERVER, patience)
+        begun = time.monotonic()
+        ending: RunEnded | None = None
+        while self.silent_seconds < SILENCE_SECONDS and (
+            time.monotonic() - begun < (_FINISH_SECONDS if self._finishing else _BEGIN_SECONDS)
+        ):
+            news = self.news(0.05)
+            if isinstance(news, Exit):
+                if news.process == OBSERVER:
+                    break
+            elif news is not None:
+                tell(news)
+                ending = news if isinstance(news, RunEnded) else ending
+        return ending
+
+    def terminate(self, name: str, after: float = 0.0) -> None:
+        """Ask a child to end, unless it ends by itself within `after` seconds."""
+        process = self._processes.get(name)
+        if process is None:
+            return
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(after)
+        if process.poll() is None:
+            process.terminate()
+
+    def wait_all(self) -> None:
+        """Wait for all processes to leave by themselves, for `GRACE_SECONDS` at most."""
+        wait_for(self._processes.values(), GRACE_SECONDS)
+
+    def failure_report(self, first: Exit | None, ending: RunEnded | None) -> str:
+        """The failure in words: the process at fault, and the last lines of its log and of the log that accuses it.
+
+        first: the first process that ended too early, if any; ending: the end as the observer reported it, if it did.
+        """
+        if orphans := [name for name, process in self._processes.items() if process.poll() == FORK_SERVER_LOST]:
+            theirs = ", ".join(orphans)
+            return f"the fork server of {theirs} ended or stopped responding (killed, suspended or out of memory); run again"
+        suspects, accused = ([], []) if ending is None else (list(ending.suspects), list(ending.accused))
+        why = ending.how if ending is not None and ending.status not in {0, 1, INTERRUPTED} else ""
+        lost = None if first is None else self._lost_by_all(first.process, suspects)
+        if lost is not None:
+            first, suspects = None, [lost]  # the router is at fault, not the process that gave up first
+        if first is not None and self._missed_observer(first.process):
+            return "\n".join(
+                [f"{OBSERVER}: {why}" if why else f"{OBSERVER} did not appear", *self._log_lines(OBSERVER)]
+            )
+        if not accused and (first is None or (first.process == OBSERVER and first.status > 0)):
+            first = self._first_failure(suspects) or first
+        if accused and why:
+            named, head = [name for name in accused if name in self._processes], why
+        elif first is not None:
+            named, head = [first.process], f"{first.process} {first.manner}"
+            words = reversed(self._log(first.process))
+            why = next((line for line in words if line.startswith(_COMPLAINT)), "")
+            if first.status == CONNECTION_LOST and why:
+                head = f"{first.process} was lost: {why.removeprefix(_COMPLAINT)}"
+        elif suspects:
+            named, head = suspects, f"{', '.join(suspects)} stopped responding: hung, suspended or cut off"
+        else:
+            named, head = [], f"the run failed: {why}"
+        at_fault = _sender(why)
+        if at_fault is not None and at_fault in self._processes and (at_fault not in named or accused):
+            named = list(dict.fromkeys([at_fault, *named]))
+            head = f"{at_fault} broke the protocol: {why.removeprefix(_COMPLAINT)}"
+        return "\n".join([head, *(line for name in named for line in self._log_lines(name))])
+
+    def _first_failure(self, suspects: list[str]) -> Exit | None:
+        """A child that failed or left too early, other than the observer. Waits a moment for missing processes to end."""
+        deadline = time.monotonic() + (_GONE_SECONDS if suspects else 0.0)
+        while True:
+            ended = {
+                name: process.poll()
+                for name, process in self._processes.items()
+                if name != OBSERVER and process.pid not in self._killed
+            }
+            for name, status in ended.items():
+                for_others = self._missed_observer(name) or (
+                    {ROUTER, RELAY} & set(suspects) and self._lost_router(name)
+                )
+                if status and not for_others:
+                    return Exit(name, status)
+            if suspects and all(ended.get(name) == 0 for name in suspects):
+                return Exit(suspects[0], 0)
+            if time.monotonic() > deadline:
+                return None
+            time.sleep(0.01)
+
+    def _missed_observer(self, name: str) -> bool:
+        """Whether a process ended because the observer did not appear."""
+        return any(_NOT_THERE.match(line) for line in self._log(name))
+
+    def _lost_router(self, name: str) -> bool:
+        """Whether a process ended because it could no longer reach its router."""
+        return any(_ROUTER_LOST in line for line in self._log(name))
+
+    def _lost_by_all(self, name: str, suspects: list[str]) -> str | None:
+        """The router that a process gave up on, if the observer or all its other users miss it, too; otherwise None."""
+        if not self._lost_router(name):
+            return None
+        if missed := next((one for one in (RELAY, ROUTER) if one in suspects), None):
+            return missed
+        place = self._briefs[name].router
+        others = [one for one, brief in self._briefs.items() if brief.router == place and one not in _HUBS]
+        deadline = time.monotonic() + (_GONE_SECONDS if len(others) > 1 and not suspects else 0.0)
+        while time.monotonic() < deadline:
+            if all(self._lost_router(one) for one in others):
+                return RELAY if RELAY in self._processes and name != SENSOR else ROUTER
+            time.sleep(0.05)
+        return None
+
+    def _log(self, name: str) -> list[str]:
+        """The lines of a log, without Zenoh's lines about messages that arrive while its session closes."""
+        try:
+            text = _COLOUR.sub("", (self._folder.now / "logs" / f"{name}.log").read_text("utf-8", "replace"))
+        except OSError as error:
+            return [f"(cannot be read: {error.strerror})"]
+        return [line for line in text.splitlines() if _ZENOH_CLOSES not in line]
+
+    def _log_lines(self, name: str) -> list[str]:
+        log = [line for line in self._log(name) if not _FRAME.match(line)]
+        lines = log[-_LOG_LINES:] or ["(it wrote nothing)"]
+        return [f"the last lines of logs/{name}.log:", *(f"    {line}" for line in lines)]

@@ -1,0 +1,99 @@
+"""The launcher: runs a scenario in one set of processes, or in one set for each of its shards.
+
+It imports neither zenoh nor rerun. It alone decides how the run ended.
+"""
+
+from __future__ import annotations
+
+import shlex
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from evedrop.errors import UsageError
+from evedrop.live.launch.ports import loopback_endpoints, warn_if_exposed
+from evedrop.live.launch.preloading import process_starter
+from evedrop.live.launch.process_set import Ended, launch_one
+from evedrop.scenario.news import Tell
+from evedrop.scenario.tables import Scenario
+from evedrop.show.view.viewer import choose
+from evedrop.system.output import say
+from evedrop.system.signals import stop_on_signals, told_when_suspended
+
+if TYPE_CHECKING:
+    from evedrop.live.launch.hosts_file import HostsPlan
+    from evedrop.live.launch.starter import Starter
+
+_HOSTS_PATIENCE = 120  # seconds; some hosts take long to start Python
+
+
+def launch(
+    scenario: Scenario,
+    folder: Path,
+    view: str,
+    listen: str | None,
+    tell: Tell,
+    relay: str | None = None,
+    *,
+    paused: bool = False,
+    hosts: HostsPlan | None = None,
+) -> Ended:
+    """Run a scenario live into a results folder; `tell` gets the observer's news as they come.
+
+    view: auto, native, web or off; listen, relay: the endpoints of router and relay, if there is one; by default no
+    port, or free ports for two routers; paused: whether the run is held before slot 0, until the operator lets it continue;
+    hosts: the hosts of processes that are not on this machine, and the endpoints of the routers then.
+
+    Raises UsageError before any process is started, RunError if the run failed, Interrupted on Ctrl-C or SIGTERM; in the
+    last two cases the results so far are in the folder and no process is left.
+    """
+    view = choose(view)
+    pausing = f"; to pause it, type `evedrop pause {shlex.quote(str(folder))}`" if scenario.shards == 1 else ""
+
+    def suspended() -> None:
+        say(f"the processes of the run go on, and only this command stops{pausing}; `fg` continues the command")
+
+    with stop_on_signals() as stop, told_when_suspended(suspended), process_starter(stop) as start:
+        if hosts is not None:
+            return _on_hosts(scenario, folder, view, tell, stop, start, hosts, paused)
+        if scenario.shards == 1:
+            endpoints = None
+            if listen is not None or relay is not None or scenario.relayed:
+                endpoints = loopback_endpoints(listen, relay, scenario.relayed)
+                warn_if_exposed(endpoints)
+            return launch_one(scenario, folder, view, endpoints, tell, stop, start, paused=paused)
+        from evedrop.live.launch.shards import launch_shards  # noqa: PLC0415 - not needed for one set of processes
+
+        given = {"listen": listen, "relay": relay}
+        for option, endpoint in given.items():
+            if endpoint is not None:
+                raise UsageError(
+                    f"{option}: {endpoint} is one router's endpoint, and each of the {scenario.shards} shards has its own; "
+                    "leave it out, or give shards=1"
+                )
+        if paused:
+            raise UsageError(f"--paused: a run in {scenario.shards} shards cannot be steered; give --set shards=1")
+        return launch_shards(scenario, folder, view, tell, stop, start)
+
+
+def _on_hosts(
+    scenario: Scenario,
+    folder: Path,
+    view: str,
+    tell: Tell,
+    stop: threading.Event,
+    here: Starter,
+    hosts: HostsPlan,
+    paused: bool,
+) -> Ended:
+    """Run a scenario as `launch` does, with processes on other hosts."""
+    from evedrop.live.launch.ssh_starter import ssh_starter  # noqa: PLC0415 - not needed on one machine
+
+    if scenario.shards > 1:
+        raise UsageError(
+            f"--hosts: the scenario has {scenario.shards} shards, and hosts carry one run; give --set shards=1"
+        )
+    with ssh_starter(hosts, here, stop, scenario.longest_outage) as start:
+        return launch_one(
+            scenario, folder, view, hosts.endpoints, tell, stop, start, paused=paused, patience=_HOSTS_PATIENCE
+        )

@@ -1,0 +1,121 @@
+"""The folder for the briefs of a run, which hold keys and passwords; it is removed even if the launcher is killed.
+
+A shell that holds the other end of a pipe to the launcher removes the folder when the launcher is dead. The launcher also
+holds a lock in the folder, which the system releases when the launcher dies: if the shell was killed, too, the next run
+finds the folder unlocked, and removes it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import secrets
+import shutil
+import signal
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from evedrop.errors import UsageError
+from evedrop.live.network.endpoint import can_be_socket
+from evedrop.names import ROUTER
+from evedrop.system.environment import own_environment
+from evedrop.system.processes import kill, signalled_when_parent_dies
+
+_PREFIX = "evedrop-"
+_LOCK = "lock"
+_SHORT = Path("/tmp")  # noqa: S108 - the folder in it is as private as one elsewhere
+"""Where sockets are if the paths in the folder for temporary files cannot be those of sockets."""
+_GUARD_SECONDS = 5.0
+# A process that is still starting may write into the folder while it is being removed, so try again.
+_GUARD = (
+    "while read -r _; do :; done; tries=0; "
+    'while [ -e "$1" ] && [ $tries -lt 50 ]; do rm -rf -- "$1" 2>/dev/null || sleep 0.2; tries=$((tries + 1)); done'
+)
+
+
+@contextlib.contextmanager
+def private_folder(where: Path | None = None) -> Iterator[Path]:
+    """A folder that only this user can read, removed after the block. Raises UsageError if it cannot be made.
+
+    where: the folder to make it in; the one for temporary files by default.
+    """
+    try:
+        where = (where or Path(tempfile.gettempdir())).absolute()
+        _sweep(where)
+        folder = where / f"{_PREFIX}{secrets.token_hex(8)}"
+        guard = _guard(folder)
+    except OSError as error:
+        raise _unmade(error) from error
+    try:
+        with _locked(folder):
+            yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        _dismiss(guard)
+
+
+@contextlib.contextmanager
+def socket_folder(private: Path) -> Iterator[Path]:
+    """The private folder of a run, or another one, if a path in it is too long for a socket. Raises UsageError."""
+    if can_be_socket(str(private / ROUTER)):
+        yield private
+        return
+    with private_folder(_SHORT) as folder:
+        yield folder
+
+
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Make the folder, and hold the lock in it."""
+    try:
+        folder.mkdir(mode=0o700)
+        lock = (folder / f"{_LOCK}.new").open("wb")
+    except OSError as error:
+        raise _unmade(error) from error
+    with lock:
+        with contextlib.suppress(OSError):  # on a file system without locks, nothing is swept
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            os.replace(lock.name, folder / _LOCK)  # so that the file never exists unlocked
+        yield
+
+
+def _unmade(error: OSError) -> UsageError:
+    return UsageError(f"cannot make a temporary folder ({error.strerror}); set TMPDIR to a folder that can be written")
+
+
+def _guard(folder: Path) -> subprocess.Popen[bytes]:
+    """Start the shell that removes the folder when the launcher is dead; called before the folder is made."""
+    # A suspended shell would not notice that the launcher is dead.
+    return subprocess.Popen(
+        signalled_when_parent_dies(["/bin/sh", "-c", _GUARD, "sh", str(folder)], signal.SIGCONT),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+        env=own_environment(),
+    )
+
+
+def _dismiss(guard: subprocess.Popen[bytes]) -> None:
+    """End the shell, which finds nothing to remove."""
+    assert guard.stdin is not None  # noqa: S101 - it was started with a pipe
+    guard.stdin.close()
+    guard.send_signal(signal.SIGCONT)
+    try:
+        guard.wait(_GUARD_SECONDS)
+    except subprocess.TimeoutExpired:
+        kill(guard)
+
+
+def _sweep(where: Path) -> None:
+    """Remove this user's folders whose launcher is dead."""
+    for folder in where.glob(f"{_PREFIX}*"):
+        with contextlib.suppress(OSError):
+            if folder.is_symlink() or folder.stat().st_uid != os.getuid():
+                continue
+            with (folder / _LOCK).open("rb+") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(folder, ignore_errors=True)

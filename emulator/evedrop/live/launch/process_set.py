@@ -1,0 +1,210 @@
+"""Launches one set of processes, watches it to its end, and ends it whatever happens.
+
+Children have sessions of their own, so a Ctrl-C reaches only the launcher. Each holds the other end of a pipe, so none
+outlives the launcher, even if that is killed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from evedrop.errors import EvedropError, Interrupted, RunError, UsageError
+from evedrop.live.launch.briefs import LAUNCHED_PATIENCE, ObserverTask, briefs_of
+from evedrop.live.launch.children import SILENCE_SECONDS, Children, Exit
+from evedrop.live.launch.ports import RouterEndpoints, socket_endpoints
+from evedrop.live.launch.private_folder import private_folder, socket_folder
+from evedrop.live.launch.starter import Starter
+from evedrop.live.network.control_file import remove_control
+from evedrop.names import OBSERVER, RELAY, ROUTER
+from evedrop.results.folder import HeldFolder, make_private, new_folder
+from evedrop.results.resolved_scenario import write_resolved
+from evedrop.scenario.news import FolderMoved, RunEnded, Tell, ViewOpened
+from evedrop.scenario.tables import Scenario
+from evedrop.show.view.viewer import Viewer
+from evedrop.system.interrupts import INTERRUPTED
+from evedrop.system.signals import AFTERTHOUGHT_SECONDS
+
+_LOOK_SECONDS = 0.1  # how soon a signal is noticed
+_EARLY_SECONDS = 1.0
+
+
+@dataclass(frozen=True)
+class Ended:
+    """The end of a run."""
+
+    status: int
+    """Its exit status."""
+    viewer: Viewer | None
+    """The viewer, if one is still open."""
+    folder: Path
+    """The results folder, which may have been renamed."""
+
+
+def launch_one(
+    scenario: Scenario,
+    folder: Path,
+    view: str,
+    endpoints: RouterEndpoints | None,
+    tell: Tell,
+    stop: threading.Event,
+    starter: Starter,
+    *,
+    shard: bool = False,
+    paused: bool = False,
+    patience: int = LAUNCHED_PATIENCE,
+) -> Ended:
+    """Run a scenario as `launch` does, in one set of processes, until `stop` is set.
+
+    endpoints: None for a socket in a private folder, which other users cannot enter.
+    shard: whether other sets of processes carry further trials; patience: seconds for which processes wait for each other.
+    """
+    with (
+        private_folder() as private,
+        _endpoints(endpoints, private) as at,
+        contextlib.closing(HeldFolder(new_folder(folder))) as held,
+    ):
+        make_private(folder / "logs")
+        viewer = None
+        try:
+            # At once, so that a run that is interrupted or killed in its first moments can be run again.
+            with contextlib.suppress(OSError):  # the observer writes it, too, and reports why it cannot
+                write_resolved(folder, scenario)
+            task = ObserverTask(folder.absolute(), view != "off", shard, paused)
+            briefs = briefs_of(scenario, at, task, patience=patience)
+            observer = briefs.pop(OBSERVER)
+            with Children(held, private, scenario.controller is not None, starter) as children:
+                for name in (ROUTER, RELAY):
+                    if name in briefs:
+                        children.start(briefs.pop(name))
+                        _wait_until_listening(children, name, stop, patience)
+                for brief in briefs.values():
+                    children.start(brief)
+                # The other processes start up at the same time as the viewer.
+                viewer = Viewer.start(view, folder / "logs", folder.absolute() / "recording.rrd")
+                if viewer is not None:
+                    tell(ViewOpened(viewer.address, viewer.warning))
+                children.start(observer)
+                status = follow_to_end(children, stop, tell)
+                if viewer is not None:
+                    viewer.complete()
+        except BaseException as error:
+            if viewer is not None:
+                viewer.stop()
+            if isinstance(error, UsageError):
+                _forget(folder)
+            elif isinstance(error, EvedropError):
+                # Tables and theory are slow to import, and a run that ends well needs neither.
+                from evedrop.results.ending import note_end  # noqa: PLC0415
+
+                with contextlib.suppress(OSError):
+                    note_end(held.now, scenario, "interrupted" if isinstance(error, Interrupted) else str(error))
+            if isinstance(error, Interrupted):
+                raise Interrupted.with_results(_now(held)) from None
+            raise
+        finally:
+            now = _now(held)
+            remove_control(now)
+            if now != held.first:
+                tell(FolderMoved(str(now)))
+    return Ended(status, viewer, now)
+
+
+@contextlib.contextmanager
+def _endpoints(given: RouterEndpoints | None, private: Path) -> Iterator[RouterEndpoints]:
+    """The given endpoints, or a socket in a private folder."""
+    if given is not None:
+        yield given
+        return
+    with socket_folder(private) as folder:
+        yield socket_endpoints(folder)
+
+
+def _wait_until_listening(children: Children, router: str, stop: threading.Event, patience: float) -> None:
+    """Wait until a router says that it listens: a process that is started earlier might connect to another program there.
+
+    Raises RunError if the router ends, or is silent for `patience` seconds; Interrupted if stopped meanwhile.
+    """
+    deadline = time.monotonic() + patience
+    while not children.listens(router):
+        if stop.is_set():
+            raise Interrupted
+        news = children.news(_LOOK_SECONDS)
+        if isinstance(news, Exit) and not _meant_us_too(news, stop) and not children.restart_router(news):
+            raise RunError(children.failure_report(news, None))
+        if time.monotonic() > deadline:
+            raise RunError(
+                f"{router} did not listen within {patience:.0f} s of its start, so no other process was started; run again, and "
+                f"look at logs/{router}.log if it happens again"
+            )
+
+
+def _now(held: HeldFolder) -> Path:
+    """The results folder, which may have been renamed; its first name if it was removed."""
+    try:
+        return held.now
+    except FileNotFoundError:
+        return held.first
+
+
+def _forget(folder: Path) -> None:
+    """Remove the folder of a run that was not started, so that the next run can use it."""
+    with contextlib.suppress(OSError):
+        shutil.rmtree(folder)
+
+
+def follow_to_end(children: Children, stop: threading.Event, tell: Tell) -> int:
+    """Follow the run to its end; returns the exit status that the observer gives it."""
+    early: tuple[Exit, float] | None = None
+    ending: RunEnded | None
+    while True:
+        if early is not None and not children.over and time.monotonic() - early[1] > _EARLY_SECONDS:
+            raise RunError(children.failure_report(early[0], children.conclude(tell)))
+        if stop.is_set():
+            ending = _stopped(children, tell)
+            break
+        if children.silent_seconds > SILENCE_SECONDS:
+            raise RunError(children.failure_report(None, RunEnded(RunError.exit_status, "", [OBSERVER])))
+        news = children.news(_LOOK_SECONDS)
+        ending = None
+        if isinstance(news, Exit):
+            if _meant_us_too(news, stop) or (
+                news.process != OBSERVER and (news.status == 0 or children.restart_router(news))
+            ):
+                # A process that leaves at the end may be faster than the news that the run is over.
+                early = early or ((news, time.monotonic()) if news.status == 0 else None)
+                continue
+            if news.process != OBSERVER:
+                # An observer that has just ended may still report so; a running one would wait for the lost process in vain.
+                ending = children.conclude(tell)
+            if ending is None or not ending.well:
+                raise RunError(children.failure_report(news, ending))
+        elif news is not None:
+            tell(news)
+            ending = news if isinstance(news, RunEnded) else None
+        if ending is not None:
+            break
+    if ending.status == Interrupted.exit_status:
+        raise Interrupted
+    if not ending.well:
+        raise RunError(children.failure_report(None, ending))
+    children.wait_all()
+    return ending.status
+
+
+def _stopped(children: Children, tell: Tell) -> RunEnded:
+    """End the run after a signal; returns its end if it was complete before. Raises Interrupted otherwise."""
+    ending = children.conclude(tell)
+    if ending is None or not ending.well:
+        raise Interrupted
+    return ending
+
+
+def _meant_us_too(ended: Exit, stop: threading.Event) -> bool:
+    """Whether the signal that ended a child soon reaches the launcher, too, as when a closing terminal hangs up on all."""
+    return ended.status == INTERRUPTED and stop.wait(AFTERTHOUGHT_SECONDS)

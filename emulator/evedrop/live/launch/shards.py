@@ -1,0 +1,210 @@
+"""A live run in shards: contiguous ranges of its trials, each carried by a run of its own, all under one launcher.
+
+Trials share only the scenario, and every random number is addressed by its trial. So a shard is a complete run, with router,
+sensor, receivers and observer, independent of all others. `gathering` merges their results.
+
+Source: docs/scale.md.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import final
+
+from evedrop.errors import Interrupted, RunError, UsageError
+from evedrop.live.launch.ports import RouterEndpoints, loopback_endpoints
+from evedrop.live.launch.process_set import Ended, launch_one
+from evedrop.live.launch.shard import SHARDS_FOLDER, Shard, shards_of
+from evedrop.live.launch.starter import Starter
+from evedrop.model.kernels.elementary import sum_in_order
+from evedrop.results.folder import HeldFolder, new_folder
+from evedrop.results.resolved_scenario import write_resolved
+from evedrop.scenario.news import ConnectionOutage, FolderMoved, News, RunEnded, RunProgress, Started, Tell
+from evedrop.scenario.tables import Scenario
+from evedrop.show.view.viewer import Viewer
+from evedrop.system.threads import wait_for_thread
+
+_LOOK_SECONDS = 0.25
+
+
+@final
+class OneProgress:
+    """Merges the news of all shards into those of one run, whose progress is the slowest shard's; thread-safe."""
+
+    def __init__(self, shards: Sequence[Shard], tell: Tell) -> None:
+        self._trials = {shard.number: shard.scenario.trials for shard in shards}
+        self._slots = shards[0].scenario.slots
+        self._tell = tell
+        self._lock = threading.Lock()
+        self._latest: dict[int, RunProgress] = {}
+        self._waited_for = set(self._trials)
+        self.started: float | None = None
+        """When the first shard began, by the monotonic clock."""
+
+    def of(self, shard: Shard) -> Tell:
+        """A function that takes the news of one shard."""
+
+        def tell(news: News) -> None:
+            with self._lock:
+                self._take(shard.number, news)
+
+        return tell
+
+    def _take(self, number: int, news: News) -> None:
+        match news:
+            case Started():
+                self.started = time.monotonic() if self.started is None else self.started
+                self._waited_for.discard(number)
+                if not self._waited_for:
+                    self._tell(news)
+            case RunProgress():
+                self._latest[number] = news
+                if len(self._latest) == len(self._trials):
+                    self._tell(self._all())
+            case FolderMoved():
+                pass  # a shard's folder moves with the run's, which is reported separately
+            case ConnectionOutage():
+                self._tell(replace(news, shard=number))
+            case _:
+                if isinstance(news, RunEnded) and news.well and number in self._latest:
+                    # Its last slots were too few for a progress report.
+                    self._latest[number] = replace(self._latest[number], done=self._slots)
+                self._tell(news)
+
+    def _all(self) -> RunProgress:
+        """The slowest shard's progress and rate, with the errors over all trials."""
+        slowest = min(self._latest.values(), key=lambda one: one.done)
+        trials = sum(self._trials.values())
+        errors = {
+            name: sum_in_order(self._trials[number] * one.squared_errors[name] for number, one in self._latest.items())
+            / trials
+            for name in slowest.squared_errors
+        }
+        return replace(slowest, squared_errors=errors)
+
+
+@final
+@dataclass
+class _ShardsState:
+    """The state of the shards so far."""
+
+    failures: list[tuple[Shard, BaseException]] = field(default_factory=list)
+    """In order of time."""
+    viewer: Viewer | None = None
+
+    def launched(
+        self,
+        shard: Shard,
+        at: RouterEndpoints | None,
+        tell: Tell,
+        view: str,
+        stop: threading.Event,
+        starter: Starter,
+    ) -> None:
+        """Run one shard to its end, its routers at these endpoints, or at a socket; if it ends early, all shards end."""
+        try:
+            ended = launch_one(shard.scenario, shard.folder, view, at, tell, stop, starter, shard=True)
+        except BaseException as error:
+            self.failures.append((shard, error))
+            stop.set()
+        else:
+            self.viewer = self.viewer or ended.viewer
+
+    @property
+    def fault(self) -> tuple[Shard, BaseException] | None:
+        """The first shard that failed, and its error, which ended the others; None if all ended well or the user ended them."""
+        found = (one for one in self.failures if not isinstance(one[1], Interrupted))
+        return next(found, None)
+
+
+def launch_shards(
+    scenario: Scenario,
+    folder: Path,
+    view: str,
+    tell: Tell,
+    stop: threading.Event,
+    starter: Starter,
+) -> Ended:
+    """Run a scenario in its shards, all at the same time, into one results folder; raises as `launch` does.
+
+    The view shows the first shard, which has the recorded trials.
+    """
+    endpoints = _endpoints(scenario.shards) if scenario.relayed else [None] * scenario.shards
+    held = HeldFolder(new_folder(folder))
+    with contextlib.suppress(OSError):  # it is written again when the shards are merged, and an error reported then
+        write_resolved(folder, scenario)
+    shards = shards_of(scenario, folder)
+    progress, state = OneProgress(shards, tell), _ShardsState()
+    first, *others = [(shard, at, progress.of(shard)) for shard, at in zip(shards, endpoints, strict=True)]
+    threads = [threading.Thread(target=state.launched, args=(*one, "off", stop, starter)) for one in others]
+    for thread in threads:
+        thread.start()
+    # On this thread, not on another one: a viewer ends with the thread that started it.
+    state.launched(*first, view, stop, starter)
+    try:
+        for thread in threads:
+            while thread.is_alive() and not stop.is_set():  # a run lasts as long as it lasts
+                thread.join(_LOOK_SECONDS)
+            wait_for_thread(thread)
+        now = held.now
+        if now != folder:
+            tell(FolderMoved(str(now)))
+            shards = [replace(shard, folder=now / SHARDS_FOLDER / str(shard.number)) for shard in shards]
+        return Ended(_made_one(scenario, now, shards, state, progress.started), state.viewer, now)
+    except BaseException as error:
+        if state.viewer is not None:
+            state.viewer.stop()
+        if isinstance(error, FileNotFoundError):
+            raise RunError(
+                f"{folder} was removed while the run went on; run again, and leave it where it is"
+            ) from error
+        raise
+    finally:
+        held.close()
+
+
+def _endpoints(shards: int) -> list[RouterEndpoints | None]:
+    """The endpoints of two routers for each shard; free ports may coincide as long as no router listens on them."""
+    found: list[RouterEndpoints | None] = []
+    taken = set[str]()
+    while len(found) < shards:
+        endpoints = loopback_endpoints(None, None, relayed=True)
+        ports = {str(one.listen) for one in (endpoints.router, endpoints.relay) if one is not None}
+        if not ports & taken:
+            found.append(endpoints)
+            taken |= ports
+    return found
+
+
+def _made_one(
+    scenario: Scenario, folder: Path, shards: Sequence[Shard], state: _ShardsState, started: float | None
+) -> int:
+    """Merge the shards' results into the run's; returns its exit status. Raises the error that ended it, if there was one."""
+    from evedrop.live.launch.gathering import gather  # noqa: PLC0415 - slow to import: start the run first
+
+    fault, how = state.fault, "interrupted" if state.failures else "complete"
+    if fault is not None:
+        shard, error = fault
+        if isinstance(error, UsageError):
+            shutil.rmtree(folder)  # the run was not started
+        if not isinstance(error, RunError):
+            raise error
+        how = shard.of_run(error)
+    try:
+        summary = gather(scenario, folder, shards, started, how)
+    except OSError as error:
+        raise RunError(
+            f"the results of the shards cannot be merged ({error}); those of each are in {folder / SHARDS_FOLDER}; free some "
+            "space, and run again"
+        ) from error
+    if fault is not None:
+        raise RunError(how)
+    if state.failures:
+        raise Interrupted.with_results(folder)
+    return 1 if summary.failed_expectations else 0

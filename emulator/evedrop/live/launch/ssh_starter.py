@@ -1,0 +1,334 @@
+"""Starts processes of a run on other hosts, over ssh: one connection for each host, with the system's `ssh`.
+
+Each host gets the briefs of its own processes and no others, over the connection. When the connection closes, however that
+happens, the processes there end.
+
+Source: docs/hosts.md, how it works.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import itertools
+import os
+import select
+import shlex
+import shutil
+import signal
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import IO, final
+
+from evedrop.errors import Interrupted, RunError, UsageError
+from evedrop.live.launch.host_messages import (
+    MOST_NOISE,
+    Answer,
+    LauncherHeartbeat,
+    LogText,
+    Order,
+    SendSignal,
+    StartProcess,
+    answer_in,
+    greeting_in,
+    line_of,
+    own_version,
+)
+from evedrop.live.launch.hosts_file import HostsPlan, HostTable
+from evedrop.live.launch.starter import CONNECTION_LOST, FORK_SERVER_LOST, ReportedProcess, StartedProcess, Starter
+from evedrop.live.protocol.brief import read_brief
+from evedrop.live.protocol.brief_parts import ImportingPart
+from evedrop.system.environment import own_environment
+from evedrop.system.processes import kill, signalled_when_parent_dies, wait_for
+
+ANSWER_SECONDS = 60.0
+"""How long a host may take to connect and to start Python."""
+_END_SECONDS = 8.0  # for a host to end its processes; they take three at most
+_SEND_SECONDS = 10.0  # for ssh to take some bytes; a suspended one takes none
+_LOOK_SECONDS = 0.05
+_MOST_SAID = 2**20
+_ALIVE_SECONDS = 3
+_BEAT_SECONDS = 30.0
+_SILENCE_SECONDS = 600.0  # after which a host considers a silent launcher gone; a user may suspend it for a while
+_OPTIONS = (
+    "-T",
+    *("-o", "BatchMode=yes"),  # never ask for a password or a key
+    *("-o", "ControlMaster=no"),  # a shared connection would outlive the run
+    *("-o", "ClearAllForwardings=yes"),
+    *("-o", "ForwardAgent=no"),
+    *("-o", "ForwardX11=no"),
+    *("-o", "LogLevel=ERROR"),
+    *("-o", "ConnectTimeout=20"),
+    *("-o", f"ServerAliveInterval={_ALIVE_SECONDS}"),
+)
+
+
+@final
+class HostedProcess(ReportedProcess):
+    """A process on another host."""
+
+    def __init__(self, number: int, host: SshHost, log: int) -> None:
+        """number: distinguishes it from all other processes of the run; log: the file descriptor of its log, which it owns."""
+        super().__init__(number)
+        self._host, self._log = host, log
+
+    def write(self, text: str) -> None:
+        """Write to its log."""
+        with contextlib.suppress(OSError):  # the disk is full
+            os.write(self._log, text.encode())
+
+    def _close(self) -> None:
+        os.close(self._log)
+
+    def send_signal(self, sig: int) -> None:
+        """Send a signal to it, if it still runs."""
+        if self._status is None:
+            self._host.send(SendSignal(self.pid, sig))
+
+
+@final
+class SshHost:
+    """A host, and the connection with it."""
+
+    def __init__(
+        self,
+        name: str,
+        table: HostTable,
+        config: Path | None,
+        longest_outage: float,
+        beat_seconds: float = _BEAT_SECONDS,
+    ) -> None:
+        """Begin to connect. Raises UsageError if there is no ssh.
+
+        longest_outage: seconds for which a process of the run may be cut off. beat_seconds: between two heartbeats.
+        """
+        self.name, self._table, self._beat_seconds = name, table, beat_seconds
+        self._sending, self._guard = threading.Lock(), threading.Lock()
+        self._processes: dict[int, HostedProcess] = {}
+        self._version = ""
+        self._answered, self._lost = threading.Event(), threading.Event()
+        self._said = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the connection
+        try:
+            self._ssh = subprocess.Popen(
+                _ended_with_us(ssh_command(table, config, longest_outage)),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._said,
+                start_new_session=True,  # Ctrl-C in the terminal must reach only the launcher
+            )
+        except OSError as error:
+            self._said.close()
+            raise UsageError(f"ssh cannot be started ({error.strerror}); install OpenSSH's client") from error
+        self._reader = threading.Thread(target=self._follow, name=f"host {name}", daemon=True)
+        self._reader.start()
+        threading.Thread(target=self._beat, name=f"heartbeat of {name}", daemon=True).start()
+
+    def _beat(self) -> None:
+        """Tell the host from time to time that this launcher is still there."""
+        while not self._lost.wait(self._beat_seconds if self._answered.is_set() else _LOOK_SECONDS):
+            if self._answered.is_set():
+                self.send(LauncherHeartbeat(_SILENCE_SECONDS))
+
+    def wait_until_ready(self, deadline: float, stop: threading.Event) -> None:
+        """Wait until Evedrop answers there. Raises UsageError if it does not, or has another version; Interrupted if stopped."""
+        while not self._answered.wait(_LOOK_SECONDS):
+            if stop.is_set():
+                raise Interrupted("interrupted before the run began; nothing was started")
+            if self._lost.is_set():
+                raise UsageError(f"{self._named}: {self._reason()}; {self._remedy()}")
+            if time.monotonic() > deadline:
+                raise UsageError(
+                    f"{self._named}: evedrop did not answer there within {ANSWER_SECONDS:.0f} s ({self._reason()}); "
+                    f"{self._remedy()}"
+                )
+        if self._version != own_version():
+            raise UsageError(
+                f"{self._named}: evedrop {self._version} is installed there, and {own_version()} here; install the same version, "
+                "since their messages and digests may differ"
+            )
+
+    def start(self, number: int, path: Path, log: IO[bytes], environment: Mapping[str, str]) -> HostedProcess:
+        """Start the process of the brief at a path there. Raises RunError if the connection is lost."""
+        brief = read_brief(path)
+        path.unlink()  # its keys should not stay on disk
+        if self._table.modules is not None and isinstance(brief.part, ImportingPart) and brief.part.modules is not None:
+            brief = replace(brief, part=replace(brief.part, modules=self._table.modules))
+        process = HostedProcess(number, self, os.dup(log.fileno()))
+        with self._guard:
+            if self._lost.is_set():
+                process.ended(CONNECTION_LOST)
+                raise RunError(f"{brief.process} cannot be started: {self._ending()}; run again")
+            self._processes[number] = process
+        own = own_environment()
+        added = {name: value for name, value in environment.items() if own.get(name) != value}
+        self.send(StartProcess(number, brief, added))
+        return process
+
+    def send(self, order: Order) -> None:
+        """Send an order; harmless if the connection is lost, which ends all processes there. Ends an ssh that takes nothing."""
+        assert self._ssh.stdin is not None  # noqa: S101 - it was started with a pipe
+        with self._sending, contextlib.suppress(OSError, ValueError):
+            handle, left = self._ssh.stdin.fileno(), line_of(order)
+            os.set_blocking(handle, False)
+            room = select.poll()
+            room.register(handle, select.POLLOUT)
+            while left:
+                if not room.poll(1000 * _SEND_SECONDS):
+                    self._ssh.kill()
+                    return
+                left = left[os.write(handle, left) :]
+
+    def hang_up(self) -> None:
+        """Close the connection: the processes there end. Does not wait."""
+        assert self._ssh.stdin is not None  # noqa: S101 - it was started with a pipe
+        with self._sending, contextlib.suppress(OSError):
+            self._ssh.stdin.close()
+
+    def close(self, deadline: float) -> None:
+        """Wait until ssh has ended, and end it at the deadline."""
+        self.hang_up()
+        kill(*wait_for([self._ssh], deadline - time.monotonic()))
+        self._reader.join(_END_SECONDS)  # it reads the end of the connection at once, and may then wait for ssh as long
+        self._said.close()
+
+    def _follow(self) -> None:
+        """Read the host's messages until the connection ends; all processes there have ended then."""
+        assert self._ssh.stdout is not None  # noqa: S101 - it was started with a pipe
+        with self._ssh.stdout as answers, contextlib.suppress(ValueError, OSError):
+            for line in itertools.islice(answers, MOST_NOISE):  # of the login shell
+                with contextlib.suppress(ValueError):
+                    self._version = greeting_in(line).evedrop
+                    break
+            else:
+                raise ValueError
+            self._answered.set()
+            for line in answers:
+                self._take(answer_in(line))
+        self._lose()
+
+    def _take(self, answer: Answer) -> None:
+        with self._guard:
+            process = self._processes.get(answer.number)
+            if process is None:
+                return
+            if not isinstance(answer, LogText):
+                del self._processes[process.pid]
+        if isinstance(answer, LogText):
+            process.write(answer.written)
+        elif answer.status == FORK_SERVER_LOST:
+            process.write(
+                f"evedrop: the fork server on host {self.name} ended or stopped responding (killed, suspended or out of memory)\n"
+            )
+            process.ended(CONNECTION_LOST)
+        else:
+            process.ended(answer.status)
+
+    def _lose(self) -> None:
+        self.hang_up()
+        wait_for([self._ssh], _END_SECONDS)
+        with self._guard:
+            self._lost.set()
+            left, self._processes = list(self._processes.values()), {}
+        for process in left:
+            process.write(f"evedrop: {self._ending()}\n")
+            process.ended(CONNECTION_LOST)
+
+    def _ending(self) -> str:
+        """Why the host can be used no more."""
+        return f"the connection with host {self.name} ended: {self._reason()}"
+
+    @property
+    def _named(self) -> str:
+        return f"host {self.name}"
+
+    def _reason(self) -> str:
+        """The last line that ssh printed, or its exit status."""
+        # Not by reading the file: ssh writes at the same position in it.
+        said = os.pread(self._said.fileno(), _MOST_SAID, 0).decode("utf-8", "replace")
+        lines = [line.strip() for line in said.splitlines() if line.strip()]
+        status = self._ssh.poll()
+        if lines:
+            return lines[-1]
+        return "ssh is still connecting" if status is None else f"ssh ended with status {status}"
+
+    def _remedy(self) -> str:
+        """A command that the user can try."""
+        words = [word for word in ssh_words(self._table) if word != "--"]
+        return f"try `ssh {shlex.join(words)} {shlex.join([*self._table.command, '--version'])}`"
+
+
+def ssh_words(table: HostTable) -> list[str]:
+    """The words after `ssh` that name the user, the port and the host."""
+    user = [] if table.user is None else ["-l", table.user]
+    port = [] if table.port is None else ["-p", str(table.port)]
+    return [*user, *port, "--", table.address]
+
+
+def ssh_command(table: HostTable, config: Path | None, longest_outage: float) -> list[str]:
+    """The command that starts Evedrop's program on a host; nothing in it is secret.
+
+    longest_outage: as for `SshHost`. ssh gives up on a host somewhat earlier, so that the host is named.
+    """
+    alive = ["-o", f"ServerAliveCountMax={max(1, int(0.8 * longest_outage / _ALIVE_SECONDS))}"]
+    given = [] if config is None else ["-F", str(config)]
+    folder = "" if table.folder is None else f"cd {shlex.quote(table.folder)} && "
+    return ["ssh", *given, *_OPTIONS, *alive, *ssh_words(table), f"{folder}exec {shlex.join([*table.command, 'host'])}"]
+
+
+def _ended_with_us(command: list[str]) -> list[str]:
+    """The same command, whose process the system kills when this one dies: ssh would wait for a host that hangs, or hang itself.
+
+    Raises FileNotFoundError if there is no such program.
+    """
+    program = shutil.which(command[0])
+    if program is None:
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
+    return signalled_when_parent_dies([program, *command[1:]], signal.SIGKILL)
+
+
+@final
+class SshStarter:
+    """Starts each process on its host, and those without one by another starter."""
+
+    def __init__(self, plan: HostsPlan, hosts: Mapping[str, SshHost], here: Starter) -> None:
+        self._plan, self._hosts, self._here = plan, hosts, here
+        # A process here has a process id, which is smaller.
+        self._numbers = itertools.count(2**32)
+
+    def __call__(self, role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:
+        """Start the process of a brief. Raises OSError, and RunError if the connection with its host is lost."""
+        host = self._plan.host_of(brief.stem)
+        if host is None:
+            return self._here(role, brief, log, environment)
+        return self._hosts[host].start(next(self._numbers), brief, log, environment)
+
+
+@contextmanager
+def ssh_starter(plan: HostsPlan, here: Starter, stop: threading.Event, longest_outage: float) -> Iterator[Starter]:
+    """A starter that is connected to all of these hosts; ends all processes on them at the end of the block.
+
+    longest_outage: as for `SshHost`. Raises UsageError if a host cannot be used, Interrupted if stopped meanwhile.
+    """
+    with ExitStack() as stack:
+        hosts: dict[str, SshHost] = {}
+
+        def close() -> None:
+            deadline = time.monotonic() + _END_SECONDS
+            for host in hosts.values():
+                host.hang_up()
+            for host in hosts.values():
+                host.close(deadline)
+
+        stack.callback(close)
+        for name, table in plan.hosts.items():
+            hosts[name] = SshHost(name, table, plan.ssh_config, longest_outage)
+        deadline = time.monotonic() + ANSWER_SECONDS
+        for host in hosts.values():
+            host.wait_until_ready(deadline, stop)
+        yield SshStarter(plan, hosts, here)

@@ -1,0 +1,80 @@
+"""The operator's access to a run in progress: `control.json` in the run's results folder, mode 0600.
+
+The file is written when the run starts and removed when it ends, for whatever reason.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from evedrop.errors import UsageError
+from evedrop.live.protocol.brief_parts import Identity
+from evedrop.system.files import Unreadable, is_folder, is_there, text_of
+
+_NAME = "control.json"
+_MOST_BYTES = 2**20
+
+
+@dataclass(frozen=True)
+class Control:
+    """The address of a run's router, and the operator's credentials, made for this run alone."""
+
+    run: str
+    router: str
+    """Zenoh endpoint."""
+    user: str
+    password: str = field(repr=False)
+    identity: Identity | None = None
+    """The operator's certificate and key, if the run's router takes certificates."""
+
+    def write(self, folder: Path) -> None:
+        """Write the file into a results folder, readable by its owner only."""
+        unfinished = folder / f"{_NAME}.new"
+        with os.fdopen(os.open(unfinished, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
+            json.dump(asdict(self), file, indent=1)
+        os.replace(unfinished, folder / _NAME)
+
+
+def remove_control(folder: Path) -> None:
+    """Remove the control file of a run that is over."""
+    with suppress(OSError):  # the disk may not be writable any more; the password is useless after the run
+        (folder / _NAME).unlink()
+
+
+def no_run(folder: Path, why: str) -> UsageError:
+    """The error for steering a run that is not in progress; why: how that was found out."""
+    return UsageError(
+        f"no run is going on in {folder}; {why}; give the results folder of a run or wire between its start and its end"
+    )
+
+
+def read_controls(folder: Path) -> list[Control]:
+    """Read the control file of a run in progress, or those of its shards. Raises UsageError as `read_control` does."""
+    shards = sorted(path.parent for path in folder.glob(f"shards/*/{_NAME}"))
+    return [read_control(shard) for shard in shards] or [read_control(folder)]
+
+
+def read_control(folder: Path) -> Control:
+    """Read the control file of a run in progress. Raises UsageError if there is none, or it is malformed."""
+    path = folder / _NAME
+    try:
+        found = json.loads(text_of(path, _MOST_BYTES))
+        identity = found.get("identity")
+        control = Control(**{**found, "identity": None if identity is None else Identity(**identity)})
+    except Unreadable as error:
+        if is_there(path):
+            raise no_run(folder, f"{path.name} cannot be read ({error})") from error
+        over = is_there(folder / "summary.json")
+        why = "it is over" if over else f"it has no {_NAME} (yet)" if is_folder(folder) else "there is no such folder"
+        raise no_run(folder, why) from error
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise no_run(folder, f"{path.name} is not a control file ({error})") from error
+    entries = asdict(control)
+    texts = [*(entries.pop("identity") or {}).values(), *entries.values()]
+    if not all(isinstance(value, str) for value in texts):
+        raise no_run(folder, f"{path.name} is not a control file (an entry is not a string)")
+    return control

@@ -1,0 +1,72 @@
+"""Sends news to the launcher: that a router listens, and the observer's news, including its heartbeat.
+
+The launcher gives up on an observer that is silent for half a minute. So the heartbeat has its own thread: it continues
+while the observer imports, computes or writes, however long that takes on a busy machine.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from contextlib import suppress
+from types import TracebackType
+from typing import Self, TextIO, cast, final
+
+from evedrop.live.protocol.news import Alive
+from evedrop.scenario.news import News
+from evedrop.system.output import Output
+
+_BEAT_SECONDS = 1.0
+_LINE = threading.Lock()  # one line at a time
+
+
+_TO: list[TextIO] = []
+"""The stream for a launched process's news; empty before `set_news_apart`, and in a process that was started by hand."""
+
+
+def set_news_apart(launched: bool) -> None:
+    """Redirect file descriptor 1 to standard error: Zenoh logs to it, and would mix its lines into the news.
+
+    launched: whether a launcher reads the news, from the former standard output; `print` then writes to the log.
+    """
+    sys.stdout.flush()
+    apart = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    if launched:
+        _TO.append(apart)
+    else:
+        sys.stdout = cast(TextIO, Output(apart))
+
+
+def tell(news: News) -> None:
+    """Send an item of news to the launcher, or to standard output if there is none; harmless if nobody reads it."""
+    left = memoryview(news.line)
+    with _LINE, suppress(OSError, ValueError, AttributeError):  # the launcher is gone, or there is no standard output
+        to = _TO[0] if _TO else sys.stdout
+        while left:
+            left = left[os.write(to.fileno(), left) :]
+
+
+@final
+class Heartbeat:
+    """Sends the heartbeat to the launcher, every second while the block runs."""
+
+    def __init__(self, seconds: float = _BEAT_SECONDS) -> None:
+        self._seconds = seconds
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._over.set()
+        self._thread.join(_BEAT_SECONDS)  # it waits if the launcher does not read
+
+    def _beat(self) -> None:
+        while not self._over.wait(self._seconds):
+            tell(Alive())

@@ -1,0 +1,80 @@
+"""How the operator asks a run in progress, and the answers: a Zenoh query to the observer.
+
+Source: docs/protocol.md, request and answer.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+
+import zenoh
+
+from evedrop.live.network.control_file import Control
+from evedrop.live.network.opening import open_session
+from evedrop.live.network.session import client_config
+from evedrop.live.protocol.codec import Reader, pack
+from evedrop.live.protocol.envelope import enclosed, payload_of
+from evedrop.live.protocol.keys import RunKeys
+from evedrop.live.protocol.requests import OperatorRequest
+from evedrop.live.protocol.status import RunStatus
+from evedrop.live.protocol.wire_status import WireStatus
+from evedrop.model.entries import expect, read, table_of
+from evedrop.names import OBSERVER
+
+_STATUSES: Mapping[str, type[RunStatus | WireStatus]] = {"status": RunStatus, "wire": WireStatus}
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The answer to a request."""
+
+    slot: int | None = None
+    """The slot from which on the request takes effect."""
+    said: str = ""
+    """The effect, as a sentence."""
+    refused: tuple[str, ...] = ()
+    """The mistakes in the request, a line each; then nothing has changed."""
+    status: RunStatus | WireStatus | None = None
+    """The status of the run or the wire, if the request was `status`."""
+
+    def pack(self) -> bytes:
+        """Encode it as a message."""
+        if self.refused:
+            return pack({"refused": list(self.refused)})
+        if self.status is not None:
+            return pack({"wire" if isinstance(self.status, WireStatus) else "status": asdict(self.status)})
+        return pack({"k": self.slot, "said": self.said})
+
+
+def read_answer(key: str, payload: bytes) -> Answer:
+    """Decode an answer. Raises MalformedMessage if the message is not an answer."""
+    message = Reader(key, payload)
+    if message.has("refused"):
+        return Answer(refused=message.names("refused"))
+    for name, kind in _STATUSES.items():
+        if message.has(name):
+            found = message.map(name)
+            try:
+                expect(table_of(kind), name, found)
+            except ValueError as error:
+                raise message.malformed(str(error), f"the status of a {'run' if name == 'status' else name}") from error
+            return Answer(status=read(kind, found))
+    return Answer(message.integer("k"), message.text("said"))
+
+
+def ask(control: Control, request: OperatorRequest, patience: float) -> Answer | None:
+    """Ask the observer of a run; None if it does not answer within `patience` seconds, because the run is over or ends.
+
+    Raises zenoh.ZError if the router is not there or refuses the operator.
+    """
+    zenoh.init_log_from_env_or("off")
+    key = RunKeys(control.run).control(OBSERVER)
+    # A run in progress has a router: one attempt is enough.
+    with open_session(zenoh.Config.from_json5(json.dumps(client_config(control)))) as session:
+        for reply in session.get(key, payload=enclosed(key, request.pack()), timeout=patience):
+            answer = None if reply.ok is None else payload_of(key, reply.ok.payload.to_bytes())
+            if answer is not None:
+                return read_answer(key, answer)
+    return None

@@ -1,0 +1,400 @@
+"""The router: takes each packet of the uplink, lets every link decide its fate, delivers, and keeps the journal.
+
+    uplink ── k, z ──┬── link of receiver 1 ── fate, γ ── downlink/1
+                     ├── link of receiver 2 ── fate, γ ── downlink/2      fates of all ── journal
+                     └── …
+
+A receiver that is present gets one delivery in every slot, with everything that arrives in the slot. At a barrier on the
+uplink the router journals all slots before it and waits until the conductor lets it continue; links change nowhere else. When
+packets are sent again, the router routes them again, with the same fates, as a restarted router would.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from queue import SimpleQueue
+from typing import final
+
+import numpy as np
+
+from evedrop.errors import NotRegistered
+from evedrop.live.network.access import access_control, at_router, grants
+from evedrop.live.network.delayed_sender import DelayedSender
+from evedrop.live.network.pending import Pending, most_slots
+from evedrop.live.network.process_session import ProcessSession
+from evedrop.live.network.resending import GapDetector
+from evedrop.live.network.router_commands import Commands, ReplayRequested
+from evedrop.live.network.router_users import until_all_left, users_file
+from evedrop.live.network.session import Session, router_config
+from evedrop.live.protocol.brief import AnyBrief, Brief
+from evedrop.live.protocol.brief_closed_loop import Wiring
+from evedrop.live.protocol.brief_parts import RouterPart
+from evedrop.live.protocol.codec import Reader
+from evedrop.live.protocol.commands import Go, LinkChange
+from evedrop.live.protocol.keys import ZenohConfig
+from evedrop.live.protocol.packet_blocks import Uplinked, read_uplinks
+from evedrop.live.protocol.packets import (
+    acknowledgement,
+    barrier,
+    delivery,
+    is_barrier,
+    is_resend,
+    packed_header,
+    read_acknowledgement,
+    read_resend,
+)
+from evedrop.live.protocol.telemetry import Journal
+from evedrop.model.acknowledgements import AckChannel, AckChannelSpec
+from evedrop.model.flag_bits import packed_flags
+from evedrop.model.kernels.current import kernels
+from evedrop.model.receiver import Flags
+from evedrop.model.slot.account import COUNTED_BURSTS, Account, Accountant
+from evedrop.model.slot.link import Change, LinkSchedule, streams_of
+from evedrop.model.slot.link_core import LinkCore
+from evedrop.model.slot.transit import Late
+from evedrop.names import ACKNOWLEDGEMENTS, LEGITIMATE, ROUTER
+
+
+@final
+class Downlink:
+    """One receiver's link, whose fates are decided a batch of slots ahead, and its outlet."""
+
+    def __init__(
+        self, name: str, schedule: LinkSchedule, brief: Brief[RouterPart], put: Callable[[bytes, float], None]
+    ) -> None:
+        keys = {stream: brief.stream_keys[stream] for stream in streams_of(name, schedule)}
+        self._core = LinkCore(schedule, name, keys, brief.batch)
+        self._schedule = schedule
+        self._accountant = Accountant(schedule.window, brief.trials)
+        self._put = put
+        self._pace = brief.part.pace
+        self._rests: dict[int, float] = {}
+        """Slot → the fraction of a slot that the first trial's packet takes in addition, for packets that may still arrive."""
+        self._leak = brief.part.leaks.get(name)
+        self._masks: list[bytes]
+        self._received: list[int]
+
+    def plan(self, slots: range) -> None:
+        """Decide the fates of the next batch of slots."""
+        self._core.plan(slots)
+        self._masks, self._received = self._described(slots)
+
+    def amend(self, at: int, changes: Iterable[Change]) -> None:
+        """Decide the slots of the batch from `at` on again, with these changes; none of them may have been journaled."""
+        self._core.amend(at, changes)
+        self._masks, self._received = self._described(self._core.slots)
+
+    def _described(self, slots: range) -> tuple[list[bytes], list[int]]:
+        """For each slot, the mask of the trials that receive in time, and how many they are."""
+        in_time = self._core.in_time[self._core.rows(slots)]
+        return [mask.tobytes() for mask in packed_flags(in_time)], np.count_nonzero(in_time, axis=1).tolist()
+
+    def account(self, slots: range) -> Account:
+        """The fates of the packets of the next slots, which belong to the current batch."""
+        return self._accountant.account(slots, self._core.part(slots))
+
+    def present(self, k: int) -> bool:
+        """Whether the receiver is present in slot k."""
+        return self._core.present(k)
+
+    def gamma(self, k: int) -> Flags:
+        """γ of slot k, which belongs to the current batch and was delivered, (R,)."""
+        return self._core.gamma(k)
+
+    def deliver(self, slots: range, packets: Uplinked, known: bool = False) -> None:
+        """Send the deliveries of consecutive slots of the batch: the packets that arrive in each.
+
+        known: the receiver has these deliveries; only update the packets under way.
+        """
+        core = self._core
+        if packets.sent is not None:
+            core.silence(slots, packets.sent)
+            rows = core.rows(slots)
+            self._masks[rows], self._received[rows] = self._described(slots)
+        arrivals = core.arrivals(slots, packets.z, packets.header)
+        if known:
+            return
+        first, trials = core.rows(slots).start, packets.z.shape[2]
+        late, rests, put = arrivals.late, bool(self._rests) or core.fates.rests is not None, self._put
+        for row, k in enumerate(slots):
+            if self._schedule.outages and not core.present(k):
+                continue
+            received, z = self._received[first + row], b""
+            if received == trials:
+                z = packets.whole[row]
+            elif received:
+                z = kernels.gather(arrivals.gamma[row], packets.z[row]).tobytes()
+            header = b"" if packets.header is None else packed_header(packets.header[row], arrivals.gamma[row])
+            truth = packets.truth[row].tobytes() if k == self._leak and row in packets.truth else b""
+            arrived = late.get(row, ())
+            message = delivery(k, self._masks[first + row], z, arrived, header, truth)
+            put(message, self._rest(k, arrivals.gamma[row], arrived) if rests else 0.0)
+
+    def _rest(self, k: int, gamma: Flags, late: tuple[Late, ...]) -> float:
+        """The seconds by which to delay slot k's delivery: the longest rest among the first trial's packets in it."""
+        rest = self._core.rest(k)
+        if rest is not None:
+            self._rests[k] = rest
+        arrived = [one.k for one in late if one.heard.gamma[0]] + [k] * bool(gamma[0])
+        longest = max((self._rests.get(slot, 0.0) for slot in arrived), default=0.0)
+        self._rests.pop(k - self._schedule.window, None)
+        return longest * self._pace
+
+    def mark(self, k: int) -> None:
+        """Pass a barrier on, if the receiver is present."""
+        if not any(away.start < k <= away.stop for away in self._schedule.outages):
+            self._put(barrier(k), 0.0)
+
+
+@final
+class Burst:
+    """Deliveries to a receiver that nobody waits for, sent many at a time.
+
+    When the sensor waits for another process in every slot, single messages would wake this receiver for each of them, and
+    these wake-ups would take most of the time.
+    """
+
+    def __init__(self, put: Callable[[bytes], None]) -> None:
+        self._put = put
+        self._held: list[bytes] = []
+
+    def hold(self, payload: bytes, _: float) -> None:
+        """Hold one message back until `flush`."""
+        self._held.append(payload)
+
+    def flush(self) -> None:
+        """Send all held messages."""
+        for payload in self._held:
+            self._put(payload)
+        self._held.clear()
+
+
+@final
+class AckLink:
+    """The link of the acknowledgements, from the legitimate estimator to the sensor, and the attack on it."""
+
+    def __init__(self, brief: AnyBrief, session: ProcessSession, spec: AckChannelSpec) -> None:
+        key = brief.stream_keys[f"link/{ACKNOWLEDGEMENTS}"]
+        self._channel = AckChannel.from_spec(spec, key, brief.batch)
+        self._jammer = spec.jammer
+        self._trials, self._place = brief.trials, session.place
+        self._key = session.keys.acknowledged
+        self._due = GapDetector(self._key, brief.flow.longest_outage)
+        self.sent: SimpleQueue[bytes | None] = SimpleQueue()
+        """The legitimate estimator's acknowledgements; None: the conductor sent a command that may end the waiting."""
+        session.funnel(self._key, self.sent.put)
+        self._put = session.outlet(session.keys.acknowledgements)
+
+    def carry(self, k: int, sent: Flags | None, downlinks: Mapping[str, Downlink], commands: Commands) -> None:
+        """Wait for the acknowledgements of slot k, and send on those that reach the sensor; sent (R,): as in `PacketExtras`.
+
+        An absent receiver acknowledges nothing. Raises the errors of `Commands.check`.
+        """
+        there = downlinks[LEGITIMATE].present(k)
+        gamma = self._acknowledged(k, commands) if there else np.zeros(self._trials, np.bool_)
+        gamma_e = gamma if self._jammer is None else downlinks[self._jammer].gamma(k)
+        self._put(acknowledgement(k, self._channel.arrived(k, sent, gamma, gamma_e)))
+
+    def count(self, k: int, sent: Flags | None, downlinks: Mapping[str, Downlink]) -> None:
+        """Count slot k, whose acknowledgements have reached the sensor, for those of later slots; sent as for `carry`."""
+        if self._jammer is not None:
+            self._channel.count(k, sent, downlinks[self._jammer].gamma(k))
+
+    def _acknowledged(self, k: int, commands: Commands) -> Flags:
+        while True:
+            with self._place.waiting(self._key):
+                payload = self.sent.get()
+            if payload is None:
+                commands.check()
+                continue
+            message = Reader(self._key, payload)
+            if (found := message.integer("k")) == k:
+                return read_acknowledgement(message, k, self._trials)
+            self._due.missed(k, found)
+
+
+def route(brief: Brief[RouterPart]) -> None:
+    """Run the router of a brief until the conductor ends it and all other processes have left."""
+    table = grants(brief.run, tuple(brief.part.links), brief.part.controller)
+    let_in = table if brief.part.zid is None else at_router(brief.run, table)
+    with _opened(brief, access_control(let_in, brief.identity is not None)) as session:
+        present = session.presence(grant.process for grant in table if grant.token is not None)
+        Routing(brief, session).carry_on()
+        session.conclude()
+        until_all_left(present, session.linked)
+
+
+@final
+class Routing:
+    """The router's work on an open session."""
+
+    def __init__(self, brief: Brief[RouterPart], session: ProcessSession) -> None:
+        self._brief, self._session = brief, session
+        self._shape = (len(brief.model.A), brief.trials)
+        self._uplink = Pending(session.inbox(session.keys.uplink), session.keys.uplink, most_slots(brief))
+        self._due = GapDetector(session.keys.uplink, brief.flow.longest_outage)
+        self._put_journal = session.outlet(session.keys.journal)
+        delayed_sender = DelayedSender() if brief.part.pace else None
+        self._bursts: list[Burst] = []
+
+        def outlet(name: str, schedule: LinkSchedule) -> Callable[[bytes, float], None]:
+            put = session.outlet(session.keys.downlink(name))
+            wiring = brief.part.controller
+            if delayed_sender is None and wiring is not None and not self._is_waited_for(name, wiring):
+                self._bursts.append(Burst(put))
+                return self._bursts[-1].hold
+            delays = any("delay" in (one or {}) for one in (schedule.settings, *(c.settings for c in schedule.changes)))
+            return (
+                (lambda payload, _: put(payload)) if delayed_sender is None or not delays else delayed_sender.round(put)
+            )
+
+        self._schedules = {name: entry.schedule for name, entry in brief.part.links.items()}
+        self._outlets = {name: outlet(name, schedule) for name, schedule in self._schedules.items()}
+        acknowledgements = brief.part.acknowledgements
+        self._ack_link = AckLink(brief, session, acknowledgements) if acknowledgements is not None else None
+        # A message to the router's own uplink wakes the thread that waits there: only the conductor ends a router.
+        knock = session.outlet(session.keys.uplink)
+        waiting = [] if self._ack_link is None else [self._ack_link.sent]
+        self._commands = Commands(
+            session, tuple(self._schedules), lambda: knock(barrier(brief.slots)), waiting, brief.flow.longest_outage
+        )
+        self._stale = False
+        """Whether to ignore packets until the resend begins."""
+        self._begin(0, 0)
+
+    def _is_waited_for(self, receiver: str, wiring: Wiring) -> bool:
+        """Whether the sensor waits in some slots for a receiver's acknowledgement or estimate."""
+        acknowledged = self._brief.part.acknowledgements is not None
+        return receiver == LEGITIMATE and (not wiring.on_truth or wiring.knows_input or acknowledged)
+
+    def carry_on(self) -> None:
+        """Route all slots, again as often as the conductor asks, until it ends the run."""
+        # No need to wait: a process subscribes before it shows its token, and it showed the token to this very session.
+        self._session.appear()
+        while not self._commands.over():
+            try:
+                self._take()
+            except ReplayRequested:
+                self._stale = True
+
+    def _begin(self, start: int, done: int) -> None:
+        """Restore the router's state before slot `start`, which follows from the links alone.
+
+        done: all slots below it have been delivered, acknowledged and journaled.
+        """
+        self._stale = False
+        self._flush()  # nobody needs these messages, but they must not mix with the following ones
+        self._k, self._done, self._journaled = start, done, start
+        self._downlinks = {
+            name: Downlink(name, schedule, self._brief, self._outlets[name])
+            for name, schedule in self._schedules.items()
+        }
+        for first in range(0, start + 1, self._brief.flow.batch):
+            slots = self._plan(first)
+            before = range(first, min(slots.stop, start))
+            if before and before.stop > start - COUNTED_BURSTS:  # for unfinished bursts and packets under way
+                for downlink in self._downlinks.values():
+                    downlink.account(before)
+
+    def _plan(self, first: int) -> range:
+        """Decide the fates of the batch that begins with this slot."""
+        self._slots = range(first, min(first + self._brief.flow.batch, self._brief.slots))
+        if self._slots:
+            for downlink in self._downlinks.values():
+                downlink.plan(self._slots)
+        return self._slots
+
+    def _take(self) -> None:
+        """Handle the sensor's next messages: packets, a barrier, or the announcement of a resend."""
+        message = self._uplink.peek()
+        if is_resend(message):
+            self._uplink.drop()
+            self._resend(message)
+            return
+        k = message.integer("k")
+        if self._stale or k == self._brief.slots or k != self._k:
+            self._uplink.drop()
+            if not self._stale and k != self._brief.slots:
+                self._due.missed(self._k, k)
+            return
+        if k == self._done:
+            self._journal(k)
+        if is_barrier(message):
+            self._uplink.drop()
+            if k >= self._done:
+                self._journal(k)
+                self._hold(k)
+            return
+        stop = self._slots.stop if k >= self._done else min(self._slots.stop, self._done)
+        self._route(k, self._uplink.take_messages(k, 1 if self._ack_link is not None else stop - k))
+        if self._k == self._slots.stop:
+            self._flush()
+            self._journal(self._k)
+            self._plan(self._k)
+
+    def _route(self, first: int, messages: Sequence[Reader]) -> None:
+        """Deliver the packets of consecutive slots, unless it is known that they have been delivered."""
+        packets = read_uplinks(messages, first, self._shape, self._brief.model.header)
+        slots, known = range(first, first + len(messages)), first < self._done
+        for downlink in self._downlinks.values():
+            downlink.deliver(slots, packets, known)
+        if self._ack_link is not None:
+            sent = None if packets.sent is None else packets.sent[0]
+            if known:
+                self._ack_link.count(first, sent, self._downlinks)
+            else:
+                self._ack_link.carry(first, sent, self._downlinks, self._commands)
+        self._k = self._session.place.slot = slots.stop
+
+    def _flush(self) -> None:
+        for burst in self._bursts:
+            burst.flush()
+
+    def _resend(self, message: Reader) -> None:
+        """Begin a resend, which the conductor and the sensor announce in either order; wait for the conductor if need be."""
+        number, done, start = read_resend(message, self._brief.slots)
+        again = self._commands.resend_of(number)
+        if again is None:  # the conductor has asked again since
+            self._stale = True
+            return
+        for name, changes in (again.links or {}).items():
+            self._schedules[name] = replace(self._schedules[name], changes=changes)
+        self._begin(start, done)
+
+    def _journal(self, end: int) -> None:
+        """Journal all slots below `end`; for those already journaled, only keep the state that later slots need."""
+        slots = range(self._journaled, end)
+        self._journaled = end
+        if slots:
+            accounts = {name: downlink.account(slots) for name, downlink in self._downlinks.items()}
+            if slots.start >= self._done:
+                self._put_journal(Journal(slots.start, len(slots), accounts).pack())
+
+    def _hold(self, k: int) -> None:
+        """Pass a barrier on, and obey the conductor until it lets the router continue."""
+        for downlink in self._downlinks.values():
+            downlink.mark(k)
+        self._flush()
+        while True:
+            match self._commands.next():
+                case Go(slot) if slot == k:
+                    return
+                case LinkChange() as change:
+                    self._amend(change, k)
+
+    def _amend(self, command: LinkChange, k: int) -> None:
+        """Change a link from slot k on, as the conductor's command says."""
+        name, changes = command.link, command.changes
+        try:
+            self._downlinks[name].amend(k, changes)
+        except (KeyError, TypeError, ValueError, NotRegistered) as error:
+            message = Reader(self._session.keys.control(ROUTER), command.pack())
+            raise message.malformed(f"invalid settings ({error!r:.80})", f"settings of the link of {name}") from error
+        schedule = self._schedules[name]
+        self._schedules[name] = replace(schedule, changes=(*(one for one in schedule.changes if one.at < k), *changes))
+
+
+def _opened(brief: Brief[RouterPart], access: ZenohConfig) -> Session:
+    with users_file(brief.part.users) as users:
+        return Session(brief, router_config(brief, str(users), access, brief.router), brief.router)

@@ -1,0 +1,244 @@
+"""The conductor, a part of the observer: waits for all processes, starts the run, passes on their reports, and ends it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection
+from functools import partial
+from queue import Empty, SimpleQueue
+from typing import NoReturn, final
+
+from evedrop.errors import Interrupted, RunError
+from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
+from evedrop.live.network.declared import Question
+from evedrop.live.network.mailbox import Mailbox
+from evedrop.live.network.session import Session
+from evedrop.live.protocol.codec import Reader, is_over, progress, read_over
+from evedrop.live.protocol.commands import Abandon, ControlCommand, End, Start
+from evedrop.names import OBSERVER, RELAY, ROUTER, SENSOR
+from evedrop.system.signals import AFTERTHOUGHT_SECONDS
+
+_ABANDON_SECONDS = 2.0  # for processes to leave when told to
+_LOOK_SECONDS = 0.05  # how soon a signal is noticed
+_END_SECONDS = 0.5  # how often a process that is still present is told that the run is over
+_RETURN_SECONDS = 3.0  # within which a process may return that was told to end and vanished without confirming it
+_ROUTERS_SECONDS = 5.0  # for a router to confirm
+
+
+@final
+class Stop:
+    """Set by a signal: the run must end now."""
+
+    def __init__(self, orphaned: Callable[[], bool] = lambda: False, clock: Clock = SYSTEM_CLOCK) -> None:
+        """orphaned: whether the launcher is gone, which ends the run, too."""
+        self._orphaned, self._clock = orphaned, clock
+        self.wanted = False
+
+    def check(self, patience: float = 0.0) -> None:
+        """Raise Interrupted if the run was told to end, or is told within `patience` seconds."""
+        deadline = self._clock.monotonic() + patience
+        while not (asked := self.wanted or self._orphaned()) and self._clock.monotonic() < deadline:
+            self._clock.sleep(0.01)
+        if asked:
+            raise Interrupted
+
+
+@final
+class Conductor:
+    """Conducts a run; passes on telemetry and journal as (source, payload), and handles all other messages itself."""
+
+    def __init__(
+        self,
+        session: Session,
+        reporters: tuple[str, ...],
+        stop: Stop,
+        relayed: bool = False,
+        clock: Clock = SYSTEM_CLOCK,
+    ) -> None:
+        """reporters: the processes that report besides router and sensor: the receivers, and a controller."""
+        self._session, self._clock = session, clock
+        self._stop = stop
+        self._present = dict.fromkeys((ROUTER, *((RELAY,) if relayed else ()), SENSOR, *reporters), False)
+        self.relayed = relayed
+        """Whether the observer is connected to a relay, and not to the router itself."""
+        self._router: str | None = None
+        self.lost: dict[str, float] = {}
+        """Process that has vanished from the network → when, on the clock."""
+        keys = session.keys
+        self.keys = {ROUTER: keys.journal, SENSOR: keys.telemetry(SENSOR)}
+        self.keys.update({name: keys.telemetry(name) for name in reporters})
+        self._news = Mailbox(self.keys, session.allowance, clock)
+        for source, key in self.keys.items():
+            session.funnel(key, partial(self._news.put, source))
+        for name in self._present:
+            session.watch(name, partial(self._news.put, name))
+        self.misdelivered: dict[str, int] = {}
+        """Process that has confirmed its end → how many messages it dropped because they name another key."""
+        self.absent: set[str] = set()
+        """Processes that are away because the scenario says so; they do not count as missing."""
+        self.questions: SimpleQueue[Question] = SimpleQueue()
+        """The operator's questions."""
+        session.asked(keys.control(OBSERVER), self.questions.put)
+        self._commands = {name: session.outlet(keys.control(name)) for name in self._present}
+        self._progress = session.outlet(keys.progress(OBSERVER))
+
+    @property
+    def missing(self) -> list[str]:
+        """The processes that are not on the network."""
+        return [name for name, there in self._present.items() if not there and name not in self.absent]
+
+    def router_changed(self) -> bool:
+        """Whether the observer is connected to another router than at the previous call, or at the start of the run."""
+        before, self._router = self._router, self._session.router_id
+        return before != self._router
+
+    def there(self, name: str) -> bool:
+        """Whether a process is on the network."""
+        return self._present[name]
+
+    @property
+    def processes(self) -> dict[str, bool]:
+        """Process → whether it is on the network."""
+        return dict(self._present)
+
+    @property
+    def unreached(self) -> list[str]:
+        """The processes that are on the network, but whose subscription to their commands is not known yet.
+
+        Behind a relay, a process's token may be back before its subscriptions, and a command put meanwhile is lost.
+        """
+        return [name for name, there in self._present.items() if there and not self._reaches(name)]
+
+    def assemble(self) -> None:
+        """Wait for every process. Raises RunError, naming the missing ones, after the brief's patience."""
+        deadline = self._clock.monotonic() + self._session.patience
+        while self.missing:
+            self._stop.check()
+            if self._clock.monotonic() > deadline:
+                # Do not name processes that wait for another one themselves.
+                names = [name for name in self.missing if not self._reaches(name)]
+                names = names or self.missing
+                do = "start it, or look at its log" if len(names) == 1 else "start them, or look at their logs"
+                raise RunError(f"{', '.join(names)} did not appear within {self._session.patience:.0f} s; {do}")
+            self._note(self._next())
+        self._session.ready()
+        self._router = self._session.router_id
+
+    def start(self) -> None:
+        """Tell the sensor to begin."""
+        self.send_to(SENSOR, Start())
+
+    def news(self) -> tuple[str, bytes] | None:
+        """The next message with its sender, or None if there was none for a moment.
+
+        Raises Interrupted if the run was told to end.
+        """
+        self._stop.check()
+        news = self._next()
+        if news is None or not isinstance(news[1], bytes):
+            self._note(news)
+            return None
+        return news[0], news[1]
+
+    def fail_cut_off(self, names: Collection[str], patience: float) -> NoReturn:
+        """Raise RunError: these processes have been missing for `patience` seconds. Raises Interrupted if told to end now."""
+        self._stop.check(AFTERTHOUGHT_SECONDS)
+        raise RunError(f"{', '.join(names)} cut off from the network for {patience:g} s; look at the logs")
+
+    def send_to(self, name: str, command: ControlCommand) -> None:
+        """Send a command to one process."""
+        self._commands[name](command.pack())
+
+    def send_to_all(self, command: ControlCommand) -> None:
+        """Send a command to every process that reports and is present."""
+        for name in self.keys:
+            if self._present[name]:
+                self.send_to(name, command)
+
+    def report_progress(self, done: int) -> None:
+        """Tell the sensor that all slots below `done` are scored."""
+        self._progress(progress(done))
+
+    def end(self, patience: float) -> None:
+        """Tell all processes that the run is over, repeatedly until they have left; the routers after all others.
+
+        patience: how many seconds to wait for the others: some may be cut off just now.
+        """
+        others = [name for name in self._present if name not in {ROUTER, RELAY} and name not in self.absent]
+        told: set[str] = set()
+        deadline = self._clock.monotonic() + patience
+        said = 0.0
+        while self._clock.monotonic() < deadline:
+            left = [name for name in others if not self._has_ended(name, told)]
+            if not left and self._present[ROUTER]:
+                break
+            if self._clock.monotonic() - said > _END_SECONDS:
+                said = self._clock.monotonic()
+                for name in left:
+                    if self._present[name]:
+                        self.send_to(name, End())
+                        told.add(name)
+            self._hear_out(self._next())
+        # The relay after the router: the router's messages pass through it.
+        for name in (ROUTER, RELAY):
+            if name in self._present:
+                self._end_router(name)
+
+    def _has_ended(self, name: str, told: Collection[str]) -> bool:
+        """Whether a process has left for good: it confirmed its end, or it vanished when told to end and did not return."""
+        if self._present[name]:
+            return False
+        gone = self._clock.monotonic() - self.lost.get(name, -math.inf)
+        return name in self.misdelivered or (name in told and gone > _RETURN_SECONDS)
+
+    def _end_router(self, name: str) -> None:
+        """Tell a router that the run is over until it confirms it: the router by a message, the relay by its token."""
+        deadline = self._clock.monotonic() + _ROUTERS_SECONDS
+        said = 0.0
+        while self._clock.monotonic() < deadline and name not in self.misdelivered:
+            if name == RELAY and not self._present[name] and self._session.linked():
+                return
+            if self._clock.monotonic() - said > _END_SECONDS:
+                said = self._clock.monotonic()
+                self.send_to(name, End())
+            self._hear_out(self._next())
+
+    def _hear_out(self, news: tuple[str, bytes | bool] | None) -> None:
+        """Note which processes are present, and which confirm that the run is over; ignore all other messages."""
+        if news is not None and isinstance(news[1], bytes):
+            message = Reader(self.keys[news[0]], news[1])
+            if is_over(message):
+                self.misdelivered[news[0]] = read_over(message)
+        self._note(news)
+
+    def abandon(self, why: str) -> None:
+        """Tell all processes that the run has been given up."""
+        others = [name for name in self._commands if name not in {ROUTER, RELAY}]
+        # The routers last, and the relay after the router: they may still have messages to pass on.
+        for names in (others, [ROUTER], [RELAY]):
+            told = [name for name in names if name in self._commands]
+            for name in told:
+                self.send_to(name, Abandon(why))
+            deadline = self._clock.monotonic() + _ABANDON_SECONDS
+            while any(self._reaches(name) for name in told) and self._clock.monotonic() < deadline:
+                self._clock.sleep(0.01)
+
+    def _reaches(self, name: str) -> bool:
+        """Whether a process has opened its session; it may still wait for others."""
+        return self._session.reaches(self._session.keys.control(name))
+
+    def _next(self) -> tuple[str, bytes | bool] | None:
+        try:
+            return self._news.get(timeout=_LOOK_SECONDS)
+        except Empty:
+            return None
+
+    def _note(self, news: tuple[str, bytes | bool] | None) -> None:
+        if news is None or not isinstance(news[1], bool):
+            return
+        name, there = news[0], news[1]
+        self._present[name] = there
+        if there:
+            self.lost.pop(name, None)
+        else:
+            self.lost.setdefault(name, self._clock.monotonic())

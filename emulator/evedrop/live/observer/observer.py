@@ -1,0 +1,99 @@
+"""The observer: the only process that sees truth and every estimate. It conducts, scores, records and feeds the view.
+
+Its news goes to standard output, one JSON object per line: every second `{"event": "alive"}`; `{"event": "started"}`, then four
+times a second `{"event": "progress", …}`, then `{"event": "over"}` if all slots are done, `{"event": "finishing"}`
+and `{"event": "ended", "status": …}`. However the run ends, the results folder is complete. An observer started by hand
+then prints the same table and verdict as `evedrop run`.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+import traceback
+from dataclasses import replace
+from queue import SimpleQueue
+
+from evedrop.errors import EvedropError, Interrupted, NoAnswer, RunError
+from evedrop.live.network.launcher_news import set_news_apart, tell
+from evedrop.live.network.launcher_watch import launcher_is_gone, when_launcher_is_gone
+from evedrop.live.network.session import Session
+from evedrop.live.observer.conductor import Stop
+from evedrop.live.observer.observation import ObservedRun, Report
+from evedrop.live.protocol.brief import Brief
+from evedrop.live.protocol.brief_parts import ObserverPart
+from evedrop.live.protocol.news import Finishing
+from evedrop.model.eavesdroppers import ANSWERS
+from evedrop.results.folder import new_folder
+from evedrop.results.resolved_scenario import write_resolved
+from evedrop.results.summary_file import unwritten
+from evedrop.scenario.tables import Scenario
+from evedrop.show.view.viewer import WebAddress
+from evedrop.system.interrupts import heeded
+from evedrop.system.lacks import lack_of, preload_within_limit
+
+_ORPHAN_SECONDS = 30.0  # to write the results once the launcher is gone
+
+
+def observe(brief: Brief[ObserverPart], report: Report, serve: str | None = None) -> int:
+    """Run the observer of a brief; returns the exit status of the run.
+
+    report: prints the end of a run that was started by hand. serve: HOST:PORT where browsers may see the run, if anywhere.
+    Raises UsageError, BriefError, RunError or Interrupted only before the run has begun, and if started by hand.
+    """
+    web_address = None if serve is None else WebAddress.of(serve)
+    stop, confirmations = Stop(launcher_is_gone if brief.ends_with_stdin else lambda: False), SimpleQueue[bytes]()
+    for number in heeded():
+        signal.signal(number, lambda *_: setattr(stop, "wanted", True))
+    preload_within_limit()
+    by_hand = not brief.ends_with_stdin
+    set_news_apart(launched=not by_hand)
+    if not by_hand:
+        when_launcher_is_gone(_end_orphaned, confirmations.put)
+        brief = replace(brief, ends_with_stdin=False)
+    ANSWERS.learn(brief.part.classes)  # so that the observer need not import the classes themselves
+    scenario = Scenario.read(brief.part.scenario)
+    observation = ObservedRun(brief, scenario, confirmations, by_hand)
+    if by_hand:
+        # Connect before writing to the folder: files left by a brief that does not fit would block the next attempt.
+        new_folder(observation.folder)
+        with Session(brief, meanwhile=stop.check):
+            pass
+    viewer = None if web_address is None else observation.show(web_address)
+    status, how, saved = 0, "complete", True
+    try:
+        observation.hold()
+        write_resolved(observation.folder, scenario)
+        with observation.writer():
+            try:
+                observation.conduct(stop)
+            except EvedropError as error:
+                status, how = error.exit_status, "interrupted" if isinstance(error, Interrupted) else str(error)
+            finally:
+                tell(Finishing())
+            observation.settle(how)
+    except OSError as error:
+        saved = False
+        status, how = RunError.exit_status, how if status == RunError.exit_status else unwritten(error)
+    except NoAnswer as error:  # of a class that is asked again after the operator's change of a link
+        status, how = (
+            RunError.exit_status,
+            f"an eavesdropper's class could not give the covariance expected of it: {error}",
+        )
+    except Exception as error:  # a bug in the observer must not cost the results
+        status, lack = RunError.exit_status, lack_of(error)
+        if lack is None:
+            traceback.print_exc()
+        how = lack or f"the observer failed ({error!r}); please report its log"
+    status = observation.finish(status, how, report, saved)
+    if viewer is not None:
+        viewer.stop()
+    return status
+
+
+def _end_orphaned() -> None:
+    """Write the results so far, and exit."""
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(_ORPHAN_SECONDS)
+    os._exit(RunError.exit_status)

@@ -1,0 +1,267 @@
+"""Steers a run: when it is held and every process has reported all earlier slots, carries out due events, and lets it continue.
+
+So an event takes effect exactly between two slots, whether it is the scenario's or the operator's. While the sensor holds,
+only packets delayed by links are under way.
+
+Source: docs/control.md.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Any, final
+
+from evedrop.errors import RunError, ScenarioError
+from evedrop.live.network.session import READY_SECONDS
+from evedrop.live.observer.conductor import Conductor
+from evedrop.live.observer.operator_orders import OperatorStep, Order
+from evedrop.live.protocol.commands import Go, Hold, LinkChange
+from evedrop.live.protocol.news import ProcessRequest
+from evedrop.live.protocol.requests import LinkRequest, PauseRequest, ResumeRequest, StepRequest
+from evedrop.model.slot.link import Change
+from evedrop.names import ROUTER, SENSOR, ProcessAction
+from evedrop.scenario.events.event import Act
+from evedrop.scenario.loading.file import with_event
+from evedrop.scenario.news import Held, RunEvent, Tell
+from evedrop.scenario.tables import Scenario
+
+
+@final
+class Steering:
+    """Carries out the events of the scenario and the requests of the operator while the run is held.
+
+    tell: sends news to the launcher, such as an act on a process, which the launcher confirms; see `done`.
+    keep: called with the amended scenario each time the operator has changed it.
+    paused: whether the run begins paused; the sensor's brief then has a hold before slot 0.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        conductor: Conductor,
+        tell: Tell,
+        keep: Callable[[Scenario], None],
+        *,
+        paused: bool = False,
+    ) -> None:
+        self._scenario, self._conductor, self._tell, self._keep = scenario, conductor, tell, keep
+        self._due = scenario.timeline.holds
+        self.at: int | None = None
+        """The slot before which the sensor holds; None while it does not."""
+        self._pending: list[Act] = []
+        self._left: dict[str, int] = {}
+        self._waiting: tuple[Act, ProcessAction] | None = None
+        self._confirmed = True
+        self._since = 0.0
+        self._orders: deque[Order] = deque()
+        self._asked = False
+        self._step: OperatorStep | None = None
+        self._last = -1
+        self._changed: set[str] = set()
+        self._gone: Go | None = None
+        """The last `Go` that was sent to the sensor."""
+        self.paused = paused
+        """Whether the run stays held until the operator resumes it."""
+        self.events: list[RunEvent] = []
+        """The events so far."""
+
+    def held(self, k: int) -> None:
+        """Take the sensor's report that it holds before slot k, which may come more than once."""
+        if k <= self._last:
+            return
+        self.at, self._last, self._asked = k, k, False
+        self._pending = list(self._due.pop(k, []))
+        self._since = time.monotonic()
+        if self.paused:  # only a run that began paused is paused here: all later pauses take effect at a hold
+            self._pause(k, "pause the run")
+
+    def left(self, name: str, k: int) -> None:
+        """Take the news that a receiver has left before slot k, the first slot of its absence."""
+        self._left[name] = k
+
+    def has_left(self, name: str, k: int) -> bool:
+        """Whether a receiver has left before slot k."""
+        return self._left.get(name) == k
+
+    def done(self, number: int) -> None:
+        """Take the launcher's confirmation of an act on a process; number: that of the event, from 1 on."""
+        self._confirmed = self._confirmed or number == len(self.events)
+
+    def take_order(self, order: Order, reported: int) -> None:
+        """Take a request from the operator, which is carried out at the next hold; ask the sensor to hold.
+
+        reported: all slots below it are joined.
+        """
+        if isinstance(order.request, ResumeRequest) and self.at is None and not self._orders:
+            self._forget_step(reported, "the run was resumed")
+            order.done(reported, "the run is not paused")
+            return
+        self._orders.append(order)
+        if self.at is None and not self._asked:
+            self._asked = True
+            self._conductor.send_to(SENSOR, Hold())
+
+    def carry_on(self, reported: int) -> None:
+        """Carry out as many events as possible, given that all slots below `reported` are joined.
+
+        Raises RunError if they do not become possible in time.
+        """
+        if self.at is None:
+            return
+        if reported < self.at:
+            self._fail(f"not every process has reported all slots below {self.at}")
+            return
+        while self._settled():
+            if self._pending and not self._may(self._pending[0]):
+                self._fail(f"{self._pending[0].names[0]} has not sent its final belief")
+                return
+            if self._pending:
+                self._do(self.at, self._pending.pop(0))
+            elif self._step is not None and self.at >= self._step.until:
+                self._step_is_over(self._step, self.at)
+            elif self._orders:
+                self._obey(self.at, self._orders.popleft())
+            else:
+                if not self.paused:
+                    self._release()
+                return
+
+    def answer_open_orders(self, reported: int, *, complete: bool) -> None:
+        """Answer all open requests, because the run has ended.
+
+        reported: all slots below it are joined; complete: whether these are all slots of the run.
+        """
+        if self._step is not None:
+            said = self._step.passed(reported)
+            if complete:
+                self._step.order.done(reported, f"{said}; the run is over")
+            else:
+                self._step.order.refuse(f"{said}; the run was ended before the step was over")
+        self._step = None
+        while self._orders:
+            self._orders.popleft().refuse("the run ended first; nothing was done")
+
+    def _settled(self) -> bool:
+        """Whether the last act on a process has taken effect."""
+        if self._waiting is None:
+            return True
+        act, action = self._waiting
+        there = action.connected
+        if self._confirmed and (there is None or self._conductor.there(act.names[0]) is there):
+            if act.effect.present:
+                self._conductor.absent -= set(act.names)
+            self._waiting = None
+            return True
+        self._fail(f"{act.said}: not done yet; look at logs/{act.names[0]}.log")
+        return False
+
+    def _fail(self, what: str) -> None:
+        """Raise RunError if the run has been waiting for too long; what: the missing condition."""
+        if time.monotonic() - self._since > READY_SECONDS:
+            raise RunError(
+                f"{READY_SECONDS:.0f} s after the run was held before slot {self.at}, {what}; look at the logs"
+            )
+
+    def _may(self, act: Act) -> bool:
+        """Whether an act may begin: a receiver is ended or stopped only after it has left, in case it missed the hold."""
+        return act.effect.present is not False or all(self._left.get(name) == act.at for name in act.names)
+
+    def _do(self, k: int, act: Act) -> None:
+        self._note(k, act.said, "scenario")
+        if act.effect.present is False:
+            self._conductor.absent |= set(act.names)
+        action = act.effect.action
+        if action is not None:
+            self._waiting, self._confirmed, self._since = (act, action), False, time.monotonic()
+            self._tell(ProcessRequest(action, act.names[0], k, len(self.events)))
+
+    def _obey(self, k: int, order: Order) -> None:
+        """Carry out a request of the operator before slot k."""
+        match order.request:
+            case LinkRequest(event):
+                self._change(k, order, event)
+            case PauseRequest():
+                said = f"held already, before slot {k}" if self.paused else f"held before slot {k}"
+                if not self.paused:
+                    self._pause(k, "pause the run")
+                self._forget_step(k, "the run was paused")
+                order.done(k, said)
+            case ResumeRequest():
+                if self.paused:
+                    self._note(k, "resume the run", "operator")
+                self.paused = False
+                self._forget_step(k, "the run was resumed")
+                order.done(k, f"the run goes on with slot {k}")
+            case StepRequest() if self._step is not None:
+                order.refuse(
+                    f"another step is under way, to slot {self._step.until - 1}; wait for its end, or pause first"
+                )
+            case StepRequest(slots):
+                self._note(k, f"step {slots} slots" if slots > 1 else "step 1 slot", "operator")
+                self._step, self.paused = OperatorStep(order, k, k + slots), False
+
+    def _change(self, k: int, order: Order, event: Mapping[str, Any]) -> None:
+        """Add an event at slot k to the scenario, and send the router the changes of its links from then on."""
+        try:
+            changed = with_event(self._scenario, event, k)
+        except ScenarioError as error:
+            order.refuse(*error.mistakes)
+            return
+        act = next(changed.event[-1].acts())
+        self._scenario = changed
+        self._note(k, act.said, "operator")
+        self._keep(changed)
+        for name in act.names:
+            self._changed.add(name)
+            changes = tuple(one for one in changed.timeline.changes[name] if one.at >= k)
+            self._conductor.send_to(ROUTER, LinkChange(name, changes))
+        order.done(k, f"from slot {k} on: {act.said}")
+
+    def _pause(self, k: int, said: str | None = None) -> None:
+        self.paused = True
+        self._tell(Held(k))
+        if said is not None:
+            self._note(k, said, "operator")
+
+    def _step_is_over(self, step: OperatorStep, k: int) -> None:
+        self._step = None
+        self._pause(k)
+        step.order.done(k, f"{step.passed(k)}; held before slot {k}")
+
+    def _forget_step(self, k: int, why: str) -> None:
+        """Answer the request for the present step, if any, which will not be completed."""
+        if self._step is not None:
+            self._step.order.done(k, f"{self._step.passed(k)}; {why} before the step was over")
+        self._step = None
+
+    def _note(self, k: int, said: str, by: str) -> None:
+        self.events.append(RunEvent(k, said, by))
+
+    def _release(self) -> None:
+        self.at = None
+        until = None if self._step is None else self._step.until
+        self._gone = Go(self._last, tuple(sorted(self._conductor.absent)), until)
+        self._go()
+
+    def _go(self) -> None:
+        if self._gone is not None:
+            self._conductor.send_to(ROUTER, Go(self._gone.slot))
+            self._conductor.send_to(SENSOR, self._gone)
+
+    @property
+    def changes(self) -> dict[str, tuple[Change, ...]]:
+        """Link that the operator has changed → all its changes."""
+        timeline = self._scenario.timeline.changes
+        return {name: tuple(timeline[name]) for name in sorted(self._changed)}
+
+    def remind(self) -> None:
+        """Send the last commands again, which may have been lost with a connection; restart the time limit of the hold.
+
+        The last `Go` is sent even if the sensor holds again: a router that was restarted may still wait at the previous hold.
+        """
+        self._since = time.monotonic()
+        self._go()
+        if self._asked:
+            self._conductor.send_to(SENSOR, Hold())

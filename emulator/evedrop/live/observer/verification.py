@@ -1,0 +1,205 @@
+"""Verifies the claims of receivers and sensor against the receivers' own reports and the router's journal.
+
+For the recorded trials a receiver reports everything that enters its digests, so the observer computes the digests again.
+For all trials it reports whether it received a packet in each slot, and so does the router. Claims that can be checked
+neither way rest on the receiver's word alone.
+
+Source: docs/results.md, what is verified.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import final
+
+import numpy as np
+
+from evedrop.errors import Contradiction
+from evedrop.live.protocol.telemetry import Extent, Report
+from evedrop.model.digest import Blocks, PartialDigests
+from evedrop.model.kernels.current import kernels
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Action, Belief
+from evedrop.names import ROUTER, SENSOR
+from evedrop.scenario.controlled import monitor_of
+from evedrop.scenario.tables import Scenario
+from evedrop.score.slots import ReceiverSlots, Slots
+
+_ROUNDING = 1e-9  # sums of a thousand traces in different orders differ by less
+
+
+@final
+class Verifier:
+    """Checks the reports of all receivers of a run, in the order of their slots."""
+
+    def __init__(self, blocks: Mapping[str, Blocks], recorded: int, first_trial: int) -> None:
+        """blocks: receiver → its digests' blocks; recorded: how many trials are reported in full; first_trial: their first."""
+        self._block_sums: dict[str, tuple[Floats, float]] = {}
+        self._blocks, self._recorded, self._first_trial = blocks, recorded, first_trial
+        self._digests: dict[str, PartialDigests] = {}
+        self._leaving: dict[tuple[str, int], Belief] = {}
+
+    def left(self, name: str, k: int, belief: Belief) -> None:
+        """Take a receiver's final belief before slot k, the first slot of its absence."""
+        self._leaving[name, k] = belief
+
+    def report(self, name: str, report: Report) -> None:
+        """Check a receiver's next report. Raises Contradiction if the report contradicts itself."""
+        self._check_traces(name, report)
+        end = report.first + report.count
+        self._check_leaving(name, report, end)
+        first, blocks = report.first, self._blocks[name]
+        some = slice(0, self._recorded)
+        while first < end:
+            stop = min(end, blocks.end(first))
+            rows = slice(first - report.first, stop - report.first)
+            partial = self._digests.setdefault(name, PartialDigests(self._recorded))
+            partial.add(report.x_hat[rows, :, some], report.P[rows], report.action[rows, some])
+            if report.x_hat.shape[2] > self._recorded:
+                self._add_to_block(name, report, rows)
+                if stop == blocks.end(first):
+                    self._check_block_sums(name, report, blocks.start(first), stop)
+            if stop == blocks.end(first):
+                self._check_digests(name, report, blocks.start(first), stop)
+            first = stop
+
+    def _check_digests(self, name: str, report: Report, start: int, stop: int) -> None:
+        found = self._digests[name].finished()
+        claimed = report.digests[start][: self._recorded]
+        wrong = (found != claimed).any(axis=1)
+        if wrong.any():
+            r = int(np.argmax(wrong))
+            raise Contradiction(
+                name,
+                f"its digest of slots {start} to {stop - 1} of trial {self._first_trial + r} is {claimed[r].tobytes().hex()}, "
+                f"and what it reported of these slots gives {found[r].tobytes().hex()}",
+            )
+
+    def _add_to_block(self, name: str, report: Report, rows: slice) -> None:
+        """Add slots of one block to the sums of tr P of the recorded trials, and to the sum over all trials."""
+        before = self._block_sums.get(name, (np.zeros(self._recorded), 0.0))
+        with np.errstate(over="ignore", invalid="ignore"):  # a receiver may have made these numbers up
+            traces = kernels.traces(report.P[rows])
+            self._block_sums[name] = (before[0] + traces.sum(axis=0), before[1] + float(report.trace[rows, 0].sum()))
+
+    def _check_block_sums(self, name: str, report: Report, start: int, stop: int) -> None:
+        """Check that the sums of tr P of a block's trials are those of the recorded trials, and of all trials together."""
+        of_recorded, of_all = self._block_sums.pop(name)
+        claimed = report.trace_sums[start]
+        known = np.append(of_recorded, of_all)
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = np.append(claimed[: self._recorded], claimed.sum())
+            wrong = ~(np.abs(found - known) <= _ROUNDING * np.maximum(np.abs(known), np.abs(found)))
+        if wrong.any():
+            place = int(np.argmax(wrong))
+            which = "all trials" if place == self._recorded else f"trial {self._first_trial + place}"
+            raise Contradiction(
+                name,
+                f"its sum of tr P over slots {start} to {stop - 1} of {which} is {found[place]:.17g}, and what it reported of "
+                f"these slots gives {known[place]:.17g}",
+            )
+
+    def _check_traces(self, name: str, report: Report) -> None:
+        """Check that the sums of tr P over all trials are possible given the recorded trials; equal, if all are recorded."""
+        traces = kernels.traces(report.P)
+        trials, claimed = report.x_hat.shape[2], report.trace
+        others = trials - traces.shape[1]
+        with np.errstate(over="ignore", invalid="ignore"):  # a receiver may have made these numbers up
+            known = np.stack([traces.sum(axis=1), (traces * traces).sum(axis=1)], axis=1)
+            size = np.stack([np.sqrt(trials * np.abs(claimed[:, 1])), np.abs(claimed[:, 1])], axis=1)
+            left = claimed - known
+            if others == 0:
+                wrong = (np.abs(left) > _ROUNDING * np.maximum(size, np.abs(known))).any(axis=1)
+            else:
+                # For any numbers: |sum| ≤ √(count · sum of squares). The remaining sum of squares is known within rounding.
+                squares = left[:, 1] + _ROUNDING * size[:, 1]
+                room = np.sqrt(others * np.maximum(squares, 0.0)) + _ROUNDING * size[:, 0]
+                wrong = (squares < 0.0) | (np.abs(left[:, 0]) > room)
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            sums = [f"{value:.17g}" for value in (*claimed[row], *known[row])]
+            raise Contradiction(
+                name,
+                f"its sums of tr P and of (tr P)² in slot {report.first + row} are {sums[0]} and {sums[1]}, and those of the "
+                f"recorded trials, {traces.shape[1]} of {report.x_hat.shape[2]}, are {sums[2]} and {sums[3]}",
+            )
+
+    def _check_leaving(self, name: str, report: Report, end: int) -> None:
+        """Check that a receiver's final belief is the one in its report of its last slot."""
+        left = self._leaving.pop((name, end), None)
+        if left is None:
+            return
+        for what, said, reported in (
+            ("x_hat", left.x_hat, report.x_hat[-1]),
+            ("P", left.P[..., : self._recorded], report.P[-1]),
+        ):
+            if said.tobytes() != np.ascontiguousarray(reported).tobytes():
+                place = tuple(int(i) for i in np.argwhere(said != reported)[0]) if (said != reported).any() else (0,)
+                raise Contradiction(
+                    name,
+                    f"before slot {end}, with which it goes away, its {what} of trial {self._first_trial + place[-1]} is "
+                    f"{said[place]}, and in its report of slot {end - 1} it is {reported[place]}",
+                )
+
+    def joined(self, slots: Slots) -> None:
+        """Check joined slots against the journal. Raises Contradiction if they disagree."""
+        for name, receiver in slots.receivers.items():
+            self._check_received(name, slots.first, receiver)
+            if slots.sent is not None:
+                self._check_sent(slots, receiver)
+
+    def _check_received(self, name: str, first: int, receiver: ReceiverSlots) -> None:
+        received = receiver.action != Action.LOST
+        wrong = received != receiver.delivered
+        if wrong.any():
+            row, r = (int(i) for i in np.argwhere(wrong)[0])
+            says = "that it received the packet" if received[row, r] else "that it received nothing"
+            journal = "that it was delivered" if receiver.delivered[row, r] else "that it was not delivered"
+            raise Contradiction(
+                name,
+                f"in slot {first + row}, trial {self._first_trial + r}, it says {says} (action "
+                f"{int(receiver.action[row, r])}), but the journal says {journal}",
+                ROUTER,
+            )
+        if receiver.late is None or receiver.late_delivered is None:
+            return
+        wrong = receiver.late != receiver.late_delivered
+        if wrong.any():
+            row, r = (int(i) for i in np.argwhere(wrong)[0])
+            raise Contradiction(
+                name,
+                f"in slot {first + row}, trial {self._first_trial + r}, it says that {int(receiver.late[row, r])} late packets "
+                f"arrived, but the journal says {int(receiver.late_delivered[row, r])}",
+                ROUTER,
+            )
+
+    def _check_sent(self, slots: Slots, receiver: ReceiverSlots) -> None:
+        """Check the sensor's report of the packets that it sent against the journal."""
+        if slots.sent is None:
+            return
+        silent = np.count_nonzero(~slots.sent, axis=1)
+        unsent = 0 if receiver.unsent is None else receiver.unsent.astype(np.int64)
+        wrong = (silent != unsent) | (receiver.delivered & ~slots.sent).any(axis=1)
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            raise Contradiction(
+                SENSOR,
+                f"in slot {slots.first + row} it says that {int(silent[row])} trials sent nothing, but the journal says "
+                f"{int(np.broadcast_to(unsent, silent.shape)[row])}, or that a packet of one of them was delivered",
+                ROUTER,
+            )
+
+
+def extent_of(scenario: Scenario, batch: int) -> Extent:
+    """The dimensions of a run, which its messages must have; batch: slots of a report."""
+    plant = scenario.driven
+    return Extent(
+        scenario.slots,
+        batch,
+        len(scenario.process.A),
+        scenario.trials,
+        scenario.record_trials,
+        0 if plant is None or scenario.controller is None else plant.inputs,
+        plant is not None and plant.output_matrix is not None,
+        monitor_of(scenario) is not None,
+    )

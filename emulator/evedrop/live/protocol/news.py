@@ -1,0 +1,93 @@
+"""The lines that observer and routers write for their launcher: JSON objects with `event` and the entries of that kind of news.
+
+Kinds that only the launcher needs are defined here; it passes the others, which are in `evedrop.scenario.news`, on to be shown.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from evedrop.model.entries import SLOT, entry, expect, read, table_of, text
+from evedrop.names import ProcessAction
+from evedrop.scenario.news import ConnectionOutage, Held, News, RunEnded, RunProgress, Started, ViewOpened
+
+
+def _action(path: str, found: Any) -> Iterator[str]:
+    if found not in [*ProcessAction]:
+        yield f"{path} is {found!r:.40}, expected one of {', '.join(ProcessAction)}"
+
+
+@dataclass(frozen=True)
+class Alive(News):
+    """The observer's heartbeat."""
+
+    event = "alive"
+
+
+@dataclass(frozen=True)
+class RouterListens(News):
+    """From a router or relay, its only news: it listens, so the processes that connect to it may be started."""
+
+    event = "listening"
+    process: str = field(metadata=entry(text))
+
+
+@dataclass(frozen=True)
+class ProcessRequest(News):
+    """The observer asks the launcher to act on a process, and to confirm it."""
+
+    event = "act"
+    do: ProcessAction = field(metadata=entry(_action, ProcessAction))
+    process: str = field(metadata=entry(text))
+    first: int = field(metadata=entry(SLOT))
+    """The first slot that a restarted process handles."""
+    number: int = field(metadata=entry(SLOT))
+    """The number with which the launcher confirms it."""
+
+
+@dataclass(frozen=True)
+class RunOver(News):
+    """All slots are done, and the processes will be told to leave."""
+
+    event = "over"
+
+
+@dataclass(frozen=True)
+class Finishing(News):
+    """The observer begins to write the results."""
+
+    event = "finishing"
+
+
+_KINDS: Mapping[str, type[News]] = {
+    kind.event: kind
+    for kind in (
+        Alive,
+        RouterListens,
+        Started,
+        Held,
+        ProcessRequest,
+        ConnectionOutage,
+        RunProgress,
+        RunOver,
+        Finishing,
+        RunEnded,
+        ViewOpened,
+    )
+}
+
+
+def read_news(line: bytes) -> News:
+    """Read a line of the observer or a router. Raises ValueError if it is malformed."""
+    try:
+        found = json.loads(line)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+    if not isinstance(found, dict) or not isinstance(event := found.pop("event", None), str) or event not in _KINDS:
+        raise ValueError(f"it is not an object with an event of {', '.join(_KINDS)}")
+    kind = _KINDS[event]
+    expect(table_of(kind), "", found)
+    return read(kind, found)

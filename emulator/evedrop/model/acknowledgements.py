@@ -1,0 +1,222 @@
+"""Which acknowledgements reach the sensor: over a lossy channel, and past a jammer that also hears the packets.
+
+Source: docs/mathematics.md, attacks on acknowledgements.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evedrop.model.receiver import Flags
+from evedrop.model.streams import Ahead, Batch, BlockReader
+
+Attack = Callable[[Flags, Flags, Flags], Flags]
+"""(γ of the user, γᵉ of the jammer, whether the attacker flips) → the acknowledgements on the air, all (R,)."""
+
+
+def _none(gamma: Flags, gamma_e: Flags, flips: Flags) -> Flags:  # noqa: ARG001 - what the jammer hears does not matter
+    return gamma
+
+
+def _block_all(gamma: Flags, gamma_e: Flags, flips: Flags) -> Flags:  # noqa: ARG001 - the same
+    return np.zeros_like(gamma)
+
+
+def _block_critical(gamma: Flags, gamma_e: Flags, flips: Flags) -> Flags:  # noqa: ARG001 - the same
+    return gamma & gamma_e
+
+
+def _forge(gamma: Flags, gamma_e: Flags, flips: Flags) -> Flags:  # noqa: ARG001 - the same
+    return np.ones_like(gamma)
+
+
+def _flip(gamma: Flags, gamma_e: Flags, flips: Flags) -> Flags:  # noqa: ARG001 - the same
+    return gamma ^ flips
+
+
+ATTACKS: Mapping[str, Attack] = {
+    "none": _none,
+    "all": _block_all,
+    "critical": _block_critical,
+    "forge": _forge,
+    "flip": _flip,
+    "hijack": _none,
+}
+"""critical blocks acknowledgements where γ = 1 and γᵉ = 0; forge sends one in the user's name where γ = 0; flip does either.
+
+hijack leaves them as they are, and decides which ones the sensor heeds: see `Heeding`.
+"""
+OVERHEARING = frozenset({"critical", "hijack"})
+"""The attacks that depend on what a jammer hears."""
+FORGING = frozenset({"forge", "flip"})
+"""The attacks that make a reference of a packet that the user has not heard."""
+
+
+class Heeding(NamedTuple):
+    """Which acknowledgements a hijacked sensor heeds, by how many packets in a row its eavesdropper has missed."""
+
+    patience: int
+    """Those of packets after fewer misses than this are heeded, those after more are not."""
+    share: float
+    """The share that is heeded of those after exactly this many misses."""
+
+    @classmethod
+    def of(cls, quality: float, overheard: float) -> Heeding | None:
+        """The rule that heeds a share `quality` of all, if the eavesdropper hears packets with the probability `overheard`.
+
+        1 − (1−μ_e)^J (1 − μ_e a) = α, with the patience J and the share a. None if there is no choice: where no acknowledgement
+        is lost, and where nothing is overheard.
+
+        Source: after Lu, Quevedo, Gupta, Dey (2020); docs/mathematics.md, the hijacked sensor.
+        """
+        if quality >= 1.0 or 1.0 - overheard == 1.0:
+            return None
+        patience = 0 if overheard >= 1.0 else max(0, int(math.log1p(-quality) / math.log1p(-overheard)) - 1)
+        # From here on only elementary operations, so that the share has the same bits on every machine.
+        while _power(1.0 - overheard, patience + 1) > 1.0 - quality:
+            patience += 1
+        left = _power(1.0 - overheard, patience)
+        return cls(patience, min(max((quality - (1.0 - left)) / (overheard * left), 0.0), 1.0))
+
+    def share_of(self, missed: int) -> float:
+        """The share that is heeded after this many misses."""
+        return 1.0 if missed < self.patience else self.share if missed == self.patience else 0.0
+
+
+def _power(base: float, exponent: int) -> float:
+    """A power by squaring."""
+    found = 1.0
+    while exponent:
+        if exponent & 1:
+            found *= base
+        base *= base
+        exponent >>= 1
+    return found
+
+
+def heeding_of(attack: str, quality: float, overheard: float) -> Heeding | None:
+    """What the sensor heeds under an attack; None if it heeds all that reach it."""
+    return Heeding.of(quality, overheard) if attack == "hijack" else None
+
+
+@dataclass(frozen=True)
+class AckChannelSpec:
+    """The acknowledgement channel as the router needs to know it."""
+
+    quality: float
+    attack: str
+    jammer: str | None
+    spans: Sequence[Sequence[int]] | None
+    """Slots [from, to) in which the attack is on; None: in all slots."""
+    flip: float = 0.0
+    """The probability of a flip, for the attack `flip`."""
+    overheard: float = 1.0
+    """The probability that the jammer hears a packet, for the attack `hijack`."""
+
+    @property
+    def memory(self) -> int:
+        """How many packets before its own decide on an acknowledgement: those that the jammer may have missed in a row."""
+        heeding = heeding_of(self.attack, self.quality, self.overheard)
+        return 0 if heeding is None else heeding.patience
+
+
+@final
+class AckChannel:
+    """Acknowledgements from user to sensor: each that is on the air arrives with probability `quality`.
+
+    spans: slots [from, to) in which the attack is on; None: in all slots. flip: the probability of a flip; overheard: that the
+    jammer hears a packet.
+    """
+
+    def __init__(
+        self,
+        attack: str,
+        quality: float,
+        key: bytes,
+        batch: Batch,
+        spans: Sequence[Sequence[int]] | None = None,
+        flip: float = 0.0,
+        overheard: float = 1.0,
+    ) -> None:
+        self._attack = ATTACKS[attack]
+        self._spans = spans
+        # The first of two words is that of a reader of one.
+        reader = BlockReader(key, batch, 2)
+        self._heeding = heeding_of(attack, quality, overheard)
+        share = 0.0 if self._heeding is None else self._heeding.share
+        words, limits = [0, 1, 0], np.array([quality, flip, share])[:, None]
+        self._drawn = Ahead(reader.ahead, lambda slots: reader.uniforms(slots)[:, words] < limits)
+        self._missed: NDArray[np.int64] = np.zeros(batch.trials, np.int64)
+        self._counted = -1
+
+    @classmethod
+    def from_spec(cls, spec: AckChannelSpec, key: bytes, batch: Batch) -> AckChannel:
+        """The channel that a specification describes."""
+        return cls(spec.attack, spec.quality, key, batch, spec.spans, spec.flip, spec.overheard)
+
+    def arrived(self, k: int, sent: Flags | None, gamma: Flags, gamma_e: Flags) -> Flags:
+        """The acknowledgements of slot k that reach the sensor, (R,).
+
+        sent: `Packet.sent`; a packet that was not sent is never acknowledged, even by a forger. gamma: what the user received;
+        gamma_e: what the jammer received.
+        """
+        attacked = self._spans is None or any(start <= k < stop for start, stop in self._spans)
+        through, flips, shared = self._drawn.at(k)
+        on_the_air = self._attack(gamma, gamma_e, flips) if attacked else gamma
+        arrived: Flags = on_the_air & through
+        if self._heeding is not None:
+            self.count(k, sent, gamma_e)
+            if attacked:
+                few, as_many = self._missed < self._heeding.patience, self._missed == self._heeding.patience
+                arrived = on_the_air & (few | (as_many & shared))
+        return arrived if sent is None else arrived & sent
+
+    def count(self, k: int, sent: Flags | None, gamma_e: Flags) -> None:
+        """Count the packets in a row that the jammer has missed; arguments as for `arrived`, which counts, too.
+
+        A slot counts once, so this is for slots whose acknowledgements another channel has passed on.
+        """
+        if k > self._counted:
+            self._counted = k
+            missed = np.where(gamma_e, 0, self._missed + 1)
+            self._missed = missed if sent is None else np.where(sent, missed, self._missed)
+
+
+class AcknowledgementRates(NamedTuple):
+    """Probabilities, for a packet that is sent."""
+
+    arrives: float
+    """Probability that an acknowledgement of it reaches the sensor."""
+    user: tuple[float, float]
+    """The same jointly with the user having received the packet, and having missed it (forged)."""
+    eavesdropper: tuple[float, float]
+    """The same jointly with the jammer having received the packet, and having missed it (critical or forged)."""
+
+
+def rates_of(attack: str, mu: float, mu_e: float, quality: float = 1.0, flip: float = 0.0) -> AcknowledgementRates:
+    """The rates under an attack, for independent links of qualities μ and μ_e and an independent acknowledgement channel.
+
+    Under `hijack` those of a packet alone: what the sensor heeds then depends on earlier packets as well.
+
+    flip: the probability of a flip.
+
+    Source: docs/mathematics.md, attacks on acknowledgements.
+    """
+    gamma, gamma_e, flips = (np.arange(8) >> bit & 1 == 0 for bit in range(3))
+    chances = np.where(gamma, mu, 1.0 - mu) * np.where(gamma_e, mu_e, 1.0 - mu_e) * np.where(flips, flip, 1.0 - flip)
+    heeding, heeded = heeding_of(attack, quality, mu_e), np.full(8, quality)
+    if heeding is not None:
+        share = heeding.share_of(0)
+        heeded = np.where(gamma_e, share, max(0.0, quality - mu_e * share) / max(1.0 - mu_e, np.finfo(float).tiny))
+    arrives = heeded * chances * ATTACKS[attack](gamma, gamma_e, flips)
+
+    def split(heard: Flags) -> tuple[float, float]:
+        return float(arrives[heard].sum()), float(arrives[~heard].sum())
+
+    return AcknowledgementRates(float(arrives.sum()), split(gamma), split(gamma_e))

@@ -1,0 +1,88 @@
+"""The Bayesian eavesdropper: knows the mechanism but not the secret, and weighs every possible history.
+
+Its posterior is a mixture with a component for each slot j that may have brought the last state packet it received: x_j was
+that packet, and all later packets were innovations. A packet either starts a new component, or is one more innovation
+for all others.
+
+Source: docs/mathematics.md, bayesian eavesdropper.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
+from evedrop.model.kernels.current import kernels
+from evedrop.model.kernels.elementary import cholesky
+from evedrop.model.kernels.factored import Factor, Factors
+from evedrop.model.kernels.mixtures import Mixture
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Belief, Beliefs, Flags, Reception
+from evedrop.model.schedule import equal_slots, in_slot
+from evedrop.model.streams import Batch
+from evedrop.model.theory.leak import Leaks
+
+CAPACITY = 12
+"""The most components of a trial; beyond it the two least probable ones are merged, with the same mean and covariance."""
+
+
+class Bayesian(PacketReader):
+    """Minimum mean square error, apart from the loss where too many components would have to be kept.
+
+    `Belief.memory` is its `Mixture`.
+    """
+
+    only_against = (
+        ("innovation", "noise"),
+        "weighs states against innovations, and there are none: it is the same as naive here",
+    )
+    reads_leaks = tests_range = True
+
+    def __init__(self, knowledge: Knowledge, batch: Batch, capacity: int = CAPACITY) -> None:
+        super().__init__(knowledge, batch)
+        self._mu_d = knowledge.mu_d
+        self._capacity = capacity
+        self._leaks = Leaks(knowledge.process, knowledge.noise_law)
+        self._stairs = self._leaks.stairs
+        """The coordinates of `Belief.memory`."""
+
+    def prior(self, first: int = 0) -> Belief:
+        """One component, without any reception."""
+        belief = super().prior(first)
+        n, trials = belief.x_hat.shape
+        factor = cholesky(self._stairs.inward_covariance(belief.P[:, :, :1])[:, :, 0])
+        spread = Factors.alike(Factor.of_triangular(factor.tolist()), (1, trials))
+        return belief._replace(memory=Mixture(np.ones((1, trials)), np.zeros((n, 1, trials)), *spread))
+
+    def knowing(self, k: int, x: Floats, belief: Belief) -> Belief:
+        """One component with covariance 0."""
+        belief, (n, trials) = super().knowing(k, x, belief), x.shape
+        nothing = np.zeros((n * (n - 1) // 2, 1, trials)), np.zeros((n, 1, trials))
+        return belief._replace(memory=Mixture(np.ones((1, trials)), self._stairs.inward(x)[:, None, :], *nothing))
+
+    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
+        """Predict every component, weight it by the packet and add the packet's own; returns their common mean and covariance."""
+        return self.follow(range(k, k + 1), belief, heard.gamma[None], heard.z[None])[1]
+
+    def follow(self, slots: range, belief: Belief, gamma: Flags, z: Floats) -> tuple[Beliefs, Belief]:
+        """The same in many slots at once."""
+        mixture, parts, stairs = belief.memory, [], self._stairs
+        z = stairs.inward(z)
+        for some in equal_slots(self._mu_d, slots):
+            rows = slice(some.start - slots.start, some.stop - slots.start)
+            x_hat, P, action, *parted = kernels.follow_mixture(
+                stairs.process.A,
+                stairs.process.noise_factor,
+                self._leaks.block(some),
+                self._leaks.rounding(some),
+                mixture,
+                gamma[rows],
+                z[rows],
+                in_slot(self._mu_d, some.start),
+                self._capacity,
+                some.start == 0,
+            )
+            mixture = Mixture(*parted)
+            parts.append(Beliefs(stairs.outward(x_hat), stairs.outward_covariance(P), action))
+        found = Beliefs.joined(parts)
+        return found, found.last._replace(memory=mixture)

@@ -1,0 +1,59 @@
+"""Eavesdroppers with an additional ability that otherwise read packets as another strategy does."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, ClassVar
+
+from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
+from evedrop.model.eavesdroppers.readers import READERS
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Belief, Beliefs, Codes, Flags, Reception
+from evedrop.model.streams import Batch
+from evedrop.model.theory.covariances import OutcomesAt
+
+
+class Delegate(Eavesdropper):
+    """Reads as `reads_as` does, with the keys that that strategy needs."""
+
+    parameters: ClassVar[Mapping[str, Any]] = MappingProxyType({"reads_as": "smart"})
+
+    def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
+        super().__init__(knowledge, batch)
+        self.reader = READERS.imported(knowledge.parameters["reads_as"])(knowledge, batch)
+
+    @classmethod
+    def streams(cls, parameters: Mapping[str, Any]) -> tuple[str, ...]:
+        """The reader's streams."""
+        return READERS[parameters["reads_as"]].streams(parameters)
+
+    @classmethod
+    def outcomes(cls, parameters: Mapping[str, Any], mu_d: float) -> OutcomesAt | None:
+        """The reader's outcomes."""
+        return READERS[parameters["reads_as"]].outcomes(parameters, mu_d)
+
+    @classmethod
+    def follows_gamma(cls, parameters: Mapping[str, Any]) -> bool:
+        """Whether the reader follows γ."""
+        return READERS[parameters["reads_as"]].follows_gamma(parameters)
+
+    def prior(self, first: int = 0) -> Belief:
+        """The reader's prior."""
+        return self.reader.prior(first)
+
+    def learned(self, belief: Belief) -> Mapping[str, Floats]:
+        """What the reader has learned."""
+        return self.reader.learned(belief)
+
+    def act(self, k: int, gamma: Flags) -> Codes:
+        """The reader's action."""
+        return self.reader.act(k, gamma)
+
+    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
+        """The reader's belief."""
+        return self.reader.step(k, belief, heard)
+
+    def follow(self, slots: range, belief: Belief, gamma: Flags, z: Floats) -> tuple[Beliefs, Belief]:
+        """The reader's beliefs."""
+        return self.reader.follow(slots, belief, gamma, z)

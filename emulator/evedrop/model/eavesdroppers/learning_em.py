@@ -1,0 +1,160 @@
+"""The eavesdropper that learns by expectation-maximisation: it knows the mechanism, but neither the process nor μ_d.
+
+Until it has kept as many slots as it may, it goes through all of them again whenever their number has doubled: the
+expectation is the Bayesian eavesdropper with estimated parameters, the maximisation a regression of the packets that may be
+states on the states before them. From the first time on, every other packet is one small step of both.
+
+Source: docs/mathematics.md, eavesdroppers that learn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evedrop.model.checks import as_toml, number_mistakes
+from evedrop.model.eavesdroppers.eavesdropper import Knowledge
+from evedrop.model.eavesdroppers.learner import Learner
+from evedrop.model.kernels.factored import covariance
+from evedrop.model.kernels.mixtures import moments as moments_of
+from evedrop.model.learning.climb import NARROW, Learned, climbed
+from evedrop.model.learning.known import knowing_mistakes
+from evedrop.model.learning.learner_posterior import LearnerPosterior, advanced, scale_of, unheard
+from evedrop.model.learning.moments import Moments
+from evedrop.model.learning.posterior import Parameters
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Action, Belief, Codes, Flags, Reception
+from evedrop.model.streams import Batch
+
+_MOST_KEPT = 4096
+_EACH = 8  # slots for each state before the first climb
+
+
+class Memory(NamedTuple):
+    """`Belief.memory`."""
+
+    learned: Learned
+    largest: Floats
+    """The largest |z| of every state so far, (n, R)."""
+    first: NDArray[np.int64]
+    """The first slot that it listened to, (1, R)."""
+    gamma: Flags
+    """The slots that it keeps, (c, R)."""
+    z: Floats
+    """(c, n, R), 0 where nothing was received."""
+
+    def stored(self) -> tuple[NDArray[Any], ...]:
+        """The arrays one after the other."""
+        posterior, theta, moments, scale = self.learned
+        return (*posterior, *theta, *moments, scale, *self[1:])
+
+    @classmethod
+    def read(cls, stored: tuple[NDArray[Any], ...]) -> Memory:
+        """The memory of these arrays."""
+        a, b, c = 7, 11, 18
+        learned = Learned(LearnerPosterior(*stored[:a]), Parameters(*stored[a:b]), Moments(*stored[b:c]), stored[c])
+        return cls(learned, *stored[c + 1 :])
+
+
+class LearningEm(Learner):
+    """Learns A, Q, μ_d and Σ_k from its own packets, and weighs packets by what it has learned.
+
+    parameters: `knows`, names of what it is given; `keeps`, the slots that it keeps to go through again.
+    """
+
+    parameters = MappingProxyType({"knows": [], "keeps": 64})
+
+    def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
+        super().__init__(knowledge, batch)
+        self._keeps = int(knowledge.parameters["keeps"])
+        self._climbs = climbing_slots(knowledge.process.n, self._keeps)
+
+    @classmethod
+    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """Names that are known, and a number of slots."""
+        return knowing_mistakes(given) + kept_mistakes(given)
+
+    def prior(self, first: int = 0) -> Belief:
+        """x̂ = 0, and the covariance I for want of Σ0."""
+        n, trials = self.process.n, self.trials
+        one, posterior = np.ones(trials), unheard(self.known, np.ones(trials))
+        theta = self.known.start(one)
+        learned = Learned(posterior, theta, Moments.imagined(theta.A, one), one)
+        none = np.zeros((0, trials), np.bool_), np.zeros((0, n, trials))
+        memory = Memory(learned, np.zeros((n, trials)), np.full((1, trials), first), *none)
+        return self._believed(np.zeros(trials, np.uint8), memory)
+
+    def knowing(self, k: int, x: Floats, belief: Belief) -> Belief:
+        """One component with covariance 0; its parameters stay."""
+        memory = Memory.read(belief.memory)
+        posterior = memory.learned.posterior.knowing(x)
+        after = super().knowing(k, x, belief)
+        return after._replace(memory=memory._replace(learned=memory.learned._replace(posterior=posterior)).stored())
+
+    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
+        """Weigh the packet by the parameters so far, and learn from it."""
+        memory, gamma = Memory.read(belief.memory), heard.gamma
+        z = np.where(gamma, heard.z, 0.0)
+        first, learned = int(memory.first.flat[0]), memory.learned
+        age = k - first + 1
+        if age <= self._keeps and not self.known.everything:
+            memory = memory._replace(
+                gamma=np.concatenate([memory.gamma, gamma[None]]), z=np.concatenate([memory.z, z[None]])
+            )
+        if age in self._climbs and not self.known.everything:
+            so_far = learned.theta if age > self._climbs[0] else None
+            state = advanced(k, self.known, learned.theta, learned.posterior, gamma, z).state
+            learned = climbed(self.known, first, memory.gamma, memory.z, so_far)
+        else:
+            learned, state = self._small_step(k, learned, gamma, z, age)
+        action = np.where(
+            gamma, np.where(state > 0.5, np.uint8(Action.STATE), np.uint8(Action.INNOVATION)), np.uint8(0)
+        )
+        return self._believed(action, memory._replace(learned=learned, largest=np.maximum(memory.largest, np.abs(z))))
+
+    def learned(self, belief: Belief) -> Mapping[str, Floats]:
+        """Its estimates."""
+        theta = Memory.read(belief.memory).learned.theta
+        return {"A": theta.A, "Q": covariance(theta.noise), "mu_d": theta.mu_d}
+
+    def _believed(self, action: Codes, memory: Memory) -> Belief:
+        """The mean and covariance of the posterior, made smaller where they are out of all proportion to the packets."""
+        x_hat, P = moments_of(memory.learned.posterior.mixture)
+        x_hat, P = self.in_proportion(x_hat, P, memory.largest)
+        return Belief(x_hat, P, action, memory.stored())
+
+    def _small_step(self, k: int, learned: Learned, gamma: Flags, z: Floats, age: int) -> tuple[Learned, Floats]:
+        """What is known after a slot, and the probability that its packet is the state."""
+        posterior, theta, moments, scale = learned
+        after = advanced(k, self.known, theta, posterior, gamma, z)
+        if age < self._climbs[0]:
+            scale = np.where((posterior.packets == 0.0) & gamma, scale_of(gamma[None], z[None]), scale)
+            theta = self.known.start(NARROW[0] * scale)
+        elif not self.known.everything:
+            share = np.where(gamma, 1.0 - 1.0 / (age + 1.0), 1.0)
+            moments = moments.faded(share).added(theta.A, z, gamma.astype(np.float64), after.last)
+            moments, theta = moments.most_likely(theta, scale, self.known.names)
+        return Learned(after.posterior, theta, moments, scale), after.state
+
+
+def climbing_slots(n: int, keeps: int) -> list[int]:
+    """The numbers of slots after which all of them are gone through again."""
+    age = _EACH
+    while age < _EACH * n:
+        age *= 2
+    found = [min(age, keeps)]
+    while 2 * found[-1] <= keeps:
+        found.append(2 * found[-1])
+    return found
+
+
+def kept_mistakes(given: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """A mistake in `keeps`."""
+    keeps = given.get("keeps", _EACH)
+    if isinstance(keeps, bool) or not isinstance(keeps, int):
+        return [("keeps", f"is {as_toml(keeps)}; expected a whole number of slots from {_EACH} to {_MOST_KEPT}")]
+    return number_mistakes(given, "keeps", _EACH, _MOST_KEPT)

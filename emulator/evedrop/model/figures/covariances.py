@@ -1,0 +1,94 @@
+"""The error covariance that a receiver believes, and the one that theory expects."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import final
+
+import numpy as np
+
+from evedrop.model.figures.figure import (
+    FigureColumn,
+    FigureTally,
+    MeanFigure,
+    ReceiverTotals,
+    ScoredSlots,
+    TotalsFigure,
+    TrialTotals,
+)
+from evedrop.model.process import Floats
+
+
+@final
+class MeanTraceCovariance(MeanFigure, TotalsFigure):
+    """The mean of tr P, where P is the covariance that the receiver believes."""
+
+    meaning = "of tr P, the error covariance that the receiver believes"
+    by_trial = False
+    of_error = True
+    rests_on = "recorded trials"
+    column = FigureColumn("believed tr P", 3)
+    sweep_column = FigureColumn("believed tr P", 2)
+
+    @classmethod
+    def of_totals(cls, totals: ReceiverTotals) -> float:
+        """Its mean over the run."""
+        return totals.trace / max(1, totals.offered)
+
+    @classmethod
+    def sums_of_trials(cls, totals: TrialTotals) -> Floats | None:
+        """The sum of tr P over the slots of every trial, (R,); None if not every trial's is known."""
+        return totals.trace
+
+    @staticmethod
+    def values(slots: ScoredSlots) -> Floats:
+        """The sum of tr P over trials, (c, 1)."""
+        return slots.trace[:, None]
+
+
+@final
+class ExpectedTraceCovariance(TotalsFigure):
+    """The mean trace of the actual error covariance that theory expects."""
+
+    meaning = (
+        "theory: trace of the expected actual error covariance over the same slots; null if no theory covers the losses "
+        "of its link, or if no closed form is known for its strategy"
+    )
+    needs_theory = True
+    rests_on = "theory"
+    column = FigureColumn("expected tr P", 4)
+    sweep_column = FigureColumn("expected tr P", 1)
+    sweep_picture = "lines"
+
+    @classmethod
+    def of_totals(cls, totals: ReceiverTotals) -> float:
+        """Its mean over the run; NaN without theory."""
+        return totals.expected_trace / max(1, totals.offered)
+
+    @classmethod
+    def tally(cls, trials: int) -> FigureTally:
+        """A tally of no slots yet."""
+        del trials
+        return ExpectedTraces()
+
+
+@final
+class ExpectedTraces(FigureTally):
+    """The expected traces of some slots, which are the same for all trials."""
+
+    def __init__(self) -> None:
+        self._traces: list[Floats] = []
+
+    def add(self, slots: ScoredSlots) -> None:
+        """Add the next slots."""
+        self._traces.append(slots.expected.copy())
+
+    @classmethod
+    def merged(cls, parts: Sequence[ExpectedTraces]) -> ExpectedTraces:
+        """The traces of the first set of trials, which are those of all."""
+        return parts[0]
+
+    @property
+    def value(self) -> float | None:
+        """Their mean; None without slots."""
+        return float(np.mean(np.concatenate(self._traces))) if self._traces else None

@@ -1,0 +1,67 @@
+"""The fractions of packets that a receiver received and used, late ones included."""
+
+from __future__ import annotations
+
+from typing import final
+
+import numpy as np
+
+from evedrop.model.figures.figure import (
+    FigureColumn,
+    MeanFigure,
+    ReceiverTotals,
+    ScoredSlots,
+    TotalsFigure,
+    TrialTotals,
+)
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Action
+
+
+@final
+class ReceivedFraction(MeanFigure, TotalsFigure):
+    """The fraction of packets that were received."""
+
+    meaning = "packets received"
+    rests_on = "observer"
+    column = FigureColumn("received", 0, ".4f")
+
+    @classmethod
+    def of_totals(cls, totals: ReceiverTotals) -> float:
+        """The fraction over the run."""
+        return (totals.received + totals.late) / max(1, totals.offered)
+
+    @classmethod
+    def sums_of_trials(cls, totals: TrialTotals) -> Floats | None:
+        """Counts of packets received in every trial, (R,)."""
+        return totals.received.astype(np.float64)
+
+    @staticmethod
+    def values(slots: ScoredSlots) -> Floats:
+        """Counts of packets received, (c, R)."""
+        received: Floats = (slots.action != Action.LOST).astype(np.float64)
+        return received if slots.late is None else np.add(received, slots.late[0], out=received)
+
+
+@final
+class UsedFraction(MeanFigure, TotalsFigure):
+    """The fraction of packets that were received and used."""
+
+    meaning = "packets received and used"
+    column = FigureColumn("used", 1, ".4f")
+
+    @classmethod
+    def of_totals(cls, totals: ReceiverTotals) -> float:
+        """The fraction over the run."""
+        return (totals.used + totals.late_used) / max(1, totals.offered)
+
+    @classmethod
+    def sums_of_trials(cls, totals: TrialTotals) -> Floats | None:
+        """Counts of packets received and used in every trial, (R,)."""
+        return totals.used.astype(np.float64)
+
+    @staticmethod
+    def values(slots: ScoredSlots) -> Floats:
+        """Counts of packets received and used, (c, R)."""
+        used: Floats = ((slots.action != Action.LOST) & (slots.action != Action.DISCARDED)).astype(np.float64)
+        return used if slots.late is None else np.add(used, slots.late[1], out=used)

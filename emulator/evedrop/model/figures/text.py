@@ -1,0 +1,63 @@
+"""Figures as text: with their standard errors, and only the digits that these leave significant."""
+
+from __future__ import annotations
+
+import math
+
+from evedrop.model.figures.shown_number import ShownNumber
+
+_SMALL_NUMBER, _LARGE_NUMBER, _LEAST_PLACE, _LAST_PLACE = 0.01, 1e5, -4, -6  # beyond them estimates have exponents
+_ROUNDING = 1e-12  # a standard error below this part of the estimate comes from the rounding of equal trials
+_MOST_DIGITS = 8  # significant digits of an estimate
+_LARGE_COUNT, _NEARLY_ALL = 1e7, 0.99
+
+
+def figure_text(value: float | None, how: str = ".4g") -> ShownNumber:
+    """A figure of the summary as text; a dash for None."""
+    return ShownNumber("–" if value is None else format(value, how), value)
+
+
+def finite_text(value: float, how: str = ".4g") -> ShownNumber:
+    """A number as text; ∞ for one that is not finite."""
+    return ShownNumber(format(value, how) if math.isfinite(value) else "∞", value)
+
+
+def count_text(number: float) -> str:
+    """A large number of trials as text: 12,345, or 1.2e12."""
+    return f"{number:,.0f}" if number < _LARGE_COUNT else _scientific(number, 1)
+
+
+def share_text(share: float) -> str:
+    """A share as a percentage of two digits; one that is nearly everything is more than 99 %."""
+    return f"{100 * share:.2g} %" if share < _NEARLY_ALL else "more than 99 %"
+
+
+def estimate(value: float | None, error: float | None, how: str = ".4g") -> ShownNumber:
+    """An estimate with its standard error, to the place of that error's first digit: 0.0123 ± 0.0004. how: without an error.
+
+    An error of the size of rounding, which trials with equal outcomes have, counts as none.
+    """
+    return ShownNumber(_estimate(value, error, how), value, error)
+
+
+def _estimate(value: float | None, error: float | None, how: str) -> str:
+    if value is None or not error or not math.isfinite(value) or math.isnan(error) or error <= _ROUNDING * abs(value):
+        return figure_text(value, how)
+    if math.isinf(error):
+        return f"{figure_text(value, how)} ± ∞"
+    place = int(f"{error:.0e}".partition("e")[2])
+    if value and math.floor(math.log10(abs(value))) - place >= _MOST_DIGITS:
+        return f"{value:.{_MOST_DIGITS}g} ± {_scientific(error, 0)}"
+    if max(abs(value), error) < _LARGE_NUMBER and place >= (
+        _LEAST_PLACE if abs(value) < _SMALL_NUMBER else _LAST_PLACE
+    ):
+        places = max(0, -place)
+        return f"{value:.{places}f} ± {error:.{places}f}"
+    digits = max(0, math.floor(math.log10(abs(value))) - place) if value else 0
+    return f"{_scientific(value, digits)} ± {_scientific(error, 0)}"
+
+
+def _scientific(value: float, digits: int) -> str:
+    """A number with this many decimal digits and a short exponent: 2.3e-4."""
+    mantissa, exponent = f"{value:.{digits}e}".split("e")
+    return f"{mantissa}e{int(exponent)}"

@@ -1,0 +1,304 @@
+"""The kernels in numpy: what they must compute, to the bit, and the fallback where no C compiler worked.
+
+Each function has a twin of the same name in `compiled.py`. Trials are the last axis, and slots the first; everything is
+elementwise over slots and trials, in a fixed order of operations. Arguments of other shapes are refused with ValueError.
+
+Source: docs/mathematics.md, model and eavesdroppers.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evedrop.model.kernels import elementary, mixtures, posterior
+from evedrop.model.kernels.elementary import Floats
+from evedrop.model.kernels.factored import Factor
+from evedrop.model.kernels.leak import Leak
+from evedrop.model.kernels.shapes import (
+    expect,
+    expect_all,
+    expect_bytes,
+    expect_counters,
+    expect_histograms,
+    expect_mixture,
+    expect_records,
+    expect_runs,
+    expect_wide,
+    expect_words,
+)
+
+Words = NDArray[np.uint64]
+Codes = NDArray[np.uint8]
+Flags = NDArray[np.bool_]
+
+_UNUSED_BITS = np.uint64(11)  # of a word for a uniform number
+_STATE, _INNOVATION = 1, 2  # `Action` of evedrop.model.receiver
+
+
+def fill_counters(counters: NDArray[np.uint64], slot: int, first: int) -> None:
+    """Fill AES counters (c, m, 2), big-endian: slot, slot + 1, … and in each of them the blocks first … first + m − 1."""
+    expect_counters(counters)
+    slots, count, _ = counters.shape
+    big = counters.view(">u8")
+    big[:, :, 0] = np.arange(slot, slot + slots, dtype=np.uint64)[:, None]
+    big[:, :, 1] = np.arange(first, first + count, dtype=np.uint64)
+
+
+def uniforms(words: Words, width: int) -> Floats:
+    """Uniform numbers in [0, 1), multiples of 2⁻⁵³, (c, width, R), from words (c, R, m), m ≥ width."""
+    return fractions(_ordered(words, width))
+
+
+def fractions(words: Words) -> Floats:
+    """A uniform number in [0, 1), a multiple of 2⁻⁵³, for each word."""
+    numbers = (words >> _UNUSED_BITS).view(np.int64).astype(np.float64)
+    numbers *= 2.0**-53
+    return numbers
+
+
+def normals(words: Words, width: int) -> Floats:
+    """Standard normal numbers, (c, width, R), from words (c, R, m), by the inverse distribution on an odd grid of 2⁻⁵³."""
+    numbers = (_ordered(words, width) >> np.uint64(12)).view(np.int64).astype(np.float64)
+    numbers += 0.5
+    numbers *= 2.0**-52
+    return elementary.normal_quantile(numbers)
+
+
+def _ordered(words: Words, width: int) -> Words:
+    expect_words(words, width)
+    return np.ascontiguousarray(words[:, :, :width].transpose(0, 2, 1))
+
+
+def product(M: Floats, x: Floats) -> Floats:
+    """M x of every slot and trial: M (c, m, n), x (c, n, R) → (c, m, R)."""
+    slots, _, n = M.shape
+    expect(x, (slots, n, x.shape[-1]))
+    return elementary.product(M, x)
+
+
+def carry(A: Floats, P: Floats) -> Floats:
+    """A P Aᵀ for every trial: P (n, n, R) → (n, n, R)."""
+    left: Floats = A[:, 0, None, None] * P[0]
+    for j in range(1, len(A)):
+        left += A[:, j, None, None] * P[j]
+    result: Floats = left[:, :1] * A[:, 0, None]
+    for j in range(1, len(A)):
+        result += left[:, j : j + 1] * A[:, j, None]
+    return result
+
+
+def advance(A: Floats, noise: Floats, before: Floats) -> tuple[Floats, Floats]:
+    """Predictions A x_{k−1} and states x_k = A x_{k−1} + noise, (c, n, R) each, from noise (c, n, R) and x before (n, R)."""
+    _, n, trials = noise.shape
+    expect_all((A, (n, n)), (before, (n, trials)))
+    predicted, x = np.empty_like(noise), np.empty_like(noise)
+    for row, one in enumerate(noise):
+        predicted[row] = product(A[None], before[None])[0]
+        before = x[row] = predicted[row] + one
+    return predicted, x
+
+
+def encode(nu: Flags, x: Floats, predicted: Floats, chi: Floats) -> Floats:
+    """(x − predicted) + χ where ν (c, R), x elsewhere; (c, n, R) each."""
+    slots, _, trials = x.shape
+    expect_bytes(nu, (slots, trials))
+    expect_all((predicted, x.shape), (chi, x.shape))
+    return np.where(nu[:, None, :], (x - predicted) + chi, x)
+
+
+def follow(
+    A: Floats,
+    Q: Floats,
+    before: tuple[Floats, Floats],
+    action: Codes,
+    z: Floats,
+    chi: Floats | None = None,
+    initial: bool = False,
+) -> tuple[Floats, Floats]:
+    """Estimates (c, n, R) and believed covariances (c, n, n, R) after c slots, from those before them.
+
+    action (c, R); z (c, n, R): packets, read where they are used; χ (c, n, R): for a decoder, subtracted from innovations.
+    initial: the first slot is slot 0, which is not predicted. The table in `evedrop.model.update` says what is computed.
+    """
+    slots, n, trials = z.shape
+    expect_all((A, (n, n)), (before[0], (n, trials)), (z if chi is None else chi, z.shape))
+    expect_bytes(action, (slots, trials))
+    x_hat = np.empty(z.shape)
+    last = before[0]
+    for row, codes in enumerate(action):
+        kept = last if initial and row == 0 else product(A[None], last[None])[0]
+        if chi is not None:
+            kept = np.where(codes == _INNOVATION, kept + (z[row] - chi[row]), kept)
+        last = x_hat[row] = np.where(codes == _STATE, z[row], kept)
+    return x_hat, follow_covariance(A, Q, before[1], action, initial)
+
+
+@np.errstate(over="ignore", invalid="ignore")  # as in C: an unstable receiver's covariance may exceed double precision
+def follow_covariance(A: Floats, Q: Floats, P: Floats, action: Codes, initial: bool = False) -> Floats:
+    """The believed covariances (c, n, n, R) of `follow`, from P (n, n, R) and actions (c, R)."""
+    (slots, trials), n = action.shape, len(A)
+    expect_all((A, (n, n)), (Q, (n, n)), (P, (n, n, trials)))
+    expect_bytes(action, (slots, trials))
+    found = np.empty((len(action), *P.shape))
+    for row, codes in enumerate(action):
+        if not (initial and row == 0):
+            carried = carry(A, P)
+            P = np.where(codes == _INNOVATION, carried, carried + Q[:, :, None])
+        P = found[row] = np.where(codes == _STATE, 0.0, P)
+    return found
+
+
+def records(marks: Flags, a: Floats, P: Floats | None, out: Codes, first: int = 0) -> None:
+    """Fill in trials' bytes to digest: for each slot a mark, then its numbers as little-endian float64.
+
+    marks (c, R), a (c, m, R); P (c, n, n, R), whose upper triangle is taken, row by row, or None. out: that of the trials from
+    `first` on, (trials, c, 1 + 8 (m + n (n + 1) / 2)).
+    """
+    expect_records(marks, a, P, out, first)
+    some = slice(first, first + len(out))
+    columns = [a[:, i, some] for i in range(a.shape[1])]
+    if P is not None:
+        columns += [P[:, i, j, some] for i in range(P.shape[1]) for j in range(i, P.shape[1])]
+    numbers = np.empty((len(out), len(marks), len(columns)), "<f8")
+    for i, column in enumerate(columns):
+        numbers[:, :, i] = column.T
+    out[:, :, 0] = marks[:, some].T
+    out[:, :, 1:] = numbers.view(np.uint8).reshape(len(out), len(marks), 8 * len(columns))
+
+
+def squared_errors(x: Floats, x_hat: Floats) -> Floats:
+    """|x − x̂|² of every slot and trial, (c, R), from (c, n, R)."""
+    slots, n, trials = x.shape
+    expect(x_hat, (slots, n, trials))
+    error = x - x_hat
+    error *= error
+    squared: Floats = error[:, 0].copy()
+    for i in range(1, error.shape[1]):
+        squared += error[:, i]
+    return squared
+
+
+def traces(P: Floats) -> Floats:
+    """Tr P of every slot and trial: P (c, n, n, R) → (c, R)."""
+    slots, n, _, trials = P.shape
+    expect(P, (slots, n, n, trials))
+    trace: Floats = P[:, 0, 0].copy()
+    for i in range(1, P.shape[1]):
+        trace += P[:, i, i]
+    return trace
+
+
+def count_codes(codes: Codes, kinds: int) -> NDArray[np.uint32]:
+    """How often each code below `kinds` occurs in each slot, (c, kinds), from codes (c, R)."""
+    slots, trials = codes.shape
+    expect_bytes(codes, (slots, trials))
+    return np.stack([(codes == code).sum(axis=1, dtype=np.uint32) for code in range(kinds)], axis=1)
+
+
+def count_bursts(codes: Codes, lost: int, run: NDArray[np.int64], most: int) -> NDArray[np.uint32]:
+    """How many runs of the code `lost` end in codes (c, R), by length: 1, 2, … and `most` or more.
+
+    run (R,): the length of each trial's current run, which is brought up to date.
+    """
+    slots, trials = codes.shape
+    expect_bytes(codes, (slots, trials))
+    expect_runs(run, trials)
+    counts = np.zeros(most, np.uint32)
+    for row in codes:
+        going = row == lost
+        ended = run[~going & (run > 0)]
+        counts += np.bincount(np.minimum(ended, most) - 1, minlength=most).astype(np.uint32)
+        run[:] = np.where(going, run + 1, 0)
+    return counts
+
+
+def add_to_histograms(counts: NDArray[np.uint32], values: Floats, shift: int, base: int) -> None:
+    """Add each of values (c, R) to a bin of its row of counts (c, bins): its bits shifted right, less base, within the bins."""
+    expect_histograms(counts)
+    rows, bins = counts.shape
+    _, trials = values.shape
+    expect(values, (rows, trials))
+    found = (np.ascontiguousarray(values).view(np.int64) >> shift) - base
+    np.clip(found, 0, bins - 1, out=found)
+    found += bins * np.arange(rows)[:, None]
+    counts += np.bincount(found.reshape(-1), minlength=rows * bins).reshape(rows, bins).astype(np.uint32)
+
+
+def scatter(flags: Flags, packed: Floats, n: int) -> Floats:
+    """Numbers of all trials, (c, n, R), from those of the flagged ones: 0 in the others.
+
+    flags (c, R); packed (m,): for each slot n rows of as many numbers as it has flags.
+    """
+    slots, trials = flags.shape
+    expect_bytes(flags, (slots, trials))
+    expect(packed, (n * int(np.count_nonzero(flags)),))
+    z = np.zeros((slots, n, trials))
+    at = 0
+    for row, some in zip(z, flags, strict=True):
+        count = n * int(np.count_nonzero(some))
+        row[:, some] = packed[at : at + count].reshape(n, -1)
+        at += count
+    return z
+
+
+def gather(flags: Flags, x: Floats) -> Floats:
+    """The columns of x (n, R) where the flags (R,) are set, (n, count)."""
+    _, trials = x.shape
+    expect_bytes(flags, (trials,))
+    some: Floats = np.compress(flags, x, axis=1)
+    return some
+
+
+def triangular_factors(M: Floats) -> Floats:
+    """Lower triangular L (c, n, n) with L Lᵀ = M Mᵀ and a non-negative diagonal, for each of M (c, n, m), m ≥ n.
+
+    Raises ZeroDivisionError where the square of an entry is too small for a double.
+    """
+    expect_wide(M)
+    count, n, _ = M.shape
+    return np.array([elementary.triangular_factor(one.tolist()) for one in M]).reshape(count, n, n)
+
+
+def carried_factors(A: Floats, G: Floats, carried: Floats, count: int) -> Floats:
+    """A L of `count` consecutive slots, (count, n, n): L is the triangular factor of [A L before, G], first of [carried, G].
+
+    Raises ZeroDivisionError as `triangular_factors` does.
+    """
+    n = len(A)
+    expect_all((A, (n, n)), (G, (n, n)), (carried, (n, n)))
+    found = np.empty((count, *carried.shape))
+    for row in range(count):
+        carried = found[row] = product(A[None], triangular_factors(np.concatenate([carried, G], axis=1)[None]))[0]
+    return found
+
+
+def follow_mixture(
+    A: Floats,
+    G: Floats,
+    leaks: Floats,
+    rounding: Floats,
+    before: tuple[Floats, ...],
+    gamma: Flags,
+    z: Floats,
+    state_probability: float,
+    capacity: int,
+    initial: bool = False,
+) -> tuple[Floats, Floats, Codes, Floats, Floats, Floats, Floats]:
+    """The Bayesian eavesdropper: estimates (c, n, R), covariances (c, n, n, R), actions (c, R), and the mixture after c slots.
+
+    G (n, n): lower triangular, G Gᵀ = Q; leaks (c, 2n, 2n), see `Leak`; rounding (c, n): the least variance of packets about
+    their prediction; before: the mixture before these slots, with at most `capacity` components, see `Mixture`; gamma (c, R);
+    z (c, n, R): packets, read where they are received.
+    initial: the first slot is slot 0, in which a packet is the state.
+    """
+    expect_mixture(A, G, leaks, rounding, before, gamma, z, capacity)
+    model = posterior.Weighing(A, Factor.of_triangular(G.tolist()), state_probability, capacity)
+    mixture, (slots, n, trials) = mixtures.Mixture(*before), z.shape
+    x_hat, P, action = np.empty(z.shape), np.empty((slots, n, n, trials)), np.empty((slots, trials), np.uint8)
+    for row, heard in enumerate(gamma):
+        leak = None if initial and row == 0 else Leak(leaks[row])
+        mixture, state = posterior.step(model, mixture, heard, np.where(heard, z[row], 0.0), leak, rounding[row])
+        x_hat[row], P[row] = mixtures.moments(mixture)
+        action[row] = np.where(heard, np.where(state > 0.5, np.uint8(_STATE), np.uint8(_INNOVATION)), np.uint8(0))
+    return x_hat, P, action, *mixture

@@ -1,0 +1,211 @@
+"""Losses by distance: a radio link whose power decreases with distance, with shadowing and fading."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from evedrop.model.checks import as_toml, number_mistakes
+from evedrop.model.kernels.elementary import exp, log, normal_quantile
+from evedrop.model.links.fading import count_variance, delivery_probability
+from evedrop.model.links.link import LossModel, fates_of
+from evedrop.model.links.way import FARTHEST, Way, way_mistakes
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Codes
+
+_NEPER = 0.23025850929940458  # ln 10 / 10: decibels as a natural logarithm
+_LONGEST_BLOCK = 1_000_000
+_AT_ONCE = 8192  # packets whose fates are decided together
+_SAMPLE = 4096  # slots over which the mean quality of a moving link is computed
+
+
+class Distance(LossModel):
+    """Received where the signal-to-noise ratio of the slot is at least `threshold` dB.
+
+    In dB the ratio at a distance of d metres is
+
+        reference_snr − 10 · exponent · log₁₀(d / reference_distance) + X + 10 · log₁₀ g
+
+    with X ~ N(0, shadowing²), drawn every `shadowing_block` slots, and g ~ Exp(1), the power of Rayleigh fading, drawn every
+    `fading_block` slots. Below the reference distance the power is that at the reference distance. Sender and receiver may move.
+
+    Uniforms: column 0 is the fading, column 1 the shadowing, each from the first slot of its block (or the slot in which the
+    link begins, if that is within the block), so that two links with the same uniforms fade and are shadowed together, wherever
+    their receivers are.
+
+    Source: docs/mathematics.md, path loss.
+    """
+
+    parameters = MappingProxyType(
+        {
+            "sender": [0.0, 0.0],
+            "receiver": [120.0, 0.0],
+            "reference_snr": 80.0,
+            "exponent": 3.0,
+            "threshold": 10.0,
+            "reference_distance": 1.0,
+            "shadowing": 6.0,
+            "shadowing_block": 50,
+            "fading_block": 1,
+        }
+    )
+    optional = frozenset({"reference_distance", "shadowing", "shadowing_block", "fading_block"})
+    uniforms_per_slot = 2
+
+    def __init__(
+        self,
+        sender: list[Any],
+        receiver: list[Any],
+        reference_snr: float,
+        exponent: float,
+        threshold: float,
+        reference_distance: float = 1.0,
+        shadowing: float = 0.0,
+        shadowing_block: int = 1,
+        fading_block: int = 1,
+    ) -> None:
+        self.ways = self._ways = (Way(sender), Way(receiver))
+        self._settled = max(slot for way in self._ways for slot in way.slots)
+        self._margin = (threshold - reference_snr) * _NEPER
+        self._exponent = float(exponent)
+        self._nearest = reference_distance * reference_distance
+        self._deviation = shadowing * _NEPER
+        self._shadowing_block, self._fading_block = shadowing_block, fading_block
+        self._fade: Floats | None = None  # of the current block, (R,)
+        self._shadow: Floats | None = None
+
+    @classmethod
+    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """Mistakes in positions, numbers outside their bounds, and a sender and receiver in the same place."""
+        ways = {name: way_mistakes(given[name]) for name in ("sender", "receiver") if name in given}
+        found = [(name, what) for name, mistakes in ways.items() for what in mistakes]
+        for name, least, most in (
+            ("reference_snr", -300.0, 300.0),
+            ("exponent", 0.0, 10.0),
+            ("threshold", -300.0, 300.0),
+            ("reference_distance", 1e-3, FARTHEST),
+            ("shadowing", 0.0, 30.0),
+        ):
+            found += number_mistakes(given, name, least, most)
+        for name in ("shadowing_block", "fading_block"):
+            value = given.get(name, 1)
+            if type(value) is not int or not 1 <= value <= _LONGEST_BLOCK:
+                found.append(
+                    (name, f"is {as_toml(value)}; expected a whole number of slots from 1 to {_LONGEST_BLOCK}")
+                )
+        if len(ways) == 2 and not any(ways.values()):
+            shared_slot = _shared_slot(Way(given["sender"]), Way(given["receiver"]))
+            if shared_slot is not None:
+                found.append(("receiver", f"is where the sender is, in slot {shared_slot}; expected another place"))
+        return found
+
+    @property
+    def quality(self) -> float:
+        """The mean of `quality_at` over the slots up to the last waypoint, or over 4096 of them if there are more."""
+        slots = np.unique(np.linspace(0, self._settled, min(_SAMPLE, self._settled + 1)).astype(np.int64))
+        return float(delivery_probability(self._needed(slots.astype(np.float64)), self._deviation).mean())
+
+    @property
+    def memoryless(self) -> bool:
+        """Whether nothing is drawn for longer than a slot."""
+        return self._fading_block == 1 and (self._shadowing_block == 1 or self._deviation == 0.0)
+
+    @property
+    def settles(self) -> bool:
+        """True: the quality is constant after the last waypoint."""
+        return True
+
+    def quality_at(self, slots: range) -> Floats:
+        """The probability that the fading compensates distance and shadowing, averaged over the shadowing; to 1e-11."""
+        needed, places = np.unique(
+            self._needed(np.arange(slots.start, slots.stop, dtype=np.float64)), return_inverse=True
+        )
+        return delivery_probability(needed, self._deviation)[places]
+
+    def rate_variance(self, slots: range) -> float:
+        """Exact where `fading_block` divides `shadowing_block` or there is no shadowing; otherwise an upper bound.
+
+        The bound holds the shadowing for the least common multiple of both: sharing more only makes slots more alike.
+        """
+        outer = math.lcm(self._fading_block, self._shadowing_block) if self._deviation else self._fading_block
+        moving = range(slots.start, min(slots.stop, max(slots.start, -(-self._settled // outer) * outer)))
+        resting = range(moving.stop, slots.stop)
+        total = self._count_variance(moving, outer)
+        head = range(resting.start, min(resting.stop, -(-resting.start // outer) * outer))
+        whole = range(head.stop, head.stop + outer)
+        blocks = (resting.stop - head.stop) // outer
+        tail = range(head.stop + blocks * outer, resting.stop)
+        total += self._count_variance(head, outer) + self._count_variance(tail, outer)
+        if blocks:
+            total += blocks * self._count_variance(whole, outer)
+        return total / len(slots) ** 2
+
+    def _count_variance(self, slots: range, outer: int) -> float:
+        if not slots:
+            return 0.0
+        needed = self._needed(np.arange(slots.start, slots.stop, dtype=np.float64))
+        return count_variance(needed, slots.start, outer, self._fading_block, self._deviation)
+
+    def fates(self, first: int, uniforms: Floats) -> Codes:
+        """Lost where fading and shadowing together give less power than the slot needs."""
+        step = max(1, _AT_ONCE // uniforms.shape[2])
+        return np.concatenate([self._fates(first + i, uniforms[i : i + step]) for i in range(0, len(uniforms), step)])
+
+    def _fates(self, first: int, uniforms: Floats) -> Codes:
+        """The same for so few slots that intermediate results fit into the cache."""
+        slots = range(first, first + len(uniforms))
+        needed = self._needed(np.arange(slots.start, slots.stop, dtype=np.float64))
+        power, self._fade = _held(slots, self._fading_block, uniforms[:, 0], self._fade, _exponential)
+        if self._deviation:
+            gain, self._shadow = _held(slots, self._shadowing_block, uniforms[:, 1], self._shadow, self._gain)
+            power = power * gain
+        return fates_of(power < needed[:, None])
+
+    def _gain(self, u: Floats) -> Floats:
+        """The shadowing's factor of the power: from the normal quantile of the upper 52 bits of a uniform number."""
+        return exp(self._deviation * normal_quantile((np.floor(u * 2.0**52) + 0.5) * 2.0**-52))
+
+    def _needed(self, slots: Floats) -> Floats:
+        """Power that fading and shadowing must give in each slot, (slots,), relative to its mean without shadowing."""
+        (x, y), (to_x, to_y) = (way.at(slots) for way in self._ways)
+        along, across = to_x - x, to_y - y
+        square = along * along + across * across
+        far = log(np.where(square > self._nearest, square, self._nearest) / self._nearest)
+        return exp(self._margin + self._exponent * (0.5 * far))
+
+
+def _exponential(u: Floats) -> Floats:
+    """Exponential numbers with mean 1."""
+    return -log(1.0 - u)
+
+
+def _held(
+    slots: range, block: int, u: Floats, before: Floats | None, draw: Callable[[Floats], Floats]
+) -> tuple[Floats, Floats]:
+    """The number drawn for the block of each slot, (slots, R) or (1, R), and that for the last slot, (R,).
+
+    before: that of the slot before the first, if there is one; it is never changed in place.
+    """
+    begins = np.arange(slots.start, slots.stop) % block == 0
+    if before is None:
+        begins[0] = True
+        drawn = draw(u[begins])
+    else:
+        drawn = np.concatenate((before[None], draw(u[begins]))) if begins.any() else before[None]
+    if begins.all():
+        drawn = drawn[-len(slots) :]
+    elif len(drawn) > 1:
+        drawn = drawn[np.cumsum(begins) - (before is None)]
+    return drawn, drawn[-1].copy()
+
+
+def _shared_slot(sender: Way, receiver: Way) -> int | None:
+    """A slot of a waypoint in which both are in one place, if there is one."""
+    slots = np.array(sorted({*sender.slots, *receiver.slots}), np.float64)
+    (x, y), (to_x, to_y) = sender.at(slots), receiver.at(slots)
+    same = np.flatnonzero((x == to_x) & (y == to_y))
+    return int(slots[same[0]]) if same.size else None

@@ -1,0 +1,297 @@
+"""The process x_{k+1} = A x_k + w_k, its checks, and its simulation over a batch of trials.
+
+Arrays of a batch have the trials as last axis: x is (n, R), P is (n, n, R). The two products below are elementwise over
+that axis, in a fixed order, so a trial's bits do not depend on the batch or the machine.
+
+Source: docs/mathematics.md, model.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from typing import final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evedrop.model.kernels.current import kernels
+from evedrop.model.kernels.elementary import cholesky, semidefinite_factor
+from evedrop.model.kernels.reference import carry
+from evedrop.model.streams import Ahead, Batch, BlockReader
+
+Floats = NDArray[np.float64]
+
+MARGINAL = 1e-7
+"""An eigenvalue of A within this distance of the unit circle counts as on it: computing a double one has errors of 1e-8."""
+MOST_STATES = 64
+"""The most states of a process: some computations before a run take a time that grows with n³ or faster."""
+_SLOTS_AT_ONCE = 1024  # whose factors are passed over
+_ALLOWS_SINGULAR = "; or singular_noise = true, which allows a Q without variance in some directions"
+_SINGULAR = 1e-13  # smallest eigenvalue of a correlation matrix that is not mere rounding
+
+
+def product(M: Floats, x: Floats) -> Floats:
+    """M x for every trial: M (…, m, n), x (…, n, R) → (…, m, R), with at most one axis before the last two."""
+    if M.ndim == x.ndim == 2:
+        one: Floats = kernels.product(M[None], x[None])[0]
+        return one
+    return kernels.product(np.broadcast_to(M, (len(x), *M.shape[-2:])), x)
+
+
+@dataclass(frozen=True)
+class Process:
+    """A (n, n), Q (n, n), initial_covariance Σ0 (n, n): the process model, which is public, also to eavesdroppers."""
+
+    A: Floats
+    Q: Floats
+    initial_covariance: Floats
+    singular_noise: bool = False
+    """Whether Q may be singular, as the covariance of a filter's innovations may be."""
+
+    @cached_property
+    def noise_factor(self) -> Floats:
+        """Lower triangular G with G Gᵀ = Q, (n, n)."""
+        return semidefinite_factor(self.Q) if self.singular_noise else cholesky(self.Q)
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return int(self.A.shape[0])
+
+    @cached_property
+    def spectral_radius(self) -> float:
+        """ρ(A): largest modulus of an eigenvalue of A."""
+        return float(np.max(np.abs(np.linalg.eigvals(self.A))))
+
+    @cached_property
+    def _Q_column(self) -> Floats:
+        return self.Q[:, :, None]
+
+    def predict(self, x_hat: Floats) -> Floats:
+        """A x̂, (n, R)."""
+        return product(self.A, x_hat)
+
+    def carry(self, P: Floats) -> Floats:
+        """A P Aᵀ, (n, n, R): the covariance when w is known."""
+        return carry(self.A, P)
+
+    def diffuse(self, carried: Floats) -> Floats:
+        """A P Aᵀ + Q from A P Aᵀ, (n, n, R): the covariance when w is not known."""
+        return carried + self._Q_column
+
+
+@final
+class ProcessNoise:
+    """x_0 = L0 ξ_0 at k = 0, then w_{k−1} = L_Q ξ_k, for every trial, with ξ from the stream `process`.
+
+    initial: x_0 (n, R), if a scheme's secret decides it; covariance: of w, (n, n), semidefinite, if it is not Q.
+    """
+
+    def __init__(
+        self,
+        process: Process,
+        key: bytes,
+        batch: Batch,
+        initial: Floats | None = None,
+        covariance: Floats | None = None,
+    ) -> None:
+        self._initial = initial
+        self._reader = BlockReader(key, batch, process.n)
+        self._initial_factor = cholesky(process.initial_covariance)
+        self._factor = process.noise_factor if covariance is None else semidefinite_factor(covariance)
+        self._noise = Ahead(self._reader.ahead, self._drawn)
+
+    def at(self, k: int) -> Floats:
+        """The noise that slot k adds to A x_{k−1}, (n, R)."""
+        return self._noise.at(k)
+
+    def block(self, slots: range) -> Floats:
+        """The noise of consecutive slots, (c, n, R)."""
+        return self._noise.of(slots)
+
+    def _drawn(self, slots: range) -> Floats:
+        factors = np.repeat(self._factor[None], len(slots), axis=0)
+        if slots.start == 0:
+            factors[0] = self._initial_factor
+        noise = product(factors, self._reader.normals(slots))
+        if slots.start == 0 and self._initial is not None:
+            noise[0] = self._initial
+        return noise
+
+
+@final
+class Trajectory:
+    """The true states of a batch: x_0, then x_k = A x_{k−1} + w_{k−1}. Must be read slot by slot.
+
+    initial, covariance: as for `ProcessNoise`.
+    """
+
+    def __init__(
+        self,
+        process: Process,
+        key: bytes,
+        batch: Batch,
+        initial: Floats | None = None,
+        covariance: Floats | None = None,
+    ) -> None:
+        self._process = process
+        self._noise = ProcessNoise(process, key, batch, initial, covariance)
+        self._next = 0
+        self.x: Floats = np.zeros((process.n, batch.trials))
+        self.predicted: Floats = self.x
+        """A x_{k−1}, (n, R): the innovation of this slot is measured against it."""
+
+    def advance(self, pushed: Floats | None = None) -> Floats:
+        """The next slot's state, (n, R); pushed: the effect of inputs and disturbances on it, (n, R) or (n, 1)."""
+        noise = self._noise.at(self._next)
+        if self._next == 0:
+            self.x = noise
+        else:
+            predicted, x = kernels.advance(self._process.A, noise[None], self.x)
+            self.predicted, self.x = predicted[0], x[0]
+        if pushed is not None:
+            self.x = self.x + pushed
+        self._next += 1
+        return self.x
+
+    def advance_block(self, count: int) -> tuple[Floats, Floats]:
+        """The states of the next `count` slots and the predictions A x_{k−1} of each, (c, n, R), without inputs."""
+        slots = range(self._next, self._next + count)
+        noise = self._noise.block(slots)
+        if slots.start == 0:
+            first, self.x = self.predicted, noise[0]
+            later, x = kernels.advance(self._process.A, noise[1:], self.x)
+            predicted, x = np.concatenate([first[None], later]), np.concatenate([noise[:1], x])
+        else:
+            predicted, x = kernels.advance(self._process.A, noise, self.x)
+        self.predicted, self.x = predicted[-1], x[-1]
+        self._next = slots.stop
+        return x, predicted
+
+
+@final
+class StateFactors:
+    """L_k with L_k L_kᵀ = Σ_k, lower triangular with positive diagonal, by QR of [A L_{k−1}, Q^½].
+
+    Σ_k itself is never formed: in the unstable example its Cholesky factorisation fails from k = 45 on.
+
+    Source: docs/mathematics.md, encoding noise.
+    """
+
+    def __init__(self, process: Process) -> None:
+        self._A = process.A
+        self._noise_factor = process.noise_factor
+        self._initial = product(self._A, cholesky(process.initial_covariance))
+        self._k = 1
+        self._carried = self._initial
+
+    def carried(self, k: int) -> Floats:
+        """A L_{k−1}, (n, n), for k ≥ 1: a factor of the encoding noise's covariance A Σ_{k−1} Aᵀ."""
+        factor: Floats = self.block(range(k, k + 1))[0]
+        return factor
+
+    def block(self, slots: range) -> Floats:
+        """The same for consecutive slots, at least one, (c, n, n); 0 for slot 0. Slots in order are fastest."""
+        first = max(slots.start, 1)
+        if first < self._k:
+            self._k, self._carried = 1, self._initial
+        self._go_to(first)
+        found = np.zeros((len(slots), *self._A.shape))
+        if slots.stop > first:
+            rows = found[first - slots.start :]
+            rows[0] = self._carried
+            rows[1:] = kernels.carried_factors(self._A, self._noise_factor, self._carried, len(rows) - 1)
+            self._k, self._carried = slots.stop - 1, rows[-1].copy()
+        return found
+
+    def _go_to(self, k: int) -> None:
+        while self._k < k:
+            count = min(k - self._k, _SLOTS_AT_ONCE)
+            self._carried = kernels.carried_factors(self._A, self._noise_factor, self._carried, count)[-1].copy()
+            self._k += count
+
+
+def mistakes_of(
+    A: Floats, Q: Floats, initial_covariance: Floats, singular_noise: bool = False
+) -> list[tuple[str, str]]:
+    """All reasons why the three are not a process: (entry, sentence) for each mistake.
+
+    singular_noise: Q may be singular.
+
+    Source: docs/mathematics.md, model (assumptions).
+    """
+    found: list[tuple[str, str]] = []
+    if max(map(len, (A, Q, initial_covariance))) > MOST_STATES:
+        large = f"has {max(map(len, (A, Q, initial_covariance)))} rows; expected at most {MOST_STATES} states"
+        return [("A", f"{large}: theory and check take time that grows with the cube of their number, and more")]
+    for name, M in (("A", A), ("Q", Q), ("initial_covariance", initial_covariance)):
+        found += [(name, sentence) for sentence in _shape_mistakes(M, A.shape[0] if name != "A" else None)]
+    if found:
+        return found
+    for name, M in (("Q", Q), ("initial_covariance", initial_covariance)):
+        found += [(name, sentence) for sentence in _covariance_mistakes(M)]
+    if singular_noise:
+        found = [entry for entry in found if entry[0] != "Q" or "positive definite" not in entry[1]]
+        with suppress(ValueError):
+            semidefinite_factor(Q)
+            return found
+        return [*found, ("Q", "has an eigenvalue below 0; expected a covariance")]
+    if any(name == "Q" and "positive definite" in sentence for name, sentence in found):
+        reached = _reachable(A, Q)
+        if reached < A.shape[0]:
+            found.append(
+                ("Q", f"the pair (A, √Q) is not controllable: the noise reaches {reached} of {A.shape[0]} directions; "
+                 "expected process noise that moves every state, such as Q = 1e-3 times the identity")
+            )  # fmt: skip
+        with suppress(ValueError):  # an eigenvalue is below 0
+            semidefinite_factor(Q)
+            found = [(name, f"{sentence}{_ALLOWS_SINGULAR}" if name == "Q" else sentence) for name, sentence in found]
+    return found
+
+
+def _shape_mistakes(M: Floats, n: int | None) -> list[str]:
+    if M.ndim != 2 or M.shape[0] != M.shape[1] or M.shape[0] == 0:
+        return [f"has shape {M.shape}; expected a square matrix, such as [[1.0, 0.3], [0.5, 1.001]]"]
+    if n is not None and M.shape[0] != n:
+        return [f"is {M.shape[0]} × {M.shape[0]}; expected {n} × {n}, as A is"]
+    for i, j in np.argwhere(~np.isfinite(M)):
+        return [f"entry [{i}][{j}] is {M[i, j]}; expected finite numbers"]
+    return []
+
+
+def _covariance_mistakes(M: Floats) -> list[str]:
+    asymmetry = np.argwhere(M != M.T)
+    if asymmetry.size:
+        i, j = asymmetry[0]
+        return [f"entry [{i}][{j}] is {M[i, j]} but [{j}][{i}] is {M[j, i]}; expected a symmetric matrix"]
+    scale = np.sqrt(np.abs(np.diag(M)))
+    lowest = float(np.linalg.eigvalsh(M)[0])
+    if not np.all(np.diag(M) > 0.0):
+        return [f"has the eigenvalue {lowest:.3g}; expected a positive definite matrix, all eigenvalues above 0"]
+    # The eigenvalues of the correlations do not depend on the states' units; the limit allows for rounding in a singular M.
+    least = float(np.linalg.eigvalsh(M / np.outer(scale, scale))[0])
+    if least <= _SINGULAR:
+        return [
+            f"has the eigenvalue {lowest:.3g}; expected a positive definite matrix: the smallest eigenvalue of its correlation "
+            f"matrix is {least:.3g}, and must exceed {_SINGULAR:g} to be told from 0 in double precision"
+        ]
+    return []
+
+
+def _reachable(A: Floats, Q: Floats) -> int:
+    """Rank of [Q, A Q, …], from an orthonormal basis extended one power at a time (powers of A itself overflow)."""
+    scale = max(1.0, float(np.abs(A).max()))
+    basis = _range(Q)
+    while 0 < basis.shape[1] < A.shape[0]:
+        grown = _range(np.hstack([basis, (A / scale) @ basis]))
+        if grown.shape[1] == basis.shape[1]:
+            break
+        basis = grown
+    return int(basis.shape[1])
+
+
+def _range(M: Floats) -> Floats:
+    u, s, _ = np.linalg.svd(M)
+    return u[:, : int(np.sum(s > 1e-12 * max(s[0], 1e-300)))]

@@ -1,0 +1,182 @@
+"""The base of every receiver: its belief, its action in a slot, and the prediction between packets."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evedrop.model.block_methods import outdated
+from evedrop.model.kernels.current import kernels
+from evedrop.model.process import Floats, Process
+
+Flags = NDArray[np.bool_]
+Codes = NDArray[np.uint8]
+
+_ROUNDING = 1e-6  # rounding leaves 1e-15 in a covariance of a few states, and 1e-10 in the worst known one of 30
+_SMALLEST = 1e-145  # the square of a smaller number has fewer digits
+
+
+class Action(IntEnum):
+    """What a receiver did in a slot, as far as the receiver knows."""
+
+    LOST = 0
+    """Nothing was received: γ = 0."""
+    STATE = 1
+    """The packet was used as the state."""
+    INNOVATION = 2
+    """The packet was read as an innovation: decoded with the secret, or used without it for the little that it leaks."""
+    DISCARDED = 3
+    """The packet was received and not used."""
+
+
+class Reception(NamedTuple):
+    """What a receiver heard in a slot, for R trials."""
+
+    gamma: Flags
+    """γ_k: received or not, (R,)."""
+    z: Floats
+    """The packets, (n, R); undefined where nothing was received."""
+    header: NDArray[np.int64] | None = None
+    """The unencrypted header that the scheme sends with each packet, (h, R); None for a scheme without a header."""
+    truth: Floats | None = None
+    """x_k itself, (n, R), in the one slot whose state is betrayed to this receiver, received or not; otherwise None."""
+
+
+class Belief(NamedTuple):
+    """A receiver's knowledge after a slot, for R trials. Immutable: a slot makes a new one."""
+
+    x_hat: Floats
+    """Estimate, (n, R)."""
+    P: Floats
+    """Error covariance the receiver believes, (n, n, R)."""
+    action: Codes
+    """`Action` of the slot, (R,)."""
+    memory: tuple[NDArray[Any], ...] = ()
+    """Further knowledge of a receiver: arrays whose last axis is the trials."""
+
+
+class Beliefs(NamedTuple):
+    """Beliefs of c consecutive slots, one row for each slot."""
+
+    x_hat: Floats
+    """(c, n, R)."""
+    P: Floats
+    """(c, n, n, R)."""
+    action: Codes
+    """(c, R)."""
+
+    @classmethod
+    def empty(cls, shape: tuple[int, ...]) -> Beliefs:
+        """Room for the beliefs of the slots, states and trials of a shape (c, n, R)."""
+        c, n, trials = shape
+        return cls(np.empty(shape), np.empty((c, n, n, trials)), np.empty((c, trials), np.uint8))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Beliefs]) -> Beliefs:
+        """The beliefs of consecutive parts, at least one, as one."""
+        return parts[0] if len(parts) == 1 else cls(*map(np.concatenate, zip(*parts, strict=True)))
+
+    def put(self, row: int, belief: Belief) -> None:
+        """Set one slot's belief."""
+        self.x_hat[row], self.P[row], self.action[row] = belief.x_hat, belief.P, belief.action
+
+    def rows(self, some: slice) -> Beliefs:
+        """The beliefs of some of the slots."""
+        return Beliefs(self.x_hat[some], self.P[some], self.action[some])
+
+    @property
+    def last(self) -> Belief:
+        """The belief after the last of the slots."""
+        return Belief(self.x_hat[-1], self.P[-1], self.action[-1])
+
+
+def select(flags: Flags, yes: Callable[[], Floats], no: Callable[[], Floats]) -> Floats:
+    """`yes()` in the trials where flags (R,) is true, `no()` in the others; neither is called without need."""
+    count = np.count_nonzero(flags)
+    if count == flags.size:
+        return yes()
+    if count == 0:
+        return no()
+    return np.where(flags, yes(), no())
+
+
+def cleared(flags: Flags, shape: tuple[int, ...], value: Callable[[], Floats]) -> Floats:
+    """0 in the trials where flags (R,) is true, `value()`, with shape (…, R), in the others."""
+    count = np.count_nonzero(flags)
+    if count == flags.size:
+        return np.zeros(shape)
+    return np.where(flags, 0.0, value()) if count else value()
+
+
+def trace_of(P: Floats) -> Floats:
+    """Tr P of every trial: P (n, n, R) → (R,)."""
+    trace: Floats = kernels.traces(P[None])[0]
+    return trace
+
+
+def asymmetry(P: Floats) -> tuple[int, ...] | None:
+    """The first place where covariances (…, n, n, R) differ from their transposes by more than rounding; None if nowhere.
+
+    A P Aᵀ is computed entry by entry, so that it is symmetric but for rounding, which is small compared with √(P_ii P_jj).
+    """
+    other = P.swapaxes(-3, -2)
+    if np.array_equal(P, other):
+        return None
+    with np.errstate(over="ignore"):  # another process may have made these numbers up
+        size = np.maximum(np.sqrt(np.abs(np.diagonal(P, axis1=-3, axis2=-2))), _SMALLEST)  # (…, R, n)
+        allowed = np.moveaxis(_ROUNDING * size[..., :, None] * size[..., None, :], -3, -1)
+        wrong = np.abs(P - other) > allowed
+    return tuple(int(i) for i in np.argwhere(wrong)[0]) if wrong.any() else None
+
+
+def prior(process: Process, trials: int, first: int = 0) -> Belief:
+    """Belief of a receiver before slot `first` if it has heard nothing: x̂ = 0, P = Σ_{first−1}, and Σ0 before slot 0.
+
+    Source: docs/mathematics.md, legitimate estimator.
+    """
+    sigma = process.initial_covariance[:, :, None]
+    for _ in range(first - 1):
+        sigma = process.diffuse(process.carry(sigma))
+    return Belief(np.zeros((process.n, trials)), np.repeat(sigma, trials, axis=2), np.zeros(trials, np.uint8))
+
+
+class Receiver(ABC):
+    """Turns deliveries into beliefs, slot by slot. It keeps no state except what its secret streams read ahead."""
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Take `follow` from this class again in a subclass that changes a slot and not a block of slots."""
+        super().__init_subclass__(**options)
+        if outdated(cls, "follow", "step", "act"):
+            setattr(cls, "follow", Receiver.follow)  # noqa: B010 - mypy refuses the assignment
+
+    def __init__(self, process: Process, trials: int) -> None:
+        self.process = process
+        self.trials = trials
+
+    def prior(self, first: int = 0) -> Belief:
+        """Belief of this receiver before slot `first` if it has heard nothing."""
+        return prior(self.process, self.trials, first)
+
+    @abstractmethod
+    def act(self, k: int, gamma: Flags) -> Codes:
+        """`Action` of slot k in every trial, (R,), from γ (R,) alone: no scheme of this kind looks at the packet first."""
+
+    @abstractmethod
+    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
+        """Belief after slot k, from the belief before it and the reception in it. Any slot may be asked for again."""
+
+    def follow(self, slots: range, belief: Belief, gamma: Flags, z: Floats) -> tuple[Beliefs, Belief]:
+        """The beliefs after consecutive slots, and the last of them, from γ (c, R) and packets z (c, n, R) without headers.
+
+        A receiver may override this to take many slots at once; the numbers must be those of `step`, slot by slot.
+        """
+        found = Beliefs.empty(z.shape)
+        for row, k in enumerate(slots):
+            belief = self.step(k, belief, Reception(gamma[row], z[row]))
+            found.put(row, belief)
+        return found, belief

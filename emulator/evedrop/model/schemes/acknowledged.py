@@ -1,0 +1,95 @@
+"""State-secrecy code: the state minus a state that the user is known to have from its acknowledgements."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+import numpy as np
+
+from evedrop.model.process import Floats, product
+from evedrop.model.receiver import Flags, Receiver
+from evedrop.model.reference import ReferenceReceiver
+from evedrop.model.reference_code import NONE, ReferenceCode, singular_warnings
+from evedrop.model.reference_form import ReferenceForm
+from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, Scheme, Shared
+from evedrop.model.streams import Batch
+from evedrop.model.theory.closed_form import ReceiverConditions
+from evedrop.model.theory.covariances import Outcomes
+from evedrop.model.theory.lost_reference import LostReference, growth_by_coin
+
+
+class AcknowledgedEncoder(Encoder):
+    """z_k = x_k − L_{t,k} x_t, with t the last acknowledged slot; x_k itself before the first acknowledgement."""
+
+    def __init__(self, code: ReferenceCode, n: int, trials: int) -> None:
+        self._code = code
+        self._reference = np.zeros((n, trials))
+        self._slot = np.full(trials, NONE, np.int64)
+        self._k = NONE
+        self._read: Floats
+
+    def encode(self, k: int, x: Floats, predicted: Floats) -> Packet:  # noqa: ARG002 - references say more
+        """The packet of slot k, which must follow the slot before."""
+        if k:
+            self._slot = np.where(self._slot >= self._code.oldest(k), self._slot, NONE)
+            self._reference = product(self._code.at(k), np.where(self._slot == NONE, 0.0, self._reference))
+        # Where there is no reference, 0 is subtracted: x − 0 is x.
+        z = x - self._reference
+        # The state as the user reads it, to the last bit: the rounding of x would grow with each reference made from another.
+        self._k, self._read = k, z + self._reference
+        return Packet(z, np.zeros(x.shape[1], np.bool_), self._slot[None].copy())
+
+    def acknowledged(self, k: int, acknowledged: Flags) -> None:
+        """Make x_k the reference where slot k is acknowledged. Raises ValueError if k is not the slot just sent."""
+        if k != self._k:
+            raise ValueError(f"acknowledgements of slot {k} after slot {self._k} was sent; expected those of that slot")
+        self._reference = np.where(acknowledged, self._read, self._reference)
+        self._slot = np.where(acknowledged, k, self._slot)
+
+
+def _reference_form(scheme: Acknowledged, conditions: ReceiverConditions) -> ReferenceForm | None:
+    return ReferenceForm.of(scheme.process, conditions, open_loop=False)
+
+
+class Acknowledged(Scheme):
+    """Subtracts a reference that the user has; an eavesdropper that missed a reference can never recover it.
+
+    The reference is carried so that a packet is independent of the state it is sent for, unless A is singular. There is no
+    secret: receivers differ only in which packets they heard, and the sensor knows that of one of them. The scheme therefore
+    depends on acknowledgements that are neither blocked nor forged.
+
+    Source: Tsiamis, Gatsis, Pappas (2018, 2020); docs/mathematics.md, acknowledged references.
+    """
+
+    best_reader = "reference"
+    closed_forms = MappingProxyType({"legitimate": _reference_form, "reference": _reference_form})
+    needs_acknowledgements = True
+    reads_packets = True
+    header = ("slot t of the reference; −1: none, z is the state",)
+
+    def warnings(self) -> list[str]:
+        """That of a singular A."""
+        return singular_warnings(self.process)
+
+    def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
+        """The references; nothing is secret."""
+        return NoInnovations(
+            self.process,
+            batch.trials,
+            lambda: AcknowledgedEncoder(ReferenceCode(self.process), self.process.n, batch.trials),
+            lambda: self.estimator(keys, batch),
+        )
+
+    def estimator(self, keys: Mapping[str, bytes], batch: Batch) -> Receiver:  # noqa: ARG002 - there is no secret
+        """A receiver that keeps the references it may have acknowledged."""
+        return ReferenceReceiver(self.process, batch.trials)
+
+    def outcomes(self, mu: float) -> Outcomes:
+        """A state with every packet, whichever acknowledgements arrive."""
+        return Outcomes.plain(mu)
+
+    def lost_reference(self, received: float, acknowledged: tuple[float, float]) -> LostReference:  # noqa: ARG002 - it lasts
+        """Nothing ends the growth: no later packet reveals the reference."""
+        remedy = "random-code or threshold-code is used, which send the state now and then"
+        return LostReference(growth_by_coin(self.process, 0.0, received), remedy)

@@ -1,0 +1,299 @@
+"""A link: the way from the router to one receiver, from random numbers and a timeline to the fate of every packet.
+
+A packet sent in slot k meets, in this order: the queue of a link of limited rate, a cut, the loss model, corruption, the
+delay, the receiver's own window for late packets, and the receiver, which may be down. The first that stops the packet is
+the reason for its loss.
+
+Source: docs/mathematics.md, links; docs/links.md.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any, NamedTuple, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evedrop.model.delays import delay_of
+from evedrop.model.links import loss_of
+from evedrop.model.links.link import Fate, LossModel
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Codes, Flags
+from evedrop.model.streams import Batch, BlockReader, Reader
+
+NEVER = 2**62
+"""A slot that no run reaches."""
+
+
+class Fates(NamedTuple):
+    """The fates of the packets of c slots."""
+
+    codes: Codes
+    """`Fate`, (c, R)."""
+    delays: NDArray[np.uint32] | None = None
+    """How many slots after its own each packet arrives, (c, R); None: all arrive in their own."""
+    again: Flags | None = None
+    """Whether a second copy arrives with it, (c, R); None: there are no copies."""
+    rests: Floats | None = None
+    """The remaining fraction of a slot in the delay of the first trial's packets, (c,); None where there are no delays."""
+
+    @property
+    def in_time(self) -> Flags:
+        """γ: delivered in its own slot, (c, R)."""
+        delivered: Flags = self.codes == Fate.DELIVERED
+        return delivered if self.delays is None else delivered & (self.delays == 0)
+
+    def copied(self) -> Fates:
+        """A copy with arrays of its own, so that packets may be silenced in it."""
+        return self._replace(codes=self.codes.copy(), again=None if self.again is None else self.again.copy())
+
+    def silence(self, row: int, sent: Flags) -> None:
+        """Mark the packets of one slot that are not sent (R,) as unsent, in place."""
+        self.codes[row][~sent] = Fate.UNSENT
+        if self.again is not None:
+            self.again[row] &= sent
+
+    def part(self, slots: slice = slice(None), trials: slice = slice(None)) -> Fates:
+        """The fates of some of the slots and some of the trials."""
+        return Fates(
+            self.codes[slots, trials],
+            None if self.delays is None else self.delays[slots, trials],
+            None if self.again is None else self.again[slots, trials],
+            None if self.rests is None else self.rests[slots],
+        )
+
+
+@dataclass(frozen=True)
+class ReceiverOutage:
+    """Slots start ≤ k < stop in which a receiver is away."""
+
+    start: int
+    stop: int
+    reason: Fate
+
+
+@dataclass(frozen=True)
+class Change:
+    """From slot `at` on, a link has other settings, or it is cut or healed."""
+
+    at: int
+    settings: Mapping[str, Any] | None = None
+    """As in `LinkSchedule.settings`; None keeps them."""
+    cut: bool | None = None
+    """None keeps the state."""
+
+
+@dataclass(frozen=True)
+class LinkSchedule:
+    """Everything that is known of a link in advance: its settings at slot 0, and their changes."""
+
+    settings: Mapping[str, Any]
+    """`loss`: {"model": …}; and, where they differ from the default, `delay`: {"model": …}, `reorder`, `duplicate`, `corrupt`:
+    probabilities, `rate` in packets a slot with `queue` in packets."""
+    window: int = 0
+    """Slots by which a packet may be late for its receiver."""
+    changes: tuple[Change, ...] = ()
+    outages: tuple[ReceiverOutage, ...] = ()
+    correlation: tuple[str, float] | None = None
+    """The receiver whose losses these are tied to, and how strongly."""
+
+
+def streams_of(receiver: str, schedule: LinkSchedule) -> tuple[str, ...]:
+    """The random streams of a receiver's link: losses, delays, all other faults, and correlation."""
+    names = (f"link/{receiver}", f"delay/{receiver}", f"fate/{receiver}")
+    return names if schedule.correlation is None else (*names, f"mix/{receiver}", f"link/{schedule.correlation[0]}")
+
+
+@final
+@dataclass
+class _State:
+    """The memory of a link between slots: it is copied so that slots can be decided again."""
+
+    settings: Mapping[str, Any]
+    loss: LossModel
+    cut: bool = False
+    free: float = 0.0
+    """When the queue will have sent all its packets, in slots."""
+
+    def copied(self) -> _State:
+        """A copy that may change; a loss model never changes its memory in place."""
+        return _State(self.settings, copy.copy(self.loss), self.cut, self.free)
+
+
+@final
+@dataclass
+class Link:
+    """One receiver's link. Slots must be read in order, any number at a time.
+
+    keys: the keys of `streams_of`; reader: what reads their numbers, from a key, the batch and the numbers of a trial.
+    """
+
+    schedule: LinkSchedule
+    receiver: str
+    keys: Mapping[str, bytes]
+    batch: Batch
+    reader: Callable[[bytes, Batch, int], Reader] = BlockReader
+    _state: _State = field(init=False)
+    _before: tuple[_State, range] | None = field(init=False, default=None)
+    _changes: list[Change] = field(init=False)
+    _readers: dict[tuple[str, int], Reader] = field(init=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._state = _State(self.schedule.settings, loss_of(self.schedule.settings["loss"]))
+        self._changes = sorted(self.schedule.changes, key=lambda change: change.at)
+
+    def like(self, keys: Mapping[str, bytes]) -> Link:
+        """The same link with other keys, which is quicker than to make it. This link must not have begun."""
+        link = Link.__new__(Link)
+        vars(link).update(vars(self), keys=keys, _state=self._state.copied(), _readers={})
+        return link
+
+    def planned(self, slots: range) -> Fates:
+        """The fates of the next slots, which may still be amended."""
+        self._before = (self._state.copied(), slots)
+        return self.fates(slots)
+
+    def amended(self, at: int, changes: Iterable[Change]) -> Fates:
+        """The fates of the last planned slots from `at` on, decided again; the changes replace all later changes."""
+        if self._before is None or at not in self._before[1]:
+            raise ValueError(f"slot {at} is not among those last planned")
+        self._state, slots = self._before
+        if at > slots.start:
+            self.fates(range(slots.start, at))
+        earlier = [change for change in self._changes if change.at < at]
+        self._changes = sorted([*earlier, *changes], key=lambda change: change.at)
+        return self.planned(range(at, slots.stop))
+
+    def fates(self, slots: range) -> Fates:
+        """The fates of the packets of the next slots in every trial."""
+        if not self._changes:
+            return self._unchanged(slots)
+        marks = sorted({change.at for change in self._changes if slots.start < change.at < slots.stop})
+        bounds = [slots.start, *marks, slots.stop]
+        parts = []
+        for start, stop in pairwise(bounds):
+            for change in self._changes:
+                if change.at == start:
+                    self._apply(change)
+            parts.append(self._unchanged(range(start, stop)))
+        return parts[0] if len(parts) == 1 else _joined(parts)
+
+    def _apply(self, change: Change) -> None:
+        if change.settings is not None:
+            if change.settings["loss"] != self._state.settings["loss"]:
+                self._state.loss = loss_of(change.settings["loss"])
+            self._state.settings = change.settings
+        if change.cut is not None:
+            self._state.cut = change.cut
+
+    def _unchanged(self, slots: range) -> Fates:
+        """The fates of slots during which the settings stay the same."""
+        settings, shape = self._state.settings, (len(slots), self.batch.trials)
+        codes = self._state.loss.fates(slots.start, self._loss_uniforms(slots))
+        befalls = settings.get("reorder") or settings.get("duplicate") or settings.get("corrupt")
+        chances = self._uniforms("fate", slots, 3) if befalls else None
+        if chances is not None and settings.get("corrupt"):
+            codes = np.where((codes == 0) & (chances[:, 0] < settings["corrupt"]), np.uint8(Fate.CORRUPTED), codes)
+        delays = self._delays(slots, chances)
+        if settings.get("rate"):
+            waits, full = self._queue(slots)
+            codes = np.where(full[:, None], np.uint8(Fate.OVERFLOW), codes)
+            delays = waits[:, None] + (np.zeros(shape) if delays is None else delays)
+        if self._state.cut:
+            codes = np.where(codes == Fate.OVERFLOW, codes, np.uint8(Fate.CUT))
+        whole = None if delays is None else delays.astype(np.uint32)
+        codes = self._received(slots, codes, whole)
+        again = None
+        if chances is not None and settings.get("duplicate"):
+            again = (codes == Fate.DELIVERED) & (chances[:, 2] < settings["duplicate"])
+        rests = None if delays is None or whole is None else delays[:, 0] - whole[:, 0]
+        return Fates(codes, whole, again, rests)
+
+    def _delays(self, slots: range, chances: Floats | None) -> Floats | None:
+        """The delays in slots, (c, R), without the queue's; None if there are none."""
+        settings = self._state.settings
+        if settings.get("delay") is None:
+            return None
+        model = delay_of(settings["delay"])
+        reader = self._reader("delay", 1)
+        numbers = (reader.normals(slots) if model.normal else reader.uniforms(slots))[:, 0]
+        delays = model.delays(slots.start, numbers)
+        if chances is not None and settings.get("reorder"):
+            delays = np.where(chances[:, 1] < settings["reorder"], 0.0, delays)
+        return delays
+
+    def _queue(self, slots: range) -> tuple[Floats, Flags]:
+        """The time that each slot's packet waits in the queue, in slots, (c,), and whether the queue is full."""
+        rate, places = float(self._state.settings["rate"]), int(self._state.settings["queue"])
+        waits, full = np.zeros(len(slots)), np.zeros(len(slots), np.bool_)
+        for row, k in enumerate(slots):
+            wait = max(0.0, self._state.free - k)
+            full[row] = wait * rate > places
+            waits[row] = 0.0 if full[row] else wait
+            if not full[row]:
+                self._state.free = max(self._state.free, float(k)) + 1.0 / rate
+        return waits, full
+
+    def _received(self, slots: range, codes: Codes, delays: NDArray[np.uint32] | None) -> Codes:
+        """The fates after checking whether the receiver can accept the packets that the network delivers."""
+        if delays is None and not self.schedule.outages:
+            return codes
+        arrives: NDArray[np.int64] = np.arange(slots.start, slots.stop)[:, None]
+        sent = arrives
+        if delays is not None:
+            arrives = sent + delays
+            codes = np.where((codes == 0) & (delays > self.schedule.window), np.uint8(Fate.LATE), codes)
+        for outage in self.schedule.outages:
+            if delays is not None or (outage.start < slots.stop and slots.start < outage.stop):
+                away = (codes == 0) & (sent < outage.stop) & (arrives >= outage.start)
+                codes = np.where(away, np.uint8(outage.reason), codes)
+        if delays is not None:
+            codes = np.where((codes == 0) & (arrives >= self.batch.slots), np.uint8(Fate.UNDERWAY), codes)
+        return codes
+
+    def _loss_uniforms(self, slots: range) -> Floats:
+        """Uniform numbers of this link's own stream, or in some slots of the stream to which its losses are tied."""
+        width = self._state.loss.uniforms_per_slot
+        own = self._uniforms("link", slots, width)
+        if self.schedule.correlation is None:
+            return own
+        other, strength = self.schedule.correlation
+        mixed = self._uniforms("mix", slots, 1)
+        theirs = self._reader_of(f"link/{other}", width).uniforms(slots)
+        return np.where(mixed < strength, theirs, own)
+
+    def _uniforms(self, stream: str, slots: range, width: int) -> Floats:
+        return self._reader(stream, width).uniforms(slots)
+
+    def _reader(self, stream: str, width: int) -> Reader:
+        return self._reader_of(f"{stream}/{self.receiver}", width)
+
+    def _reader_of(self, name: str, width: int) -> Reader:
+        reader = self._readers.get((name, width))
+        if reader is None:
+            reader = self._readers[name, width] = self.reader(self.keys[name], self.batch, width)
+        return reader
+
+
+def _joined(parts: list[Fates]) -> Fates:
+    """Fates of consecutive slots as one."""
+    shapes = [part.codes.shape for part in parts]
+
+    def column(name: str, dtype: Any, axes: int = 2) -> Any:
+        values = [getattr(part, name) for part in parts]
+        if all(value is None for value in values):
+            return None
+        blank = [np.zeros(shape[:axes], dtype) for shape in shapes]
+        return np.concatenate([one if one is not None else zero for one, zero in zip(values, blank, strict=True)])
+
+    codes = np.concatenate([part.codes for part in parts])
+    return Fates(codes, column("delays", np.uint32), column("again", np.bool_), column("rests", np.float64, 1))
+
+
+def link_of(loss: Mapping[str, Any], key: bytes, batch: Batch) -> Link:
+    """A link that only loses packets: by a loss model, `{"model": …}`, and the key of its losses."""
+    return Link(LinkSchedule({"loss": loss}), "it", {"link/it": key}, batch)

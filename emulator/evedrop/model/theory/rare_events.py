@@ -1,0 +1,158 @@
+"""The share of an expected error that is due to rare events, and how many trials it takes to see them, behind independent losses.
+
+A *streak* begins where the error leaves 0, where an innovation misleads the receiver, or in slot 0 if its packet was not
+used; it lasts until a state, or the next misleading innovation, replaces the error. Long streaks are rare, and may
+nevertheless carry most of the expectation: a mean over too few trials then misses it, and its standard error does not show that.
+
+Source: docs/mathematics.md, rare events.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from evedrop.model.kernels.elementary import sum_in_order
+from evedrop.model.parts_of_runs import SLOTS_AT_ONCE, parts_of
+from evedrop.model.process import Floats, Process
+from evedrop.model.theory.covariances import (
+    ExpectedCovariance,
+    NoiseCovariances,
+    Outcomes,
+    block_length,
+    powers_of,
+)
+
+LARGEST_RUN = 2**22
+"""The most numbers, slots × n², in the covariances of a run for which the streaks of a misled receiver are computed."""
+RARE = 20
+"""Events that are expected less often than this in all trials are rare: their number, and with it a mean, is too uncertain."""
+REST = 1e-9
+"""The share of the expectation that is left out, in the longest streaks."""
+
+
+@final
+@dataclass(frozen=True)
+class Streaks:
+    """What streaks carry of Σ_k tr E P_k over the slots of a run; rows: those begun by a loss, by being misled, and in slot 0."""
+
+    number: Floats
+    """Expected number, in one trial, of streaks that last for more than l slots, (3, L) for l = 0, 1, …."""
+    carried: Floats
+    """What streaks carry in their slot number l, (3, L); the longest ones, which carry next to nothing, are left out."""
+    total: float
+    """Σ_k tr E P_k."""
+
+    def share(self, trials: int) -> float:
+        """The share of the expectation in slots that fewer than RARE streaks of all trials are expected to reach, 0 … 1."""
+        if self.total == 0.0:
+            return 0.0
+        met = float(self.carried[self.number * trials >= RARE].sum()) / self.total
+        return 1.0 - met if met < 1.0 - REST else 0.0
+
+    def trials_for(self, share: float) -> float:
+        """The number of trials for which this share is left in such slots; inf if it exceeds double precision. share > 1e-9."""
+        if self.total == 0.0:
+            return 1.0
+        order = np.argsort(-self.number, axis=None, kind="stable")
+        met = np.cumsum(self.carried.reshape(-1)[order])
+        last = int(np.searchsorted(met, (1.0 - share) * self.total))
+        number = float(self.number.reshape(-1)[order[min(last, len(order) - 1)]])
+        return max(1.0, float(np.ceil(RARE / number))) if number > 0.0 else math.inf
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def streaks(process: Process, outcomes: Outcomes, slots: int) -> Streaks | None:
+    """The streaks of a receiver in slots 0 … slots−1.
+
+    None if its error leaves double precision, for a genie, whose slots differ (`modulated_streaks` knows them), and for a misled
+    receiver in a run that is too long (LARGEST_RUN).
+
+    Source: docs/mathematics.md, rare events.
+    """
+    if outcomes.leaked or (outcomes.misled and slots * process.n**2 > LARGEST_RUN):
+        return None
+    total = total_of(ExpectedCovariance(process, outcomes).next_traces, slots)
+    if not math.isfinite(total):
+        return None
+    kept, lost, misled = outcomes.kept, outcomes.predicted, outcomes.misled
+    last = min(slots, SLOTS_AT_ONCE)
+    begun, spread = _begun(process, outcomes, slots, last)
+    F = math.sqrt(kept) * process.A
+    powers = np.concatenate([np.eye(process.n)[None], powers_of(F, block_length(F))])
+    base, noise, found = powers[0], 0.0, np.zeros((2, 3, 0))
+    while found.shape[2] < slots and found[1].sum() < (1.0 - REST) * total:
+        length = np.arange(found.shape[2], min(slots, found.shape[2] + len(powers) - 1))
+        if length[-1] >= last:
+            last = min(slots, 4 * (int(length[-1]) + 1))
+            begun, spread = _begun(process, outcomes, slots, last)
+        F_l, after, row = (powers @ base)[: len(length)], slots - 1 - length, last - 1 - length
+        base = powers[-1] @ base
+        q = _traces(F_l, process.Q)
+        u = np.empty(len(length))
+        for i, one in enumerate(q):
+            u[i] = noise
+            noise = kept * noise + lost * one
+        often = kept**length
+        number = [often * begun[row], often * misled * after, often * outcomes.initial]
+        carried = [
+            begun[row] * (q + u),
+            np.zeros(len(length)) if spread is None else misled * (_traces(F_l, spread[row]) + after * u),
+            outcomes.initial * (_traces(F_l, process.initial_covariance) + u),
+        ]
+        found = np.concatenate([found, [number, carried]], axis=2)
+    return Streaks(found[0], found[1], total)
+
+
+def total_of(next_traces: Callable[[int], Floats], slots: int) -> float:
+    """Σ_k tr E P_k over slots 0 … slots−1; next_traces: returns tr E P_k of as many next slots as it is asked for."""
+    return sum_in_order(float(next_traces(len(part)).sum()) for part in parts_of(range(slots)))
+
+
+def _begun(process: Process, outcomes: Outcomes, slots: int, last: int) -> tuple[Floats, Floats | None]:
+    """For each of the last slots of a run, (last,): the expected number of streaks that a loss has begun so far.
+
+    And Σ f_k so far, (last, n, n); None for a receiver that is never misled.
+    """
+    number, noise = _InStep(outcomes), NoiseCovariances(process) if outcomes.misled else None
+    begun, spread = np.zeros(1), np.zeros((1, process.n, process.n))
+    kept: list[tuple[Floats, Floats]] = []
+    for part in parts_of(range(slots)):
+        count = len(part)
+        begun = np.cumsum(np.concatenate([begun[-1:], outcomes.predicted * number.next(count)]))[1:]
+        if noise is not None:
+            spread = np.cumsum(np.concatenate([spread[-1:], 2.0 * noise.next(count)]), axis=0)[1:]
+        if part.stop > slots - last:
+            kept.append((begun, spread))
+    numbers, sums = (np.concatenate(one)[-last:] for one in zip(*kept, strict=True))
+    return numbers, sums if outcomes.misled else None
+
+
+@final
+class _InStep:
+    """The probability that the error is 0 before slot k, a number of slots at a time from k = 0; 0 for k = 0."""
+
+    def __init__(self, outcomes: Outcomes) -> None:
+        self._outcomes = outcomes
+        self._next, self._first = 0.0, True
+
+    def next(self, slots: int) -> Floats:
+        """That of the next slots, (slots,)."""
+        found, one = np.empty(slots), self._outcomes
+        for k in range(slots):
+            found[k] = self._next
+            after = 1.0 - one.initial if self._first else one.state + one.decoded * self._next
+            if not self._first and after == self._next:  # and so in all later slots
+                found[k:] = after
+                break
+            self._next, self._first = after, False
+        return found
+
+
+def _traces(F: Floats, P: Floats) -> Floats:
+    """Tr F_l P Fᵀ_l, (L,), of F (L, n, n) and P (n, n) or (L, n, n)."""
+    return np.asarray(np.einsum("lij,lij->l", F @ P, F))

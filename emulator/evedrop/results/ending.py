@@ -1,0 +1,57 @@
+"""The end of a run that its own observer could not complete: it was killed, or its disk was full.
+
+Source: docs/results.md, while a run goes on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+from evedrop.errors import UsageError
+from evedrop.results.growing_tables import UNFINISHED, finish, is_unfinished, last_round
+from evedrop.results.reading import age_of_figures
+from evedrop.results.writer import ResultsWriter, load_results, write_summary
+from evedrop.scenario.tables import Scenario
+from evedrop.score.scorekeeper import Ending, summary_of
+from evedrop.score.summary import Summary
+from evedrop.score.totals import Totals
+
+
+def note_end(folder: Path, scenario: Scenario, how: str) -> Summary:
+    """Write the reason for the run's end into its summary, and finish the tables that could not be finished before.
+
+    The figures are the last that were written; if they are of an earlier slot than the rows, the first line of `ended` says so.
+
+    Raises OSError if the folder cannot be written.
+    """
+    left_behind = is_unfinished(folder)
+    rows = last_round(folder)
+    how = noted(how, age_of_figures(folder))
+    try:
+        summary = replace(load_results(folder).typed_summary, ended=how)
+    except UsageError:  # there are no figures
+        totals = Totals.nothing(scenario, scenario.trials)
+        summary = summary_of(scenario, totals, dict.fromkeys(scenario.digested), Ending(0.0, how))
+        summary = replace(summary, slots=rows.slots)
+        if not rows.at:
+            left_behind = False
+            shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
+            if not any(folder.glob("*.parquet")):
+                with ResultsWriter.of(folder, scenario):
+                    pass
+    if left_behind:
+        # The recording lacks its end; `evedrop view` makes another one from the tables.
+        (folder / "recording.rrd").unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # the disk is full: the streams stay, and can be read
+            finish(folder)
+    write_summary(folder, summary)
+    return summary
+
+
+def noted(how: str, note: str) -> str:
+    """The reason for a run's end, with a note at the end of its first line: an excerpt of a log may follow."""
+    first, *excerpt = how.split("\n")
+    return "\n".join([first + note, *excerpt])

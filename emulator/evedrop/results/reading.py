@@ -1,0 +1,305 @@
+"""Reads results folders: the summary, and the tables as Arrow, of a run that ended, is in progress, or was killed.
+
+Source: docs/results.md.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from evedrop.errors import UsageError
+from evedrop.model.digest import DIGEST_BYTES
+from evedrop.model.streams import MOST_SLOTS
+from evedrop.results.growing_tables import batches_of, figures_path, goes_on, is_unfinished, last_round, schema_of
+from evedrop.results.summary_file import plain
+from evedrop.results.tables import DIGESTS, JOURNAL, NULLABLE, SLOTS, inputs_schema_in, trials_schema
+from evedrop.scenario.arguments import path_argument
+from evedrop.scenario.news import RunEvent
+from evedrop.score.summary import Summary
+from evedrop.system.files import Unreadable, opened, text_of
+
+_MOST_BYTES = 2**28
+_PIECE_ROWS = 8192
+
+
+@dataclass(frozen=True)
+class Results:
+    """A results folder that was read: `summary` as in docs/results.md, the tables as Arrow.
+
+    `typed_summary` is the same summary with types, and raises UsageError if this version does not write such a summary.
+    """
+
+    folder: Path
+    summary: Mapping[str, Any]
+
+    @property
+    def typed_summary(self) -> Summary:
+        """The summary with types. Raises UsageError if it is not one of this version."""
+        try:
+            return Summary.read(self.summary)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            path = self.folder / "summary.json"
+            why = _one_line(error) if isinstance(error, ValueError) else repr(error)
+            raise UsageError(f"{path} is not a run summary of this version ({why}); run the scenario again") from error
+
+    @property
+    def remark(self) -> str | None:
+        """A remark on a run that did not complete; None for a complete run."""
+        ended = str(self.summary.get("ended", "complete"))
+        return None if ended == "complete" else f"{self.folder}: {ended.splitlines()[0]}"
+
+    @property
+    def events(self) -> list[RunEvent]:
+        """The events of the run; also of a run of an older version."""
+        return [RunEvent(one["slot"], one["event"], one["by"]) for one in self.summary.get("events", ())]
+
+    def _table(self, name: str, expected: pa.Schema | None = None) -> pa.Table:
+        path = self.folder / f"{name}.parquet"
+        schema = None if path.exists() else schema_of(self.folder, name)
+        try:
+            if schema is None:
+                _refuse_pipe(path)
+                # By its path: threads of Arrow that read a Python file may abort the interpreter at its end (Python 3.11).
+                table = pq.read_table(path)
+            else:
+                table = pa.Table.from_batches(batches_of(self.folder, name), schema)
+            columns = table.column_names  # which are read only here, and need not be text
+            table.validate(full=True)  # a damaged column of words may name words that are not there
+        except Exception as error:  # pyarrow raises many kinds of errors for a damaged file
+            raise UsageError(f"{path} cannot be read ({_one_line(error)}); run the scenario again") from error
+        wanted = trials_schema(_states_in(table.schema)) if expected is None else expected
+        if not table.schema.equals(wanted):
+            raise UsageError(
+                f"{path} is not a table of this version ({_differences(table.schema, wanted)}); run the scenario again"
+            )
+        empty = [name for name in columns if name not in NULLABLE and table[name].null_count]
+        if empty:
+            raise UsageError(f"{path} has empty cells in {', '.join(empty)}; run the scenario again")
+        return table
+
+    def part(self, name: str, columns: Sequence[str], where: pc.Expression | None = None) -> pa.Table:
+        """Some columns of a table, of the rows for which `where` holds; of a finished run, reads only these.
+
+        Raises UsageError if the table cannot be read, or lacks a column.
+        """
+        path = self.folder / f"{name}.parquet"
+        try:
+            if path.exists():
+                _refuse_pipe(path)
+                table = pq.read_table(path, columns=list(columns), filters=where)
+            else:
+                whole = pa.Table.from_batches(batches_of(self.folder, name), schema_of(self.folder, name))
+                table = (whole if where is None else whole.filter(where)).select(columns)
+            table.validate(full=True)
+        except Exception as error:  # pyarrow raises many kinds of errors for a damaged file
+            raise UsageError(f"{path} cannot be read ({_one_line(error)}); run the scenario again") from error
+        return table
+
+    def pieces(self, name: str, columns: Sequence[str]) -> Iterator[pa.Table]:
+        """Some columns of a table in pieces of some thousand rows: memory does not grow with the table.
+
+        Raises UsageError if the table cannot be read, or lacks a column.
+        """
+        path = self.folder / f"{name}.parquet"
+        try:
+            if path.exists():
+                _refuse_pipe(path)
+                with pq.ParquetFile(path) as file:
+                    # `iter_batches` passes over columns that are not there, and this raises an error.
+                    file.schema_arrow.empty_table().select(columns)
+                    # Without threads, each of which would keep memory.
+                    for batch in file.iter_batches(_PIECE_ROWS, columns=list(columns), use_threads=False):
+                        yield _validated(batch, columns)
+                        pa.default_memory_pool().release_unused()
+            elif schema_of(self.folder, name) is None:
+                raise FileNotFoundError("there is no such file")
+            else:
+                for batch in batches_of(self.folder, name):
+                    yield _validated(batch, columns)
+        except Exception as error:  # pyarrow raises many kinds of errors for a damaged file
+            raise UsageError(f"{path} cannot be read ({_one_line(error)}); run the scenario again") from error
+
+    @property
+    def slots(self) -> pa.Table:
+        """A row per slot and peer: statistics over trials."""
+        return self._table("slots", SLOTS)
+
+    @property
+    def trials(self) -> pa.Table:
+        """A row per slot, peer and recorded trial."""
+        return self._table("trials")
+
+    @property
+    def journal(self) -> pa.Table:
+        """A row per slot and link."""
+        return self._table("journal", JOURNAL)
+
+    @property
+    def inputs(self) -> pa.Table | None:
+        """A row per slot and recorded trial of a closed loop; None without a controller."""
+        if self.summary.get("controller") is None:
+            return None
+        path = self.folder / "inputs.parquet"
+        schema = None if path.exists() else schema_of(self.folder, "inputs")
+        return self._table("inputs", inputs_schema_in(path) if schema is None else schema)
+
+    @property
+    def digests(self) -> pa.Table:
+        """A row per peer, trial and block of 256 slots. Raises UsageError for the digests of an older version."""
+        return self._table("digests", DIGESTS)
+
+
+def _refuse_pipe(path: Path) -> None:
+    """Raise an error unless a path is that of a regular file: reading a pipe would block."""
+    with opened(path):
+        pass
+
+
+def _validated(batch: pa.RecordBatch, columns: Sequence[str]) -> pa.Table:
+    """Some columns of a batch. Raises an error of Arrow if their contents are damaged, or one is not there."""
+    table = pa.Table.from_batches([batch]).select(columns)
+    table.validate(full=True)
+    return table
+
+
+def _states_in(schema: pa.Schema) -> int:
+    """The number of states in a table of trials; 1 if it is not such a table."""
+    x = schema.field("x").type if "x" in schema.names else None
+    return int(x.list_size) if x is not None and pa.types.is_fixed_size_list(x) else 1
+
+
+def _differences(found: pa.Schema, wanted: pa.Schema) -> str:
+    """How a table's columns differ from those of this version."""
+    digest = found.field("digest").type if "digest" in found.names else None
+    if digest is not None and pa.types.is_fixed_size_binary(digest) and digest.byte_width != DIGEST_BYTES:
+        return (
+            f"its digests have {digest.byte_width} bytes, and those of this version, which cover other bytes, have "
+            f"{DIGEST_BYTES}: they cannot be compared"
+        )
+    other = [field.name for field in wanted if field not in found] or found.names
+    return f"it differs in {', '.join(other)}"
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+@contextmanager
+def results_of_this_version(folder: Path) -> Iterator[None]:
+    """Turn an error about entries that no run of this version writes into UsageError: somebody may have changed the folder."""
+    try:
+        yield
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        why = f"{type(error).__name__}: {_one_line(error)}"
+        raise UsageError(f"{folder} has results that this version does not write ({why}); run it again") from error
+
+
+def load_results(folder: str | Path) -> Results:
+    """Read a results folder, also one of a run that is in progress or was killed: `ended` in its summary says so.
+
+    Raises UsageError naming the missing or broken file if it is not a results folder.
+    """
+    path_argument("folder", folder, "the results folder of a run")
+    place = Path(folder)
+    path = place / "summary.json"
+    if not path.exists() and (place / "shards").is_dir():
+        raise UsageError(
+            f"{folder} is of a run in shards that is in progress or was killed; each of its shards is a results folder by "
+            f"itself, such as {place / 'shards' / '1'}"
+        )
+    if not path.exists() and is_unfinished(place):
+        return Results(place, _cut_short(place))
+    return Results(place, _read_summary(path))
+
+
+def _read_summary(path: Path) -> dict[str, Any]:
+    try:
+        summary = json.loads(text_of(path, _MOST_BYTES))
+    except Unreadable as error:
+        raise UsageError(
+            f"{path.parent} is not a results folder ({path.name}: {error}); give the results folder of a run"
+        ) from error
+    except (ValueError, RecursionError) as error:
+        raise UsageError(f"{path} is not JSON ({error}); run the scenario again") from error
+    parts = {"peers": dict, "secrecy": dict, "links": dict, "slots": int, "trials": int}
+    if not isinstance(summary, dict) or any(type(summary.get(name)) is not kind for name, kind in parts.items()):
+        raise UsageError(f"{path} is not a run summary; run the scenario again")
+    events = summary.get("events", [])
+    if not isinstance(events, list) or not all(map(_is_event, events)):
+        raise UsageError(f"{path} has invalid events; run the scenario again")
+    return summary
+
+
+def _is_event(found: Any) -> bool:
+    return (
+        isinstance(found, dict)
+        and type(found.get("slot")) is int
+        and 0 <= found["slot"] <= MOST_SLOTS
+        and all(isinstance(found.get(name), str) for name in ("event", "by"))
+    )
+
+
+def _cut_short(folder: Path) -> dict[str, Any]:
+    """The last figures that were written, as the summary of a results folder that has no summary yet."""
+    found = last_round(folder)
+    at = found.at
+    if not at:
+        raise UsageError(
+            f"{folder} has nothing yet: its run has just begun, or was killed then; run the scenario again"
+        )
+    try:
+        summary = _read_summary(figures_path(folder))
+    except UsageError:
+        summary = _no_figures(folder)
+    ended = (
+        f"the run goes on, at {at}"
+        if goes_on(folder)
+        else f"cut short at {at}, because its run was killed or its disk was full"
+    )
+    return {**summary, "slots": found.slots, "ended": ended + age_of_figures(folder)}
+
+
+def age_of_figures(folder: Path) -> str:
+    """What `ended` of an unfinished results folder adds if its figures are of an earlier moment than its rows."""
+    rows = last_round(folder)
+    try:
+        figures = _read_summary(figures_path(folder))
+        at, slots = figures["ended"], figures["slots"]
+    except UsageError:  # no figures have been written
+        at, slots = "slot 0", 0
+    return as_of(at, slots < rows.slots) if rows.at and at != rows.at else ""
+
+
+def as_of(moment: str, more: bool = True) -> str:
+    """What `ended` adds if figures are of an earlier moment. more: whether the tables have slots that the figures lack."""
+    return f" (the figures are as of {moment}{'; the tables have more' if more else ''})"
+
+
+def _no_figures(folder: Path) -> dict[str, Any]:
+    """The summary of a run that was killed before it wrote one. Raises UsageError if its scenario cannot be read."""
+    # Only this case needs theory and the scenario to read results.
+    from evedrop.scenario.loading.recorded import recorded  # noqa: PLC0415
+    from evedrop.score.scorekeeper import Ending, summary_of  # noqa: PLC0415
+    from evedrop.score.totals import Totals  # noqa: PLC0415
+
+    found = recorded(folder)
+    if not found.complete:
+        raise UsageError(
+            f"{folder} has no figures yet, and theory needs its classes, which are not built in; looking at results imports "
+            "none: look again when the run has figures, or run the scenario again"
+        )
+    scenario = found.scenario
+    nothing = Totals.nothing(scenario, scenario.trials)
+    summary: dict[str, Any] = plain(
+        summary_of(scenario, nothing, dict.fromkeys(scenario.digested), Ending(0.0, "slot 0")).as_dict()
+    )
+    return summary

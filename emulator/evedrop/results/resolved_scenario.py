@@ -1,0 +1,64 @@
+"""The scenario of a run in its results folder: complete, with the versions that made it."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+from pathlib import Path
+from typing import Any
+
+from evedrop.results.folder import replace_private
+from evedrop.results.taken_states import STATES
+from evedrop.scenario.plugins import sources_of
+from evedrop.scenario.recordings.disturbance_file import table_text
+from evedrop.scenario.tables import Scenario
+from evedrop.scenario.toml_text import toml_text
+
+DISTURBANCES = "disturbances.csv"
+"""The file in a results folder if its scenario has disturbances."""
+
+
+def write_resolved(folder: Path, scenario: Scenario, taken: bool = False) -> None:
+    """Write the scenario.toml of a results folder, and its states and disturbances; each file is complete at any moment.
+
+    taken: whether all states of a program have been written, so that the run can be repeated from them.
+    """
+    for name, text in {**input_texts(scenario), "scenario.toml": resolved(scenario, taken)}.items():
+        replace_private(folder / name, text)
+
+
+def input_texts(scenario: Scenario) -> dict[str, str]:
+    """The files that a complete scenario needs next to it: name → text."""
+    plant, process = scenario.plant, scenario.process
+    found = {}
+    if plant is not None and plant.disturbance_values:
+        found[DISTURBANCES] = table_text(plant.disturbances, plant.disturbance_units, plant.disturbance_values)
+    if process.source == "file":
+        found[STATES] = table_text(process.states or (), process.units, process.state_values or ())
+    return found
+
+
+def resolved(scenario: Scenario, taken: bool = False) -> str:
+    """The complete scenario as TOML, with the versions that made it: running it again gives the same digests.
+
+    taken: as in `write_resolved`.
+    """
+    tables = scenario.model_dump(mode="json", exclude_none=True)
+    if scenario.plant is not None and tables["plant"].pop("disturbance_values", None):
+        tables["plant"]["disturbance_file"] = DISTURBANCES
+    if scenario.process.given:
+        tables["process"].pop("state_values", None)
+        tables["process"] |= {"state_file": STATES, **({"source": "file"} if taken else {})}
+    if scenario.secret_file is not None:
+        tables["secret_file"] = str(Path(scenario.secret_file).absolute())
+    tables["made_with"] = made_with(tables)
+    return toml_text(tables)
+
+
+def made_with(tables: dict[str, Any]) -> dict[str, Any]:
+    """The versions of the software, and the SHA-256 of the modules of a scenario, given as its tables."""
+    return {
+        "python": platform.python_version(),
+        **{name: importlib.metadata.version(name) for name in ("evedrop", "numpy", "cryptography", "eclipse-zenoh")},
+        **sources_of(tables),
+    }

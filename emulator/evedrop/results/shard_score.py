@@ -1,0 +1,63 @@
+"""The totals of a shard's trials, stored with its tables for the process that scores the whole run.
+
+They never leave the machine or the user: written by one process of a run, read by another, then removed. They are data
+(`evedrop.results.object_data`), which cannot run code where they are read.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from evedrop.errors import RunError
+from evedrop.results.folder import private_replacement
+from evedrop.results.object_data import NotData, packed, unpacked
+from evedrop.scenario.tables import Scenario
+from evedrop.score.totals import Totals
+
+_NAME = "score"
+
+
+def dump_score(totals: Totals, folder: Path, scenario: Scenario) -> None:
+    """Write the totals to a results folder; the file is complete at any moment, and private to this user.
+
+    scenario: that of the shard. The figure of a package whose tally is not data fails, which the totals then say.
+
+    Raises OSError.
+    """
+    example = _example(scenario)
+    for name, tally in totals.tallies.items():
+        blank = example.tallies[name].watched.of_packages
+        for watch, kept in tally.watched.of_packages.items():
+            try:
+                unpacked(packed(kept), blank[watch])
+            except NotData as error:
+                kept.fail(
+                    f"a shard cannot store its tally ({error}); docs/your-own.md says what a tally may consist of"
+                )
+    with private_replacement(folder / _NAME) as unfinished:
+        unfinished.write_bytes(packed(totals))
+
+
+def load_score(folder: Path, scenario: Scenario) -> Totals:
+    """Read the totals from a results folder; empty totals if the process that should have written them was killed.
+
+    scenario: that of the shard. Raises RunError if they are damaged.
+    """
+    try:
+        data = (folder / _NAME).read_bytes()
+    except OSError:
+        return Totals.nothing(scenario, scenario.trials)
+    try:
+        totals = unpacked(data, _example(scenario))
+    except NotData as error:
+        raise RunError(f"{folder / _NAME} is damaged ({error}); run again") from error
+    if not isinstance(totals, Totals):
+        raise RunError(f"{folder / _NAME} is damaged (it has no totals); run again")
+    return totals
+
+
+def _example(scenario: Scenario) -> Totals:
+    """Totals without slots, which have an instance wherever the totals of a run may have one."""
+    example = Totals.from_scenario(scenario, scenario.trials)
+    example.begin()
+    return example

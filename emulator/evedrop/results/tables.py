@@ -1,0 +1,138 @@
+"""The columns of the tables in a results folder.
+
+Source: docs/results.md, tables.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from evedrop.model.digest import DIGEST_BYTES
+from evedrop.model.integrity.monitor import MonitoredSlots
+from evedrop.model.links.link import REASONS
+from evedrop.model.plant import Plant
+from evedrop.model.process import Floats
+from evedrop.score.histogram import LEVELS
+from evedrop.score.slots import Slots
+from evedrop.system.files import opened
+
+SLOTS = pa.schema(
+    [
+        ("slot", pa.int64()),
+        ("peer", pa.dictionary(pa.int8(), pa.string())),
+        ("trials", pa.int64()),
+        ("mean_squared_error", pa.float64()),
+        ("mean_actual_trace_covariance", pa.float64()),
+        ("standard_error", pa.float64()),
+        ("mean_trace_covariance", pa.float64()),
+        ("expected_trace_covariance", pa.float64()),
+        ("received_fraction", pa.float64()),
+        ("used_fraction", pa.float64()),
+        *((f"{quantity}_quantile_{level:g}", pa.float64()) for quantity in ("error", "trace") for level in LEVELS),
+    ]
+)
+JOURNAL = pa.schema(
+    [
+        ("slot", pa.int64()),
+        ("link", pa.dictionary(pa.int8(), pa.string())),
+        ("offered", pa.int64()),
+        ("delivered", pa.int64()),
+        ("late", pa.int64()),
+        ("lost", pa.int64()),
+        *((f"lost_by_{reason}", pa.int64()) for reason in REASONS),
+        ("delivered_mask", pa.binary()),
+    ]
+)
+
+NULLABLE = {
+    "mean_squared_error",
+    "mean_actual_trace_covariance",
+    "expected_trace_covariance",
+    *(field.name for field in SLOTS if "quantile" in field.name),
+}
+"""Columns in which NaN means that there is no value."""
+
+
+def trials_schema(n: int) -> pa.Schema:
+    """The schema of the recorded trials of a process with n states."""
+    return pa.schema(
+        [
+            ("slot", pa.int64()),
+            ("peer", pa.dictionary(pa.int8(), pa.string())),
+            ("trial", pa.int64()),
+            ("sent", pa.dictionary(pa.int8(), pa.string())),
+            ("action", pa.dictionary(pa.int8(), pa.string())),
+            ("squared_error", pa.float64()),
+            ("trace_covariance", pa.float64()),
+            ("x", pa.list_(pa.float64(), n)),
+            ("x_hat", pa.list_(pa.float64(), n)),
+            ("P", pa.list_(pa.float64(), n * n)),
+        ]
+    )
+
+
+DIGESTS = pa.schema(
+    [
+        ("peer", pa.dictionary(pa.int8(), pa.string())),
+        ("trial", pa.int64()),
+        ("block", pa.int64()),
+        ("digest", pa.binary(DIGEST_BYTES)),
+    ]
+)
+
+
+def inputs_schema(inputs: int, disturbances: int, monitored: bool = False) -> pa.Schema:
+    """The schema for these numbers of inputs and disturbances; monitored: whether there are a watermark and a detector."""
+    return pa.schema(
+        [
+            ("slot", pa.int64()),
+            ("trial", pa.int64()),
+            ("u", pa.list_(pa.float64(), inputs)),
+            *([("d", pa.list_(pa.float64(), disturbances))] if disturbances else []),
+            ("failed", pa.bool_()),
+            ("clipped", pa.bool_()),
+            *([("watermark", pa.list_(pa.float64(), inputs)), ("statistic", pa.float64())] if monitored else []),
+        ]
+    )
+
+
+def inputs_schema_in(path: Path) -> pa.Schema:
+    """The schema that a file should have; for a file that is not such a table, one with which reading it reports that."""
+    try:
+        with opened(path):  # a pipe would be waited for
+            pass
+        schema = pq.read_schema(path)
+        u, d = (int(schema.field(name).type.list_size) if name in schema.names else 0 for name in ("u", "d"))
+        monitored = "statistic" in schema.names
+    except Exception:  # pyarrow raises many kinds of errors for a damaged file, and the table's reader reports them
+        u, d, monitored = 0, 0, False
+    return inputs_schema(max(1, u), d, monitored)
+
+
+def input_columns(slots: Slots, plant: Plant, disturbances: Floats, first_trial: int) -> list[NDArray[Any]]:
+    """A row per slot and recorded trial, from first_trial on; disturbances (slots, q) are of the whole run."""
+    assert slots.inputs is not None  # noqa: S101 - asked by the caller
+    recorded = next(iter(slots.receivers.values())).P.shape[3]
+    u, some = slots.inputs.u[:, :, :recorded], slice(slots.first, slots.first + slots.count)
+    return [
+        np.repeat(np.arange(some.start, some.stop), recorded),
+        np.tile(np.arange(first_trial, first_trial + recorded), slots.count),
+        np.stack([plant.limited(one) for one in u]).transpose(0, 2, 1).reshape(slots.count * recorded, -1),
+        *([np.repeat(disturbances[some], recorded, axis=0)] if disturbances.shape[1] else []),
+        slots.inputs.failed[:, :recorded].reshape(-1),
+        plant.clips(u).reshape(-1),
+        *_monitored_columns(slots.inputs.monitored, recorded),
+    ]
+
+
+def _monitored_columns(monitored: MonitoredSlots | None, recorded: int) -> list[NDArray[Any]]:
+    if monitored is None:
+        return []
+    e = monitored.watermark[:, :, :recorded].transpose(0, 2, 1)
+    return [e.reshape(-1, e.shape[2]), monitored.statistic[:, :recorded].reshape(-1)]

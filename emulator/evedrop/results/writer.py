@@ -1,0 +1,344 @@
+"""The results folder: written during the run, complete whenever it ends, and read back as typed tables.
+
+Source: docs/results.md.
+"""
+
+from __future__ import annotations
+
+import errno
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, final
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from evedrop.model.digest import Digests
+from evedrop.model.flag_bits import packed_flags
+from evedrop.model.links.link import REASONS
+from evedrop.model.packet_words import ACTIONS, MISLED, NOTHING, TYPES
+from evedrop.model.plant import Plant
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Action, Codes, Flags
+from evedrop.names import CONTROLLER
+from evedrop.results.folder import HeldFolder
+from evedrop.results.growing_tables import BATCH_BYTES, UNFINISHED, TableStream, Unfinished, finish, write_figures
+from evedrop.results.reading import Results, load_results
+from evedrop.results.summary_file import plain, summary_text, write_summary
+from evedrop.results.tables import (
+    DIGESTS,
+    JOURNAL,
+    NULLABLE,
+    SLOTS,
+    input_columns,
+    inputs_schema,
+    trials_schema,
+)
+from evedrop.results.taken_states import TakenStates
+from evedrop.scenario.controlled import monitor_of
+from evedrop.scenario.input_files import disturbances_of
+from evedrop.scenario.process import ProcessTable
+from evedrop.scenario.tables import Scenario
+from evedrop.score.histogram import LEVELS
+from evedrop.score.slots import Slots
+from evedrop.score.summary import Summary
+from evedrop.score.sums import SlotSums
+
+_ROUND_SECONDS = 3.0  # the longest time between rounds, which a killed writer loses
+_ROUND_BYTES = (32 * 2**10, 4 * 2**20)  # the most that is held back, at the start of a run and later
+_ROUND_SHARE = 8  # at most this fraction (one in 8) of the bytes on disk is held back
+_FIGURES_SHARE = 50  # after figures took some time, none are computed for 50 times as long
+
+__all__ = [
+    "DIGESTS", "JOURNAL", "NULLABLE", "SLOTS", "Results", "ResultsWriter", "load_results", "plain",
+    "seen_actions", "write_summary",
+]  # fmt: skip
+
+
+@final
+class ResultsWriter:
+    """Writes the tables of a results folder; a context manager.
+
+    Inside the block, rows go to streams that can be read however the writer ends; on leaving it they become Parquet files.
+    `write_summary` then completes the folder.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        receivers: tuple[str, ...],
+        n: int,
+        around: Sequence[float] | None = None,
+        loop: tuple[Plant, Floats] | None = None,
+        monitored: bool = False,
+        program: ProcessTable | None = None,
+    ) -> None:
+        """around: added to states and estimates, (n,); loop: plant and disturbances (slots, q) of a closed loop.
+
+        monitored: whether there are a watermark and a detector; program: a process whose states come from one.
+
+        Raises OSError if the folder cannot be written.
+        """
+        self._digested = receivers if loop is None else (*receivers, CONTROLLER)
+        self._around = None if around is None or not any(around) else np.array(around)
+        self._held = HeldFolder(folder)
+        self._unfinished = Unfinished(folder)
+        self._loop = loop
+        self._taken = None if program is None else TakenStates(folder, program)
+        peers = {"peer": self._digested}
+        words = {**peers, "sent": TYPES, "action": ACTIONS}
+        self._kinds: dict[str, tuple[pa.Schema, Mapping[str, tuple[str, ...]]]] = {
+            "slots": (SLOTS, peers),
+            "trials": (trials_schema(n), words),
+            "journal": (JOURNAL, {"link": receivers}),
+            "digests": (DIGESTS, peers),
+        }
+        if loop is not None:
+            plant, disturbances = loop
+            self._kinds["inputs"] = (inputs_schema(plant.inputs, disturbances.shape[1], monitored), {})
+        self._streams = {name: self._stream(name, 0) for name in self._kinds}
+        self._outdated: list[TableStream] = []
+        self._restarts = self._bytes = self._on_disk = self._slots = 0
+        self._at = "slot 0"
+        self._broken = self._figures_before = False
+        self._round_due = self._figures_due = time.monotonic() + _ROUND_SECONDS
+        self._with_figures: Callable[[], None] = lambda: None
+        self._round()
+
+    def _stream(self, name: str, number: int) -> TableStream:
+        schema, names = self._kinds[name]
+        return TableStream(self._held.now / UNFINISHED / f"{name}-{number}.arrows", schema, names)
+
+    @classmethod
+    def of(cls, folder: Path, scenario: Scenario, with_figures: Callable[[], None] = lambda: None) -> Self:
+        """A writer for the results of a scenario.
+
+        with_figures: called before figures are written; their rows are on disk by then.
+        """
+        loop = (
+            None
+            if scenario.driven is None or scenario.controller is None
+            else (scenario.driven, disturbances_of(scenario))
+        )
+        states, around = len(scenario.process.A), scenario.process.around
+        program = scenario.process if scenario.process.source == "zenoh" else None
+        writer = cls(folder, scenario.receivers, states, around, loop, monitor_of(scenario) is not None, program)
+        writer._with_figures = with_figures
+        return writer
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        failure: OSError | None = None
+        try:
+            if not self._broken:
+                self._round()
+        except OSError as found:
+            failure = found
+        for stream in (*self._streams.values(), *self._outdated):
+            stream.close()
+        try:
+            finish(self._held.now)
+        except (OSError, pa.ArrowException) as found:  # the streams stay where they are, and can be read
+            failure = failure or (found if isinstance(found, OSError) else OSError(str(found)))
+        self._unfinished.close()
+        if self._taken is not None:
+            self._taken.close()
+        self._held.close()
+        if failure is not None and error is None:
+            raise failure
+
+    def checkpoint(self, at: str, figures: Callable[[], Summary], before: Callable[[], None] = lambda: None) -> None:
+        """Write rows to disk if some seconds have passed since the last round, or if many are held back.
+
+        at: how far the run came, in words; figures: returns the summary so far, called more rarely if it takes long;
+        before: called before figures. Raises OSError if the disk is full or the folder is gone.
+        """
+        self._at = at
+        began = time.monotonic()
+        least, most = _ROUND_BYTES
+        if began < self._round_due and self._bytes < min(most, max(least, self._on_disk // _ROUND_SHARE)):
+            return
+        first = not self._figures_before
+        due = first or began >= self._figures_due
+        if due:
+            before()
+        if first:  # rows without figures could not be looked at, if the run were killed now
+            earliest = figures()
+            self._round(lambda: self.write_figures(earliest))
+            self._figures_before = True
+        else:
+            self._round()
+        self._round_due = time.monotonic() + _ROUND_SECONDS
+        if due:
+            self._figures_due = self._round_due
+        if due and not first:  # the first figures import the theory, so their time says nothing about the next
+            self.write_figures(figures())
+            now = time.monotonic()
+            self._figures_due = now + max(_ROUND_SECONDS, _FIGURES_SHARE * (now - began))
+
+    def write_rows(self, at: str) -> None:
+        """Write all rows to disk now. Raises OSError as `checkpoint` does."""
+        self._at = at
+        self._round()
+
+    def settle(self, at: str, figures: Summary) -> None:
+        """Write everything to disk, with the last figures; no rows may follow. Raises OSError as `checkpoint` does."""
+        self._at = at
+        self._round()
+        self.write_figures(figures)
+
+    def write_figures(self, figures: Summary) -> None:
+        """Write the summary so far, of a run that has not ended."""
+        self._with_figures()
+        write_figures(self._held.now, summary_text(replace(figures, ended=self._at)))
+
+    def restart_slots(self) -> None:
+        """Discard the rows of all slots; other rows will replace them."""
+        self._restarts += 1
+        self._outdated.append(self._streams["slots"])
+        self._streams["slots"] = self._stream("slots", self._restarts)
+
+    def _round(self, before: Callable[[], None] = lambda: None) -> None:
+        """Write all rows; before: called when they are written, and do not count yet."""
+        if self._broken:  # rows after an incomplete batch could not be read
+            raise OSError(errno.EIO, "an earlier part could not be written")
+        self._broken = True  # until the round succeeds
+        if self._taken is not None:
+            self._taken.write()
+        self._unfinished.round(self._at, self._slots, self._streams, before)
+        self._broken = False
+        self._on_disk, self._bytes = self._on_disk + self._bytes, 0
+        for stream in self._outdated:
+            stream.close()
+            (self._held.now / UNFINISHED / stream.file).unlink()
+        self._outdated = []
+
+    def _add(self, table: str, columns: Sequence[NDArray[Any]]) -> None:
+        stream = self._streams[table]
+        self._bytes += stream.add(columns)
+        if stream.held_bytes >= BATCH_BYTES:  # these rows count only from the next round on
+            stream.write()
+
+    def slot_rows(
+        self,
+        first: int,
+        name: str,
+        sums: SlotSums,
+        expected: Floats,
+        quantiles: Floats | None = None,
+        covariance_only: bool = False,
+    ) -> None:
+        """A row per slot: statistics over trials of one receiver.
+
+        expected: the trace by theory, (c,); quantiles: of error and of trace, (c, 2 levels), NaN where there are none;
+        covariance_only: the error is the trace of the actual covariance, not a squared error.
+        """
+        count, trials = len(expected), sums.trials
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            mean = sums.error / trials
+            columns = [sums.trace / trials, expected, sums.received / trials, sums.used / trials]
+        self._slots = max(self._slots, first + count)
+        nothing = np.full(count, np.nan)
+        spread = quantiles if quantiles is not None else np.full((count, 2 * len(LEVELS)), np.nan)
+        self._add(
+            "slots",
+            [
+                np.arange(first, first + count),
+                self._names(name, count),
+                trials.astype(np.int64),
+                nothing if covariance_only else mean,
+                mean if covariance_only else nothing,
+                sums.standard_errors,
+                *columns,
+                *spread.T,
+            ],
+        )
+
+    def trial_rows(self, slots: Slots, squared_errors: Mapping[str, Floats], first_trial: int) -> None:
+        """A row per slot, receiver and recorded trial, from first_trial on, with all columns."""
+        recorded = next(iter(slots.receivers.values())).P.shape[3]
+        count = slots.count * recorded
+        k = np.repeat(np.arange(slots.first, slots.first + slots.count), recorded)
+        trials = np.tile(np.arange(first_trial, first_trial + recorded), slots.count)
+        nu = slots.nu[:, :recorded]
+        packets = nu if slots.sent is None else np.where(slots.sent[:, :recorded], nu, TYPES.index(NOTHING))
+        x = self._levels(slots.x[:, :, :recorded])
+        for name, receiver in slots.receivers.items():
+            self._add(
+                "trials",
+                [
+                    k,
+                    self._names(name, count),
+                    trials,
+                    packets.reshape(-1),
+                    seen_actions(receiver.action[:, :recorded], nu).reshape(-1),
+                    squared_errors[name][:, :recorded].reshape(-1),
+                    np.trace(receiver.P, axis1=1, axis2=2).reshape(-1),
+                    x,
+                    self._levels(receiver.x_hat[:, :, :recorded]),
+                    np.moveaxis(receiver.P, 3, 1).reshape(count, -1),
+                ],
+            )
+
+    def state_rows(self, slots: Slots) -> None:
+        """A line per slot: the states that were taken from a program, which all trials share."""
+        if self._taken is not None:
+            self._taken.add(slots.x[:, :, 0])
+
+    def _levels(self, x: Floats) -> Floats:
+        """States (c, n, r) as rows, (c r, n), with the reference added, from which they are deviations."""
+        rows = x.transpose(0, 2, 1).reshape(-1, x.shape[1])
+        return rows if self._around is None else rows + self._around
+
+    def input_rows(self, slots: Slots, first_trial: int) -> None:
+        """A row per slot and recorded trial, from first_trial on: the inputs and disturbances of the plant."""
+        if slots.inputs is None or self._loop is None:
+            return
+        self._add("inputs", input_columns(slots, *self._loop, first_trial))
+
+    def journal_rows(self, slots: Slots) -> None:
+        """A row per slot and link of a live run: counts by reason, and a bit mask of the trials that were delivered."""
+        for name, receiver in slots.receivers.items():
+            silent = 0 if receiver.unsent is None else receiver.unsent.astype(np.int64)
+            offered = np.full(slots.count, slots.trials) - silent
+            delivered = np.count_nonzero(receiver.delivered, axis=1)
+            by_reason = [receiver.lost[reason].astype(np.int64) for reason in REASONS]
+            lost = np.sum(by_reason, axis=0)
+            self._add(
+                "journal",
+                [
+                    np.arange(slots.first, slots.first + slots.count),
+                    self._names(name, slots.count),
+                    offered,
+                    delivered,
+                    offered - delivered - lost,
+                    lost,
+                    *by_reason,
+                    packed_flags(receiver.delivered),
+                ],
+            )
+
+    def _names(self, name: str, count: int) -> NDArray[np.int8]:
+        return np.full(count, self._digested.index(name), np.int8)
+
+    def digest_rows(self, first_trial: int, digests: Mapping[str, Mapping[int, Digests]]) -> None:
+        """A row per receiver, trial and block: receiver → block → digests (R, 16) of the trials from first_trial on."""
+        for name, blocks in digests.items():
+            for block, values in sorted(blocks.items()):
+                trials = len(values)
+                numbers = np.arange(first_trial, first_trial + trials)
+                self._add("digests", [self._names(name, trials), numbers, np.full(trials, block), values])
+
+
+def seen_actions(action: Codes, nu: Flags) -> Codes:
+    """Indices into `ACTIONS`: the actions, with the truth about each packet's type."""
+    misled = (action == Action.STATE) & nu
+    return np.where(misled, np.uint8(ACTIONS.index(MISLED)), action)

@@ -1,0 +1,322 @@
+"""The hook for applications: uses of a closed loop's plant.
+
+An application has a table of its own in a scenario, figures in the summary and in expectations, lines in the closing report,
+panels in the view and a picture of a sweep. Nothing else names an application: it asks those whose tables a scenario contains.
+
+Source: docs/your-own.md, applications.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+from evedrop.errors import NotRegistered
+from evedrop.model.controllers import Assignment, Controller
+from evedrop.model.figures import error_column
+from evedrop.model.figures.standard_error import standard_error
+from evedrop.model.figures.text import estimate
+from evedrop.model.integrity.monitor import MonitoredSlots, MonitorPlan
+from evedrop.model.plant import Plant
+from evedrop.model.process import Floats, Process
+from evedrop.model.registry import Registry
+from evedrop.scenario.table import Table
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+Summary = Mapping[str, Any]
+"""An application's entry of the summary: its figures by name, and under `receivers` those of each receiver."""
+Kind = Literal["inputs", "disturbances", "states"]
+"""A kind of quantity that has names."""
+RECEIVERS, STANDARD_ERRORS = "receivers", "standard_errors"
+
+
+@dataclass(frozen=True)
+class ControlledPlant:
+    """A plant with its controller, as an application sees it."""
+
+    assignment: Assignment
+    """What the controller knows, process and plant included."""
+    strategy: type[Controller]
+    around: Floats
+    """The reference of the states, (n,): states and estimates are deviations from it."""
+    disturbances: Floats
+    """The disturbances of every slot, (slots, q)."""
+    states: tuple[str, ...]
+    """Names of the n states; empty if the scenario gives none."""
+    inputs: tuple[str, ...]
+    """Names of the m inputs."""
+    disturbance_names: tuple[str, ...]
+    disturbance_labels: tuple[str, ...]
+    """The same with their units, if the scenario gives units."""
+    receivers: tuple[str, ...]
+    """The legitimate estimator first."""
+    on_truth: bool = False
+    """Whether the controller acts on the true state."""
+    spoofed: tuple[tuple[int, int], ...] = ()
+    """The slots [from, to) of events in which the measurements are attacked; without such events an attack lasts all run."""
+
+    @property
+    def process(self) -> Process:
+        """The process."""
+        return self.assignment.process
+
+    @property
+    def plant(self) -> Plant:
+        """The plant."""
+        return self.assignment.plant
+
+    @property
+    def period(self) -> int:
+        """Slots between two decisions."""
+        return self.assignment.period
+
+    @property
+    def slot_seconds(self) -> float:
+        """The duration of a slot in seconds."""
+        return self.assignment.slot_seconds
+
+    @property
+    def slots(self) -> int:
+        """Slots of the run."""
+        return len(self.disturbances)
+
+    def state(self, name: str) -> int:
+        """The index of a state."""
+        return self.states.index(name)
+
+    def input(self, name: str) -> int:
+        """The index of an input."""
+        return self.inputs.index(name)
+
+    def disturbance(self, name: str) -> int:
+        """The index of a disturbance."""
+        return self.disturbance_names.index(name)
+
+
+class ApplicationTally(ABC):
+    """An application's totals over a set of trials, whose slots come in order. Pickled between processes."""
+
+    @abstractmethod
+    def add(self, x: Floats, u: Floats, estimates: Mapping[str, Floats]) -> None:
+        """Add the next c slots: true states (c, n, R), inputs as decided (c, m, R), and every receiver's estimates, (c, n, R)."""
+
+    def add_monitored(self, x: Floats, u: Floats, monitored: MonitoredSlots) -> None:
+        """Add watermark and detector of the next c slots, before these go to `add`; by default nothing. x and u as there."""
+        del x, u, monitored
+
+    @classmethod
+    @abstractmethod
+    def merged(cls, parts: Sequence[Self]) -> Self:
+        """The totals of several sets of trials, in order."""
+
+    @abstractmethod
+    def summary(self) -> Summary:
+        """The summary's entry: every figure, a number or None; under `receivers`, each receiver's figures by its name."""
+
+    @property
+    def of_trials(self) -> Mapping[tuple[str, ...], Floats]:
+        """The place of a figure in the summary's entry → what it is the mean of, for every trial, (R,); by default none.
+
+        These figures have standard errors, at the same places of `standard_errors` in the entry.
+        """
+        return {}
+
+    def entry(self) -> Summary:
+        """The summary's entry, with the standard errors of its figures if there are any."""
+        errors: dict[str, Any] = {}
+        for (*outer, name), values in self.of_trials.items():
+            inner = errors
+            for part in outer:
+                inner = inner.setdefault(part, {})
+            inner[name] = standard_error(values)
+        return {**self.summary(), **({STANDARD_ERRORS: errors} if errors else {})}
+
+
+@dataclass(frozen=True)
+class PanelCurve:
+    """One curve of a panel."""
+
+    name: str
+    """The label; a receiver's name for a curve of its beliefs."""
+    colour: tuple[int, int, int] | None = None
+    """None: the colour of the receiver of this name."""
+    drawn: Literal["line", "steps", "points"] = "line"
+    width: float = 1.8
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A panel of the view. Its curves are drawn over the slots of the run."""
+
+    path: str
+    """Its path in the recording, one word."""
+    title: str
+    curves: tuple[PanelCurve, ...]
+    span: tuple[float, float] | None = None
+    """Lowest and highest value shown; None: fitted to the curves."""
+    with_beliefs: bool = False
+    """Whether it is placed with the panels of the receivers' beliefs, rather than with those of the plant."""
+
+
+class PanelFeed(ABC):
+    """The values of an application's panels in one trial, whose slots come in order."""
+
+    @abstractmethod
+    def take(self, first: int, u: Floats, estimates: Mapping[str, Floats]) -> Mapping[str, Floats]:
+        """Add slots from `first` on: inputs within their limits, (c, m), and estimates as deviations, (c, n).
+
+        Returns PATH/CURVE → slots and values of its g new points, (2, g).
+        """
+
+    def take_monitored(self, first: int, monitored: MonitoredSlots) -> Mapping[str, Floats]:
+        """The points of curves from watermark and detector of these slots, of one trial; by default none."""
+        del first, monitored
+        return {}
+
+
+class PowerFeed(ABC):
+    """The power that an application takes from the grid in a set of trials, whose slots come in order."""
+
+    @abstractmethod
+    def take(self, x: Floats, u: Floats) -> tuple[Floats, Floats]:
+        """Add the next c slots: true states (c, n, R), and inputs as decided (c, m, R).
+
+        Returns its power in each of them, and that of a controller that sees the truth, in kW, (c, R) each; negative if sold.
+        """
+
+
+class Application(ABC):
+    """A use of a plant with a controller. A class, never an instance, is registered.
+
+    The name of its entry point is also the name of its table in a scenario, and of its entry in the summary.
+    """
+
+    table: ClassVar[type[Table]]
+    """The entries of its table."""
+    names: ClassVar[Mapping[str, Kind]]
+    """The entries of its table that name an input or a disturbance of the plant, or a state of the process."""
+    figures: ClassVar[tuple[str, ...]]
+    """Its figures in the summary that expectations and sweeps can use."""
+    receiver_figures: ClassVar[tuple[str, ...]] = ()
+    """Its figures for each receiver, likewise."""
+    metrics: ClassVar[tuple[str, ...]] = ()
+    """Those of `figures` that `evedrop run --metrics` serves."""
+    has_monitor: ClassVar[bool] = False
+    """Whether it can have a monitor."""
+    has_power: ClassVar[bool] = False
+    """Whether it has a `power`, so that `evedrop cost` can compute the energy that secrecy costs it."""
+    example: ClassVar[str | None] = None
+    """A shipped scenario that has it, for messages; None for an application of a package."""
+
+    @classmethod
+    def objections(cls, loop: ControlledPlant, table: Table) -> list[str]:
+        """Mistakes that only show with a valid process, plant and controller: "ENTRY: what is wrong"; by default none."""
+        del loop, table
+        return []
+
+    @classmethod
+    def monitor(cls, loop: ControlledPlant, table: Table) -> MonitorPlan | None:
+        """The watermark, the detector for the sensor's filter and the attack that it wants; by default none."""
+        del loop, table
+        return None
+
+    @classmethod
+    def power(cls, loop: ControlledPlant, table: Table, trials: int) -> PowerFeed | None:
+        """The power that it takes, from slot 0 on; by default none. trials: R."""
+        del loop, table, trials
+        return None
+
+    @classmethod
+    @abstractmethod
+    def tally(cls, loop: ControlledPlant, table: Table, trials: int) -> ApplicationTally:
+        """New totals, of no slots yet; table: an instance of `cls.table`; trials: R."""
+
+    @classmethod
+    def lines(cls, summary: Summary) -> list[str]:
+        """Its lines in the closing report; by default none."""
+        del summary
+        return []
+
+    @classmethod
+    def panels(cls, loop: ControlledPlant, table: Table) -> tuple[Panel, ...]:
+        """Its panels in the view; by default none."""
+        del loop, table
+        return ()
+
+    @classmethod
+    def feed(cls, loop: ControlledPlant, table: Table) -> PanelFeed | None:
+        """The source of its panels' values; None if it has no panels."""
+        del loop, table
+        return None
+
+    @classmethod
+    def draw_sweep(cls, path: Path, table: pa.Table, key: str) -> None:
+        """Draw its figures in a sweep over the entry `key`, as `path`.png and `path`.pdf; by default nothing."""
+        del path, table, key
+
+    @classmethod
+    def figure(cls, summary: Summary, path: Sequence[str]) -> float | None:
+        """A figure by its path, as in an expectation but without the application's name: FIGURE, or RECEIVER and FIGURE."""
+        inner: Any = summary
+        for part in _place(path):
+            inner = inner[part]
+        return None if inner is None else float(inner)
+
+    @classmethod
+    def standard_error(cls, summary: Summary, path: Sequence[str]) -> float | None:
+        """The standard error of a figure by its path, as above; None if it has none."""
+        inner: Any = summary.get(STANDARD_ERRORS, {})
+        for part in _place(path):
+            inner = {} if inner is None else inner.get(part)
+        return None if inner is None else float(inner)
+
+    @classmethod
+    def text(cls, summary: Summary, path: Sequence[str], how: str = ".4g") -> str:
+        """A figure by its path, as above, with its standard error: 0.0123 ± 0.0004; how: its format without one."""
+        return estimate(cls.figure(summary, path), cls.standard_error(summary, path), how)
+
+    @classmethod
+    def sweep_columns(cls, summary: Summary, receiver: str) -> dict[str, float | None]:
+        """Its columns in a receiver's row of a sweep's table: column → value."""
+        paths = {name: [name] for name in cls.figures} | {name: [receiver, name] for name in cls.receiver_figures}
+        found = {name: cls.figure(summary, path) for name, path in paths.items()}
+        return found | {error_column(name): cls.standard_error(summary, path) for name, path in paths.items()}
+
+
+def _place(path: Sequence[str]) -> Sequence[str]:
+    """The place of a figure in its application's entry of the summary."""
+    return (RECEIVERS, *path) if len(path) > 1 else path
+
+
+APPLICATIONS: Registry[Application] = Registry(
+    "application",
+    Application,  # type: ignore[type-abstract]
+    "evedrop.applications",
+    {},
+)
+"""By the name of the table. All are found by entry points; those of Evedrop are in its own pyproject.toml."""
+
+
+def applications_in(tables: Iterable[str], besides: Container[str] = ()) -> dict[str, type[Application]]:
+    """Name → application, for those of these names that are applications and can be loaded.
+
+    besides: names that cannot be applications.
+    """
+    return {name: APPLICATIONS[name] for name in tables if name not in besides and name in APPLICATIONS}
+
+
+def unloadable_in(tables: Iterable[str], besides: Container[str] = ()) -> dict[str, str]:
+    """Name → why it cannot be loaded, in words that follow the name, for applications among these names. besides: as above."""
+    found = {}
+    for name in tables:
+        if name not in besides and name in APPLICATIONS.names:
+            try:
+                _ = APPLICATIONS[name]
+            except NotRegistered as error:
+                found[name] = error.why
+    return found

@@ -1,0 +1,178 @@
+"""Checks the results of classes that are not built in while a run is in progress, live and in memory.
+
+A dry run calls these classes for the first slots only (`evedrop.scenario.dry_run`). An error or a wrong result in any later slot
+ends the run, and the message names class, slots and trials.
+
+Source: docs/your-own.md, mistakes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Iterator, Mapping
+from typing import Any, final
+
+from evedrop.errors import EvedropError, RunError
+from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.packet_user import PacketUser
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Belief, Beliefs, Codes, Flags, Receiver, Reception
+from evedrop.model.registry import place_of
+from evedrop.model.schemes import SCHEMES
+from evedrop.model.schemes.scheme import Encoder, Packet, PacketBlock, Scheme
+from evedrop.model.streams import Batch
+from evedrop.scenario.conformance.packets import (
+    expect_belief,
+    expect_beliefs,
+    expect_packet,
+    expect_packets,
+    slots_text,
+)
+from evedrop.scenario.conformance.problems import Problem
+from evedrop.scenario.conformance.rules import Broken
+
+
+def failed(what: str, slots: range, batch: Batch, how: str) -> RunError:
+    """The error of a class that failed in consecutive slots; what: such as `the scheme mine:Mine`."""
+    first = batch.first_trial
+    trials = f"trial {first}" if batch.trials == 1 else f"trials {first} to {first + batch.trials - 1}"
+    said = how.removeprefix(f"{slots_text(slots)}: ")
+    return RunError(f"{what} failed in {slots_text(slots)}, {trials}: {said}; run `evedrop check` on the class")
+
+
+@contextlib.contextmanager
+def asking(what: str, slots: range, batch: Batch, one: object = None) -> Iterator[None]:
+    """Turn an error in consecutive slots into a RunError that names the class, the slots and the trials.
+
+    what: as for `failed`; one: the object that is called, whose module the message quotes a line of.
+    """
+    try:
+        yield
+    except (EvedropError, OSError):
+        raise
+    except Broken as error:
+        raise failed(what, slots, batch, str(error)) from error
+    except Exception as error:
+        raise failed(what, slots, batch, place_of(error, _file_of(type(one)))) from error
+
+
+def _file_of(kind: type) -> str | None:
+    """The file of a class that is not built in; None for any other."""
+    if kind.__module__.partition(".")[0] in {"evedrop", "builtins"}:
+        return None
+    return getattr(sys.modules.get(kind.__module__), "__file__", None)
+
+
+@final
+class CheckedEncoder(Encoder):
+    """An encoder whose packets are all checked. Raises RunError for a wrong one, and for any error of the encoder's class."""
+
+    def __init__(self, encoder: Encoder, what: str, scheme: Scheme, problem: Problem) -> None:
+        self._encoder, self._what, self._scheme, self._problem = encoder, what, scheme, problem
+
+    def _asking(self, slots: range) -> contextlib.AbstractContextManager[None]:
+        return asking(self._what, slots, self._problem.batch, self._encoder)
+
+    def encode(self, k: int, x: Floats, predicted: Floats) -> Packet:
+        """The encoder's packet."""
+        with self._asking(range(k, k + 1)):
+            packet = self._encoder.encode(k, x, predicted)
+            expect_packet(k, packet, self._scheme, self._problem)
+        return packet
+
+    def encode_block(self, slots: range, x: Floats, predicted: Floats) -> PacketBlock:
+        """The encoder's packets; those of a class that makes one at a time are checked one at a time."""
+        if type(self._encoder).encode_block is Encoder.encode_block:
+            return super().encode_block(slots, x, predicted)
+        with self._asking(slots):
+            packets = self._encoder.encode_block(slots, x, predicted)
+            expect_packets(slots, packets, self._scheme, self._problem)
+        return packets
+
+    def acknowledged(self, k: int, acknowledged: Flags) -> None:
+        """Pass the acknowledgements on to the encoder."""
+        with self._asking(range(k, k + 1)):
+            self._encoder.acknowledged(k, acknowledged)
+
+
+@final
+class CheckedReceiver(Receiver):
+    """A receiver whose beliefs are all checked. Raises RunError for a wrong one, and for any error of the receiver's class."""
+
+    def __init__(self, receiver: Receiver, what: str, problem: Problem) -> None:
+        super().__init__(problem.process, problem.batch.trials)
+        self._receiver, self._what, self._problem = receiver, what, problem
+
+    def _asking(self, slots: range) -> contextlib.AbstractContextManager[None]:
+        return asking(self._what, slots, self._problem.batch, self._receiver)
+
+    def prior(self, first: int = 0) -> Belief:
+        """The receiver's prior."""
+        with self._asking(range(first, first + 1)):
+            belief = self._receiver.prior(first)
+            expect_belief("prior(): Belief", belief, self._problem)
+        return belief
+
+    def act(self, k: int, gamma: Flags) -> Codes:
+        """The receiver's action."""
+        return self._receiver.act(k, gamma)
+
+    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
+        """The receiver's belief."""
+        with self._asking(range(k, k + 1)):
+            after = self._receiver.step(k, belief, heard)
+            expect_belief(f"slot {k}: Belief", after, self._problem)
+        return after
+
+    def follow(self, slots: range, belief: Belief, gamma: Flags, z: Floats) -> tuple[Beliefs, Belief]:
+        """The receiver's beliefs; those of a class that is written for one slot at a time are checked one at a time."""
+        if _takes_single_slots(type(self._receiver)):
+            return super().follow(slots, belief, gamma, z)
+        with self._asking(slots):
+            found = self._receiver.follow(slots, belief, gamma, z)
+            expect_beliefs(slots, found, self._problem)
+        return found
+
+
+def _takes_single_slots(kind: type[Receiver]) -> bool:
+    """Whether a class inherits everything that takes many slots at once, so that an error in it belongs to one slot."""
+    if issubclass(kind, PacketUser) and kind.follow is PacketUser.follow:
+        return kind.uses_block is PacketUser.uses_block
+    return kind.follow is Receiver.follow
+
+
+def scheme_in_words(name: str) -> str:
+    """A scheme's class, as messages name it."""
+    return f"the scheme {name}"
+
+
+def eavesdropper_in_words(eavesdropper: str, strategy: str, parameters: Mapping[str, Any]) -> str:
+    """An eavesdropper's class, as messages name it: its strategy's, or that of the strategy that it reads as."""
+    used = parameters.get("reads_as", strategy)
+    return f"{eavesdropper}'s strategy {strategy if STRATEGIES.foreign(strategy) else used}"
+
+
+def checked_encoder(encoder: Encoder, name: str, scheme: Scheme, problem: Problem) -> Encoder:
+    """The encoder of the scheme of a name, with checks if its class is not built in."""
+    return CheckedEncoder(encoder, scheme_in_words(name), scheme, problem) if SCHEMES.foreign(name) else encoder
+
+
+def checked_estimator(estimator: Receiver, name: str, problem: Problem) -> Receiver:
+    """The estimator of the scheme of a name, with checks if its class is not built in."""
+    return CheckedReceiver(estimator, scheme_in_words(name), problem) if SCHEMES.foreign(name) else estimator
+
+
+def checked_eavesdropper(
+    receiver: Receiver, eavesdropper: str, strategy: str, parameters: Mapping[str, Any], problem: Problem
+) -> Receiver:
+    """An eavesdropper, with checks if its class, or that of the strategy that it reads as, is not built in."""
+    if not is_foreign(strategy, parameters):
+        return receiver
+    return CheckedReceiver(receiver, eavesdropper_in_words(eavesdropper, strategy, parameters), problem)
+
+
+def is_foreign(strategy: str, parameters: Mapping[str, Any]) -> bool:
+    """Whether a strategy's class, or that of the strategy that it reads as, is not built in."""
+    used = parameters.get("reads_as")
+    return STRATEGIES.foreign(strategy) or (used is not None and STRATEGIES.foreign(str(used)))

@@ -1,0 +1,134 @@
+"""Checks classes by name against every rule, for `evedrop check --scheme NAME` and its like.
+
+Source: docs/your-own.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from evedrop.errors import NotRegistered, UsageError
+from evedrop.model.delays import DELAY_MODELS
+from evedrop.model.eavesdroppers import READERS, STRATEGIES
+from evedrop.model.links import LOSS_MODELS
+from evedrop.model.registry import Registry, asked
+from evedrop.model.schemes import PAPERS_SCHEME, SCHEMES, scheme_of
+from evedrop.scenario.conformance.eavesdroppers import Listening, eavesdropper_verdicts
+from evedrop.scenario.conformance.links import DelayChecks, LossChecks
+from evedrop.scenario.conformance.rules import Broken, RuleVerdict, calling
+from evedrop.scenario.conformance.schemes import scheme_verdicts
+from evedrop.scenario.plugins import look_in
+
+_REGISTRIES: Mapping[str, Registry[Any]] = {
+    "scheme": SCHEMES,
+    "eavesdropper": STRATEGIES,
+    "link": LOSS_MODELS,
+    "delay": DELAY_MODELS,
+}
+_OWN_COIN = "coin"
+
+
+@dataclass(frozen=True)
+class Examined:
+    """One class, and the verdict on each rule."""
+
+    title: str
+    verdicts: list[RuleVerdict]
+
+
+@dataclass(frozen=True)
+class _Named:
+    """A class, its name, and its parameters for the check."""
+
+    name: str
+    kind: Any
+    parameters: Mapping[str, Any]
+
+
+def examined(names: Mapping[str, str], parameters: Mapping[str, Any]) -> Iterator[Examined]:
+    """Check every class, one by one.
+
+    names: `scheme`, `eavesdropper`, `link` or `delay` → its name; modules are looked for in the current folder.
+    parameters: replace the classes' own examples.
+
+    Raises UsageError for unknown names and for unknown or wrong parameters.
+    """
+    look_in(str(Path.cwd()))
+    classes = {option: _named(option, name, parameters) for option, name in names.items()}
+    known = [entry for one in classes.values() for entry in (*one.kind.parameters, *one.parameters)]
+    for entry in parameters:
+        if entry not in known:
+            said = f"expected {', '.join(dict.fromkeys(known))}" if known else "they have no parameters; remove it"
+            raise UsageError(f"--set {entry}: is not a parameter of {', '.join(names.values())}; {said}")
+    for option, one in classes.items():
+        title = f"{one.name}, {'an' if option[0] == 'e' else 'a'} {_REGISTRIES[option].kind}"
+        if option == "eavesdropper":
+            scheme = classes.get("scheme") or _scheme_for(one)
+            yield Examined(f"{title}, with the scheme {scheme.name}", _listened(one, scheme))
+        else:
+            yield Examined(title, _verdicts(option, one))
+
+
+def _named(option: str, name: str, parameters: Mapping[str, Any]) -> _Named:
+    registry = _REGISTRIES[option]
+    try:
+        kind = registry.imported(name)
+        given = _given(kind, parameters)
+        if "reads_as" in given:
+            given = {**_given(READERS.imported(str(given["reads_as"])), parameters), **given}
+    except NotRegistered as error:
+        why = error.why or f" is unknown; expected MODULE:CLASS, or {', '.join(registry.names)}"
+        raise UsageError(f"--{option} {error.name}{why}") from error
+    wrong = [f"{entry}: {what}" for entry, what in asked(kind, given)]
+    if wrong:
+        raise UsageError(f"--{option} {name}: {'; '.join(wrong)}; give others by --set")
+    return _Named(name, kind, given)
+
+
+def _given(kind: Any, parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """The examples of a class's parameters, without the optional ones, and the parameters given."""
+    optional = getattr(kind, "optional", ())
+    examples = {entry: example for entry, example in kind.parameters.items() if entry not in optional}
+    return examples | {entry: value for entry, value in parameters.items() if entry in kind.parameters}
+
+
+def _verdicts(option: str, one: _Named) -> list[RuleVerdict]:
+    if option == "scheme":
+        return scheme_verdicts(lambda process: scheme_of(process, {"scheme": one.name, **one.parameters}), one.kind)
+    checks = LossChecks if option == "link" else DelayChecks
+    return checks(lambda: one.kind(**one.parameters), one.kind).verdicts()
+
+
+def _listened(one: _Named, scheme: _Named) -> list[RuleVerdict]:
+    lacking = sorted({*_streams(one)} - {*scheme.kind.secret_streams})
+    if lacking:
+        raise UsageError(
+            f"--eavesdropper {one.name}: asks for the key of {' and '.join(lacking)}, and the scheme {scheme.name} has "
+            f"{', '.join(scheme.kind.secret_streams) or 'no keys'}; give another --scheme, or take it out of streams()"
+        )
+    spec = {"scheme": scheme.name, **scheme.parameters}
+    listening = Listening(one.name, one.kind, one.parameters, lambda process: scheme_of(process, spec), scheme.kind)
+    try:
+        return eavesdropper_verdicts(listening)
+    except Broken as error:
+        return [RuleVerdict("facts on the class", str(error))]
+
+
+def _streams(one: _Named) -> list[str]:
+    try:
+        with calling("streams()", one.kind):
+            return [stream for stream in one.kind.streams(one.parameters) if stream != _OWN_COIN]
+    except Broken as error:
+        raise UsageError(f"--eavesdropper {one.name}: {error}") from error
+
+
+def _scheme_for(one: _Named) -> _Named:
+    """The paper's scheme, or the first scheme that has the keys the eavesdropper asks for."""
+    needed = {*_streams(one)}
+    for name in (PAPERS_SCHEME, *SCHEMES):
+        if needed <= {*SCHEMES[name].secret_streams}:
+            return _Named(name, SCHEMES[name], dict(SCHEMES[name].parameters))
+    return _Named(PAPERS_SCHEME, SCHEMES[PAPERS_SCHEME], dict(SCHEMES[PAPERS_SCHEME].parameters))

@@ -1,0 +1,244 @@
+"""The rules for loss models and delay models.
+
+Source: docs/your-own.md.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from typing import final
+
+import numpy as np
+
+from evedrop.model.delays.delay import DelayModel
+from evedrop.model.links.link import Chain, Fate, LossModel
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Codes
+from evedrop.model.streams import BlockReader
+from evedrop.scenario.conformance.problems import Problem, large, small
+from evedrop.scenario.conformance.receivers import SIGMAS
+from evedrop.scenario.conformance.rules import (
+    Broken,
+    RuleVerdict,
+    calling,
+    expect_array,
+    expect_finite,
+    expect_probability,
+    expect_same,
+    frozen,
+    judged,
+    key,
+)
+
+_COLUMN = "compute each trial from its own column of numbers alone"
+_PIECES = "let a slot depend only on the model's memory and the slot's numbers, not on how many slots are asked for"
+
+
+@final
+class LossChecks:
+    """The rules for loss models, each checked on one problem. model: makes a new instance."""
+
+    def __init__(self, model: Callable[[], LossModel], kind: type[LossModel]) -> None:
+        self._model, self._kind = model, kind
+
+    def verdicts(self) -> list[RuleVerdict]:
+        """Check every rule, on small problems."""
+        exact = [
+            ("shapes and types", self.shapes),
+            ("the same link made twice", self.twice),
+            ("a trial by itself", self.alone),
+            ("slots in pieces", self.pieces),
+            ("a copy that goes on", self.copied),
+        ]
+        return judged((exact, small()), ([("the quality it says", self.rate)], [_long(one) for one in large()]))
+
+    def _made(self) -> LossModel:
+        with calling(f"{self._kind.__name__}(…)", self._kind):
+            return self._model()
+
+    def _uniforms(self, model: LossModel, problem: Problem) -> Floats:
+        words = model.uniforms_per_slot
+        if type(words) is not int or words < 1:
+            raise Broken(f"uniforms_per_slot is {words!r}; expected a whole number from 1 on")
+        reader = BlockReader(key("link"), problem.batch, words)
+        return frozen(reader.uniforms(range(problem.slots)))
+
+    def _fates(self, model: LossModel, first: int, uniforms: Floats) -> Codes:
+        with calling(f"fates() of slot {first} and on", self._kind):
+            found = model.fates(first, uniforms)
+        slots, _, trials = uniforms.shape
+        expect_array(f"fates() of slot {first} and on", found, np.uint8, (slots, trials), "slots, R trials")
+        other = ~np.isin(found, (Fate.DELIVERED, Fate.LOST))
+        if other.any():
+            row, trial = np.argwhere(other)[0]
+            raise Broken(
+                f"slot {first + row}, trial {trial}: the fate is {found[row, trial]}; expected Fate.DELIVERED or Fate.LOST, "
+                "such as by fates_of(lost)"
+            )
+        return found
+
+    def _whole(self, problem: Problem) -> Codes:
+        model = self._made()
+        return self._fates(model, 0, self._uniforms(model, problem))
+
+    def shapes(self, problem: Problem) -> None:
+        """Fates, and the figures that the model states, have the right shapes and types."""
+        self._whole(problem)
+        model, slots = self._made(), range(problem.slots)
+        with calling("quality, quality_at(), rate_variance()", self._kind):
+            quality, each, variance = model.quality, model.quality_at(slots), model.rate_variance(slots)
+            settles, memoryless, chain = model.settles, model.memoryless, model.chain
+        expect_probability("quality", quality)
+        expect_array("quality_at()", each, np.float64, (len(slots),), "one for each of the slots")
+        if not 0.0 <= quality <= 1.0 or not ((each >= 0.0) & (each <= 1.0)).all():
+            raise Broken(
+                f"quality is {quality}, quality_at() from {each.min()} to {each.max()}; expected probabilities"
+            )
+        if not 0.0 <= variance <= 0.25 + 1e-12:
+            raise Broken(f"rate_variance() is {variance}; expected a variance of a fraction, 0 to 0.25")
+        if type(settles) is not bool or type(memoryless) is not bool:
+            raise Broken("settles or memoryless is neither True nor False")
+        if chain is not None and not isinstance(chain, Chain):
+            raise Broken(f"chain is {type(chain).__name__}; expected a Chain, or None")
+        if chain is not None and not np.allclose(chain.law @ chain.transitions, chain.law):
+            raise Broken("chain.law is not the stationary law of chain.transitions; correct them, or return None")
+
+    def twice(self, problem: Problem) -> None:
+        """Two that take turns do the same as one alone."""
+        once = self._whole(problem)
+        pair = [self._made() for _ in range(2)]
+        uniforms = self._uniforms(pair[0], problem)
+        each: list[list[Codes]] = [[], []]
+        for k in range(problem.slots):
+            for model, found in zip(pair, each, strict=True):
+                found.append(self._fates(model, k, uniforms[k : k + 1]))
+        said = "{0!r} by itself and {1!r} with another one of its kind, slot by slot"
+        for found in each:
+            self._same(once, np.concatenate(found), problem, said, "keep no state outside of the model")
+
+    def alone(self, problem: Problem) -> None:
+        """A trial alone gives the same fates as among others."""
+        among = self._whole(problem)
+        for trial in (0, problem.batch.trials - 1):
+            one = self._whole(problem.part(trial, 1))
+            said = f"{{0!r}} among {problem.batch.trials} trials and {{1!r}} alone"
+            self._same(among[:, trial : trial + 1], one, problem.part(trial, 1), said, _COLUMN)
+
+    def pieces(self, problem: Problem) -> None:
+        """Slots give the same fates in one call and in several."""
+        once, model = self._whole(problem), self._made()
+        uniforms = self._uniforms(model, problem)
+        bounds = [0, 1, 4, 5, problem.slots]
+        parts = [self._fates(model, first, uniforms[first:stop]) for first, stop in pairwise(bounds)]
+        self._same(once, np.concatenate(parts), problem, "{0!r} in one call and {1!r} in several", _PIECES)
+
+    def copied(self, problem: Problem) -> None:
+        """A shallow copy continues from where it was made, whatever the original does meanwhile."""
+        once, model = self._whole(problem), self._made()
+        uniforms = self._uniforms(model, problem)
+        self._fates(model, 0, uniforms[:5])
+        other = copy.copy(model)
+        self._fates(model, 5, uniforms[5:])
+        found = np.concatenate([once[:5], self._fates(other, 5, uniforms[5:])])
+        remedy = "replace what the model remembers, and never change an array of it in place"
+        self._same(once, found, problem, "{0!r}, and {1!r} of a copy made before slot 5", remedy)
+
+    def rate(self, problem: Problem) -> None:
+        """The fraction delivered has the mean and the variance over trials that the model states."""
+        delivered = (self._whole(problem) == Fate.DELIVERED).mean(axis=0)
+        model, slots = self._made(), range(problem.slots)
+        expected, variance = float(model.quality_at(slots).mean()), model.rate_variance(slots)
+        scatter = max(variance, float(delivered.var()))
+        if abs(delivered.mean() - expected) > SIGMAS * np.sqrt(scatter / len(delivered)) + 1e-9:
+            raise Broken(
+                f"delivers {delivered.mean():.4f} of the packets, and quality_at() says {expected:.4f}; correct it"
+            )
+        if delivered.var() > 1.6 * variance + 1e-9:
+            raise Broken(
+                f"the fraction delivered has the variance {delivered.var():.3g} over trials, and rate_variance() says "
+                f"{variance:.3g}; give `chain`, or a rate_variance() of its own"
+            )
+
+    def _same(self, one: Codes, other: Codes, problem: Problem, said: str, remedy: str) -> None:
+        rows = [[{"the fate": row} for row in codes] for codes in (one, other)]
+        expect_same(rows[0], rows[1], slice(None), problem.batch.first_trial, said, remedy)
+
+
+@final
+class DelayChecks:
+    """The rules for delay models, each checked on one problem. model: makes a new instance."""
+
+    def __init__(self, model: Callable[[], DelayModel], kind: type[DelayModel]) -> None:
+        self._model, self._kind = model, kind
+
+    def verdicts(self) -> list[RuleVerdict]:
+        """Check every rule, on small problems."""
+        exact = [
+            ("shapes and types", self.shapes),
+            ("a trial by itself", self.alone),
+            ("slots in pieces", self.pieces),
+        ]
+        return judged((exact, small()), ([("the delays it says", self.law)], large()))
+
+    def _delays(self, problem: Problem, bounds: tuple[int, ...] = ()) -> Floats:
+        reader, parts = BlockReader(key("delay"), problem.batch, 1), []
+        for first, stop in pairwise((0, *bounds, problem.slots)):
+            slots = range(first, stop)
+            with calling(f"{self._kind.__name__}(…)", self._kind):
+                model = self._model()
+            numbers = frozen((reader.normals(slots) if model.normal else reader.uniforms(slots))[:, 0])
+            where = f"delays() of slot {first} and on"
+            with calling(where, self._kind):
+                found = model.delays(first, numbers)
+            expect_array(where, found, np.float64, numbers.shape, "slots, R trials")
+            expect_finite(where, found)
+            if (found < 0.0).any():
+                raise Broken(f"{where}: one is {found.min()}; expected slots, 0 or more")
+            parts.append(found)
+        return np.concatenate(parts)
+
+    def shapes(self, problem: Problem) -> None:
+        """Delays, and the probabilities that the model states, have the right shapes and types."""
+        self._delays(problem)
+        with calling("arrived()", self._kind):
+            said = [self._model().arrived(lag) for lag in range(4)]
+        known = [one for one in said if one is not None]
+        for lag, one in enumerate(said):
+            if one is not None:
+                expect_probability(f"arrived({lag})", one)
+        if known and (len(known) < len(said) or known != sorted(known) or not 0.0 <= known[0] <= known[-1] <= 1.0):
+            raise Broken(f"arrived() of 0 to 3 is {said}; expected probabilities that do not fall, or None always")
+
+    def alone(self, problem: Problem) -> None:
+        """A trial alone gives the same delays as among others."""
+        among = self._delays(problem)
+        for trial in (0, problem.batch.trials - 1):
+            one = self._delays(problem.part(trial, 1))
+            said = f"{{0!r}} among {problem.batch.trials} trials and {{1!r}} alone"
+            self._same(among[:, trial : trial + 1], one, problem.part(trial, 1), said, _COLUMN)
+
+    def pieces(self, problem: Problem) -> None:
+        """Slots give the same delays in one call as in several calls to new instances."""
+        once = self._delays(problem)
+        self._same(once, self._delays(problem, (1, 4)), problem, "{0!r} in one call and {1!r} in several", _PIECES)
+
+    def law(self, problem: Problem) -> None:
+        """The fraction of packets in time is the stated one."""
+        delays = self._delays(problem)
+        for lag in range(4):
+            said = self._model().arrived(lag)
+            found = float((delays < lag + 1).mean())
+            if said is not None and abs(found - said) > SIGMAS * np.sqrt(max(said * (1.0 - said), 1e-3) / delays.size):
+                raise Broken(f"{found:.4f} of the delays are below {lag + 1} slots, and arrived({lag}) is {said:.4f}")
+
+    def _same(self, one: Floats, other: Floats, problem: Problem, said: str, remedy: str) -> None:
+        rows = [[{"the delay": row} for row in delays] for delays in (one, other)]
+        expect_same(rows[0], rows[1], slice(None), problem.batch.first_trial, said, remedy)
+
+
+def _long(problem: Problem) -> Problem:
+    """The problem with more slots, for models with a memory."""
+    return replace(problem, batch=replace(problem.batch, slots=60))

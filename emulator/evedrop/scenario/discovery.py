@@ -1,0 +1,48 @@
+"""Finds scenario files. Every TOML file of a folder is examined, so this reads as little as possible and imports little.
+
+Source: docs/testing.md.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+from evedrop.system.files import Unreadable, text_of
+
+_HEADINGS = tuple(re.compile(rf"^\s*\[{name}\]", re.MULTILINE) for name in ("process", "encoding"))
+_MOST_BYTES = 2**28  # as for every scenario
+_OF_RESULTS = ("summary.json", "slots.parquet", "unfinished")  # the last one exists while a run is in progress
+
+
+def is_scenario(path: Path) -> bool:
+    """Whether a file looks like a user's scenario: TOML with the tables `process` and `encoding`.
+
+    False for a name that begins with an underscore, and for the copy in a results folder. True for a file that is not
+    valid TOML but has both headings: a scenario with a mistake to report.
+    """
+    if path.suffix != ".toml" or path.name.startswith("_"):
+        return False
+    if path.name == "scenario.toml" and any(path.with_name(name).exists() for name in _OF_RESULTS):
+        return False
+    try:
+        text = text_of(path, _MOST_BYTES)
+    except Unreadable:
+        return False
+    if "process" not in text or "encoding" not in text:
+        return False
+    try:
+        tables = tomllib.loads(text)
+    except (ValueError, RecursionError):
+        return all(heading.search(text) for heading in _HEADINGS)
+    return all(isinstance(tables.get(name), dict) for name in ("process", "encoding"))
+
+
+def scenarios_in(folder: Path) -> Iterator[Path]:
+    """The scenarios in a folder and its subfolders, in order of their names; hidden folders are left out."""
+    for place, folders, files in os.walk(folder):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        yield from (path for name in sorted(files) if is_scenario(path := Path(place) / name))

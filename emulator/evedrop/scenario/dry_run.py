@@ -1,0 +1,143 @@
+"""A dry run of classes that are not built in: a few slots of the scenario in memory, before any process is started.
+
+Source: docs/your-own.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import partial
+from typing import Any
+
+from evedrop.errors import NoAnswer
+from evedrop.model.delays import DELAY_MODELS, delay_of
+from evedrop.model.eavesdroppers import ANSWERS, STRATEGIES
+from evedrop.model.links import LOSS_MODELS, POOLED, loss_of, single_specs
+from evedrop.model.process import Process
+from evedrop.model.schemes import SCHEMES, scheme_of
+from evedrop.model.schemes.scheme import Scheme
+from evedrop.model.streams import Batch
+from evedrop.names import LEGITIMATE
+from evedrop.scenario.conformance.eavesdroppers import EavesdropperChecks, Listening
+from evedrop.scenario.conformance.links import DelayChecks, LossChecks
+from evedrop.scenario.conformance.problems import Problem
+from evedrop.scenario.conformance.rules import how_broken
+from evedrop.scenario.conformance.schemes import SchemeChecks
+from evedrop.scenario.plugins import names_in
+from evedrop.scenario.receivers import EavesdropperTable
+from evedrop.scenario.table import model_mistakes
+from evedrop.scenario.tables import Scenario
+from evedrop.scenario.words import as_toml
+
+_SLOTS = 4
+_TRIALS = 3
+
+
+def foreign(tables: Any) -> bool:
+    """Whether tables name any class that is not built in."""
+    built_in = {POOLED}.union(SCHEMES, STRATEGIES, LOSS_MODELS, DELAY_MODELS)
+    return any(name not in built_in for name in names_in(tables))
+
+
+def dry_run(scenario: Scenario) -> list[str]:
+    """Try the classes that are not built in; returns a mistake for each that breaks a rule on shapes, types or keys, or raises.
+
+    Does not affect the digests of the run.
+    """
+    # The numbers of a day are hundreds of thousands, and name no class.
+    if not foreign(
+        scenario.model_dump(exclude_unset=True, exclude={"plant": {"disturbance_values"}, "process": {"state_values"}})
+    ):
+        return []
+    batch = Batch(min(scenario.slots, _SLOTS), _TRIALS, scenario.first_trial)
+    problem = Problem(scenario.process.process, batch)
+    found = [*_link_mistakes(scenario, problem)]
+    spec = scenario.encoding.spec
+    kind = SCHEMES[scenario.encoding.scheme]
+    if SCHEMES.foreign(scenario.encoding.scheme):
+        broken = how_broken(SchemeChecks(lambda process: scheme_of(process, spec), kind).at_first, problem)
+        if broken is not None:
+            return [*found, f"encoding.scheme: is {as_toml(scenario.encoding.scheme)}; in a dry run: {broken}"]
+    for name, table in scenario.eavesdroppers.items():
+        entry = "strategy" if table.reads_as is None else "reads_as"
+        if not SCHEMES.foreign(scenario.encoding.scheme) and not STRATEGIES.foreign(getattr(table, entry)):
+            continue
+        broken = _eavesdropper_broken(scenario, table, entry, batch)
+        if broken is not None:
+            found.append(f"eavesdroppers.{name}.{entry}: is {as_toml(getattr(table, entry))}; in a dry run: {broken}")
+    return found
+
+
+def _eavesdropper_broken(scenario: Scenario, table: EavesdropperTable, entry: str, batch: Batch) -> str | None:
+    """What breaks when an eavesdropper hears the scheme; a class that is not built in runs in a process of its own."""
+    spec, name = scenario.encoding.spec, getattr(table, entry)
+    if not STRATEGIES.foreign(name):
+        kind = SCHEMES[scenario.encoding.scheme]
+        strategy = STRATEGIES[table.strategy]
+        make = partial(_scheme, spec)
+        checks = EavesdropperChecks(Listening(table.strategy, strategy, table.parameters, make, kind))
+        return how_broken(checks.at_first, Problem(scenario.process.process, batch))
+    public = scenario.process
+    process = (public.A, public.Q, public.initial_covariance, public.singular_noise)
+    registry = "STRATEGIES" if entry == "strategy" else "READERS"
+    try:
+        drawn = (batch.slots, batch.trials, batch.first_trial)
+        found = ANSWERS.ask(name, "dry_run", registry, table.strategy, table.parameters, spec, process, drawn)
+        if found is None:
+            _ask_for_theory(scenario, table)
+    except NoAnswer as error:
+        return str(error)
+    return None if found is None else str(found)
+
+
+def _ask_for_theory(scenario: Scenario, table: EavesdropperTable) -> None:
+    """Raise NoAnswer if a class's answer about its outcomes is invalid."""
+    outcomes_at = STRATEGIES[table.strategy].outcomes(table.parameters, scenario.encoding.mu_d)
+    if outcomes_at is not None:
+        for quality in (0.0, 0.5, 1.0):
+            outcomes_at(quality)
+
+
+def _scheme(spec: Mapping[str, Any], process: Process) -> Scheme:
+    return scheme_of(process, spec)
+
+
+def _link_mistakes(scenario: Scenario, problem: Problem) -> Iterator[str]:
+    for receiver in scenario.receivers:
+        path = f"{LEGITIMATE}.link" if receiver == LEGITIMATE else f"eavesdroppers.{receiver}.link"
+        link = scenario.link(receiver)
+        yield from _settings_mistakes(path, link.settings(scenario.slot_seconds), problem)
+    for i, event in enumerate(scenario.event):
+        # An event's models are checked when tables are compared: mistakes are reported there, not here.
+        for act in event.acts():
+            settings = act.effect.entries
+            if settings is not None and not _model_mistakes(settings):
+                yield from _settings_mistakes(f"event.{i}.{act.entry}", settings, problem)
+
+
+def _model_mistakes(settings: Mapping[str, Any]) -> bool:
+    """Whether a loss or delay model cannot be constructed from its description."""
+    for name, models in (("loss", LOSS_MODELS), ("delay", DELAY_MODELS)):
+        found = settings.get(name)
+        if found is not None and not isinstance(found, Mapping):
+            return True
+        given = {entry: value for entry, value in (found or {}).items() if entry != "unit"}
+        if found is not None and model_mistakes(name, given, models):
+            return True
+    return False
+
+
+def _settings_mistakes(path: str, settings: Mapping[str, Any], problem: Problem) -> Iterator[str]:
+    losses = settings.get("loss")
+    for spec in single_specs(losses) if losses else ():
+        if LOSS_MODELS.foreign(spec["model"]):
+            check = LossChecks(lambda spec=spec: loss_of(spec), LOSS_MODELS[spec["model"]]).shapes  # type: ignore[misc]
+            broken = how_broken(check, problem)
+            if broken is not None:
+                yield f"{path}.loss.model: is {as_toml(spec['model'])}; in a dry run: {broken}"
+    delay = settings.get("delay")
+    if delay and DELAY_MODELS.foreign(delay["model"]):
+        given = {name: value for name, value in delay.items() if name != "unit"}
+        broken = how_broken(DelayChecks(lambda: delay_of(given), DELAY_MODELS[delay["model"]]).shapes, problem)
+        if broken is not None:
+            yield f"{path}.delay.model: is {as_toml(delay['model'])}; in a dry run: {broken}"

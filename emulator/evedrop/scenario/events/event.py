@@ -1,0 +1,173 @@
+"""The base class of the kinds of event: the time of an event, and the properties of its kind.
+
+Source: docs/scenario.md, events; docs/your-own.md, an event.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Annotated, Any, ClassVar, Self
+
+from pydantic import Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from evedrop.errors import NoAnswer
+from evedrop.model.registry import place_of
+from evedrop.model.schemes.scheme import Scheme
+from evedrop.model.streams import MOST_SLOTS
+from evedrop.scenario.events.effects import Effect
+from evedrop.scenario.table import Found, Table
+
+Names = str | list[str]
+Slot = Annotated[int, Field(strict=True, ge=0, le=MOST_SLOTS, examples=[400])]
+
+
+@dataclass(frozen=True)
+class Act:
+    """One thing done at one slot."""
+
+    at: int
+    entry: str
+    """The entry of the event that messages about a mistake in this act name."""
+    names: tuple[str, ...]
+    """The receivers it concerns."""
+    said: str
+    """Its line in the list of events."""
+    effect: Effect
+
+
+@dataclass(frozen=True)
+class Fault:
+    """How a nemesis draws events of a kind."""
+
+    place: int
+    """Its place among the kinds that a draw chooses from; another place would change the faults of every seed."""
+    together: bool = False
+    """Whether one event hits several receivers; a coin decides for each of them."""
+    needs: Mapping[str, str] = field(default_factory=dict)
+    """Entry of `[nemesis]` that the event needs → a description for the message if it is missing."""
+    may_have: tuple[str, ...] = ()
+    """Entries of `[nemesis]` that the event takes over if they are given."""
+
+    @property
+    def entries(self) -> tuple[str, ...]:
+        """The entries of `[nemesis]` that go into the event."""
+        return (*self.needs, *self.may_have)
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """The parts of a scenario that a single event is compared with; None where there is a mistake."""
+
+    scheme: type[Scheme] | None
+    scheme_name: str
+    attack: str | None
+    """The attack on acknowledgements; `none` if there is none."""
+    monitored: bool = False
+    """Whether the scenario has an application that can attack measurements, and detect it."""
+
+
+class When(Table):
+    """The slots of an event."""
+
+    at: Slot | None = None
+    start: Annotated[Slot | None, Field(alias="from")] = None
+    to: Slot | None = None
+
+
+class EventKind(When):
+    """`[[event]]`: one thing that happens `at` a slot, or lasts `from` one slot `to` another. A class for each kind."""
+
+    kind: ClassVar[str]
+    """Its name in the registry, and its main entry."""
+    does: ClassVar[type[Effect]]
+    """What it does when it begins."""
+    lasts: ClassVar[bool] = False
+    """Whether it can last `from` one slot `to` another."""
+    names_in: ClassVar[str | None] = None
+    """The entry with the receivers it happens to; None if it happens to none."""
+    by_operator: ClassVar[bool] = False
+    """Whether an operator can cause it during a run. Only for built-in kinds that change links."""
+    fault: ClassVar[Fault | None] = None
+    """How a nemesis draws it; None if it does not."""
+    alone: ClassVar[Mapping[str, str]] = {}
+    """Entry besides `kind` → the mistake if it is given without a kind that has it."""
+
+    @abstractmethod
+    def acts(self) -> Iterator[Act]:
+        """The beginning of the event, and its end if it lasts."""
+
+    @model_validator(mode="after")
+    def _acts_are_usable(self) -> Self:
+        """Refuse an event whose acts cannot be carried out: its class may come from a package."""
+        try:
+            _expect_acts(list(self.acts()))
+        except Exception as error:
+            said = str(error) if isinstance(error, NoAnswer) else f"acts() raised {place_of(error)}"
+            wrong = [(self.kind, f"is an event that cannot be carried out: {said}")]
+            raise PydanticCustomError("mistakes", "one", {"mistakes": wrong}) from error
+        return self
+
+    def compared(self, surroundings: Surroundings) -> Iterator[Found]:
+        """Mistakes that only show with other tables. Slots, receivers and changed links are checked elsewhere, for every kind."""
+        del surroundings
+        yield from ()
+
+    @classmethod
+    def in_turn(cls, events: Sequence[tuple[int, Self]]) -> Iterator[str]:
+        """Mistakes that only show when all events of this kind are compared; events: each with its number."""
+        del events
+        yield from ()
+
+    @classmethod
+    def own_entries(cls) -> list[str]:
+        """Its entries besides the slots."""
+        return [name for name in cls.model_fields if name not in When.model_fields]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The receivers it happens to."""
+        found: Any = () if self.names_in is None else getattr(self, self.names_in)
+        return (found,) if isinstance(found, str) else tuple(found)
+
+    @property
+    def first(self) -> int:
+        """The slot in which it begins."""
+        slot = self.at if self.at is not None else self.start
+        assert slot is not None  # noqa: S101 - checked when it was made
+        return slot
+
+    def begin(self, said: str, effect: Effect) -> Act:
+        """The act with which it begins."""
+        return Act(self.first, self.kind, self.names, said, effect)
+
+
+def _expect_acts(acts: Sequence[object]) -> None:
+    """Raise NoAnswer unless these are acts, at least one, and each names as many receivers as its effect needs."""
+    if not acts:
+        raise NoAnswer("acts() gave none; expected an Act, or several")
+    for act in acts:
+        if not isinstance(act, Act) or not isinstance(act.effect, Effect):
+            raise NoAnswer(f"acts() gave {act!r:.60}; expected an Act with an effect")
+        if not act.names and act.effect.needs_receivers:
+            raise NoAnswer("it names no receiver; expected one, or several")
+        if len(act.names) != 1 and act.effect.one_receiver:
+            raise NoAnswer("it names several receivers; expected one")
+
+
+def begun_too_early(events: Sequence[tuple[int, EventKind]]) -> Iterator[str]:
+    """Mistakes where an event of a kind begins before the previous one has ended; events: each with its number."""
+    in_order = sorted(events, key=lambda one: one[1].first)
+    for (_, before), (i, event) in pairwise(in_order):
+        if before.to is None or before.to > event.first:
+            yield (
+                f"event.{i}.{event.kind}: begins in slot {event.first}, while another one lasts; expected that one to end first"
+            )
+
+
+def spoken(names: Sequence[str]) -> str:
+    """Receivers in the line of an act."""
+    return ", ".join(names)

@@ -1,0 +1,337 @@
+"""`[[expect]]`: a condition that a run must meet: on a figure, on a link, on secrecy, or on when a receiver is in step.
+
+Source: docs/scenario.md, expect.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, Field
+
+from evedrop.model.checks import is_number
+from evedrop.model.figures import expectable_figures, figures_of, unloadable_figures
+from evedrop.model.figures.links import LINK_FIGURES
+from evedrop.scenario.application import APPLICATIONS, Application
+from evedrop.scenario.table import Found, Number, Table, expected, one_of
+from evedrop.scenario.words import as_toml, listed
+from evedrop.system.hints import near
+
+SECRECY = ("relative", "perfect")
+
+LINKS, DIRECTIONS = "links", "directions"
+_LOST_BY = re.compile(r"lost_by\.[a-z][a-z0-9_-]*")
+_COMPARISONS = ("below", "above", "near", "within", "within_relative")
+_ENTRIES: Mapping[str, tuple[str, ...]] = {
+    "figure": (*_COMPARISONS, "slots", "quantile"),
+    "link": (),
+    "secrecy": ("against", "direction"),
+    "in_step": ("by", "since"),
+}
+"""The subjects an expectation may have → the entries that go with each."""
+_EXAMPLES: Mapping[str, str] = {
+    "figure": 'figure = "legitimate.mean_squared_error"',
+    "link": 'link = "legitimate"',
+    "secrecy": 'secrecy = "relative"',
+    "in_step": 'in_step = "legitimate"',
+}
+
+
+def _range(slots: list[int]) -> list[int]:
+    if len(slots) != 2 or not 0 <= slots[0] < slots[1]:
+        raise expected("two slots [from, to], 0 ≤ from < to")
+    return slots
+
+
+def _quantile(value: float) -> float:
+    if not 0.0 < value < 1.0:
+        raise expected("a number between 0 and 1, both excluded")
+    return value
+
+
+Secrecy = Annotated[str, AfterValidator(one_of(SECRECY))]
+Range = Annotated[list[Annotated[int, Field(strict=True)]], AfterValidator(_range)]
+Quantile = Annotated[float, Field(strict=True), AfterValidator(_quantile)]
+Distance = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)]
+Slot = Annotated[int, Field(strict=True, ge=0)]
+
+
+class ExpectTable(Table):
+    """`[[expect]]`: one of `figure`, `link`, `secrecy` and `in_step`, with the entries that go with it."""
+
+    figure: Annotated[str | None, Field(examples=["legitimate.mean_squared_error"])] = None
+    below: Annotated[Number | None, Field(examples=[0.01])] = None
+    above: Annotated[Number | None, Field(examples=[0.01])] = None
+    near: Annotated[Number | None, Field(examples=[0.01])] = None
+    within: Annotated[Distance | None, Field(examples=[0.002])] = None
+    within_relative: Annotated[Distance | None, Field(examples=[0.1])] = None
+    slots: Annotated[Range | None, Field(examples=[[100, 200]])] = None
+    quantile: Annotated[Quantile | None, Field(examples=[0.9])] = None
+    link: Annotated[str | None, Field(examples=["legitimate"])] = None
+    secrecy: Annotated[Secrecy | None, Field(examples=["relative"])] = None
+    against: Annotated[str | None, Field(examples=["smart"])] = None
+    direction: Annotated[str | None, Field(examples=["position"])] = None
+    in_step: Annotated[str | None, Field(examples=["legitimate"])] = None
+    by: Annotated[Slot | None, Field(examples=[40])] = None
+    since: Annotated[Slot | None, Field(examples=[0])] = None
+
+    @classmethod
+    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+        """Mistakes unless the table has exactly one subject, all the entries that this subject needs, and no others."""
+        given = [name for name, value in table.items() if value is not None]
+        kinds = [kind for kind in _ENTRIES if kind in given]
+        if not kinds:
+            meant = [kind for kind, entries in _ENTRIES.items() if any(name in given for name in entries)]
+            kind = meant[0] if meant else "figure"
+            others = ", or one of " + ", ".join(name for name in _ENTRIES if name != kind) if not meant else ""
+            return [(kind, f"is missing; expected {_EXAMPLES[kind]}{others}")]
+        if len(kinds) > 1:
+            one_each = f"expected one of {', '.join(_ENTRIES)} in a table"
+            return [(kind, f"is given together with {kinds[0]}; {one_each}") for kind in kinds[1:]]
+        (kind,) = kinds
+        found = [
+            (name, f"is set, but {kind} has no such entry; remove the line")
+            for other, entries in _ENTRIES.items()
+            for name in entries
+            if other != kind and name in given
+        ]
+        check = {"figure": _figure_mistakes, "link": _nothing, "secrecy": _secrecy_mistakes, "in_step": _step_mistakes}
+        return found + check[kind](table)
+
+    @property
+    def kind(self) -> str:
+        """Its subject: `figure`, `link`, `secrecy` or `in_step`."""
+        return next(kind for kind in _ENTRIES if getattr(self, kind) is not None)
+
+    @property
+    def wanted(self) -> str:
+        """The value or outcome that is expected."""
+        match self.kind:
+            case "link":
+                return "within its confidence interval"
+            case "secrecy":
+                both = self.direction is None or self.secrecy == "perfect"
+                return "promised by theory and shown by the run" if both else "shown by the run"
+            case "in_step":
+                return f"by slot {self.by}" + ("" if self.since is None else f", since slot {self.since}")
+        bounds = [f"{name} {value:.10g}" for name in ("below", "above") if (value := getattr(self, name)) is not None]
+        if self.near is not None:
+            around = f"{self.within:.10g}" if self.within is not None else f"{self.within_relative:.10g} of it"
+            bounds.append(f"near {self.near:.10g} within {around}")
+        return " and ".join(bounds)
+
+    @property
+    def text(self) -> str:
+        """The expectation as a sentence."""
+        of_direction = "" if self.direction is None else f" of {self.direction}"
+        subject = {
+            "figure": self.figure,
+            "link": f"link {self.link}",
+            "secrecy": f"{self.secrecy} secrecy{of_direction} against {self.against}",
+            "in_step": f"{self.in_step} in step",
+        }[self.kind]
+        if self.quantile is not None:
+            subject = f"{self.quantile:.10g} quantile of {subject}"
+        if self.slots is not None:
+            subject = f"{subject} over slots {self.slots[0]} to {self.slots[1] - 1}"
+        return f"{subject} {self.wanted}"
+
+    def holds(self, found: float) -> bool:
+        """Whether a figure meets the expectation."""
+        if (self.below is not None and not found < self.below) or (self.above is not None and not found > self.above):
+            return False
+        if self.near is None:
+            return True
+        relative = self.within_relative or 0.0
+        return abs(found - self.near) <= (self.within if self.within is not None else relative * abs(self.near))
+
+
+def link_figure(figure: str) -> tuple[str, tuple[str, ...]] | None:
+    """The receiver of a link's figure, and the figure's path in the account of the link; None for a receiver's own figure."""
+    parts = figure.split(".")
+    return (parts[1], tuple(parts[2:])) if parts[0] == LINKS and len(parts) > 2 else None
+
+
+def direction_figure(figure: str) -> tuple[str, str] | None:
+    """The receiver and the direction of a direction's figure; None for any other."""
+    parts = figure.split(".")
+    return (parts[1], parts[2]) if parts[0] == DIRECTIONS and len(parts) == 3 else None
+
+
+def _nothing(table: Mapping[str, Any]) -> list[Found]:
+    del table
+    return []
+
+
+def _figure_mistakes(table: Mapping[str, Any]) -> list[Found]:
+    """Mistakes unless there is a bound to compare with, and slots or a quantile only for a figure that allows them."""
+    below, above, middle = (table.get(name) for name in ("below", "above", "near"))
+    distances = [name for name in ("within", "within_relative") if table.get(name) is not None]
+    found: list[Found] = []
+    if middle is None and distances:
+        found.append((distances[0], "is set without near; expected near = 0.01 as well"))
+    elif middle is None and below is None and above is None:
+        what = "is missing, and so is above; add below, above or near, such as below = 0.01"
+        found.append(("below", what))
+    elif middle is not None and not distances:
+        found.append(("within", "is missing; expected within = 0.002, or within_relative = 0.1, with near"))
+    elif len(distances) > 1:
+        found.append(("within_relative", "is given together with within; expected one of them"))
+    elif middle == 0 and distances == ["within_relative"]:
+        found.append(("within_relative", "is set, but any fraction of near = 0 is 0; expected within"))
+    if below is not None and above is not None and is_number(below) and is_number(above) and not above < below:
+        found.append(("above", f"is {as_toml(above)}, and below is {as_toml(below)}; expected above < below"))
+    figure = table["figure"]
+    if not isinstance(figure, str):
+        return found
+    link = link_figure(figure)
+    for name in ("slots", "quantile"):
+        if direction_figure(figure) is not None and table.get(name) is not None:
+            found.append((name, "is set, but the error in a direction is the mean of the whole run; remove the line"))
+        if link is not None and table.get(name) is not None:
+            instead = f"expected none, or the figure {link[0]}.received_fraction"
+            found.append((name, f"is set, but a link's account is of the whole run; {instead}"))
+    known = expectable_figures()
+    of_receiver = known.get(figure.rpartition(".")[2])
+    if link is None and table.get("quantile") is not None and of_receiver is not None and not of_receiver.by_trial:
+        instead = (
+            f"expected a figure that every trial has: {listed([name for name, one in known.items() if one.by_trial])}"
+        )
+        found.append(("quantile", f"is set, but {figure} is not known trial by trial; {instead}"))
+    return found
+
+
+def _secrecy_mistakes(table: Mapping[str, Any]) -> list[Found]:
+    """A mistake if the eavesdropper is missing."""
+    if table.get("against") is None:
+        return [("against", "is missing; expected the name of an eavesdropper")]
+    return []
+
+
+def _step_mistakes(table: Mapping[str, Any]) -> list[Found]:
+    """Mistakes in `by` and `since`."""
+    by, since = table.get("by"), table.get("since")
+    if by is None:
+        return [("by", "is missing; expected the last slot by which it must be in step, such as by = 40")]
+    if type(by) is int and type(since) is int and by < since:
+        return [("by", f"is {by}, before since, which is {since}; expected since ≤ by")]
+    return []
+
+
+@dataclass(frozen=True)
+class Around:
+    """The parts of a scenario that expectations refer to; None where the file has a mistake there."""
+
+    receivers: Sequence[str]
+    """The legitimate estimator first."""
+    slots: int | None
+    trials: int | None
+    no_theory: Callable[[str], str | None]
+    """Why no theory covers a receiver; None if one does."""
+    applications: Mapping[str, type[Application]] = field(default_factory=dict)
+    """Those whose tables the scenario has."""
+    directions: Sequence[str] | None = ()
+    """Names of the process's directions; None if its table has a mistake."""
+
+    def mistakes(self, expectation: ExpectTable) -> list[Found]:
+        """Unknown receivers and figures, slots beyond the run, and quantiles of too few trials."""
+        found: list[Found] = []
+        direction = None if expectation.figure is None else direction_figure(expectation.figure)
+        if expectation.figure is not None and (direction is None or direction[0] not in self.receivers):
+            found += self._figure_mistakes(expectation.figure)
+            application = expectation.figure.partition(".")[0]
+            if application in self.applications:
+                mean = (
+                    f"is set, but the {application}'s figures are means over trials of the whole run; remove the line"
+                )
+                found += [(name, mean) for name in ("slots", "quantile") if getattr(expectation, name) is not None]
+        names = {"link": self.receivers, "in_step": self.receivers, "against": self.receivers[1:]}
+        for entry, known in names.items():
+            name = getattr(expectation, entry)
+            if name is not None and name not in known:
+                choice = f"expected {listed(known)}" if known else "there is no eavesdropper; add one"
+                found.append((entry, f"is {as_toml(name)}; {choice}{near(name, known)}"))
+        found += self._direction_mistakes(expectation)
+        return found + self._slot_mistakes(expectation) + self._quantile_mistakes(expectation.quantile)
+
+    def _unknown_direction(self, name: str) -> str | None:
+        """What to do if the process has no such direction; None if it has, or has mistakes."""
+        if self.directions is None or name in self.directions:
+            return None
+        if not self.directions:
+            return f"there are no directions; expected process.directions = {{ {name} = [1.0, 0.0] }}, a number for each state"
+        return f"expected {listed(self.directions)}{near(name, self.directions)}"
+
+    def _direction_mistakes(self, expectation: ExpectTable) -> list[Found]:
+        """Directions that the process does not have, as the entry `direction` or in a figure."""
+        named = [("direction", expectation.direction, "")]
+        figure = None if expectation.figure is None else direction_figure(expectation.figure)
+        if figure is not None and figure[0] in self.receivers:
+            named.append(("figure", figure[1], f"{DIRECTIONS}.{figure[0]}."))
+        return [
+            (entry, f"is {as_toml(before + name)}; {what}")
+            for entry, name, before in named
+            if name is not None and (what := self._unknown_direction(name)) is not None
+        ]
+
+    def _figure_mistakes(self, figure: str) -> list[Found]:
+        link = link_figure(figure)
+        if link is not None and link[0] in self.receivers and _LOST_BY.fullmatch(".".join(link[1])):
+            return []
+        known = expectable_figures()
+        own = [f"{receiver}.{name}" for receiver in self.receivers for name in figures_of(receiver) if name in known]
+        links = [f"{LINKS}.{receiver}.{name}" for receiver in self.receivers for name in LINK_FIGURES]
+        first = figure.partition(".")[0]
+        if first not in self.receivers and first in APPLICATIONS:
+            return self._application_mistakes(figure, first, APPLICATIONS[first])
+        name = figure.rpartition(".")[2]
+        if figure not in [*own, *links]:
+            broken = unloadable_figures().get(name)
+            if broken is not None:
+                return [("figure", f"is {as_toml(figure)}{broken}")]
+            names = f"RECEIVER ({', '.join(self.receivers)}).FIGURE ({', '.join(known)})"
+            of_links = f"{LINKS}.RECEIVER.FIGURE ({', '.join(LINK_FIGURES)}, lost_by.REASON)"
+            hint = near(figure, [*own, *links])
+            return [("figure", f"is {as_toml(figure)}; expected {names} or {of_links}{hint}")]
+        why = self.no_theory(first) if link is None and known[name].needs_theory else None
+        if why is not None:
+            return [("figure", f"is {as_toml(figure)}, but {why}; expected another figure")]
+        return []
+
+    def _application_mistakes(self, figure: str, name: str, application: type[Application]) -> list[Found]:
+        own, of_receivers = application.figures, application.receiver_figures
+        if name not in self.applications:
+            wanted = f"expected a table [{name}], or another figure"
+            return [("figure", f"is {as_toml(figure)}, but there is no {name}; {wanted}")]
+        known = [f"{name}.{one}" for one in own]
+        known += [f"{name}.{receiver}.{one}" for receiver in self.receivers for one in of_receivers]
+        if figure in known:
+            return []
+        choice = [f"{name}.FIGURE ({', '.join(own)})"] if own else []
+        choice += [f"{name}.RECEIVER.FIGURE ({', '.join(of_receivers)})"] if of_receivers else []
+        return [("figure", f"is {as_toml(figure)}; expected {' or '.join(choice)}{near(figure, known)}")]
+
+    def _slot_mistakes(self, expectation: ExpectTable) -> list[Found]:
+        if self.slots is None:
+            return []
+        found: list[Found] = []
+        span = expectation.slots
+        if span is not None and span[1] > self.slots:
+            found.append(("slots", f"is {as_toml(span)}; expected from < to ≤ slots, which is {self.slots}"))
+        for name, slot in (("by", expectation.by), ("since", expectation.since)):
+            if slot is not None and slot >= self.slots:
+                found.append((name, f"is {slot}; expected a slot of the run, 0 to {self.slots - 1}"))
+        return found
+
+    def _quantile_mistakes(self, quantile: float | None) -> list[Found]:
+        if self.trials is None or quantile is None:
+            return []
+        # At least one trial is expected beyond the quantile. The tolerance is for rounding: 1/q is seldom exact in binary.
+        least = math.ceil(1.0 / min(quantile, 1.0 - quantile) - 1e-9)
+        if self.trials >= least:
+            return []
+        return [("quantile", f"is {quantile:g} of {self.trials} trials; expected trials = {least} or more")]

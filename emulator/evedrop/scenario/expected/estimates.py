@@ -1,0 +1,113 @@
+"""Statements about a run before it starts: whether the estimator is bounded, and how much will be written."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from evedrop.model.acknowledgements import FORGING, rates_of
+from evedrop.model.local_filter import settled
+from evedrop.model.schemes import scheme_of
+from evedrop.model.theory.covariances import stability_bound
+from evedrop.names import LEGITIMATE
+from evedrop.scenario.expected.expectations import expectations_of
+from evedrop.scenario.filter_noise import is_singular
+from evedrop.scenario.plugins import sources_of
+from evedrop.scenario.tables import Scenario
+
+_LARGE_BYTES = 1e9
+_SHOWN_STATES = 3  # the largest matrix that is written out
+_NEAR = 0.01  # relative to a covariance's largest entry
+
+
+def warnings_of(scenario: Scenario) -> list[str]:
+    """Warnings that the user should read before the run; the run starts regardless.
+
+    Source: docs/mathematics.md, secrecy and design (stability bound).
+    """
+    found = []
+    process, mu_d = scenario.process.process, scenario.encoding.mu_d
+    expectation = expectations_of(scenario)[LEGITIMATE]
+    alike = None if expectation.law is None else expectation.law.alike
+    mu = 0.0 if alike is None else float(alike.quality[0])
+    bound = stability_bound(process, mu)
+    if alike is None:
+        if math.isinf(expectation.limit):
+            found.append(
+                f"the legitimate estimator's expected error grows without bound: with spectral radius "
+                f"{process.spectral_radius:.6g} and state_probability {mu_d:g} the losses of its link last too long"
+            )
+    elif expectation.has_limit and not mu_d > bound and process.spectral_radius >= 1.0 and mu < 1.0:
+        needed = f"{bound:.6g}" if math.isfinite(bound) else "∞"
+        found.append(
+            f"the legitimate estimator's expected error grows without bound: state_probability is {mu_d:g}, and with "
+            f"link quality {mu:g} and spectral radius {process.spectral_radius:.6g} it must exceed {needed}"
+            + ("; no state_probability can, the link must be better" if bound >= 1.0 else "")
+        )
+    found += _reference_warnings(scenario, mu)
+    found += [*_filter_warnings(scenario), *scheme_of(process, scenario.encoding.spec).warnings()]
+    size = written_bytes(scenario)
+    if size > _LARGE_BYTES:
+        found.append(
+            f"this run will write about {size / 1e9:.1f} GB of results; fewer slots or record_trials write less"
+        )
+    for module, source in sources_of(scenario.model_dump(mode="json")).items():
+        if scenario.made_with.get(module, source) != source:
+            found.append(f"the {module} is not the one these results were made with; its digests may differ")
+    return found
+
+
+def _reference_warnings(scenario: Scenario, mu: float) -> list[str]:
+    """A warning if acknowledgements are forged and a user that lost the reference gets it back too late.
+
+    mu: the quality of its link, 0 if that varies.
+
+    Source: docs/mathematics.md, flipped acknowledgements.
+    """
+    table = scenario.acknowledgements
+    if table is None or table.attack not in FORGING or mu == 0.0:
+        return []
+    rates = rates_of(table.attack, mu, 1.0, table.link.quality, table.flip or 0.0)
+    scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
+    lost = scheme.lost_reference(mu, rates.user)
+    if lost is None or rates.user[1] == 0.0 or lost.growth < 1.0:
+        return []
+    return [
+        f"the legitimate estimator's expected error grows without bound unless {lost.remedy}: acknowledgements of packets that "
+        f"it missed are forged, with link quality {mu:g} and spectral radius {scenario.process.process.spectral_radius:.6g}"
+    ]
+
+
+def _filter_warnings(scenario: Scenario) -> list[str]:
+    """Warnings about a Q that does not match the sensor's filter, and about a singular Q, which reveals packet types.
+
+    Source: docs/mathematics.md, a filter at the sensor.
+    """
+    found = []
+    process, driven = scenario.process.process, scenario.driven
+    if driven is not None and driven.output_matrix is not None:
+        wanted = settled(process, driven).innovation
+        if np.abs(wanted - process.Q).max() > _NEAR * np.abs(wanted).max():
+            small = process.n <= _SHOWN_STATES
+            found.append(
+                f"process.Q is {process.Q.tolist() if small else 'another'}, but the sensor's filter adds, per slot, noise "
+                f"with the covariance {wanted.tolist() if small else 'of its innovations'}: "
+                f'process.Q = "filter" uses that; inputs and disturbances are not in it'
+            )
+    if process.singular_noise and is_singular(process.Q):
+        found.append(
+            "process.Q is singular: apart from A, inputs and disturbances, consecutive states differ only "
+            "within its range, so anybody who knows A and Q recognises, with certainty, two states in a row, and an "
+            "innovation after a state"
+        )
+    return found
+
+
+def written_bytes(scenario: Scenario) -> float:
+    """The approximate size of the results folder in bytes, before compression."""
+    n, receivers = len(scenario.process.A), len(scenario.receivers)
+    recorded_row = 8 * (2 * n + n * n) + 40
+    journal_row = scenario.trials / 8 + 60
+    digest_rows = scenario.trials / 256 * 34
+    return scenario.slots * receivers * (recorded_row * scenario.record_trials + journal_row + digest_rows + 80)

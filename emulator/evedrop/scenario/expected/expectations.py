@@ -1,0 +1,269 @@
+"""Theory's expectation for each receiver of a scenario, as far as theory covers its link."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import Protocol, final
+
+import numpy as np
+
+from evedrop.model import modulated
+from evedrop.model.acknowledgements import FORGING
+from evedrop.model.modulated_streaks import modulated_streaks
+from evedrop.model.outcomes import eavesdropper_outcomes, legitimate_outcomes
+from evedrop.model.parts_of_runs import parts_of
+from evedrop.model.process import Floats, Process
+from evedrop.model.schedule import in_slot
+from evedrop.model.schemes import scheme_of
+from evedrop.model.schemes.scheme import Scheme
+from evedrop.model.slot.link_law import LinkLaw, law_of
+from evedrop.model.theory import covariances as theory
+from evedrop.model.theory.closed_form import ClosedForm
+from evedrop.model.theory.covariances import ExpectedCovariance, Outcomes, OutcomesAt, SlotOutcomes
+from evedrop.model.theory.directions import Growth, growth
+from evedrop.model.theory.rare_events import Streaks, streaks, total_of
+from evedrop.names import LEGITIMATE
+from evedrop.scenario.expected.closed_forms import ClosedStream, closed_of
+from evedrop.scenario.tables import Scenario
+
+_ROUNDING = 1e-12  # of an error, relative to the state
+_SMALL = 1e-15  # of a squared error, relative to those of the first slots: above it none is rounding
+
+
+class ExpectedTraceStream(Protocol):
+    """Expected traces, a number of slots at a time."""
+
+    def next_traces(self, slots: int) -> Floats:
+        """The traces of the next slots, (slots,)."""
+
+
+@final
+class KnownTraces:
+    """The stream of traces that have been computed, (slots,)."""
+
+    def __init__(self, traces: Floats) -> None:
+        self._left = traces
+
+    def next_traces(self, slots: int) -> Floats:
+        """The traces of the next slots, (slots,)."""
+        found, self._left = self._left[:slots], self._left[slots:]
+        return found
+
+
+@final
+class _Unknown:
+    """The stream of a receiver that no theory covers."""
+
+    def next_traces(self, slots: int) -> Floats:
+        """NaN for each slot, (slots,)."""
+        return np.full(slots, np.nan)
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """One receiver's expected actual error covariance, by the chain that its link's losses follow."""
+
+    process: Process
+    law: LinkLaw | None
+    """None: theory does not cover the link."""
+    outcomes_at: OutcomesAt | None
+    """Maps a link's quality to the frequencies of the receiver's actions; None if these are unknown."""
+    bound_at: OutcomesAt | None = None
+    """For a receiver without the secret and without a theory of its own: one that it cannot outperform, such as the genie."""
+    bound_slots_at: SlotOutcomes | None = None
+    """The same as `slots_at` for `bound_at`."""
+    closed: ClosedForm | None = None
+    """The closed form of a receiver whose slots differ."""
+    closed_bound: ClosedForm | None = None
+    """A lower bound for such a receiver, in place of a closed form."""
+    slots_at: SlotOutcomes | None = None
+    """The outcomes of each slot, where μ_d differs from slot to slot; `outcomes_at` is then their mean, and there is no limit."""
+    of_model: bool = False
+    """Whether the process is only a model of what moves the states: then it is not the errors of a run that theory expects."""
+    assumed: bool = False
+    """Whether it is only what receivers assume: then theory expects nothing."""
+
+    @property
+    def known(self) -> bool:
+        """Whether there is a theory for the link and for the receiver's actions."""
+        return self.closed is not None or self._known is not None
+
+    @property
+    def _known(self) -> tuple[LinkLaw, OutcomesAt] | None:
+        return None if self.law is None or self.outcomes_at is None else (self.law, self.outcomes_at)
+
+    @property
+    def _outcomes(self) -> Outcomes | None:
+        """The outcomes behind a link whose losses are independent, as in the paper."""
+        if self._known is None or self.slots_at is not None:
+            return None
+        law, outcomes_at = self._known
+        alike = law.alike
+        return None if alike is None else outcomes_at(float(alike.quality[0]))
+
+    @property
+    def bound(self) -> Expectation | None:
+        """A lower bound on the receiver's error, if theory knows only that."""
+        if self.closed_bound is not None:
+            return Expectation(self.process, self.law, None, closed=self.closed_bound)
+        if self.known or self.law is None or self.bound_at is None:
+            return None
+        return Expectation(self.process, self.law, self.bound_at, slots_at=self.bound_slots_at)
+
+    @property
+    def has_limit(self) -> bool:
+        """Whether there may be a limit: slots continue as they are, and do not follow a list that ends."""
+        return self.slots_at is None
+
+    def stream(self) -> ExpectedTraceStream:
+        """The expected traces from slot 0 on; NaN without a theory."""
+        if self.closed is not None:
+            return ClosedStream(self.closed)
+        if self._outcomes is not None:
+            return ExpectedCovariance(self.process, self._outcomes)
+        if self._known is None:
+            return _Unknown()
+        return modulated.ModulatedCovariance(self.process, *self._known, self.slots_at)
+
+    def traces(self, slots: int) -> Floats:
+        """The expected traces of slots 0 … slots−1, (slots,); NaN without a theory."""
+        return self.stream().next_traces(slots)
+
+    @property
+    def limit(self) -> float:
+        """Trace of the limit, for the link in its last state; inf if unbounded, NaN without a theory or a limit."""
+        if not self.has_limit:
+            return math.nan
+        if self.closed is not None:
+            return self.closed.limit
+        if self._outcomes is not None:
+            return theory.limit_trace(self.process, self._outcomes)
+        return math.nan if self._known is None else modulated.limit_of(self.process, *self._known)
+
+    def along(self, v: Floats, slots: int) -> Floats | None:
+        """The expected squared error of vᵀx, v (n,), in slots 0 … slots−1; None unless it is known by single slots."""
+        outcomes = None if self.closed is not None else self._outcomes
+        if outcomes is None:
+            return None
+        stream, found = ExpectedCovariance(self.process, outcomes), np.empty(slots)
+        for part in parts_of(range(slots)):
+            found[part.start : part.stop] = np.einsum("i,kij,j->k", v, stream.next(len(part)), v)
+        return found
+
+    def is_rounding(self, error: float, slots: int) -> bool:
+        """Whether a mean squared error over slots 0 … slots−1 is only rounding: below 1e-24 of the state's own square."""
+        process = self.process
+        if error > _SMALL * float(np.trace(process.initial_covariance) + np.trace(process.Q)):
+            return False  # the horizon of runs keeps the state from growing so far
+        own = total_of(ExpectedCovariance(process, theory.NOBODY).next_traces, slots) / slots
+        return error < _ROUNDING**2 * own
+
+    @property
+    def growth(self) -> Growth | None:
+        """The directions in which the expected error grows without bound; None if theory knows none."""
+        closed = self.closed_bound if self.closed is None else self.closed
+        if closed is not None:
+            return closed.growth
+        outcomes = self._outcomes
+        return None if outcomes is None else growth(self.process, outcomes)
+
+    def streaks(self, slots: int) -> Streaks | None:
+        """What streaks carry of its error in slots 0 … slots−1; None unless a closed form knows them (docs/mathematics.md)."""
+        if self.closed is not None or self._known is None:
+            return None
+        if self._outcomes is not None and not self._outcomes.leaked:
+            return streaks(self.process, self._outcomes, slots)
+        total = total_of(self.stream().next_traces, slots)
+        return modulated_streaks(self.process, *self._known, slots, total, self.slots_at)
+
+    @property
+    def infinite_variance(self) -> bool:
+        """Whether the variance of tr P over trials has no bound (docs/mathematics.md, heavy tails)."""
+        if self.bound is not None:
+            return self.bound.infinite_variance
+        if self.closed is not None:
+            return self.closed.infinite_variance
+        if self._known is None or not self.has_limit:
+            return False
+        if self._outcomes is not None:
+            return theory.has_infinite_variance(self.process, self._outcomes)
+        law, outcomes_at = self._known
+        return theory.has_infinite_variance(self.process, modulated.tail_outcomes(law.last, outcomes_at))
+
+
+def outcomes_of(scenario: Scenario, receiver: str) -> OutcomesAt | None:
+    """Maps the quality of a receiver's link to the frequencies of its actions; None if these are unknown."""
+    return _outcomes_of(scenario, receiver, scheme_of(scenario.process.process, scenario.encoding.spec))
+
+
+def _outcomes_of(scenario: Scenario, receiver: str, scheme: Scheme) -> OutcomesAt | None:
+    if receiver == LEGITIMATE:
+        table = scenario.acknowledgements
+        forged = table is not None and table.attack in FORGING and LEGITIMATE in scheme.closed_forms
+        return None if forged else legitimate_outcomes(scheme)
+    eavesdropper = scenario.eavesdroppers[receiver]
+    return eavesdropper_outcomes(scheme, eavesdropper.strategy, eavesdropper.parameters)
+
+
+def bound_of(scenario: Scenario, receiver: str) -> OutcomesAt | None:
+    """The same for a receiver that knows the types of packets, behind the same link, where it bounds this one: without leaks."""
+    scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
+    if receiver == LEGITIMATE or receiver in scenario.leaks or scheme.bound_outcomes(0.5) is None:
+        return None
+    return partial(_bound, scheme)
+
+
+def expectations_of(scenario: Scenario) -> dict[str, Expectation]:
+    """Receiver → theory's expectation of it."""
+    table = scenario.process
+    if table.given and not table.theory:
+        return dict.fromkeys(scenario.receivers, Expectation(table.process, None, None, of_model=True, assumed=True))
+    found = {}
+    scheme, mu_d = scheme_of(scenario.process.process, scenario.encoding.spec), scenario.encoding.state_probabilities
+    for name in scenario.receivers:
+        closed = closed_of(scenario, name)
+        bound = closed is not None and closed.bound
+        found[name] = Expectation(
+            scenario.process.process,
+            law_of(scenario.schedule(name)),
+            outcomes_of(scenario, name),
+            bound_of(scenario, name),
+            closed=None if bound else closed,
+            closed_bound=closed if bound else None,
+            slots_at=None if mu_d is None else _in_slots(mu_d, partial(_known_in_slot, scenario, name, scheme)),
+            bound_slots_at=None if mu_d is None else lambda k: partial(_bound, scheme.in_slot(k)),
+            of_model=scenario.of_model,
+        )
+    return found
+
+
+def _in_slots(mu_d: tuple[float, ...], outcomes_in: SlotOutcomes) -> SlotOutcomes:
+    """The outcomes of each slot, asked for once for each value of μ_d."""
+    known: dict[float, OutcomesAt] = {}
+
+    def at(k: int) -> OutcomesAt:
+        value = in_slot(mu_d, k)
+        if value not in known:
+            known[value] = outcomes_in(k)
+        return known[value]
+
+    return at
+
+
+def _known_in_slot(scenario: Scenario, receiver: str, scheme: Scheme, k: int) -> OutcomesAt:
+    found = _outcomes_of(scenario, receiver, scheme.in_slot(k))
+    assert found is not None  # noqa: S101 - the mean over the slots has outcomes, so each slot has
+    return found
+
+
+def _bound(scheme: Scheme, quality: float) -> Outcomes:
+    found = scheme.bound_outcomes(quality)
+    assert found is not None  # noqa: S101 - checked before
+    return found
+
+
+def expected_traces_of(scenario: Scenario) -> dict[str, Floats]:
+    """Receiver → trace of the expected actual error covariance in every slot, (slots,); NaN without a theory."""
+    return {name: one.traces(scenario.slots) for name, one in expectations_of(scenario).items()}

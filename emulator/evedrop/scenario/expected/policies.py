@@ -1,0 +1,149 @@
+"""The best transmission policies for a scenario, against each of its eavesdroppers.
+
+Source: docs/mathematics.md, the best policy.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from evedrop.errors import UsageError
+from evedrop.model.schemes import SCHEMES
+from evedrop.model.theory.covariances import LARGEST_OPERATOR, stability_bound
+from evedrop.model.theory.policy import held_traces, least_weight
+from evedrop.model.theory.policy_front import Front, ScheduledLinks, front
+from evedrop.names import LEGITIMATE
+from evedrop.scenario.expected.closed_forms import conditions_of, stated_form
+from evedrop.scenario.tables import Scenario
+from evedrop.scenario.words import listed
+
+_LARGEST_CHAIN = 4 * LARGEST_OPERATOR  # rows of the linear equation of a policy's chain, which then takes a second
+_LARGEST_ERROR = 1e200  # the sums of value iteration are then far from overflow
+
+
+@dataclass(frozen=True)
+class PolicyDesign:
+    """The best policies against each eavesdropper of a scenario."""
+
+    mu: float
+    states: int
+    """Holding times are distinguished up to this one."""
+    fronts: dict[str, Front]
+    left_out: dict[str, str]
+    """Eavesdropper → strategy, for those whose error has no closed form under this scheme."""
+
+    def as_dict(self) -> dict[str, object]:
+        """The JSON of `evedrop design --policy`; `left_out` is present only if it has values."""
+        found: dict[str, object] = {
+            "mu": self.mu,
+            "states": self.states,
+            "eavesdroppers": {name: one.as_dict() for name, one in self.fronts.items()},
+        }
+        return {**found, "left_out": self.left_out} if self.left_out else found
+
+
+def policies_of(scenario: Scenario, weights: Sequence[float], prices: Sequence[float], states: int) -> PolicyDesign:
+    """The front of each eavesdropper of a scenario.
+
+    weights: of the user's error, from 0 to 1, the eavesdropper's has the rest; prices: of a transmission; states: how many
+    holding times are distinguished.
+
+    Raises UsageError if acknowledgements do not decide when the scheme sends, if the losses of a link are not independent and
+    alike in all slots, if the user's error is unbounded under every policy, for weights at which the best policy never sends,
+    for numbers out of range, and for so many holding times that the error grows too large.
+    """
+    _check_numbers(scenario, weights, prices, states)
+    kind = SCHEMES[scenario.encoding.scheme]
+    if not kind.sends_by_holding_time:
+        raise UsageError(_not_for(scenario.encoding.scheme))
+    left_out = {
+        name: table.strategy
+        for name, table in scenario.eavesdroppers.items()
+        if table.strategy not in kind.closed_forms
+    }
+    heard = {name: _heard(scenario, name) for name in scenario.receivers if name not in left_out}
+    if len(heard) == 1:
+        raise UsageError(
+            "the design of a policy needs an eavesdropper whose error has a closed form under this scheme; expected a "
+            f"strategy of {listed(sorted(set(kind.closed_forms) - {LEGITIMATE}))}"
+        )
+    unknown = [name for name, one in heard.items() if one is None]
+    unknown = [LEGITIMATE] if LEGITIMATE in unknown else unknown  # without the user's, no other closed form is known
+    if unknown:
+        raise UsageError(
+            "the design of a policy is for independent losses that stay the same, without late packets and outages, and for "
+            "an attack on acknowledgements that is always on; the link of "
+            f"{', '.join(unknown)} is different; give each link only a quality, such as "
+            "legitimate.link={quality = 0.9}, and remove events"
+        )
+    user = heard[LEGITIMATE]
+    assert user is not None  # noqa: S101 - refused above
+    process, (mu, acknowledged) = scenario.process.process, user
+    with np.errstate(over="ignore", invalid="ignore"):
+        largest = float(held_traces(process, states)[-1])
+    if not largest <= _LARGEST_ERROR:
+        raise UsageError(
+            f"{states} states: {states} slots after a packet the error exceeds {_LARGEST_ERROR:g}, and policies cannot be "
+            "compared; give fewer holding times"
+        )
+    if mu == 0.0 or (process.spectral_radius >= 1.0 and stability_bound(process, mu) >= 1.0):
+        bound = max(0.0, 1.0 - process.spectral_radius**-2)
+        raise UsageError(
+            f"no policy keeps the user's error bounded: the legitimate link's quality μ = {mu:g} must exceed "
+            f"max(0, 1 − ρ⁻²) = {bound:.6g}; give a better link, such as legitimate.link.quality={0.5 + 0.5 * bound:.3g}"
+        )
+    fronts = {}
+    for name, one in heard.items():
+        if name == LEGITIMATE or one is None:
+            continue
+        links = ScheduledLinks(mu, one[0], acknowledged, one[1])
+        fronts[name] = front(process, links, weights, prices, states)
+        if not fronts[name].points:
+            raise UsageError(_never(scenario, name, links, max(weights), min(prices), states))
+    return PolicyDesign(mu, states, fronts, left_out)
+
+
+def _heard(scenario: Scenario, receiver: str) -> tuple[float, tuple[float, float]] | None:
+    """`received` and `acknowledged` of a receiver's conditions; None if its error has no closed form under them."""
+    found = conditions_of(scenario, receiver)
+    if found.received is None or found.acknowledged is None or stated_form(scenario, receiver) is None:
+        return None
+    return found.received, found.acknowledged
+
+
+def _check_numbers(scenario: Scenario, weights: Sequence[float], prices: Sequence[float], states: int) -> None:
+    for weight in weights:
+        if not 0.0 <= weight <= 1.0:
+            raise UsageError(f"a weight of {weight:g}: expected a number from 0 to 1, the weight of the user's error")
+    for price in prices:
+        if not 0.0 <= price < math.inf:
+            raise UsageError(
+                f"a price of {price:g}: expected a finite number of at least 0, the cost of a transmission"
+            )
+    most = math.isqrt(_LARGEST_CHAIN // scenario.process.process.n**2)
+    if not 2 <= states <= max(2, most):
+        raise UsageError(
+            f"{states} state{'' if states == 1 else 's'}: "
+            f"expected a whole number from 2 to {max(2, most)}, how many holding times are distinguished"
+        )
+
+
+def _not_for(scheme: str) -> str:
+    able = [name for name in SCHEMES if SCHEMES[name].sends_by_holding_time]
+    return (
+        f"a policy decides, by acknowledgements, when to send: its design is for the scheme {listed(able)}, and this scenario "
+        f"has {scheme}; evedrop compare SCENARIO --schemes {able[0]} --out DIR writes DIR/scenarios/{able[0]}.toml, "
+        "which can be designed"
+    )
+
+
+def _never(scenario: Scenario, name: str, links: ScheduledLinks, weight: float, price: float, states: int) -> str:
+    least = least_weight(scenario.process.process, links.mu, links.mu_e, price, states)
+    never = f"the best policy against {name} never sends at weight {weight:g} and price {price:g}"
+    if least is None:
+        return f"{never}, nor at any other weight: give a lower price"
+    return f"{never}: it sends from weight {least:.4f} on; give a larger weight to the user's error, up to 1"

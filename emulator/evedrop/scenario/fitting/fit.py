@@ -1,0 +1,206 @@
+"""The fit of a recording: candidates, the chosen model, its goodness of fit, and the line for the scenario."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evedrop.errors import TraceError
+from evedrop.model.checks import toml_of
+from evedrop.model.process import Floats
+from evedrop.scenario.fitting import candidate
+from evedrop.scenario.fitting.candidate import Candidate, delay_candidates, wilson
+from evedrop.scenario.fitting.run_lengths import RunLaw, lengths_of, p_value
+from evedrop.scenario.recordings.link_recording import DELAY, LinkRecording, Outcomes
+
+FEWEST = 100
+"""The fewest outcomes from which a model can be estimated."""
+FEWEST_DELAYS = 10
+"""The fewest delays from which a model can be estimated."""
+_LEVEL = 0.01
+
+
+@dataclass(frozen=True)
+class RunLengths:
+    """Bursts or gaps: runs of lost or delivered packets that begin and end within the recording."""
+
+    count: int
+    mean: float | None
+    """Slots, observed; None if there are no runs."""
+    fitted: float
+    """Slots, under the chosen model."""
+    p_value: float | None
+    """None: too few runs for a test."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The result of fitting a recording."""
+
+    trace: str
+    count: int
+    lost: int
+    candidates: Sequence[Candidate]
+    bursts: RunLengths
+    gaps: RunLengths
+    delays: int
+    """Packets whose delay was measured."""
+    delay_candidates: Sequence[Candidate]
+
+    @property
+    def chosen(self) -> Candidate:
+        """The loss model with the least BIC."""
+        return min(self.candidates, key=lambda one: one.bic(self.count))
+
+    @property
+    def chosen_delay(self) -> Candidate | None:
+        """The delay model with the least BIC; None if no delays were measured."""
+        return min(self.delay_candidates, key=lambda one: one.bic(self.delays), default=None)
+
+    @property
+    def link(self) -> dict[str, Any]:
+        """The link as a scenario describes it."""
+        delay = self.chosen_delay
+        return {"loss": dict(self.chosen.spec)} | ({} if delay is None else {"delay": dict(delay.spec)})
+
+    @property
+    def toml(self) -> str:
+        """The line for the scenario."""
+        return f"link = {toml_of(self.link)}"
+
+    @property
+    def goodness(self) -> str:
+        """How well the chosen model explains the lengths of bursts and gaps, in a sentence."""
+        told = {"bursts": self.bursts.p_value, "gaps": self.gaps.p_value}
+        judged = {name: value for name, value in told.items() if value is not None}
+        shown = " and ".join(f"{value:.2g} for {name}" for name, value in judged.items())
+        if not judged:
+            return f"too few bursts ({self.bursts.count}) to tell how well it fits"
+        # Each of two tests has half the level: together they reject a correct model in one of a hundred recordings.
+        if min(judged.values()) < _LEVEL / 2.0:
+            return (
+                f"it does NOT explain how long bursts and gaps last (chi-square, p = {shown}): the link has habits that none "
+                'of these models has; use the recording itself, model = "trace"'
+            )
+        return f"bursts and gaps last as long as the model predicts (chi-square, p = {shown})"
+
+    def as_dict(self) -> dict[str, Any]:
+        """The fit as JSON values."""
+        delay = self.chosen_delay
+        return {
+            "trace": self.trace,
+            "outcomes": self.count,
+            "lost": self.lost,
+            "candidates": [one.as_dict(self.count) for one in self.candidates],
+            "chosen": self.chosen.name,
+            "bursts": vars(self.bursts),
+            "gaps": vars(self.gaps),
+            "goodness": self.goodness,
+            "delays": self.delays,
+            "delay_candidates": [one.as_dict(self.delays) for one in self.delay_candidates],
+            "chosen_delay": None if delay is None else delay.name,
+            "link": self.link,
+            "toml": self.toml,
+        }
+
+
+def fit(path: Path, column: str | None = None, delay_column: str | None = None, lost: str | None = None) -> Fit:
+    """Find the models that may have produced a recording.
+
+    column: that of the outcomes, in a file with several, by default `received`; delay_column: that of delays in slots, by default
+    `delay` if present; lost: in place of column, one whose ones are losses.
+
+    Raises TraceError if the file is not a recording, or if nothing can be estimated from it.
+    """
+    recording = LinkRecording(path)
+    names = recording.columns()
+    outcomes = recording.outcomes(column, lost)
+    _check(str(path), outcomes)
+    wanted = delay_column or (DELAY if DELAY in names and DELAY not in {column, lost} else None)
+    delays = np.empty(0) if wanted is None else recording.delays(wanted)
+    delays = delays[~np.isnan(delays)]
+    if wanted is not None and len(delays) < FEWEST_DELAYS:
+        what = f"{wanted} has {len(delays)} delays; expected {FEWEST_DELAYS} or more, such as a longer recording"
+        raise TraceError(str(path), "file", what)
+    return fit_outcomes(str(path), outcomes, delays)
+
+
+def fit_outcomes(name: str, outcomes: Outcomes, delays: Floats) -> Fit:
+    """Find the models that may have produced outcomes, (n,), and delays, (d,), which may be empty.
+
+    name: what was recorded, for messages. Raises TraceError if nothing can be estimated.
+    """
+    _check(name, outcomes)
+    candidates = [candidate.bernoulli(outcomes), candidate.gilbert(outcomes), candidate.gilbert_elliott(outcomes)]
+    chosen = min(candidates, key=lambda one: one.bic(len(outcomes)))
+    return Fit(
+        name,
+        len(outcomes),
+        int((outcomes == 0).sum()),
+        candidates,
+        _runs(outcomes, chosen, True),
+        _runs(outcomes, chosen, False),
+        len(delays),
+        delay_candidates(delays) if len(delays) else (),
+    )
+
+
+def _check(name: str, outcomes: Outcomes) -> None:
+    """Raise TraceError for a recording from which nothing can be estimated."""
+    count, delivered = len(outcomes), int(outcomes.sum())
+    if count < FEWEST:
+        raise TraceError(name, "file", f"has {count} outcomes; expected {FEWEST} or more, such as a longer recording")
+    if delivered in {0, count}:
+        low, high = wilson(delivered, count)
+        all_or_none, bound = ("delivered", f"at least {low:.4g}") if delivered else ("lost", f"at most {high:.4g}")
+        raise TraceError(
+            name,
+            "file",
+            f"has {count} outcomes, all {all_or_none}: the quality is {bound} with 95 % confidence if losses are independent, "
+            "and nothing can be said about bursts; expected a recording with both, such as a longer one",
+        )
+
+
+def _runs(outcomes: Outcomes, chosen: Candidate, lost: bool) -> RunLengths:
+    lengths = lengths_of(outcomes == 0 if lost else outcomes == 1)
+    law = RunLaw.of(chosen.spec, lost)
+    return RunLengths(
+        len(lengths),
+        float(lengths.mean()) if len(lengths) else None,
+        law.mean,
+        p_value(lengths, law, 3 if chosen.parameters == 4 else 1),
+    )
+
+
+def lines(found: Fit) -> list[str]:
+    """The fit as printed lines."""
+    share = 100.0 * found.lost / found.count
+    mean = "none of them ended" if found.bursts.mean is None else f"{found.bursts.mean:.4g} slots on average"
+    return [
+        f"{found.trace}: {found.count} outcomes, {found.lost} lost ({share:.4g} %), {found.bursts.count} bursts, {mean}",
+        *model_lines(found),
+        found.toml,
+    ]
+
+
+def model_lines(found: Fit) -> list[str]:
+    """The candidates, the models that were taken, and how well they fit, as printed lines."""
+    told = _table(found.candidates, found.chosen, found.count)
+    told.append(f"taken: {found.chosen.name}, by BIC; its bursts last {found.bursts.fitted:.4g} slots on average")
+    told.append(f"fit: {found.goodness}")
+    if found.chosen_delay is not None:
+        told.append(f"{found.delays} delays")
+        told += _table(found.delay_candidates, found.chosen_delay, found.delays)
+    return told
+
+
+def _table(candidates: Sequence[Candidate], chosen: Candidate, count: int) -> list[str]:
+    rows = [f"  {'model':<16} {'log-likelihood':>16} {'BIC':>14}  parameters"]
+    for one in candidates:
+        mark = "*" if one is chosen else " "
+        rows.append(f"{mark} {one.name:<16} {one.log_likelihood:>16.2f} {one.bic(count):>14.2f}  {one.text}")
+    return rows

@@ -1,0 +1,153 @@
+"""The news of a run in progress: a class for each kind.
+
+The observer sends it to its launcher as lines of JSON: `event`, and the entries of that kind.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+from evedrop.model.entries import SLOT, Check, entry, listed, maybe, named, plain, text, whole
+
+
+def _real(path: str, found: Any) -> Iterator[str]:
+    """Check that a value is a number; errors of an estimate may be infinite."""
+    if type(found) not in (int, float):
+        yield f"{path} is {found!r:.40}, expected a number"
+
+
+_TEXTS: Check = listed(text)
+
+
+@dataclass(frozen=True)
+class News:
+    """One item of news."""
+
+    event: ClassVar[str]
+
+    @property
+    def plain(self) -> dict[str, object]:
+        """The news as a JSON object."""
+        return {"event": self.event, **plain(self)}
+
+    @property
+    def line(self) -> bytes:
+        """The news as a line for the launcher."""
+        return json.dumps(self.plain, ensure_ascii=False).encode() + b"\n"
+
+
+@dataclass(frozen=True)
+class Started(News):
+    """All processes are present, and the sensor begins."""
+
+    event = "started"
+
+
+@dataclass(frozen=True)
+class Held(News):
+    """The operator holds the run."""
+
+    event = "held"
+    before: int = field(metadata=entry(SLOT))
+    """The slot before which the run is held."""
+
+
+@dataclass(frozen=True)
+class ConnectionOutage(News):
+    """A process was cut off, and the run has gone on or ended since."""
+
+    event = "reconnected"
+    process: str = field(metadata=entry(text))
+    """The process whose connection was lost; the router if it was restarted, because every connection goes through it."""
+    slot: int = field(metadata=entry(SLOT))
+    """The first slot that was not joined when the loss was noticed."""
+    until: int | None = field(metadata=entry(maybe(SLOT)))
+    """The first slot that was not joined when the run went on; None if it did not."""
+    seconds: float = field(metadata=entry(_real))
+    """From the last joined slot before the loss until the run went on: the loss itself may be noticed late."""
+    shard: int | None = field(default=None, metadata=entry(maybe(SLOT), left_out=True))
+    """The shard whose process it is; None if the run is not in shards."""
+
+
+@dataclass(frozen=True)
+class RunProgress(News):
+    """How far a run has come."""
+
+    event = "progress"
+    done: int = field(metadata=entry(SLOT))
+    """Slots in a live run; slots times trials in memory."""
+    rate: float = field(metadata=entry(_real))
+    """Of progress, in `rate_unit`."""
+    rate_unit: str = field(metadata=entry(text))
+    """`slots/s` or `trial-slots/s`."""
+    squared_errors: Mapping[str, float] = field(metadata=entry(named(_real)))
+    """Receiver → its squared error, mean over the trials and the latest slots; empty in memory."""
+    total: int | None = field(default=None, metadata=entry(maybe(SLOT), left_out=True))
+    """The value of `done` at the end; None in a live run, where it is the scenario's number of slots."""
+
+
+@dataclass(frozen=True)
+class RunEnded(News):
+    """The end of a run, as the observer sees it."""
+
+    event = "ended"
+    status: int = field(metadata=entry(whole(0, 255)))
+    """Its exit status."""
+    how: str = field(metadata=entry(text))
+    """`complete`, `interrupted`, or the reason for a failure."""
+    suspects: Sequence[str] = field(default=(), metadata=entry(_TEXTS))
+    """Processes that were missing."""
+    accused: Sequence[str] = field(default=(), metadata=entry(_TEXTS))
+    """Processes whose misbehaviour ended the run."""
+    view: str | None = field(default=None, metadata=entry(maybe(text)))
+    """Why the view stopped early, if it did."""
+
+    @property
+    def well(self) -> bool:
+        """Whether the run came to its end, whatever its expectations."""
+        return self.status in {0, 1}
+
+
+@dataclass(frozen=True)
+class ViewOpened(News):
+    """A live view is open, or there is a warning about it."""
+
+    event = "view"
+    address: str | None = field(metadata=entry(maybe(text)))
+    """The address to open in a browser; None for a window."""
+    warning: str | None = field(default=None, metadata=entry(maybe(text)))
+
+
+@dataclass(frozen=True)
+class FolderMoved(News):
+    """The results folder was renamed while the run went on."""
+
+    event = "moved"
+    folder: str = field(metadata=entry(text))
+
+
+@dataclass(frozen=True)
+class RunEvent:
+    """An event that took place during the run."""
+
+    slot: int = field(metadata=entry(SLOT))
+    event: str = field(metadata=entry(text))
+    by: str = field(metadata=entry(text))
+    """`scenario` or `operator`."""
+
+    @property
+    def line(self) -> str:
+        """The event as a line of the view."""
+        return self.event if self.by == "scenario" else f"{self.event} (by the {self.by})"
+
+
+Tell = Callable[[News], None]
+"""Takes each item of news."""
+
+
+def silent(news: News) -> None:
+    """Ignore the news."""
+    del news

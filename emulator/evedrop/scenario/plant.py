@@ -1,0 +1,222 @@
+"""`[plant]` and `[controller]`: the inputs and disturbances that move the true states, and the strategy that decides the inputs.
+
+Source: docs/scenario.md, plant and controller.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import AfterValidator, ConfigDict, Field
+
+from evedrop.model.controllers import CONTROLLERS, Assignment
+from evedrop.model.kernels.elementary import semidefinite_factor
+from evedrop.model.plant import Plant
+from evedrop.model.process import MOST_STATES, Floats, Process
+from evedrop.scenario.table import Found, Matrix, Number, Table, numbers, one_of
+from evedrop.scenario.words import as_toml, listed
+
+Numbers = list[Number]
+Names = list[Annotated[str, Field(strict=True, min_length=1)]]
+
+
+class PlantTable(Table):
+    """`[plant]`: inputs, disturbances, limits and noise of the true states."""
+
+    inputs: Annotated[Names, Field(examples=[["P_H", "P_grid"]])] = Field(default_factory=list)
+    input_matrix: Annotated[Matrix | None, Field(examples=[[[0.00156, 0.00156], [-0.00566, 0.0]]])] = None
+    input_units: Annotated[Names | None, Field(examples=[["kW", "kW"]])] = None
+    input_lower: Annotated[Numbers | None, Field(examples=[[-1.5, -3.0]])] = None
+    input_upper: Annotated[Numbers | None, Field(examples=[[1.5, 3.0]])] = None
+    disturbances: Annotated[Names, Field(examples=[["P_solar", "P_load"]])] = Field(default_factory=list)
+    disturbance_matrix: Annotated[Matrix | None, Field(examples=[[[0.00156, -0.00156], [0.0, 0.0]]])] = None
+    disturbance_units: Annotated[Names | None, Field(examples=[["kW", "kW"]])] = None
+    disturbance_file: Annotated[str | None, Field(strict=True, examples=["day.csv"])] = None
+    disturbance_values: Annotated[Matrix | None, Field(examples=[[[0.0, 0.4], [0.0, 0.4]]])] = None
+    noise: Annotated[Matrix | None, Field(examples=[[[1e-6, 0.0], [0.0, 1e-6]]])] = None
+    output_matrix: Annotated[Matrix | None, Field(examples=[[[1.0, 0.0]]])] = None
+    measurement_noise: Annotated[Matrix | None, Field(examples=[[[0.01]]])] = None
+    start: Annotated[Numbers | None, Field(examples=[[55.0, 50.0]])] = None
+    state_lower: Annotated[Numbers | None, Field(examples=[[20.0, 10.0]])] = None
+    state_upper: Annotated[Numbers | None, Field(examples=[[90.0, 90.0]])] = None
+
+    @classmethod
+    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+        """Entries that do not fit each other; whether they fit the process is checked later."""
+        found: list[Found] = []
+        for kind in ("input", "disturbance"):
+            names, matrix, units = table.get(f"{kind}s") or [], table.get(f"{kind}_matrix"), table.get(f"{kind}_units")
+            if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+                continue
+            if len(names) > MOST_STATES:
+                found.append((f"{kind}s", f"has {len(names)} names; expected at most {MOST_STATES}"))
+                continue
+            twice = sorted(name for name, count in Counter(names).items() if count > 1)
+            found += [(f"{kind}s", f"has {as_toml(name)} twice") for name in twice]
+            if names and matrix is None:
+                found.append(
+                    (f"{kind}_matrix", f"is missing; expected a row for each state, a number for each of {kind}s")
+                )
+            if matrix is not None and numbers(matrix) and any(len(row) != len(names) for row in matrix):
+                wrong = next(row for row in matrix if len(row) != len(names))
+                found.append(
+                    (
+                        f"{kind}_matrix",
+                        f"has a row of {len(wrong)} numbers; expected {len(names)}, one for each of {kind}s",
+                    )
+                )
+            if isinstance(units, list) and len(units) != len(names):
+                found.append(
+                    (f"{kind}_units", f"has {len(units)} entries; expected {len(names)}, one for each of {kind}s")
+                )
+        inputs = table.get("inputs") or []
+        if isinstance(inputs, list):
+            found += limit_mistakes(table, "input", len(inputs), "one for each of inputs", {})
+        for one, other in (("output_matrix", "measurement_noise"), ("measurement_noise", "output_matrix")):
+            if table.get(one) is not None and table.get(other) is None:
+                example = as_toml((cls.model_fields[other].examples or [0])[0])
+                found.append((other, f"is missing, but {one} is given; expected {other} = {example}, or neither"))
+        rows, disturbances = table.get("disturbance_values"), table.get("disturbances") or []
+        if isinstance(disturbances, list):
+            if disturbances and rows is None:
+                found.append(
+                    ("disturbance_file", 'is missing; expected disturbance_file = "day.csv", or disturbance_values')
+                )
+            # A day has 86 400 rows: their numbers are checked elsewhere, in a faster way.
+            whole = isinstance(rows, list) and {type(row) for row in rows} == {list}
+            if whole and rows is not None and {*map(len, rows)} != {len(disturbances)}:
+                i = next(i for i, row in enumerate(rows) if len(row) != len(disturbances))
+                few = f"row {i} has {len(rows[i])} numbers; expected {len(disturbances)}, one for each of disturbances"
+                found.append(("disturbance_values", few))
+        return found
+
+
+def limit_mistakes(
+    table: Mapping[str, Any], kind: str, count: int, why: str, within: Mapping[str, Sequence[float]]
+) -> list[Found]:
+    """Mistakes in the lower and upper limits of `kind`, and in values outside them.
+
+    count: how many limits there must be; why: the reason for that number; within: name → values that must lie between them.
+    """
+    found: list[Found] = []
+    limits: dict[str, list[float]] = {}
+    for name in (f"{kind}_lower", f"{kind}_upper"):
+        values = table.get(name)
+        if values is None or not numbers([values]):
+            continue
+        if len(values) != count:
+            found.append((name, f"has {len(values)} entries; expected {count}, {why}"))
+        else:
+            limits[name] = values
+    lower, upper = limits.get(f"{kind}_lower"), limits.get(f"{kind}_upper")
+    for i, (least, most) in enumerate(zip(lower or [], upper or [], strict=False)):
+        if least > most:
+            found.append(
+                (f"{kind}_lower", f"entry {i} is {least}, above that of {kind}_upper, which is {most}; swap them")
+            )
+    for name, values in within.items():
+        for i, value in enumerate(values):
+            if (lower is not None and value < lower[i]) or (upper is not None and value > upper[i]):
+                span = f"{lower[i] if lower is not None else '−∞'} to {upper[i] if upper is not None else '∞'}"
+                found.append((name, f"entry {i} is {value}, outside its limits, {span}; change one of them"))
+    return found
+
+
+class ControllerTable(Table):
+    """`[controller]`: the strategy that decides the inputs, how often and from what, with the strategy's own parameters."""
+
+    model_config = ConfigDict(extra="allow")
+
+    strategy: Annotated[str, Field(strict=True, examples=["lqr"]), AfterValidator(one_of(CONTROLLERS))]
+    period: Annotated[int, Field(strict=True, ge=1, le=1_000_000, examples=[60])] = 1
+    acts_on: Annotated[Literal["estimate", "truth"], Field(examples=["estimate"])] = "estimate"
+    state_weights: Annotated[Numbers, Field(examples=[[1.0, 0.3]])]
+    input_weights: Annotated[Numbers, Field(examples=[[0.02, 0.05]])]
+    rate_weights: Annotated[Numbers | None, Field(examples=[[1.0, 0.02]])] = None
+    rate_limits: Annotated[Numbers | None, Field(examples=[[0.05, 3.0]])] = None
+
+    @classmethod
+    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+        """Weights and limits below 0, and missing, unknown or wrong parameters of the strategy."""
+        found: list[Found] = []
+        for name in ("state_weights", "input_weights", "rate_weights", "rate_limits"):
+            values = table.get(name)
+            if values is not None and numbers([values]) and any(value < 0.0 for value in values):
+                found.append((name, f"has {min(values)}; expected numbers of 0 or more"))
+        strategy = CONTROLLERS.get(str(table.get("strategy")))
+        given = {name: value for name, value in table.items() if name not in cls.model_fields}
+        if strategy is None:
+            return found
+        found += [
+            (name, f"is missing; the strategy {table['strategy']} needs it, such as {name} = {as_toml(example)}")
+            for name, example in strategy.parameters.items()
+            if name not in given and name not in strategy.optional
+        ]
+        known = f"expected {listed(sorted(strategy.parameters))}" if strategy.parameters else "remove the line"
+        what = f"is set, but the strategy {table['strategy']} has no such parameter; {known}"
+        found += [(name, what) for name in given if name not in strategy.parameters]
+        return found + strategy.mistakes({name: value for name, value in given.items() if name in strategy.parameters})
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """The strategy's parameters, with defaults for those that are left out."""
+        return {**CONTROLLERS[self.strategy].optional, **(self.model_extra or {})}
+
+
+def noise_mistakes(table: PlantTable, n: int) -> list[str]:
+    """Mistakes in `noise`, for n states."""
+    if table.noise is None:
+        return []
+    if len(table.noise) != n:
+        return [f"plant.noise: has {len(table.noise)} rows; expected {n}, one for each state"]
+    if any(len(row) != n for row in table.noise):
+        return [f"plant.noise: has a row that is not of {n} numbers; expected {n} × {n}, as A is"]
+    noise = np.array(table.noise, np.float64)
+    if not np.array_equal(noise, noise.T):
+        return ["plant.noise: is not symmetric; expected a covariance, such as 1e-6 times the identity, or 0"]
+    try:
+        semidefinite_factor(noise)
+    except ValueError:
+        return ["plant.noise: has an eigenvalue below 0; expected a covariance, such as 1e-6 times the identity, or 0"]
+    return []
+
+
+def plant_of(table: PlantTable, reference: Sequence[float]) -> Plant:
+    """The plant that a table describes, in deviations from the reference; the table must fit its process."""
+    around, n, m = np.array(reference), len(reference), len(table.inputs)
+
+    def limits(values: Sequence[float] | None, without: float, count: int) -> Floats:
+        return np.full(count, without) if values is None else np.array(values)
+
+    return Plant(
+        np.array(table.input_matrix or [[]] * n).reshape(n, m),
+        np.array(table.disturbance_matrix or [[]] * n).reshape(n, len(table.disturbances)),
+        np.zeros((n, n)) if table.noise is None else np.array(table.noise),
+        limits(table.start, 0.0, n) - (around if table.start is not None else 0.0),
+        limits(table.input_lower, -np.inf, m),
+        limits(table.input_upper, np.inf, m),
+        limits(table.state_lower, -np.inf, n) - around,
+        limits(table.state_upper, np.inf, n) - around,
+        None if table.output_matrix is None else np.array(table.output_matrix),
+        None if table.measurement_noise is None else np.array(table.measurement_noise),
+    )
+
+
+def assignment_of(table: ControllerTable, process: Process, plant: Plant, slot_seconds: float) -> Assignment:
+    """The assignment of the controller that a table describes; the table must fit its plant."""
+    m = plant.inputs
+    per_slot = np.full(m, np.inf) if table.rate_limits is None else np.array(table.rate_limits)
+    return Assignment(
+        process,
+        plant,
+        table.period,
+        slot_seconds,
+        np.array(table.state_weights),
+        np.array(table.input_weights),
+        np.zeros(m) if table.rate_weights is None else np.array(table.rate_weights),
+        per_slot * table.period,
+        table.parameters,
+    )

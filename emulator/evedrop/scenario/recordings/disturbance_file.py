@@ -1,0 +1,303 @@
+"""The disturbances of a plant, or states, from a CSV file: a line with their names, then a line of numbers for every slot.
+
+    time [s], P_solar [kW], P_load [kW]
+    0, 0.0, 0.235
+    1, 0.0, 0.235
+
+A name may be followed by its unit. If the scenario states the units, the file must state them too; powers in W and kW are
+converted to the scenario's unit. A column `time`, in seconds, shows where slots are missing. The file may be compressed
+(`.csv.gz`), may have other columns, and may be longer than the run: rows after the last slot are not read.
+
+Source: docs/scenario.md, process and plant; docs/microgrid.md, a day of your own.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from itertools import islice, pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+from evedrop.errors import DisturbanceError
+from evedrop.system.files import Limit, Unreadable, lines_of
+
+_KILOWATTS = {"W": 1e-3, "kW": 1.0}
+_HEADER = re.compile(r"^(?P<name>[^\[\]]*?)\s*\[(?P<unit>[^\[\]]*)\]$")
+_TIME = "time"
+_EXAMPLE = "time [s], P_solar [kW], P_load [kW]"
+_TIME_ERROR, _SCATTER = 1e-6, 0.1  # in slots: times may be rounded, and those that were measured scatter
+MOST_REPORTED = 5
+"""The most lines of one kind of mistake in a message: more would not be read."""
+MOST_NUMBERS = 10_000_000
+"""The most numbers in a table of disturbances, slots times columns: more than a month of two columns by the second."""
+_ROWS_UNASKED = 10_000  # for a scenario without a number of slots, which is reported as a mistake of its own
+
+
+def found_file(name: str, folder: Path) -> Path:
+    """The path of a file that a scenario in this folder names: in the folder, or otherwise among the built-in files."""
+    own = folder / name
+    shipped = Path(str(resources.files("evedrop.scenarios"))) / name
+    try:
+        return shipped if not own.exists() and shipped.is_file() else own
+    except OSError:  # the name cannot be a file's: opening it reports that
+        return own
+
+
+def read_disturbances(
+    path: Path,
+    names: Sequence[str],
+    units: Sequence[str] | None = None,
+    slots: int | None = None,
+    slot_seconds: float = 1.0,
+    recorded: bool = False,
+) -> list[list[float]]:
+    """A row for each slot with the numbers of these names, in their order and units.
+
+    recorded: whether times were measured: they may start anywhere, and scatter by a tenth of a slot.
+
+    Raises DisturbanceError with every mistake: no file, missing columns, wrong units, values that are not finite numbers, times
+    that do not advance by `slot_seconds`, fewer rows than `slots`.
+    """
+    most = MOST_NUMBERS // max(1, len(names))
+    if slots is not None and slots > most:
+        raise DisturbanceError(
+            str(path),
+            [f"is read for {slots} slots of {len(names)} columns; expected at most {most} slots, or fewer columns"],
+        )
+    limit = _ROWS_UNASKED if slots is None else max(0, slots)
+    rows = _rows(path, limit)
+    head = next(rows, None)
+    if head is None:
+        what = f"is empty; expected a line of names such as {_EXAMPLE}, then a line for every slot"
+        raise DisturbanceError(str(path), [what])
+    columns, mistakes = _columns(head, names, units)
+    if mistakes:
+        raise DisturbanceError(str(path), mistakes)
+    found = _numbers(islice(rows, limit), len(head.cells), columns)
+    numbers, mistakes = found.numbers, found.mistakes
+    timed = columns != [] and columns[0].name == _TIME and _TIME not in names
+    if timed and not mistakes:
+        times = [row[0] for row in numbers]
+        mistakes = list(_few(_time_mistakes(found.lines, times, slot_seconds, recorded), "times"))
+    if not mistakes and slots is not None and len(numbers) < slots:
+        few = f"has {len(numbers)} rows; expected slots, which is {slots}, or more"
+        mistakes = [f"{few}: a longer file, or slots = {len(numbers)}" if numbers else few]
+    if mistakes:
+        raise DisturbanceError(str(path), mistakes)
+    return [row[1:] for row in numbers] if timed else numbers
+
+
+@dataclass(frozen=True)
+class StateRecording:
+    """A recording of states."""
+
+    path: str
+    names: Sequence[str]
+    units: Sequence[str] | None
+    """None unless every column has one."""
+    rows: Sequence[Sequence[float]]
+    seconds: float | None
+    """The time from one state to the next; None without a column of times."""
+
+
+def recorded_states(path: Path, names: Sequence[str] | None = None) -> StateRecording:
+    """All states of a file; names: its columns, by default all but the time.
+
+    Raises DisturbanceError as `read_disturbances` does; times may scatter by a tenth of their mean distance.
+    """
+    rows = _rows(path, MOST_NUMBERS)
+    head = next(rows, None)
+    if head is None:
+        raise DisturbanceError(
+            str(path), ["is empty; expected a line of names such as x, y, then a line for every slot"]
+        )
+    there = [match["name"] if (match := _HEADER.match(cell)) else cell for cell in head.cells]
+    names = [name for name in there if name != _TIME] if names is None else names
+    columns, mistakes = _columns(head, names, None)
+    found = _numbers(islice(rows, MOST_NUMBERS // max(1, len(columns))), len(head.cells), columns)
+    if mistakes := mistakes or found.mistakes:
+        raise DisturbanceError(str(path), mistakes)
+    numbers, seconds = found.numbers, None
+    if columns[0].name == _TIME and _TIME not in names:
+        times, numbers = [row[0] for row in numbers], [row[1:] for row in numbers]
+        seconds = (times[-1] - times[0]) / (len(times) - 1) if len(times) > 1 else 0.0
+        if len(times) > 1 and not 0.0 < seconds < math.inf:
+            raise DisturbanceError(str(path), ["has times that do not grow from line to line; expected seconds"])
+        if mistakes := list(_few(_time_mistakes(found.lines, times, seconds, recorded=True), "times")):
+            raise DisturbanceError(str(path), mistakes)
+    units = [match["unit"].strip() for cell in head.cells if (match := _HEADER.match(cell)) and match["name"] in names]
+    return StateRecording(str(path), names, units if len(units) == len(names) else None, numbers, seconds)
+
+
+def table_text(names: Sequence[str], units: Sequence[str] | None, rows: Sequence[Sequence[float]]) -> str:
+    """The text of a file that is read back to the same bits."""
+    return table_head(names, units) + number_lines(rows)
+
+
+def table_head(names: Sequence[str], units: Sequence[str] | None) -> str:
+    """The first line of such a file."""
+    head = names if units is None else [f"{name} [{unit}]" for name, unit in zip(names, units, strict=True)]
+    return f"{','.join(head)}\n"
+
+
+def number_lines(rows: Sequence[Sequence[float]]) -> str:
+    """Its lines of numbers."""
+    return "".join(f"{','.join([repr(value) for value in row])}\n" for row in rows)
+
+
+class _Row(NamedTuple):
+    """A line of the file and its number. A tuple, since a day has 86 400 of them."""
+
+    line: int
+    cells: list[str]
+
+
+@dataclass(frozen=True)
+class _Column:
+    """A column that is read: its place in the file, and the factor for its values."""
+
+    name: str
+    place: int
+    factor: float
+
+
+@dataclass(frozen=True)
+class _Found:
+    """The contents of the lines after the first: numbers and line number of each, and the mistakes."""
+
+    numbers: list[list[float]]
+    lines: list[int]
+    mistakes: list[str]
+
+
+def _rows(path: Path, slots: int) -> Iterator[_Row]:
+    """Every line that is neither blank nor a comment, from a file for this number of slots. Raises DisturbanceError."""
+    try:
+        reader = csv.reader(lines_of(path, Limit.of_rows(slots)), skipinitialspace=True)
+        for cells in reader:
+            stripped = list(map(str.strip, cells))
+            if any(stripped) and not stripped[0].startswith("#"):
+                yield _Row(reader.line_num, stripped)
+    except (Unreadable, csv.Error) as error:
+        what = f"cannot be read ({error}); expected a CSV file whose first line is such as {_EXAMPLE}"
+        raise DisturbanceError(str(path), [what]) from error
+
+
+def _columns(head: _Row, names: Sequence[str], units: Sequence[str] | None) -> tuple[list[_Column], list[str]]:
+    """The column of the time, if there is one, and those of the names; and mistakes in the first line."""
+    found: dict[str, tuple[int, str | None]] = {}
+    mistakes = []
+    for place, cell in enumerate(head.cells):
+        match = _HEADER.match(cell)
+        name, unit = (match["name"], match["unit"].strip()) if match else (cell, None)
+        if name in found and name in (_TIME, *names):
+            mistakes.append(f'line {head.line} names "{name}" twice; expected each column once')
+        found[name] = (place, unit)
+    columns = []
+    if _TIME in found and _TIME not in names:
+        place, unit = found[_TIME]
+        columns.append(_Column(_TIME, place, 1.0))
+        if unit not in (None, "s"):
+            mistakes.append(f'line {head.line}: the column "{_TIME}" is in [{unit}]; expected {_TIME} [s]')
+    for i, name in enumerate(names):
+        wanted = None if units is None or i >= len(units) else units[i]
+        if name not in found:
+            there = ", ".join(f'"{cell}"' for cell in head.cells[:8])
+            known = name if wanted is None else f"{name} [{wanted}]"
+            mistakes.append(f'line {head.line} has no column "{name}", only {there}; expected {known} among them')
+            continue
+        place, unit = found[name]
+        factor = 1.0 if wanted is None else _factor(unit, wanted)
+        if factor is None:
+            given = "has no unit" if unit is None else f"is in [{unit}]"
+            choice = [wanted, *(one for one in _KILOWATTS if one != wanted)] if wanted in _KILOWATTS else [wanted]
+            known = " or ".join(f"{name} [{one}]" for one in choice)
+            mistakes.append(f'line {head.line}: the column "{name}" {given}; expected {known}')
+        else:
+            columns.append(_Column(name, place, factor))
+    return columns, mistakes
+
+
+def _factor(unit: str | None, wanted: str | None) -> float | None:
+    """The factor from one unit to the other; None if they cannot be converted."""
+    if unit == wanted:
+        return 1.0
+    if unit in _KILOWATTS and wanted in _KILOWATTS:
+        return _KILOWATTS[unit] / _KILOWATTS[wanted]
+    return None
+
+
+def _numbers(rows: Iterable[_Row], width: int, columns: Sequence[_Column]) -> _Found:
+    """The columns' values of every line, and the mistakes in lines."""
+    places = [(column.place, column.factor) for column in columns]
+    numbers: list[list[float]] = []
+    lines: list[int] = []
+    wrong: list[_Row] = []
+    all_lines = all_wrong = 0
+    for row in rows:
+        line, cells = row
+        all_lines += 1
+        try:
+            values = [float(cells[place]) * factor for place, factor in places]
+        except (ValueError, IndexError):
+            values = [math.nan]
+        if len(cells) == width and all(map(math.isfinite, values)):
+            numbers.append(values)
+            lines.append(line)
+            continue
+        all_wrong += 1
+        if all_wrong <= MOST_REPORTED + 1:  # more are not reported, and need not be kept
+            wrong.append(row)
+    mistakes = list(_few(_cell_mistakes(wrong, width, columns), f"{all_wrong} of {all_lines} lines"))
+    return _Found(numbers, lines, mistakes)
+
+
+def _cell_mistakes(rows: Sequence[_Row], width: int, columns: Sequence[_Column]) -> Iterator[str]:
+    for row in rows:
+        if len(row.cells) != width:
+            yield f"line {row.line} has {len(row.cells)} columns; expected {width}, as the first line has"
+            continue
+        for column in columns:
+            cell = row.cells[column.place]
+            if not _is_finite(cell):
+                shown = f'"{cell[:40]}"' if cell else "empty"
+                yield f"line {row.line}: {column.name} is {shown}; expected a finite number"
+
+
+def _time_mistakes(lines: Sequence[int], times: Sequence[float], slot_seconds: float, recorded: bool) -> Iterator[str]:
+    """Mistakes where the time does not start at 0 or does not advance by one slot; recorded: as in `read_disturbances`."""
+    if times and times[0] != 0.0 and not recorded:
+        yield f"line {lines[0]}: the time starts at {times[0]:.10g} s; expected 0, with that subtracted from every time"
+    for line, (before, time) in zip(lines[1:], pairwise(times), strict=True):
+        if abs(time - before - slot_seconds) <= (_SCATTER if recorded else _TIME_ERROR) * slot_seconds:
+            continue
+        slots = (time - before) / slot_seconds
+        missing = round(slots) - 1 if math.isfinite(slots) else 0
+        what = "times must grow by a slot from line to line"
+        if missing > 0:
+            what = f"a gap of {missing:.10g} slot{'' if missing == 1 else 's'}: fill it, such as with the line before"
+        yield (
+            f"line {line}: the time is {time:.10g} s after {before:.10g} s; expected {before + slot_seconds:.10g} s, "
+            f"for slots of {slot_seconds:.10g} s: {what}"
+        )
+
+
+def _few(mistakes: Iterator[str], where: str) -> Iterator[str]:
+    """The first of the mistakes, and a note if there are more."""
+    for i, mistake in enumerate(mistakes):
+        if i == MOST_REPORTED:
+            yield f"and more such mistakes, in {where}"
+            return
+        yield mistake
+
+
+def _is_finite(cell: str) -> bool:
+    try:
+        return math.isfinite(float(cell))
+    except ValueError:
+        return False

@@ -1,0 +1,356 @@
+"""The scenario as a table: its entries, checks and meaning.
+
+Source: docs/scenario.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Self, Unpack
+
+from pydantic import (
+    Field,
+    ModelWrapValidatorHandler,
+    PrivateAttr,
+    SerializationInfo,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from evedrop.errors import UsageError
+from evedrop.model.controllers import Assignment
+from evedrop.model.eavesdroppers import ANSWERS, STRATEGIES
+from evedrop.model.energy import EnergyModel
+from evedrop.model.plant import Plant
+from evedrop.model.slot.link import LinkSchedule
+from evedrop.model.streams import MOST_SLOTS
+from evedrop.names import CONTROLLER, LEGITIMATE
+from evedrop.scenario.acknowledgements import AcknowledgementsTable
+from evedrop.scenario.application import APPLICATIONS, applications_in, unloadable_in
+from evedrop.scenario.arguments import CHANGES, table_argument
+from evedrop.scenario.encoding import EncodingTable
+from evedrop.scenario.entries import ScenarioEntries
+from evedrop.scenario.events.table import AnyEvent, event_table
+from evedrop.scenario.expect import ExpectTable
+from evedrop.scenario.link_table import LinkTable, changed_link
+from evedrop.scenario.nemesis import NemesisTable
+from evedrop.scenario.plant import ControllerTable, PlantTable, assignment_of, plant_of
+from evedrop.scenario.plugins import elsewhere, look_in, trusted_in
+from evedrop.scenario.process import ProcessTable
+from evedrop.scenario.receivers import EavesdropperTable, LegitimateTable
+from evedrop.scenario.table import Found, ProcessName, Table, again
+from evedrop.scenario.timeline import Timeline
+from evedrop.scenario.values import MOST_EAVESDROPPERS
+from evedrop.scenario.wire_table import WireTable
+from evedrop.scenario.words import as_toml, dotted
+
+_LOADS = 'Scenario.load("vehicle") reads a built-in scenario, a file or a results folder'
+_Energy = Annotated[float, Field(strict=True, ge=0.0, le=1e12)]
+
+
+class EnergyTable(Table):
+    """`[energy]`: what packets cost the sensor, in any unit; it does not change the trials."""
+
+    packet: Annotated[_Energy, Field(examples=[1.0])] = EnergyModel.packet
+    bit: Annotated[_Energy, Field(examples=[0.01])] = EnergyModel.bit
+    encryption: Annotated[_Energy, Field(examples=[0.5])] = EnergyModel.encryption
+
+
+class NetworkTable(Table):
+    """`[network]`: how the processes of a live run are connected; it does not change the trials."""
+
+    routers: Annotated[int, Field(ge=1, le=2, strict=True, examples=[2])] = 1
+
+
+@dataclass(frozen=True)
+class Builders:
+    """The functions of `evedrop.scenario.loading` that check whole scenarios, which compare the tables, too."""
+
+    build: Callable[[Mapping[str, Any]], Scenario]
+    """Takes entries."""
+    load: Callable[[str | Path, Mapping[str, Any]], Scenario]
+    """Takes a name or file, and changes."""
+    change: Callable[[Scenario, Mapping[str, Any]], Scenario]
+    """Takes a scenario, and changes."""
+
+
+class Scenario(Table):
+    """A scenario: every entry of docs/scenario.md as an argument; tables are dicts, matrices lists or numpy arrays.
+
+    A class in the place of a name is a scheme, an eavesdropper, a loss model or a delay model of your own.
+
+    `Scenario.read` makes one whose tables are valid by themselves; `evedrop.scenario.loading`, which
+    also compares the tables, uses it.
+
+    >>> Scenario(
+    ...     title="One eavesdropper",
+    ...     slots=500,
+    ...     process={"A": [[1.0]], "Q": [[0.1]], "initial_covariance": [[1.0]]},
+    ...     encoding={"scheme": "innovation", "state_probability": 0.4},
+    ...     legitimate={"link": {"quality": 0.9}},
+    ...     eavesdroppers={"antenna": {"strategy": "smart", "link": {"quality": 0.97}}},
+    ... )  # doctest: +SKIP
+    """
+
+    builders: ClassVar[Builders | None] = None
+    """Set by `evedrop.scenario.loading` when it is imported."""
+
+    title: Annotated[str, Field(min_length=1, max_length=200, examples=["Two eavesdroppers near a planar vehicle"])]
+    slots: Annotated[int, Field(ge=1, le=MOST_SLOTS, strict=True, examples=[2000])]
+    seed: Annotated[int, Field(ge=0, lt=2**256, strict=True, examples=[7])] = 0
+    trials: Annotated[int, Field(ge=1, le=1_000_000, strict=True, examples=[1])] = 1
+    first_trial: Annotated[int, Field(ge=0, le=2**48, strict=True, examples=[0])] = 0
+    record_trials: Annotated[int, Field(ge=1, strict=True, examples=[1])] = 1
+    shards: Annotated[int, Field(ge=1, le=64, strict=True, examples=[2])] = 1
+    pace: Annotated[float, Field(ge=0.0, le=3600.0, strict=True, examples=[0.02])] = 0.0
+    longest_outage: Annotated[float, Field(ge=0.0, le=86400.0, strict=True, examples=[30.0])] = 30.0
+    slot_seconds: Annotated[float | None, Field(gt=0.0, le=1e6, strict=True, examples=[0.02])] = None
+    secret_file: Annotated[str | None, Field(examples=["secret.bin"])] = None
+    modules: Annotated[str | None, Field(strict=True, examples=["."])] = None
+    process: Annotated[ProcessTable, Field(examples=[{"A": [[1.0]], "Q": [[0.001]], "initial_covariance": [[1.0]]}])]
+    encoding: Annotated[EncodingTable, Field(examples=[{"scheme": "innovation", "state_probability": 0.6}])]
+    legitimate: Annotated[LegitimateTable, Field(examples=[{"link": {"quality": 0.9}}])]
+    eavesdroppers: Annotated[
+        dict[ProcessName, EavesdropperTable],
+        Field(max_length=MOST_EAVESDROPPERS, examples=[{"smart": {"strategy": "smart", "link": {"quality": 0.9}}}]),
+    ] = Field(default_factory=dict)
+    plant: Annotated[PlantTable | None, Field(examples=[{"noise": [[1e-6, 0.0], [0.0, 1e-6]]}])] = None
+    controller: Annotated[ControllerTable | None, Field(examples=[{"strategy": "lqr"}])] = None
+    acknowledgements: Annotated[AcknowledgementsTable | None, Field(examples=[{"link": {"quality": 0.9}}])] = None
+    energy: Annotated[EnergyTable | None, Field(examples=[{"packet": 1.0, "encryption": 0.5}])] = None
+    wire: Annotated[
+        WireTable | None, Field(examples=[{"seed": 7, "key": "robot/pose", "links": {"legitimate": "radio"}}])
+    ] = None
+    network: Annotated[NetworkTable | None, Field(examples=[{"routers": 2}])] = None
+    event: Annotated[list[AnyEvent], Field(max_length=10_000, examples=[[{"at": 400, "cut": "legitimate"}]])] = Field(
+        default_factory=list
+    )
+    nemesis: Annotated[
+        NemesisTable | None, Field(examples=[{"faults": ["kill", "cut"], "every": 200, "lasting": 50}])
+    ] = None
+    expect: Annotated[
+        list[ExpectTable], Field(examples=[[{"figure": "legitimate.mean_squared_error", "below": 0.01}]])
+    ] = Field(default_factory=list)
+    made_with: Annotated[dict[str, str], Field(exclude=True)] = Field(default_factory=dict)
+    _applications: dict[str, Table] = PrivateAttr(default_factory=dict)
+
+    def __init__(self, entries: Mapping[str, Any] | None = None, /, **others: Unpack[ScenarioEntries]) -> None:
+        """Check the entries as those of a file are checked; entries: further ones, such as the table of an application.
+
+        Raises ScenarioError with every mistake: its key, what was found, what was expected.
+        """
+        given = table_argument("entries", entries, f"a dict of entries; {_LOADS}")
+        self.__setstate__(_builders().build({**given, **others}).__getstate__())
+
+    # Pydantic calls a model's own constructor for every table that it validates, unless the constructor has this mark.
+    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
+
+    @classmethod
+    def load(cls, source: str | Path, changes: Mapping[str, Any] | None = None, /, **others: Any) -> Scenario:
+        """A built-in scenario by its name, or one of a file or a results folder, with changes.
+
+        changes: entries by dotted key, such as `{"eavesdroppers.smart.link.quality": 0.8}`; as keywords they have `__` for the
+        dot, such as `legitimate__link__quality=0.8`.
+
+        Raises ScenarioError with every mistake, UsageError if there is no such scenario.
+        """
+        return _builders().load(source, {**table_argument("changes", changes, CHANGES), **dotted(others)})
+
+    def replace(self, changes: Mapping[str, Any] | None = None, /, **others: Any) -> Scenario:
+        """The same scenario with changes, given as for `load`; None removes an entry. Raises ScenarioError with every mistake."""
+        return _builders().change(self, {**table_argument("changes", changes, CHANGES), **dotted(others)})
+
+    def to_toml(self) -> str:
+        """The scenario as the text of a file; loading the file gives an equal scenario, which gives equal digests."""
+        from evedrop.scenario.toml_text import toml_text  # noqa: PLC0415 - a live run does not wait for it
+
+        made_with = {"made_with": self.made_with} if self.made_with else {}
+        return toml_text({**self.as_tables(), **made_with})
+
+    def as_tables(self) -> dict[str, Any]:
+        """The tables of its file, with the entries that were given."""
+        return self.model_dump(mode="json", exclude_none=True, exclude_unset=True)
+
+    def __repr__(self) -> str:
+        others = [f"{name} ({one.strategy})" for name, one in self.eavesdroppers.items()]
+        facts = [f"{self.slots} slots", f"{len(self.process.A)} states", f"scheme {self.encoding.scheme}"]
+        return f"<Scenario {as_toml(self.title)}: {', '.join([*facts, *others])}>"
+
+    def __str__(self) -> str:
+        return repr(self)
+
+    @classmethod
+    def read(cls, tables: Mapping[str, Any]) -> Self:
+        """The scenario that tables describe. From now on modules are found in its folder of modules. Raises ValidationError.
+
+        This process imports such modules only for schemes and links: see `evedrop.model.answers` for eavesdroppers.
+        """
+        folder = tables.get("modules")
+        if isinstance(folder, str) and Path(folder).is_dir():
+            ANSWERS.folder = str(Path(folder).absolute())
+            if any(trusted_in(tables)):
+                look_in(ANSWERS.folder)
+        return cls.model_validate(tables)
+
+    @classmethod
+    def entries(cls) -> list[str]:
+        """The names of its entries, those of applications included."""
+        return [name for name in super().entries() if name != "made_with"] + APPLICATIONS.names
+
+    @classmethod
+    def inner(cls, entry: str) -> type[Table] | None:
+        """As in `Table`; knows the tables of applications, and that of events of all kinds, too."""
+        if entry == "event":
+            return event_table()
+        if entry not in cls.model_fields and entry in APPLICATIONS:
+            return APPLICATIONS[entry].table
+        return super().inner(entry)
+
+    @property
+    def applications(self) -> Mapping[str, Table]:
+        """Application → its table, for those that the scenario uses."""
+        return self._applications
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _with_applications(cls, found: Any, check: ModelWrapValidatorHandler[Self]) -> Self:
+        """Check the tables of applications together with the fields, so that a mistake in one does not hide one in the other."""
+        if not isinstance(found, Mapping):
+            return check(found)
+        applications, broken = applications_in(found, cls.model_fields), unloadable_in(found, cls.model_fields)
+        made: dict[str, Table] = {}
+        mistakes = [
+            InitErrorDetails(
+                type=PydanticCustomError("mistakes", "one", {"mistakes": [(name, f"is a table{why}")]}), input=None
+            )
+            for name, why in broken.items()
+        ]
+        for name, application in applications.items():
+            try:
+                made[name] = application.table.model_validate(found[name])
+            except ValidationError as error:
+                mistakes += [again(detail, name) for detail in error.errors(include_url=False)]
+        scenario = None
+        try:
+            scenario = check({name: value for name, value in found.items() if name not in {*applications, *broken}})
+        except ValidationError as error:
+            mistakes = [again(detail) for detail in error.errors(include_url=False)] + mistakes
+        if scenario is None or mistakes:
+            raise ValidationError.from_exception_data(cls.__name__, mistakes)
+        scenario._applications = made
+        return scenario
+
+    @model_serializer(mode="wrap")
+    def _with_application_tables(
+        self, handler: SerializerFunctionWrapHandler, info: SerializationInfo
+    ) -> dict[str, Any]:
+        tables: dict[str, Any] = handler(self)
+        for name, table in self._applications.items():
+            tables[name] = table.model_dump(
+                mode=info.mode, exclude_none=info.exclude_none, exclude_unset=info.exclude_unset
+            )
+        return tables
+
+    @classmethod
+    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+        """Mistakes in the folder of modules."""
+        folder = table.get("modules")
+        if not isinstance(folder, str):
+            return []
+        if not Path(folder).is_dir():
+            return [("modules", f'is "{folder}", which is not a folder; expected the folder that contains the modules')]
+        return [("modules", what) for what in elsewhere(str(Path(folder).absolute()), table)]
+
+    @property
+    def relayed(self) -> bool:
+        """Whether there are two routers; the second is a relay."""
+        return self.network is not None and self.network.routers > 1
+
+    @property
+    def receivers(self) -> tuple[str, ...]:
+        """All receivers, the legitimate estimator first."""
+        return (LEGITIMATE, *self.eavesdroppers)
+
+    @property
+    def of_model(self) -> bool:
+        """Whether the process is only a model: a plant, a recording or a program moves the true states."""
+        return self.plant is not None or self.process.given
+
+    @property
+    def driven(self) -> Plant | None:
+        """The plant that drives the true states; None if the process alone does."""
+        return None if self.plant is None else plant_of(self.plant, self.process.around)
+
+    @property
+    def assignment(self) -> Assignment | None:
+        """The controller's assignment; None without a controller."""
+        if self.driven is None or self.controller is None:
+            return None
+        return assignment_of(self.controller, self.process.process, self.driven, self.slot_seconds or 1.0)
+
+    @property
+    def digested(self) -> tuple[str, ...]:
+        """The processes that have a digest: all receivers, and the controller if there is one."""
+        return self.receivers if self.controller is None else (*self.receivers, CONTROLLER)
+
+    @property
+    def energy_model(self) -> EnergyModel:
+        """What packets cost the sensor."""
+        return EnergyModel() if self.energy is None else EnergyModel(**self.energy.model_dump())
+
+    @property
+    def quality(self) -> dict[str, float]:
+        """Receiver → mean probability that a packet reaches it: μ, μ_e."""
+        return {name: self.link(name).model.quality for name in self.receivers}
+
+    @property
+    def leaks(self) -> dict[str, int]:
+        """Eavesdropper → the slot whose true state is betrayed to it, for eavesdroppers to which one is."""
+        slots = {name: STRATEGIES[one.strategy].betrayed(one.parameters) for name, one in self.eavesdroppers.items()}
+        return {name: slot for name, slot in slots.items() if slot is not None}
+
+    def link(self, receiver: str) -> LinkTable:
+        """A receiver's link, or its pooled links as one."""
+        return self.legitimate.link if receiver == LEGITIMATE else self.eavesdroppers[receiver].pool
+
+    def window(self, receiver: str) -> int:
+        """The number of slots by which a packet may be late for a receiver."""
+        return (self.legitimate if receiver == LEGITIMATE else self.eavesdroppers[receiver]).window
+
+    @cached_property
+    def timeline(self) -> Timeline:
+        """The order of events and their effects."""
+        return Timeline.of(self.event, self.receivers, self._changed_settings)
+
+    def _changed_settings(self, receiver: str, changes: Mapping[str, Any]) -> dict[str, Any]:
+        """A link's settings with some entries changed; `changes` includes those of earlier events."""
+        return changed_link(self.link(receiver), changes).settings(self.slot_seconds)
+
+    def schedule(self, receiver: str) -> LinkSchedule:
+        """The schedule of a receiver's link: its settings, its changes and the receiver's outages, all known in advance."""
+        link = self.link(receiver)
+        return LinkSchedule(
+            link.settings(self.slot_seconds),
+            self.window(receiver),
+            self.timeline.changes[receiver],
+            self.timeline.outages[receiver],
+            None if link.correlation is None else (link.correlation.to, link.correlation.strength),
+        )
+
+    def outage_bounds(self, receiver: str) -> list[int]:
+        """The slots in which a receiver goes away or comes back: each begins a new block of its digest. None for a controller."""
+        if receiver == CONTROLLER:
+            return []
+        return sorted({slot for one in self.timeline.outages[receiver] for slot in (one.start, one.stop)})
+
+
+def _builders() -> Builders:
+    if Scenario.builders is None:
+        raise UsageError("this class only checks single tables; give `from evedrop import Scenario` instead")
+    return Scenario.builders

@@ -1,0 +1,192 @@
+"""Totals of a closed loop: failed decisions, clipped inputs, and the errors of the two possible estimators.
+
+Source: docs/results.md, controller.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from evedrop.model.figures.standard_error import standard_error
+from evedrop.model.input_aware import Offset
+from evedrop.model.plant import Plant
+from evedrop.model.process import Floats, Process
+from evedrop.model.receiver import Codes
+from evedrop.names import LEGITIMATE
+from evedrop.scenario.application import APPLICATIONS, ApplicationTally
+from evedrop.scenario.controlled import controlled_plant
+from evedrop.scenario.tables import Scenario
+from evedrop.score.slots import InputSlots
+from evedrop.score.summary import ControllerSummary, PeerSummary, StandardErrors
+
+ESTIMATORS = ("ignoring_input", "knowing_input")
+
+
+@dataclass(frozen=True)
+class Acted:
+    """A closed loop over c slots of R trials."""
+
+    inputs: InputSlots
+    x: Floats
+    """The states that the sensor sends, (c, n, R)."""
+    estimates: Mapping[str, Floats]
+    """Receiver → x̂, (c, n, R)."""
+    action: Codes
+    """The legitimate estimator's actions, (c, R)."""
+    true: Floats
+    """The true states, (c, n, R); equal to x unless the sensor filters."""
+
+    def part(self, trials: slice) -> Acted:
+        """The same for some of the trials."""
+        inputs = self.inputs.part(trials)
+        estimates = {name: x_hat[..., trials] for name, x_hat in self.estimates.items()}
+        return Acted(inputs, self.x[..., trials], estimates, self.action[:, trials], self.true[..., trials])
+
+
+@final
+@dataclass
+class SolveTimes:
+    """The time that decisions take; one decision covers all trials that are simulated together."""
+
+    decisions: int = 0
+    seconds: float = 0.0
+    longest: float = 0.0
+
+    def add_seconds(self, seconds: Iterable[float]) -> None:
+        """Add some decisions."""
+        for one in seconds:
+            self.decisions += 1
+            self.seconds += one
+            self.longest = max(self.longest, one)
+
+    def merge(self, other: SolveTimes) -> None:
+        """Add another process's decisions."""
+        self.decisions += other.decisions
+        self.seconds += other.seconds
+        self.longest = max(self.longest, other.longest)
+
+    @property
+    def mean(self) -> float | None:
+        """Mean seconds per decision; None if there were none."""
+        return self.seconds / self.decisions if self.decisions else None
+
+
+@final
+class LoopTally:
+    """A closed loop's totals over a set of trials, whose slots come in order."""
+
+    def __init__(self, process: Process, plant: Plant, trials: int, knows_input: bool, comparable: bool) -> None:
+        """comparable: whether the error of the other estimator, which is not in the loop, can be computed."""
+        self._plant = plant
+        self._sign = -1.0 if knows_input else 1.0
+        self._offset = Offset(process, plant, trials) if comparable else None
+        self.trial_slots = 0
+        """Slots times trials so far."""
+        self.failed = 0
+        """Trial-slots whose inputs were held because a decision failed."""
+        self.clipped = 0
+        """Trial-slots in which the plant clipped an input."""
+        self.other_error = 0.0
+        """Sum of squared errors of the estimator that is not in the loop."""
+        self.of_trials: Floats = np.zeros((4, trials))
+        """The slots of each trial, and its shares of the three totals above, in their order."""
+        self.applications: dict[str, ApplicationTally] = {}
+        """Application → its totals, for those that the scenario uses."""
+
+    @classmethod
+    def from_scenario(cls, scenario: Scenario, trials: int) -> LoopTally | None:
+        """The totals of some trials of a scenario; None without a controller."""
+        loop = controlled_plant(scenario)
+        if loop is None:
+            return None
+        comparable = scenario.window(LEGITIMATE) == 0 and not scenario.timeline.outages[LEGITIMATE]
+        tally = cls(loop.process, loop.plant, trials, scenario.legitimate.knows_input, comparable)
+        tally.applications = {
+            name: APPLICATIONS[name].tally(loop, table, trials) for name, table in scenario.applications.items()
+        }
+        return tally
+
+    def add_slots(self, acted: Acted) -> None:
+        """Add the next slots."""
+        inputs = acted.inputs
+        for application in self.applications.values():
+            if inputs.monitored is not None:
+                application.add_monitored(acted.true, inputs.u, inputs.monitored)
+            application.add(acted.true, inputs.u, acted.estimates)
+        self.trial_slots += inputs.failed.size
+        self.failed += int(np.count_nonzero(inputs.failed))
+        clipped = self._plant.clips(inputs.u)
+        self.clipped += int(np.count_nonzero(clipped))
+        self.of_trials[0] += len(clipped)
+        self.of_trials[1:3] += np.count_nonzero(inputs.failed, axis=0), np.count_nonzero(clipped, axis=0)
+        if self._offset is None:
+            return
+        error = acted.x - acted.estimates[LEGITIMATE]
+        for row, (action, u) in enumerate(zip(acted.action, inputs.u, strict=True)):
+            error[row] -= self._sign * self._offset.next(action, u)
+        error *= error
+        self.other_error += float(error.sum(axis=(1, 2)).sum())
+        self.of_trials[3] += error.sum(axis=(0, 1))
+
+    @classmethod
+    def merged(cls, parts: Sequence[LoopTally | None]) -> LoopTally | None:
+        """The totals of several sets of trials, in order."""
+        known = [part for part in parts if part is not None]
+        if not known:
+            return None
+        whole = copy(known[0])
+        for part in known[1:]:
+            whole.trial_slots += part.trial_slots
+            whole.failed += part.failed
+            whole.clipped += part.clipped
+            whole.other_error += part.other_error
+        whole.of_trials = np.concatenate([part.of_trials for part in known], axis=1)
+        whole.applications = {
+            name: type(one).merged([part.applications[name] for part in known])
+            for name, one in known[0].applications.items()
+        }
+        return whole
+
+    def summary(
+        self, scenario: Scenario, user: PeerSummary, times: SolveTimes, digest: str | None
+    ) -> ControllerSummary:
+        """The summary's entry on the controller; user: its entry on the legitimate estimator."""
+        assert scenario.controller is not None  # noqa: S101 - else there is no tally
+        knows = scenario.legitimate.knows_input
+        errors = [
+            user.figure("mean_squared_error"),
+            self.other_error / self.trial_slots if self._offset and self.trial_slots else None,
+        ]
+        return ControllerSummary(
+            strategy=scenario.controller.strategy,
+            period=scenario.controller.period,
+            acts_on=scenario.controller.acts_on,
+            knows_input=knows,
+            decisions=times.decisions,
+            mean_solve_seconds=times.mean,
+            longest_solve_seconds=times.longest,
+            failed_fraction=self.failed / self.trial_slots if self.trial_slots else None,
+            clipped_fraction=self.clipped / self.trial_slots if self.trial_slots else None,
+            mean_squared_errors=dict(zip(ESTIMATORS, errors[::-1] if knows else errors, strict=True)),
+            mean_trace_covariance=user.figure("mean_trace_covariance"),
+            digest=digest,
+            standard_errors=self._standard_errors(user, knows),
+        )
+
+    def _standard_errors(self, user: PeerSummary, knows: bool) -> StandardErrors:
+        """The standard errors of the figures; user: the summary's entry on the legitimate estimator."""
+        slots, *totals = self.of_trials
+        alike = bool(slots.all()) and bool((slots == slots[0]).all())
+        failed, clipped, other = (standard_error(total / slots) if alike else None for total in totals)
+        errors = [user.standard_errors.get("mean_squared_error"), other if self._offset else None]
+        return {
+            "failed_fraction": failed,
+            "clipped_fraction": clipped,
+            "mean_squared_errors": dict(zip(ESTIMATORS, errors[::-1] if knows else errors, strict=True)),
+            "mean_trace_covariance": user.standard_errors.get("mean_trace_covariance"),
+        }

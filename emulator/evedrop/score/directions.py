@@ -1,0 +1,72 @@
+"""Errors and verdicts by direction: of vᵀx for the scenario's directions v.
+
+Source: docs/mathematics.md, verdicts by direction; docs/results.md, directions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from evedrop.model.figures.standard_error import standard_error
+from evedrop.names import LEGITIMATE
+from evedrop.scenario.expected.expectations import Expectation
+from evedrop.score.rare_events import rare_events_of, z_of_error
+from evedrop.score.summary import DirectionSummary, RareEvents
+from evedrop.score.sums import DirectionErrors, Tally, window_means
+from evedrop.score.verdict import Verdict, perfect_verdict, relative_verdict, sign_of_mean, sign_of_median
+
+
+def directions_of(
+    tallies: Mapping[str, Tally], expected: Mapping[str, Expectation]
+) -> dict[str, dict[str, DirectionSummary]]:
+    """Receiver → direction → its entry; empty without directions, and in a run without estimates."""
+    found: dict[str, dict[str, DirectionSummary]] = {}
+    user = tallies[LEGITIMATE]
+    for receiver, tally in tallies.items():
+        for name, errors in tally.directions.items():
+            if not errors.done:
+                continue
+            one = _measured(errors, expected[receiver], rare_events_of(expected[receiver], tally))
+            if receiver != LEGITIMATE:
+                pair = (expected[LEGITIMATE], expected[receiver])
+                one = _judged(one, found[LEGITIMATE][name], (user.directions[name], errors), pair)
+            found.setdefault(receiver, {})[name] = one
+    return found
+
+
+def _measured(errors: DirectionErrors, expected: Expectation, rare: RareEvents | None) -> DirectionSummary:
+    """The error, and what theory knows of it; rare: the receiver's rare events."""
+    means = errors.window_errors.sum(axis=0) / errors.done
+    mean, series = float(np.mean(means)), None if expected.of_model else expected.along(errors.v, errors.done)
+    scatter = None if expected.infinite_variance else standard_error(means)
+    theory = None if series is None else float(np.mean(series))
+    growth = None if expected.of_model else expected.growth
+    z = z_of_error(means, theory, expected, errors.done, rare)
+    return DirectionSummary(mean, scatter, theory, z, None if growth is None else growth.along(errors.v))
+
+
+def _judged(
+    one: DirectionSummary,
+    user: DirectionSummary,
+    errors: tuple[DirectionErrors, DirectionErrors],
+    expected: tuple[Expectation, Expectation],
+) -> DirectionSummary:
+    """The entry of an eavesdropper with its verdict; errors, expected: the user's and the eavesdropper's."""
+    promised = None
+    if user.unbounded is not None and one.unbounded is not None:
+        promised = one.unbounded and not user.unbounded
+    relative, perfect = Verdict.UNDECIDED, Verdict.FAILED if promised is False else Verdict.UNDECIDED
+    if all(each.done == each.slots for each in errors):
+        heavy = any(each.infinite_variance for each in expected)
+        test = sign_of_median if heavy else sign_of_mean
+        legitimate, other = (window_means(each) for each in errors)
+        relative, _ = relative_verdict(other - legitimate, test, errors[0].slots)
+        if promised is not False:
+            series = expected[0].along(errors[0].v, errors[0].slots)
+            bound = math.inf if series is None or user.unbounded else float(np.max(series))
+            perfect = perfect_verdict(other, legitimate, bound, test)
+    return replace(one, relative=relative.value, perfect=perfect.value, perfect_by_theory=promised)

@@ -1,0 +1,142 @@
+"""Whether a run met its expectations: the value found, the value expected, and how to reproduce a failure.
+
+Source: docs/scenario.md, expect; docs/results.md, expectations.
+"""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from evedrop.model.links.link import REASONS
+from evedrop.scenario.application import APPLICATIONS, Summary
+from evedrop.scenario.expect import ExpectTable, direction_figure, link_figure
+from evedrop.scenario.tables import Scenario
+from evedrop.score.summary import MODES, DirectionSummary, Found, Judged, LinkSummary, PeerSummary
+from evedrop.score.sums import Tally
+from evedrop.score.verdict import Secrecy, Verdict
+from evedrop.score.watched import watch_of
+
+_THEORY = {True: "theory promises it", False: "theory denies it", None: "no theory covers these links"}
+_RUN = {Verdict.HELD.value: "the run shows it", Verdict.FAILED.value: "the run shows that it fails"}
+
+
+def replay_of(folder: Path, scenario: Scenario, mode: str = "live") -> str:
+    """The command that repeats the run in a results folder, to the same bits."""
+    return repeating(folder, scenario.trials, mode)
+
+
+def repeating(folder: Path, trials: int, mode: str) -> str:
+    """The same; trials: of the run, mode: as in the summary."""
+    where = shlex.quote(str(folder.absolute()))
+    if mode == "live":
+        return f"evedrop run {where}"
+    return f"evedrop montecarlo {where} --trials {trials}{MODES[mode]}"
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The results of a run by receiver."""
+
+    scenario: Scenario
+    peers: Mapping[str, PeerSummary]
+    links: Mapping[str, LinkSummary]
+    tallies: Mapping[str, Tally]
+    secrecy: Mapping[str, Secrecy]
+    applications: Mapping[str, Summary] = field(default_factory=dict)
+    """Application → its entry of the summary."""
+    directions: Mapping[str, Mapping[str, DirectionSummary]] = field(default_factory=dict)
+    """As in the summary."""
+
+    def judged(self, replay: str | None) -> list[Judged]:
+        """Every expectation of the scenario; `replay` is the command that reproduces a failure."""
+        return [self._judged(expect, replay) for expect in self.scenario.expect]
+
+    def _judged(self, expect: ExpectTable, replay: str | None) -> Judged:
+        judge = {"figure": self._figure, "link": self._link, "secrecy": self._secrecy, "in_step": self._in_step}
+        found, held = judge[expect.kind](expect)
+        return Judged(expect.text, held, found, expect.wanted, replay if held is False else None)
+
+    def _figure(self, expect: ExpectTable) -> tuple[float | None, bool | None]:
+        name = str(expect.figure)
+        link = link_figure(name)
+        application, *path = name.split(".")
+        direction = direction_figure(name)
+        if direction is not None:
+            entry = self.directions.get(direction[0], {}).get(direction[1])
+            found = None if entry is None else entry.mean_squared_error
+        elif application in self.scenario.applications:
+            summary = self.applications.get(application)
+            found = None if summary is None else APPLICATIONS[application].figure(summary, path)
+        else:
+            found = self._of_link(*link) if link is not None else self._of_receiver(expect, *name.split("."))
+        return found, None if found is None else expect.holds(found)
+
+    def _of_link(self, receiver: str, path: tuple[str, ...]) -> float | None:
+        """A figure of a link's account, or of its losses by reason: 0 for a reason that did not occur."""
+        entries: Mapping[str, object] = vars(self.links[receiver])
+        *place, figure = path
+        for part in place:
+            inner = entries.get(part)
+            entries = inner if isinstance(inner, Mapping) else {}
+        value = entries.get(figure, 0 if place == ["lost_by"] and figure in REASONS else None)
+        return value if isinstance(value, (int, float)) else None
+
+    def _of_receiver(self, expect: ExpectTable, receiver: str, figure: str) -> float | None:
+        """A figure of the whole run or of some slots, or a quantile of it over trials."""
+        whole = self.peers[receiver].figure(figure)
+        wanted = watch_of(self.scenario, expect)
+        if whole is None or wanted is None:
+            return whole
+        if self.tallies[receiver].done < wanted[1].end:
+            return None
+        tally = self.tallies[receiver].watched.tally(wanted[1])
+        if expect.quantile is None:
+            return tally.value
+        found = tally.of_trials
+        return None if found is None else float(np.quantile(found, expect.quantile))
+
+    def _link(self, expect: ExpectTable) -> tuple[Found, bool | None]:
+        account = self.links[str(expect.link)]
+        return account.rate, account.within_interval
+
+    def _secrecy(self, expect: ExpectTable) -> tuple[Found, bool | None]:
+        """Held if theory promises secrecy and the run shows it, otherwise not; undecided in a run that was cut short."""
+        if expect.direction is not None:
+            return self._secrecy_in(expect)
+        verdict = self.secrecy[str(expect.against)]
+        relative = expect.secrecy == "relative"
+        shown = verdict.relative if relative else verdict.perfect
+        promised = verdict.relative_by_theory if relative else verdict.perfect_by_theory
+        found = f"{_THEORY[promised]}, {_RUN.get(shown.value, f'the run has {shown.value}')}"
+        complete = all(tally.done == tally.slots for tally in self.tallies.values())
+        return found, promised is True and shown is Verdict.HELD if complete else None
+
+    def _secrecy_in(self, expect: ExpectTable) -> tuple[Found, bool | None]:
+        """The same in one direction, where theory only promises perfect secrecy: relative secrecy is what the run shows."""
+        verdict = self.directions.get(str(expect.against), {}).get(str(expect.direction))
+        if verdict is None:
+            return None, None
+        relative = expect.secrecy == "relative"
+        shown = str(verdict.relative if relative else verdict.perfect)
+        promise = "" if relative else f"{_THEORY[verdict.perfect_by_theory]}, "
+        run = _RUN.get(shown, f"the run has {shown}")
+        held = shown == Verdict.HELD.value and (relative or verdict.perfect_by_theory is True)
+        complete = all(tally.done == tally.slots for tally in self.tallies.values())
+        return f"{promise}{run}", held if complete else None
+
+    def _in_step(self, expect: ExpectTable) -> tuple[Found, bool | None]:
+        """The slot by which it was in step in all trials; undecided if the run was cut short before `by`."""
+        wanted = watch_of(self.scenario, expect)
+        assert wanted is not None  # noqa: S101 - every such expectation has one
+        tally = self.tallies[wanted[0]]
+        by = math.inf if expect.by is None else expect.by
+        if tally.done <= by and tally.done < tally.slots:
+            return None, None
+        found = tally.watched.tally(wanted[1]).value
+        return found, found is not None and found <= by

@@ -1,0 +1,104 @@
+"""Errors against the true state, for a sensor that filters: it sends an estimate, so these differ from the usual errors.
+
+Source: docs/results.md, filter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy
+from typing import final
+
+import numpy as np
+
+from evedrop.model.figures.standard_error import standard_error, z_of
+from evedrop.model.kernels.elementary import sum_in_order
+from evedrop.model.local_filter import LocalFilter, Steps
+from evedrop.model.process import Floats
+from evedrop.model.streams import Batch
+from evedrop.names import SENSOR
+from evedrop.scenario.tables import Scenario
+from evedrop.score.summary import FilterSummary
+from evedrop.score.sums import squared_errors
+
+
+def local_filter_of(
+    scenario: Scenario, key: bytes, batch: Batch, spoofing: Callable[[int, Floats], Floats] | None = None
+) -> LocalFilter | None:
+    """The sensor's filter; None if the sensor knows the state. spoofing: as for `LocalFilter`."""
+    driven = scenario.driven
+    if driven is None or driven.output_matrix is None:
+        return None
+    return LocalFilter(scenario.process.process, driven, key, batch, spoofing)
+
+
+def true_errors(true: Floats, x: Floats, x_hats: Mapping[str, Floats]) -> dict[str, Floats]:
+    """Squared errors against the true state (c, n, R): of the sensor's estimate x, and of the receivers', (c, R) each."""
+    return {SENSOR: squared_errors(true, x), **{name: squared_errors(true, x_hat) for name, x_hat in x_hats.items()}}
+
+
+@final
+class FilterTally:
+    """Sums of errors against the true state, over the slots and trials so far."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        """Slots times trials so far."""
+        self.slots = 0
+        self.sums: dict[str, float] = {}
+        """Sensor or receiver → sum of squared errors."""
+        self.of_trials: dict[str, Floats] = {}
+        """The same for each trial, (R,)."""
+
+    @classmethod
+    def from_scenario(cls, scenario: Scenario) -> FilterTally | None:
+        """A tally for a scenario; None if its sensor knows the state."""
+        driven = scenario.driven
+        return None if driven is None or driven.output_matrix is None else cls()
+
+    def add_errors(self, errors: Mapping[str, Floats]) -> None:
+        """Add the next slots, errors as from `true_errors`, (c, R) each."""
+        self.slots += len(errors[SENSOR])
+        self.count += errors[SENSOR].size
+        for name, error in errors.items():
+            self.sums[name] = self.sums.get(name, 0.0) + float(error.sum(axis=1).sum())
+            self.of_trials[name] = self.of_trials.get(name, 0.0) + error.sum(axis=0)
+
+    @classmethod
+    def merged(cls, parts: Sequence[FilterTally | None]) -> FilterTally | None:
+        """The sums of several sets of trials, in order."""
+        known = [part for part in parts if part is not None]
+        if not known:
+            return None
+        whole = copy(known[0])
+        whole.sums = dict(whole.sums)
+        for part in known[1:]:
+            whole.slots = min(whole.slots, part.slots)
+            whole.count += part.count
+            for name, value in part.sums.items():
+                whole.sums[name] = whole.sums.get(name, 0.0) + value
+        whole.of_trials = {
+            name: np.concatenate([part.of_trials[name] for part in known]) for name in known[0].of_trials
+        }
+        return whole
+
+    def summary(self, scenario: Scenario) -> FilterSummary:
+        """The summary's entry on the filter."""
+        driven = scenario.driven
+        assert driven is not None  # noqa: S101 - else there is no tally
+        steps = Steps(scenario.process.process, driven)
+        traces: list[float] = []
+        last = 0.0
+        while len(traces) < self.slots and not steps.settled:
+            last = float(np.trace(steps.next().covariance))
+            traces.append(last)
+        mean = (sum_in_order(traces) + (self.slots - len(traces)) * last) / max(1, self.slots)
+        errors = {name: value / max(1, self.count) for name, value in self.sums.items()}
+        own = errors.pop(SENSOR, None)
+        mean_trace = mean if self.slots else None
+        alike = all(self.slots * len(one) == self.count for one in self.of_trials.values())
+        spread = {name: standard_error(one / self.slots) if alike else None for name, one in self.of_trials.items()}
+        error, own_of_trials = spread.pop(SENSOR, None), self.of_trials.get(SENSOR)
+        z = z_of(own_of_trials / self.slots, mean_trace) if alike and self.slots and own_of_trials is not None else None
+        of_mean = {"mean_squared_error": error, "mean_true_squared_errors": spread}
+        return FilterSummary(mean_trace, own, errors, of_mean, z)

@@ -1,0 +1,148 @@
+"""What the packets that an eavesdropper received reveal without the secret: states in clear, and bits of other packets.
+
+Source: docs/mathematics.md, leak in bits.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple, final
+
+import numpy as np
+
+from evedrop.model.block_sums import added_in_order
+from evedrop.model.figures.standard_error import standard_error, z_of
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Action, Codes, Flags
+from evedrop.model.schedule import StateProbability, in_slots
+from evedrop.model.schemes import scheme_of
+from evedrop.model.slot.link_law import law_of
+from evedrop.model.theory.leaked_bits import RevealedBits
+from evedrop.names import LEGITIMATE
+from evedrop.scenario.tables import Scenario
+from evedrop.score.summary import LeakSummary
+
+
+class PacketBits(NamedTuple):
+    """What the packets of c slots reveal without the secret."""
+
+    by_type: Floats
+    """Bits of a packet with ν = 0, and of one with ν = 1, (c, 2); inf for the state itself."""
+    clear: Floats
+    """The probability that it is the state itself, (c,)."""
+    hidden_bits: Floats
+    """The expected bits of a packet that is not, times the probability of such a packet, (c,)."""
+
+
+class HeardBits(NamedTuple):
+    """What the packets of c slots reveal to the receiver behind one link."""
+
+    by_type: Floats
+    """Bits of a packet with ν = 0, and of one with ν = 1, (c, 2); inf for the state itself."""
+    expected: Floats | None
+    """Theory: bits that packets other than states reveal, (c,); None if theory does not cover the link."""
+
+
+@final
+class LeakTally:
+    """The bits, and the states in clear, that R trials received, summed over slots from slot 0 on."""
+
+    def __init__(self, trials: int) -> None:
+        self._bits, self._clear = np.zeros(trials), np.zeros(trials)
+        self._expected = np.zeros(1)  # NaN without theory
+        self.slots = 0
+        """The number of slots so far; 0 in a mode without packets."""
+
+    def add_slots(self, action: Codes, nu: Flags, revealed: HeardBits) -> None:
+        """Add the next slots: the receiver's actions, and the packets' types, (c, R) each."""
+        self.slots += len(action)
+        of_state, of_other = revealed.by_type.T[:, :, None]
+        bits = np.where(action == Action.LOST, 0.0, np.where(nu, of_other, of_state))
+        clear = np.isinf(bits)
+        self._bits = added_in_order(self._bits, np.where(clear, 0.0, bits))
+        self._clear += clear.sum(axis=0)
+        expected = np.full(len(action), math.nan) if revealed.expected is None else revealed.expected
+        self._expected = added_in_order(self._expected, expected[:, None])
+
+    @classmethod
+    def merged(cls, parts: Sequence[LeakTally]) -> LeakTally:
+        """The sums of disjoint sets of trials, in their order; of no slots if the trials were cut short at different slots."""
+        whole = cls(0)
+        whole._bits = np.concatenate([part._bits for part in parts])
+        whole._clear = np.concatenate([part._clear for part in parts])
+        whole._expected = parts[0]._expected
+        whole.slots = parts[0].slots if len({part.slots for part in parts}) == 1 else 0
+        return whole
+
+    @property
+    def summary(self) -> LeakSummary | None:
+        """The entry of the summary; None without slots."""
+        if not self.slots:
+            return None
+        means = self._bits / self.slots
+        bits, error = float(np.mean(means)), standard_error(means)
+        total = float(self._expected[0])
+        expected = None if math.isnan(total) else total / self.slots
+        clear = float(np.mean(self._clear)) / self.slots
+        return LeakSummary(clear, bits, error, expected, z_of(means, expected))
+
+
+def leak_is_known(scenario: Scenario, receiver: str) -> bool:
+    """Whether it is known what the packets that a receiver hears reveal.
+
+    Not for the legitimate estimator, which has the secret, for schemes that do not say what their packets reveal, for packets
+    that may come late, and for a plant, whose noise is not the one that theory describes.
+    """
+    if receiver == LEGITIMATE or scenario.of_model or scenario.window(receiver):
+        return False
+    return scheme_of(scenario.process.process, scenario.encoding.spec).revealed_bits() is not None
+
+
+@final
+class PacketBitsStream:
+    """What a scenario's packets reveal, a number of slots at a time from slot 0 on."""
+
+    def __init__(self, mu_d: StateProbability, revealed: RevealedBits) -> None:
+        """mu_d: the probability of ν = 0."""
+        self._mu_d, self._revealed, self._first = mu_d, revealed, 0
+
+    def next(self, slots: int) -> PacketBits:
+        """What those of the next slots reveal."""
+        known, some = self._revealed.next(slots), range(self._first, self._first + slots)
+        self._first = some.stop
+        state = np.where(np.arange(some.start, some.stop) == 0, 1.0, in_slots(self._mu_d, some))
+        clear, hidden = np.zeros(slots), np.zeros(slots)
+        for odds, bits in zip((state, 1.0 - state), known, strict=True):
+            clear += np.where(np.isinf(bits), odds, 0.0)
+            hidden += np.where(np.isinf(bits), 0.0, bits) * odds
+        return PacketBits(np.stack(known, axis=1), clear, hidden)
+
+
+def revealed_by_packets(scenario: Scenario) -> PacketBitsStream | None:
+    """What the scenario's packets reveal; None if its scheme does not say."""
+    scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
+    revealed = scheme.revealed_bits()
+    return None if revealed is None else PacketBitsStream(scheme.mu_d, revealed)
+
+
+@final
+class HeardBitsStream:
+    """What packets reveal to each receiver for which it is known, a number of slots at a time from slot 0 on."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        names = [name for name in scenario.receivers if leak_is_known(scenario, name)]
+        self._packets = revealed_by_packets(scenario) if names else None
+        self._laws = {name: law_of(scenario.schedule(name)) for name in names}
+        self._first = 0
+
+    def next(self, slots: int) -> dict[str, HeardBits]:
+        """Receiver → what the packets of the next slots reveal to it."""
+        if self._packets is None:
+            return {}
+        packets, some = self._packets.next(slots), range(self._first, self._first + slots)
+        self._first = some.stop
+        return {
+            name: HeardBits(packets.by_type, None if law is None else law.rates(some) * packets.hidden_bits)
+            for name, law in self._laws.items()
+        }

@@ -1,0 +1,40 @@
+"""What rare events carry of a receiver's expected error, and the z-score of an error that they do not carry.
+
+Source: docs/mathematics.md, rare events and z-scores.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from evedrop.model.figures.standard_error import mean_skewness, z_of
+from evedrop.model.process import Floats
+from evedrop.scenario.expected.expectations import Expectation
+from evedrop.score.summary import RARE_SHARE, RareEvents
+from evedrop.score.sums import Tally
+
+_LARGEST_SKEWNESS = 0.3
+"""Of a mean whose rare events are unknown. Beyond it the correction of a z-score is too small."""
+
+
+def rare_events_of(expected: Expectation, tally: Tally) -> RareEvents | None:
+    """The rare events of a receiver over the slots so far; None if they are unknown."""
+    streaks = expected.streaks(tally.done) if tally.alike else None
+    return None if streaks is None else RareEvents(streaks.share(tally.trials), streaks.trials_for(RARE_SHARE))
+
+
+def z_of_error(
+    of_trials: Floats | None, theory: float | None, expected: Expectation, slots: int, rare: RareEvents | None
+) -> float | None:
+    """The z-score of a mean error over slots 0 … slots−1, from the mean error of every trial, (R,), and theory's.
+
+    rare: the receiver's rare events, None if they are unknown: then the trials must not be skewed too much. None where rare
+    events carry more than RARE_SHARE of the expectation, where the variance is infinite, and as from `z_of`.
+    """
+    if theory is None or expected.infinite_variance or (rare is not None and rare.share > RARE_SHARE):
+        return None
+    if rare is None and of_trials is not None and abs(mean_skewness(of_trials)) > _LARGEST_SKEWNESS:
+        return None
+    if of_trials is None or not slots or expected.is_rounding(max(theory, float(np.mean(of_trials))), slots):
+        return None
+    return z_of(of_trials, theory)

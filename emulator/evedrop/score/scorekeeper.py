@@ -1,0 +1,284 @@
+"""Scores a run, live or in memory: compares every slot with theory, keeps a tally per receiver, and makes the summary.
+
+The summary is described in docs/results.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import NamedTuple, final
+
+import numpy as np
+
+from evedrop.model.digest import Digests, RunDigest, block_starts
+from evedrop.model.figures import figures_of
+from evedrop.model.figures.figure import COVARIANCE_ONLY, ScoredSlots
+from evedrop.model.process import Floats
+from evedrop.names import CONTROLLER, LEGITIMATE
+from evedrop.scenario.expected.expectations import Expectation, ExpectedTraceStream, expectations_of
+from evedrop.scenario.news import ConnectionOutage, RunEvent
+from evedrop.scenario.tables import Scenario
+from evedrop.score.channel import link_summary_of
+from evedrop.score.closed_loop_tally import Acted
+from evedrop.score.directions import directions_of
+from evedrop.score.expectations_held import Evidence
+from evedrop.score.filtering import true_errors
+from evedrop.score.histogram import LEVELS
+from evedrop.score.leak import HeardBitsStream
+from evedrop.score.rare_events import rare_events_of, z_of_error
+from evedrop.score.slots import Slots
+from evedrop.score.summary import PeerSummary, Summary, Surprising, Verification
+from evedrop.score.sums import SlotSums, Tally, slot_sums, squared_errors, trial_means
+from evedrop.score.totals import Totals
+from evedrop.score.verdict import Secrecy, secrecy
+
+_ENOUGH_TO_SURPRISE = 10  # trials
+
+
+class Scored(NamedTuple):
+    """One receiver over c slots, scored."""
+
+    squared_error: Floats
+    """(c, R)."""
+    sums: SlotSums
+    expected: Floats
+    """Theory: trace of the expected actual error covariance, (c,)."""
+
+
+@final
+class Scorekeeper:
+    """Scores the slots of a batch of trials, in order.
+
+    theory: receiver → its expected traces; computed if it is not given.
+    """
+
+    def __init__(
+        self, scenario: Scenario, trials: int, theory: Mapping[str, ExpectedTraceStream] | None = None
+    ) -> None:
+        if theory is None:
+            theory = {name: one.stream() for name, one in expectations_of(scenario).items()}
+        self._theory = theory
+        self._revealed = HeardBitsStream(scenario)
+        self.totals = Totals.from_scenario(scenario, trials)
+
+    def add_slots(self, slots: Slots, known: Mapping[str, tuple[Floats, Floats]] | None = None) -> dict[str, Scored]:
+        """Score the next slots: receiver → its errors, sums and theory.
+
+        known: receiver → its squared errors, and tr P of every trial, (c, R) each, if they have been computed.
+        """
+        scored = {}
+        self._add_plant(slots)
+        revealed = self._revealed.next(slots.count)
+        for name, receiver in slots.receivers.items():
+            if known is None:
+                errors, traces = squared_errors(slots.x, receiver.x_hat), receiver.traces_of_trials
+            else:
+                errors, traces = known[name]
+            one = Scored(
+                errors, slot_sums(errors, receiver.action, receiver.trace), self._theory[name].next_traces(slots.count)
+            )
+            tally = self.totals.tallies[name]
+            tally.add_slots(slots.first, *one)
+            if tally.conditional is not None:
+                tally.conditional.add_actions(receiver.action)
+            if tally.leak is not None:
+                tally.leak.add_slots(receiver.action, slots.nu, revealed[name])
+            for direction in tally.directions.values():
+                direction.add_slots(slots.first, slots.x, receiver.x_hat)
+            tally.add_traces(slots.first, traces)
+            tally.account(receiver.delivered, receiver.action, receiver.lost, receiver.unsent)
+            if slots.sent is not None:
+                tally.account_sent(slots.sent, receiver.delivered, receiver.unsent)
+            late = None
+            if receiver.late is not None and receiver.late_used is not None and receiver.late_delivered is not None:
+                late = (receiver.late, receiver.late_used)
+                tally.account_late(receiver.late_delivered, *late)
+            tally.watched.add_slots(
+                ScoredSlots(
+                    slots.first, errors, receiver.action, one.sums.trace, one.expected, late, slots.x, receiver.x_hat
+                )
+            )
+            scored[name] = one
+        return scored
+
+    def _add_plant(self, slots: Slots) -> None:
+        """Add the slots' alarms, the controller's decisions, and the true errors of a sensor that filters."""
+        totals, estimates = self.totals, {name: one.x_hat for name, one in slots.receivers.items()}
+        if slots.alarms is not None and totals.detection is not None:
+            totals.detection.add_alarms(slots.first, slots.alarms)
+        if slots.true is not None and totals.filter is not None:
+            totals.filter.add_errors(true_errors(slots.true, slots.x, estimates))
+        if slots.inputs is not None and totals.loop is not None:
+            true = slots.x if slots.true is None else slots.true
+            totals.loop.add_slots(Acted(slots.inputs, slots.x, estimates, slots.receivers[LEGITIMATE].action, true))
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a run ended."""
+
+    wall_seconds: float
+    """From the start command to the last row on disk."""
+    how: str = "complete"
+    """`complete`, `interrupted`, or why it failed."""
+    replay: str | None = None
+    """The command that runs it again, shown when an expectation fails."""
+    mode: str = "live"
+    """`live`, or the mode of a run in memory."""
+    events: Sequence[RunEvent] = ()
+    outages: Sequence[ConnectionOutage] = ()
+    accused: tuple[str, ...] = ()
+    """The processes whose misbehaviour ended the run."""
+    misdelivered: Mapping[str, int] = field(default_factory=dict)
+    """Process → messages with other processes' keys, which it dropped."""
+
+
+def verdicts(scenario: Scenario, tallies: Mapping[str, Tally]) -> list[Secrecy]:
+    """The verdict on every eavesdropper."""
+    expected = expectations_of(scenario)
+    user = (tallies[LEGITIMATE], expected[LEGITIMATE])
+    return [secrecy(user, (name, tallies[name], expected[name])) for name in scenario.eavesdroppers]
+
+
+def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | None], ending: Ending) -> Summary:
+    """The summary of a run; digests: process → its digest, None if it has none or the run was cut short.
+
+    An accused process has no digest either, because its reports were contradicted. A run to the end in which a package's
+    figure failed is not `complete`: it ended with that failure.
+    """
+    tallies, detection, loop = totals.tallies, totals.detection, totals.loop
+    digests = {name: None if name in ending.accused else one for name, one in digests.items()}
+    expected = expectations_of(scenario)
+    peers = {name: _peer(name, tally, expected[name], digests[name], ending.mode) for name, tally in tallies.items()}
+    applications = {} if loop is None else {name: one.entry() for name, one in loop.applications.items()}
+    user = tallies[LEGITIMATE]
+    links = {name: link_summary_of(scenario, name, tally) for name, tally in tallies.items()}
+    secret = {one.eavesdropper: one for one in verdicts(scenario, tallies)}
+    directions = directions_of(tallies, expected)
+    expectations = Evidence(scenario, peers, links, tallies, secret, applications, directions).judged(ending.replay)
+    # Known only now that every figure has been computed.
+    failures = totals.failures if ending.how == Ending.how else []
+    return Summary(
+        scenario=scenario.title,
+        mode=ending.mode,
+        seed=scenario.seed,
+        slots=user.done,
+        trials=user.trials,
+        first_trial=scenario.first_trial,
+        wall_seconds=ending.wall_seconds,
+        slots_per_second=user.offered / user.trials / ending.wall_seconds if ending.wall_seconds else 0.0,
+        ended=failures[0] if failures else ending.how,
+        peers=peers,
+        links=links,
+        events=ending.events,
+        outages=ending.outages,
+        verification=verification_of(scenario, ending.accused) if ending.mode == "live" else None,
+        misdelivered=ending.misdelivered,
+        secrecy={name: one.summary for name, one in secret.items()},
+        detection=None if detection is None else detection.summary(scenario),
+        controller=None
+        if loop is None
+        else loop.summary(scenario, peers[LEGITIMATE], totals.solve_times, digests[CONTROLLER]),
+        filter=None if totals.filter is None else totals.filter.summary(scenario),
+        applications=applications,
+        surprising=_surprising(scenario, tallies),
+        expectations=expectations,
+        directions=directions,
+    )
+
+
+def _peer(name: str, tally: Tally, expected: Expectation, digest: str | None, mode: str) -> PeerSummary:
+    """A receiver's entry of the summary."""
+    infinite_variance = expected.infinite_variance
+    figures: dict[str, float | None] = {}
+    of_mode: dict[str, float | None] = {}
+    errors: dict[str, float | None] = {}
+    for figure, one in figures_of(name).items():
+        if one.only_in_mode not in {None, mode}:
+            continue
+        found = None if one.not_in_mode == mode else tally.figure(figure)
+        (figures if one.only_in_mode is None else of_mode)[figure] = found
+        if one.rests_on != "theory":
+            meaningless = found is None or (one.of_error and infinite_variance)
+            errors[figure] = None if meaningless else tally.standard_error(figure)
+    known, comparable = {**figures, **of_mode}, not expected.of_model or mode == COVARIANCE_ONLY
+    rare = rare_events_of(expected, tally) if comparable else None
+    z = {
+        figure: z_of_error(tally.of_trials(figure), known[one.expected], expected, tally.done, rare)
+        if comparable and known[figure] is not None
+        else None
+        for figure, one in figures_of(name).items()
+        if one.expected is not None and figure in errors
+    }
+    return PeerSummary(figures, _quantiles(tally), infinite_variance, digest, of_mode, errors, z, rare)
+
+
+def _quantiles(tally: Tally) -> dict[str, float] | None:
+    """Quantiles over trials of a trial's mean error; None if the run was cut short."""
+    if tally.done != tally.slots:
+        return None
+    return {f"{level:g}": float(np.quantile(trial_means(tally), level)) for level in LEVELS}
+
+
+def _surprising(scenario: Scenario, tallies: Mapping[str, Tally]) -> Surprising | None:
+    """The trial whose mean error, for any receiver, is least probable, given what happened to its own packets.
+
+    None without such a trial: the run was cut short, has too few trials, or no receiver with such expectations.
+    """
+    found: Surprising | None = None
+    for name, tally in tallies.items():
+        own = tally.conditional
+        if own is None or not own.slots or tally.done != tally.slots or tally.trials < _ENOUGH_TO_SURPRISE:
+            continue
+        means, expected = trial_means(tally), own.expected / tally.slots
+        probability = own.probability(means * tally.slots)
+        # Where probabilities are too small for a float, the error decides.
+        least = int(np.lexsort((-means, np.nan_to_num(probability, nan=1.0)))[0])
+        if expected[least] > 0.0 and (found is None or probability[least] < found.probability):
+            trial = scenario.first_trial + least
+            found = Surprising(trial, name, *(float(one[least]) for one in (means, expected, probability)))
+    return found
+
+
+def digest_of(scenario: Scenario, receiver: str, blocks: Mapping[int, Digests]) -> str | None:
+    """A receiver's digest from all its blocks; None if the run was cut short."""
+    if sorted(blocks) != block_starts(scenario.slots, scenario.outage_bounds(receiver)):
+        return None
+    digest = RunDigest()
+    digest.add(blocks)
+    return digest.hexadecimal
+
+
+def events_of(scenario: Scenario, done: int) -> list[RunEvent]:
+    """The scenario's events before slot `done`."""
+    return [RunEvent(act.at, act.said, "scenario") for act in scenario.timeline.acts if act.at < done]
+
+
+def verification_of(scenario: Scenario, accused: Collection[str] = ()) -> dict[str, Verification]:
+    """The entry `verification` of a live run's summary: receiver → the verified figures, and those that rest on its word.
+
+    accused: processes whose misbehaviour ended the run.
+    """
+    recorded = _recorded_of(scenario)
+    found = {}
+    for name in scenario.receivers:
+        figures = {who: _resting_on(who, name) for who in ("observer", "receiver", "recorded trials")}
+        checked, of_recorded = figures["observer"], [*figures["recorded trials"], "digest"]
+        verified = [] if name in accused else checked + (of_recorded if recorded == scenario.trials else [])
+        own_word = [one for one in (*checked, *figures["receiver"], *of_recorded) if one not in verified]
+        found[name] = Verification(0 if name in accused else recorded, verified, own_word)
+    return found
+
+
+def _resting_on(who: str, receiver: str) -> list[str]:
+    """The figures of a receiver of a live run with this value of `rests_on`."""
+    figures = figures_of(receiver).items()
+    return [name for name, one in figures if one.rests_on == who and one.only_in_mode is None]
+
+
+def _recorded_of(scenario: Scenario) -> int:
+    """The number of recorded trials; each shard records at least its first."""
+    bounds = [scenario.trials * i // scenario.shards for i in range(scenario.shards + 1)]
+    return sum(max(1, min(scenario.record_trials, stop) - start) for start, stop in pairwise(bounds))

@@ -1,0 +1,331 @@
+"""Sums over the trials of every slot, and over the slots of every trial; the summary is made from them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evedrop.model.block_sums import BlockSums, added_in_order
+from evedrop.model.figures import figure
+from evedrop.model.figures.figure import ReceiverTotals, TotalsFigure, TrialTotals
+from evedrop.model.figures.standard_error import standard_error
+from evedrop.model.kernels.current import kernels
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Action, Codes, Flags
+from evedrop.model.slot.account import COUNTED_BURSTS, Account
+from evedrop.score.conditional import ConditionalError
+from evedrop.score.leak import LeakTally
+from evedrop.score.watched import Watched, WatchedSlots
+
+WINDOWS = 8
+"""The number of windows into which slots k ≥ 1 are divided for verdicts; their lengths differ by at most one slot."""
+
+
+@final
+@dataclass
+class SlotSums:
+    """Sums over trials, slot by slot, (c,) each."""
+
+    trials: Floats
+    error: Floats
+    """Squared error, or in a covariance-only study the trace of the actual covariance."""
+    error_squared: Floats
+    trace: Floats
+    """Believed tr P."""
+    trace_squared: Floats
+    received: Floats
+    used: Floats
+
+    @classmethod
+    def zero(cls, slots: int) -> SlotSums:
+        """Sums of no trials, to add to."""
+        return cls(*(np.zeros(slots) for _ in fields(cls)))
+
+    def add_trials(self, first: int, other: SlotSums) -> None:
+        """Add the sums of further trials over some slots from `first` on."""
+        rows = slice(first, first + len(other.error))
+        for one in fields(self):
+            getattr(self, one.name)[rows] += getattr(other, one.name)
+
+    @property
+    def standard_errors(self) -> Floats:
+        """The standard error of the mean error in each slot, (c,); NaN for one trial."""
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            mean = self.error / self.trials
+            variance = np.maximum(0.0, self.error_squared / self.trials - mean * mean)
+            variance = variance * self.trials / (self.trials - 1.0)
+            found: Floats = np.where(self.trials > 1, np.sqrt(variance / self.trials), np.nan)
+        return found
+
+    def measured(self) -> SlotSums:
+        """Only the slots that some trial reached: a run that was cut short lacks the last ones."""
+        rows = slice(0, int(np.count_nonzero(self.trials)))
+        return SlotSums(*(getattr(self, one.name)[rows] for one in fields(self)))
+
+
+def squared_errors(x: Floats, x_hat: Floats) -> Floats:
+    """|x − x̂|² of every slot and trial, (c, R), from (c, n, R)."""
+    return kernels.squared_errors(x, x_hat)
+
+
+def slot_sums(error: Floats, action: Codes, trace: Floats | None = None) -> SlotSums:
+    """The sums of some slots, from error (c, R), action (c, R), and the sums of tr P and of its square, (c, 2).
+
+    trace: if None, the error is tr P itself.
+    """
+    count, trials = error.shape
+    errors, squares = error.sum(axis=1), (error * error).sum(axis=1)
+    counts = kernels.count_codes(action, len(Action))
+    received = trials - counts[:, Action.LOST].astype(np.float64)
+    discarded = counts[:, Action.DISCARDED]
+    return SlotSums(
+        trials=np.full(count, float(trials)),
+        error=errors,
+        error_squared=squares,
+        trace=errors if trace is None else trace[:, 0],
+        trace_squared=squares if trace is None else trace[:, 1],
+        received=received,
+        used=received - discarded,
+    )
+
+
+def window_of(k: NDArray[np.intp], slots: int) -> NDArray[np.intp]:
+    """The window that contains each slot k ≥ 1 of a run of `slots` slots; −1 for k = 0."""
+    return np.where(k == 0, -1, (k - 1) * WINDOWS // max(slots - 1, 1))
+
+
+def window_bounds(slots: int) -> NDArray[np.intp]:
+    """The first slot of each window of a run of `slots` slots, and the slot after the last one, (WINDOWS + 1,)."""
+    return 1 - -np.arange(WINDOWS + 1) * max(slots - 1, 0) // WINDOWS
+
+
+@final
+class DirectionErrors:
+    """The squared errors of vᵀx of one receiver, summed over the slots of each window and trial."""
+
+    def __init__(self, v: Floats, slots: int, trials: int) -> None:
+        """v: the direction, (n,); slots: of the whole run."""
+        self.v, self.slots = v, slots
+        self.window_errors = np.zeros((WINDOWS + 1, trials))
+        """As that of `Tally`."""
+        self.done = 0
+        """The number of slots so far; 0 in a mode without estimates."""
+
+    def add_slots(self, first: int, x: Floats, x_hat: Floats) -> None:
+        """Add the slots from `first` on, from x and x̂, (c, n, R) each."""
+        self.done += len(x)
+        error = np.zeros((len(x), x.shape[2]))
+        for i, weight in enumerate(self.v.tolist()):
+            error += weight * (x[:, i] - x_hat[:, i])
+        windows = window_of(np.arange(first, self.done), self.slots)
+        for window in dict.fromkeys(windows.tolist()):
+            self.window_errors[window] = added_in_order(self.window_errors[window], (error * error)[windows == window])
+
+    @classmethod
+    def merged(cls, parts: Sequence[DirectionErrors]) -> DirectionErrors:
+        """The sums of disjoint sets of trials, in their order."""
+        whole = cls(parts[0].v, parts[0].slots, 0)
+        whole.window_errors = np.concatenate([part.window_errors for part in parts], axis=1)
+        whole.done = min(part.done for part in parts)
+        return whole
+
+
+@final
+@dataclass
+class Tally(ReceiverTotals):
+    """One receiver's totals over a run."""
+
+    slots: int
+    """The number of slots of the whole run."""
+    trials: int
+    watched: Watched = field(default_factory=lambda: Watched((), 0))
+    """Further totals that its figures and expectations need."""
+    done: int = 0
+    """Slots that all trials have reached."""
+    conditional: ConditionalError | None = None
+    """The expected errors given what happened to the packets; None where that does not determine them."""
+    leak: LeakTally | None = None
+    """What its packets reveal without the secret; None where that is unknown."""
+    directions: dict[str, DirectionErrors] = field(default_factory=dict)
+    """The errors in the scenario's directions, by their names."""
+    window_errors: Floats = field(init=False)
+    """Sum of errors of each window and trial, (WINDOWS + 1, R); the last row is slot 0, which is in no window."""
+    bursts: NDArray[np.int64] = field(init=False)
+    """As in `Account`."""
+    delays: NDArray[np.int64] = field(init=False)
+    """As in `Account`; empty until something is counted."""
+    cuts: Sequence[int] = ()
+    """Slots in which an outage of the receiver begins or ends."""
+    packets: NDArray[np.int64] = field(init=False)
+    """Counts of the packets that each trial received, and used, late ones included, (2, R)."""
+
+    def __post_init__(self) -> None:
+        self.window_errors = np.zeros((WINDOWS + 1, self.trials))
+        self.bursts = np.zeros(COUNTED_BURSTS, np.int64)
+        self.delays = np.zeros(0, np.int64)
+        self._finished: Floats | None = np.zeros(self.trials)
+        self._unfinished = BlockSums(self.trials, self.slots, self.cuts)
+        self.packets = np.zeros((2, self.trials), np.int64)
+
+    def add_slots(self, first: int, error: Floats, sums: SlotSums, expected: Floats) -> None:
+        """Add the c slots from `first` on: their errors (c, R), sums, and expected traces (c,)."""
+        count = len(error)
+        self.done += count
+        self.offered += count * self.trials
+        self.error += float(sums.error.sum())
+        self.trace += float(sums.trace.sum())
+        self.expected_trace += float(expected.sum()) * self.trials
+        self.received += int(sums.received.sum())
+        self.used += int(sums.used.sum())
+        windows = window_of(np.arange(first, first + count), self.slots)
+        for window in range(windows[0], windows[-1] + 1):
+            inside = np.flatnonzero(windows == window)
+            if inside.size:
+                self.window_errors[window] += error[inside[0] : inside[-1] + 1].sum(axis=0)
+
+    def add_traces(self, first: int, traces: Floats | None) -> None:
+        """Add tr P of the slots from `first` on and of every trial, (c, R); None if it is not known."""
+        if traces is None:
+            self._finished = None
+        elif self._finished is not None:
+            for sums in self._unfinished.add(range(first, first + len(traces)), traces).values():
+                self._finished = self._finished + sums
+
+    def know_traces(self, traces: Floats) -> None:
+        """Set the sum of tr P over all slots of the run of every trial, (R,), which another process has computed."""
+        self._finished = traces
+
+    @property
+    def traces(self) -> Floats | None:
+        """Sum of tr P of each trial, (R,); None once slots were added whose tr P is not known trial by trial."""
+        return None if self._finished is None else self._finished + self._unfinished.unfinished
+
+    def account(
+        self,
+        delivered: Flags,
+        action: Codes,
+        lost: Mapping[str, NDArray[np.uint32]],
+        unsent: NDArray[np.uint32] | None = None,
+    ) -> None:
+        """Compare the journal with the receiver's action (c, R): delivered in time (c, R), reason → lost (c,), unsent (c,)."""
+        received = action != Action.LOST
+        self.unexplained += int(np.count_nonzero(delivered != received))
+        self.packets[0] += _counts_of_trials(received)
+        self.packets[1] += _counts_of_trials(received & (action != Action.DISCARDED))
+        count = delivered.size - int(np.count_nonzero(delivered))
+        for reason, counts in lost.items():
+            self.lost[reason] = self.lost.get(reason, 0) + int(counts.sum())
+            count -= int(counts.sum())
+        silent = 0 if unsent is None else int(unsent.sum())
+        self.unsent += silent
+        self.late_sent += count - silent
+
+    def account_sent(self, sent: Flags, delivered: Flags, unsent: NDArray[np.uint32] | None) -> None:
+        """Compare the packets that the sensor reports as sent, (c, R), with the journal's delivered (c, R) and unsent (c,)."""
+        silent = np.count_nonzero(~sent, axis=1)
+        self.unexplained += int(np.count_nonzero(delivered & ~sent))
+        self.unexplained += int(np.abs(silent - (0 if unsent is None else unsent.astype(np.int64))).sum())
+
+    def account_late(self, delivered: NDArray[np.uint16], taken: NDArray[np.uint16], used: NDArray[np.uint16]) -> None:
+        """Compare the late packets that the router delivered in each slot, (c, R), with those that the receiver took."""
+        self.late += int(taken.sum())
+        self.late_used += int(used.sum())
+        self.packets += taken.sum(axis=0, dtype=np.int64), used.sum(axis=0, dtype=np.int64)
+        self.unexplained += int(np.count_nonzero(delivered != taken))
+
+    def count(self, account: Account) -> None:
+        """Add a link's bursts and delays."""
+        self.bursts += account.bursts
+        if self.delays.size < account.delays.size:
+            self.delays = np.zeros(account.delays.size, np.int64)
+        self.delays += account.delays
+
+    def figure(self, name: str) -> float | None:
+        """A figure of the run by its name; None if it has no value."""
+        found = figure(name)
+        if not issubclass(found, TotalsFigure):
+            return self.watched.tally(WatchedSlots(name, 0, self.slots)).value
+        value = found.of_totals(self) if self.offered else math.nan
+        return None if math.isnan(value) else value
+
+    @property
+    def alike(self) -> bool:
+        """Whether there are slots, and every trial has the same: trials in memory may be cut short at different slots."""
+        return self.done > 0 and self.offered == self.done * self.trials
+
+    def of_trials(self, name: str) -> Floats | None:
+        """What a figure is the mean of, for every trial, (R,).
+
+        None if the figure is not such a mean, if that is not known, or if trials were cut short at different slots.
+        """
+        found = figure(name)
+        if not (found.averages_trials and self.alike):
+            return None
+        if issubclass(found, TotalsFigure):
+            error: Floats = self.window_errors.sum(axis=0)
+            sums = found.sums_of_trials(TrialTotals(error, self.traces, self.packets[0], self.packets[1]))
+            return None if sums is None else sums / self.done
+        return self.watched.tally(WatchedSlots(name, 0, self.slots)).of_trials if found.by_trial else None
+
+    def standard_error(self, name: str) -> float | None:
+        """The standard error of a figure of the run; None if it has none."""
+        return standard_error(self.of_trials(name))
+
+
+def _counts_of_trials(flags: Flags) -> NDArray[np.int64]:
+    """The number of flags (c, R) that are set in each trial, (R,). Bytes are added up, which takes a tenth of the time."""
+    counts = np.zeros(flags.shape[1], np.int64)
+    for first in range(0, len(flags), _BYTE):
+        counts += flags[first : first + _BYTE].view(np.uint8).sum(axis=0, dtype=np.uint8)
+    return counts
+
+
+_BYTE = 255  # the largest count in a byte
+
+
+def window_means(tally: Tally | DirectionErrors) -> Floats:
+    """Mean squared error of each window and trial, (WINDOWS, R); NaN for windows without slots."""
+    lengths = np.diff(window_bounds(tally.slots))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        means: Floats = tally.window_errors[:WINDOWS] / lengths[:, None]
+    return means
+
+
+def trial_means(tally: Tally | DirectionErrors) -> Floats:
+    """Mean error of every trial over its slots, (R,)."""
+    means: Floats = tally.window_errors.sum(axis=0) / tally.slots
+    return means
+
+
+_COUNTED = [one.name for one in fields(ReceiverTotals) if one.name != "lost"]
+
+
+def merged(parts: Sequence[Tally]) -> Tally:
+    """The tally of several disjoint sets of trials, in their order."""
+    total = Tally(parts[0].slots, sum(part.trials for part in parts))
+    total.watched = Watched.merged([part.watched for part in parts])
+    total.done = min(part.done for part in parts)
+    for part in parts:
+        for name in _COUNTED:
+            setattr(total, name, getattr(total, name) + getattr(part, name))
+        for reason, count in part.lost.items():
+            total.lost[reason] = total.lost.get(reason, 0) + count
+        total.bursts += part.bursts
+        if part.delays.size:
+            total.delays = part.delays + (total.delays if total.delays.size else 0)
+    total.window_errors = np.concatenate([part.window_errors for part in parts], axis=1)
+    conditional = [part.conditional for part in parts if part.conditional is not None]
+    total.conditional = ConditionalError.merged(conditional) if conditional else None
+    for name in parts[0].directions:
+        total.directions[name] = DirectionErrors.merged([part.directions[name] for part in parts])
+    leaks = [part.leak for part in parts if part.leak is not None]
+    total.leak = LeakTally.merged(leaks) if leaks else None
+    total.packets = np.concatenate([part.packets for part in parts], axis=1)
+    traces = [part.traces for part in parts if part.traces is not None]
+    total._finished = np.concatenate(traces) if len(traces) == len(parts) else None
+    return total

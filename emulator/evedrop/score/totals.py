@@ -1,0 +1,77 @@
+"""The totals of a set of trials, updated slot by slot, live or in memory; the summary is made from them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from evedrop.scenario.tables import Scenario
+from evedrop.score.acknowledging import Detection
+from evedrop.score.closed_loop_tally import LoopTally, SolveTimes
+from evedrop.score.conditional import conditional_error_of
+from evedrop.score.filtering import FilterTally
+from evedrop.score.leak import LeakTally, leak_is_known
+from evedrop.score.sums import DirectionErrors, Tally, merged
+from evedrop.score.watched import Watched, watches_of
+
+
+@dataclass(frozen=True)
+class Totals:
+    """The totals of some trials. Those that do not concern receivers are None if the run or its mode does not have them."""
+
+    tallies: Mapping[str, Tally]
+    """Receiver → its tally."""
+    detection: Detection | None = None
+    loop: LoopTally | None = None
+    filter: FilterTally | None = None
+    solve_times: SolveTimes = field(default_factory=SolveTimes)
+
+    @classmethod
+    def nothing(cls, scenario: Scenario, trials: int) -> Totals:
+        """Empty totals with tallies only: of trials without slots, or in a mode without states."""
+        watches = watches_of(scenario)
+        tallies = {
+            name: Tally(scenario.slots, trials, Watched(one, trials), cuts=scenario.outage_bounds(name))
+            for name, one in watches.items()
+        }
+        for name, tally in tallies.items():
+            tally.conditional = conditional_error_of(scenario, name, trials)
+            for direction, v in scenario.process.directions_as_arrays.items():
+                tally.directions[direction] = DirectionErrors(v, scenario.slots, trials)
+            tally.leak = LeakTally(trials) if leak_is_known(scenario, name) else None
+        return cls(tallies)
+
+    @classmethod
+    def from_scenario(cls, scenario: Scenario, trials: int) -> Totals:
+        """Empty totals of trials that are about to begin, in a mode with states."""
+        return cls(
+            cls.nothing(scenario, trials).tallies,
+            Detection(trials),
+            LoopTally.from_scenario(scenario, trials),
+            FilterTally.from_scenario(scenario),
+        )
+
+    def begin(self) -> None:
+        """Make the tallies of packages' figures now, not with the first slot: an example of all that totals consist of."""
+        for tally in self.tallies.values():
+            tally.watched.begin()
+
+    @property
+    def failures(self) -> list[str]:
+        """Why figures of packages failed, in words."""
+        return [failure for tally in self.tallies.values() for failure in tally.watched.failures]
+
+    @classmethod
+    def merged(cls, parts: Sequence[Totals]) -> Totals:
+        """The totals of disjoint sets of trials, in their order."""
+        times = SolveTimes()
+        for part in parts:
+            times.merge(part.solve_times)
+        detections = [part.detection for part in parts if part.detection is not None]
+        return cls(
+            {name: merged([part.tallies[name] for part in parts]) for name in parts[0].tallies},
+            Detection.merged(detections) if detections else None,
+            LoopTally.merged([part.loop for part in parts]),
+            FilterTally.merged([part.filter for part in parts]),
+            times,
+        )

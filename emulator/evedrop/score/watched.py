@@ -1,0 +1,220 @@
+"""Quantities of a receiver that its totals do not have: figures over some slots, packages' figures, when it was in step.
+
+They take a number for each trial and expectation. A trial's numbers are added slot by slot, so they have the same bits
+however its slots and the other trials were divided, live and in memory.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple, TypeVar, final
+
+import numpy as np
+
+from evedrop.errors import NoAnswer
+from evedrop.model.figures import FIGURES, figure, figures_of
+from evedrop.model.figures.figure import FigureTally, ScoredSlots, TotalsFigure
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Action
+from evedrop.model.registry import place_of
+from evedrop.scenario.expect import ExpectTable
+from evedrop.scenario.tables import Scenario
+
+T = TypeVar("T")
+
+
+@final
+class GuardedTally(FigureTally):
+    """The tally of a package's figure, which never raises an error."""
+
+    def __init__(self, name: str, trials: int) -> None:
+        """name: the figure's name."""
+        self._name, self._trials = name, trials
+        self.failure = ""
+        """Why the figure is None, if it failed."""
+        self._tally: FigureTally | None = None
+
+    def begin(self) -> None:
+        """Make the package's tally now, not with the first slot."""
+        self._asked(lambda: self._begun)
+
+    def add(self, slots: ScoredSlots) -> None:
+        """Add the next slots."""
+        self._asked(lambda: self._begun.add(slots))
+
+    @classmethod
+    def merged(cls, parts: Sequence[GuardedTally]) -> GuardedTally:
+        """The totals of disjoint sets of trials, in their order."""
+        whole = cls(parts[0]._name, sum(part._trials for part in parts))
+        whole.failure = next((part.failure for part in parts if part.failure), "")
+        tallies = whole._asked(lambda: [part._begun for part in parts])
+        whole._tally = whole._asked(lambda: type(tallies[0]).merged(tallies)) if tallies else None
+        return whole
+
+    @property
+    def value(self) -> float | None:
+        """The figure over the slots so far; None if it has no value, or if it is not a number."""
+        found = self._asked(lambda: _number(self._begun.value))
+        return None if found is None or math.isnan(found) else found
+
+    @property
+    def of_trials(self) -> Floats | None:
+        """The figure of every trial, (R,); None if it failed."""
+        return self._asked(lambda: _numbers(self._begun.of_trials, self._trials))
+
+    @property
+    def _begun(self) -> FigureTally:
+        if self._tally is None:
+            found: object = figure(self._name).tally(self._trials)
+            if not isinstance(found, FigureTally):
+                raise NoAnswer(f"tally() gave {found!r:.40}; expected a FigureTally")
+            self._tally = found
+        return self._tally
+
+    def fail(self, why: str) -> None:
+        """From now on the figure is None; why: in words."""
+        self.failure, self._tally = f"the figure {self._name} of an installed package failed: {why}", None
+
+    def _asked(self, ask: Callable[[], T]) -> T | None:
+        if not self.failure:
+            try:
+                return ask()
+            except Exception as error:
+                self.fail(place_of(error))
+        return None
+
+
+def _number(found: object) -> float | None:
+    if found is None or (isinstance(found, (int, float, np.number)) and not isinstance(found, bool)):
+        return None if found is None else float(found)
+    raise NoAnswer(f"value gave {found!r:.40}; expected a number, or None")
+
+
+def _numbers(found: object, trials: int) -> Floats:
+    if isinstance(found, np.ndarray) and found.shape == (trials,):
+        return found.astype(np.float64)
+    raise NoAnswer(f"of_trials gave {found!r:.40}; expected an array of {trials} numbers")
+
+
+IN_STEP = "in_step"
+_NEVER = -1
+
+
+class WatchedSlots(NamedTuple):
+    """A quantity to keep, over the slots from `first` to before `end`."""
+
+    what: str
+    """A figure's name, or `in_step`."""
+    first: int
+    end: int
+
+
+def watch_of(scenario: Scenario, expect: ExpectTable) -> tuple[str, WatchedSlots] | None:
+    """The receiver and the quantity that an expectation needs; None if the summary's figures are enough."""
+    if expect.in_step is not None:
+        return expect.in_step, WatchedSlots(IN_STEP, _since(scenario, expect), scenario.slots)
+    if expect.figure is None or (expect.slots is None and expect.quantile is None):
+        return None
+    receiver, _, name = expect.figure.partition(".")
+    return receiver, WatchedSlots(name, *(expect.slots or (0, scenario.slots)))
+
+
+def _since(scenario: Scenario, expect: ExpectTable) -> int:
+    """The slot from which a receiver must come into step: `since`, or the slot of the last event on it up to slot `by`."""
+    if expect.since is not None:
+        return expect.since
+    by = scenario.slots if expect.by is None else expect.by
+    over = [act.at for act in scenario.timeline.acts if expect.in_step in act.names and act.at <= by]
+    return max(over, default=0)
+
+
+def watches_of(scenario: Scenario) -> dict[str, tuple[WatchedSlots, ...]]:
+    """Receiver → all quantities that its figures and the scenario's expectations need."""
+    wanted = [watch for expect in scenario.expect if (watch := watch_of(scenario, expect)) is not None]
+    found = {}
+    for receiver in scenario.receivers:
+        own = [
+            WatchedSlots(name, 0, scenario.slots)
+            for name, one in figures_of(receiver).items()
+            if not issubclass(one, TotalsFigure)
+        ]
+        found[receiver] = tuple(dict.fromkeys([*own, *(watch for name, watch in wanted if name == receiver)]))
+    return found
+
+
+@final
+class FirstState(FigureTally):
+    """The first slot of each trial in which a packet was used as the state."""
+
+    def __init__(self, trials: int) -> None:
+        self._first = np.full(trials, _NEVER)
+
+    def add(self, slots: ScoredSlots) -> None:
+        """Add the next slots."""
+        states = slots.action == Action.STATE
+        new = states.any(axis=0) & (self._first == _NEVER)
+        self._first[new] = slots.first + states.argmax(axis=0)[new]
+
+    @classmethod
+    def merged(cls, parts: Sequence[FirstState]) -> FirstState:
+        """The first slots of disjoint sets of trials, in their order."""
+        whole = cls(0)
+        whole._first = np.concatenate([part._first for part in parts])
+        return whole
+
+    @property
+    def value(self) -> int | None:
+        """The largest of them; None if a trial has no such slot."""
+        return None if (self._first == _NEVER).any() else int(self._first.max())
+
+
+def _tally(what: str, trials: int) -> FigureTally:
+    """A tally of a quantity, of no slots yet."""
+    if what == IN_STEP:
+        return FirstState(trials)
+    return GuardedTally(what, trials) if FIGURES.foreign(what) else figure(what).tally(trials)
+
+
+@final
+class Watched:
+    """Keeps the tallies of these quantities over R trials."""
+
+    def __init__(self, watches: Iterable[WatchedSlots], trials: int) -> None:
+        self._kept = {watch: _tally(watch.what, trials) for watch in watches}
+
+    def add_slots(self, slots: ScoredSlots) -> None:
+        """Add the next slots."""
+        for watch, kept in self._kept.items():
+            start, stop = max(watch.first - slots.first, 0), min(watch.end - slots.first, len(slots.error))
+            stateless = slots.x is None and watch.what != IN_STEP and figure(watch.what).needs_states
+            if start < stop and not stateless:
+                kept.add(slots if (start, stop) == (0, len(slots.error)) else slots.part(start, stop))
+
+    def begin(self) -> None:
+        """Make the tallies of packages' figures now, not with the first slot."""
+        for tally in self.of_packages.values():
+            tally.begin()
+
+    @property
+    def of_packages(self) -> dict[WatchedSlots, GuardedTally]:
+        """The tallies of packages' figures."""
+        return {watch: tally for watch, tally in self._kept.items() if isinstance(tally, GuardedTally)}
+
+    @property
+    def failures(self) -> list[str]:
+        """Why figures of packages failed, in words."""
+        return [tally.failure for tally in self.of_packages.values() if tally.failure]
+
+    def tally(self, watch: WatchedSlots) -> FigureTally:
+        """The tally of a quantity over its slots."""
+        return self._kept[watch]
+
+    @classmethod
+    def merged(cls, parts: Sequence[Watched]) -> Watched:
+        """The quantities of disjoint sets of trials, in their order."""
+        total = cls((), 0)
+        total._kept = {
+            watch: type(one).merged([part._kept[watch] for part in parts]) for watch, one in parts[0]._kept.items()
+        }
+        return total

@@ -1,0 +1,1 @@
+"""What a person looks at: the view, the page and pictures."""

@@ -1,0 +1,241 @@
+"""The words of the closing report of a run: its table, and the sentences that go with it.
+
+Source: docs/results.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+
+from evedrop.model.figures import columns, shown_figure, unloadable_figures
+from evedrop.model.figures.text import count_text, estimate, figure_text, share_text
+from evedrop.model.theory.rare_events import RARE
+from evedrop.scenario.application import applications_in
+from evedrop.score.summary import (
+    RARE_SHARE,
+    ControllerSummary,
+    DirectionSummary,
+    Judged,
+    LinkSummary,
+    PeerSummary,
+    Summary,
+    failed,
+)
+from evedrop.show.report.text_table import TextTable
+
+
+def amount(summary: Summary) -> str:
+    """How much was run, and how fast."""
+    trials = f"{summary.trials:,} trials" if summary.trials > 1 else "1 trial"
+    rate = f"{summary.slots_per_second:,.0f} slots/s"
+    if summary.mode != "live":
+        rate = f"{summary.slots_per_second * summary.trials:,.0f} trial-slots/s in memory"
+    return f"{summary.slots:,} slots · {trials} · {rate}"
+
+
+def heading(summary: Summary) -> str:
+    """What was run, how much of it, how fast, and how many expectations failed."""
+    title = f"{summary.scenario} · {amount(summary)}"
+    if summary.failed_expectations:
+        title += f" · {summary.failed_expectations} of {len(summary.expectations)} expectations FAILED"
+    return title
+
+
+def outcome(summary: Summary) -> tuple[str, bool | None]:
+    """The outcome of a run in a sentence, and whether it is good; None if there is nothing to judge."""
+    said, good = expectations_outcome(summary.expectations, "scenario")
+    if summary.ended != "complete":
+        return f"{summary.ended.splitlines()[0]}; {said}", False
+    return said[0].upper() + said[1:], good
+
+
+def expectations_outcome(expectations: Sequence[Judged], of: str) -> tuple[str, bool | None]:
+    """How many expectations held, and whether that is good; None without any. of: what gives them, such as "scenario"."""
+    if not expectations:
+        return f"the {of} has no expectations", None
+    if number := len(failed(expectations)):
+        return f"{number} of {len(expectations)} expectations FAILED", False
+    return f"all {len(expectations)} expectations held" if len(expectations) > 1 else "the expectation held", True
+
+
+def receivers_table(summary: Summary, wide: bool = True) -> TextTable:
+    """The table of the receivers: their figures; if `wide`, with all standard errors, and the digests."""
+    shown = columns("column", summary.mode)
+    compared = {figure: z for peer in summary.peers.values() for figure, z in peer.z.items() if z is not None}
+    table = TextTable.headed(
+        ["receiver"],
+        [*(column.heading for column in shown), *(["z"] if compared else [])],
+        ["digest"] if wide else [],
+        heading(summary),
+    )
+    for name, peer in summary.peers.items():
+        figures, errors, z, marked = _with_rare_estimate(peer)
+        table.add(
+            name,
+            *(
+                estimate(
+                    shown_figure(figures, names),
+                    shown_figure(errors, names) if wide or not compared.keys().isdisjoint(names) else None,
+                    column.format,
+                )
+                + (_MARK if marked and not set(_SPLIT).isdisjoint(names) else "")
+                for column, names in shown.items()
+            ),
+            *([_z_text(shown_figure(z, list(compared)), marked)] if compared else []),
+            *([(peer.digest or "–")[:12]] if wide else []),
+        )
+    return table
+
+
+_Figures = Mapping[str, float | None]
+_MARK = "*"
+_SPLIT = ("mean_squared_error", "mean_actual_trace_covariance")
+"""The figures that splitting estimates; a run has one of them."""
+
+
+def _with_rare_estimate(peer: PeerSummary) -> tuple[_Figures, _Figures, _Figures, bool]:
+    """The figures of a receiver, their standard errors and z, and whether its mean error is that of splitting."""
+    rare = peer.rare_estimate
+    given = peer.all_figures, peer.standard_errors, peer.z
+    if rare is None or rare.mean_error is None:
+        return *given, False
+    values = (rare.mean_error, rare.standard_error, rare.z)
+    figures, errors, z = ({**old, **dict.fromkeys(_SPLIT, new)} for old, new in zip(given, values, strict=True))
+    return figures, errors, z, True
+
+
+def _z_text(z: float | None, marked: bool) -> str:
+    return figure_text(z, "+.1f") + (_MARK if marked and z is not None else "")
+
+
+def _split_lines(summary: Summary) -> Iterator[str]:
+    """A line for each receiver whose mean error was estimated by splitting, or should have been."""
+    for name, peer in summary.peers.items():
+        rare = peer.rare_estimate
+        if rare is None:
+            continue
+        if rare.mean_error is None:
+            yield f"{name}: splitting gives no estimate that can be trusted: {rare.doubt}"
+            continue
+        plain = estimate(shown_figure(peer.all_figures, _SPLIT), shown_figure(peer.standard_errors, _SPLIT))
+        yield (
+            f"{_MARK} {name}: by splitting, {rare.populations} populations of {rare.trials:,} trials, copied after "
+            f"{rare.splits} slot{'' if rare.splits == 1 else 's'}; the mean over the {summary.trials:,} trials is {plain}"
+        )
+
+
+def remarks(summary: Summary) -> Iterator[str]:
+    """Notes to the table: figures by splitting, figures that are left out, and links unlike their models."""
+    yield from _split_lines(summary)
+    for name, why in unloadable_figures().items():
+        yield f"the figure {name} is left out{why}"
+    yield from _link_lines(summary.links)
+    if summary.controller is not None:
+        yield _loop_line(summary.controller)
+
+
+def verdicts(summary: Summary) -> Iterator[str]:
+    """The verdicts on secrecy, and what hidden packets revealed."""
+    for name, verdict in summary.secrecy.items():
+        yield verdict.sentence
+        if verdict.leak is not None and verdict.leak.bits > 0.0:
+            yield f"{name}: packets that hide the state revealed {verdict.leak.text} of its path"
+
+
+def doubts(summary: Summary) -> Iterator[str]:
+    """A line for each receiver whose mean error is meaningless or too uncertain."""
+    for name, peer in summary.peers.items():
+        if peer.infinite_variance and peer.error_quantiles and summary.trials > 1:
+            low, middle, high = (f"{value:.3g}" for value in peer.error_quantiles.values())
+            yield (
+                f"{name}: its error has infinite variance, so the mean over trials says nothing; "
+                f"a trial's mean error is {middle} in the median, {low} to {high} in nine of ten"
+            )
+    yield from _rare_lines(summary)
+
+
+def surprise(summary: Summary) -> str | None:
+    """The most surprising trial, as a sentence; None without one."""
+    one = summary.surprising
+    if one is None:
+        return None
+    return (
+        f"most surprising: trial {one.trial}, {one.receiver}, mean error "
+        f"{one.mean_error:.3g} against {one.expected_error:.3g} expected after the same losses "
+        f"(probability {one.probability:.1g})"
+    )
+
+
+def directions_table(directions: Mapping[str, Mapping[str, DirectionSummary]]) -> TextTable:
+    """A row for each receiver and direction: its error, theory, and the verdict on secrecy in that direction."""
+    table = TextTable.headed(
+        ["receiver", "direction"],
+        ["mean error", "theory", "z"],
+        ["by theory", "relative secrecy", "perfect secrecy"],
+    )
+    for receiver, entries in directions.items():
+        for direction, one in entries.items():
+            table.add(
+                receiver,
+                direction,
+                estimate(one.mean_squared_error, one.standard_error),
+                figure_text(one.expected),
+                figure_text(one.z, "+.1f"),
+                {True: "unbounded", False: "bounded", None: "–"}[one.unbounded],
+                one.relative or "–",
+                one.perfect or "–",
+            )
+    return table
+
+
+def _link_lines(links: Mapping[str, LinkSummary]) -> Iterator[str]:
+    """A line for each link whose delivered fraction differs from its model's."""
+    for name, link in links.items():
+        if link.within_interval is False and link.interval is not None:
+            low, high = link.interval
+            yield (
+                f"the link of {name} let {link.rate:.5g} of its packets through; its model predicts "
+                f"{link.expected_rate:.5g}, and for this run an interval of {low:.5g} to {high:.5g}"
+            )
+
+
+def _rare_lines(summary: Summary) -> Iterator[str]:
+    """A line for each receiver whose expected error is carried by events that too few of the trials contain."""
+    for name, peer in summary.peers.items():
+        rare = peer.rare_events
+        if rare is not None and rare.share > RARE_SHARE and summary.trials > 1:
+            split = peer.rare_estimate is not None
+            enough = f"{count_text(rare.trials)} trials" if math.isfinite(rare.trials) else "no number of trials"
+            yield (
+                f"{name}: {share_text(rare.share)} of its expected error is carried by {rare_events_words(summary.trials)}, so "
+                f"its mean over the trials is uncertain, probably too small{'' if split else ', and has no z'}; {enough} would "
+                f"leave {share_text(RARE_SHARE)}" + ("" if split else "; montecarlo --rare estimates it by splitting")
+            )
+
+
+def rare_events_words(trials: int) -> str:
+    """Events that are too rare for this number of trials."""
+    return f"events that are expected fewer than {RARE} times in {trials:,} trials"
+
+
+def application_lines(summary: Summary) -> Iterator[str]:
+    """The lines of the applications that the scenario uses."""
+    for name, application in applications_in(summary.applications).items():
+        yield from application.lines(summary.applications[name])
+
+
+def _loop_line(controller: ControllerSummary) -> str:
+    """The line about a closed loop."""
+    scatter = controller.standard_errors.get("mean_squared_errors")
+    of_mean = scatter if isinstance(scatter, Mapping) else {}  # results of an older version have none
+    errors = ", ".join(
+        f"{estimate(error, of_mean.get(name))} {name.replace('_', ' the ')}"
+        for name, error in controller.mean_squared_errors.items()
+    )
+    line = f"controller {controller.strategy}, {controller.decisions:,} decisions; the estimator's error is {errors}"
+    if controller.failed_fraction:
+        line += f"; {controller.failed_fraction:.2%} of inputs were held because a decision failed"
+    if controller.clipped_fraction:
+        line += f"; {controller.clipped_fraction:.2%} were clipped by the plant"
+    return line

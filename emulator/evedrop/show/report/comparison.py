@@ -1,0 +1,162 @@
+"""The words of a comparison: the cost and secrecy of each scheme, then every pair.
+
+Source: docs/compare.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import groupby
+from typing import TYPE_CHECKING
+
+from evedrop.model.figures.shown_number import ShownNumber
+from evedrop.model.figures.text import estimate, figure_text, share_text
+from evedrop.score.summary import RARE_SHARE
+from evedrop.score.verdict import MARKS, SecrecyKept
+from evedrop.show.report.closing import rare_events_words
+from evedrop.show.report.text_table import TextTable
+
+if TYPE_CHECKING:
+    from evedrop.results.comparison import Cell, Comparison, SimulatedError
+
+WORDS = {
+    SecrecyKept.PERFECT: "perfect",
+    SecrecyKept.RELATIVE: "relative",
+    SecrecyKept.UNDECIDED: "too few",
+    SecrecyKept.BROKEN: "broken",
+}
+"""Each verdict in a word."""
+
+
+def comparison_heading(found: Comparison) -> str:
+    """What was compared, and how much of it."""
+    trials = f"{found.trials:,} trials" if found.trials > 1 else "1 trial"
+    return f"{found.title} · {found.slots:,} slots · {trials}"
+
+
+def comparison_lines(found: Comparison) -> Iterator[str]:
+    """Notes to the tables: what was left out or is not defined, what their words mean, and which schemes dominate."""
+    yield from _left_out(found)
+    yield from _undefined(found)
+    yield from _remarks(found)
+
+
+def schemes_table(found: Comparison) -> TextTable:
+    """A row for each scheme: its error, its cost, and its closest adversary."""
+    numbers = ("legitimate", "theory", "ACKs", "sent", "bits", "energy", "secret", "clear", "leak")
+    table = TextTable.headed(["scheme"], numbers, ["closest adversary", "verdict"])
+    for name, one in found.schemes.items():
+        cell, needs = one.closest, one.needs
+        once = f" + {needs.initial_secret_bits}" if needs.initial_secret_bits else ""
+        table.add(
+            name,
+            simulated(one.legitimate),
+            theory(one.legitimate),
+            "yes" if needs.acknowledgements else "–",
+            figure_text(needs.sent_fraction, ".3g"),
+            figure_text(needs.bits_per_slot),
+            estimate(needs.energy_per_slot, needs.standard_errors["energy_per_slot"] or None, ".3g"),
+            f"{needs.secret_bits_per_slot}{once}" if needs.secret_bits_per_slot else "–",
+            *(
+                ("–", "–")
+                if one.leak is None
+                else (figure_text(one.leak.clear_fraction, ".3g"), figure_text(one.leak.bits, ".3g"))
+            ),
+            *(("–", "–") if cell is None else (cell.match.adversary, verdict(cell))),
+        )
+    return table
+
+
+def pairs_table(found: Comparison) -> TextTable:
+    """A row for each pair of scheme and adversary that is defined."""
+    numbers = ("its error", "theory", "z", "legitimate", "theory", "ratio")
+    table = TextTable.headed(["scheme", "adversary"], numbers, ["verdict"])
+    for name, one in found.schemes.items():
+        shown = name
+        for adversary, cell in one.cells.items():
+            if cell.eavesdropper is None or cell.legitimate is None:
+                continue
+            table.add(
+                shown,
+                adversary if cell.match.attack == "none" else f"{adversary} ({cell.match.strategy})",
+                simulated(cell.eavesdropper),
+                theory(cell.eavesdropper),
+                figure_text(cell.eavesdropper.z, "+.1f"),
+                simulated(cell.legitimate),
+                theory(cell.legitimate),
+                estimate(cell.ratio, cell.ratio_error, ".3g"),
+                verdict(cell),
+            )
+            shown = ""
+    return table
+
+
+def simulated(of: SimulatedError) -> str:
+    """The mean over trials with its standard error, or the median if the variance is infinite."""
+    if of.infinite_variance:
+        return figure_text(of.typical, ".3g") + " med"
+    return estimate(of.mean, of.standard_error, ".3g")
+
+
+def theory(of: SimulatedError) -> str:
+    """The mean that theory expects over the same slots; with ≥ if it is only a bound."""
+    if of.theory is None:
+        return figure_text(None)
+    mean = of.theory.mean
+    return ShownNumber(f"≥ {mean:.3g}", mean, after="at least") if of.theory.bound else figure_text(mean, ".3g")
+
+
+def verdict(cell: Cell) -> str:
+    """The mark and the word of a cell's verdict."""
+    return "–" if cell.verdict is None else f"{MARKS[cell.verdict]} {WORDS[cell.verdict]}"
+
+
+def _rare_share(of: SimulatedError | None) -> float:
+    return 0.0 if of is None or of.rare_events is None or of.infinite_variance else of.rare_events.share
+
+
+def _left_out(found: Comparison) -> Iterator[str]:
+    """A line for each scheme that cannot be used with the process."""
+    for scheme, why in found.left_out.items():
+        yield f"left out: {scheme}: {'; '.join(why)}"
+
+
+def _undefined(found: Comparison) -> Iterator[str]:
+    """A line for each adversary and reason that a pair is not defined, with its schemes."""
+    cells = [cell.match for one in found.schemes.values() for cell in one.cells.values()]
+    why = sorted((one.adversary, one.not_defined, one.scheme) for one in cells if one.not_defined is not None)
+    for (adversary, reason), some in groupby(why, lambda one: one[:2]):
+        yield f"not defined: {adversary} {reason} ({', '.join(scheme for _, _, scheme in some)})"
+
+
+def _remarks(found: Comparison) -> Iterator[str]:
+    yield (
+        "sent: the share of slots with a packet; bits, energy: what the sensor sends, headers included, and spends in a "
+        "slot on average; secret: the most bits that a slot uses, + bits that a trial uses once; "
+        "clear: the share of slots whose packet is the state itself; leak: the bits about the path of states that another packet "
+        "reveals without the secret"
+    )
+    measured = [cell.eavesdropper for one in found.schemes.values() for cell in one.cells.values()]
+    if any(one is not None and one.infinite_variance for one in measured):
+        yield (
+            "med: the variance over trials is infinite, so the mean says nothing; this is the median trial, which lies far "
+            "below the expectation of theory"
+        )
+    shares = {
+        name: max((_rare_share(cell.eavesdropper) for cell in one.cells.values()), default=0.0)
+        for name, one in found.schemes.items()
+    }
+    rare = [f"{name} up to {share_text(share)}" for name, share in shares.items() if share > RARE_SHARE]
+    if rare:
+        yield (
+            f"{rare_events_words(found.trials)} carry a part of expected errors, whose means and standard errors are then "
+            f"probably too small: {', '.join(rare)}"
+        )
+    if any(one is not None and one.theory is not None and one.theory.bound for one in measured):
+        yield "≥: no closed form is known; a lower bound on the expected error of any receiver without the secret"
+    if found.dominant:
+        more = "each of them dominates" if len(found.dominant) > 1 else "dominates"
+        yield (
+            f"{', '.join(found.dominant)}: {more}: no other scheme costs the legitimate estimator less in the long run, "
+            "and no other scheme gives the closest adversary a larger error"
+        )

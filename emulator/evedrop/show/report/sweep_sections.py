@@ -1,0 +1,193 @@
+"""The sections of the report of a sweep. To add one, write a class and add it to `SWEEP_SECTIONS`."""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+import pyarrow.parquet as pq
+
+from evedrop.errors import UsageError
+from evedrop.model.checks import toml_of
+from evedrop.model.figures import all_figures, error_column, shown_figure
+from evedrop.model.process import Floats
+from evedrop.scenario.loading import value_of
+from evedrop.show.report.chart import Curve, LogChart
+from evedrop.show.report.markup import Node, element, paragraphs
+from evedrop.show.report.section import Section
+from evedrop.show.report.sweep import sweep_table
+from evedrop.show.report.tables import html_table
+from evedrop.show.view import palette
+from evedrop.system.files import text_of
+
+SWEEP_TABLE = "sweep.parquet"
+_MOST_BYTES = 2**24
+_MOST_CHARTS = 12
+_MODES = {"covariance-only": ["--covariance-only"], "error-coordinates": ["--error-coordinates"]}
+
+
+@dataclass(frozen=True)
+class SweepSource:
+    """The folder of a sweep, read."""
+
+    folder: Path
+    rows: Sequence[Mapping[str, Any]]
+    scenario: str
+    changes: Mapping[str, Any]
+    grid: Mapping[str, Sequence[Any]]
+    """Entry → its values."""
+    mode: str
+    amount: str
+    """How much was run."""
+    outcome: str
+    """How many points were done, as a sentence."""
+
+    @classmethod
+    def read(cls, folder: Path) -> SweepSource:
+        """Read a folder. Raises UsageError if it is not that of a sweep."""
+        try:
+            found = json.loads(text_of(folder / "sweep.json", _MOST_BYTES))
+            rows, grid = pq.read_table(folder / SWEEP_TABLE).to_pylist(), found["over"]
+            done, planned = len({tuple(row[key] for key in grid) for row in rows}), math.prod(map(len, grid.values()))
+            sizes = (_size([row[name] for row in rows], name) for name in ("slots", "trials"))
+            amount = " · ".join((f"{done:,} points of {', '.join(grid)}", *sizes))
+            outcome = f"All {planned:,} points were done" if done == planned else f"{done:,} of {planned:,} points"
+            return cls(folder, rows, found["scenario"], found["changes"], grid, found["mode"], amount, outcome)
+        except Exception as error:  # pyarrow raises many kinds of errors for a damaged file
+            raise UsageError(f"{folder} cannot be read as a sweep ({error}); run the sweep again") from error
+
+
+def _size(counts: Sequence[int], of: str) -> str:
+    """The counts of all points in words, such as "1,000 slots"; their range if the points differ."""
+    least, most = min(counts), max(counts)
+    return f"{least:,} {of}" if least == most else f"{least:,} to {most:,} {of}"
+
+
+@final
+class SweepVerdicts(Section[SweepSource]):
+    """The number of points in which secrecy held."""
+
+    title = "Verdicts"
+
+    @classmethod
+    def nodes(cls, of: SweepSource) -> Iterator[Node]:
+        """A sentence for each eavesdropper."""
+        found, lines = dict[str, Counter[str]](), list[str]()
+        for row in of.rows:
+            if row["relative_secrecy"] is not None:
+                found.setdefault(row["peer"], Counter())[row["relative_secrecy"]] += 1
+        for name, counts in found.items():
+            said = ", ".join(f"{said} at {count:,} point{'' if count == 1 else 's'}" for said, count in counts.items())
+            lines.append(f"{name}: relative secrecy: {said}")
+        yield from paragraphs(lines)
+
+
+@final
+class SweepErrors(Section[SweepSource]):
+    """The error of every receiver against the first entry, in a chart for each combination of the others."""
+
+    title = "Errors"
+
+    @classmethod
+    def nodes(cls, of: SweepSource) -> Iterator[Node]:
+        """The charts: marks with 95 % intervals, and theory as lines."""
+        first, *others = of.grid
+        for values in list(dict.fromkeys(tuple(row[key] for key in others) for row in of.rows))[:_MOST_CHARTS]:
+            rows = [row for row in of.rows if tuple(row[key] for key in others) == values]
+            where = ", ".join(f"{key} = {value}" for key, value in zip(others, values, strict=True))
+            words = None
+            if not all(isinstance(row[first], (int, float)) for row in rows):
+                words = list(dict.fromkeys(str(row[first]) for row in rows))
+            curves = [
+                _curve(name, i, [row for row in rows if row["peer"] == name], first, words)
+                for i, name in enumerate(dict.fromkeys(row["peer"] for row in rows))
+            ]
+            label = f"Mean error of every receiver against {first}, with what theory expects. The table has the values. {where}"
+            shown = f"Mean error with its 95 % interval; dotted: theory{'; ' if where else ''}{where}"
+            node = LogChart(label, first, shown, curves, words).node
+            if node is not None:
+                yield node
+
+
+def _curve(name: str, i: int, rows: Sequence[Mapping[str, Any]], key: str, words: Sequence[str] | None) -> Curve:
+    """The curve of the i-th receiver; words: the names of the places of the axis, if it has names."""
+    marks, lines = (
+        [one for one, kind in all_figures().items() if kind.sweep_picture == way] for way in ("marks", "lines")
+    )
+    x = [float(row[key]) if words is None else float(words.index(str(row[key]))) for row in rows]
+    y, theory = (_values(rows, names) for names in (marks, lines))
+    scatter = 1.96 * np.nan_to_num(_values(rows, [error_column(one) for one in marks]))
+    return Curve(
+        name, palette.hexadecimal(palette.colour(i)), np.array(x), y, y - scatter, y + scatter, theory, bars=True
+    )
+
+
+def _values(rows: Sequence[Mapping[str, Any]], names: list[str]) -> Floats:
+    found = [shown_figure(row, names) for row in rows]
+    return np.array([math.nan if one is None else one for one in found], np.float64)
+
+
+@final
+class SweepFigures(Section[SweepSource]):
+    """The figures of all points, with their standard errors, theory, and z."""
+
+    title = "Figures"
+
+    @classmethod
+    def nodes(cls, of: SweepSource) -> Iterator[Node]:
+        """The table that the terminal shows."""
+        caption = (
+            "A row for each point and receiver: means ± standard errors; z: the z-score of the error against theory; "
+            "ratio: an eavesdropper's error over the legitimate one, in the second half of the run"
+        )
+        yield html_table(sweep_table(of.rows, tuple(of.grid)), caption)
+
+
+@final
+class SweepRepeat(Section[SweepSource]):
+    """How to repeat the sweep."""
+
+    title = "Repeat it"
+
+    @classmethod
+    def nodes(cls, of: SweepSource) -> Iterator[Node]:
+        """The command."""
+        given = of.folder / "scenario.toml"  # of a scenario that was made in Python, whose name is only its title
+        words = ["evedrop", "sweep", str(given.absolute()) if given.exists() else of.scenario]
+        for key, values in of.grid.items():
+            words += ["--over", f"{key}={','.join(_listed(values))}"]
+        for key, value in of.changes.items():
+            words += [f"--{key}", _toml(value)] if key == "trials" else ["--set", f"{key}={_toml(value)}"]
+        words += _MODES.get(of.mode, [])
+        yield element("pre", element("code", shlex.join(words)))
+
+
+def _listed(values: Sequence[Any]) -> list[str]:
+    """Values as the command line takes a list of them: all with quotes where one needs them, for they are read together."""
+    return [str(value) if all(map(_is_plain, values)) else toml_of(value) for value in values]
+
+
+def _toml(value: Any) -> str:
+    """A value as the command line takes it; a word without quotes unless it would be read as something else."""
+    return str(value) if _is_plain(value) else toml_of(value)
+
+
+def _is_plain(value: Any) -> bool:
+    """Whether a value is a word that is read as such without quotes."""
+    return isinstance(value, str) and value_of(value) == value and not {",", ":"} & set(value)
+
+
+SWEEP_SECTIONS: tuple[type[Section[SweepSource]], ...] = (
+    SweepVerdicts,
+    SweepErrors,
+    SweepFigures,
+    SweepRepeat,
+)
+"""In the order of the page."""

@@ -1,0 +1,132 @@
+"""The words of a wire's summary: its tables, and the sentences below them.
+
+Source: docs/wire.md, the summary.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from evedrop.results.wire_summary import WireSummary
+from evedrop.score.summary import failed
+from evedrop.show.report.closing import expectations_outcome
+from evedrop.show.report.text_table import TextTable
+
+WITHOUT_MODEL = {"overflow", "cut", "unlinked", "too_large", "looped", "too_many_keys"}
+"""The reasons for which messages are lost before a link's models decide on them."""
+_MARKS = {True: "yes", False: "NO", None: "–"}
+
+
+def wire_title(summary: WireSummary) -> str:
+    """How much a wire did, in a line."""
+    return f"wire · seed {summary.seed} · {summary.heard:,} messages · {summary.seconds:,.1f} s"
+
+
+def wire_table(summary: WireSummary) -> TextTable:
+    """The table of the links."""
+    heads = ["heard", "delivered", "lost", "dropped", "rate", "model", "within", "delay", "gap"]
+    table = TextTable.headed(["link"], heads, title=wire_title(summary))
+    for name, link in summary.links.items():
+        median = link.delays.get("0.5")
+        table.add(
+            name,
+            f"{link.heard:,}",
+            f"{link.delivered:,}",
+            f"{sum(link.lost_by.values()):,}",
+            f"{sum(link.dropped_by.values()):,}",
+            "–" if link.rate is None else f"{link.rate:.4f}",
+            "–" if link.expected_rate is None else f"{link.expected_rate:.4f}",
+            _MARKS[link.within_bounds],
+            "–" if median is None else f"{1000 * median:.3g} ms",
+            f"{link.gap_messages:,}",
+        )
+    return table
+
+
+def reasons_table(summary: WireSummary) -> TextTable:
+    """Why messages did not arrive: a row for each link and reason."""
+    table = TextTable.headed(["link"], ["messages"], ["reason"])
+    for name, link in summary.links.items():
+        for by, said in ((link.lost_by, "lost"), (link.dropped_by, "dropped by the wire itself, or Zenoh")):
+            for reason, count in by.items():
+                table.add(name, f"{count:,}", f"{said}: {reason.replace('_', ' ')}")
+    return table
+
+
+def wire_outcome(summary: WireSummary) -> tuple[str, bool | None]:
+    """The outcome of a wire in a sentence, and whether it is good; None if there is nothing to judge."""
+    said, good = expectations_outcome(summary.expectations, "wire")
+    if summary.unaccounted:
+        return f"unaccounted for: {_messages(summary.unaccounted)}; {said}", False
+    if summary.bypasses:
+        return f"no verdict, because programs could speak past the wire; {said}", False
+    if summary.journal.incomplete_since is not None:
+        return f"the journal is incomplete; {said}", False
+    if _unfinished(summary):
+        return f"{_unfinished(summary)}; {said}", False if good is False else None
+    return said[0].upper() + said[1:], good
+
+
+def wire_sentences(summary: WireSummary) -> Iterator[str]:
+    """Notes to the table: why messages did not arrive, and which expectations were met."""
+    for name, link in summary.links.items():
+        lost = _counted(link.lost_by)
+        dropped = _counted(link.dropped_by)
+        undecided = [reason for reason in (*link.lost_by, *link.dropped_by) if reason in WITHOUT_MODEL]
+        if lost:
+            yield f"{name} lost {lost}"
+        if dropped:
+            yield f"{name}: the wire itself, or Zenoh, dropped {dropped}"
+        if undecided and link.rate is not None:
+            reasons = " and ".join(reason.replace("_", " ") for reason in undecided)
+            yield f"{name}: rate, model and within leave out the messages by {reasons}, on which its models did not decide"
+    yield from unlinked_sentence(summary)
+    yield from (judged.sentence for judged in summary.expectations if judged.held)
+
+
+def unlinked_sentence(summary: WireSummary) -> Iterator[str]:
+    """How many messages no link took, if there were some."""
+    if summary.unlinked:
+        yield f"no link of the file takes {_messages(summary.unlinked)}; add a link, or let programs not publish them"
+
+
+def wire_failures(summary: WireSummary) -> Iterator[str]:
+    """What went wrong: faults, as below, and expectations that failed."""
+    yield from wire_faults(summary)
+    yield from (judged.sentence for judged in failed(summary.expectations))
+
+
+def wire_faults(summary: WireSummary) -> Iterator[str]:
+    """A wire that has not ended, ways past it, links outside their bounds, unaccounted messages, and an incomplete journal."""
+    if _unfinished(summary):
+        yield f"{_unfinished(summary)}: these are the figures that its journal gives so far"
+    yield from (f"no verdict: {bypass.event}" for bypass in summary.bypasses)
+    for name, link in summary.links.items():
+        if link.within_bounds is False and link.bounds is not None:
+            low, high = link.bounds
+            yield (
+                f"{name} is outside the 99 % bounds of its model: it let {link.rate:.4f} of the messages through, where "
+                f"{low:.4f} to {high:.4f} were expected"
+            )
+    if summary.unaccounted:
+        yield f"unaccounted for: {_messages(summary.unaccounted)}; this is a fault of Evedrop"
+    if summary.journal.missing:
+        yield f"the journal lacks {_messages(summary.journal.missing)}, because its folder could not be written"
+    elif summary.journal.incomplete_since is not None:
+        yield (
+            "the folder of the journal could not be written for some time: the journal has all messages, but perhaps not all "
+            "changes and events"
+        )
+
+
+def _unfinished(summary: WireSummary) -> str:
+    """The sentence about a wire that has not ended; empty if it has ended."""
+    return {"running": "the wire still runs", "killed": "the wire was killed"}.get(summary.state, "")
+
+
+def _counted(reasons: Mapping[str, int]) -> str:
+    return ", ".join(f"{count:,} by {reason.replace('_', ' ')}" for reason, count in reasons.items())
+
+
+def _messages(count: int) -> str:
+    return "1 message" if count == 1 else f"{count:,} messages"

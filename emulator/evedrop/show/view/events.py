@@ -1,0 +1,110 @@
+"""Chooses the moments of a run that deserve a line. Does not use Rerun.
+
+Frequent events are visible in the lanes; a line reports a stretch without usable packets that is long for this receiver.
+The threshold adapts, so that a run of any length gets at most a few hundred lines per receiver.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, final
+
+import numpy as np
+
+from evedrop.model.receiver import Action, Codes, Flags
+from evedrop.show.view.lanes import MISLED_CODE, SILENT_CODE
+from evedrop.show.view.scene import Scene, Shown
+
+_SHORTEST = 3  # packets in a row; missing fewer is normal
+_LINES = 200  # the approximate number of stretches that a receiver may report in a whole run
+_SLOTS_PER_LINE = 100  # at least, so that the lines of a run in real time can be read
+
+
+class Event(NamedTuple):
+    """A line of the events panel."""
+
+    k: int
+    level: str
+    """INFO, WARN or ERROR."""
+    text: str
+
+
+def introduction(scene: Scene) -> list[Event]:
+    """The first lines: the title of the run, and its receivers."""
+    trials = "" if scene.trials == 1 else f"; curves: mean of {scene.trials} trials"
+    about = [Event(0, "INFO", f"{scene.title}{trials}")]
+    for shown in scene.receivers:
+        kind = "scheme" if shown.role == "legitimate" else "strategy"
+        quality = "with a loss model that is not built in" if shown.quality is None else f"quality {shown.quality:.4g}"
+        about.append(Event(0, "INFO", f"{shown.name}: {kind} {shown.strategy}, link {quality}"))
+    return about
+
+
+@final
+class Watcher:
+    """Finds the events of one receiver in its lane's codes, chunk by chunk.
+
+    A good slot tells the receiver as much as the state: for the legitimate estimator any packet, for an eavesdropper a state
+    that it used as such. A stretch without a good slot is reported when it has become long, and when it ends.
+    """
+
+    def __init__(self, shown: Shown, scene: Scene) -> None:
+        self._name = shown.name
+        self._legitimate = shown.role == "legitimate"
+        self._spacing = max(_SLOTS_PER_LINE, scene.slots // _LINES)
+        self._long = _SHORTEST
+        self._reported = 0
+        self._bad = 0  # length so far of the stretch that the next chunk may continue
+        self._misled = 0  # how many of these slots misled the receiver
+        self._silent = 0  # how many of them had no packet
+        self._told = False  # whether this stretch was reported
+        self._ever_misled = False
+
+    def watch(self, first: int, codes: Codes) -> list[Event]:
+        """Events of the chunk that starts at slot `first`, in order of slot."""
+        misled, silent = codes == MISLED_CODE, codes == SILENT_CODE
+        good = (codes == Action.STATE) | (codes == Action.INNOVATION)
+        events: list[Event] = []
+        if not self._ever_misled and misled.any():
+            self._ever_misled = True
+            k = first + int(misled.argmax())
+            events.append(Event(k, "WARN", f"{self._name} took an innovation for the state, for the first time"))
+        start = 0
+        for end in (*np.flatnonzero(good).tolist(), len(codes)):
+            if end > start:
+                self._extend(first, slice(start, end), misled, silent, events)
+            if end < len(codes):
+                self._recover(first + end, events)
+            start = end + 1
+        return sorted(events, key=lambda event: event.k)
+
+    def _extend(self, first: int, some: slice, misled: Flags, silent: Flags, events: list[Event]) -> None:
+        """Extend the current stretch by some slots of the chunk."""
+        length = self._bad + some.stop - some.start
+        if not self._told and length >= self._long:
+            turn = some.start + self._long - self._bad  # the slot after the one that made it long
+            fooled = self._misled + int(np.count_nonzero(misled[some.start : turn]))
+            unsent = self._silent + int(np.count_nonzero(silent[some.start : turn]))
+            events.append(Event(first + turn - 1, "WARN", self._lost(fooled, unsent)))
+            self._told = True
+        self._bad = length
+        self._misled += int(np.count_nonzero(misled[some]))
+        self._silent += int(np.count_nonzero(silent[some]))
+
+    def _recover(self, k: int, events: list[Event]) -> None:
+        if self._told:
+            how = "is in step again" if self._legitimate else "caught a state again"
+            events.append(Event(k, "INFO", f"{self._name} {how} after {self._bad} slots"))
+            self._told = False
+            self._reported += 1
+            if self._reported > 3 + k // self._spacing:
+                self._long += 1
+        self._bad = self._misled = self._silent = 0
+
+    def _lost(self, fooled: int, unsent: int) -> str:
+        if self._legitimate and not unsent:
+            return f"{self._name} lost {self._long} packets in a row"
+        line = f"{self._name} lost track: {self._long} slots without a state"
+        if self._legitimate:
+            line = f"{self._name} had no packet for {self._long} slots"
+        line = f"{line}, {unsent} of them silent" if unsent else line
+        return f"{line}, {fooled} misled" if fooled else line

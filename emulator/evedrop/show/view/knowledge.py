@@ -1,0 +1,115 @@
+"""Whether a receiver is in track, drifting or fooled in each slot, for the view. Does not use Rerun.
+
+Source: docs/view.md, who knows what.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import Enum
+from typing import final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Codes
+from evedrop.score.track import FACTOR, Track, track_of
+from evedrop.show.view import palette
+from evedrop.show.view.scene import PeerSlots, Scene
+
+
+class KnowledgeState(Enum):
+    """What a receiver knows, as a word, and the colour of its lane."""
+
+    IN_TRACK = Track.IN_TRACK
+    DRIFTING = Track.DRIFTING
+    FOOLED = Track.FOOLED
+
+    def __init__(self, track: Track) -> None:
+        self.word = track.word
+        self.colour = palette.KNOWLEDGE[track]
+
+
+KNOWLEDGE = tuple(KnowledgeState)
+
+
+def knowledge(scene: Scene, x: Floats, peer: PeerSlots) -> Codes:
+    """Indices into `KNOWLEDGE`, (c,), in the first recorded trial, by the rule of `track_of`; x: true states, (c, n)."""
+    with np.errstate(all="ignore"):
+        squared = np.sum((x - peer.x_hat) ** 2, axis=1)
+        trace = np.trace(peer.P, axis1=1, axis2=2)
+    return track_of(squared, trace, scene.noise)
+
+
+@final
+class ErrorDistance:
+    """How far an estimate is from the truth, as a number with its unit and in words.
+
+    It counts the first states as far as they have the unit of the first, such as the two coordinates of a place in metres and
+    not the speeds that follow. Without units it counts all states. One instance follows one receiver.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        unit = scene.units[0] if scene.units else ""
+        others = [i for i, one in enumerate(scene.units) if one != unit]
+        self._count = others[0] if others else scene.n
+        self._unit = f" {unit}" if unit else ""
+        self._level, self._step = -1, 0  # of the last slot
+        self._near = math.sqrt(FACTOR * scene.noise)
+        self._nothing = math.sqrt(scene.noise) * _NOTHING
+        first = math.floor(math.log10(self._near)) + 1
+        self._steps = np.array([self._near, *(10.0**decade for decade in range(first, first + _DECADES))])
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """All words of `codes`, such as "drifting, off by more than 10 m", by index."""
+        near = self._text(self._near)
+        found = [f"{KnowledgeState.IN_TRACK.word}, within {near}"]
+        for one in KNOWLEDGE[1:]:
+            found.append(f"{one.word}, off by less than {near}")
+            found += [f"{one.word}, off by more than {self._text(step)}" for step in self._steps]
+        return tuple(found)
+
+    @property
+    def meanings(self) -> tuple[KnowledgeState, ...]:
+        """What each of the words says."""
+        each = len(self._steps) + 1
+        return (KnowledgeState.IN_TRACK, *[KnowledgeState.DRIFTING] * each, *[KnowledgeState.FOOLED] * each)
+
+    def of(self, x: Floats, x_hat: Floats) -> Floats:
+        """The distances of estimates from true states, (c,)."""
+        apart = (x - x_hat)[:, : self._count]
+        distances: Floats = np.sqrt(np.sum(apart**2, axis=1))
+        return distances
+
+    def codes(self, known: Codes, distances: Floats) -> NDArray[np.int64]:
+        """Indices into `words` of the next slots, (c,), for what is known and distances, (c,).
+
+        A word names the largest distance since this stretch of equal knowledge began, so that it does not flicker.
+        """
+        step = np.searchsorted(self._steps, np.nan_to_num(distances, nan=np.inf), side="left")
+        level = known.astype(np.int64)
+        begins = np.cumsum(np.diff(level, prepend=self._level) != 0)  # the number of the stretch of equal knowledge
+        if len(level):
+            carried = np.where(begins == 0, self._step, 0)
+            each = len(self._steps) + 1
+            step = np.maximum.accumulate(begins * each + np.maximum(step, carried)) - begins * each
+            self._level, self._step = int(level[-1]), int(step[-1])
+        return np.where(level == 0, 0, 1 + (level - 1) * (len(self._steps) + 1) + step)
+
+    def text(self, distance: float) -> str:
+        """A distance with two digits and its unit, such as "0.32 m"; "0 m" if it is less than a thousandth of √(tr Q)."""
+        return self._text(0.0 if distance < self._nothing else distance)
+
+    def _text(self, distance: float) -> str:
+        if not math.isfinite(distance):
+            return "everything"
+        digits = f"{distance:.2g}"
+        if "e" in digits and 1e-4 <= abs(distance) < 1e7:
+            digits = f"{float(digits):,.0f}" if distance >= 1 else f"{float(digits):f}".rstrip("0")
+        return digits + self._unit
+
+
+_DECADES = 9
+_NOTHING = 1e-3  # the share of √(tr Q), the distance of one step, below which a distance is only that of rounding

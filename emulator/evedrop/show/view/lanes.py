@@ -1,0 +1,71 @@
+"""The outcome of each packet, as the coloured lanes show it. Does not use Rerun."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from evedrop.model.packet_words import DISCARDED, DROPPED, INNOVATION, MISLED, SILENT, STATE
+from evedrop.model.receiver import Action, Codes
+from evedrop.show.view import palette
+from evedrop.show.view.palette import Colour
+from evedrop.show.view.scene import SceneSlots, Shown
+
+_LEGEND = (
+    ("state", palette.STATE),
+    ("innovation decoded", palette.DECODED),
+    ("misled by innovation", palette.MISLED),
+    ("innovation sent, or discarded", palette.DISCARDED),
+    ("dropped", palette.DROPPED),
+    ("silence", palette.SILENT),
+)
+
+
+@dataclass(frozen=True)
+class Lane:
+    """The words of a lane; a word's index is its code."""
+
+    words: tuple[str, ...]
+    colours: tuple[Colour, ...]
+
+
+SENT = Lane((STATE, INNOVATION, SILENT), (palette.STATE, palette.DISCARDED, palette.SILENT))
+LEGITIMATE = Lane(
+    (DROPPED, STATE, INNOVATION, DISCARDED, SILENT),
+    (palette.DROPPED, palette.STATE, palette.DECODED, palette.DISCARDED, palette.SILENT),
+)
+EAVESDROPPER = Lane((*LEGITIMATE.words, MISLED), (*LEGITIMATE.colours, palette.MISLED))
+SILENT_CODE = np.uint8(EAVESDROPPER.words.index(SILENT))
+"""Code of a slot in which nothing was sent, so that nothing could be lost."""
+MISLED_CODE = np.uint8(EAVESDROPPER.words.index(MISLED))
+"""Code of the only outcome that an eavesdropper does not know itself."""
+
+
+def legend() -> list[tuple[str, Colour]]:
+    """What the colours of all lanes stand for."""
+    return [*_LEGEND]
+
+
+def lane_of(shown: Shown) -> Lane:
+    """The lane of a receiver."""
+    return LEGITIMATE if shown.role == "legitimate" else EAVESDROPPER
+
+
+def sent(slots: SceneSlots) -> Codes:
+    """Codes of the sensor's lane, (c,): the packets' types, or silence."""
+    types = slots.nu.astype(np.uint8)
+    return types if slots.sent is None else np.where(slots.sent, types, np.uint8(SENT.words.index(SILENT)))
+
+
+def received(shown: Shown, slots: SceneSlots) -> Codes:
+    """Codes of a receiver's lane, (c,).
+
+    They are its actions, except for silence, and for an innovation that an eavesdropper took for the state, which misled. The
+    legitimate estimator knows every type, and is never misled.
+    """
+    action = slots.peers[shown.name].action
+    codes: Codes = action
+    if shown.role != "legitimate":
+        codes = np.where(slots.nu & (action == Action.STATE), MISLED_CODE, action)
+    return codes if slots.sent is None else np.where(slots.sent, codes, SILENT_CODE)

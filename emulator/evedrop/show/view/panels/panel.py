@@ -1,0 +1,69 @@
+"""The base class of the panels of the view. The recording and the layout ask each panel; neither knows a panel's paths.
+
+Source: docs/your-own.md, a panel.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from evedrop.show.view.column import Column
+from evedrop.show.view.events import Event
+from evedrop.show.view.scene import Scene, SceneSlots
+
+Side = Literal["title", "top", "left", "middle", "right", "legend"]
+"""`title`, `top` and `legend` are rows; `left`, `middle` and `right` are columns between them."""
+ROWS_ABOVE: tuple[Side, ...] = ("title", "top")
+COLUMNS: tuple[Side, ...] = ("left", "middle", "right")
+ROWS_BELOW: tuple[Side, ...] = ("legend",)
+
+
+@dataclass(frozen=True)
+class PlacedView:
+    """A Rerun view and its place: in a row over the whole width, or in a column between the rows."""
+
+    view: rrb.View
+    side: Side
+    share: float = 1.0
+    """Its height, compared with the other views of its column, or its width, compared with those of its row; most have 1."""
+    height: float = 0.0
+    """Of a view in a row: the share of the window's height that it needs. The row is as high as its highest view."""
+
+
+class ViewPanel(ABC):
+    """A panel of the view. The class is registered; each recording makes an instance of it before the first slot.
+
+    Its paths in the recording begin with a word that no other panel uses. Views show entity names, so keep these short.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+
+    @classmethod
+    def applies(cls, scene: Scene) -> bool:
+        """Whether the recording of this run has the panel; by default always."""
+        del scene
+        return True
+
+    @abstractmethod
+    def views(self) -> Iterable[PlacedView]:
+        """Its views; none if it is recorded but not shown."""
+
+    def styles(self) -> Mapping[str, rr.AsComponents]:
+        """Path → name, colour and other styles, recorded once; by default none, so that Rerun chooses."""
+        return {}
+
+    @abstractmethod
+    def columns(self, slots: SceneSlots) -> Iterable[Column]:
+        """Its values in the next slots. Calls are in order of slot; the arrays cannot be written to."""
+
+    def notes(self, notes: Sequence[Event]) -> Iterable[Column]:
+        """Its values for lines about the run, such as "cut smart"; by default none."""
+        del notes
+        return ()

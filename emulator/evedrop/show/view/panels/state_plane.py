@@ -1,0 +1,345 @@
+"""The panel of the first two states, and its geometry: truth, estimates with their recent paths, covariance ellipses believed.
+
+It follows the truth and the legitimate estimator. An eavesdropper that is farther away is an arrow at the border.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, final
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from evedrop.model.process import Floats
+from evedrop.show.view.column import TIMELINE, Column
+from evedrop.show.view.knowledge import ErrorDistance
+from evedrop.show.view.palette import GROUND, Colour, colour, dim
+from evedrop.show.view.palette import TRUTH as WHITE
+from evedrop.show.view.panels.panel import PlacedView, ViewPanel
+from evedrop.show.view.scene import TRUTH, Scene, SceneSlots
+
+_PATH = "plane"
+_FRAME = f"{_PATH}/frame"
+_TRAIL = 30
+_TRUTH_TRAIL = 130
+
+
+@final
+class StatePlane(ViewPanel):
+    """The plane of the first two states, recorded only at the view's frames. Recorded but not shown for a closed loop."""
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__(scene)
+        self._frame, every = Frame(), stride(scene)
+        self._distance = ErrorDistance(scene)
+        self._trails = {name: Trail(every) for name in (TRUTH, *(shown.name for shown in scene.receivers))}
+
+    @classmethod
+    def applies(cls, scene: Scene) -> bool:
+        """Only for two states or more."""
+        return scene.n > 1
+
+    def views(self) -> Iterator[PlacedView]:
+        """One view, on the right."""
+        if self.scene.moving:
+            return
+        trails: dict[str, rrb.VisibleTimeRanges] = {
+            _trail(shown.name): self._past(_TRAIL) for shown in self.scene.receivers
+        }
+        trails[_trail(TRUTH)] = self._past(_TRUTH_TRAIL)
+        view = rrb.Spatial2DView(
+            name="State plane   ellipses: 2σ believed",
+            origin=_PATH,
+            background=list(GROUND),
+            overrides=trails,  # type: ignore[arg-type]
+        )
+        yield PlacedView(view, "right")
+
+    def _past(self, slots: int) -> rrb.VisibleTimeRanges:
+        # A piece of a trail is recorded at its end, so the oldest piece shown begins a frame earlier.
+        reach = max(slots, 4 * stride(self.scene))
+        return rrb.VisibleTimeRanges(
+            [
+                rrb.VisibleTimeRange(
+                    TIMELINE,
+                    start=rrb.TimeRangeBoundary.cursor_relative(seq=-reach),
+                    end=rrb.TimeRangeBoundary.cursor_relative(seq=0),
+                )
+            ]
+        )
+
+    def styles(self) -> dict[str, rr.AsComponents]:
+        """Each estimate in its receiver's colour; the truth white, on top of the others."""
+        found = _point_styles(TRUTH, WHITE, radius=3.5, order=40.0)
+        for i, shown in enumerate(self.scene.receivers):
+            found |= _point_styles(shown.name, colour(i), radius=5.0, order=30.0 - i)
+            if i > 0:
+                found[_arrow(shown.name)] = rr.LineStrips2D.from_fields(
+                    colors=[colour(i)], radii=rr.Radius.ui_points(1.5)
+                )
+                found[_away(shown.name)] = rr.Points2D.from_fields(
+                    colors=[WHITE], radii=rr.Radius.ui_points(0.0), show_labels=True
+                )
+        # Invisible: the view fits its range to it.
+        found[_FRAME] = rr.LineStrips2D.from_fields(colors=[GROUND], radii=rr.Radius.ui_points(0.1))
+        return found
+
+    def columns(self, slots: SceneSlots) -> Iterator[Column]:
+        """Points, trails, ellipses, and the frame around them."""
+        k, at = slots.numbers, frames(self.scene, slots.first, slots.count)
+        positions = {TRUTH: on_plane(slots.x)}
+        positions |= {name: on_plane(peer.x_hat) for name, peer in slots.peers.items()}
+        pieces = {name: self._trails[name].pieces(points, at) for name, points in positions.items()}
+        followed = np.stack([positions[TRUTH], positions[self.scene.receivers[0].name]])
+        boxes = self._frame.boxes(followed.min(axis=0), followed.max(axis=0), at)
+        if not len(at):
+            return
+        border = _BORDER * (boxes[:, 2] - boxes[:, 0])
+        low, high = boxes[:, 0] + border, boxes[:, 2] - border
+        truth = positions[TRUTH][at]
+        labels: list[Points] = []
+        yield Column(_FRAME, k[at], rr.LineStrips2D.columns(strips=boxes))
+        for name, points in positions.items():
+            trail = within(pieces[name], low, high, truth)
+            yield Column(_trail(name), k[at], rr.LineStrips2D.columns(strips=trail))
+            yield Column(_point(name), k[at], rr.Points2D.columns(positions=borders(truth, points[at], low, high)))
+        for i, shown in enumerate(self.scene.receivers):
+            peer = slots.peers[shown.name]
+            outlines = np.clip(ellipses(peer.x_hat[at], peer.P[at]), low[:, None], high[:, None])
+            outlines = np.where(inside(positions[shown.name][at], low, high)[:, None, None], outlines, truth[:, None])
+            yield Column(_ellipse(shown.name), k[at], rr.LineStrips2D.columns(strips=outlines))
+            if i > 0:
+                distances = self._distance.of(slots.x[at], peer.x_hat[at])
+                seen = truth, positions[shown.name][at], low, high
+                yield from self._far(shown.name, k[at], seen, distances, labels)
+
+    def _far(
+        self,
+        name: str,
+        k: NDArray[np.int64],
+        seen: tuple[Points, Points, Points, Points],
+        distances: Floats,
+        labels: list[Points],
+    ) -> Iterator[Column]:
+        """Arrows with distances where an estimate is outside the frame.
+
+        seen: truth, estimates, lows and highs; labels: those of other receivers, as in `apart`, to which its own are added.
+        """
+        truth, points, low, high = seen
+        far = ~inside(points, low, high)
+        drawn = arrows(truth[far], points[far], low[far], high[far])
+        texts = [f"{name}: {self._distance.text(one)}" for one in distances[far].tolist()]
+        lengths = far.astype(np.int64)
+        yield Column(_arrow(name), k, rr.LineStrips2D.columns(strips=drawn).partition(lengths))
+        centres = np.full((len(k), 2), np.nan, np.float32)
+        centres[far] = labels_of(truth[far], drawn[:, 1], low[far], high[far])
+        centres = apart(centres, labels, low, high)
+        labels.append(centres)
+        columns = rr.Points2D.columns(positions=centres[far], labels=texts)
+        yield Column(_away(name), k, columns.partition(lengths))
+
+
+def _point_styles(name: str, bright: Colour, *, radius: float, order: float) -> dict[str, rr.AsComponents]:
+    pixels = rr.Radius.ui_points
+    return {
+        _trail(name): rr.LineStrips2D.from_fields(
+            colors=[dim(bright, 0.55)], radii=pixels(0.9), draw_order=order - 20.0
+        ),
+        _ellipse(name): rr.LineStrips2D.from_fields(colors=[bright], radii=pixels(0.9), draw_order=order - 10.0),
+        _point(name): rr.Points2D.from_fields(colors=[bright], radii=pixels(radius), draw_order=order),
+    }
+
+
+def _trail(name: str) -> str:
+    return f"{_PATH}/{name}/trail"
+
+
+def _ellipse(name: str) -> str:
+    return f"{_PATH}/{name}/cov"
+
+
+def _point(name: str) -> str:
+    return f"{_PATH}/{name}/at"
+
+
+def _arrow(name: str) -> str:
+    return f"{_PATH}/{name}/arrow"
+
+
+def _away(name: str) -> str:
+    return f"{_PATH}/{name}/away"
+
+
+Points = NDArray[np.float32]
+
+_FRAMES_PER_SECOND = 30.0
+_MOST_FRAMES = 4_000
+_MOST_FRAMES_IN_REAL_TIME = 30_000  # five a second for more than an hour
+_LARGEST = 1e30  # Rerun's points are float32
+_FRAMED_SLOTS = 130  # the length of the path of the truth
+_SIGMAS = 2.0
+_CORNERS = 40
+_BORDER = 0.04  # of the frame's sides, where a dot would be cut
+_EDGE = 0.1  # of a frame's sides: the room between the arrows' tips and its border
+_LABEL = 0.18  # the same for the labels: half the width of one
+_LINE = 0.11  # of a frame's height: what a label needs
+_ARROW = 0.08  # length of an arrow, compared with the longer side
+_ROOM = 0.3  # around what the frame follows, compared with its longer side
+
+
+def stride(scene: Scene) -> int:
+    """Slots from one frame to the next."""
+    most = _MOST_FRAMES_IN_REAL_TIME if scene.pace > 0 else _MOST_FRAMES
+    smooth = math.ceil(1.0 / (_FRAMES_PER_SECOND * scene.pace) - 1e-9) if scene.pace > 0 else 1
+    return max(1, smooth, math.ceil(scene.slots / most))
+
+
+def frames(scene: Scene, first: int, count: int) -> NDArray[np.intp]:
+    """The slots among `count` from `first` on that are frames, as offsets; the run's last slot always is."""
+    every = stride(scene)
+    offsets = np.arange(-first % every, count, every)
+    if first + count == scene.slots and (first + count - 1) % every:
+        offsets = np.append(offsets, count - 1)
+    return offsets
+
+
+def on_plane(states: Floats) -> Points:
+    """The first two states, (c, 2), of states (c, n); Rerun's y axis points down, so the second is negated."""
+    return _shown(states[:, :2] * np.array([1.0, -1.0]))
+
+
+def ellipses(centres: Floats, P: Floats) -> Points:
+    """2σ ellipses of P (c, n, n) around states (c, n) as closed lines, (c, 41, 2).
+
+    A circle mapped by the Cholesky factor, written out so that a covariance of 0 gives a point and not an error.
+    """
+    angle = np.linspace(0.0, 2.0 * math.pi, _CORNERS + 1)
+    with np.errstate(all="ignore"):
+        spread = np.sqrt(np.maximum(P[:, 0, 0], 0.0))
+        lean = np.where(spread > 0.0, P[:, 1, 0] / np.where(spread > 0.0, spread, 1.0), 0.0)
+        rest = np.sqrt(np.maximum(P[:, 1, 1] - lean * lean, 0.0))
+        across = spread[:, None] * np.cos(angle)
+        along = lean[:, None] * np.cos(angle) + rest[:, None] * np.sin(angle)
+        lines = centres[:, None, :2] + _SIGMAS * np.stack([across, along], axis=2)
+    return _shown(lines * np.array([1.0, -1.0]))
+
+
+def inside(points: Points, low: Points, high: Points) -> NDArray[np.bool_]:
+    """Which points, (f, 2), are in the frames from low to high, (f, 2)."""
+    found: NDArray[np.bool_] = np.all((points >= low) & (points <= high), axis=1)
+    return found
+
+
+def within(pieces: Points, low: Points, high: Points, otherwise: Points) -> Points:
+    """The pieces of a path, (f, p, 2); one that leaves its frame becomes a dot at a point of `otherwise`, (f, 2)."""
+    stays = np.asarray(np.all((pieces >= low[:, None]) & (pieces <= high[:, None]), axis=(1, 2)))
+    found: Points = np.where(stays[:, None, None], pieces, otherwise[:, None])
+    return found
+
+
+def borders(truth: Points, points: Points, low: Points, high: Points) -> Points:
+    """The points, (f, 2); one outside its frame is moved along its line to the truth, to a border inside the frame's."""
+    edge = _EDGE * (high - low).astype(np.float64)
+    towards = points.astype(np.float64) - truth
+    with np.errstate(all="ignore"):
+        room = np.where(towards > 0.0, high - edge - truth, low + edge - truth) / towards
+    share = np.clip(np.nan_to_num(np.where(towards == 0.0, np.inf, room), nan=0.0).min(axis=1, initial=1.0), 0.0, 1.0)
+    moved = truth + share[:, None] * towards
+    return _shown(np.where(inside(points, low, high)[:, None], points, moved))
+
+
+def arrows(truth: Points, points: Points, low: Points, high: Points) -> Points:
+    """Arrows, (f, 5, 2), from within the frame to the border, towards points outside: a shaft, and both sides of its head."""
+    tips = borders(truth, points, low, high).astype(np.float64)
+    towards = points.astype(np.float64) - truth
+    direction = towards / np.maximum(np.hypot(towards[:, 0], towards[:, 1]), 1e-300)[:, None]
+    across = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
+    length = _ARROW * (high - low).astype(np.float64).max(axis=1, keepdims=True, initial=0.0)
+    heads = [tips - 0.4 * length * (direction + sign * 0.6 * across) for sign in (1.0, -1.0)]
+    return _shown(np.stack([tips - length * direction, tips, heads[0], tips, heads[1]], axis=1))
+
+
+def labels_of(truth: Points, tips: Points, low: Points, high: Points) -> Points:
+    """Where the labels of arrows with these tips, (f, 2), are drawn: away from the truth, with room for their letters."""
+    size = high - low
+    rising = np.where(tips[:, 1] <= truth[:, 1], -_LABEL, 0.0)[:, None] * size * [0.0, 1.0]
+    return _shown(np.clip(tips + rising, low + size * [_LABEL, 0.0], high - size * [_LABEL, 0.5 * _LABEL]))
+
+
+def apart(centres: Points, others: Sequence[Points], low: Points, high: Points) -> Points:
+    """The centres of labels, (f, 2), moved towards the middle of their frames by lines until none covers one of `others`.
+
+    NaN where there is no label.
+    """
+    found, size = centres.astype(np.float64), (high - low).astype(np.float64)
+    line = np.where(found[:, 1] > (low + high)[:, 1] / 2, -_LINE, _LINE) * size[:, 1]
+    for _ in range(2 * len(others)):  # each of them covers two lines at most
+        distances = [np.abs(found - other) for other in others]
+        covered = np.any([np.all(one < size * [2 * _LABEL, 0.99 * _LINE], axis=1) for one in distances], axis=0)
+        found[:, 1] += np.where(covered, line, 0.0)
+    return found.astype(np.float32)
+
+
+def _shown(values: NDArray[Any]) -> Points:
+    points: Points = np.clip(np.nan_to_num(values, nan=_LARGEST), -_LARGEST, _LARGEST).astype(np.float32)
+    return points
+
+
+@final
+@dataclass
+class Frame:
+    """The part of the plane to show: a box around recent points, with some room.
+
+    Its sides lie on a grid that is coarse compared with its size, so that the view does not jitter.
+    """
+
+    _lows: Points = field(default_factory=lambda: np.empty((0, 2), np.float32))
+    _highs: Points = field(default_factory=lambda: np.empty((0, 2), np.float32))
+
+    def boxes(self, lows: Points, highs: Points, offsets: NDArray[np.intp]) -> Points:
+        """Closed boxes (len(offsets), 5, 2) at these offsets of the next slots, which reach from lows to highs (c, 2)."""
+        before = len(self._lows)
+        self._lows = np.concatenate([self._lows, lows])
+        self._highs = np.concatenate([self._highs, highs])
+        low, high = np.empty((len(offsets), 2)), np.empty((len(offsets), 2))
+        for i, end in enumerate((offsets + before + 1).tolist()):
+            recent = slice(max(0, end - _FRAMED_SLOTS), end)
+            low[i], high[i] = self._lows[recent].min(axis=0), self._highs[recent].max(axis=0)
+        self._lows, self._highs = self._lows[-_FRAMED_SLOTS:], self._highs[-_FRAMED_SLOTS:]
+        room = _ROOM * (high - low).max(axis=1, keepdims=True, initial=0.0)
+        low, high = low - room, high + room
+        step = np.exp2(np.floor(np.log2(np.maximum(high - low, 1e-30).max(axis=1, keepdims=True, initial=1e-30)))) / 8
+        low, high = (np.floor(low / step) - 0.5) * step, (np.ceil(high / step) + 0.5) * step
+        corners = [(low, low), (high, low), (high, high), (low, high), (low, low)]
+        return _shown(np.stack([np.stack([x[:, 0], y[:, 1]], axis=1) for x, y in corners], axis=1))
+
+
+@final
+@dataclass
+class Trail:
+    """The path of one point, cut at the frames into pieces of equal length, so that they fit into one array.
+
+    Piece i leads from the previous frame to frame i, through every slot between.
+    """
+
+    every: int
+    """Slots from one frame to the next, as by `stride`."""
+    _since: Points | None = None
+
+    def pieces(self, positions: Points, offsets: NDArray[np.intp]) -> Points:
+        """Pieces (len(offsets), every + 1, 2) that end at these offsets of the next positions (c, 2)."""
+        since = positions[:1] if self._since is None else self._since
+        path = np.concatenate([since, positions])
+        ends = offsets + len(since)
+        # A piece that would begin before the run, or before the frame ahead of a shortened last one, repeats its start.
+        starts = np.concatenate([[len(since) - 1 if self._since is None else 0], ends[:-1]]) if len(ends) else ends
+        index = np.maximum(ends[:, None] - np.arange(self.every, -1, -1), starts[:, None])
+        pieces: Points = path[np.minimum(index, len(path) - 1)]
+        keep_from = int(ends[-1]) if len(ends) else 0
+        self._since = path[keep_from:]
+        return pieces

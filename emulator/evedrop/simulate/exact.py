@@ -1,0 +1,246 @@
+"""Exact mode: the same cores as in a live run, without messages between them.
+
+Slots are simulated a chunk at a time. Where something flows back to the sensor, the parts that it depends on are simulated one
+slot at a time, and all others follow a chunk at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evedrop.model.acknowledgements import AckChannel
+from evedrop.model.digest import BlockDigests, Digests, InputLog
+from evedrop.model.given_states import GivenStates, recorded
+from evedrop.model.input_aware import InputAwareEstimator
+from evedrop.model.integrity.monitor import Monitor
+from evedrop.model.kernels.current import kernels
+from evedrop.model.numeric.detection import CusumBatch
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Belief, Flags, Receiver
+from evedrop.model.schemes.scheme import Scheme, Shared
+from evedrop.model.slot.controller import ControllerCore
+from evedrop.model.slot.link_core import LinkCore
+from evedrop.model.slot.plant import PlantCore
+from evedrop.model.slot.receiver import FollowedSlots
+from evedrop.model.slot.sensor import SensorCore, Sent
+from evedrop.model.streams import Batch
+from evedrop.names import CONTROLLER, LEGITIMATE
+from evedrop.scenario.controlled import monitor_of
+from evedrop.scenario.input_files import disturbances_of, states_of
+from evedrop.scenario.stream_keys import StreamKeys
+from evedrop.scenario.tables import Scenario
+from evedrop.score.acknowledging import ack_channel_of, chart_of
+from evedrop.score.closed_loop_tally import SolveTimes
+from evedrop.score.filtering import local_filter_of
+from evedrop.score.slots import InputSlots, ReceiverSlots, Slots
+from evedrop.score.sums import squared_errors
+from evedrop.simulate.chunk import Chunk, ReceiverChunk
+from evedrop.simulate.guarded_classes import Guard
+from evedrop.simulate.linked_receiver import LinkedReceiver
+from evedrop.simulate.packet_counts import PacketCounts
+
+
+@dataclass(frozen=True)
+class Roles:
+    """A scenario's sensor, scheme and receivers for a batch of trials."""
+
+    scenario: Scenario
+    batch: Batch
+    keys: StreamKeys
+    guard: Guard
+    """Checks the results of classes that are not built in."""
+    scheme: Scheme
+    shared: Shared
+    """The scheme's shared part of both sides."""
+    initial: Floats | None
+    """As for `Trajectory`."""
+    receivers: Mapping[str, Receiver]
+    betrayed: Mapping[str, int | None]
+    """Eavesdropper → the slot whose state it learns."""
+
+
+@final
+class ExactSimulation:
+    """Simulates all slots of a batch of trials.
+
+    digests: filled with the digests of receivers and controller, block by its first slot → (R, bytes); times: filled with the
+    times of decisions; packets: filled with the counts of packets.
+    """
+
+    def __init__(
+        self, roles: Roles, digests: Mapping[str, dict[int, Digests]], times: SolveTimes, packets: PacketCounts
+    ) -> None:
+        scenario, batch, keys = roles.scenario, roles.batch, roles.keys
+        self._roles, self._digests, self._packets = roles, digests, packets
+        self._guard = roles.guard
+        disturbances = disturbances_of(scenario)
+        process, chart, plan = scenario.process.process, chart_of(scenario), monitor_of(scenario)
+        states = states_of(scenario)
+        given = None if states is None else GivenStates(process, recorded(states), batch.trials)
+        self._sensor = SensorCore(
+            roles.guard.encoder(roles.shared.encoder()),
+            PlantCore(process, keys.process, batch, roles.initial, scenario.driven, disturbances, given),
+            local_filter_of(
+                scenario, keys.measurement, batch, None if plan is None else plan.spoofing(keys.spoofing, batch)
+            ),
+            None if chart is None else CusumBatch(chart, batch.trials),
+            None if plan is None else Monitor(plan, keys.watermark, batch),
+        )
+        ack_channel = ack_channel_of(scenario)
+        self._jammer = None if ack_channel is None else ack_channel.jammer
+        self._ack_channel = (
+            None if ack_channel is None else AckChannel.from_spec(ack_channel, keys.acknowledgements, batch)
+        )
+        self._steering = None
+        if scenario.controller is not None and scenario.assignment is not None:
+            controller = ControllerCore(scenario.controller.strategy, scenario.assignment, disturbances, batch.trials)
+            self._steering = _Steering(roles, controller, self._sensor, digests[CONTROLLER], times)
+        self._receivers = {
+            name: LinkedReceiver(one, scenario.window(name), scenario.timeline.outages[name])
+            for name, one in roles.receivers.items()
+        }
+        self._logs = {
+            name: BlockDigests(batch.trials, scenario.slots, scenario.outage_bounds(name)) for name in roles.receivers
+        }
+
+    def belief(self, name: str) -> Belief:
+        """A receiver's belief after the last chunk."""
+        return self._receivers[name].belief
+
+    def play(self, chunk: range, links: Mapping[str, LinkCore]) -> Chunk:
+        """Simulate the next slots, which are those that the links have planned. No receiver leaves or returns among them."""
+        answered = self._ack_channel is not None or self._steering is not None
+        sent: list[Sent] = []
+        alarms: list[Flags] = []
+        users: list[FollowedSlots] = []
+        inputs = None if self._steering is None else self._steering.room(len(chunk))
+        for slots in [range(k, k + 1) for k in chunk] if answered else [chunk]:
+            with self._guard.asking(LEGITIMATE, slots):
+                made = self._sensor.send(slots)
+            sent.append(made)
+            if made.packets.sent is not None:
+                for link in links.values():
+                    link.silence(slots, made.packets.sent)
+            if self._ack_channel is not None:
+                alarm = self._acknowledge(self._ack_channel, slots.start, made.packets.sent, links)
+                alarms += [] if alarm is None else [alarm]
+            if self._steering is not None and inputs is not None:
+                if self._steering.awaits_estimate:
+                    users.append(self._follow(LEGITIMATE, slots, links[LEGITIMATE], made))
+                x_hat = users[-1].beliefs.x_hat[0] if users else None
+                self._steering.act(slots.start, slots.start - chunk.start, made.true[0], x_hat, inputs)
+        whole = Sent.joined(sent)
+        with self._guard.asking(LEGITIMATE, chunk):
+            self._packets.add_slots(self._roles.scheme.encrypted(whole.packets), whole.packets.sent)
+        followed = {
+            name: FollowedSlots.joined(users)
+            if users and name == LEGITIMATE
+            else self._follow(name, chunk, link, whole)
+            for name, link in links.items()
+        }
+        for name, one in followed.items():
+            self._digests[name].update(self._logs[name].add(chunk, one.beliefs))
+        return self._chunk(chunk, whole, followed, links, np.array(alarms) if alarms else None, inputs)
+
+    def _acknowledge(
+        self, ack_channel: AckChannel, k: int, sent: Flags | None, links: Mapping[str, LinkCore]
+    ) -> Flags | None:
+        """Return the acknowledgements of slot k to the sensor; where they raise an alarm, (R,), or None."""
+        gamma = links[LEGITIMATE].gamma(k)
+        gamma_e = gamma if self._jammer is None else links[self._jammer].gamma(k)
+        arrived = ack_channel.arrived(k, None if sent is None else sent[0], gamma, gamma_e)
+        with self._guard.asking(LEGITIMATE, range(k, k + 1)):
+            return self._sensor.acknowledged(k, arrived, None if sent is None else sent[0])
+
+    def _follow(self, name: str, slots: range, link: LinkCore, made: Sent) -> FollowedSlots:
+        arrivals = link.arrivals(slots, made.packets.z, made.packets.header)
+        betrayed = self._roles.betrayed.get(name)
+        if betrayed is not None and betrayed in slots:
+            row = betrayed - slots.start
+            arrivals = arrivals._replace(truth={row: made.x[row]})
+        with self._guard.asking(name, slots):
+            return self._receivers[name].take_slots(slots, arrivals)
+
+    def _chunk(
+        self,
+        chunk: range,
+        made: Sent,
+        followed: Mapping[str, FollowedSlots],
+        links: Mapping[str, LinkCore],
+        alarms: Flags | None,
+        inputs: InputSlots | None,
+    ) -> Chunk:
+        """What is measured of the slots."""
+        none_counted: dict[str, NDArray[np.uint32]] = {}
+        no_sums = np.full((len(chunk), 2), np.nan)  # only receivers of a live run report sums over slots
+        receivers, slots = {}, {}
+        for name, (beliefs, late) in followed.items():
+            link = links[name]
+            error = squared_errors(made.x, beliefs.x_hat)
+            receivers[name] = ReceiverChunk(error, kernels.traces(beliefs.P), beliefs.action, link.fates)
+            arrived, used = (None, None) if late is None else late
+            slots[name] = ReceiverSlots(
+                beliefs.x_hat,
+                beliefs.action,
+                beliefs.P,
+                no_sums,
+                link.in_time,
+                none_counted,
+                arrived,
+                used,
+            )
+        true = made.true if self._sensor.filters else None
+        inputs = None if inputs is None else replace(inputs, monitored=made.monitored)
+        whole = Slots(chunk.start, made.x, made.packets.nu, slots, made.packets.sent, alarms, inputs, true)
+        return Chunk(chunk.start, receivers, whole)
+
+
+@final
+class _Steering:
+    """The controller of a scenario, and the way of its inputs to the sensor and to an estimator that knows them."""
+
+    def __init__(
+        self,
+        roles: Roles,
+        controller: ControllerCore,
+        sensor: SensorCore,
+        digests: dict[int, Digests],
+        times: SolveTimes,
+    ) -> None:
+        scenario, trials = roles.scenario, roles.batch.trials
+        table, plant, estimator = scenario.controller, scenario.driven, roles.receivers[LEGITIMATE]
+        inputs = 0 if plant is None else plant.inputs
+        self._controller, self._sensor, self._digests, self._times = controller, sensor, digests, times
+        self._on_truth = table is not None and table.acts_on == "truth"
+        self._estimator = estimator if isinstance(estimator, InputAwareEstimator) else None
+        self._log = InputLog(inputs, trials, scenario.slots)
+        self._u: Floats = np.zeros((inputs, trials))
+        self._failed: Flags = np.zeros(trials, np.bool_)
+
+    @property
+    def awaits_estimate(self) -> bool:
+        """Whether the legitimate estimator and the controller wait for each other in every slot."""
+        return not self._on_truth or self._estimator is not None
+
+    def room(self, count: int) -> InputSlots:
+        """Room for the inputs of some slots."""
+        return InputSlots(np.empty((count, *self._u.shape)), np.empty((count, len(self._failed)), np.bool_))
+
+    def act(self, k: int, row: int, true: Floats, x_hat: Floats | None, inputs: InputSlots) -> None:
+        """Decide the inputs of slot k, from its true state or the estimate of it, (n, R), and note them in their row."""
+        if k % self._controller.period == 0:
+            decision = self._controller.decide(k, true if self._on_truth or x_hat is None else x_hat)
+            self._u, self._failed = decision.u, decision.failed
+            self._times.add_seconds([decision.seconds])
+            self._sensor.set_inputs(self._u)
+        if self._estimator is not None:
+            self._estimator.learn(k, self._u)
+        inputs.u[row], inputs.failed[row] = self._u, self._failed
+        digests = self._log.add(k, self._u, self._failed)
+        if digests is not None:
+            self._digests.update([digests])

@@ -1,0 +1,177 @@
+"""Estimates means that rare events dominate, by splitting: trials with large errors are copied, and copies weigh less.
+
+A copy is a trial that reads the random numbers of its ancestor up to the slot of the split (`evedrop.model.streams.Lineage`), so
+the simulation is that of all other trials, and nothing in it has to be copied. After a split the slots before it are simulated
+again.
+
+Source: docs/mathematics.md, splitting; docs/montecarlo.md, rare events.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from evedrop.model.figures.standard_error import standard_error, z_of
+from evedrop.model.numeric.splitting import SplitPopulations, importance_floor
+from evedrop.model.process import Floats
+from evedrop.model.streams import OWN, Batch, BlockReader, Lineage, root_of_seed, stream_key
+from evedrop.scenario.expected.expectations import Expectation, expectations_of
+from evedrop.scenario.tables import Scenario
+from evedrop.score.summary import RareEstimate
+from evedrop.simulate.chunk import ReceiverChunk
+from evedrop.simulate.simulation import Mode, Simulation
+
+POPULATIONS = 32
+LEAST_TRIALS = 100
+"""The least number of trials of a population."""
+_PILOTS = 8  # populations that decide in which slots all others are split
+_FIRST_TRIAL = 2**47  # far from the trials of any study, so that both are independent
+_SPLIT_BELOW = 0.5  # of the trials that count
+_WIDEST = 0.1  # of the mean: with a larger standard error the populations are too skewed for it to be true
+
+
+@final
+@dataclass(frozen=True)
+class SplitMeans:
+    """What populations say about one receiver."""
+
+    errors: Floats
+    """The estimate of each slot's mean error by each population, (P, slots)."""
+    splits: tuple[int, ...]
+    """The slots after which trials were copied."""
+    counting: float
+    """The least share of trials that counted in a slot, in the mean over populations."""
+
+    @property
+    def of_populations(self) -> Floats:
+        """The mean error of the run by each population, (P,)."""
+        return np.asarray(self.errors.mean(axis=1), np.float64)
+
+    @property
+    def doubt(self) -> str | None:
+        """Why the estimate is not to be trusted; None if it is."""
+        found = self.of_populations
+        if not np.isfinite(found).all():
+            return "an error leaves double precision; give fewer slots"
+        mean, error = float(found.mean()), standard_error(found)
+        if mean == 0.0 or error is None:
+            return None
+        if error > _WIDEST * mean:
+            return (
+                f"its standard error would be {100 * error / mean:.0f} % of the mean; give more trials or fewer slots"
+            )
+        return None
+
+    def estimate(self, trials: int, expected: Expectation) -> RareEstimate:
+        """The entry of the summary; trials: of each population; expected: what theory expects of the receiver."""
+        found, count = self.of_populations, len(self.errors)
+        about = (count, trials, len(self.splits), self.counting)
+        if (doubt := self.doubt) is not None:
+            return RareEstimate(None, None, None, *about, doubt, {})
+        mean, error = float(found.mean()), standard_error(found)
+        known = expected.known and not expected.of_model
+        theory = float(expected.traces(self.errors.shape[1]).mean()) if known else None
+        slots = {
+            "mean_error": self.errors.mean(axis=0).tolist(),
+            "standard_error": (self.errors.std(axis=0, ddof=1) / np.sqrt(count)).tolist(),
+        }
+        return RareEstimate(mean, error, z_of(found, theory), *about, None, slots)
+
+
+@final
+class Splitter:
+    """Splits trials of a scenario by the error of one receiver.
+
+    trials: of each population; stopped: asked between slots, ends the work; tell: gets the trial-slots done since its last call.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        mode: Mode,
+        receiver: str,
+        trials: int = LEAST_TRIALS,
+        stopped: Callable[[], bool] = lambda: False,
+        tell: Callable[[int], None] = lambda _: None,
+    ) -> None:
+        self._scenario, self._mode, self._receiver, self._trials = scenario, mode, receiver, trials
+        self._stopped, self._tell = stopped, tell
+        self._key = stream_key(root_of_seed(scenario.seed), f"splitting/{receiver}")
+        jammer = None if scenario.acknowledgements is None else scenario.acknowledgements.jammer
+        self._others = scenario.eavesdroppers.keys() - {receiver, jammer}
+        pilots = range(_FIRST_TRIAL, _FIRST_TRIAL + _PILOTS * trials)
+        chunks = (chunk.receivers[receiver] for chunk in self._simulation(pilots, OWN).chunks())
+        errors = np.concatenate([self._size(one) for one in chunks])
+        self._floor = importance_floor(errors, float(np.trace(scenario.process.process.Q)))
+
+    def estimated(self, populations: int = POPULATIONS) -> SplitMeans:
+        """The estimates of some populations, split in the slots in which pilots with other trials had to be split."""
+        pilots = self._simulated(range(_PILOTS), None)
+        return self._simulated(range(_PILOTS, _PILOTS + populations), pilots.splits)
+
+    def _size(self, one: ReceiverChunk) -> Floats:
+        """What makes a trial important, (c, R): the error, and what the receiver believes of it where both scatter."""
+        return one.error if self._mode is Mode.COVARIANCE_ONLY else 0.5 * (one.error + one.trace)
+
+    def _simulated(self, numbers: range, splits: Collection[int] | None) -> SplitMeans:
+        """The estimates of the populations with these numbers; splits: after which slots; None: wherever few trials count."""
+        count, slots = len(numbers), self._scenario.slots
+        size = self._trials
+        first = _FIRST_TRIAL + numbers.start * size
+        uniforms = BlockReader(self._key, Batch(slots, count, numbers.start), 1)
+        populations, lineage, start = SplitPopulations(count, size), OWN, 0
+        errors, counting, done = np.empty((count, slots)), np.ones(slots), list[int]()
+        while start < slots and not self._stopped():
+            simulation = self._simulation(range(first, first + count * size), lineage)
+            for k, error, important in self._slots(simulation, start):
+                errors[:, k] = populations.means(error.reshape(count, size))
+                share = populations.weigh((important + self._floor[k]).reshape(count, size)).mean()
+                counting[k], start = share, k + 1
+                self._tell(count * size)
+                if self._stopped():
+                    break
+                if k + 1 < slots and (share < _SPLIT_BELOW if splits is None else k in splits):
+                    ancestors = populations.split(uniforms.uniforms(range(k, k + 1))[0, 0])
+                    lineage = lineage.split(k + 1, ancestors)
+                    done.append(k)
+                    break
+        return SplitMeans(errors, tuple(done), float(counting.min()))
+
+    def _simulation(self, trials: range, lineage: Lineage) -> Simulation:
+        return Simulation(self._scenario, trials, self._mode, lineage=lineage, leaving_out=self._others)
+
+    def _slots(self, simulation: Simulation, start: int) -> Iterator[tuple[int, Floats, Floats]]:
+        """Each slot from `start` on, with the errors of its trials, and what makes them important, (R,)."""
+        for chunk in simulation.chunks():
+            one = chunk.receivers[self._receiver]
+            sizes = self._size(one)
+            for row in range(max(0, start - chunk.first), len(one.error)):
+                yield chunk.first + row, one.error[row], sizes[row]
+
+
+def rare_estimates(
+    scenario: Scenario, mode: Mode, stopped: Callable[[], bool], tell: Callable[[int], None]
+) -> dict[str, RareEstimate]:
+    """Receiver → its estimate, by populations that together have at least the scenario's trials; empty once `stopped`."""
+    found: dict[str, RareEstimate] = {}
+    trials, expected = trials_of(scenario), expectations_of(scenario)
+    for name in scenario.receivers:
+        means = Splitter(scenario, mode, name, trials, stopped, tell).estimated()
+        if stopped():
+            return {}
+        found[name] = means.estimate(trials, expected[name])
+    return found
+
+
+def trials_of(scenario: Scenario) -> int:
+    """The trials of each population."""
+    return max(LEAST_TRIALS, -(-scenario.trials // POPULATIONS))
+
+
+def work_of(scenario: Scenario) -> int:
+    """The trial-slots that the populations of all receivers have."""
+    return len(scenario.receivers) * (_PILOTS + POPULATIONS) * trials_of(scenario) * scenario.slots

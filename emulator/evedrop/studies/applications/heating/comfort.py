@@ -1,0 +1,201 @@
+"""The comfort of a heated room: how long it is too cold or too warm, how much the heater heats, and whether receivers can tell.
+
+Source: docs/scenario.md, comfort.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from copy import copy
+from typing import Annotated, Any, ClassVar, Self, final
+
+import numpy as np
+from pydantic import Field
+
+from evedrop.model.process import Floats
+from evedrop.scenario.application import (
+    RECEIVERS,
+    Application,
+    ApplicationTally,
+    ControlledPlant,
+    Kind,
+    Panel,
+    PanelCurve,
+    PanelFeed,
+    Summary,
+)
+from evedrop.scenario.table import Found, Number, Table
+from evedrop.show.view.palette import PLANT
+
+_HOUR = 3600.0
+_ENERGY, _DISCOMFORT = "heating", "discomfort"
+
+Name = Annotated[str, Field(strict=True, min_length=1)]
+
+
+class ComfortTable(Table):
+    """`[comfort]`: the room's temperature in °C, the heater's power in kW, and the temperatures that are comfortable."""
+
+    temperature: Annotated[Name, Field(examples=["T_room"])]
+    heater: Annotated[Name, Field(examples=["P_heat"])]
+    lowest: Annotated[Number, Field(examples=[20.0])]
+    highest: Annotated[Number, Field(examples=[23.0])]
+
+    @classmethod
+    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+        """A range without temperatures."""
+        lowest, highest = table.get("lowest"), table.get("highest")
+        if isinstance(lowest, float) and isinstance(highest, float) and lowest >= highest:
+            return [("lowest", f"is {lowest}, and highest is {highest}; expected lowest < highest")]
+        return []
+
+
+@final
+class _Range:
+    """The comfortable temperatures, for deviations of the state from the reference."""
+
+    def __init__(self, loop: ControlledPlant, table: ComfortTable) -> None:
+        self.state = loop.state(table.temperature)
+        around = float(loop.around[self.state])
+        self._lowest, self._highest = table.lowest - around, table.highest - around
+
+    def outside(self, temperature: Floats) -> Floats:
+        """By how much temperatures are too low or too high, in K; 0 for comfortable ones."""
+        return np.maximum(self._lowest - temperature, 0.0) + np.maximum(temperature - self._highest, 0.0)
+
+
+@final
+class ComfortTally(ApplicationTally):
+    """A room's totals over a set of trials, whose slots come in order."""
+
+    def __init__(self, loop: ControlledPlant, table: ComfortTable, trials: int) -> None:
+        self._range, self._plant = _Range(loop, table), loop.plant
+        self._heater, self._hours = loop.input(table.heater), loop.slot_seconds / _HOUR
+        self._outside: Floats = np.zeros(trials)
+        self._power: Floats = np.zeros(trials)
+        self._known = {name: np.zeros(trials, np.int64) for name in loop.receivers}
+        self._slots = np.zeros(trials, np.int64)
+
+    def add(self, x: Floats, u: Floats, estimates: Mapping[str, Floats]) -> None:
+        """Add the next slots."""
+        state = self._range.state
+        outside = self._range.outside(x[:, state])
+        self._slots += len(x)
+        for row, inputs in zip(outside, u, strict=True):  # slot by slot: the same bits however the slots are divided
+            self._outside = self._outside + row
+            self._power = self._power + self._plant.limited(inputs)[self._heater]
+        for name, known in self._known.items():
+            believed = self._range.outside(estimates[name][:, state])
+            self._known[name] = known + np.count_nonzero((believed > 0.0) == (outside > 0.0), axis=0)
+
+    @classmethod
+    def merged(cls, parts: Sequence[Self]) -> Self:
+        """The totals of several sets of trials, in order."""
+        whole = copy(parts[0])
+        for name in ("_outside", "_power", "_slots"):
+            setattr(whole, name, np.concatenate([getattr(part, name) for part in parts]))
+        whole._known = {name: np.concatenate([part._known[name] for part in parts]) for name in parts[0]._known}
+        return whole
+
+    @property
+    def of_trials(self) -> Mapping[tuple[str, ...], Floats]:
+        """Every figure of every trial, (R,); none where trials were cut short at different slots."""
+        slots = int(self._slots[0])
+        if not slots or (self._slots != slots).any():
+            return {}
+        return {
+            ("discomfort",): self._outside * self._hours,
+            ("heating_energy",): self._power * self._hours,
+            **{(RECEIVERS, name, "known_fraction"): counts / slots for name, counts in self._known.items()},
+        }
+
+    def summary(self) -> Summary:
+        """The summary's entry: means over trials; None before the first slot."""
+        slots = int(self._slots.sum())
+        return {
+            "discomfort": float(self._outside.mean()) * self._hours if slots else None,
+            "heating_energy": float(self._power.mean()) * self._hours if slots else None,
+            "receivers": {
+                name: {"known_fraction": int(known.sum()) / slots if slots else None}
+                for name, known in self._known.items()
+            },
+        }
+
+
+@final
+class ComfortFeed(PanelFeed):
+    """The heating energy and the discomfort that each receiver believes, since slot 0, in one trial."""
+
+    def __init__(self, loop: ControlledPlant, table: ComfortTable) -> None:
+        self._range, self._heater, self._hours = (
+            _Range(loop, table),
+            loop.input(table.heater),
+            loop.slot_seconds / _HOUR,
+        )
+        self._sums: dict[str, float] = {}
+
+    def take(self, first: int, u: Floats, estimates: Mapping[str, Floats]) -> Mapping[str, Floats]:
+        """Add the next slots."""
+        rates = {f"{_ENERGY}/energy": u[:, self._heater]}
+        for name, x_hat in estimates.items():
+            rates[f"{_DISCOMFORT}/{name}"] = self._range.outside(x_hat[:, self._range.state])
+        slots = np.arange(first, first + len(u), dtype=np.float64)
+        curves = {}
+        for path, values in rates.items():
+            sums = self._sums.get(path, 0.0) + np.cumsum(values)
+            self._sums[path] = float(sums[-1])
+            curves[path] = np.stack([slots, sums * self._hours])
+        return curves
+
+
+@final
+class Comfort(Application):
+    """A room with a heater."""
+
+    table = ComfortTable
+    names: ClassVar[Mapping[str, Kind]] = {"temperature": "states", "heater": "inputs"}
+    figures = ("discomfort", "heating_energy")
+    receiver_figures = ("known_fraction",)
+
+    @classmethod
+    def tally(cls, loop: ControlledPlant, table: Table, trials: int) -> ComfortTally:
+        """Totals over no slots yet."""
+        return ComfortTally(loop, _room(table), trials)
+
+    @classmethod
+    def lines(cls, summary: Summary) -> list[str]:
+        """The discomfort, the energy, and how often receivers know whether the room is comfortable."""
+        if summary["discomfort"] is None:
+            return []
+        known = ", ".join(
+            f"{name} {cls.text(summary, (name, 'known_fraction'), '.3f')}" for name in summary["receivers"]
+        )
+        return [
+            f"the room is uncomfortable by {cls.text(summary, ('discomfort',), '.3g')} K h, and the heater gives "
+            f"{cls.text(summary, ('heating_energy',), '.3g')} kWh",
+            f"fraction of slots in which each knows whether the room is comfortable: {known}",
+        ]
+
+    @classmethod
+    def panels(cls, loop: ControlledPlant, table: Table) -> tuple[Panel, ...]:
+        """The heater's energy, and the discomfort that each receiver believes."""
+        del table
+        return (
+            Panel(_ENERGY, "Heating energy (kWh)", (PanelCurve("energy", PLANT[0]),)),
+            Panel(
+                _DISCOMFORT,
+                "Discomfort that each believes (K h)",
+                tuple(PanelCurve(name, width=1.2) for name in loop.receivers),
+                with_beliefs=True,
+            ),
+        )
+
+    @classmethod
+    def feed(cls, loop: ControlledPlant, table: Table) -> ComfortFeed:
+        """What fills its panels."""
+        return ComfortFeed(loop, _room(table))
+
+
+def _room(table: Table) -> ComfortTable:
+    assert isinstance(table, ComfortTable)  # noqa: S101 - the hook gives each application its own table
+    return table

@@ -1,0 +1,239 @@
+"""Compares schemes against adversaries, on one process and its links: the secrecy of each scheme, and its cost.
+
+Each scheme is a Monte Carlo study of its own, with another for every attack on acknowledgements; all of them have the same
+trials, and an adversary has the same losses in each.
+
+Source: docs/compare.md.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import math
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from evedrop.errors import Interrupted, RunError, UsageError
+from evedrop.model.figures.errors import MeanSquaredError
+from evedrop.model.figures.standard_error import standard_error
+from evedrop.model.schemes import scheme_of
+from evedrop.names import LEGITIMATE
+from evedrop.results.comparison import Cell, Comparison, Needs, PacketLeak, SchemeResult, SimulatedError, Theory
+from evedrop.results.folder import (
+    disk_errors,
+    make_private,
+    private_pictures,
+    replace_private,
+    write_private,
+)
+from evedrop.results.resolved_scenario import input_texts, resolved
+from evedrop.scenario.expected.expectations import Expectation, expectations_of
+from evedrop.scenario.news import Tell
+from evedrop.scenario.tables import Scenario
+from evedrop.score.histogram import LEVELS
+from evedrop.score.leak import revealed_by_packets
+from evedrop.score.rare_events import rare_events_of, z_of_error
+from evedrop.score.scorekeeper import verdicts
+from evedrop.score.sums import Tally, trial_means
+from evedrop.simulate.kept_tasks import kept_tasks, study_of
+from evedrop.simulate.montecarlo import Merger, Plan, teller
+from evedrop.simulate.packet_counts import PacketCounts
+from evedrop.simulate.simulation import Mode
+from evedrop.simulate.trials import BatchResult, tasks_of
+from evedrop.studies.matchups import Group, Matchups
+from evedrop.system.signals import stop_on_signals
+
+_WRITE_SECONDS, _WRITE_SHARE = (
+    3.0,
+    50.0,
+)  # from one compare.json to the next, and as a multiple of the time to write one
+
+
+def compare_all(matchups: Matchups, folder: Path, tell: Tell, plan: Plan, *, resume: bool = False) -> Comparison:
+    """Simulate all matches into a results folder: compare.json, compare.png and .pdf, and the simulated scenarios.
+
+    resume: go on with the comparison in the folder, which was interrupted.
+
+    Raises UsageError for an unusable folder or plan; Interrupted on Ctrl-C and RunError if a worker fails, with the completed
+    schemes in the folder.
+    """
+    if plan.mode is not Mode.EXACT:
+        raise UsageError(
+            f"a comparison follows packets, which the mode {plan.mode.value} does not have; leave the mode out"
+        )
+    groups = matchups.groups
+    wanted = {"schemes": [*matchups.schemes], "adversaries": [*matchups.adversaries]}
+    study = study_of("compare", wanted, [group.scenario for group in groups])
+    told = teller(tell, sum(group.scenario.trials * group.scenario.slots for group in groups))
+    played: list[tuple[Group, Merger]] = []
+    failure: RunError | None = None
+    with (
+        stop_on_signals() as stop,
+        plan.crew(group.scenario for group in groups) as crew,
+        kept_tasks(folder, study, resume) as kept,
+    ):
+        tasks = [tasks_of(group.scenario, plan.mode, 1, kept) for group in groups]
+        everything = list(itertools.chain(*tasks))
+        with (
+            disk_errors(folder),
+            contextlib.closing(crew.results(everything, told, stop.is_set, kept)) as results,
+        ):
+            written, took = time.monotonic(), 0.0
+            try:
+                for group, its_tasks in zip(groups, tasks, strict=True):
+                    merger = _merged(group, plan, itertools.islice(results, len(its_tasks)))
+                    if not merger.complete:
+                        break
+                    played.append((group, merger))
+                    began = time.monotonic()
+                    if began - written > max(_WRITE_SECONDS, _WRITE_SHARE * took):
+                        _write_found(folder, _comparison(matchups, played))
+                        written = time.monotonic()
+                        took = written - began
+            except RunError as error:
+                failure = error
+        found = _comparison(matchups, played)
+        if not found.schemes:
+            kept.remove_unless_any()
+            raise failure or kept.interrupted("a scheme was done")
+        _write(folder, found, played)
+        if failure is not None:
+            raise failure
+        if len(played) < len(groups):
+            raise Interrupted(f"interrupted; {len(found.schemes)} of {len(matchups.schemes)} schemes are in {folder}")
+        kept.forget()
+    return found
+
+
+def _merged(group: Group, plan: Plan, results: Iterator[BatchResult]) -> Merger:
+    merger = Merger(group.scenario, plan.mode)
+    for result in results:
+        merger.add_batch(result)
+    return merger
+
+
+def _comparison(matchups: Matchups, played: Sequence[tuple[Group, Merger]]) -> Comparison:
+    """The comparison of the schemes whose matches are all done."""
+    some = matchups.groups[0].scenario
+    wanted = [group.scheme for group in matchups.groups]
+    done = [group.scheme for group, _ in played]
+    whole = [scheme for scheme in matchups.schemes if done.count(scheme) == wanted.count(scheme)]
+    title = some.title.rpartition(" (")[0]
+    schemes = {}
+    for scheme in whole:
+        groups = [(group, merger) for group, merger in played if group.scheme == scheme]
+        cells = {one.adversary: Cell(one) for one in matchups.undefined if one.scheme == scheme}
+        for group, merger in groups:
+            cells |= _cells(group, merger.totals.tallies)
+        scenario, merger = groups[0][0].scenario, groups[0][1]
+        user = merger.totals.tallies[LEGITIMATE]
+        schemes[scheme] = SchemeResult(
+            scheme,
+            scenario.encoding.parameters,
+            _needs(scenario, merger.packets),
+            _measured(scenario, LEGITIMATE, user, expectations_of(scenario)[LEGITIMATE]),
+            {adversary: cells[adversary] for adversary in matchups.adversaries},
+            _leak(scenario),
+        )
+    return Comparison(
+        title, some.slots, some.trials, some.seed, some.first_trial, matchups.adversaries, schemes, matchups.left_out
+    )
+
+
+def _cells(group: Group, totals: Mapping[str, Tally]) -> dict[str, Cell]:
+    expected = expectations_of(group.scenario)
+    measured = {name: _measured(group.scenario, name, tally, expected[name]) for name, tally in totals.items()}
+    secrecy = {one.eavesdropper: one for one in verdicts(group.scenario, totals)}
+    return {
+        one.adversary: Cell(one, measured[LEGITIMATE], measured[one.receiver], secrecy[one.receiver])
+        for one in group.matches
+    }
+
+
+def _needs(scenario: Scenario, packets: PacketCounts) -> Needs:
+    scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
+    sent, encrypted = packets.sent / scenario.slots, packets.encrypted / scenario.slots
+    of_trials = {
+        "sent_fraction": sent,
+        "encrypted_fraction": encrypted,
+        "bits_per_slot": scheme.packet_bits * sent,
+        "energy_per_slot": scenario.energy_model.spent(scheme, sent, encrypted),
+    }
+    return Needs(
+        scheme.needs_acknowledgements,
+        scheme.payload_bits,
+        scheme.header_bits,
+        **{name: float(np.mean(one)) for name, one in of_trials.items()},
+        standard_errors={name: standard_error(one) for name, one in of_trials.items()},
+        secret_bits_per_slot=scheme.secret_bits,
+        initial_secret_bits=scheme.initial_secret_bits,
+    )
+
+
+def _leak(scenario: Scenario) -> PacketLeak | None:
+    if scenario.of_model:
+        return None
+    packets = revealed_by_packets(scenario)
+    if packets is None:
+        return None
+    revealed = packets.next(scenario.slots)
+    hidden = 1.0 - revealed.clear
+    bits = float(revealed.hidden_bits.sum()) / float(hidden.sum()) if hidden.any() else None
+    return PacketLeak(float(np.mean(revealed.clear)), bits)
+
+
+def _measured(scenario: Scenario, receiver: str, tally: Tally, expected: Expectation) -> SimulatedError:
+    means = trial_means(tally)
+    heavy = expected.infinite_variance
+    error = None if heavy else standard_error(means)
+    mean, theory = MeanSquaredError.of_totals(tally), _theory(scenario, receiver, expected)
+    rare = None if expected.of_model else rare_events_of(expected, tally)
+    exact = None if theory is None or theory.bound or expected.of_model else theory.mean
+    return SimulatedError(
+        mean,
+        error,
+        {f"{level:g}": float(np.quantile(means, level)) for level in LEVELS},
+        heavy,
+        theory,
+        z_of_error(means, exact, expected, tally.done, rare),
+        rare,
+    )
+
+
+def _theory(scenario: Scenario, receiver: str, expected: Expectation) -> Theory | None:
+    """The theory of a receiver: its error, or a lower bound for receivers of its kind; None if neither is known."""
+    known = expected if expected.known else expected.bound
+    if known is not None:
+        traces = known.traces(scenario.slots)
+        return Theory(float(np.mean(traces)), float(traces[-1]), known.limit, known is not expected)
+    if receiver == LEGITIMATE or receiver in scenario.leaks or expected.assumed:
+        return None
+    found = scheme_of(scenario.process.process, scenario.encoding.spec).error_floor(scenario.slots)
+    if found is None:
+        return None
+    floor, grows = found
+    return Theory(float(np.mean(floor)), float(floor[-1]), math.inf if grows else None, True)
+
+
+def _write(folder: Path, found: Comparison, played: Sequence[tuple[Group, Merger]]) -> None:
+    from evedrop.show.view.comparison_picture import draw  # noqa: PLC0415 - matplotlib takes half a second
+
+    with disk_errors(folder):
+        _write_found(folder, found)
+        scenarios = folder / "scenarios"
+        make_private(scenarios)
+        for group, _ in played:
+            write_private(scenarios / f"{group.name}.toml", resolved(group.scenario))
+            for name, text in input_texts(group.scenario).items():
+                write_private(scenarios / name, text)
+        draw(private_pictures(folder / "compare"), found)
+
+
+def _write_found(folder: Path, found: Comparison) -> None:
+    """Write compare.json with the schemes so far, if there are any; replaces the file atomically."""
+    if found.schemes:
+        replace_private(folder / "compare.json", found.as_json() + "\n")

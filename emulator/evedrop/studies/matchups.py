@@ -1,0 +1,284 @@
+"""The matches of a comparison: from one scenario, a scenario for every scheme, and one for each attack on the scheme.
+
+An adversary is either a strategy, by its name, or an attack on the acknowledgements combined with the best strategy against
+the scheme.
+
+Source: docs/compare.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from evedrop.errors import NotRegistered, ScenarioError, UsageError
+from evedrop.model.acknowledgements import OVERHEARING
+from evedrop.model.eavesdroppers import STRATEGIES
+from evedrop.model.eavesdroppers.readers import RESERVED
+from evedrop.model.registry import Registry
+from evedrop.model.schemes import SCHEMES
+from evedrop.names import LEGITIMATE
+from evedrop.results.comparison import Match, receiver_name
+from evedrop.scenario.across import lacking_streams
+from evedrop.scenario.events.effects import Jamming
+from evedrop.scenario.loading import checked
+from evedrop.scenario.singular_noise import unsuited
+from evedrop.scenario.tables import Scenario
+from evedrop.scenario.words import listed
+from evedrop.system.hints import near
+
+ATTACKERS: Mapping[str, str] = {
+    "blocks-critical": "critical",
+    "blocks-all": "all",
+    "forges": "forge",
+    "flips": "flip",
+    "hijacks": "hijack",
+}
+"""Adversary → its attack on acknowledgements."""
+
+_FLIP = 0.1
+"""The probability with which `flips` flips an acknowledgement, unless the scenario has one."""
+
+_ACK_CHANNEL = {"link": {"quality": 1.0}}
+
+Tables = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Group:
+    """The matches of one simulation: one scheme, under one attack or none."""
+
+    scenario: Scenario
+    matches: tuple[Match, ...]
+
+    @property
+    def scheme(self) -> str:
+        """The scheme of all its matches."""
+        return self.scenario.encoding.scheme
+
+    @property
+    def name(self) -> str:
+        """Name of its scenario's file."""
+        attacker = next((match.adversary for match in self.matches if match.attack != "none"), None)
+        scheme = self.scheme.replace(":", ".")
+        return scheme if attacker is None else f"{scheme}-{attacker}"
+
+
+@dataclass(frozen=True)
+class Matchups:
+    """All matches of a comparison, and those that are not defined."""
+
+    schemes: tuple[str, ...]
+    adversaries: tuple[str, ...]
+    groups: tuple[Group, ...]
+    """In order of schemes; for each scheme, the group without an attack comes first."""
+    undefined: tuple[Match, ...]
+    left_out: Mapping[str, tuple[str, ...]]
+    """Scheme that cannot be used with this process → why not, in lines."""
+
+
+def adversaries_of() -> tuple[str, ...]:
+    """The names of all adversaries."""
+    return (*STRATEGIES, *ATTACKERS)
+
+
+def usual_adversaries(scenario: Scenario) -> tuple[str, ...]:
+    """The names of all adversaries but those that are costly and not in the scenario."""
+    own = {table.strategy for table in scenario.eavesdroppers.values()}
+    return tuple(name for name in adversaries_of() if name in ATTACKERS or name in own or not STRATEGIES[name].costly)
+
+
+def matchups_of(
+    scenario: Scenario,
+    schemes: Sequence[str] | None = None,
+    adversaries: Sequence[str] | None = None,
+    parameters: Mapping[str, Any] | None = None,
+) -> Matchups:
+    """The matches of schemes and adversaries, by name; by default all that the sensor can use and that are not costly.
+
+    parameters: SCHEME.PARAMETER → value.
+
+    Raises UsageError with every unknown name. Raises ScenarioError if a scheme that is named, or has such a parameter, cannot be
+    used with this process, if none can, and if the adversaries of a scheme cannot.
+    """
+    if adversaries is None:
+        adversaries = usual_adversaries(scenario)
+    chosen = _chosen(schemes, adversaries, parameters or {})
+    groups: list[Group] = []
+    undefined: list[Match] = []
+    mistakes: dict[str, None] = {}
+    left_out: dict[str, tuple[str, ...]] = {}
+    for scheme in chosen[0]:
+        matches = [_match(scenario, scheme, name) for name in chosen[1]]
+        encoding = _encoding(scenario, scheme, parameters or {})
+        for attack in ("none", *ATTACKERS.values()):
+            some = tuple(one for one in matches if one.not_defined is None and one.attack == attack)
+            if not some and attack != "none":
+                continue
+            try:
+                groups.append(Group(_scenario(scenario, encoding, attack, some), some))
+            except ScenarioError as error:
+                unusable = _unusable(scenario, encoding)
+                if unusable:
+                    left_out[scheme] = unusable
+                    break
+                mistakes.update(dict.fromkeys(_with_scheme(scheme, error.mistakes)))
+        else:
+            undefined += [match for match in matches if match.not_defined is not None]
+    meant = {key.rpartition(".")[0] for key in parameters or {}} if schemes is None else set(schemes)
+    for scheme, why in left_out.items():
+        if scheme in meant or not groups:
+            mistakes.update(dict.fromkeys(_with_scheme(scheme, why)))
+    if mistakes:
+        raise ScenarioError(scenario.title, list(mistakes))
+    usable = tuple(scheme for scheme in chosen[0] if scheme not in left_out)
+    return Matchups(usable, chosen[1], tuple(groups), tuple(undefined), left_out)
+
+
+def _with_scheme(scheme: str, mistakes: Iterable[str]) -> list[str]:
+    return [f"with the scheme {scheme}: {line}" for line in mistakes]
+
+
+def _unusable(scenario: Scenario, encoding: Tables) -> tuple[str, ...]:
+    """Why a scheme cannot be used with this process, whatever the adversaries, in lines; empty if it can."""
+    try:
+        _scenario(scenario, encoding, "none", ())
+    except ScenarioError as error:
+        return tuple(error.mistakes)
+    return ()
+
+
+def _chosen(
+    schemes: Sequence[str] | None, adversaries: Sequence[str] | None, parameters: Mapping[str, Any]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    found: list[str] = []
+    chosen = []
+    for what, names, known in (("scheme", schemes, tuple(SCHEMES)), ("adversary", adversaries, adversaries_of())):
+        wanted = known if names is None else tuple(dict.fromkeys(names))
+        found += _strange(what, wanted, known, SCHEMES if what == "scheme" else STRATEGIES)
+        if not wanted:
+            found.append(f"no {what} is named; expected {listed(known)}")
+        chosen.append(wanted)
+    receivers = {name: receiver_name(name) for name in chosen[1]}
+    for name, receiver in receivers.items():
+        other = next(one for one, its in receivers.items() if its == receiver)
+        if other != name:
+            found.append(
+                f"{name} and {other} would both be called {receiver} in a scenario; compare them one after the other"
+            )
+    entries = {one: SCHEMES[one].parameters for one in (*SCHEMES, *chosen[0]) if one in SCHEMES}
+    for key in parameters:
+        scheme, _, name = key.rpartition(".")
+        if name not in entries.get(scheme, ()):
+            parts = [f"{one}.{entry}" for one, known in entries.items() for entry in known]
+            found.append(f"{key} is not a parameter of a scheme; expected {listed(parts)}{near(key, parts)}")
+    if found:
+        raise UsageError("\n  ".join(["nothing was compared:", *found]))
+    return chosen[0], chosen[1]
+
+
+def _strange(what: str, names: Iterable[str], known: Sequence[str], registry: Registry[Any]) -> list[str]:
+    """What is wrong with names of schemes or adversaries; each may be a class of a plug-in."""
+    found = []
+    for name in names:
+        if name in known:
+            continue
+        try:
+            _ = registry[name]
+        except NotRegistered as error:
+            why = error.why or f"; expected {listed(known)}{near(name, known)}"
+            found.append(f"{name or 'nothing'} is not {'an' if what == 'adversary' else 'a'} {what}{why}")
+    return found
+
+
+def _match(scenario: Scenario, scheme: str, adversary: str) -> Match:
+    attack = ATTACKERS.get(adversary, "none")
+    if attack != "none" and not SCHEMES[scheme].needs_acknowledgements:
+        return Match(scheme, adversary, not_defined="there are no acknowledgements to attack")
+    strategy = adversary if attack == "none" else SCHEMES[scheme].best_reader
+    where, why = STRATEGIES[strategy].only_against or (scheme, "")
+    if scheme not in ((where,) if isinstance(where, str) else where):
+        return Match(scheme, adversary, not_defined=why)
+    table = _eavesdropper(scenario, scheme, strategy)
+    parameters = {name: value for name, value in table.items() if name not in ("strategy", "link", "links", "window")}
+    for one in (strategy, table.get("reads_as")):
+        for reason in () if one is None else unsuited(scenario.process, scenario.plant, one):
+            return Match(scheme, adversary, not_defined=reason.why)
+    lacking = lacking_streams(STRATEGIES[strategy].streams(parameters), SCHEMES[scheme])
+    if lacking:
+        return Match(scheme, adversary, not_defined=f"knows the {listed(lacking)}, and there is none")
+    betrayed = STRATEGIES[strategy].betrayed(parameters) is not None
+    return Match(scheme, adversary, strategy, attack, betrayed=betrayed)
+
+
+def _encoding(scenario: Scenario, scheme: str, parameters: Mapping[str, Any]) -> Tables:
+    """The scheme's parameters: given ones, else the scenario's own, else the examples of docs/scenario.md."""
+    own = scenario.encoding.parameters
+    given = {name: parameters.get(f"{scheme}.{name}") for name in SCHEMES[scheme].parameters}
+    examples = SCHEMES[scheme].parameters
+    return {
+        "scheme": scheme,
+        **{name: own.get(name, examples[name]) if value is None else value for name, value in given.items()},
+    }
+
+
+def _scenario(scenario: Scenario, encoding: Tables, attack: str, matches: Sequence[Match]) -> Scenario:
+    tables: Tables = scenario.model_dump(mode="json", exclude_none=True)
+    scheme = encoding["scheme"]
+    under = "" if attack == "none" else f", acknowledgements attacked: {attack}"
+    tables |= {
+        "title": f"{scenario.title} ({scheme}{under})",
+        "encoding": encoding,
+        "eavesdroppers": {one.receiver: _eavesdropper(scenario, scheme, str(one.strategy)) for one in matches},
+        "event": [
+            table
+            for event, table in zip(scenario.event, tables["event"], strict=True)
+            if event.does.attacked != Jamming.attacked and set(event.names) <= {LEGITIMATE}
+        ],
+        "expect": [],
+        "record_trials": 1,
+    }
+    tables[LEGITIMATE]["link"].pop("correlation", None)  # with an eavesdropper that may not be in this scenario
+    ack_channel = tables.pop("acknowledgements", _ACK_CHANNEL)
+    if SCHEMES[scheme].needs_acknowledgements:
+        flip = ack_channel.get("flip", _FLIP)
+        ack_channel = {name: value for name, value in ack_channel.items() if name not in ("attack", "jammer", "flip")}
+        more = {"flip": flip} if attack == "flip" else {}
+        if attack in OVERHEARING:
+            more = {"jammer": matches[0].receiver}
+        tables["acknowledgements"] = {**ack_channel, "attack": attack, **more}
+    return checked(tables, scenario.title)
+
+
+def _eavesdropper(scenario: Scenario, scheme: str, strategy: str) -> Tables:
+    """The scenario's first eavesdropper of that strategy, else one on the link of the scenario's first eavesdropper."""
+    tables: dict[str, Tables] = scenario.model_dump(mode="json", exclude_none=True)["eavesdroppers"]
+    own = next((table for table in tables.values() if table["strategy"] == strategy), None)
+    if own is not None and "reads_as" not in own:
+        return _alone(own)
+    donor = next((table for table in tables.values() if "link" in table), None)
+    if donor is None:
+        donor = scenario.legitimate.model_dump(mode="json", exclude_none=True)
+    link = donor["link"]
+    kind = STRATEGIES[strategy]
+    made: Tables = {"strategy": strategy, "window": donor["window"], **(own or {})}
+    if kind.pools_links:
+        made.setdefault("links", [{name: link[name] for name in ("quality", "loss") if name in link}] * 2)
+    else:
+        made.setdefault("link", link)
+    if "reads_as" in kind.parameters:
+        # The best strategy against this scheme: the scenario's own choice is for the scenario's own scheme.
+        made = {name: value for name, value in made.items() if name in {*kind.parameters, *RESERVED}}
+        made["reads_as"] = SCHEMES[scheme].best_reader
+    if "learns_at" in kind.parameters:
+        made.setdefault("learns_at", scenario.slots // 2)
+    return _alone({**kind.parameters, **made})
+
+
+def _alone(table: Tables) -> Tables:
+    """Remove a correlation with the losses of another eavesdropper, which may not be in this scenario."""
+    link = table.get("link", {})
+    if link.get("correlation", {}).get("with", LEGITIMATE) == LEGITIMATE:
+        return table
+    return {**table, "link": {name: value for name, value in link.items() if name != "correlation"}}

@@ -1,0 +1,173 @@
+"""The energy that secrecy costs: a scenario's scheme against `plain`, over the same link, in the same trials.
+
+A trial is run with the scenario's scheme and with `plain`, with the same noise of the plant and the same losses, and each
+time also with a controller that sees the truth. Every figure is made from differences within a trial, so its standard error
+is that of the mean of the trials' differences.
+
+Source: docs/microgrid.md, what does secrecy cost in energy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, final
+
+import numpy as np
+
+from evedrop.errors import UsageError
+from evedrop.model.process import Floats
+from evedrop.scenario.application import APPLICATIONS, ControlledPlant, applications_in
+from evedrop.scenario.controlled import controlled_plant
+from evedrop.scenario.loading import checked
+from evedrop.scenario.tables import Scenario
+from evedrop.score.energy import Meter, energy
+from evedrop.simulate.montecarlo import Plan
+from evedrop.simulate.simulation import Simulation
+from evedrop.simulate.tasks import Stopped, Task, Tell
+from evedrop.studies.parts import StudyPlace, all_results, parts_of, write_found
+
+_SIDE_BY_SIDE = 50  # trials
+MEASURES = ("net", "total", "summed")
+"""The fields of `EnergyDifference`."""
+
+
+@dataclass(frozen=True)
+class MeanEstimate:
+    """The mean over trials of a figure."""
+
+    mean: float
+    standard_error: float
+    low: float
+    """The 95 % interval of the mean, by Student's t, is from here to `high`."""
+    high: float
+
+    @classmethod
+    def of_trials(cls, trials: Floats) -> MeanEstimate:
+        """From the figure of each trial, (R,), R ≥ 2."""
+        from scipy.special import stdtrit  # noqa: PLC0415 - 0.2 s that only this needs
+
+        mean, error = float(np.mean(trials)), float(np.std(trials, ddof=1)) / len(trials) ** 0.5
+        reach = float(stdtrit(len(trials) - 1, 0.975)) * error
+        return cls(mean, error, mean - reach, mean + reach)
+
+
+@dataclass(frozen=True)
+class SecrecyCost:
+    """What a scheme costs an application."""
+
+    scheme: str
+    trials: int
+    more_than_plain: Mapping[str, MeanEstimate]
+    """`net_energy` and `total_energy`: that with the scheme less that with `plain`, in Wh."""
+    differences: Mapping[str, Mapping[str, MeanEstimate]]
+    """`scheme_from_plain`, `scheme_from_truth`, `plain_from_truth` → measure → the difference, as a share."""
+
+
+def secrecy_cost(
+    scenario: Scenario,
+    tell: Tell,
+    plan: Plan | None = None,
+    place: StudyPlace | None = None,
+    side_by_side: int = _SIDE_BY_SIDE,
+) -> SecrecyCost:
+    """Compare a scenario's scheme with `plain`.
+
+    plan: where the trials are carried out, by default here; place: the folder for cost.json; side_by_side: trials that are
+    simulated at once.
+
+    Raises UsageError for a scenario without an application that has a power, or with fewer than two trials; RunError if a
+    worker fails, Interrupted on Ctrl-C.
+    """
+    loop = controlled_plant(scenario)
+    if loop is None or not any(APPLICATIONS[name].has_power for name in scenario.applications):
+        raise UsageError(f"{scenario.title}: {_lacking()}")
+    if scenario.trials < 2:
+        raise UsageError(f"--trials {scenario.trials}: expected 2 or more, so that there is a standard error")
+    tasks = parts_of(_CostTask, scenario, side_by_side)
+    with all_results(tasks, plan or Plan(), tell, "cost", place) as parts:
+        found = _combined(scenario, loop, parts)
+        write_found(place, "cost.json", asdict(found))
+    return found
+
+
+def _combined(scenario: Scenario, loop: ControlledPlant, parts: Sequence[_Part]) -> SecrecyCost:
+    """The cost from the power of all trials."""
+    plain, truth, plain_truth = (
+        Meter.of_all(list(meters)) for meters in zip(*(one.meters for one in parts), strict=True)
+    )
+    more = {
+        "net_energy": plain.bought - plain.sold - (plain.other_bought - plain.other_sold),
+        "total_energy": plain.bought + plain.sold - (plain.other_bought + plain.other_sold),
+    }
+    pairs = {"scheme_from_plain": plain, "scheme_from_truth": truth, "plain_from_truth": plain_truth}
+    return SecrecyCost(
+        scenario.encoding.scheme,
+        scenario.trials,
+        {name: MeanEstimate.of_trials(1000.0 * energy(power, loop.slot_seconds)) for name, power in more.items()},
+        {
+            name: {measure: MeanEstimate.of_trials(getattr(meter.difference, measure)) for measure in MEASURES}
+            for name, meter in pairs.items()
+        },
+    )
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Some trials."""
+
+    meters: tuple[Meter, Meter, Meter]
+    """The power of scheme and plain, of scheme and truth, and of plain and truth."""
+    complete: bool
+
+
+@final
+@dataclass(frozen=True)
+class _CostTask(Task[_Part]):
+    """Some trials that are simulated at once, each with both schemes."""
+
+    def carry_out(self, tell: Tell, stopped: Stopped) -> _Part:
+        """Simulate the trials."""
+        return _part_of(Scenario.read(self.scenario), range(self.start, self.stop), tell, stopped)
+
+    def example(self) -> _Part:
+        """A part of one trial without slots."""
+        return _Part((Meter.zero(1), Meter.zero(1), Meter.zero(1)), complete=True)
+
+
+def _part_of(scenario: Scenario, trials: range, tell: Tell, stopped: Stopped) -> _Part:
+    found = [Meter.zero(len(trials)) for _ in range(3)]
+    tables: dict[str, Any] = scenario.model_dump(mode="json", exclude_none=True)
+    alone = {**tables, "eavesdroppers": {}, "expect": []}  # eavesdroppers change nothing
+    ours, plain = (
+        _powers(checked(one, scenario.title), trials) for one in (alone, {**alone, "encoding": {"scheme": "plain"}})
+    )
+    for (power, truth), (other, other_truth) in zip(ours, plain, strict=True):
+        pairs = ((power, other), (power, truth), (other, other_truth))
+        found = [meter.then(*pair) for meter, pair in zip(found, pairs, strict=True)]
+        tell(power.size)
+        if stopped():
+            return _Part((found[0], found[1], found[2]), complete=False)
+    return _Part((found[0], found[1], found[2]), complete=True)
+
+
+def _powers(scenario: Scenario, trials: range) -> Iterator[tuple[Floats, Floats]]:
+    """The application's power, and that of a controller that sees the truth, in kW, (c, R) each, some slots at a time."""
+    loop = controlled_plant(scenario)
+    assert loop is not None  # noqa: S101 - there is a controller
+    name, table = next(one for one in scenario.applications.items() if APPLICATIONS[one[0]].has_power)
+    feed = APPLICATIONS[name].power(loop, table, len(trials))
+    assert feed is not None  # noqa: S101 - it has a power
+    for chunk in Simulation(scenario, trials).chunks():
+        slots = chunk.slots
+        assert slots is not None  # noqa: S101 - there are states in this mode
+        assert slots.inputs is not None  # noqa: S101 - there is a controller
+        yield feed.take(slots.x if slots.true is None else slots.true, slots.inputs.u)
+
+
+def _lacking() -> str:
+    """Say that a scenario lacks an application that has a power, and name a scenario that does not."""
+    able = {name: one for name, one in applications_in(APPLICATIONS.names).items() if one.has_power}
+    examples = [one.example for one in able.values() if one.example is not None]
+    hint = f"; try the scenario {' or '.join(examples)}" if examples else ""
+    return f"there is no {' or '.join(able)} with a controller{hint}"

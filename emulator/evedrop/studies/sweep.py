@@ -1,0 +1,230 @@
+"""Monte Carlo over a grid: every combination of values of any entries of the scenario, in one tidy table."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import math
+import re
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from evedrop.errors import Interrupted, RunError, ScenarioError, UsageError
+from evedrop.model.figures import all_figures, error_column, estimated_figures, z_column
+from evedrop.results.folder import disk_errors, private_pictures, private_replacement, write_private
+from evedrop.scenario.application import APPLICATIONS
+from evedrop.scenario.loading import prepared, value_of
+from evedrop.scenario.news import Tell
+from evedrop.scenario.tables import Scenario
+from evedrop.score.scorekeeper import Ending
+from evedrop.score.summary import Summary
+from evedrop.simulate.kept_tasks import kept_tasks, study_of
+from evedrop.simulate.montecarlo import Merger, Plan, check_mode, teller
+from evedrop.simulate.trials import BatchResult, tasks_of
+from evedrop.system.signals import stop_on_signals
+
+Grid = Mapping[str, Sequence[Any]]
+Point = Mapping[str, Any]
+
+MOST_POINTS = 10_000
+"""The most combinations of values."""
+_WRITE_SECONDS = 3.0  # from one table of the points so far to the next
+_RANGE = re.compile(r"[^\[\]{}\"',]*:[^\[\]{}\"',]*")  # a colon, and no character of a list or string
+_WHOLE = re.compile(r"[+-]?\d+")
+
+
+def grid_of(texts: Sequence[str]) -> dict[str, list[Any]]:
+    """The grid that `--over` options describe: KEY=first:last:step, both ends included, or KEY=a,b,c.
+
+    Raises UsageError for anything else, an empty range, or more than 10 000 points.
+    """
+    grid: dict[str, list[Any]] = {}
+    for text in texts:
+        key, equals, values = text.partition("=")
+        if not equals or not key or not values:
+            raise UsageError(f"--over {text}: expected KEY=first:last:step or KEY=a,b,c, such as slots=100,200")
+        if key in grid:
+            raise UsageError(f"--over {text}: {key} is given twice; give all its values in one option")
+        grid[key] = _range(text, values) if _RANGE.fullmatch(values) else _listed(values)
+    if math.prod(len(values) for values in grid.values()) > MOST_POINTS:
+        raise UsageError(f"--over asks for more than {MOST_POINTS} points; take wider steps")
+    return grid
+
+
+def _listed(values: str) -> list[Any]:
+    """The values between commas: TOML values, including lists and quoted strings, or else strings."""
+    whole = value_of(f"[{values}]")
+    return whole if isinstance(whole, list) else [value_of(value.strip()) for value in values.split(",")]
+
+
+def _range(text: str, values: str) -> list[Any]:
+    """The values of a range: whole numbers if all three are; decimal steps give decimals, 0.3 and not 0.30000000000000004."""
+    try:
+        first, last, step = (Decimal(value.strip()) for value in values.split(":"))
+    except (ValueError, InvalidOperation):
+        raise UsageError(f"--over {text}: expected three numbers first:last:step, such as 0.1:0.9:0.1") from None
+    if not all(number.is_finite() for number in (first, last, step)) or not step or (last - first) / step < 0:
+        raise UsageError(f"--over {text}: the range is empty; expected first:last:step with the step towards last")
+    if (last - first) / step >= MOST_POINTS:
+        raise UsageError(f"--over {text} asks for more than {MOST_POINTS} values; take a wider step")
+    found = [first + i * step for i in range(int((last - first) / step) + 1)]
+    whole = all(_WHOLE.fullmatch(value.strip()) for value in values.split(":"))
+    return [int(value) if whole else float(value) for value in found]
+
+
+def sweep_over(
+    source: str | Path | Scenario,
+    changes: Mapping[str, Any],
+    grid: Grid,
+    folder: Path,
+    tell: Tell,
+    plan: Plan,
+    *,
+    resume: bool = False,
+) -> pa.Table:
+    """Run every point of the grid into a folder: sweep.parquet, sweep.json and a plot.
+
+    resume: go on with the sweep in the folder, which was interrupted.
+
+    Returns the table, with a row for each point and peer. Raises ScenarioError if the scenario of any point has mistakes,
+    before any point is run; Interrupted, or RunError if a worker fails, with the points done so far in the folder.
+    """
+    scenarios = _checked(source, changes, grid, plan)
+    total = sum(scenario.trials * scenario.slots for _, scenario in scenarios)
+    rows: list[dict[str, Any]] = []
+    failure: RunError | None = None
+    done = 0
+    description = {"scenario": _title(source), "changes": dict(changes), "over": dict(grid), "mode": plan.mode.value}
+    text = json.dumps(description, indent=1, ensure_ascii=False, default=str)
+    study = study_of("sweep", json.loads(text) | {"mode": plan.mode.value}, [scenario for _, scenario in scenarios])
+    with (
+        stop_on_signals() as stop,
+        plan.crew(scenario for _, scenario in scenarios) as crew,
+        kept_tasks(folder, study, resume) as kept,
+    ):
+        each = crew.workers if len(scenarios) < 4 * crew.workers else 1  # if there are many points, do not split them
+        tasks = [tasks_of(scenario, plan.mode, each, kept) for _, scenario in scenarios]
+        told = teller(tell, total)
+        everything = list(itertools.chain(*tasks))
+        with disk_errors(folder):
+            write_private(folder / "sweep.json", text + "\n")
+            if isinstance(source, Scenario):  # there is no other file from which the sweep could be repeated
+                write_private(folder / "scenario.toml", source.to_toml())
+            with contextlib.closing(crew.results(everything, told, stop.is_set, kept)) as results:
+                written = time.monotonic()
+                try:
+                    for (point, scenario), its_tasks in zip(scenarios, tasks, strict=True):
+                        summary = _summary(scenario, plan, itertools.islice(results, len(its_tasks)))
+                        if summary is None:
+                            break
+                        rows += _rows(point, scenario, summary)
+                        done += 1
+                        if time.monotonic() - written > _WRITE_SECONDS:
+                            _write_table(folder, rows)
+                            written = time.monotonic()
+                except RunError as error:
+                    failure = error
+            if not rows:
+                kept.remove_unless_any()
+                raise failure or kept.interrupted("a point was done")
+            table = _write_table(folder, rows)
+            used = dict.fromkeys(name for _, scenario in scenarios for name in scenario.applications)
+            _draw(folder, table, grid, used)
+        if failure is not None:
+            raise failure
+        if done < len(scenarios):
+            raise Interrupted(f"interrupted; {done} of {len(scenarios)} points were done, and are in {folder}")
+        kept.forget()
+    return table
+
+
+def _write_table(folder: Path, rows: list[dict[str, Any]]) -> pa.Table:
+    """Write the table of the points so far; replaces the file atomically."""
+    table = pa.Table.from_pylist(rows)
+    with private_replacement(folder / "sweep.parquet") as unfinished:
+        pq.write_table(table, unfinished)
+    return table
+
+
+def _draw(folder: Path, table: pa.Table, grid: Grid, applications: Iterable[str]) -> None:
+    from evedrop.show.view.sweep_picture import draw  # noqa: PLC0415 - matplotlib takes half a second
+
+    draw(private_pictures(folder / "sweep"), table, tuple(grid))
+    for name in applications:
+        APPLICATIONS[name].draw_sweep(private_pictures(folder / name), table, next(iter(grid)))
+
+
+def _summary(scenario: Scenario, plan: Plan, results: Iterator[BatchResult]) -> Summary | None:
+    """The summary of a point; None if it was interrupted."""
+    started = time.monotonic()
+    merger = Merger(scenario, plan.mode)
+    for result in results:
+        merger.add_batch(result)
+    if not merger.complete:
+        return None
+    ending = Ending(time.monotonic() - started)
+    summary = merger.summary(ending)
+    if summary.ended != ending.how:  # a figure failed
+        raise RunError(summary.ended)
+    return summary
+
+
+def _checked(
+    source: str | Path | Scenario, changes: Mapping[str, Any], grid: Grid, plan: Plan
+) -> list[tuple[Point, Scenario]]:
+    """Every point with its scenario. Raises ScenarioError with the mistakes of all points."""
+    points: list[Point] = [dict(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())]
+    found: list[tuple[Point, Scenario]] = []
+    mistakes: dict[str, None] = {}
+    for point in points:
+        try:
+            scenario = prepared(source, {**changes, **point}, beyond_horizon=plan.mode.value != "exact")
+        except ScenarioError as error:
+            mistakes.update(dict.fromkeys(error.mistakes))
+            continue
+        check_mode(scenario, plan.mode)
+        found.append((point, scenario))
+    if mistakes:
+        raise ScenarioError(_title(source), list(mistakes))
+    return found
+
+
+def _title(source: str | Path | Scenario) -> str:
+    return source.title if isinstance(source, Scenario) else str(source)
+
+
+def _rows(point: Point, scenario: Scenario, summary: Summary) -> Iterator[dict[str, Any]]:
+    """A row for each peer: the point, the figures, the verdict."""
+    for name, peer in summary.peers.items():
+        verdict = summary.secrecy.get(name)
+        yield {
+            **{key: json.dumps(value) if isinstance(value, (list, dict)) else value for key, value in point.items()},
+            "peer": name,
+            "slots": scenario.slots,
+            "trials": summary.trials,
+            **{figure: peer.figure(figure) for figure in all_figures()},
+            **{error_column(name): peer.standard_errors.get(name) for name in estimated_figures()},
+            **{z_column(name): peer.z.get(name) for name, one in all_figures().items() if one.expected is not None},
+            **{f"error_quantile_{level}": value for level, value in (peer.error_quantiles or {}).items()},
+            "infinite_variance": peer.infinite_variance,
+            "rare_share": None if peer.rare_events is None else peer.rare_events.share,
+            "rare_trials": None if peer.rare_events is None else peer.rare_events.trials,
+            **{
+                column: value
+                for application, entry in summary.applications.items()
+                for column, value in APPLICATIONS[application].sweep_columns(entry, name).items()
+            },
+            "ratio": None if verdict is None else verdict.ratio,
+            "ratio_standard_error": None if verdict is None else verdict.ratio_standard_error,
+            "ratio_from": None if verdict is None else verdict.ratio_from,
+            "relative_secrecy": None if verdict is None else verdict.relative,
+            "perfect_secrecy": None if verdict is None else verdict.perfect,
+            "digest": peer.digest,
+        }

@@ -1,0 +1,177 @@
+"""Handles Ctrl-C, SIGTERM and SIGHUP in a command that has begun its work: by an event, an exception, or at once.
+
+The first signal counts: while the block that it ends is left in order, further ones are ignored, unless it says otherwise.
+"""
+
+from __future__ import annotations
+
+import _thread
+import faulthandler
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from evedrop.system.interrupts import INTERRUPTED, SIGNALS, heeded, leave
+
+SHOW_STACKS = signal.SIGUSR1
+"""The signal upon which a process of a run writes the stack of every thread to its log."""
+AFTERTHOUGHT_SECONDS = 0.5
+"""A signal that ended another process of a run may reach this one as well, within this time: then the run did not fail.
+
+A closing terminal hangs up on all processes; a user may end them one by one.
+"""
+AGAIN_SECONDS = 1.0
+"""A signal that comes within this time of another is not a second one: some programs, and terminals, send several."""
+
+
+@contextmanager
+def stop_on_signals() -> Iterator[threading.Event]:
+    """An event that Ctrl-C, SIGTERM and SIGHUP set while the block runs; has no effect outside the main thread."""
+    stop = threading.Event()
+    # By a thread: the main thread may hold the lock of the event right now, and would wait for itself.
+    with _handled(lambda: _thread.start_new_thread(stop.set, ())):
+        yield stop
+
+
+@contextmanager
+def stop_or_leave_on_signals(leave: Callable[[], object]) -> Iterator[threading.Event]:
+    """An event that the first signal sets while the block runs; a second one calls `leave`, which exits, whatever hangs.
+
+    Both happen on a thread of its own, even while the main thread waits outside Python. Signals within `AGAIN_SECONDS` of the
+    first count as one. Has no effect outside the main thread.
+    """
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    ours, theirs = os.pipe()
+    os.set_blocking(theirs, False)
+
+    def listen() -> None:
+        first = 0.0
+        while number := os.read(ours, 1):
+            if number[0] not in SIGNALS:
+                continue
+            if not stop.is_set():
+                first = time.monotonic()
+                stop.set()
+            elif time.monotonic() - first > AGAIN_SECONDS:
+                leave()
+        os.close(ours)
+
+    threading.Thread(target=listen, name="signals", daemon=True).start()
+    before = {number: signal.getsignal(number) for number in heeded()}
+    woken = signal.set_wakeup_fd(theirs, warn_on_full_buffer=False)
+    for number in before:
+        signal.signal(number, _ignore)
+    try:
+        yield stop
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)
+        signal.set_wakeup_fd(woken)
+        os.close(theirs)
+
+
+@contextmanager
+def raise_on_signals() -> Iterator[None]:
+    """Make Ctrl-C, SIGTERM and SIGHUP raise KeyboardInterrupt while the block runs, so that its files are removed."""
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    with _handled(interrupt):
+        yield
+
+
+@contextmanager
+def leave_after(act: Callable[[], object]) -> Iterator[None]:
+    """Make Ctrl-C, SIGTERM and SIGHUP call `act` and exit at once while the block runs."""
+
+    def interrupt() -> None:
+        act()
+        os._exit(INTERRUPTED)
+
+    with _handled(interrupt):
+        yield
+
+
+@contextmanager
+def told_when_suspended(tell: Callable[[], object]) -> Iterator[None]:
+    """Call `tell` before Ctrl-Z suspends this process while the block runs; has no effect outside the main thread."""
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGTSTP) != signal.SIG_DFL:
+        yield
+        return
+
+    def handler(_number: int, _frame: FrameType | None) -> None:
+        tell()
+        os.kill(os.getpid(), signal.SIGSTOP)
+
+    signal.signal(signal.SIGTSTP, handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTSTP, signal.SIG_DFL)
+
+
+@contextmanager
+def held_back() -> Iterator[None]:
+    """Delay signals to processes that are started in the block until they have handlers.
+
+    An interpreter that is still starting would end with a traceback; `evedrop.system.interrupts` then unblocks pending signals.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _ignore(_number: int, _frame: FrameType | None) -> None:
+    """The handler of further signals."""
+
+
+@contextmanager
+def _handled(interrupt: Callable[[], object]) -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def handler(_number: int, _frame: FrameType | None) -> None:
+        for number in before:  # by a function: Python reports a signal that is under way to SIG_IGN as an error
+            signal.signal(number, _ignore)
+        interrupt()
+
+    # Signals ignored from the start stay ignored: by nohup, and the interrupts of a background job.
+    before = {number: signal.getsignal(number) for number in heeded()}
+    for number in before:
+        signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)
+
+
+def leave_on_signals() -> None:
+    """Make Ctrl-C, SIGTERM and SIGHUP end this process at once, even while its main thread waits outside Python."""
+    ours, theirs = os.pipe()
+    os.set_blocking(theirs, False)
+    signal.set_wakeup_fd(theirs, warn_on_full_buffer=False)
+    for number in heeded():
+        signal.signal(number, leave)
+
+    def wait() -> None:
+        os.read(ours, 1)
+        os._exit(INTERRUPTED)
+
+    threading.Thread(target=wait, name="signals", daemon=True).start()
+
+
+def show_stacks_on_request() -> None:
+    """Write the stack of every thread to standard error upon `SHOW_STACKS`, even while native code holds Python's lock."""
+    faulthandler.register(SHOW_STACKS, all_threads=True)

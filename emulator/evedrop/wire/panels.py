@@ -1,0 +1,269 @@
+"""The views of a wire and their contents: lanes, rates, delays, the graph of sides, a table and events.
+
+Source: docs/wire.md, the view.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
+
+from evedrop.model.process import Floats
+from evedrop.show.view.column import ELAPSED
+from evedrop.show.view.palette import colour, dim
+from evedrop.wire.graph import GRAPH, WireGraph, loss_of
+from evedrop.wire.lane_states import LaneState, legend, state_of
+from evedrop.wire.notices import CutWatcher, LinkWatcher, Notice, why
+from evedrop.wire.plan import WirePlan
+from evedrop.wire.step_counts import DELIVERED, Counts, WireSteps, quantile
+
+_LANES, _RATES, _DELAYS, _TABLE, _EVENTS = "links", "rates", "delays", "table", "events"
+_WHOLE = "–"
+_DIM = 0.55
+_ROOM = 0.24  # of the window, to the right of the present, kept free for the legend
+_LANES_OF_A_SCREEN = 17.0  # lanes that would fill the usual window from top to bottom
+_MOST_IN_LEGEND = 6  # links
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How finely a view shows time. A lane of more than some 130 steps would turn grey, because they are too narrow."""
+
+    step: float = 0.2
+    """Seconds of a step."""
+    window: float = 24.0
+    """Seconds of the time axes."""
+    whole: bool = False
+    """Whether the window is all that there is."""
+
+    @classmethod
+    def of_length(cls, seconds: float) -> Pace:
+        """For the whole of a wire that has ended, in at most 130 steps of a multiple of 0.1 s."""
+        step = 0.1 * max(1.0, float(np.ceil(seconds / 13.0 - 1e-9)))
+        return cls(step, max(seconds, 10.0), True)
+
+    @property
+    def steps_per_rate(self) -> int:
+        """The number of steps over which rates and delays are measured: 0.6 seconds, or one step."""
+        return max(1, round(0.6 / self.step))
+
+
+@final
+class WirePanels:
+    """The panels of one recording."""
+
+    def __init__(self, plan: WirePlan, pace: Pace) -> None:
+        self._plan, self._pace = plan, pace
+        self._names = [link.name for link in plan.links]
+        digits = len(str(len(self._names)))
+        self._lane_paths = [
+            f"{_LANES}/{rr.escape_entity_path_part(f'{i:0{digits}d}_{name}')}"
+            for i, name in enumerate(self._names, start=1)
+        ]
+        self._cut_path = f"{_LANES}/{'0' * digits}_cut"
+        self._graph = WireGraph(plan)
+        self._watcher = LinkWatcher(self._names, pace.step)
+        self._cuts = CutWatcher(plan.links)
+        self._cut_word = ""
+        self._cut_words: dict[str, str] = {}
+        self._lane = [-1] * len(self._names)
+        self._states = list(LaneState)
+        self._next = 0
+        self._last_counts: Counts | None = None
+        self._last_delays: Counts | None = None
+        self._total: Counts | None = None
+        self._recent: deque[Counts] = deque(maxlen=max(1, round(pace.window / pace.step)))
+
+    def layout(self) -> rrb.Blueprint:
+        """All views on two sides."""
+        pace = self._pace
+        axis = rrb.TimeAxis(
+            view_range=rrb.TimeRange(
+                start=rrb.TimeRangeBoundary.cursor_relative(seconds=-pace.window),
+                end=rrb.TimeRangeBoundary.cursor_relative(seconds=_ROOM * pace.window),
+            ),
+            zoom_lock=True,
+        )
+        past = "since the start" if pace.whole else f"in the last {pace.window:g} s"
+        links = len(self._names)
+        lanes = min(0.5, (links + 2.6) / _LANES_OF_A_SCREEN)
+        left = rrb.Vertical(
+            rrb.StateTimelineView(name=f"Links   {legend(self._plan)}", origin=_LANES, time_view=axis),
+            _curves(
+                "Messages per second   dim: heard, bright: delivered", _RATES, axis, named=0 < links <= _MOST_IN_LEGEND
+            ),
+            _curves("Delay of delivered messages (ms)   dim: 99 %, bright: median", _DELAYS, axis, named=False),
+            row_shares=[2.0 * lanes / (1.0 - lanes), 1.1, 0.9],
+        )
+        right = rrb.Vertical(
+            self._graph.view(f"Losses {past}   coloured as the lanes"),
+            rrb.TextDocumentView(name="What became of the messages since the start", origin=_TABLE),
+            rrb.TextLogView(
+                name="Events",
+                origin=_EVENTS,
+                columns=rrb.TextLogColumns(
+                    timeline_columns=[TimelineColumn(ELAPSED)],
+                    text_log_columns=[TextLogColumn("LogLevel"), TextLogColumn("Body")],
+                ),
+                format_options=rrb.TextLogFormat(monospace_body=True),
+            ),
+            row_shares=[1.1, 0.4 + 0.13 * min(links, 10), 1.0],
+        )
+        return rrb.Blueprint(
+            rrb.Horizontal(left, right, column_shares=[1.25, 1.0]),
+            rrb.TopPanel(state="hidden"),
+            rrb.BlueprintPanel(state="hidden"),
+            rrb.SelectionPanel(state="hidden"),
+            rrb.TimePanel(state="collapsed", timeline=ELAPSED, play_state="following"),
+            auto_views=False,
+            auto_layout=False,
+        )
+
+    def style(self, to: rr.RecordingStream) -> None:
+        """Record names and colours, once."""
+        words, blank = [state.word for state in self._states], [" "] * len(self._states)
+        lanes = rr.StateConfiguration(values=words, labels=blank, colors=[state.colour for state in self._states])
+        for path in self._lane_paths:
+            to.log(path, lanes, static=True, strict=True)
+        bright = [colour(i) for i in range(len(self._names))]
+        colours = [*bright, *(dim(one, _DIM) for one in bright)]
+        widths = [2.0] * len(bright) + [1.2] * len(bright)
+        for path, first in ((_RATES, "heard"), (_DELAYS, "99 %")):
+            names = [*self._names, *(f"{name} {first}" for name in self._names)]
+            to.log(path, rr.SeriesLines(names=names, colors=colours, widths=widths), static=True, strict=True)
+        self._graph.style(to)
+
+    def notes(self, notices: Sequence[Notice], to: rr.RecordingStream) -> None:
+        """Record lines of the events."""
+        if notices:
+            texts, levels = [one.text for one in notices], [one.level for one in notices]
+            _send(to, _EVENTS, [round(one.seconds, 1) for one in notices], rr.TextLog.columns(text=texts, level=levels))
+
+    def send(self, steps: WireSteps, to: rr.RecordingStream) -> None:
+        """Record the next steps."""
+        if self._total is None or steps.first != self._next:
+            self._reset(steps)
+        begins = np.asarray(steps.numbers * self._pace.step, np.float64)
+        ends = begins + np.float64(self._pace.step)
+        self._next = steps.first + len(begins)
+        self._send_rates(steps, ends, to)
+        self._send_lanes(steps.counts, begins, to)
+        self._send_graph(steps.counts, ends, to)
+        self.notes(self._watcher.watch(steps), to)
+
+    def end(self, to: rr.RecordingStream) -> None:
+        """Record that nothing follows: otherwise the last state of a lane would continue."""
+        last = [(path, LaneState.QUIET.word) for path in self._lane_paths]
+        for path, word in (*last, (self._cut_path, _WHOLE)):
+            _send(to, path, [self._next * self._pace.step], rr.StateChange.columns(state=[word]))
+
+    def _reset(self, steps: WireSteps) -> None:
+        """Forget the steps before these: at the beginning they are not known, and after a silence they had no messages."""
+        before = 0 if self._total is None else self._pace.steps_per_rate - 1
+        self._last_counts = np.zeros((before, *steps.counts.shape[1:]), np.int64)
+        self._last_delays = np.zeros((before, *steps.delays.shape[1:]), np.int64)
+        if self._total is None:
+            self._total = np.zeros(steps.counts.shape[1:], np.int64)
+        else:  # the graph forgets values older than its window
+            silent = np.zeros(steps.counts.shape[1:], np.int64)
+            self._recent.extend(silent for _ in range(min(steps.first - self._next, self._recent.maxlen or 0)))
+
+    def _send_rates(self, steps: WireSteps, ends: Floats, to: rr.RecordingStream) -> None:
+        if not self._names:
+            return
+        over = self._pace.steps_per_rate
+        counts, self._last_counts = _sliding(self._last_counts, steps.counts, over)
+        delays, self._last_delays = _sliding(self._last_delays, steps.delays, over)
+        if not len(counts):
+            return
+        seconds = over * self._pace.step
+        ends = ends[-len(counts) :]
+        rates = np.maximum(np.concatenate([counts[:, :-1, DELIVERED], counts[:, :-1].sum(2)], 1), 0) / seconds
+        _send_series(to, _RATES, ends, rates)
+        quantiles = [quantile(delays[:, :-1], share) for share in (0.5, 0.99)]
+        _send_series(to, _DELAYS, ends, 1e3 * np.concatenate(quantiles, 1))
+
+    def _send_lanes(self, counts: Counts, begins: Floats, to: rr.RecordingStream) -> None:
+        self._send_cuts(counts, begins, to)
+        for link, path in enumerate(self._lane_paths):
+            codes = np.array([self._states.index(state_of(one)) for one in counts[:, link]])
+            at = np.flatnonzero(np.diff(codes, prepend=self._lane[link]))
+            self._lane[link] = int(codes[-1])
+            if len(at):
+                words = [self._states[code].word for code in codes[at].tolist()]
+                _send(to, path, begins[at], rr.StateChange.columns(state=words))
+
+    def _send_cuts(self, counts: Counts, begins: Floats, to: rr.RecordingStream) -> None:
+        for begin, one in zip(begins, counts, strict=True):
+            self._cuts.watch(one)
+            word = ", ".join(self._cuts.cut()) or _WHOLE
+            if word != self._cut_word:
+                self._cut_word = word
+                self._cut_words[word] = " " if word == _WHOLE else word
+                colours = [
+                    LaneState.QUIET.colour if one == _WHOLE else LaneState.MOST.colour for one in self._cut_words
+                ]
+                labels = [*self._cut_words.values()]
+                shown = rr.StateConfiguration(values=[*self._cut_words], labels=labels, colors=colours)
+                to.log(self._cut_path, shown, static=True, strict=True)
+                _send(to, self._cut_path, [begin], rr.StateChange.columns(state=[word]))
+
+    def _send_graph(self, counts: Counts, ends: Floats, to: rr.RecordingStream) -> None:
+        assert self._total is not None  # noqa: S101 - send makes it
+        recent, texts = [], []
+        for at, one in enumerate(counts, start=1):
+            self._recent.append(one)
+            self._total = self._total + one
+            if self._pace.whole or at == len(counts):  # nobody sees those in between while they come
+                recent.append(self._total if self._pace.whole else np.sum(self._recent, 0))
+                texts.append(self._table(self._total))
+        ends = ends[-len(texts) :]
+        _send(to, GRAPH, ends, self._graph.columns(recent))
+        markdown = ["text/markdown"] * len(texts)
+        _send(to, _TABLE, ends, rr.TextDocument.columns(text=texts, media_type=markdown))
+
+    def _table(self, total: Counts) -> str:
+        lines = ["| link | way | heard | lost | why |", "|---|---|---:|---:|---|"]
+        for link, counts in zip(self._plan.links, total, strict=False):
+            way = f"{link.source} → {link.target}"
+            lines.append(
+                f"| {link.name} | {way} | {counts.sum():,} | {loss_of(counts).removesuffix(' lost')} | {why(counts)} |"
+            )
+        if total[-1].any():
+            lines.append(f"| no link | | {total[-1].sum():,} | | {why(total[-1])} |")
+        return "\n".join(lines)
+
+
+def _curves(title: str, path: str, axis: rrb.TimeAxis, *, named: bool) -> rrb.TimeSeriesView:
+    corner = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=named)
+    return rrb.TimeSeriesView(name=title, origin=path, axis_x=axis, plot_legend=corner)
+
+
+def _sliding(before: Counts | None, counts: Counts, over: int) -> tuple[Counts, Counts]:
+    """Sums of `over` consecutive steps that end with each of the new ones, and the steps that the next call needs.
+
+    A step that has fewer than `over` - 1 known steps before it has no sum.
+    """
+    assert before is not None  # noqa: S101 - send makes it
+    joined = np.concatenate([before, counts])
+    sums = np.zeros((len(joined) + 1, *joined.shape[1:]), np.int64)
+    np.cumsum(joined, axis=0, out=sums[1:])
+    return sums[over:] - sums[: max(0, len(sums) - over)], joined[max(0, len(joined) - over + 1) :]
+
+
+def _send_series(to: rr.RecordingStream, path: str, seconds: Floats, values: Floats) -> None:
+    """Values at c times, (c, curves), as curves of one entity."""
+    columns = rr.Scalars.columns(scalars=values.ravel()).partition([values.shape[1]] * len(values))
+    _send(to, path, seconds, columns)
+
+
+def _send(to: rr.RecordingStream, path: str, seconds: Iterable[float], columns: rr.ComponentColumnList) -> None:
+    at = np.round(np.asarray(seconds) * 1e6).astype("timedelta64[us]")
+    to.send_columns(path, indexes=[rr.TimeColumn(ELAPSED, duration=at)], columns=columns, strict=True)

@@ -1,0 +1,249 @@
+"""Reads from a wire's journal the losses and delays of one link, or of the network before the wire: for `evedrop links fit`.
+
+Source: docs/links.md, recordings of messages.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NoReturn, final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import zenoh
+from numpy.typing import NDArray
+
+from evedrop.errors import TraceError, UsageError
+from evedrop.scenario.recordings.message_numbers import MessageArrivals, MessageSeries, joined, series_of
+from evedrop.scenario.recordings.message_recording import MessageRecording, check_parts
+from evedrop.wire.advanced import numbered_as
+from evedrop.wire.crossing import Crossing, Kind
+from evedrop.wire.file import load_wire
+from evedrop.wire.history import WireHistory
+from evedrop.wire.journal_part import REASONS
+from evedrop.wire.journal_reader import JOURNAL_FOLDER, journal_tables
+from evedrop.wire.plan import WireLink
+
+_COLUMNS = ["time", "link", "key", "source", "sequence", "reason", "delay", "n", "kind", "again"]
+_MOST_SHOWN = 10  # links or keys that a message lists
+_HIDDEN = {Crossing.OVERFLOW, Crossing.CUT, Crossing.TOO_LARGE, Crossing.LOOPED}
+"""The fates of messages that the loss model may have lost as well: nobody can tell."""
+
+
+def is_wire_folder(path: Path) -> bool:
+    """Whether a path is the results folder of a wire."""
+    return (path / JOURNAL_FOLDER).is_dir()
+
+
+def journal_recording(
+    folder: Path, link: str | None = None, key: str | None = None, *, gaps: bool = False, longest: float | None = None
+) -> MessageRecording:
+    """What became of the messages of a link, in the order of sending.
+
+    key: a key expression, to read only some of the link's keys. gaps: what was lost before the wire, from the numbers that the
+    senders gave to their messages, in place of what the wire itself lost. longest: as for `series_of`, only for gaps.
+
+    Raises UsageError if the folder has no journal, and TraceError if it does not tell what was asked.
+    """
+    return _Reader(folder, link, key).recording(gaps, longest)
+
+
+@final
+class _Reader:
+    """The rows of one link in a journal."""
+
+    def __init__(self, folder: Path, link: str | None, key: str | None) -> None:
+        """Raises UsageError or TraceError."""
+        self._folder = folder
+        table = pa.concat_tables([one.select(_COLUMNS) for one in journal_tables(folder)])
+        self._link = self._chosen(table, link)
+        rows = table.filter(pc.equal(table["link"].cast(pa.string()), self._link))
+        rows = rows.unify_dictionaries().combine_chunks()
+        if key is not None:
+            rows = rows.filter(self._has_key(rows, key))
+        self._keys = key
+        self._rows = rows
+        self._notes: list[str] = []
+
+    def recording(self, gaps: bool, longest: float | None) -> MessageRecording:
+        """See `journal_recording`."""
+        name = f"{self._folder}, link {self._link}" + (f", {self._keys}" if self._keys is not None else "")
+        if not self._rows.num_rows:
+            self._no("has no message on this link and key")
+        found = self._before(name, longest) if gaps else self._emulated(name)
+        plan = self._planned()
+        if plan is None:
+            return replace(found, notes=tuple(self._notes), keys=self._keys or "**")
+        return replace(
+            found, notes=tuple(self._notes), source=plan.source, target=plan.target, keys=self._keys or plan.keys
+        )
+
+    def _emulated(self, name: str) -> MessageRecording:
+        """What the link's models did."""
+        rows = self._rows.filter(pc.is_valid(self._rows["n"]))
+        if not rows.num_rows:
+            self._no("has only messages that no model decides on")
+        streams, n = self._streams(rows, key=numbered_as, kind=_stream_of), _numbers(rows["n"])
+        order = np.lexsort((n, streams))
+        streams, n = streams[order], n[order]
+        fates = _fates(rows)[order]
+        known = ~np.isin(fates, list(_HIDDEN))
+        hidden = int((~known).sum())
+        if hidden:
+            self._notes.append(f"{hidden} messages met a cut, a full queue or a limit before the loss model: left out")
+        if not known.any():
+            self._no("has only messages that met a cut, a full queue or a limit before the loss model")
+        follows = (np.diff(streams) == 0) & (np.diff(n) == 1)
+        heard = _floats(rows["time"])[order]
+        goes_on = np.concatenate([[False], follows & known[:-1]])
+        survived = ~np.isin(fates, [Crossing.LOST])
+        delivered, corrupted = known & (fates == Crossing.DELIVERED), fates == Crossing.CORRUPTED
+        series = MessageSeries(
+            survived[known].astype(np.uint8),
+            parts=int((known & ~goes_on).sum()),
+            repeated=int((_flags(rows["again"])[order] & delivered).sum()),
+            seconds=float(np.median(np.diff(heard)[follows])) if follows.any() else None,
+        )
+        check_parts(name, series, "cuts, queues and limits hide what the loss model did in between")
+        self._note_changes(rows)
+        whole = int((delivered | corrupted).sum())
+        corrupt = float(corrupted.sum()) / whole if corrupted.any() else None
+        return MessageRecording(name, series, _floats(rows["delay"])[order][delivered], corrupt)
+
+    def _before(self, name: str, longest: float | None) -> MessageRecording:
+        """What was lost before the wire heard it."""
+        puts = pa.array([_stream_of(kind) == "put" for kind in self._rows["kind"].to_pylist()])
+        rows = self._rows.filter(pc.and_(puts, pc.is_valid(self._rows["sequence"])))
+        if not rows.num_rows:
+            self._no(
+                "has no publication with a number of its sender's, as rmw_zenoh and publishers with Zenoh's source info give it"
+            )
+        streams, numbers, heard = (
+            self._streams(rows, key=str, source=str),
+            _numbers(rows["sequence"]),
+            _floats(rows["time"]),
+        )
+        parts = []
+        for which in _groups(streams):
+            try:
+                parts.append(series_of(MessageArrivals(numbers[which], heard[which]), longest))
+            except ValueError as error:
+                self._no(str(error), error)
+        if len(parts) > 1:
+            self._notes.append(f"{len(parts)} senders and keys, one after the other")
+        series = joined(parts)
+        if series.outcomes.all():
+            self._no(f"lacks none of {len(series.outcomes)} numbers of its senders: nothing was lost before the wire")
+        check_parts(name, series, "the senders were started again so often, or several use one identity")
+        self._notes.append("what was lost before the wire; no delays: the journal does not contain the time of sending")
+        return MessageRecording(name, series, np.empty(0))
+
+    def _chosen(self, table: pa.Table, link: str | None) -> str:
+        """The name of the link that was named, or of the only one with messages."""
+        counts = {
+            str(one["values"]): int(one["counts"])
+            for one in pc.value_counts(table["link"].cast(pa.string())).to_pylist()
+            if one["values"] is not None
+        }
+        if link is None and len(counts) == 1:
+            return next(iter(counts))
+        if link is not None and link in counts:
+            return link
+        shown = _some([f"{name} ({count} messages)" for name, count in counts.items()])
+        if not counts:
+            self._no("has no messages on any link")
+        if link is not None:
+            self._no(f'has no messages on a link "{link}"; it has {shown}')
+        return self._no(f"has several links; expected --link and one of {shown}")
+
+    def _has_key(self, rows: pa.Table, key: str) -> pa.Array:
+        """Which rows have a key that the expression takes."""
+        try:
+            expression = zenoh.KeyExpr(key)
+        except zenoh.ZError as error:
+            raise UsageError(
+                f"--key {key}: Zenoh refuses this key expression; expected one such as */scan/**"
+            ) from error
+        taken = [
+            text
+            for text in pc.unique(rows["key"].cast(pa.string())).to_pylist()
+            if expression.intersects(zenoh.KeyExpr(text))
+        ]
+        return pc.is_in(rows["key"].cast(pa.string()), pa.array(taken, pa.string()))
+
+    def _streams(self, rows: pa.Table, **columns_as: Callable[[str], str]) -> NDArray[np.int64]:
+        """A number for each row, the same where the columns are. columns_as: column → the word for each of its words."""
+        columns = []
+        for name, word_for in columns_as.items():
+            texts = rows[name].cast(pa.string()).combine_chunks().dictionary_encode()
+            codes = texts.indices.fill_null(len(texts.dictionary)).to_numpy(zero_copy_only=False).astype(np.int64)
+            words = [word_for(text) for text in texts.dictionary.to_pylist()]
+            same = np.array([*(words.index(word) for word in words), len(words)], np.int64)
+            columns.append(same[codes])
+        found: NDArray[np.int64] = (
+            np.unique(np.stack(columns), axis=1, return_inverse=True)[1].reshape(-1).astype(np.int64)
+        )
+        return found
+
+    def _note_changes(self, rows: pa.Table) -> None:
+        """Tell that a link did not have the same settings all the time."""
+        history = WireHistory.read(self._folder / JOURNAL_FOLDER)
+        pairs = pa.TableGroupBy(rows.select(["key", "kind"]), ["key", "kind"]).aggregate([]).to_pylist()
+        changes = max(len(history.changes_of(self._link, pair["key"], _stream_of(pair["kind"]))) for pair in pairs)
+        if changes > 1:
+            self._notes.append(f"the link had {changes} settings one after the other: fitted as one")
+
+    def _planned(self) -> WireLink | None:
+        """The link in the wire's file; None if it is not there."""
+        with suppress(UsageError):
+            plan = load_wire(self._folder / "wire.toml")
+            return next((one for one in plan.links if one.name == self._link), None)
+        return None
+
+    def _no(self, what: str, cause: Exception | None = None) -> NoReturn:
+        raise TraceError(str(self._folder), "file", what) from cause
+
+
+def _stream_of(kind: str) -> str:
+    """The kind of messages with which a kind, by its word in the journal, shares its numbers."""
+    return Kind[kind.upper()].stream
+
+
+def _groups(codes: NDArray[np.int64]) -> Iterator[NDArray[np.intp]]:
+    """The places of each code, in order."""
+    order = np.argsort(codes, kind="stable")
+    yield from np.split(order, np.flatnonzero(np.diff(codes[order])) + 1)
+
+
+def _fates(rows: pa.Table) -> NDArray[np.uint8]:
+    """`Crossing` of each row."""
+    by_reason = {reason: fate for fate, reason in REASONS.items()}
+    texts = rows["reason"].cast(pa.string()).combine_chunks().dictionary_encode()
+    table = np.array([*(by_reason[one] for one in texts.dictionary.to_pylist()), Crossing.DELIVERED], np.uint8)
+    found: NDArray[np.uint8] = table[texts.indices.fill_null(len(table) - 1).to_numpy(zero_copy_only=False)]
+    return found
+
+
+def _numbers(column: Any) -> NDArray[np.int64]:
+    found: NDArray[np.int64] = column.to_numpy().astype(np.int64)
+    return found
+
+
+def _floats(column: Any) -> NDArray[np.float64]:
+    found: NDArray[np.float64] = column.to_numpy().astype(np.float64)
+    return found
+
+
+def _flags(column: Any) -> NDArray[np.bool_]:
+    found: NDArray[np.bool_] = column.to_numpy().astype(np.bool_)
+    return found
+
+
+def _some(names: Sequence[str]) -> str:
+    """Names, in a line of bounded length."""
+    more = [] if len(names) <= _MOST_SHOWN else [f"{len(names) - _MOST_SHOWN} more"]
+    return ", ".join([*names[:_MOST_SHOWN], *more])

@@ -1,0 +1,193 @@
+"""A running wire: the sessions of its sides, and everything that crosses between them.
+
+Source: docs/wire.md.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from types import TracebackType
+from typing import Self, final
+
+import zenoh
+
+from evedrop.live.network.zenoh_log import LOGGED
+from evedrop.system.output import warn
+from evedrop.system.threads import wait_for_thread
+from evedrop.wire.bypasses import Bypasses
+from evedrop.wire.departures import Departures
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.lanes import LinkState
+from evedrop.wire.liveliness import LivelinessRelay
+from evedrop.wire.neighbours import Neighbours
+from evedrop.wire.outlet import LAST_SECONDS, SideOutlet
+from evedrop.wire.plan import WirePlan
+from evedrop.wire.publications import PublicationRelay
+from evedrop.wire.publishers import Publishers
+from evedrop.wire.queries import QueryRelay
+from evedrop.wire.ros2 import service_key
+from evedrop.wire.ros2_entities import EntityLog
+from evedrop.wire.side import SideSession
+from evedrop.wire.timeline import Moment
+from evedrop.wire.watchdog import Duty
+
+_LOOK_SECONDS = 0.2
+_RECEIVERS = (
+    32  # threads of Zenoh: a program that waits for the wire holds one, and with none left all sides would wait
+)
+_LAST_SECONDS = 1.0  # for the messages that wait for the wire when it ends; a longer backlog is not worth the wait
+
+
+@final
+class WireRelay:
+    """The open sides of a wire and what crosses between them; use it as a context manager.
+
+    `apply` may be called by any thread.
+    """
+
+    def __init__(
+        self,
+        plan: WirePlan,
+        journal: WireJournal,
+        tell: Callable[[str], None] = warn,
+        happened: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        """tell: for what the user must know while the wire runs; happened: for lines about programs that lost their connection.
+
+        These begin with the seconds since the wire started. Raises UsageError if a side cannot be opened.
+        """
+        self.plan = plan
+        self.duties: Sequence[Duty] = ()
+        """What its threads do, once it is open."""
+        self.links: Mapping[str, LinkState] = {link.name: LinkState(link, plan, journal) for link in plan.links}
+        """By their names."""
+        self._journal, self._tell, self._happened = journal, tell, happened
+        self._stack = contextlib.ExitStack()
+        self._duty = Duty("in the list of what programs declare")
+        self._ended = threading.Event()
+        self._woken = threading.Event()
+        os.environ.setdefault("ZENOH_RUNTIME", f"(rx: (worker_threads: {_RECEIVERS}))")  # read with the first session
+        zenoh.init_log_from_env_or(LOGGED)
+
+    def __enter__(self) -> Self:
+        with contextlib.ExitStack() as stack:
+            self._open(stack)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.close()
+
+    @property
+    def endpoints(self) -> Mapping[str, tuple[str, ...]]:
+        """Side → where programs connect."""
+        return {name: side.endpoints for name, side in self.sides.items()}
+
+    @property
+    def tokens(self) -> Mapping[str, frozenset[str]]:
+        """Side → the liveliness tokens that its programs hold, as far as the wire knows."""
+        return self._liveliness.tokens
+
+    def mirrored(self, side: str) -> frozenset[str]:
+        """The keys of the complete queryables that the wire offers at a side for services of other sides."""
+        return self._queries.mirrored(side)
+
+    def apply(self, moment: Moment) -> None:
+        """Cut the links that are cut from now on, restore the others, and give all of them their settings."""
+        for name, state in self.links.items():
+            state.cut = name in moment.cut
+            state.change(moment.settings[name])
+
+    def _open(self, stack: contextlib.ExitStack) -> None:
+        plan, journal, links = self.plan, self._journal, self.links
+        self.sides = {name: stack.enter_context(SideSession(side, plan.largest)) for name, side in plan.sides.items()}
+        outlets = {name: SideOutlet(name, plan, journal, self._tell) for name in plan.sides}
+        stack.callback(self._end_outlets, [*outlets.values()])
+        publishers = {name: Publishers(side.session) for name, side in self.sides.items()}
+        self._queries = QueryRelay(self.sides, links, outlets, plan, journal, self._tell)
+        stack.callback(self._queries.close)
+        relays = [
+            PublicationRelay(side, links, publishers, outlets, plan, journal, self._tell)
+            for side in self.sides.values()
+        ]
+        for relay in relays:
+            stack.callback(relay.close)
+        stack.callback(self._leave, relays)
+        of_sides = [side.duty for side in self.sides.values()]
+        of_outlets = [duty for outlet in outlets.values() for duty in outlet.duties]
+        of_relays = [duty for relay in relays for duty in relay.duties]
+        self.duties = [*of_sides, *of_relays, *of_outlets, self._queries.duty, self._duty]
+        self._bypasses = Bypasses(self._note_bypass)
+        self._neighbours = Neighbours(self.sides, [*links.values()], self._tell, self._bypasses)
+        self._liveliness = LivelinessRelay(self.sides, plan, self._woken.set, EntityLog(journal.folder).add)
+        stack.callback(self._liveliness.close)
+        self._look()
+        self._queries.start()
+        for relay in relays:
+            relay.start()
+        self._bypasses.watch(self.sides.values())
+        stack.callback(self._bypasses.close)
+        backlogs = {name: relay.backlogs for name, relay in zip(self.sides, relays, strict=True)}
+        departures = Departures(backlogs, lambda side: outlets[side].waiting, self._note_departure)
+        departures.watch(self.sides.values())
+        thread = threading.Thread(target=self._keep_up, name="wire", daemon=True)
+        thread.start()
+        stack.callback(wait_for_thread, thread)
+        stack.callback(self._woken.set)
+        stack.callback(self._ended.set)
+        stack.callback(departures.close)
+
+    def _note_bypass(self, line: str) -> None:
+        """Tell a way past the wire, and note it in the journal."""
+        self._journal.note(line, bypass=True)
+        self._tell(line)
+
+    def _note_departure(self, line: str) -> None:
+        self._happened(f"{self._journal.seconds:.1f} s: {line}")
+
+    def _leave(self, relays: Sequence[PublicationRelay]) -> None:
+        """Limit the time in which messages that wait still cross."""
+        until = time.time() + _LAST_SECONDS
+        for relay in relays:
+            relay.leave(until)
+
+    def _end_outlets(self, outlets: Sequence[SideOutlet]) -> None:
+        """End what sends to the sides, all at once: each may have to wait for its programs."""
+        for outlet in outlets:
+            outlet.end()
+        deadline = time.monotonic() + LAST_SECONDS
+        for outlet in outlets:
+            outlet.close(deadline)
+
+    def _look(self) -> None:
+        """Follow what programs declare.
+
+        Queryables come before tokens: a program that sees a service's token may query it at once.
+        """
+        self._liveliness.note()
+        held = self._liveliness.tokens.items()
+        found = ((side, service_key(token)) for side, tokens in held for token in tokens)
+        self._queries.update((side, key) for side, key in found if key is not None)
+        self._liveliness.mirror()
+
+    def _keep_up(self) -> None:
+        due = 0.0
+        while not self._ended.is_set():
+            self._woken.wait(max(0.0, due - time.monotonic()))
+            self._woken.clear()
+            try:
+                with self._duty.busy():
+                    self._look()
+                    if time.monotonic() >= due:
+                        self._neighbours.update()
+                        self._bypasses.update()
+                        due = time.monotonic() + _LOOK_SECONDS
+            except Exception as error:  # whatever it is: the next look may succeed
+                if not self._ended.is_set():
+                    self._tell(f"Zenoh does not say what programs declare ({error!r}); trying again")

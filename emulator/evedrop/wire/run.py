@@ -1,0 +1,158 @@
+"""`evedrop wire`: opens a wire, carries out its events, and ends it in order.
+
+Source: docs/wire.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import NoReturn
+
+from evedrop.errors import Interrupted, RunError
+from evedrop.live.network.control_file import remove_control
+from evedrop.results.folder import make_private, new_folder, write_private
+from evedrop.results.wire_folder import WIRE_FILE
+from evedrop.results.wire_summary import WIRE_SUMMARY_FILE
+from evedrop.scenario.wire_table import PUT
+from evedrop.show.report.wire import wire_failures
+from evedrop.system.environment import check_zenoh_runtime
+from evedrop.system.output import warn
+from evedrop.system.signals import stop_or_leave_on_signals
+from evedrop.wire.closing import closing_lines
+from evedrop.wire.conductor import WireConductor
+from evedrop.wire.control import WireControl
+from evedrop.wire.file import resolved_wire
+from evedrop.wire.history import Numbered
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.journal_reader import JOURNAL_FOLDER
+from evedrop.wire.live_view import live_view
+from evedrop.wire.plan import WirePlan
+from evedrop.wire.relay import WireRelay
+from evedrop.wire.scorekeeper import WireScorekeeper
+from evedrop.wire.watchdog import ANSWER_SECONDS, WORK_SECONDS, Duty, Watchdog, end_at_once
+
+
+def run_wire(
+    plan: WirePlan,
+    out: Path,
+    *,
+    seconds: float | None = None,
+    say: Callable[[str], None] = print,
+    complain: Callable[[str], None] | None = None,
+    view: str = "off",
+) -> int:
+    """Run a wire until a signal, or for some seconds; returns the exit status.
+
+    out: its results folder, empty or that of an earlier start; say: for a line about each side and each event, and for the
+    summary; complain: for what went wrong, by default as `say`; view: as `live_view` takes it.
+
+    Raises UsageError if the folder, a side or `ZENOH_RUNTIME` cannot be used, and RunError if the folder was removed while the
+    wire ran, or if the machine lacks threads.
+    """
+    check_zenoh_runtime()
+    if (out / JOURNAL_FOLDER).is_dir():
+        make_private(out)
+    else:
+        new_folder(out)
+    events: list[str] = []
+
+    def leave(why: str, status: int) -> NoReturn:
+        end_at_once(f"{why}; {_on_disk(out)}", status, lambda: remove_control(out))
+
+    with (
+        Watchdog(lambda what: leave(f"the wire no longer answers: {what}", RunError.exit_status)) as watchdog,
+        stop_or_leave_on_signals(lambda: leave("interrupted again", Interrupted.exit_status)) as stop,
+    ):
+        with live_view(plan, out, view, say) as shown, WireJournal(out, plan) as journal:
+            scorekeeper = WireScorekeeper(plan, journal)
+            if shown is not None:
+                shown.follow(journal)
+
+            def happened(line: str) -> None:
+                events.append(line)
+                journal.note(line.partition(": ")[2])
+                say(line)
+
+            _begin_results(out, plan)
+            if journal.recovered:
+                say(
+                    f"{journal.recovered:,} messages were recovered from an earlier start, which was killed; their numbers go on"
+                )
+            if journal.start > 1:
+                say(continuation(journal.start, journal.counts))
+            with ExitStack() as stack:
+                with watchdog.doing(Duty("while the sides were opened", ANSWER_SECONDS)):
+                    relay = stack.enter_context(WireRelay(plan, journal, warn, happened))
+                for name, endpoints in relay.endpoints.items():
+                    say(f"{name} {' '.join(endpoints)}")
+                conductor = stack.enter_context(WireConductor(plan, relay, happened))
+                stack.enter_context(WireControl(out, relay, conductor, scorekeeper, journal, events))
+                _watch(watchdog, relay, journal)
+                stop.wait(seconds)
+                watchdog.hurry()
+                with watchdog.doing(Duty("while the wire was ended", waits=True)):
+                    stack.close()
+            with watchdog.doing(Duty("in the journal, while its last files were written", end_seconds=WORK_SECONDS)):
+                journal.close()
+        status = scorekeeper.finish(out) if out.is_dir() else RunError.exit_status
+    summary = scorekeeper.summary()
+    for line in closing_lines(summary):
+        say(line)
+    for line in wire_failures(summary):
+        (say if complain is None else complain)(line)
+    if journal.removed is not None:
+        raise RunError(_removed(journal.removed, out))
+    say(f"results: {out}")
+    return status
+
+
+def continuation(start: int, counts: Mapping[Numbered, int]) -> str:
+    """The sentence about a start in the folder of an earlier one. counts: the number of each stream's next message, from 0."""
+    if not counts:
+        return f"start {start} continues start {start - 1}, which numbered no message"
+    (link, key, kind), number = max(counts.items(), key=lambda item: item[1])
+    others = f", and likewise for {len(counts) - 1:,} more" if len(counts) > 1 else ""
+    what = "message" if kind == PUT else kind
+    return (
+        f"start {start} continues start {start - 1}: {what} {number + 1:,} of {key} on the link {link} is next{others}; for the "
+        "fates of a first start, give another folder"
+    )
+
+
+def _watch(watchdog: Watchdog, relay: WireRelay, journal: WireJournal) -> None:
+    """Let a watchdog watch all threads of the wire, and ask its sides and its journal."""
+    watchdog.watch(*relay.duties)
+    for name, side in relay.sides.items():
+        watchdog.ask(f"at the side {name}", side.answer)
+    watchdog.ask("in the journal", journal.flush, WORK_SECONDS)
+
+
+def _on_disk(out: Path) -> str:
+    """The part of a sentence that says how to use the results of a wire that ended at once."""
+    return (
+        f"the wire has ended with what is on disk: `evedrop report {out}` shows it, and the next start with this folder goes on "
+        "from there"
+    )
+
+
+def _removed(folder: Path, out: Path) -> str:
+    """The sentence about a wire without a journal. folder: the one that was removed."""
+    left = f"{out} has only the summary" if (out / WIRE_SUMMARY_FILE).is_file() else "only the table above is left"
+    return (
+        f"{folder} was removed or moved while the wire ran, so its records are not there, and {left}; start the "
+        "wire again, and leave its folder in place while it runs"
+    )
+
+
+def _begin_results(out: Path, plan: WirePlan) -> None:
+    """Write wire.toml, the complete file of the wire, and remove the summary of an earlier start."""
+    try:
+        (out / WIRE_SUMMARY_FILE).unlink(missing_ok=True)
+    except OSError as error:
+        warn(f"the summary of an earlier start cannot be removed ({error}); the wire goes on")
+    try:
+        write_private(out / WIRE_FILE, resolved_wire(plan))
+    except OSError as error:
+        warn(f"wire.toml cannot be written ({error}); the wire goes on")

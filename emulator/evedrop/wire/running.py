@@ -1,0 +1,265 @@
+"""A wire in a process of its own, for programs and tests in Python.
+
+Source: docs/wire.md, from Python.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import tomllib
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self, final
+
+import zenoh
+
+from evedrop.errors import EvedropError, RunError, UsageError
+from evedrop.live.network.control_file import no_run, read_control
+from evedrop.live.network.operator import Answer, ask
+from evedrop.live.network.zenoh_log import MARK
+from evedrop.live.protocol.requests import LinkRequest, OperatorRequest, StatusRequest
+from evedrop.live.protocol.wire_status import WireStatus
+from evedrop.results.folder import claimed, default_folder, write_private
+from evedrop.results.wire_summary import WIRE_SUMMARY_FILE, WireSummary
+from evedrop.scenario.words import listed
+from evedrop.score.summary import failed
+from evedrop.show.report.wire import wire_failures
+from evedrop.system.processes import kill, wait_for
+from evedrop.wire.file import load_wire, resolved_wire, wire_of
+from evedrop.wire.journal_on_disk import scorekeeper_on_disk
+from evedrop.wire.journal_reader import journal_tables
+from evedrop.wire.plan import WirePlan
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+_PATIENCE = 60.0  # seconds, for the process to begin, to answer, and to end
+_POLL_SECONDS = 0.02
+LONGEST_SECONDS = 3600.0
+"""The seconds after which a wire ends by itself: the program that opened it may have been killed."""
+
+
+class ExpectationFailed(EvedropError, AssertionError):
+    """An expectation of a wire that failed; or programs could speak past the wire."""
+
+    exit_status = 1
+
+
+def wire(
+    source: str | Path | WirePlan | None = None,
+    *,
+    out: str | Path | None = None,
+    seconds: float = LONGEST_SECONDS,
+    **entries: Any,
+) -> RunningWire:
+    """A wire in a process of its own, which begins with the `with` statement and ends with it.
+
+    source: a wire file, or a plan; None: the entries are the whole wire, such as `side=["robot", "base"]` and
+    `link=[{"from": "robot", "to": "base", "quality": 0.6}]`. out: the results folder; seconds: after which the wire ends by
+    itself. entries: with a file, changes by dotted key, with `__` for the dot, such as `seed=8` or `side__base__listen=[]`.
+
+    Raises ScenarioError with every mistake of the wire. The `with` statement raises UsageError or RunError if the wire cannot
+    begin, and ExpectationFailed if one of its `[[expect]]` failed, or programs could speak past it.
+    """
+    if isinstance(source, WirePlan):
+        if entries:
+            raise UsageError(
+                f"wire(plan, {', '.join(entries)}): expected no entries with a plan; change the plan instead"
+            )
+        plan, name = source, "wire"
+    elif source is not None:
+        plan = load_wire(source, {entry.replace("__", "."): value for entry, value in entries.items()})
+        name = Path(source).stem
+    else:
+        side = entries.get("side")
+        if isinstance(side, Sequence) and not isinstance(side, str):
+            entries["side"] = {one: {} for one in side}
+        plan, name = wire_of(entries), "wire"
+    folder = claimed(default_folder(f"wire-{name}")) if out is None else Path(out)
+    return RunningWire(plan, folder, seconds)
+
+
+@final
+class RunningWire:
+    """A wire in a process of its own; use it as a context manager."""
+
+    def __init__(self, plan: WirePlan, folder: Path, seconds: float = LONGEST_SECONDS) -> None:
+        self.plan = plan
+        self.folder = folder
+        """The results folder."""
+        self._seconds = seconds
+        self._process: subprocess.Popen[str] | None = None
+        self._endpoints: Mapping[str, Sequence[str]] = {}
+        self._errors: list[str] = []
+
+    def __enter__(self) -> Self:
+        """Start the wire, and wait until programs can connect. Raises UsageError or RunError if it cannot begin."""
+        with tempfile.TemporaryDirectory() as given:  # the results folder must be empty, or that of an earlier start
+            file = Path(given) / "wire.toml"
+            write_private(file, resolved_wire(self.plan))
+            self._process = _started("wire", str(file), "--out", str(self.folder), "--for", f"{self._seconds:g} s")
+            self._wait()
+        return self
+
+    def _wait(self) -> None:
+        """Wait until the wire answers."""
+        assert self._process is not None  # noqa: S101 - it was started
+        self._listener = threading.Thread(target=self._hear_errors, args=(self._process,), name="wire", daemon=True)
+        self._listener.start()
+        deadline = time.monotonic() + _PATIENCE
+        while not self._endpoints:
+            if not self.is_running or time.monotonic() > deadline:
+                raise self._failure(self._stop(signal.SIGKILL))
+            with suppress(UsageError):  # it has not begun yet
+                self._endpoints = self.status().sides
+            time.sleep(_POLL_SECONDS)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the wire. Raises ExpectationFailed or RunError, unless the `with` block raised an error itself."""
+        status = self._stop(signal.SIGINT)
+        if error is not None or status == 0:
+            return
+        with suppress(UsageError):
+            summary = self.typed_summary()
+            if summary.failed_expectations or summary.bypasses:
+                raise ExpectationFailed("\n".join(wire_failures(summary)))
+        raise self._failure(status)
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the wire is running."""
+        return self._process is not None and self._process.poll() is None
+
+    def endpoint(self, side: str) -> str:
+        """The Zenoh endpoint of a side, such as tcp/127.0.0.1:41999. Raises UsageError if it does not listen."""
+        return self._endpoints_of(side)[0]
+
+    def config(self, side: str) -> zenoh.Config:
+        """A configuration for `zenoh.open`: a client of a side, which finds no other program without the wire."""
+        settings = {
+            "mode": "client",
+            "connect": {"endpoints": list(self._endpoints_of(side))},
+            "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        }
+        return zenoh.Config.from_json5(json.dumps(settings))
+
+    def partition(self, one: str, other: str) -> None:
+        """Let nothing pass between two sides, except liveliness and lossless messages."""
+        self._steer({"partition": [one, other]})
+
+    def heal(self, one: str, other: str | None = None) -> None:
+        """End the partition of two sides, or the cut of a link."""
+        self._steer({"heal": one} if other is None else {"join": [one, other]})
+
+    def cut(self, link: str) -> None:
+        """Let nothing pass over a link, except lossless messages."""
+        self._steer({"cut": link})
+
+    def link(self, name: str, **settings: Any) -> None:
+        """Give a link other settings, such as `quality=0.2` or `delay={"model": "constant", "value": 0.1}`."""
+        self._steer({"link": name, "set": settings})
+
+    def status(self) -> WireStatus:
+        """The state of the wire now. Raises UsageError if it does not run."""
+        found = self._ask(StatusRequest()).status
+        if not isinstance(found, WireStatus):
+            raise UsageError(f"{self.folder} is the folder of a run; expected that of a wire")
+        return found
+
+    def rows(self) -> pa.Table:
+        """The journal so far: a row for each message and link (docs/wire.md, the journal)."""
+        import pyarrow as pa  # noqa: PLC0415 - only for this
+
+        return pa.concat_tables(journal_tables(self.folder))
+
+    def summary(self) -> Mapping[str, Any]:
+        """What became of the messages so far: the entries of summary.json (docs/wire.md, the summary)."""
+        return self.typed_summary().as_dict()
+
+    def typed_summary(self) -> WireSummary:
+        """What became of the messages so far, with types. Raises UsageError if it cannot be read."""
+        path = self.folder / WIRE_SUMMARY_FILE
+        if not self.is_running and path.is_file():
+            return WireSummary.read(path)
+        return scorekeeper_on_disk(self.folder, self.plan).summary()
+
+    def expect(self, figure: str | None = None, **bounds: Any) -> None:
+        """Raise ExpectationFailed if an expectation fails so far.
+
+        The arguments are the entries of an `[[expect]]` of a wire file, such as `"scan.delivery", above=0.5`, or `link="scan"`.
+        """
+        table = {"figure": figure, **bounds} if figure is not None else bounds
+        plan = wire_of({**tomllib.loads(resolved_wire(self.plan)), "expect": [table]})
+        summary = scorekeeper_on_disk(self.folder, plan).summary()
+        if failures := failed(summary.expectations):
+            lines = [*(judged.sentence for judged in failures), *(bypass.event for bypass in summary.bypasses)]
+            raise ExpectationFailed("\n".join(lines))
+
+    def _endpoints_of(self, side: str) -> Sequence[str]:
+        found = self._endpoints.get(side, ())
+        if not found:
+            sides = [name for name, endpoints in self._endpoints.items() if endpoints]
+            raise UsageError(f'side "{side}": expected a side that listens: {listed(sides)}')
+        return found
+
+    def _steer(self, event: Mapping[str, Any]) -> None:
+        """Let an event begin now. Raises UsageError if the wire refuses it, or does not run."""
+        if refused := self._ask(LinkRequest(event)).refused:
+            raise UsageError(f"{'; '.join(refused)}; nothing was changed")
+
+    def _ask(self, request: OperatorRequest) -> Answer:
+        """The wire's answer. Raises UsageError if it does not run."""
+        control = read_control(self.folder)
+        try:
+            answer = ask(control, request, _PATIENCE)
+        except zenoh.ZError as error:
+            raise no_run(self.folder, f"no wire answers at {control.router}") from error
+        if answer is None:
+            raise no_run(self.folder, "it ended before it answered")
+        return answer
+
+    def _hear_errors(self, process: subprocess.Popen[str]) -> None:
+        assert process.stderr is not None  # noqa: S101 - it is a pipe
+        with process.stderr as errors:
+            self._errors.extend(line for line in errors if not line.startswith(MARK))
+
+    def _stop(self, number: int) -> int:
+        """End the process, wait until it is gone, and return its status."""
+        process = self._process
+        if process is None:
+            return 0
+        if process.poll() is None:
+            process.send_signal(number)
+        kill(*wait_for([process], _PATIENCE))
+        self._listener.join(_PATIENCE)
+        return -signal.SIGKILL if process.returncode is None else process.returncode
+
+    def _failure(self, status: int) -> EvedropError:
+        """The error for a process that failed, in its own words."""
+        said = "".join(self._errors).strip().removeprefix("evedrop: ")
+        text = said or f"the wire in {self.folder} ended with status {status}"
+        return UsageError(text) if status == UsageError.exit_status else RunError(text)
+
+
+def _started(*arguments: str) -> subprocess.Popen[str]:
+    """A process of Evedrop that Ctrl-C in the terminal does not reach; the program that started it ends it."""
+    return subprocess.Popen(
+        [sys.executable, "-P", "-m", "evedrop", *arguments],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        env={**os.environ, "PYTHONIOENCODING": "utf-8"},
+        encoding="utf-8",
+        process_group=0,
+    )

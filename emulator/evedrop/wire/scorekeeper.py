@@ -1,0 +1,297 @@
+"""Adds up the summary of a wire: the fates of all messages, each link against its model, and whether expectations held.
+
+Source: docs/wire.md, the summary.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Protocol, final
+
+import numpy as np
+import zenoh
+from numpy.typing import NDArray
+
+from evedrop.errors import UsageError
+from evedrop.model.kernels.elementary import sum_in_order
+from evedrop.model.slot.link import Change
+from evedrop.results.folder import replace_private
+from evedrop.results.wire_summary import (
+    WIRE_SUMMARY_FILE,
+    JournalState,
+    JournalSummary,
+    WireEventSummary,
+    WireLinkSummary,
+    WireSummary,
+)
+from evedrop.score.summary import Judged
+from evedrop.system.output import warn
+from evedrop.wire.crossing import UNLINKED, Crossing, Kind
+from evedrop.wire.expect import WireExpectTable
+from evedrop.wire.figures import WIRE_FIGURES
+from evedrop.wire.history import NotedEvent
+from evedrop.wire.journal import AmendmentListener, Listener
+from evedrop.wire.journal_part import REASONS, Records
+from evedrop.wire.law import bounds, expected
+from evedrop.wire.plan import WireLink, WirePlan
+from evedrop.wire.tallies import LinkTally, StreamTally
+
+_FEW = 8  # messages of a key in a block; more are added as arrays
+_QUANTILES = (0.5, 0.9, 0.99)
+BYPASSED = "programs could speak past the wire"
+"""Why an expectation of a wire with bypasses did not hold."""
+
+
+class SummarisedJournal(Protocol):
+    """What a summary needs from a journal; `WireJournal` and `JournalOnDisk` provide it."""
+
+    listeners: list[Listener]
+    amendment_listeners: list[AmendmentListener]
+    recorded: int
+    missing: int
+
+    @property
+    def incomplete_since(self) -> float | None:
+        """When something could not be written for the first time, in seconds since 1970."""
+
+    @property
+    def start(self) -> int:
+        """The number of the start of the wire in its folder, from 1."""
+
+    @property
+    def seconds(self) -> float:
+        """How long this start has lasted."""
+
+    @property
+    def state(self) -> JournalState:
+        """What became of this start."""
+
+    @property
+    def recovered(self) -> int:
+        """The number of records that an earlier start had left behind."""
+
+    @property
+    def events(self) -> Sequence[NotedEvent]:
+        """The events of this start, with seconds since it began."""
+
+    def key_of(self, code: int) -> str:
+        """The key of a code."""
+
+    def changes_of(self, link: str, key: str, kind: str) -> tuple[Change, ...]:
+        """The settings that the messages of a stream had."""
+
+
+@final
+class WireScorekeeper:
+    """Listens to a wire's journal, and adds up. Threads may call its methods at the same time."""
+
+    def __init__(self, plan: WirePlan, journal: SummarisedJournal) -> None:
+        self._plan, self._journal = plan, journal
+        self._links = {link.number: LinkTally() for link in plan.links}
+        self._unlinked = LinkTally()
+        self._lossless: dict[int, bool] = {}
+        self._lock = threading.Lock()
+        journal.listeners.append(self.add)
+        journal.amendment_listeners.append(self.amend)
+
+    def add(self, records: Records) -> None:
+        """Add a block of the journal."""
+        with self._lock:
+            kinds = (records["kind"] & 0x7F).astype(np.int64)
+            kinds[kinds == Kind.DELETE] = Kind.PUT  # they share their numbers
+            streams = np.stack([records["link"], records["key"], kinds]).astype(np.int64)
+            order = np.lexsort(streams[::-1])  # stable
+            streams, records = streams[:, order], records[order]
+            for part in _split(records, streams[:1]):
+                self._tally(int(part["link"][0])).add(part)
+            times, numbers, fates = (records[name].tolist() for name in ("time", "n", "fate"))
+            starts = [0, *_changes(streams).tolist(), len(records)]
+            for (code, key, kind), start, stop in zip(_firsts(streams), starts, starts[1:], strict=False):
+                if code == UNLINKED or not key:
+                    continue  # a key that is not kept has no numbers
+                streams_of = self._links[code].streams
+                stream = streams_of.get((key, kind)) or streams_of.setdefault((key, kind), StreamTally())
+                decided = not self._is_lossless(key)
+                if stop - start > _FEW:
+                    stream.add(records[start:stop], decided)
+                else:
+                    for at in range(start, stop):
+                        stream.add_one(times[at], numbers[at], fates[at], decided)
+
+    def amend(self, records: Records, fate: Crossing) -> None:
+        """Count records of the journal that were added with another fate."""
+        with self._lock:
+            for code in np.unique(records["link"]).tolist():
+                self._tally(code).amend(records[records["link"] == code], fate)
+
+    def _tally(self, code: int) -> LinkTally:
+        return self._unlinked if code == UNLINKED else self._links[code]
+
+    def _is_lossless(self, key: int) -> bool:
+        if not self._plan.lossless:
+            return False
+        if key not in self._lossless:
+            self._lossless[key] = self._plan.is_lossless(zenoh.KeyExpr(self._journal.key_of(key)))
+        return self._lossless[key]
+
+    def links(self) -> dict[str, WireLinkSummary]:
+        """Link → what became of its messages so far."""
+        with self._lock:
+            return {link.name: self._of_link(link, self._links[link.number]) for link in self._plan.links}
+
+    def counts(self) -> dict[str, tuple[int, int]]:
+        """Link → messages heard and messages delivered so far."""
+        with self._lock:
+            return {
+                link.name: (self._links[link.number].heard, self._links[link.number].delivered)
+                for link in self._plan.links
+            }
+
+    @property
+    def unaccounted(self) -> int:
+        """Records of the closed journal that are not in exactly one fate of one link: 0, or the wire has a fault."""
+        tallies = [*self._links.values(), self._unlinked]
+        return abs(self._journal.recorded - sum(int(tally.fates.sum()) for tally in tallies))
+
+    def summary(self) -> WireSummary:
+        """The summary so far."""
+        journal, links = self._journal, self.links()
+        return WireSummary(
+            seed=self._plan.seed,
+            start=journal.start,
+            state=journal.state,
+            seconds=journal.seconds,
+            heard=journal.recorded,
+            unlinked=self._unlinked.heard,
+            unaccounted=self.unaccounted,
+            journal=JournalSummary(journal.recovered, journal.missing, journal.incomplete_since),
+            links=links,
+            expectations=self.judged(links),
+            events=[WireEventSummary(*event) for event in journal.events],
+            made_with={
+                "python": platform.python_version(),
+                **{name: importlib.metadata.version(name) for name in ("evedrop", "eclipse-zenoh")},
+            },
+        )
+
+    def judged(self, links: Mapping[str, WireLinkSummary]) -> list[Judged]:
+        """The expectations of the wire, and whether they held. None held if programs could have spoken past the wire."""
+        bypassed = any(event.bypass for event in self._journal.events)
+        judged = [self._judged(table, links[table.subject]) for table in self._plan.expectations]
+        return [replace(result, held=None, why=BYPASSED) if bypassed and result.held else result for result in judged]
+
+    def finish(self, out: Path) -> int:
+        """Write summary.json of a wire whose journal is closed; returns the exit status.
+
+        1 if an expectation failed, programs could have spoken past the wire, or the journal is incomplete; 3 if a message is
+        unaccounted for.
+        """
+        found = self.summary()
+        try:
+            replace_private(out / WIRE_SUMMARY_FILE, found.text)
+        except OSError as error:
+            warn(f"the summary of the wire cannot be written ({error})")
+            return 1
+        if found.unaccounted:
+            return 3
+        return 1 if found.failed_expectations or found.bypasses or found.journal.incomplete_since is not None else 0
+
+    def _judged(self, table: WireExpectTable, link: WireLinkSummary) -> Judged:
+        if table.link is not None:
+            held, value, lacking = link.within_bounds, link.rate, "the link's models decided on no message"
+        else:
+            figure = WIRE_FIGURES[str(table.figure).rpartition(".")[2]]
+            value = figure.value(link, self._links[self._plan.named(table.subject).number], table.quantile)
+            held, lacking = None if value is None else table.holds(value), "no message was delivered"
+        if held is not None:
+            return Judged(table.text, held, value, table.wanted)
+        why = lacking if link.heard else "the link heard nothing"
+        return Judged(table.text, None, value, table.wanted, why=why)
+
+    def _of_link(self, link: WireLink, tally: LinkTally) -> WireLinkSummary:
+        streams = list(tally.streams.values())
+        tried, passed = (sum(getattr(one, name) for one in streams) for name in ("tried", "passed"))
+        rate = model = between = within = None
+        if tried:
+            shared: dict[Any, tuple[float, float]] = {}
+            laws = [
+                self._law(link, *stream, stream_tally, shared)
+                for stream, stream_tally in tally.streams.items()
+                if stream_tally.tried
+            ]
+            mean, variance = (sum_in_order(law[i] for law in laws) for i in (0, 1))
+            low, high = bounds(mean, variance, tried)
+            rate, model, between, within = (
+                passed / tried,
+                mean / tried,
+                (low / tried, high / tried),
+                low <= passed <= high,
+            )
+        reasons = [(REASONS[fate], count, fate.emulated) for fate, count in tally.lost_by()]
+        quantiles = {f"{level:g}": tally.delay_quantile(level) for level in _QUANTILES}
+        return WireLinkSummary(
+            source=link.source,
+            target=link.target,
+            keys=link.keys,
+            heard=tally.heard,
+            bytes=tally.bytes,
+            delivered=tally.delivered,
+            again=tally.again,
+            lost_by={reason: count for reason, count, emulated in reasons if emulated},
+            dropped_by={reason: count for reason, count, emulated in reasons if not emulated},
+            rate=rate,
+            expected_rate=model,
+            bounds=between,
+            within_bounds=within,
+            delays={level: found for level, found in quantiles.items() if found is not None},
+            gap_messages=max((one.longest for one in streams), default=0),
+            gap_seconds=max((one.silence for one in streams), default=0.0),
+        )
+
+    def _law(
+        self, link: WireLink, key: int, kind: int, tally: StreamTally, shared: dict[Any, tuple[float, float]]
+    ) -> tuple[float, float]:
+        """How many of a stream's messages its models should have let through, and the variance of this number.
+
+        known: the laws of the link so far, which streams with the same numbers and settings share: a key that never came again
+        is like all others. Raises UsageError if a message has two fates, which only a journal on disk that was changed can say.
+        """
+        changes = self._journal.changes_of(link.name, self._journal.key_of(key), Kind(kind).stream)
+        numbers = tuple(sorted(tally.ranges))
+        name = (tuple((change.at, id(change.settings)) for change in changes), numbers, tally.tried)
+        if name not in shared:
+            ranges = [range(*pair) for pair in numbers]
+            for before, after in pairwise(ranges):
+                if after.start < before.stop:
+                    raise UsageError(
+                        f"the journal has two fates for message {after.start} of {self._journal.key_of(key)!r} on the link "
+                        f"{link.name!r}; a file of it was changed, so give the results folder as the wire wrote it"
+                    )
+            mean, variance = expected(link.settings, changes, ranges)
+            if tally.scattered:  # a sample of a known range: the range varies as a whole, and the sample within it
+                share = tally.tried / sum(map(len, ranges))
+                mean, variance = mean * share, variance * share**2 + mean * share * (1.0 - mean * share / tally.tried)
+            shared[name] = (mean, variance)
+        return shared[name]
+
+
+def _changes(columns: NDArray[np.int64]) -> NDArray[np.intp]:
+    """Where sorted columns differ from those before them."""
+    return np.flatnonzero((np.diff(columns) != 0).any(axis=0)) + 1
+
+
+def _split(records: Records, columns: NDArray[np.int64]) -> list[Records]:
+    """The records in groups with equal columns."""
+    return np.split(records, _changes(columns))
+
+
+def _firsts(columns: NDArray[np.int64]) -> list[list[int]]:
+    """The columns of each group."""
+    found: list[list[int]] = columns[:, np.r_[0, _changes(columns)]].T.tolist()
+    return found

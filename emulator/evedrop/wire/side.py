@@ -1,0 +1,206 @@
+"""The session of a side: a Zenoh router to which programs connect, their permissions, and where it listens.
+
+Source: docs/wire.md, sides.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, final
+
+import zenoh
+
+from evedrop.errors import UsageError
+from evedrop.live.network.opening import open_session
+from evedrop.system.ports import free_port
+from evedrop.wire.plan import Side, SideTls, WireLink
+from evedrop.wire.watchdog import ANSWER_SECONDS, Duty
+
+_REMOTE = zenoh.Locality.REMOTE
+ZenohConfig = dict[str, Any]
+PROBES = "@evedrop/*/*"
+"""The keys of messages with which the wire finds out whether sides are joined outside it; `**` does not include them."""
+HIDDEN = ("@ros2_lv/**", "@/*/@ros2_lv/**", "**/@adv/**")
+"""Keys that `**` does not match although programs use them: the graph of ROS 2, and the histories of advanced publishers."""
+_CONNECT_SECONDS = 10.0
+_ATTEMPTS = 5  # another program may take a port between its choice and its use
+_PORT_0 = re.compile(r":0(?=[?#]|$)")
+_IN_SOURCE = re.compile(r" at \S+\.rs:\d+\.")
+"""Where in its source Zenoh raised an error, as its messages say it."""
+_CLIENT_MESSAGES = (
+    "put",
+    "delete",
+    "declare_subscriber",
+    "query",
+    "reply",
+    "declare_queryable",
+    "liveliness_token",
+    "liveliness_query",
+    "declare_liveliness_subscriber",
+)
+
+
+@final
+class SideSession:
+    """The open session of a side; use it as a context manager, or its threads outlive the program."""
+
+    def __init__(self, side: Side, largest: int) -> None:
+        """largest: bytes of the largest message. Raises UsageError if the side cannot listen or connect where it must."""
+        self.side = side
+        self.name = side.name
+        with _users_file(side.users) as users:
+            self.session, self.endpoints = _opened(side, largest, users)
+        """Its session, and where programs connect: with a free port where the plan has port 0."""
+        self.zid = str(self.session.zid())
+        self.duty = Duty(f"at the side {side.name}", ANSWER_SECONDS)
+        """The work of the main thread on the session when the wire ends."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        # Zenoh gives up after 10 s if a program that does not read keeps its connection: the process ends all the same.
+        with self.duty.busy(), contextlib.suppress(zenoh.ZError):
+            self.session.close()
+
+    def answer(self) -> None:
+        """Return if Zenoh answers at this side: a declaration needs all its locks."""
+        self.session.declare_subscriber(
+            f"@evedrop/{self.zid}/alive", lambda _: None, allowed_origin=_REMOTE
+        ).undeclare()
+
+
+def _opened(side: Side, largest: int, users_file: str | None) -> tuple[zenoh.Session, tuple[str, ...]]:
+    """The session of a side, and its endpoints. Raises UsageError."""
+    for attempt in range(_ATTEMPTS):
+        endpoints = tuple(_with_port(endpoint) for endpoint in side.listen)
+        config = side_config(replace(side, listen=endpoints), largest, users_file)
+        try:
+            return open_session(zenoh.Config.from_json5(json.dumps(config))), endpoints
+        except zenoh.ZError as error:
+            fixed = endpoints == side.listen or "in use" not in str(error)
+            if fixed or attempt == _ATTEMPTS - 1:
+                raise UsageError(_refusal(side, str(error))) from error
+    raise AssertionError
+
+
+def _with_port(endpoint: str) -> str:
+    """An endpoint with a free port in place of port 0.
+
+    Zenoh, too, listens at any free port for port 0, but tells which only in its administration space, which is closed.
+    """
+    return _PORT_0.sub(lambda _: f":{free_port()}", endpoint)
+
+
+def expressions_of(side: Side, links: Iterable[WireLink] = ()) -> tuple[str, ...]:
+    """The key expressions under which a wire listens at a side: those that the side allows, and those that `**` hides.
+
+    links: whose key expressions may name further keys that `**` hides.
+    """
+    found = list(side.keys)
+    if side.keys == ("**",):
+        found += [*HIDDEN, *(link.keys for link in links if "@" in link.keys)]
+    else:
+        found += [f"{key}/@adv/**" for key in side.keys if key.endswith("**")]
+    return tuple(dict.fromkeys(found))
+
+
+def side_config(side: Side, largest: int, users_file: str | None) -> ZenohConfig:
+    """The configuration of a side's session. Messages keep the timestamp that they have, or have none."""
+    link: ZenohConfig = {"rx": {"max_message_size": max(2 * largest, 2**30)}}  # what is larger is in no journal
+    if side.tls is not None:
+        link["tls"] = _tls(side.tls)
+    config: ZenohConfig = {
+        "mode": "router",
+        "listen": {"endpoints": list(side.listen), "exit_on_failure": True},
+        "connect": {
+            "endpoints": list(side.connect),
+            "timeout_ms": int(_CONNECT_SECONDS * 1000),
+            "exit_on_failure": True,
+            "retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
+        },
+        "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        # A router may hang for ever if its administration space is asked while a program declares something (docs/upstream.md).
+        "adminspace": {"enabled": False},
+        "timestamping": {"enabled": False},
+        "transport": {"link": link},
+    }
+    if users_file is not None:
+        config["transport"]["auth"] = {"usrpwd": {"dictionary_file": users_file}}
+    if side.keys != ("**",):
+        # Only a side that connects to a router needs probes, and with them its programs could say that sides are joined.
+        probes = (PROBES,) if side.connect else ()
+        config["access_control"] = _access((*expressions_of(side), *probes))
+    return config
+
+
+def _access(keys: tuple[str, ...]) -> ZenohConfig:
+    """Access control that lets every program use some keys and no others."""
+    rule = {
+        "id": "keys",
+        "permission": "allow",
+        "flows": ["ingress", "egress"],
+        "messages": list(_CLIENT_MESSAGES),
+        "key_exprs": list(keys),
+    }
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": [rule],
+        "subjects": [{"id": "everybody"}],
+        "policies": [{"subjects": ["everybody"], "rules": ["keys"]}],
+    }
+
+
+def _tls(tls: SideTls) -> ZenohConfig:
+    section: ZenohConfig = {
+        "listen_certificate": tls.certificate,
+        "listen_private_key": tls.key,
+        "connect_certificate": tls.certificate,
+        "connect_private_key": tls.key,
+        "enable_mtls": tls.authority is not None,
+    }
+    if tls.authority is not None:
+        section["root_ca_certificate"] = tls.authority
+    return section
+
+
+@contextlib.contextmanager
+def _users_file(users: Mapping[str, str] | None) -> Iterator[str | None]:
+    """A private file of users and passwords, which Zenoh reads when it opens a session."""
+    if users is None:
+        yield None
+        return
+    with tempfile.TemporaryDirectory(prefix="evedrop-") as folder:
+        path = Path(folder, "users")
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:
+            file.writelines(f"{user}:{password}\n" for user, password in users.items())
+        yield str(path)
+
+
+def _refusal(side: Side, why: str) -> str:
+    """The message for a session that Zenoh does not open."""
+    where = " and ".join(
+        filter(
+            None,
+            (
+                f"listen at {', '.join(side.listen)}" if side.listen else "",
+                f"connect to {', '.join(side.connect)}" if side.connect else "",
+            ),
+        )
+    )
+    why = _IN_SOURCE.sub("", why.splitlines()[0])
+    return (
+        f"side {side.name} cannot {where} ({why}); end the program that listens there already, start the router "
+        "that it must connect to, or give the side other endpoints"
+    )

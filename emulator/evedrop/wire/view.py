@@ -1,0 +1,127 @@
+"""The recording of a wire while it runs.
+
+The wire appends blocks of rows to a list; a thread counts them and writes the file that viewers read. A viewer or a disk that is
+slow, hung or absent cannot delay the wire.
+
+Source: docs/wire.md, the view.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from evedrop.show.view.recording import RecordingThread
+from evedrop.wire.journal import WireJournal
+from evedrop.wire.notices import Notice, introduction, level_of
+from evedrop.wire.panels import Pace, WirePanels
+from evedrop.wire.plan import WirePlan
+from evedrop.wire.step_counts import StepCounter
+
+_MOST_ROWS = 2_000_000  # 100 MB
+_LATE = 0.3  # seconds after which the rows of a step are there
+_BATCH = 0.5  # seconds between two additions to the recording, each of which takes some kilobytes
+_JUMP = 1.0  # seconds by which the system's clock and a steady clock may differ
+
+
+@final
+class WireView(RecordingThread[NDArray[Any], Notice]):
+    """Writes the recording of a wire to `path`. No method waits, and none raises: see `failure`."""
+
+    def __init__(
+        self,
+        path: Path,
+        plan: WirePlan,
+        name: str,
+        start: float,
+        pace: Pace | None = None,
+        clocks: Callable[[], tuple[float, float]] = lambda: (time.time(), time.monotonic()),
+        most_rows: int = _MOST_ROWS,
+    ) -> None:
+        """name: identifies the recording. start: when the wire started, in seconds since 1970.
+
+        clocks: seconds since 1970, and those of a clock that is never set; called once by each round of the thread.
+        most_rows: that the thread may be behind.
+        """
+        self._pace = Pace() if pace is None else pace
+        self._panels = WirePanels(plan, self._pace)
+        self._counter = StepCounter(len(plan.links), self._pace.step, start)
+        self._start, self._clocks, self._most_rows = start, clocks, most_rows
+        now, steady = clocks()
+        self._ahead, self._shift = now - steady, 0.0
+        self._amended: list[tuple[NDArray[Any], int]] = []
+        self._sent = 0.0
+        super().__init__(path, name, [Notice(0.0, "INFO", introduction(plan))])
+
+    def add(self, rows: NDArray[Any]) -> None:
+        """Record a block of `RECORD` rows, which must not change afterwards."""
+        if len(rows):
+            self._append(rows, len(rows), self._most_rows, 0.0)
+
+    def follow(self, journal: WireJournal) -> None:
+        """Record the rows of a journal and its events from now on."""
+        journal.listeners.append(self.add)
+        journal.amendment_listeners.append(self.amend)
+        journal.event_listeners.append(lambda time, line: self.note(time, level_of(line), line))
+
+    def note(self, time: float, level: str, text: str) -> None:
+        """Add a line to the events, at a time in seconds since 1970; level: INFO, WARN or ERROR."""
+        with self._changed:
+            if self.failure is None:
+                self._notes.append(Notice(self._elapsed(time), level, text))
+
+    def amend(self, rows: NDArray[Any], fate: int) -> None:
+        """Change the fate of rows that were added."""
+        with self._changed:
+            if self.failure is None:
+                self._amended.append((rows, fate))
+
+    def _elapsed(self, time: float) -> float:
+        return max(0.0, time - self._start - self._shift)
+
+    def _layout(self) -> rrb.Blueprint:
+        return self._panels.layout()
+
+    def _style(self, to: rr.RecordingStream) -> None:
+        self._panels.style(to)
+
+    def _send(self, chunks: list[NDArray[Any]], notes: list[Notice], to: rr.RecordingStream) -> bool:
+        with self._changed:
+            amended, self._amended = self._amended, []
+        now = self._now(notes)
+        self._panels.notes(notes, to)
+        found = bool(notes)
+        for rows in chunks:
+            timed = rows.copy()
+            timed["time"] = np.minimum(rows["time"] - self._shift, now)  # rows from before the clock was set
+            for steps in self._counter.add(timed):
+                self._panels.send(steps, to)
+                found = True
+        for rows, fate in amended:
+            self._counter.amend(rows, fate)
+        if self._last or not 0.0 <= now - self._sent < _BATCH:
+            self._sent = now
+            for steps in (*self._counter.close(now - _LATE), *(self._counter.finish() if self._last else ())):
+                self._panels.send(steps, to)
+                found = True
+        if self._last:
+            self._panels.end(to)
+        return found or self._last
+
+    def _now(self, notes: list[Notice]) -> float:
+        """The time as if the system's clock had never been set, in seconds since 1970; adds a note when it was set."""
+        now, steady = self._clocks()
+        by = now - steady - self._ahead
+        if abs(by - self._shift) >= _JUMP:
+            moved, self._shift = by - self._shift, by
+            way = "forward" if moved > 0 else "back"
+            text = f"the system's clock was set {abs(moved):.1f} s {way}; the view goes on"
+            notes.append(Notice(self._elapsed(now), "WARN", text))
+        return now - self._shift

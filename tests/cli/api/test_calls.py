@@ -1,0 +1,287 @@
+"""The functions of the Python API: where results are, what they contain, and how progress is reported."""
+
+from __future__ import annotations
+
+import fcntl
+import gc
+import json
+import os
+import pickle
+import shlex
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from evedrop import Scenario, compare, load_results, montecarlo, run, sweep
+from evedrop.cli.api import RunResults
+from evedrop.cli.api.given import place_for
+from evedrop.cli.main import parser_of
+from evedrop.cli.options import changes_of
+from evedrop.errors import RunError, ScenarioError, UsageError
+from evedrop.model.figures import all_figures
+from evedrop.results.by_name import ByName
+from evedrop.scenario.loading import load
+from evedrop.scenario.news import News, RunProgress
+from evedrop.score.built_in_figures import BuiltInFigures
+from evedrop.score.summary import PeerSummary
+from evedrop.show.report import closing
+from evedrop.simulate.montecarlo import Plan
+from evedrop.simulate.simulation import Mode
+from evedrop.studies.sweep import grid_of
+from tests.builders import digests_of
+from tests.pages import checked
+from tests.scenario.good import GOOD
+
+SMALL = Scenario(GOOD).replace(slots=12)
+
+
+@pytest.fixture(scope="module")
+def results() -> RunResults:
+    """A small study without a folder of its own."""
+    return montecarlo(SMALL.replace(title="<Small> & quick"), trials=4)
+
+
+def test_results_without_out_live_as_long_as_their_object(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without `out`, results are in a private temporary folder, not in the current one."""
+    monkeypatch.chdir(tmp_path)
+    found = montecarlo(SMALL, trials=2)
+    folder = found.folder
+    assert (folder.stat().st_mode & 0o777, [*tmp_path.iterdir()]) == (0o700, [])
+    assert found.slots.num_rows == 24
+    del found
+    gc.collect()
+    assert not folder.exists()
+
+
+def test_a_live_run_has_the_digests_of_memory_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    """Without `out`, in a program of its own that keeps its results until it exits."""
+    (tmp_path / "s.toml").write_text(SMALL.to_toml())
+    code = (
+        "from evedrop import Scenario, run; kept = run(Scenario.load('s.toml')); import json; "
+        "print(json.dumps([str(kept.folder), kept.folder.exists(), {n: p.digest for n, p in kept.peers.items()}]))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    folder, existed, digests = json.loads(done.stdout)
+    assert existed
+    assert not Path(folder).exists()
+    assert [one.name for one in tmp_path.iterdir()] == ["s.toml"]
+    assert digests == digests_of(montecarlo(SMALL, trials=1))
+
+
+def test_out_that_is_in_use_is_only_replaced_when_asked(tmp_path: Path) -> None:
+    """`overwrite` leaves none of the earlier results; the scenario is checked first."""
+    out = tmp_path / "out"
+    first = montecarlo(SMALL, trials=2, out=out)
+    (out / "extra.txt").write_text("mine")
+    for call in (montecarlo, run, compare):
+        with pytest.raises(UsageError, match=r"out is not empty; give another out, or overwrite=True"):
+            call(SMALL, out=out)
+    with pytest.raises(ScenarioError):
+        montecarlo(SMALL, trials=2, out=out, overwrite=True, slots=0)
+    assert load_results(out).summary == first.summary
+    again = montecarlo(out, trials=3, out=out, overwrite=True)
+    assert (again.typed_summary.trials, (out / "extra.txt").exists()) == (3, False)
+
+
+def test_overwrite_never_removes_what_is_not_results(tmp_path: Path) -> None:
+    """Nor are results overwritten that a run still writes."""
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(UsageError, match="is not a results folder, and overwrite=True replaces only those"):
+        montecarlo(SMALL, out=tmp_path, overwrite=True)
+    assert (tmp_path / "thesis.tex").exists()
+    going = tmp_path / "going"
+    (going / "unfinished").mkdir(parents=True)
+    held = os.open(going / "unfinished", os.O_RDONLY)
+    fcntl.flock(held, fcntl.LOCK_EX)
+    with pytest.raises(UsageError, match="belongs to a run in progress"):
+        montecarlo(SMALL, out=going, overwrite=True)
+    os.close(held)
+
+
+@pytest.fixture
+def at_exit(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """What is to be done when this program ends; it is not done."""
+    calls: list[Any] = []
+    monkeypatch.setattr("evedrop.cli.api.given.atexit.register", lambda *given, **_: calls.append(given))
+    return calls
+
+
+def failed(error: BaseException, *files: str) -> tuple[Path, list[str]]:
+    """A call that fails after it has written these files: its folder, and the notes of the error."""
+    place = place_for(None, overwrite=False)
+    folder = place.__enter__().folder
+    for name in files:
+        (folder / name).write_text("{}")
+    assert not place.__exit__(type(error), error, None)
+    return folder, getattr(error, "__notes__", [])
+
+
+def test_results_so_far_of_a_failed_call_stay_until_the_program_ends(at_exit: list[Any]) -> None:
+    """The error says where the results so far are; an empty folder is removed."""
+    folder, said = failed(RunError("a process died"), "summary.json")
+    assert (folder.exists(), said) == (
+        True,
+        [f"Until this program ends, load_results('{folder}') reads the results so far."],
+    )
+    assert at_exit == [(shutil.rmtree, folder)]
+    shutil.rmtree(folder)
+    for error in (RunError("at once"), KeyboardInterrupt()):
+        folder, said = failed(error)
+        assert (folder.exists(), said) == (False, [])
+
+
+def test_figures_are_attributes_with_types(results: RunResults) -> None:
+    """Every built-in figure, with the number of the summary; an editor knows their names."""
+    assert list(results.peers) == ["legitimate", "smart"]
+    for name, entry in results.summary["peers"].items():
+        peer = results.peers[name]
+        assert isinstance(peer, PeerSummary)
+        assert peer.mean_squared_error == entry["mean_squared_error"] > 0.0
+        for figure in all_figures():
+            assert getattr(peer, figure) == peer.figure(figure)
+    written = {name for name, one in vars(BuiltInFigures).items() if isinstance(one, property)}
+    assert written == set(all_figures())
+    assert results.links["smart"].offered == 48
+    assert results.secrecy["smart"].sentence
+    assert results.expectations == []
+
+
+def test_results_are_short_when_printed_and_a_table_in_a_notebook(results: RunResults) -> None:
+    """Texts of the scenario are escaped."""
+    assert repr(results).startswith(
+        "<RunResults of '<Small> & quick': 12 slots, 4 trials, in memory (exact); mean error: legitimate 0."
+    )
+    assert len(repr(results)) < 150
+    html = results._repr_html_()
+    assert "&lt;Small&gt; &amp; quick" in html
+    assert "<Small>" not in html
+    assert html.count("<tr>") == 3
+    for sentence in closing.verdicts(results.typed_summary):
+        assert sentence.split(";")[0] in html
+
+
+def test_a_table_in_a_notebook_has_the_cautions_of_the_terminal(results: RunResults) -> None:
+    """An incomplete run says so first; a mean that rare events carry is doubted."""
+    rare = {"share": 0.5, "trials": 1e6}
+    changed = json.loads(json.dumps(results.summary))
+    changed["ended"] = "a process died"
+    changed["peers"]["smart"]["rare_events"] = rare
+    html = RunResults(results.folder, changed)._repr_html_()
+    assert f"{results.folder}: a process died" in html
+    assert (
+        "smart: 50 % of its expected error is carried by events that are expected fewer than 20 times in 4 trials"
+        in html
+    )
+
+
+def test_an_unknown_name_is_named_with_the_known_ones(results: RunResults) -> None:
+    """The error is a KeyError, and its text is a sentence without quotes around it."""
+    with pytest.raises(KeyError) as caught:
+        results.peers["antena"]
+    assert str(caught.value) == "there is no receiver 'antena'; expected one of legitimate, smart"
+    with pytest.raises(KeyError, match=r"there is no verdict on 'legitimate'; expected one of smart"):
+        results.secrecy["legitimate"]
+    with pytest.raises(KeyError, match="there is no link 'smrt'"):
+        results.links["smrt"]
+    assert results.peers.get("antena") is None
+    with pytest.raises(KeyError, match=r"^there is no verdict on 'smart'; these results have none$"):
+        ByName("verdict on", {})["smart"]
+    copy = pickle.loads(pickle.dumps(caught.value))  # noqa: S301 - as it comes from another process
+    assert (type(copy), str(copy)) == (type(caught.value), str(caught.value))
+
+
+def test_workers_change_no_digest() -> None:
+    """As with the option of the command; 0 is refused."""
+    tiny = SMALL.replace(slots=2, eavesdroppers=None)
+    assert digests_of(montecarlo(tiny, trials=501, workers=2)) == digests_of(montecarlo(tiny, trials=501, workers=1))
+    with pytest.raises(UsageError, match="workers=0: expected 1 or more"):
+        montecarlo(tiny, workers=0)
+
+
+def test_errors_alone_can_be_followed_for_any_number_of_slots() -> None:
+    """States grow beyond double precision; the mode that does not follow them takes the scenario."""
+    fast = SMALL.replace(process={"A": [[2.0]], "Q": [[0.1]], "initial_covariance": [[1.0]]}, slots=200)
+    with pytest.raises(ScenarioError, match="slots"):
+        montecarlo(fast, trials=1)
+    assert montecarlo(fast, trials=1, plan=Plan(Mode.ERROR_COORDINATES)).typed_summary.slots == 200
+
+
+def test_a_sweep_takes_arrays_and_gives_a_table() -> None:
+    """A row for each point and receiver, with the numbers of the point's own study; the page has the command that repeats it."""
+    over = {"encoding.state_probability": np.array([0.2, 0.6]), "slots": range(5, 8, 2), "title": ["1:2"]}
+    link = {"quality": 0.7}
+    found = sweep(SMALL, over, trials=3, legitimate={"link": link})
+    assert (found.points, found.table.num_rows, found.keys) == (4, 8, tuple(over))
+    row = found.table.to_pylist()[-1]
+    same = montecarlo(SMALL, trials=3, slots=7, encoding__state_probability=0.6, legitimate__link=link)
+    assert (row["peer"], row["mean_squared_error"]) == ("smart", same.peers["smart"].mean_squared_error)
+    assert "4 points" in repr(found)
+    html = found._repr_html_()
+    assert ("4 points" in html, html.count("<tr>"), "more:" in html) == (True, 9, False)
+    wide = replace(found, table=pa.concat_tables([found.table] * 6))
+    assert "and 8 more rows: .table has all of them" in wide._repr_html_()
+    found.report()
+    (command,) = (text for text in checked(found.folder).texts if text.startswith("evedrop sweep"))
+    options = parser_of("sweep").parse_whole(shlex.split(command)[1:])
+    assert grid_of(options.over) == {"encoding.state_probability": [0.2, 0.6], "slots": [5, 7], "title": ["1:2"]}
+    assert load(options.scenario, changes_of(options)) == SMALL.replace(trials=3, legitimate__link=link)
+
+
+@pytest.mark.parametrize(
+    ("over", "said"),
+    [
+        ({}, "expected 1 to 10000 points"),
+        ({"slots": 5}, "slots is 5; expected a list of values"),
+        ({"slots": []}, "slots is "),
+        ({"slots": range(10_001)}, "expected 1 to 10000 points"),
+    ],
+)
+def test_a_sweep_over_no_values_is_refused(over: dict[str, Any], said: str) -> None:
+    """The message has the key and what is expected."""
+    with pytest.raises(UsageError, match=said):
+        sweep(SMALL, over)
+
+
+@pytest.mark.long
+def test_a_comparison_takes_a_scenario_of_python() -> None:
+    """A comparison needs no folder."""
+    found = compare(SMALL, schemes=["innovation"], adversaries=["naive"], trials=2)
+    assert found.cell("innovation", "naive").eavesdropper is not None
+
+
+def test_a_notebook_shows_progress_and_takes_it_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only the kernel of a notebook shows a bar, and only if no function takes the news; the kernel is a stand-in."""
+    shown: list[str] = []
+    handle = SimpleNamespace(update=shown.append)
+
+    def display(text: str, display_id: bool) -> SimpleNamespace:
+        assert display_id
+        shown.append(text)
+        return handle
+
+    monkeypatch.setitem(sys.modules, "IPython", _module(get_ipython=lambda: SimpleNamespace(kernel=None)))
+    monkeypatch.setitem(sys.modules, "IPython.display", _module(HTML=str, display=display))
+    news: list[News] = []
+    montecarlo(SMALL, trials=1, tell=news.append)
+    assert shown == []
+    montecarlo(SMALL, trials=1)
+    assert (shown[0], shown[-1]) == ('<progress max="1" value="0.0000"></progress> 0% · starting', "")
+    from evedrop.cli.api.notebook import progress
+
+    with progress(None, 50) as tell:
+        tell(RunProgress(25, 1000.0, "slots/s", {}))
+    assert shown[-2] == '<progress max="1" value="0.5000"></progress> 50% · 1,000 slots/s'
+
+
+def _module(**names: Any) -> ModuleType:
+    found = ModuleType("IPython")
+    vars(found).update(names)
+    return found

@@ -1,0 +1,184 @@
+"""The figures of results: what they show, and that they need no display."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+
+from evedrop import Scenario, montecarlo
+from evedrop.cli.api import ComparisonResults, RunResults, SweepResults, compare, sweep
+from evedrop.errors import UsageError
+from evedrop.model.eavesdroppers.naive import Naive
+from evedrop.show.report.writing import REPORT
+from evedrop.show.view.palette import DROPPED, colour, hexadecimal
+from evedrop.simulate.montecarlo import Plan
+from evedrop.simulate.simulation import Mode
+from tests.pages import Checked, checked
+from tests.scenario.conformance.own_classes import BLOCK, PAGE
+from tests.scenario.good import GOOD
+
+SCENARIO = Scenario(GOOD).replace(slots=30, trials=2, record_trials=2)
+
+
+@pytest.fixture(scope="module")
+def results() -> RunResults:
+    """A small study with two recorded trials."""
+    return montecarlo(SCENARIO, trials=5)
+
+
+def test_errors_are_those_of_the_table_in_the_colours_of_the_view(results: RunResults) -> None:
+    """A curve and a dashed one of theory for each receiver, and a band around it."""
+    (axes,) = results.plot("errors").axes
+    curves = {str(line.get_label()): line for line in axes.get_lines()}
+    for i, name in enumerate(results.peers):
+        rows = [row for row in results.slots.to_pylist() if row["peer"] == name]
+        errors = np.maximum([row["mean_squared_error"] for row in rows], 1e-5)  # tr Q / trials is 0.0004
+        np.testing.assert_allclose(np.asarray(curves[name].get_ydata()), errors, rtol=1e-12)
+        assert to_hex(curves[name].get_color()) == hexadecimal(colour(i))
+    assert (len(axes.get_lines()), len(axes.collections), axes.get_yscale()) == (4, 2, "log")
+
+
+def test_the_error_of_the_only_slot_is_a_dot() -> None:
+    """A line through one slot would not be seen."""
+    (axes,) = montecarlo(SCENARIO.replace(slots=1, trials=1, record_trials=1), trials=1).plot("errors").axes
+    assert [line.get_marker() for line in axes.get_lines()] == ["o", "None", "o", "None"]
+
+
+def test_errors_of_rounding_lie_on_the_lower_edge(results: RunResults) -> None:
+    """One trial ends far below tr Q where a state was received; a mean over several is shown further down."""
+    one = montecarlo(SCENARIO.replace(record_trials=1), trials=1)
+    (axes,) = one.plot("errors").axes
+    floor = 1e-4  # tr Q is 0.002
+    assert min(row["mean_squared_error"] for row in one.slots.to_pylist()) < 1e-20
+    assert axes.get_ylim()[0] == pytest.approx(floor)
+    assert "values below 0.0001 lie on the lower edge" in axes.get_title("left")
+    assert min(np.min(np.asarray(line.get_ydata())) for line in axes.get_lines()) == pytest.approx(floor)
+    (axes,) = results.plot("errors").axes
+    assert axes.get_ylim()[0] < floor
+
+
+def test_a_run_without_any_error_has_a_figure() -> None:
+    """Without a warning, which would be an error here: no value is positive."""
+    results = montecarlo("replay-attack-before", trials=1)
+    (axes,) = results.plot("errors").axes
+    assert {row["mean_squared_error"] for row in results.slots.to_pylist()} == {0.0}
+    assert axes.get_ylim()[1] == pytest.approx(10.0 * axes.get_ylim()[0])
+
+
+def test_lanes_have_the_outcome_of_every_packet(results: RunResults) -> None:
+    """A row for each receiver; a lost packet has the colour that it has in the view."""
+    (axes,) = results.plot("lanes", slots=range(5, 25), trial=1).axes
+    (image,) = axes.get_images()
+    codes = np.asarray(image.get_array())
+    rows = [row for row in results.trials.to_pylist() if row["trial"] == 1 and 5 <= row["slot"] < 25]
+    lost = [[row["action"] == "dropped" for row in rows if row["peer"] == name] for name in results.peers]
+    assert np.array_equal(codes == 0, lost)
+    assert to_hex(image.get_cmap()(0)) == hexadecimal(DROPPED)
+    assert [one.get_text() for one in axes.get_yticklabels()] == list(results.peers)
+    assert "trial 1, slots 5 to 24" in axes.get_title("left")
+
+
+def test_the_plane_shows_the_truth_and_who_follows_it(results: RunResults) -> None:
+    """Estimates far from the truth lie outside the picture; a process of one state is drawn against the slot."""
+    (axes,) = results.plot("plane").axes
+    truth = np.array([row["x"] for row in results.trials.to_pylist() if row["trial"] == 0 and row["peer"] == "smart"])
+    drawn = {str(line.get_label()): np.array(line.get_data()).T for line in axes.get_lines()}
+    assert np.array_equal(drawn["truth"], truth)
+    assert list(drawn) == ["truth", *results.peers]
+    low, high = axes.get_xlim()
+    assert low < truth[:, 0].min() <= truth[:, 0].max() < high < truth[:, 0].max() + np.ptp(truth[:, 0])
+    one = {"A": [[0.9]], "Q": [[0.1]], "initial_covariance": [[1.0]]}
+    (axes,) = montecarlo(SCENARIO, trials=2, process=one).plot("plane").axes
+    assert axes.get_xlabel() == "slot"
+
+
+def test_nine_receivers_look_different() -> None:
+    """Colours repeat after seven; then the lines and dots are others, in the legend, too."""
+    eavesdroppers = {f"antenna{i}": {"strategy": "naive", "link": {"quality": 0.5}} for i in range(8)}
+    results = montecarlo(SCENARIO, trials=2, eavesdroppers=eavesdroppers)
+    errors, _, plane = results.plot().axes
+    manners = []
+    for axes, kind in ((errors, "get_linestyle"), (plane, "get_marker")):
+        lines = [one for one in axes.get_lines() if str(one.get_label()) in results.peers]
+        assert [one.get_label() for one in lines] == list(results.peers)
+        manners += [{(to_hex(one.get_color()), getattr(one, kind)()) for one in lines}]
+        assert len({to_hex(one.get_color()) for one in lines}) == 7
+    assert [len(one) for one in manners] == [9, 9]
+
+
+def test_a_figure_shows_itself_in_a_notebook_without_a_display(
+    results: RunResults, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A notebook shows the figure as a PNG, without pyplot and its windows."""
+    monkeypatch.delenv("DISPLAY", raising=False)
+    figure = results.plot()
+    assert len(figure.axes) == 3
+    assert figure._repr_png_().startswith(b"\x89PNG")
+
+
+def test_what_cannot_be_drawn_is_refused(results: RunResults) -> None:
+    """The message lists what can be shown; errors alone need no recorded trial."""
+    with pytest.raises(UsageError, match="there is no panel 'error'; expected errors, lanes, plane"):
+        results.plot("error")  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match="trial 7 is not recorded; recorded are 0, 1"):
+        results.plot(trial=7)
+    for slots in (range(31), range(0), range(0, 9, 2)):
+        with pytest.raises(UsageError, match=r"expected some such as range\(0, 30\)"):
+            results.plot("errors", slots=slots)
+    covariances = montecarlo(SCENARIO.replace(record_trials=1), trials=2, plan=Plan(Mode.COVARIANCE_ONLY))
+    with pytest.raises(UsageError, match="the run has recorded none, and 'errors' needs none"):
+        covariances.plot()
+    assert len(covariances.plot("errors", slots=range(10)).axes) == 1
+
+
+@pytest.mark.long
+def test_a_sweep_is_drawn_as_its_file_is() -> None:
+    """Errors against the first entry, a panel for each value of the second."""
+    found: SweepResults = sweep(SCENARIO, {"encoding.state_probability": [0.3, 0.7], "slots": [4, 6]}, trials=3)
+    axes = found.plot().axes
+    assert [one.get_title("left") for one in axes] == ["slots = 4", "slots = 6"]
+    assert axes[0].get_xlabel() == "encoding.state_probability"
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The module `flipped` of the tutorial, imported from a folder as a user does."""
+    (tmp_path / "flipped.py").write_text(dict(BLOCK.findall(PAGE.read_text(encoding="utf-8")))["flipped.py"])
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield importlib.import_module("flipped")
+    del sys.modules["flipped"]
+
+
+def test_a_comparison_takes_a_class_and_has_a_figure_and_a_page(own: Any) -> None:
+    """The figure has a row for each scheme; the page lies in the folder of the results."""
+    found = compare(SCENARIO, schemes=[own.Flipped, "plain"], adversaries=[Naive], trials=2, plan=Plan(workers=1))
+    assert isinstance(found, ComparisonResults)
+    assert list(found.schemes) == ["flipped:Flipped", "plain"]
+    assert found.adversaries == ("naive",)
+    for scheme, adversary, said in (("plane", "naive", "scheme 'plane'; expected one of flipped:Flipped, plain"),
+                                    ("plain", "naiv", "adversary 'naiv'; expected one of naive")):  # fmt: skip
+        with pytest.raises(KeyError, match=f"there is no {said}$"):
+            found.cell(scheme, adversary)
+    texts = {one.get_text() for one in found.plot().axes[0].texts}
+    assert {*found.schemes, *found.adversaries} <= texts
+    assert found.report() == found.folder / REPORT
+    assert any("flipped:Flipped" in text for text in checked(found.folder).texts)
+    assert repr(found) == f"<ComparisonResults of {SCENARIO.title!r}: 30 slots, 2 trials, 2 schemes, 1 adversary>"
+    shown = found._repr_html_()
+    cells = Checked(shown).texts[5:]  # after the caption and the heads
+    assert cells[::4] == ["flipped:Flipped", "plain"]
+    assert cells[5] == f"{found.schemes['plain'].price:.3g}"
+    assert cells[3::4] == ["no" if name in found.dominant else "yes" for name in found.schemes]
+
+
+def test_results_write_their_page(results: RunResults) -> None:
+    """The page is written into their folder."""
+    assert results.report() == results.folder / REPORT
+    assert SCENARIO.title in checked(results.folder).headings

@@ -1,0 +1,88 @@
+"""Loss and delay models that break a rule are told which."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evedrop.model.delays.normal import Normal
+from evedrop.model.links.bernoulli import Bernoulli
+from evedrop.model.links.gilbert_elliott import GilbertElliott
+from evedrop.model.links.link import fates_of
+from evedrop.model.process import Floats
+from evedrop.model.receiver import Codes
+from evedrop.scenario.conformance.links import DelayChecks, LossChecks
+from tests.scenario.conformance.breaking import broken
+
+
+class Better(Bernoulli):
+    """Says that it delivers more than it does."""
+
+    def fates(self, first: int, uniforms: Floats) -> Codes:
+        """Fewer."""
+        return super().fates(first, uniforms / 0.9)
+
+
+class Unsteady(GilbertElliott):
+    """Has bursts, and says that it has none."""
+
+    chain = None  # type: ignore[assignment]  # the lie
+
+
+class InPlace(Bernoulli):
+    """Counts slots in an array, in place."""
+
+    def __init__(self, quality: float) -> None:
+        super().__init__(quality)
+        self.count = np.zeros(1)
+
+    def fates(self, first: int, uniforms: Floats) -> Codes:
+        """Every third packet of those asked for is lost."""
+        lost = np.empty((len(uniforms), uniforms.shape[2]), np.bool_)
+        for row in range(len(lost)):
+            self.count += 1.0
+            lost[row] = (self.count % 3.0 == 0.0).item() | (uniforms[row, 0] >= self.quality)
+        del first
+        return fates_of(lost)
+
+
+class Whole(Bernoulli):
+    """Loses the last of the slots that it is asked for."""
+
+    def fates(self, first: int, uniforms: Floats) -> Codes:
+        """By how many they are."""
+        found = super().fates(first, uniforms).copy()
+        found[-1] = 1
+        return found
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters", "rule", "said"),
+    [
+        (Better, {"quality": 0.8}, "the quality it says", "quality_at() says 0.8"),
+        (Unsteady, {"p": 0.05, "r": 0.1}, "the quality it says", "give `chain`"),
+        (InPlace, {"quality": 0.9}, "a copy that goes on", "never change an array of it in place"),
+        (Whole, {"quality": 0.9}, "slots in pieces", "not on how many slots"),
+    ],
+)
+def test_a_loss_model_that_breaks_a_rule_is_told_which(
+    kind: Any, parameters: dict[str, float], rule: str, said: str
+) -> None:
+    """As a scheme is."""
+    assert said in broken(LossChecks(lambda: kind(**parameters), kind).verdicts())[rule]
+
+
+class Early(Normal):
+    """Says that more is there in time than is."""
+
+    def arrived(self, lag: int) -> float | None:
+        """As if a slot later."""
+        return super().arrived(lag + 1)
+
+
+def test_a_delay_model_that_breaks_a_rule_is_told_which() -> None:
+    """As a loss model is."""
+    found = broken(DelayChecks(lambda: Early(2.0, 1.0), Early).verdicts())
+    assert "and arrived(" in found["the delays it says"]

@@ -1,0 +1,443 @@
+"""The report on one page: complete, safe, without requests, with the sentences of the terminal; the results stay unchanged."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import shutil
+import stat
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import suppress
+from io import BytesIO
+from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from evedrop import montecarlo
+from evedrop.errors import UsageError
+from evedrop.results.writer import load_results
+from evedrop.score.track import LongestSpans, LostSpan, Track, lost_spans, track_of
+from evedrop.show.report import closing
+from evedrop.show.report.chart import Curve, LogChart
+from evedrop.show.report.groups import GroupCounts, GroupMeans
+from evedrop.show.report.markup import element, written
+from evedrop.show.report.run_sections import LostTrackSection
+from evedrop.show.report.run_source import OUTCOMES, RecordedTrial, RunSource
+from evedrop.show.report.slot_rows import RowExtent
+from evedrop.show.report.strip import PIXELS, strip
+from evedrop.show.report.writing import REPORT, try_report, write_report
+from evedrop.simulate.montecarlo import Plan
+from evedrop.simulate.simulation import Mode
+from tests.conftest import LIMIT, Evedrop
+from tests.examples import examples
+from tests.pages import Checked, checked
+
+HOSTILE = "<script>alert('&amp;')</script>\"></title>"
+"""A title that tries to inject code into the page."""
+QUICK: dict[str, Any] = {"slots": 60, "plan": Plan(workers=1)}
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A study with a hostile title, in which one expectation fails."""
+    expect = [
+        {"figure": "legitimate.received_fraction", "above": 0.5},
+        {"figure": "smart.received_fraction", "above": 2},
+    ]
+    folder = tmp_path_factory.mktemp("report") / "study"
+    montecarlo("eavesdroppers", trials=20, out=folder, title=HOSTILE, expect=expect, **QUICK)
+    write_report(folder)
+    return folder
+
+
+def test_a_page_says_what_the_terminal_says_and_does_nothing_else(study: Path) -> None:
+    """Outcome and verdicts first, every cell of the table, links, spans, the command that repeats it; the title is only text."""
+    page, summary = checked(study), load_results(study).typed_summary
+    said = "".join(page.texts)
+    assert page.headings == [
+        HOSTILE,
+        "Verdicts", "Expectations", "Figures", "Errors", "Lost track", "Links", "Repeat it",
+    ]  # fmt: skip
+    assert "1 of 2 expectations FAILED" in page.texts
+    cells = [cell for row in closing.receivers_table(summary).rows for cell in row]
+    assert Counter(cells) <= Counter(page.texts)
+    for line in (*closing.verdicts(summary), *(one.sentence for one in summary.expectations)):
+        assert line in page.texts
+    for name, link in summary.links.items():
+        assert {name, f"{link.offered:,}", f"{link.rate:.4f}", f"{link.expected_rate:.4f}"} <= set(page.texts)
+    assert f"evedrop montecarlo {study} --trials 20" in said
+    assert {str(summary.seed), summary.peers["smart"].digest} <= set(page.texts)
+    assert page.tags["svg"] == 1
+    assert page.tags["img"] == 8
+    assert (study / REPORT).stat().st_size < 300_000
+    assert stat.S_IMODE((study / REPORT).stat().st_mode) == 0o600
+
+
+def test_a_report_that_cannot_be_written_leaves_everything_as_it_was(
+    study: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The older page and all results stay; a warning says so, and no partial file is left."""
+
+    def contents() -> dict[str, bytes]:
+        return {path.name: path.read_bytes() for path in study.iterdir()}
+
+    before = contents()
+
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("evedrop.results.folder.os.replace", full)
+    assert try_report(study) is None
+    assert "report.html was not written ([Errno 28] No space left on device)" in capsys.readouterr().err
+    assert contents() == before
+    monkeypatch.undo()
+    assert try_report(study) == study / REPORT
+    assert contents() == before
+
+
+def test_a_folder_of_another_version_has_the_parts_that_can_be_read(study: Path, tmp_path: Path) -> None:
+    """A table without a column is named in its part; a folder that is not a results folder gives only a warning."""
+    for name in ("summary.json", "scenario.toml", "trials.parquet"):
+        (tmp_path / name).write_bytes((study / name).read_bytes())
+    pq.write_table(pq.read_table(study / "slots.parquet").drop_columns(["standard_error"]), tmp_path / "slots.parquet")
+    write_report(tmp_path)
+    page = checked(tmp_path)
+    assert any("slots.parquet cannot be read" in text and "standard_error" in text for text in page.texts)
+    assert {"Lost track", "Links", "Repeat it"} <= set(page.headings)
+
+
+def test_a_page_has_cautions_events_and_outages_and_does_not_depend_on_the_order_of_rows(
+    study: Path, tmp_path: Path
+) -> None:
+    """A mean that rare events carry is doubted; an event and an outage have a row each; a failure has its command."""
+    summary = json.loads((study / "summary.json").read_text())
+    summary["peers"]["smart"]["rare_events"] = {"share": 0.5, "trials": 1e6}
+    summary["events"] = [{"slot": 1234, "event": "the link of smart is cut", "by": "scenario"}]
+    summary["outages"] = [{"process": "smart", "slot": 7, "until": None, "seconds": 1.0, "shard": None}]
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    (tmp_path / "scenario.toml").write_bytes((study / "scenario.toml").read_bytes())
+    for name in ("slots.parquet", "trials.parquet"):
+        table = pq.read_table(study / name)
+        pq.write_table(table.take(np.random.default_rng(0).permutation(table.num_rows)), tmp_path / name)
+    write_report(tmp_path)
+    page, before = checked(tmp_path), checked(study)
+    doubts = list(closing.doubts(load_results(tmp_path).typed_summary))
+    assert any("smart: 50 % of its expected error" in line for line in doubts)
+    assert set(doubts) <= set(page.texts)
+    assert {"1,234", "the link of smart is cut", "smart cut off from the network, the run did not continue"} <= set(
+        page.texts
+    )
+    (failed,) = (one for one in load_results(study).typed_summary.expectations if not one.held)
+    assert before.texts[before.texts.index(failed.sentence) + 1] == failed.replay
+    for name in ("d", "src"):  # the curves and the lanes
+        assert page.values(name) == before.values(name)
+
+
+def lengthened(study: Path, folder: Path, times: int) -> None:
+    """A run with the slots of a study, so many times one after the other."""
+    folder.mkdir()
+    summary = json.loads((study / "summary.json").read_text())
+    once = summary["slots"]
+    (folder / "summary.json").write_text(json.dumps({**summary, "slots": once * times}))
+    (folder / "scenario.toml").write_bytes((study / "scenario.toml").read_bytes())
+    for name in ("slots", "trials"):
+        table = pq.read_table(study / f"{name}.parquet")
+        place = table.column_names.index("slot")
+        with pq.ParquetWriter(folder / f"{name}.parquet", table.schema) as writer:
+            for first in range(0, times, 100):
+                shifts = np.repeat(once * np.arange(first, min(times, first + 100)), table.num_rows)
+                part = pa.concat_tables([table] * (len(shifts) // table.num_rows))
+                slots = part["slot"].to_numpy() + shifts
+                writer.write_table(
+                    part.set_column(place, table.schema.field(place), pa.array(slots, part["slot"].type))
+                )
+
+
+def peak_of_report(folder: Path) -> int:
+    """The largest resident memory of a process that makes a report, in bytes.
+
+    Not from getrusage: there a program has at least the memory of the process that started it.
+    """
+    code = (
+        "import sys; from pathlib import Path; from evedrop.show.report.writing import write_report; "
+        "write_report(Path(sys.argv[1])); print(Path('/proc/self/status').read_text())"
+    )
+    command = [sys.executable, "-c", code, str(folder)]
+    status = subprocess.run(command, check=True, capture_output=True, text=True, timeout=LIMIT).stdout
+    return 1024 * int(status.partition("VmHWM:")[2].split()[0])
+
+
+@pytest.mark.long
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells the largest memory of a program alone")
+def test_the_memory_of_a_report_does_not_grow_with_the_slots(study: Path, tmp_path: Path) -> None:
+    """It used to read whole tables: 0.7 kB a slot, that is 70 MB for the further slots here."""
+    peaks = []
+    for times in (200, 1850):
+        lengthened(study, tmp_path / str(times), times)
+        peaks.append(peak_of_report(tmp_path / str(times)))
+    assert peaks[1] < 250e6
+    assert peaks[1] - peaks[0] < 40e6
+
+
+def test_a_slot_without_a_packet_is_silent_in_its_lane(study: Path, tmp_path: Path) -> None:
+    """For every action of the receiver: nothing was sent."""
+    for name in ("summary.json", "scenario.toml"):
+        (tmp_path / name).write_bytes((study / name).read_bytes())
+    table = pq.read_table(study / "trials.parquet")
+    column = pc.if_else(pc.less(table["slot"], 3), "nothing", table["sent"].cast(pa.string()))
+    pq.write_table(table.set_column(table.column_names.index("sent"), "sent", column), tmp_path / "trials.parquet")
+    outcome = RunSource.read(tmp_path).trial["smart"].outcome.commonest
+    assert [OUTCOMES[code] == "silent" for code in outcome[:6]] == [True] * 3 + [False] * 3
+
+
+def test_the_longest_spans_are_listed_in_the_order_of_time() -> None:
+    """Of many spans without track those that say most."""
+    spans = [LostSpan(100 * i, 100 * i + length, 0) for i, length in enumerate([5, 1, *range(10, 21)])]
+    errors = np.zeros(1400)
+    for span in spans:
+        errors[span.first : span.last + 1] = 100.0
+    words = pa.array([OUTCOMES[0]] * 1400)
+    trial = RecordedTrial(RowExtent(1400, 0, 1399), 1.0)
+    traces = np.full(1400, 50.0)  # it expects such errors: it drifts, and is never fooled
+    traces[errors == 0.0] = 1.0
+    rows = {"sent": pa.array(["state"] * 1400), "action": words, "squared_error": errors, "trace_covariance": traces}
+    trial.add(pa.table(rows))
+    source: Any = SimpleNamespace(summary=SimpleNamespace(first_trial=0), trial={"smart": trial})
+    nodes = [node for node in LostTrackSection.nodes(source) if not isinstance(node, str) and node.tag == "details"]
+    (listed,) = nodes
+    said = [str(item.text).partition(":")[0] for item in listed.iter("li")]
+    assert said == [f"slots {one.first:,} to {one.last:,}" for one in spans if one.slots > 2]
+
+
+@pytest.mark.parametrize("mode", [Mode.COVARIANCE_ONLY, Mode.ERROR_COORDINATES])
+def test_every_mode_has_its_page(tmp_path: Path, mode: Mode) -> None:
+    """Without recorded states there are no lanes, but all other parts are there."""
+    folder = tmp_path / "study"
+    montecarlo("vehicle", trials=3, out=folder, slots=30, plan=Plan(mode, workers=1))
+    write_report(folder)
+    assert {"Verdicts", "Figures", "Errors"} <= set(checked(folder).headings)
+
+
+def slot_by_slot(errors: list[float], traces: list[float], noise: float) -> Iterator[str]:
+    """The rule of docs/results.md, written out."""
+    for error, trace in zip(errors, traces, strict=True):
+        if error > 20 * trace and error > 20 * noise:
+            yield "fooled"
+        elif error > 20 * noise or trace > 20 * noise:
+            yield "drifting"
+        else:
+            yield "in track"
+
+
+numbers = st.lists(st.tuples(st.floats(0, 100), st.floats(0, 100)), max_size=60)
+
+
+@given(numbers, st.floats(0.0, 2.0), st.integers(0, 9))
+@settings(deadline=None, max_examples=examples(200))
+def test_spans_cover_exactly_the_slots_off_the_track(
+    slots: list[tuple[float, float]], noise: float, first: int
+) -> None:
+    """Each slot by the rule; a span begins and ends off the track, and between two spans are more than three slots in track."""
+    errors, traces = [error for error, _ in slots], [trace for _, trace in slots]
+    codes = track_of(np.array(errors), np.array(traces), noise)
+    words = list(slot_by_slot(errors, traces, noise))
+    assert [Track(code).word for code in codes] == words
+    spans = lost_spans(codes, first)
+    covered = [k - first for span in spans for k in range(span.first, span.last + 1)]
+    assert {k for k, word in enumerate(words) if word != "in track"} <= set(covered)
+    for span in spans:
+        assert "in track" not in {words[span.first - first], words[span.last - first]}
+        off = [k for k in range(span.first - first, span.last - first + 1) if words[k] != "in track"]
+        assert all(after - before <= 3 for before, after in pairwise(off))
+        assert span.fooled == words[span.first - first : span.last - first + 1].count("fooled")
+    for one, other in pairwise(spans):
+        assert other.first - one.last > 3
+
+
+codes_of_pieces = st.lists(st.lists(st.sampled_from([0, 0, 0, 1, 2]), max_size=12), max_size=12)
+
+
+@given(codes_of_pieces, st.integers(0, 9), st.integers(1, 6))
+@settings(deadline=None, max_examples=examples(200))
+def test_spans_do_not_depend_on_the_pieces_that_they_are_found_in(
+    pieces: list[list[int]], first: int, most: int
+) -> None:
+    """Their number, and the longest of them, are those of all slots at once."""
+    longest = LongestSpans(most, first)
+    for piece in pieces:
+        longest.add(np.array(piece, np.uint8))
+    spans = lost_spans(np.array([code for piece in pieces for code in piece], np.uint8), first)
+    assert longest.count == len(spans)
+    assert longest.spans == sorted(spans, key=lambda span: -span.slots)[:most]
+
+
+@given(st.lists(st.integers(0, 7), min_size=1, max_size=20), st.integers(1, 30))
+@settings(deadline=None, max_examples=examples(100))
+def test_means_and_counts_do_not_depend_on_the_pieces(lengths: list[int], most: int) -> None:
+    """Groups are neighbours, each place is in one group, and the groups' sizes differ by one at most."""
+    count = sum(lengths)
+    values = np.arange(count, dtype=float) ** 2
+    codes = np.arange(count) % 3
+    means, counts = GroupMeans(count, most, 1), GroupCounts(count, most, 3)
+    for part in np.split(np.arange(count), np.cumsum(lengths)[:-1]):
+        means.add(values[None, part])
+        counts.add(codes[part].astype(np.uint8))
+    edges = np.linspace(0, count, min(count, most) + 1).astype(int)
+    groups = [slice(*edge) for edge in pairwise(edges.tolist())]
+    assert np.allclose(means.means[0], [values[group].mean() for group in groups], rtol=1e-12)
+    tallies = [np.bincount(codes[group], minlength=3) for group in groups]
+    assert counts.commonest.tolist() == [int(tally.argmax()) for tally in tallies]
+    assert counts.highest.tolist() == [int(codes[group].max()) for group in groups]
+    if count:
+        assert counts.shares == [float(share) for share in np.bincount(codes, minlength=3) / count]
+
+
+def test_a_lane_has_a_pixel_for_every_slot_or_the_worst_of_several() -> None:
+    """The PNG says what the codes say; in a lane that is too long no lost slot disappears."""
+    colours = [(1, 2, 3), (200, 0, 9), (0, 0, 255)]
+
+    def pixels(codes: np.ndarray, worst: bool) -> list[list[int]]:
+        lane = GroupCounts(len(codes), PIXELS, len(colours))
+        for part in np.array_split(codes, 7):
+            lane.add(part)
+        image = strip(lane.highest if worst else lane.commonest, colours, "label")
+        assert not isinstance(image, str)
+        data = base64.b64decode(str(image.get("src")).partition(",")[2])
+        return list(np.asarray(Image.open(BytesIO(data)).convert("RGB"))[0].reshape(-1, 3).tolist())
+
+    codes = np.array([0, 2, 1, 1, 0], np.uint8)
+    assert pixels(codes, worst=False) == [list(colours[code]) for code in codes]
+    long = np.zeros(100_000, np.uint8)
+    long[[17, 50_000]] = 1
+    assert pixels(long, worst=True).count(list(colours[1])) == 2
+    assert pixels(long, worst=False).count(list(colours[1])) == 0
+
+
+def test_a_chart_has_gaps_where_nothing_is_known_and_few_points() -> None:
+    """A curve of 10⁵ slots is drawn with 400 points; no chart is drawn of nothing; zeros and ∞ do not break the axis."""
+    x = np.arange(100_000.0)
+    node = LogChart("label", "slot", "error", [Curve("one", "#123456", x, 1.0 + x, x, 2.0 + x, theory=1.0 + x)]).node
+    assert isinstance(node, ET.Element)
+    (band,) = [path for path in node.iter("path") if path.get("class") == "band"]
+    assert str(band.get("d")).count("L") == 799
+    (curve,) = [path for path in node.iter("path") if path.get("class") == "curve"]
+    assert str(curve.get("d")).count("L") == 399
+    broken = np.array([1.0, np.nan, 0.0, 10.0, np.inf, 5.0, 6.0])
+    node = LogChart("label", "slot", "error", [Curve("one", "#123456", x[:7], broken)]).node
+    assert isinstance(node, ET.Element)
+    (curve,) = [path for path in node.iter("path") if path.get("class") == "curve"]
+    assert str(curve.get("d")).count("M") == 3
+    assert LogChart("label", "slot", "error", [Curve("one", "#123456", x[:2], np.zeros(2))]).node is None
+
+
+def test_values_below_the_floor_lie_on_the_lower_edge_and_the_chart_says_so() -> None:
+    """Rounding errors leave the axis to the errors that matter; a chart without them has no such words, and its own axis."""
+    errors = np.array([1e-30, 0.0, 5.0, 0.02])
+    for values, words in ((errors, "error; values below 0.01 lie on the lower edge"), (errors[2:], "error")):
+        curve = Curve("one", "#123456", np.arange(float(len(values))), values)
+        node = LogChart("label", "slot", "error", [curve], floor=0.01).node
+        assert isinstance(node, ET.Element)
+        assert node[0].text == words
+        ticks = [float(str(one.text)) for one in node.iter("span") if one.get("class") == "y"]
+        assert min(ticks) >= 0.01
+        edge = [one.get("style") for one in node.iter("span") if one.text == "0.01"]
+        assert edge == (["top:100.00%"] if len(values) == 4 else [])
+        (path,) = [one for one in node.iter("path") if one.get("class") == "curve"]
+        assert str(path.get("d")).count(" 1000") == (2 if len(values) == 4 else 0)
+    assert LogChart("", "", "", [Curve("", "", errors[:2], np.zeros(2))], floor=0.01).node is not None
+
+
+def test_texts_are_escaped_wherever_they_stand() -> None:
+    """In text, in attributes, and after other elements; characters that HTML does not allow are replaced."""
+    texts = ("<b>\x00", "</p>", '"><x onload="y">')
+    page = Checked(written(element("p", texts[0], element("i", "&"), texts[1], title=texts[2])))
+    assert page.tags == {"p": 1, "i": 1}
+    assert page.texts == ["<b>\ufffd", "&", texts[1]]
+    assert page.attributes == [("p", "title", texts[2])]
+
+
+def with_other_values(found: Any, others: tuple[Any, ...]) -> Iterator[Any]:
+    """The contents of a JSON file with one value replaced, for every value (of lists: the first) and every other one."""
+    if isinstance(found, dict):
+        for name, inner in found.items():
+            yield {key: value for key, value in found.items() if key != name}
+            yield from ({**found, name: one} for one in (*others, *with_other_values(inner, others)))
+    elif isinstance(found, list) and found:
+        yield from ([one, *found[1:]] for one in (*others, *with_other_values(found[0], others)))
+
+
+OTHERS: tuple[Any, ...] = ("nonsense", None, -1, [], {}, math.inf)
+some_or_all_others = pytest.mark.parametrize(
+    "others", [pytest.param(OTHERS[:2], id="two"), pytest.param(OTHERS, id="all", marks=pytest.mark.long)]
+)
+
+
+@some_or_all_others
+def test_a_changed_summary_is_refused_in_a_sentence(others: tuple[Any, ...], study: Path, tmp_path: Path) -> None:
+    """Or shown, whatever word or number in it is another one."""
+    folder = Path(shutil.copytree(study, tmp_path / "run"))
+    summary = json.loads((folder / "summary.json").read_text())
+    for name, word in (("mode", "nonsense"), ("trials", -1), ("slots", -1)):
+        (folder / "summary.json").write_text(json.dumps({**summary, name: word}))
+        with pytest.raises(UsageError, match=f"{name} is .*expected"):
+            write_report(folder)
+    top = {
+        name: summary[name] for name in ("mode", "slots", "trials", "secrecy", "expectations", "ended", "first_trial")
+    }
+    for changed in with_other_values(top, others):
+        (folder / "summary.json").write_text(
+            json.dumps({**{k: v for k, v in summary.items() if k not in top}, **changed})
+        )
+        with suppress(UsageError):
+            write_report(folder)
+
+
+def test_a_changed_entry_of_an_application_is_refused_in_a_sentence(evedrop: Evedrop) -> None:
+    """Also where the table is printed again."""
+    made = ("montecarlo", "replay-attack", "--slots", "300", "--trials", "2", "--set", "expect=[]", "--out", "run")
+    assert evedrop(*made).status == 0
+    path = evedrop.folder / "run" / "summary.json"
+    summary = json.loads(path.read_text())
+    path.write_text(
+        json.dumps({**summary, "integrity": {**summary["integrity"], "expected_watermark_cost": "nonsense"}})
+    )
+    for words in (("view", "run", "--table"), ("report", "run")):
+        done = evedrop(*words)
+        assert done.status == 2
+        assert "has results that this version does not write" in done.err
+
+
+@some_or_all_others
+@pytest.mark.parametrize(
+    ("words", "file"),
+    [
+        (("compare", "eavesdroppers", "--schemes", "plain", "--adversaries", "smart"), "compare.json"),
+        (("sweep", "eavesdroppers", "--over", "seed=1,2"), "sweep.json"),
+    ],
+)
+def test_a_changed_study_is_refused_in_a_sentence(
+    others: tuple[Any, ...], evedrop: Evedrop, words: tuple[str, ...], file: str
+) -> None:
+    """The same of a comparison and of a sweep."""
+    assert evedrop(*words, "--slots", "12", "--trials", "2", "--out", "study").status == 0
+    path = evedrop.folder / "study" / file
+    for changed in with_other_values(json.loads(path.read_text()), others):
+        path.write_text(json.dumps(changed))
+        with suppress(UsageError):
+            write_report(path.parent)
+    assert evedrop("report", "study").status in {0, 2}

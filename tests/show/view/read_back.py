@@ -1,0 +1,26 @@
+"""A recording read back."""
+
+from pathlib import Path
+from typing import Any
+
+from rerun.chunk import RrdReader
+
+from evedrop.show.view.column import TIMELINE
+
+
+def rows(rrd: Path, entity: str, component: str) -> dict[int, Any]:
+    """The component's values of one entity, by slot."""
+    found: dict[int, Any] = {}
+    for chunk in RrdReader(rrd).stream().filter(content=f"/{entity}", is_static=False):
+        columns = chunk.to_record_batch().to_pydict()
+        found |= dict(zip(columns[TIMELINE], columns[component], strict=True))
+    return found
+
+
+def lane(rrd: Path, entity: str, slots: int) -> list[str]:
+    """A lane's word in every slot, from its changes."""
+    changes = rows(rrd, entity, "StateChange:state")
+    words: list[str] = []
+    for k in range(slots):
+        words.append(changes[k][0] if k in changes else words[-1])
+    return words

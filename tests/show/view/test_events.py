@@ -1,0 +1,63 @@
+from itertools import pairwise
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evedrop.model.receiver import Codes
+from evedrop.show.view.events import Event, Watcher
+from evedrop.show.view.scene import Scene, Shown
+
+LOST, STATE, SILENT, MISLED = 0, 1, 4, 5
+
+
+def watch(codes: list[int], cuts: list[int], slots: int = 1000, role: str = "eavesdropper") -> list[Event]:
+    """Events of a lane that is handed over in pieces."""
+    shown = Shown("eve", role, "naive", 0.9)
+    watcher = Watcher(shown, Scene("", "r", slots, 1, 2, 0.0, (shown,), 1.0))
+    found: list[Event] = []
+    bounds = [0, *sorted(cuts), len(codes)]
+    for start, end in pairwise(bounds):
+        part: Codes = np.array(codes[start:end], np.uint8)
+        found += watcher.watch(start, part)
+    return found
+
+
+def test_stretch_is_told_when_long_and_when_over() -> None:
+    """Three slots without a state are told in the third, with how many misled, and their end in the slot that ends them."""
+    assert watch([STATE, LOST, MISLED, LOST, LOST, STATE], [3]) == [
+        Event(2, "WARN", "eve took an innovation for the state, for the first time"),
+        Event(3, "WARN", "eve lost track: 3 slots without a state, 1 misled"),
+        Event(5, "INFO", "eve caught a state again after 4 slots"),
+    ]
+
+
+def test_silence_is_no_loss() -> None:
+    """Where nothing was sent in some slots of a stretch, it is told in how many, and no packet is called lost."""
+    codes = [STATE, SILENT, LOST, SILENT, STATE]
+    assert watch(codes, [2])[0] == Event(3, "WARN", "eve lost track: 3 slots without a state, 2 of them silent")
+    assert watch(codes, [2], role="legitimate") == [
+        Event(3, "WARN", "eve had no packet for 3 slots, 2 of them silent"),
+        Event(4, "INFO", "eve is in step again after 3 slots"),
+    ]
+    lost = watch([STATE, LOST, LOST, LOST, STATE], [], role="legitimate")
+    assert lost[0] == Event(3, "WARN", "eve lost 3 packets in a row")
+
+
+def test_short_stretches_are_not_told() -> None:
+    """One or two missed packets are everyday life."""
+    assert watch([LOST, LOST, STATE] * 20, []) == []
+
+
+@given(st.lists(st.sampled_from([LOST, STATE, 3, SILENT, MISLED]), min_size=1, max_size=80), st.data())
+def test_pieces_do_not_matter(codes: list[int], data: st.DataObject) -> None:
+    """However a lane is cut, the same events are found."""
+    cuts = data.draw(st.lists(st.integers(0, len(codes)), max_size=6))
+    assert watch(codes, cuts) == watch(codes, [])
+
+
+def test_long_run_has_few_lines() -> None:
+    """Long stretches over and over become everyday life too: a long run has some hundreds of lines."""
+    lengths = np.random.default_rng(1).geometric(0.1, 10_000)
+    codes = [code for length in lengths.tolist() for code in (*[LOST] * length, STATE)]
+    assert 50 < len(watch(codes, [], len(codes))) < 1000

@@ -1,0 +1,85 @@
+"""The graph of a run: the fate of the last packet on every link, and what each receiver knows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from evedrop.show.view import lanes
+from evedrop.show.view.knowledge import KNOWLEDGE, knowledge
+from evedrop.show.view.palette import DROPPED_TEXT, IN_TRACK_TEXT, MISLED, RUN_TEXTS, STATE, TRUTH, TRUTH_CURVE, Colour
+from evedrop.show.view.panels.fates import FATES, KNOWN, LastPacket
+from evedrop.show.view.panels.packets import Packets
+from evedrop.show.view.recording import ViewRecording
+from tests.show.view.read_back import rows
+from tests.show.view.simulated_run import Simulated
+
+COLOURS = {
+    **dict.fromkeys(("state", "innovation"), STATE),
+    **dict.fromkeys(("misled", "drifting"), MISLED),
+    **dict.fromkeys(("dropped", "fooled"), DROPPED_TEXT),
+    **dict.fromkeys(("discarded", "silent"), TRUTH_CURVE),
+    "in track": IN_TRACK_TEXT,
+}
+"""Word → its colour: blue for what was used, amber for what misleads, red for what is lost, green for what is known."""
+
+
+def coloured(found: int) -> Colour:
+    """A colour as it is in a recording, in bytes of red, green, blue and opacity."""
+    red, green, blue, _ = found.to_bytes(4)
+    return red, green, blue
+
+
+def test_the_graph_tells_fates_and_errors(simulated: Callable[..., Simulated], tmp_path: Path) -> None:
+    """In every frame: what was sent, what became of it on each link, and how far off each receiver is."""
+    run = simulated(60)
+    recording = ViewRecording(tmp_path / "r.rrd", run.scene)
+    for slots in run.chunks(7):
+        recording.add(slots)
+    assert recording.close()
+    labels = rows(tmp_path / "r.rrd", "graph", "GraphNodes:labels")
+    colours = rows(tmp_path / "r.rrd", "graph", "GraphNodes:colors")
+    assert sorted(labels) == list(range(60))
+    receivers, nothing = run.scene.receivers, 1e-3 * np.sqrt(run.scene.noise)
+    for k, shown in labels.items():
+        assert shown[:2] == [f"sensor: {'innovation' if run.slots.nu[k] else 'state'}", "router"]
+        assert [coloured(one) for one in colours[k][:2]] == [TRUTH, TRUTH]
+        for i, one in enumerate(receivers):
+            peer = run.slots.peers[one.name]
+            word = lanes.lane_of(one).words[int(lanes.received(one, run.slots)[k])]
+            assert shown[2 + i] == word
+            known = KNOWLEDGE[int(knowledge(run.scene, run.slots.x, peer)[k])]
+            name, _, rest = shown[2 + len(receivers) + i].partition(": ")
+            what, _, off = rest.partition(", ")
+            assert (name, what) == (one.name, known.word)
+            inks = [coloured(colours[k][at + i]) for at in (2, 2 + len(receivers))]
+            assert inks == [COLOURS[word], COLOURS[what]]
+            distance = float(off.removesuffix(" off").replace(",", ""))
+            assert np.isclose(distance, np.linalg.norm(run.slots.x[k] - peer.x_hat[k]), rtol=0.05, atol=nothing)
+
+
+def test_every_fate_and_state_has_a_colour_of_the_table() -> None:
+    """The graph can show everything that a lane shows."""
+    assert {*lanes.LEGITIMATE.words, *lanes.EAVESDROPPER.words} == set(FATES)
+    assert set(KNOWN) == set(KNOWLEDGE)
+    assert {*FATES.values(), *KNOWN.values()} <= set(RUN_TEXTS)
+
+
+def test_a_closed_loop_has_no_graph(simulated: Callable[..., Simulated]) -> None:
+    """The view of a closed loop has panels of the plant instead."""
+    scene = simulated(20).scene
+    assert LastPacket.applies(scene)
+    assert not LastPacket.applies(replace(scene, moving=("P (kW)",)))
+
+
+def test_with_many_receivers_the_lanes_of_packets_have_its_place(simulated: Callable[..., Simulated]) -> None:
+    """Docs/view.md: with more than four receivers; the letters of the graph would be too small."""
+    scene = simulated(20, copies=2).scene
+    for count in (1, 4, 5, 7):
+        some = replace(scene, receivers=scene.receivers[:count])
+        (packets,) = Packets(some).views()
+        drawn = [*LastPacket(some).views()]
+        assert (len(drawn), packets.side) == ((1, "left") if count <= 4 else (0, "top"))

@@ -1,0 +1,149 @@
+"""Whether a receiver is in track, drifting or fooled, and the lanes that show it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from evedrop.model.process import Floats
+from evedrop.score.track import FACTOR
+from evedrop.show.view.glyphs import drawable
+from evedrop.show.view.knowledge import KNOWLEDGE, ErrorDistance, KnowledgeState, knowledge
+from evedrop.show.view.panels.knowledge import WhoKnowsWhat
+from evedrop.show.view.panels.title import Title
+from evedrop.show.view.recording import ViewRecording
+from evedrop.show.view.scene import PeerSlots, Scene, Shown
+from tests.show.view.read_back import lane, rows
+from tests.show.view.simulated_run import Simulated
+
+SCENE = Scene("", "r", 10, 1, 2, 0.0, (Shown("smart", "eavesdropper", "smart", 1.0),), noise=0.05, units=("m", "m"))
+
+
+def known(error: float, trace: float, scene: Scene = SCENE) -> KnowledgeState:
+    """What a receiver knows with this squared error and tr P, shared by two states."""
+    none = np.zeros(1)
+    P = np.diag([trace / 4, 3 * trace / 4])[None]
+    off = np.sqrt(error / 4), -np.sqrt(3 * error / 4)
+    peer = PeerSlots(np.array([off]), P, none.astype(np.uint8), none, none, none, none)
+    return KNOWLEDGE[int(knowledge(scene, np.zeros((1, 2)), peer)[0])]
+
+
+@pytest.mark.parametrize(
+    ("error", "trace", "expected"),
+    [
+        (0.0, 0.0, KnowledgeState.IN_TRACK),
+        (0.99, 0.0, KnowledgeState.IN_TRACK),  # 20 times the noise of a step is 1
+        (1.01, 0.0, KnowledgeState.FOOLED),
+        (1.01, 0.1, KnowledgeState.DRIFTING),
+        (0.0, 1.01, KnowledgeState.DRIFTING),  # near the truth by chance
+        (99.0, 5.0, KnowledgeState.DRIFTING),
+        (101.0, 5.0, KnowledgeState.FOOLED),
+        (np.nan, 5.0, KnowledgeState.FOOLED),
+        (np.inf, 5.0, KnowledgeState.FOOLED),
+    ],
+)
+def test_a_word_for_error_and_covariance(error: float, trace: float, expected: KnowledgeState) -> None:
+    """The bounds of docs/view.md."""
+    assert known(error, trace) is expected
+
+
+def test_a_right_covariance_is_hardly_ever_called_fooled() -> None:
+    """The bound of the docstring; errors in one direction exceed it most often, and those in several hardly ever."""
+    assert stats.chi2.sf(FACTOR, 1) < 1e-5
+    for n in (2, 4, 10):
+        assert stats.chi2.sf(FACTOR * n, n) < stats.chi2.sf(FACTOR, 1)
+
+
+def walk(errors: list[float], levels: list[int], distance: ErrorDistance) -> list[str]:
+    """The words for distances along the first state."""
+    x: Floats = np.array([[one, 0.0] for one in errors])
+    codes = distance.codes(np.array(levels, np.uint8), distance.of(x, np.zeros_like(x)))
+    return [distance.words[code] for code in codes]
+
+
+def test_words_say_the_largest_distance_of_a_stretch() -> None:
+    """They name powers of ten, do not flicker, and continue over calls."""
+    distance = ErrorDistance(SCENE)
+    first = walk([0.2, 3.0, 30.0, 9.0], [0, 2, 2, 2], distance)
+    more = "off by more than"
+    assert first == ["in track, within 1 m", f"fooled, {more} 1 m", f"fooled, {more} 10 m", f"fooled, {more} 10 m"]
+    assert walk([9.0, 0.5, 0.9, 5.0], [2, 1, 0, 1], distance) == [
+        f"fooled, {more} 10 m",
+        "drifting, off by less than 1 m",
+        "in track, within 1 m",
+        f"drifting, {more} 1 m",
+    ]
+    assert walk([np.inf, np.nan], [2, 2], distance)[0] == f"fooled, {more} 1e+09 m"
+    assert len(set(distance.words)) == len(distance.words) == len(distance.meanings)
+    assert all(word.startswith(what.word) for word, what in zip(distance.words, distance.meanings, strict=True))
+
+
+def test_distances_have_a_unit() -> None:
+    """Only states with the unit of the first count; without units, all do."""
+    moving = replace(SCENE, n=3, units=("m", "m", "m/s"))
+    x: Floats = np.array([[3.0, 4.0, 12.0]])
+    assert ErrorDistance(moving).of(x, np.zeros((1, 3)))[0] == 5.0
+    assert ErrorDistance(replace(moving, units=())).of(x, np.zeros((1, 3)))[0] == 13.0
+    texts = [ErrorDistance(moving).text(one) for one in (0.0, 0.316, 12.34, 4567.0, 1e9, np.inf)]
+    assert texts == ["0 m", "0.32 m", "12 m", "4,600 m", "1e+09 m", "everything"]
+
+
+def test_distances_of_rounding_are_none() -> None:
+    """√(tr Q) is 0.22 m here: less than a thousandth of it is 0, and the finest distance that is said has two digits."""
+    assert [ErrorDistance(SCENE).text(one) for one in (2e-15, 2.2e-4, 2.3e-4)] == ["0 m", "0 m", "0.00023 m"]
+    finer = ErrorDistance(replace(SCENE, noise=1e-20))
+    assert [finer.text(one) for one in (9e-14, 2e-13)] == ["0 m", "2e-13 m"]
+
+
+def test_the_strip_shows_who_knows_what(simulated: Callable[..., Simulated], tmp_path: Path) -> None:
+    """However slots are handed over, a lane has the words of its receiver; a naive eavesdropper is fooled, a smart one is not."""
+    run, lanes = simulated(300), {}
+    for length in (7, 300):
+        recording = ViewRecording(tmp_path / f"{length}.rrd", run.scene)
+        for slots in run.chunks(length):
+            recording.add(slots)
+        assert recording.close()
+        for i, shown in enumerate(run.scene.receivers, 1):
+            lanes[shown.name, length] = lane(tmp_path / f"{length}.rrd", f"knows/{i}_{shown.name}", 300)
+    for i, shown in enumerate(run.scene.receivers, 1):
+        assert lanes[shown.name, 7] == lanes[shown.name, 300]
+        changes = rows(tmp_path / "7.rrd", f"knows/{i}_{shown.name}", "StateChange:state")
+        assert [word for _, (word,) in sorted(changes.items())] == [word for word, _ in groupby(lanes[shown.name, 7])]
+        expected = knowledge(run.scene, run.slots.x, run.slots.peers[shown.name])
+        assert [word.split(",")[0] for word in lanes[shown.name, 7]] == [KNOWLEDGE[code].word for code in expected]
+    words = {name: " ".join(found) for (name, _), found in lanes.items()}
+    assert "fooled" in words["naive"]
+    assert "fooled" not in words["smart"]
+    assert "drifting" in words["smart"]
+    assert set(words["legitimate"].split()) & {"fooled", "drifting"} == set()
+    assert set(WhoKnowsWhat(run.scene).styles()) == {
+        f"knows/{i + 1}_{s.name}" for i, s in enumerate(run.scene.receivers)
+    }
+
+
+def test_titles_in_any_letters_are_drawn() -> None:
+    """Letters that the viewer's font lacks become question marks, and Markdown stays as it was typed."""
+    assert drawable("Größe σ² ≥ 1 Ж x\u0302") == "Größe σ² ≥ 1 Ж x\u0302"
+    assert drawable("東 🚗 \u0387\u038b\u038d\u03a2") == "? ? ????"
+    assert title_of(replace(SCENE, title="a *b* # c")) == r"**a \*b\* \# c**"
+
+
+def title_of(scene: Scene) -> str:
+    """The text in the first line of a view, in Markdown."""
+    text = Title(scene).styles()["title"].text
+    assert text is not None
+    (found,) = text.as_arrow_array().to_pylist()
+    return str(found)
+
+
+def test_the_title_says_which_trials_are_shown() -> None:
+    """If there are several."""
+    assert title_of(replace(SCENE, title="a", trials=1)) == "**a**"
+    many = "**a** · curves: means of 2,000 trials, everything else: the first of them"
+    assert title_of(replace(SCENE, title="a", trials=2000)) == many

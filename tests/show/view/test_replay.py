@@ -1,0 +1,115 @@
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from evedrop import load_results, montecarlo, run
+from evedrop.errors import UsageError
+from evedrop.show.view.replay import replay
+from evedrop.simulate.montecarlo import Plan
+from evedrop.simulate.simulation import Mode
+from tests.show.view.read_back import lane, rows
+
+SLOTS = 120
+EVE = {"eve": {"strategy": "naive", "link": {"quality": 0.7}}}
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small study in memory, of two trials from the fourth on."""
+    folder = tmp_path_factory.mktemp("study") / "run"
+    montecarlo("eavesdroppers", trials=2, first_trial=3, slots=SLOTS, out=folder)
+    return folder
+
+
+def test_recording_of_a_study_holds_its_curves(study: Path) -> None:
+    """A run made in memory gets the recording that a live run would have: errors averaged over its trials."""
+    path = replay(study)
+    table = load_results(study).slots.to_pylist()
+    expected = {row["slot"]: row["mean_squared_error"] for row in table if row["peer"] == "naive"}
+    shown = rows(path, "error/naive", "Scalars:scalars")
+    above = [k for k in range(SLOTS) if expected[k] > 1e-2]
+    assert len(above) > SLOTS / 2
+    np.testing.assert_allclose([shown[k][0] for k in above], [np.log10(expected[k]) for k in above], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "live"),
+    [
+        ("scheduled", False),
+        ("withholding", False),
+        ("scheduled", True),
+        pytest.param("withholding", True, marks=pytest.mark.long),
+    ],
+    ids=["scheduled in memory", "withholding in memory", "scheduled live", "withholding live"],
+)
+def test_silence_is_shown_as_silence(scheme: str, live: bool, tmp_path: Path) -> None:
+    """In the sensor's lane and in every receiver's, and nowhere else: as the tables have it."""
+    changes: dict[str, Any] = {"encoding": {"scheme": scheme, "threshold": 3}, "eavesdroppers": EVE, "slots": SLOTS}
+    if scheme == "withholding":
+        changes["encoding"] = {"scheme": scheme, "state_probability": 0.5}
+    else:
+        changes["acknowledgements"] = {"link": {"quality": 0.9}}
+    if live:
+        results = run("eavesdroppers", trials=2, out=tmp_path / "run", view="web", **changes)
+        recording = results.folder / "recording.rrd"
+    else:
+        results = montecarlo("eavesdroppers", trials=2, out=tmp_path / "run", **changes)
+        recording = replay(results.folder)
+    table = [row for row in results.trials.to_pylist() if row["trial"] == 0]
+    kinds = {"nothing": "silent"}
+    for peer, path in (("legitimate", "1_legitimate"), ("eve", "2_eve")):
+        its = sorted((row for row in table if row["peer"] == peer), key=lambda row: row["slot"])
+        sent = [kinds.get(row["sent"], row["sent"]) for row in its]
+        assert 10 < sent.count("silent") < SLOTS - 10
+        assert lane(recording, "packets/0_sent", SLOTS) == sent
+        done = ["silent" if word == "silent" else row["action"] for word, row in zip(sent, its, strict=True)]
+        assert lane(recording, f"packets/{path}", SLOTS) == done
+        assert {"silent", "dropped", "state"} <= set(done)
+
+
+def test_nothing_recorded_is_said(tmp_path: Path) -> None:
+    """A study of covariances alone has no trial to show, and says so."""
+    montecarlo("eavesdroppers", trials=2, slots=10, out=tmp_path / "run", plan=Plan(Mode.COVARIANCE_ONLY))
+    with pytest.raises(UsageError, match="no recorded trial"):
+        replay(tmp_path / "run")
+
+
+def one_action(table: pa.Table) -> pa.Table:
+    """Every action another word."""
+    words = pa.array(["guessed"] * table.num_rows).dictionary_encode().cast(pa.dictionary(pa.int8(), pa.string()))
+    return table.set_column(table.schema.get_field_index("action"), "action", words)
+
+
+OTHER: dict[str, tuple[str, Callable[[pa.Table], pa.Table], str]] = {
+    "other columns": ("trials", lambda table: table.drop_columns(["x_hat"]), "differs in x_hat"),
+    "slots cut short": ("slots", lambda table: table.slice(0, 40), "do not have the same slots of"),
+    "an unknown action": ("trials", one_action, "unknown action guessed"),
+}
+
+
+@pytest.mark.parametrize("what", OTHER)
+def test_tables_that_do_not_fit_are_refused(what: str, study: Path, tmp_path: Path) -> None:
+    """A table of another version, one cut short, and unknown words: one line, and no recording is left."""
+    name, change, said = OTHER[what]
+    folder = tmp_path / "run"
+    shutil.copytree(study, folder, ignore=shutil.ignore_patterns("*.rrd"))
+    pq.write_table(change(pq.read_table(folder / f"{name}.parquet")), folder / f"{name}.parquet")
+    with pytest.raises(UsageError, match=said) as told:
+        replay(folder)
+    assert "\n" not in str(told.value)
+    assert not (folder / "recording.rrd").exists()
+
+
+def test_another_process_is_refused(study: Path, tmp_path: Path) -> None:
+    """Tables of two states with a scenario of one: the message comes at once; a recording would never be finished."""
+    one: dict[str, Any] = {"process__A": [[1.0]], "process__Q": [[1e-3]], "process__initial_covariance": [[1.0]]}
+    folder = montecarlo("eavesdroppers", trials=2, slots=SLOTS, out=tmp_path / "run", **one).folder
+    shutil.copy(study / "trials.parquet", folder)
+    with pytest.raises(UsageError, match=r"trials\.parquet has 2 states and scenario\.toml 1; run the scenario again"):
+        replay(folder)

@@ -1,0 +1,59 @@
+"""What happened in a run as lines of its recording: live, and of a run made in memory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from evedrop import load_results, montecarlo
+from evedrop.cli.main import main
+from evedrop.scenario.news import RunEvent
+from evedrop.show.view.replay import replay
+from tests.show.view.read_back import rows
+
+EVENTS = [{"at": 3, "link": "legitimate", "set": {"quality": 0.2}}, {"from": 5, "to": 9, "cut": "smart"}]
+LINES = {3: ["link legitimate: quality = 0.2"], 5: ["cut smart"], 9: ["heal smart"]}
+
+
+def lines(rrd: Path) -> dict[int, list[str]]:
+    """Slot → the line of the run's events there; those of slot 0 are its introduction."""
+    return {slot: text for slot, text in rows(rrd, "events/run", "TextLog:text").items() if slot}
+
+
+def test_a_run_in_memory_shows_what_its_scenario_had_happen(tmp_path: Path) -> None:
+    """A line at its slot for every event and for its end, from the summary."""
+    results = montecarlo("eavesdroppers", trials=1, slots=30, out=tmp_path / "run", event=EVENTS)
+    assert [(one["slot"], [one["event"]]) for one in results.summary["events"]] == list(LINES.items())
+    assert {one["by"] for one in results.summary["events"]} == {"scenario"}
+    assert lines(replay(tmp_path / "run")) == LINES
+
+
+def test_what_comes_after_the_last_slot_did_not_happen(tmp_path: Path) -> None:
+    """An event that lasts to the end of the run ends in none of its slots."""
+    results = montecarlo("eavesdroppers", trials=1, slots=9, out=tmp_path / "run", event=EVENTS)
+    assert [one["slot"] for one in results.summary["events"]] == [3, 5]
+
+
+@pytest.mark.long
+def test_a_live_run_shows_what_was_done_to_it(evedrop: Any) -> None:
+    """The scenario's events and the operator's, at their slots, in the recording that was made while it went on."""
+    scenario = evedrop.folder / "shown.toml"
+    evedrop("new", str(scenario))
+    changes = ("--slots", "60", "--set", 'event=[{ at = 3, cut = "legitimate" }]', "--set", "expect=[]")
+    live = evedrop.live(str(scenario), *changes, "--view", "web", "--paused")
+    live.held()
+    assert main(["step", str(live.folder), "8"]) == 0
+    assert main(["link", str(live.folder), "legitimate", "quality=0.5"]) == 0
+    assert main(["resume", str(live.folder)]) == 0
+    assert live.end().status == 0
+    events = load_results(live.folder).summary["events"]
+    shown = lines(live.folder / "recording.rrd")
+    assert [one["event"] for one in events if one["by"] == "scenario"] == ["cut legitimate"]
+    assert [one["slot"] for one in events if one["event"] == "cut legitimate"] == [3]
+    assert any(one["event"].startswith("link") for one in events)
+    last = {
+        one["slot"]: RunEvent(**one).line for one in events if one["slot"]
+    }  # the recording has the last line of a slot
+    assert shown == {slot: [line] for slot, line in last.items()}

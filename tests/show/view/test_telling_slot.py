@@ -1,0 +1,83 @@
+from pathlib import Path
+
+import numpy as np
+
+from evedrop import montecarlo
+from evedrop.model.process import Floats
+from evedrop.results.reading import load_results
+from evedrop.scenario.loading import load
+from evedrop.show.view.telling_slot import most_telling, telling_slot
+
+
+def errors_of(slots: int, **far: tuple[int, float]) -> dict[str, Floats]:
+    """Receiver → its errors: 1 for eavesdroppers and 0 for the legitimate estimator, but in one slot."""
+    errors = {"legitimate": np.zeros(slots)}
+    for name, (slot, error) in far.items():
+        errors.setdefault(name, np.ones(slots))[slot] = error
+    return errors
+
+
+def believed(errors: dict[str, Floats], **traces: float) -> dict[str, Floats]:
+    """Receiver → the trace that it believes, 1 unless told otherwise."""
+    return {name: np.full(len(column), traces.get(name, 1.0)) for name, column in errors.items()}
+
+
+def test_the_slot_in_which_most_are_fooled_is_chosen() -> None:
+    """An eavesdropper that knows how far it may be off does not count, however far it is."""
+    errors = errors_of(1000, naive=(400, 50.0), drifting=(700, 900.0))
+    assert most_telling(errors, believed(errors, drifting=900.0), 0.1) == 400
+    assert most_telling(errors, believed(errors), 0.1) == 700
+
+
+def test_where_the_legitimate_estimator_errs_as_well_there_is_nothing_to_see() -> None:
+    """The separation is a ratio."""
+    errors = errors_of(1000, naive=(400, 50.0))
+    errors["naive"][600], errors["legitimate"][600] = 500.0, 500.0
+    assert most_telling(errors, believed(errors), 0.1) == 400
+
+
+def test_without_a_fooled_eavesdropper_all_count() -> None:
+    """If no eavesdropper is ever fooled, drifting ones count."""
+    errors = errors_of(1000, drifting=(700, 900.0))
+    assert most_telling(errors, believed(errors, drifting=900.0), 0.1) == 700
+
+
+def test_without_an_eavesdropper_the_legitimate_estimator_counts() -> None:
+    """The slot of its largest error is chosen."""
+    errors = errors_of(1000, legitimate=(300, 2.0))
+    assert most_telling(errors, believed(errors), 0.1) == 300
+
+
+def test_the_slots_around_it_fill_the_panels() -> None:
+    """Neither the beginning nor the end is chosen; of a short run, the last slot is."""
+    errors = errors_of(1000, naive=(20, 1e6), other=(990, 1e6))
+    errors["naive"][500] = 100.0
+    assert most_telling(errors, believed(errors), 0.1) == 500
+    for slots in (1, 60, 105):
+        errors = errors_of(slots, naive=(0, 5.0))
+        assert most_telling(errors, believed(errors), 0.1) == slots - 1
+
+
+def test_the_first_recorded_trial_decides(tmp_path: Path) -> None:
+    """It is the one that the view shows; the covariances are those that receivers believe."""
+    found = []
+    for trials in (1, 3):
+        montecarlo("vehicle", slots=400, record_trials=trials, trials=trials, out=tmp_path / str(trials))
+        found.append(telling_slot(load_results(tmp_path / str(trials))))
+    assert found[0] == found[1]
+    results = load_results(tmp_path / "3")
+    rows = [row for row in results.trials.to_pylist() if row["trial"] == 0]
+    errors: dict[str, list[float]] = {}
+    traces: dict[str, list[float]] = {}
+    for row in sorted(rows, key=lambda one: one["slot"]):
+        errors.setdefault(row["peer"], []).append(row["squared_error"])
+        traces.setdefault(row["peer"], []).append(np.trace(np.array(row["P"]).reshape(len(row["x"]), -1)))
+    noise = float(np.trace(load("vehicle").process.process.Q))
+    seen, claimed = ({name: np.array(one) for name, one in by.items()} for by in (errors, traces))
+    assert found[1] == most_telling(seen, claimed, noise)
+
+
+def test_a_closed_loop_is_shown_to_its_end(tmp_path: Path) -> None:
+    """Its panels show the whole run, up to the slot; so there is no slot to choose."""
+    montecarlo("heated-room", trials=1, out=tmp_path / "run")
+    assert telling_slot(load_results(tmp_path / "run")) is None
