@@ -36,7 +36,8 @@ def test_the_image_is_built_from_all_that_the_package_contains() -> None:
     assert "docs" in folders
     copied = re.findall(r"^COPY (\S+) /source/\1$", (ROOT / "Dockerfile").read_text(), re.MULTILINE)
     let_through = (ROOT / ".dockerignore").read_text().splitlines()
-    assert [one for one in folders if one not in copied or f"!{one}" not in let_through] == []
+    tops = {folder.split("/")[0] for folder in folders}
+    assert [top for top in sorted(tops) if top not in copied or f"!{top}" not in let_through] == []
 
 
 def test_the_shipped_services_are_those_that_the_command_writes(evedrop: Evedrop) -> None:

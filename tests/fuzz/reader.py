@@ -90,10 +90,10 @@ def as_parquet(mutator: Mutator, data: bytes) -> bytes:
 
 
 def lines(mutator: Mutator, data: bytes) -> bytes:
-    """Lines of JSON, some of them changed."""
+    """Lines of JSON, some of them changed. Zeros may follow them, in a file whose end is mapped into memory."""
     lines = [
         mutator.tree(json.loads(line)) if mutator.random.random() < 0.5 else json.loads(line)
-        for line in data.splitlines()
+        for line in data.rstrip(b"\0").splitlines()
     ]
     return "".join(f"{json.dumps(line)}\n" for line in lines).encode("utf-8", "replace")
 

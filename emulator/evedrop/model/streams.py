@@ -150,7 +150,7 @@ class Batch:
         return range(self.first_trial, self.first_trial + self.trials)
 
 
-class Reader(Protocol):
+class StreamReader(Protocol):
     """Reads the numbers of a stream."""
 
     def uniforms(self, slots: range) -> Floats:

@@ -23,7 +23,7 @@ from evedrop.model.links import loss_of
 from evedrop.model.links.link import Fate, LossModel
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes, Flags
-from evedrop.model.streams import Batch, BlockReader, Reader
+from evedrop.model.streams import Batch, BlockReader, StreamReader
 
 NEVER = 2**62
 """A slot that no run reaches."""
@@ -136,11 +136,11 @@ class Link:
     receiver: str
     keys: Mapping[str, bytes]
     batch: Batch
-    reader: Callable[[bytes, Batch, int], Reader] = BlockReader
+    reader: Callable[[bytes, Batch, int], StreamReader] = BlockReader
     _state: _State = field(init=False)
     _before: tuple[_State, range] | None = field(init=False, default=None)
     _changes: list[Change] = field(init=False)
-    _readers: dict[tuple[str, int], Reader] = field(init=False, default_factory=dict)
+    _readers: dict[tuple[str, int], StreamReader] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         self._state = _State(self.schedule.settings, loss_of(self.schedule.settings["loss"]))
@@ -269,10 +269,10 @@ class Link:
     def _uniforms(self, stream: str, slots: range, width: int) -> Floats:
         return self._reader(stream, width).uniforms(slots)
 
-    def _reader(self, stream: str, width: int) -> Reader:
+    def _reader(self, stream: str, width: int) -> StreamReader:
         return self._reader_of(f"{stream}/{self.receiver}", width)
 
-    def _reader_of(self, name: str, width: int) -> Reader:
+    def _reader_of(self, name: str, width: int) -> StreamReader:
         reader = self._readers.get((name, width))
         if reader is None:
             reader = self._readers[name, width] = self.reader(self.keys[name], self.batch, width)
