@@ -93,7 +93,7 @@ lint-rest: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
-	$(BIN)/python tools/floor_plan.py --check
+	$(BIN)/python tools/package_drawing.py --check
 
 setup: $(READY)
 

@@ -12,17 +12,18 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-ROOMS = {"peers": ROOT / "peers"}
+ELSEWHERE = {"peers": ROOT / "peers"}
+"""Packages whose folder is not in `emulator/evedrop/`."""
 SCIPY = "evedrop.model.theory."
 
 
-def modules_of(room: str) -> list[str]:
-    """The modules of a room. Raises AssertionError if there is no such room, so that no check becomes void."""
-    folder = ROOMS.get(room, ROOT / "emulator" / "evedrop" / room.replace(".", "/"))
+def modules_of(package: str) -> list[str]:
+    """The modules of a package. Raises AssertionError if there is no such package, so that no check becomes void."""
+    folder = ELSEWHERE.get(package, ROOT / "emulator" / "evedrop" / package.replace(".", "/"))
     paths = sorted(folder.rglob("*.py"))
-    assert paths, f"there is no room {room}"
+    assert paths, f"there is no package {package}"
     names = (path.relative_to(folder).with_suffix("").parts for path in paths)
-    return [".".join(["evedrop", room, *name]).removesuffix(".__init__") for name in names]
+    return [".".join(["evedrop", package, *name]).removesuffix(".__init__") for name in names]
 
 
 def loaded_by(*modules: str) -> dict[str, set[str]]:
@@ -62,8 +63,8 @@ def loaded() -> dict[str, set[str]]:
     What comes before a module can only make a check of it stricter.
     """
     peers = (*modules_of("peers"), *modules_of("live.network"), *modules_of("live.protocol"))
-    rooms = ("live", "simulate", "scenario", "score", "results")
-    rest = (module for room in rooms for module in modules_of(room))
+    others = ("live", "simulate", "scenario", "score", "results")
+    rest = (module for package in others for module in modules_of(package))
     return loaded_by("evedrop.model.controllers", *model(), *peers, "evedrop.live.observer.observer", *rest)
 
 
@@ -93,7 +94,7 @@ def test_a_solver_is_loaded_only_when_a_controller_is_made(loaded: dict[str, set
     assert not packages(names) & {"osqp", "scipy"}
 
 
-MATHEMATICS = {f"evedrop.{room}" for room in ("model", "system", "names", "errors")}
+MATHEMATICS = {f"evedrop.{name}" for name in ("model", "system", "names", "errors")}
 """What the model may import."""
 
 
@@ -169,6 +170,6 @@ def test_the_pytest_plugin_loads_nothing_but_pytest() -> None:
 
 
 def test_only_view_and_paper_load_rerun_and_matplotlib(loaded: dict[str, set[str]]) -> None:
-    """No module of the other rooms loads Rerun or matplotlib when it is imported; theory is looked at above."""
+    """No module of the other packages loads Rerun or matplotlib when it is imported; theory is looked at above."""
     for module, names in loaded.items():
         assert not packages(names) & {"rerun", "matplotlib"}, module

@@ -1,4 +1,4 @@
-"""Names in the code: one public class for each name."""
+"""Names in the code: one public class for each name, one word for each thing."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import re
 from collections import defaultdict
 from functools import cache
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted(path for folder in ("emulator", "peers") for path in (ROOT / folder).rglob("*.py"))
@@ -64,3 +66,68 @@ def test_no_two_test_files_have_the_same_name() -> None:
         for path in (ROOT / folder).rglob("test_*.py"):
             folders[path.name].append(str(path.parent))
     assert {name: where for name, where in folders.items() if len(where) > 1} == {}
+
+
+GLOSSARY = ROOT / "docs" / "glossary.md"
+FORMER = {
+    "floor plan": "drawing of the packages",
+    "floor_plan": "package_drawing",
+    "rooms": "packages",
+}
+"""Former word → the word of the glossary, or the name, in its place. Parts of names count: `open_rooms`, `openRooms`."""
+PROSE = [path for path in ROOT.glob("*.md") if path.name != "CHANGELOG.md"]
+
+
+def former_words(text: str) -> set[str]:
+    """Those of the former words that a text has, as words or as parts of names."""
+    low = text.lower()
+    return {word for word in FORMER if word.lower() in low and re.search(pattern_of(word), text)}
+
+
+def pattern_of(word: str) -> str:
+    """Matches the word with a small or a capital letter, where no other letter continues it."""
+    first = word[0]
+    if first.isupper():
+        return rf"(?<![A-Z]){word}(?![a-z])"
+    return rf"(?:(?<![A-Za-z]){first}|{first.upper()}){word[1:]}(?![a-z])|(?<![A-Z]){word.upper()}(?![A-Z])"
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("two rooms", True),
+        ("def open_rooms():", True),
+        ("OpenRooms()", True),
+        ("ROOMS = 3", True),
+        ("mushrooms", False),
+        ("a room", False),
+        ("roomster", False),
+    ],
+)
+def test_parts_of_names_are_words(text: str, found: bool) -> None:
+    """And parts of words are not."""
+    assert former_words(text) == ({"rooms"} if found else set())
+
+
+def test_former_words_are_gone() -> None:
+    """The glossary has one word for each thing; the others are in no code, page, test or tool, except as the changelog's."""
+    folders = ("emulator/evedrop", "peers", "tests", "tools", "benchmarks", "docs", "scenarios", "containers")
+    paths = [
+        path for folder in folders for path in (ROOT / folder).rglob("*") if path.suffix in {".py", ".md", ".toml"}
+    ]
+    assert len(paths) > 800
+    own = Path(__file__)
+    found = {
+        str(path.relative_to(ROOT)): words
+        for path in {*PROSE, *paths} - {own}
+        if (words := former_words(path.read_text(encoding="utf-8")) | former_words(path.stem))
+    }
+    assert found == {}, "docs/glossary.md has the words to use"
+
+
+def test_the_glossary_says_each_word_once() -> None:
+    """In the order of the alphabet, so that a word is found."""
+    rows = re.findall(r"^\| ([^|]+?) \|", GLOSSARY.read_text(encoding="utf-8"), re.MULTILINE)[1:]
+    words = [word.lower() for word in rows if not word.startswith("-")]
+    assert len(words) > 70
+    assert words == sorted(set(words))

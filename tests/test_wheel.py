@@ -22,7 +22,7 @@ pytestmark = pytest.mark.wheel
 ROOT = Path(__file__).parents[1]
 REQUIRED = "EVEDROP_KERNELS_REQUIRED"
 SOURCES = ("pyproject.toml", "hatch_build.py", "README.md", "LICENSE")
-ROOMS = ("emulator", "peers", "scenarios")
+FOLDERS = ("emulator", "peers", "scenarios")
 BUILD = """
 import runpy, sys
 sys.modules.update(dict.fromkeys(sys.argv.pop().split(",")))  # these packages are not installed
@@ -34,8 +34,8 @@ runpy.run_module("hatchling", run_name="__main__")
 def build(folder: Path, without: str = "-", **changes: str) -> subprocess.CompletedProcess[str]:
     """Build the wheel of a copy of the sources, into `dist`; without: a package to hide; changes: of the environment."""
     copy = folder / "copy"
-    for room in ROOMS:
-        shutil.copytree(ROOT / room, copy / room, True, shutil.ignore_patterns("_compiled*", "__pycache__"))
+    for name in FOLDERS:
+        shutil.copytree(ROOT / name, copy / name, True, shutil.ignore_patterns("_compiled*", "__pycache__"))
     for name in SOURCES:
         shutil.copy(ROOT / name, copy)
     environment = {name: value for name, value in os.environ.items() if name not in {REQUIRED, "CC"}} | changes
@@ -135,7 +135,7 @@ addopts = "--strict-markers --strict-config -p no:randomly -p no:hypothesispytes
 filterwarnings = ["error"]
 """,
     "conftest.py": "import emulator\n",
-    **{f"{name}/__init__.py": f"NAME = 'their {name}'\n" for name in ROOMS},
+    **{f"{name}/__init__.py": f"NAME = 'their {name}'\n" for name in FOLDERS},
     "scenarios/vehicle.toml": "[process]\ncommand = 'web'\n",
     "scenarios/spied.toml": SPIED,
     "scenarios/spy.py": "from evedrop.extend import Naive\n\n\nclass Spy(Naive):\n    pass\n",

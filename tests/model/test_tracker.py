@@ -148,10 +148,10 @@ def test_its_room_is_enough_for_as_many_packets_as_the_documents_say(process: Pr
     """
     gamma, words = np.ones((6, 40), bool) if lossless else coins(0.7, 6, 40), Words(process, 6)
     scale = float(np.sqrt(np.trace(process.initial_covariance + process.Q)))
-    rooms = CAPACITY, 16
-    trackers = [Tracker(Knowledge(process, 1.0, {}, {}), Batch(6, 40), room) for room in rooms]
+    capacities = CAPACITY, 16
+    trackers = [Tracker(Knowledge(process, 1.0, {}, {}), Batch(6, 40), capacity) for capacity in capacities]
     beliefs, heard = [one.prior() for one in trackers], [dict[int, np.ndarray]() for _ in range(40)]
-    found = np.zeros((len(rooms), *gamma.shape))
+    found = np.zeros((len(capacities), *gamma.shape))
     for slot in slots(process, Batch(6, 40), gamma):
         reception = Reception(slot.gamma, slot.z)
         beliefs = [one.step(slot.k, belief, reception) for one, belief in zip(trackers, beliefs, strict=True)]

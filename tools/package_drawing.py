@@ -1,7 +1,7 @@
 """Draws the packages in docs/architecture.md from the imports, or checks that the drawing is up to date.
 
-    python tools/floor_plan.py            # writes the drawing
-    python tools/floor_plan.py --check    # exits with 1 if it is out of date
+    python tools/package_drawing.py            # writes the drawing
+    python tools/package_drawing.py --check    # exits with 1 if it is out of date
 
 The order comes from the layers contract in pyproject.toml, the arrows from the imports themselves.
 """
@@ -16,7 +16,7 @@ import grimp
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "architecture.md"
-BEGIN, END = "<!-- packages: drawn by tools/floor_plan.py -->", "<!-- end of the drawing -->"
+BEGIN, END = "<!-- packages: drawn by tools/package_drawing.py -->", "<!-- end of the drawing -->"
 PACKAGE = "evedrop"
 
 
@@ -84,7 +84,9 @@ def main(arguments: list[str]) -> int:
     if "--check" not in arguments:
         PAGE.write_text(drawn, encoding="utf-8")
     elif drawn != text:
-        sys.stderr.write(f"{PAGE.relative_to(ROOT)}: the drawing is out of date; run: python tools/floor_plan.py\n")
+        sys.stderr.write(
+            f"{PAGE.relative_to(ROOT)}: the drawing is out of date; run: python tools/package_drawing.py\n"
+        )
         return 1
     return 0
 
