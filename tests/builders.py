@@ -13,7 +13,7 @@ from evedrop.live.protocol.brief_parts import Part
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Belief, Beliefs
 from evedrop.model.streams import root_of_seed, stream_key
-from evedrop.results.writer import Results, load_results
+from evedrop.results.reading import Results
 
 P = TypeVar("P", bound=Part)
 
@@ -59,7 +59,7 @@ def scalar_tables(A: float, Q: float, **entries: Any) -> dict[str, Any]:
 
 def digests_of(results: Results | Path) -> dict[str, str]:
     """Receiver → its digest, of results or of the folder that has them."""
-    found = results if isinstance(results, Results) else load_results(results)
+    found = results if isinstance(results, Results) else Results.read(results)
     return {name: peer["digest"] for name, peer in found.summary["peers"].items()}
 
 

@@ -22,7 +22,7 @@ from evedrop.live.launch.starter import StartedProcess, Starter
 from evedrop.live.network.endpoint import Endpoint
 from evedrop.live.protocol.brief import read_brief
 from evedrop.names import OBSERVER
-from evedrop.results.writer import load_results
+from evedrop.results.reading import Results
 from evedrop.scenario.tables import Scenario
 from tests.conftest import wait_until
 
@@ -145,7 +145,7 @@ class ByHand:
     @property
     def summary(self) -> Mapping[str, Any]:
         """The summary of the results."""
-        return load_results(self.results).summary
+        return Results.read(self.results).summary
 
 
 @contextmanager

@@ -27,7 +27,7 @@ from evedrop import preloaded
 from evedrop.cli import main as cli
 from evedrop.model.kernels import choice
 from evedrop.names import KERNELS_VARIABLE
-from evedrop.results.writer import Results, load_results
+from evedrop.results.reading import Results
 from tests.commands import LARGEST_FILE, NEWS, TELLING, CommandProcess, ForkedCommand
 from tests.examples import register_profiles
 from tests.privileged import say_what_was_skipped
@@ -194,7 +194,7 @@ class Live:
     @property
     def results(self) -> Results:
         """What is on disk."""
-        return load_results(self.folder)
+        return Results.read(self.folder)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from evedrop.results.writer import load_results
+from evedrop.results.reading import Results
 from tests.builders import digests_of
 from tests.conftest import Evedrop
 from tests.examples import mostly_long
@@ -78,7 +78,7 @@ def test_a_package_with_one_of_each_runs(evedrop: Evedrop, environment: dict[str
         assert done.status == 0, (words, done.out, done.err)
         assert "warning" not in done.err, done.err
     assert done.out == "hello\n"
-    live, memory = (load_results(evedrop.folder / name).summary for name in ("live", "memory"))
+    live, memory = (Results.read(evedrop.folder / name).summary for name in ("live", "memory"))
     assert digests_of(evedrop.folder / "live") == digests_of(evedrop.folder / "memory")
     assert live["peers"]["smart"]["largest_error"] == memory["peers"]["smart"]["largest_error"] > 0.0
     assert [one["held"] for one in live["expectations"]] == [True]

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from evedrop.results.writer import load_results
+from evedrop.results.reading import Results
 from evedrop.scenario.loading import load, shipped
 from tests.conftest import Done, Evedrop
 from tests.examples import mostly_long
@@ -77,7 +77,7 @@ def test_json_is_one_object_and_nothing_else(evedrop: Evedrop, command: str, bel
     )
     assert (done.status, done.err) == (status, "")
     assert done.out.count("\n") == 1
-    assert done.summary == load_results(evedrop.folder / "here").summary
+    assert done.summary == Results.read(evedrop.folder / "here").summary
     assert done.summary["trials"] == 2
     assert done.summary["expectations"][0]["held"] is (status == 0)
 
@@ -88,7 +88,7 @@ def test_a_failed_expectation_is_exit_1(evedrop: Evedrop) -> None:
     done = evedrop("montecarlo", "eavesdroppers", *changes, "--out", "here")
     assert (done.status, done.err) == (1, "")
     assert "expected legitimate.mean_squared_error below 1e-09: FAILED, found" in done.out
-    assert load_results(evedrop.folder / "here").summary["expectations"][0]["held"] is False
+    assert Results.read(evedrop.folder / "here").summary["expectations"][0]["held"] is False
 
 
 def test_a_scenario_with_mistakes_starts_nothing(evedrop: Evedrop) -> None:
@@ -188,9 +188,9 @@ def test_a_secret_of_its_own_changes_the_schedule_alone(evedrop: Evedrop) -> Non
     digests = {name: {peer["digest"] for peer in summary["peers"].values()} for name, summary in runs.items()}
     assert digests["one"] == digests["one again"]
     assert digests["one"].isdisjoint(digests["two"] | digests["none"])
-    schedules = {name: load_results(evedrop.folder / name).trials["sent"].to_pylist() for name in "abd"}
+    schedules = {name: Results.read(evedrop.folder / name).trials["sent"].to_pylist() for name in "abd"}
     assert len({tuple(schedule) for schedule in schedules.values()}) == 3
-    truths = [load_results(evedrop.folder / name).trials["x"].to_pylist() for name in "abd"]
+    truths = [Results.read(evedrop.folder / name).trials["x"].to_pylist() for name in "abd"]
     assert truths[0] == truths[1] == truths[2]
     done = evedrop(*base, "e", "--secret", "short")
     assert done.status == 2

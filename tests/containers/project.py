@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from evedrop.results.writer import Results, load_results
+from evedrop.results.reading import Results
 from tests.conftest import wait_until
 from tests.containers.machine import Docker
 from tests.debian import ROOT
@@ -109,7 +109,7 @@ class Project:
     def results(self) -> Results:
         """The newest results."""
         newest: Path = max((self.folder / "runs").iterdir(), key=lambda folder: folder.stat().st_mtime_ns)
-        return load_results(newest)
+        return Results.read(newest)
 
     def down(self) -> None:
         """Take everything down. Fails if a container, a network or a volume is left."""

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import pyarrow.parquet as pq
 
 from evedrop.errors import UsageError
-from evedrop.results.writer import load_results
+from evedrop.results.reading import Results
 from tests.faults import ours
 from tests.faults.disturbed import CLEANER, CONFUSED_FILE, FORK_SERVERS
 from tests.faults.figures import unlike_digests, unlike_rows
@@ -229,7 +229,7 @@ def _of_results(status: int, run: Run, hits: Mapping[Fault, float], reference: R
     written = [folder for folder in folders if any(_has_rows(path) for path in folder.glob("**/*.parquet"))]
     for folder in folders:
         try:
-            results = load_results(folder)
+            results = Results.read(folder)
             tables = dict(tables_of(results))
         except UsageError as error:
             # Where nothing was measured there is nothing to read.

@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from evedrop import montecarlo
 from evedrop.model.digest import block_starts
-from evedrop.results.writer import Results
+from evedrop.results.reading import Results
 from evedrop.scenario.tables import Scenario
 from tests.faults.fates import journal_rows
 from tests.faults.figures import unlike_memory

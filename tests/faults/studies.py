@@ -20,7 +20,7 @@ from typing import Any, final
 
 from evedrop import montecarlo
 from evedrop.errors import UsageError
-from evedrop.results.writer import Results, load_results
+from evedrop.results.reading import Results
 from tests.faults import ours
 from tests.faults.figures import unlike_memory
 from tests.faults.looks import failed_looks
@@ -90,7 +90,7 @@ def undisturbed(folder: Path) -> Undisturbed:
         command = subprocess.run(_command("usual", False), cwd=folder, stdout=output, stderr=output, check=False)
     if command.returncode != 0:
         raise ValueError(f"an undisturbed study ends with status {command.returncode}: {(folder / 'said').read_text()}")
-    return Undisturbed(load_results(folder / "memory"), time.monotonic() - begun)
+    return Undisturbed(Results.read(folder / "memory"), time.monotonic() - begun)
 
 
 def _command(out: str, resume: bool) -> list[str]:
@@ -119,7 +119,7 @@ def carried_out(case: StudyCase, folder: Path, before: frozenset[int], usual: Un
     if not complete:
         yield "the study is not complete, although nothing disturbed its last attempt"
         return
-    results = load_results(folder / "out")
+    results = Results.read(folder / "out")
     yield from unlike_memory({**results.summary, "expectations": None}, {**usual.results.summary, "expectations": None})
     for name in _TABLES:
         found, wanted = getattr(results, name), getattr(usual.results, name)
@@ -167,7 +167,7 @@ def _interrupted_at_its_end(status: int, out: Path) -> bool:
     if status not in signals or (out / "kept").exists():
         return False
     try:
-        return bool(load_results(out).summary["ended"] == "complete")
+        return bool(Results.read(out).summary["ended"] == "complete")
     except UsageError:
         return False
 
@@ -213,7 +213,7 @@ def _partial(out: Path, complete: bool) -> Iterator[str]:
     if complete or not out.exists():
         return
     try:
-        results = load_results(out)
+        results = Results.read(out)
     except UsageError as error:
         if (
             "has nothing yet" not in str(error)

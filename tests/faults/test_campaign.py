@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from evedrop.results.writer import load_results
+from evedrop.results.reading import Results
 from tests.faults.campaign import SKIPPED, Campaign
 from tests.faults.cases import HASTY_SECONDS, PATIENT_SECONDS, Case, case_of
 from tests.faults.disturbed import CLEANER, CONFUSED_FILE, FORK_SERVERS, disturbed
@@ -65,7 +65,7 @@ def test_a_run_whose_router_confuses_keys_leaves_word_of_it(tmp_path: Path) -> N
     with disturbed(VARIANTS["plain"], tmp_path, limits={"confused": 20}) as run:
         assert run.launcher.wait() == 0, run.text("stderr")
         assert (tmp_path / CONFUSED_FILE).exists()
-        assert load_results(run.out).summary["misdelivered"]
+        assert Results.read(run.out).summary["misdelivered"]
 
 
 def test_a_number_is_always_the_same_case() -> None:

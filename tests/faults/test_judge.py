@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from evedrop.results.writer import load_results
+from evedrop.results.reading import Results
 from tests.conftest import wait_until
 from tests.examples import mostly_long
 from tests.faults import ours
@@ -40,7 +40,7 @@ FLAP = Fault("flap", "smart", Moment("run", 0.5), seconds=1.0, count=3)
 
 def test_wrong_rows_are_seen(reference: Reference, memory: Path) -> None:
     """A number that is off in its last bit, a row that is another's, one that is there twice; and no other."""
-    tables = dict(tables_of(load_results(memory), journal=False))
+    tables = dict(tables_of(Results.read(memory), journal=False))
     assert [line for name, table in tables.items() for line in reference.wrong_rows(name, table)] == []
     rows = tables["trials"].slice(100, 3).to_pylist()
     rows[0]["squared_error"] = math.nextafter(rows[0]["squared_error"], math.inf)
@@ -139,7 +139,7 @@ def test_missing_rows_of_a_run_that_ended_early_are_seen(what: str, early: Ended
 def test_a_closed_loop_needs_inputs_from_its_first_slot_on(memory: Path, reference: Reference) -> None:
     """A run that ended before has no account of its controller."""
     loop = replace(reference, tables={**reference.tables, "inputs": {(0, 0): {}}})
-    results = load_results(memory)
+    results = Results.read(memory)
     tables = {name: table.slice(0, 0) for name, table in tables_of(results)}
     tables["journal"] = results.journal.slice(0, 0)
 
@@ -287,7 +287,7 @@ def test_a_panic_of_zenoh_is_no_mistake_where_threads_are_few(ended: Ended, refe
 @pytest.mark.parametrize("without", ["a row", "a receiver", "a block"])
 def test_digests_that_are_not_those_of_the_rows_are_seen(without: str, ended: Ended) -> None:
     """The reference is computed by the same code, so that a mistake in the rows would be in both."""
-    results = load_results(ended.out)
+    results = Results.read(ended.out)
     table = results.digests
     assert list(unlike_digests(results.summary, table)) == []
     last = pc.field("block") < pc.scalar(max(table["block"].to_pylist()))
@@ -318,7 +318,7 @@ def test_a_panic_in_zenohs_code_must_cost_nothing(ended: Ended, reference: Refer
 
 def test_figures_of_shards_cover_all_rows(ended: Ended, reference: Reference) -> None:
     """However far each shard came; unless the run says that some are of an earlier slot."""
-    results = load_results(ended.out)
+    results = Results.read(ended.out)
     tables = dict(tables_of(results))
     summary = {**results.summary, "slots": results.summary["slots"] // 2}
     assert list(unlike_rows(summary, tables))

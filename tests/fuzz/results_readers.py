@@ -18,7 +18,7 @@ from evedrop.live.network.control_file import Control, read_controls
 from evedrop.live.protocol.brief import read_brief
 from evedrop.live.protocol.brief_use import expect_usable
 from evedrop.results.diff import difference
-from evedrop.results.reading import load_results
+from evedrop.results.reading import Results
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.writer import ResultsWriter
 from evedrop.scenario.loading import load
@@ -105,7 +105,7 @@ def _look_at(place: Path) -> None:
     """As view, diff and their likes do, but for the drawing."""
     from evedrop.cli.closing_report import print_results
 
-    results = load_results(place)
+    results = Results.read(place)
     for table in ("slots", "trials", "journal", "digests", "inputs"):
         tried(partial(getattr, results, table))
     tried(lambda: difference(results, results))

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from evedrop.live.protocol.brief import read_brief
-from evedrop.results.writer import load_results
+from evedrop.results.reading import Results
 from evedrop.scenario.loading import checked
 from evedrop.scenario.tables import Scenario
 from tests.builders import MARGINAL, process_table
@@ -70,7 +70,7 @@ def captured(network: Lan, host: str, file: Path) -> Iterator[None]:
 def readable(file: Path, run: ByHand) -> tuple[int, set[str]]:
     """How many of the run's payloads can be found in a capture, and whose names and passwords."""
     traffic = file.read_bytes()
-    rows = load_results(run.folder / "run").trials.to_pylist()
+    rows = Results.read(run.folder / "run").trials.to_pylist()
     payloads = {struct.pack("<2d", *row["x"]) for row in rows if row["peer"] == "legitimate"}
     assert len(payloads) == run.scenario.slots
     words = set()

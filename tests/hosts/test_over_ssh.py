@@ -13,8 +13,8 @@ from functools import partial
 from pathlib import Path
 
 from evedrop.results.growing_tables import last_round
+from evedrop.results.reading import Results
 from evedrop.results.resolved_scenario import resolved
-from evedrop.results.writer import load_results
 from evedrop.scenario.tables import Scenario
 from tests.by_hand import as_if_undisturbed
 from tests.conftest import wait_until, with_mark
@@ -103,7 +103,7 @@ def test_over_ssh_hosts_give_the_same_run(tmp_path: Path) -> None:
         network.plug("beta")
         _, said = launcher.communicate(timeout=120.0)
         assert launcher.returncode == 0, said
-        summary = load_results(tmp_path / "run").summary
+        summary = Results.read(tmp_path / "run").summary
         as_if_undisturbed(summary, scenario, tmp_path / "memory")
         assert [outage["process"] for outage in summary["outages"]] == ["eve"]
         nothing_left(tmp_path)

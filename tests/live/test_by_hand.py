@@ -14,7 +14,7 @@ from typing import final
 
 import pytest
 
-from evedrop.results.writer import load_results
+from evedrop.results.reading import Results
 from evedrop.system.ports import free_port
 from tests.builders import digests_of
 from tests.commands import ForkedCommand
@@ -281,7 +281,7 @@ def test_who_does_not_come_is_named(evedrop: Evedrop) -> None:
     assert done.status == 3
     assert done.err == "evedrop: smart did not appear within 15 s; start it, or look at its log\n"
     assert closing(done)[0] == "smart did not appear within 15 s; start it, or look at its log; the results so far:"
-    assert load_results(evedrop.folder / "results").summary["ended"].startswith("smart did not appear")
+    assert Results.read(evedrop.folder / "results").summary["ended"].startswith("smart did not appear")
     said = {name: live.end() for name, live in lives.items() if name != "observer"}
     assert {name: one.status for name, one in said.items()} == dict.fromkeys(said, 3)
     for name, one in said.items():
@@ -299,7 +299,7 @@ def test_who_ends_the_observer_ends_the_run(evedrop: Evedrop) -> None:
     ended = {name: live.end() for name, live in lives.items()}
     assert ended["observer"].status == 130
     assert closing(ended["observer"])[0] == "interrupted; the results so far:"
-    assert load_results(evedrop.folder / "results").summary["ended"] == "interrupted"
+    assert Results.read(evedrop.folder / "results").summary["ended"] == "interrupted"
     others = {name: done for name, done in ended.items() if name != "observer"}
     assert {name: (done.status, done.err) for name, done in others.items()} == {
         name: (3, f"evedrop: {name}: the observer gave the run up: interrupted\n") for name in others

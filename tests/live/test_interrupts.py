@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from evedrop.results.growing_tables import UNFINISHED, last_round
-from evedrop.results.writer import load_results
+from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
 from evedrop.system.ports import free_port
 from tests.by_hand import by_hand
@@ -90,7 +90,7 @@ def interrupted(live: Live, done: Done) -> None:
     assert all(line.startswith(LINES) for line in done.err.splitlines()), done.err
     live.nothing_left()
     if (live.folder / "summary.json").exists() or (live.folder / UNFINISHED).exists():
-        results = load_results(live.folder)
+        results = Results.read(live.folder)
         assert results.slots.num_rows >= 0
         assert results.digests.num_rows >= 0
 
@@ -250,7 +250,7 @@ def test_a_process_by_hand_ends_with_130_too(tmp_path: Path, number: signal.Sign
         wait_until(lambda: last_round(run.folder / "run").slots > 0, "slots on disk")
         run.processes["observer"].send_signal(number)
         assert run.processes["observer"].wait(LIMIT) == 130
-        results = load_results(run.folder / "run")
+        results = Results.read(run.folder / "run")
         assert results.summary["ended"] == "interrupted"
         assert results.slots.num_rows == 4 * results.summary["slots"] > 0
     (tmp_path / "second").mkdir()

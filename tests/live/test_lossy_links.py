@@ -13,7 +13,7 @@ import tomli_w
 from evedrop.cli.api import design, montecarlo, run
 from evedrop.errors import UsageError
 from evedrop.model.links import LOSS_MODELS
-from evedrop.results.writer import Results
+from evedrop.results.reading import Results
 from evedrop.scenario.expected.estimates import warnings_of
 from evedrop.scenario.loading import load
 from evedrop.scenario.tables import Scenario

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from evedrop.cli.api import run
 from evedrop.results.diff import difference
-from evedrop.results.writer import load_results
+from evedrop.results.reading import Results
 from evedrop.scenario.loading import checked, shipped
 from evedrop.scenario.news import silent
 from evedrop.simulate.montecarlo import Plan, simulate
@@ -20,7 +20,7 @@ def test_a_live_run_is_the_one_in_memory(tmp_path: Path) -> None:
     scenario = checked({**tables, "slots": 120, "trials": 3, "expect": []}, "measured")
     live = run(scenario, out=tmp_path / "live")
     simulate(scenario, tmp_path / "memory", silent, Plan(workers=1))
-    memory = load_results(tmp_path / "memory")
+    memory = Results.read(tmp_path / "memory")
     assert live.summary["ended"] == "complete"
     assert len(digests_of(live)) == 7
     assert digests_of(live) == digests_of(memory)

@@ -11,7 +11,7 @@ import pytest
 from evedrop import montecarlo, run
 from evedrop.errors import UsageError
 from evedrop.live.launch.metrics import MetricsAddress, RunMetrics, metrics_served
-from evedrop.results.reading import load_results
+from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
 from evedrop.scenario.news import ConnectionOutage, FolderMoved, Held, News, RunProgress, Started, silent
 from tests.conftest import LIMIT, Evedrop, wait_until
@@ -53,7 +53,7 @@ def test_a_scrape_has_the_figures_of_the_run(tmp_path: Path) -> None:
     assert 0 < slots[0] <= last["evedrop_slots_total",] == last["evedrop_slots_planned",] == scenario.slots
     assert last["evedrop_running",] == 1
     assert all(one["evedrop_slots_per_second",] > 0 for one in seen)
-    summary = load_results(tmp_path / "run").summary
+    summary = Results.read(tmp_path / "run").summary
     for name, figures in summary["peers"].items():
         for figure in ("mean_squared_error", "mean_trace_covariance", "received_fraction", "used_fraction"):
             assert last[f"evedrop_{figure}", name] == figures[figure]
@@ -134,7 +134,7 @@ def test_figures_are_those_of_the_folder_and_alarms_of_the_watermark(tmp_path: P
         assert ("evedrop_mean_squared_error", "legitimate") not in scraped(page)
         metrics.tell(FolderMoved(str(tmp_path / "after")))
         found = scraped(page)
-    summary = load_results(tmp_path / "after").summary
+    summary = Results.read(tmp_path / "after").summary
     assert found["evedrop_mean_squared_error", "legitimate"] == summary["peers"]["legitimate"]["mean_squared_error"]
     for figure in ("false_alarm_fraction", "detected_fraction"):
         assert found[f"evedrop_{figure}",] == summary["integrity"][figure]
@@ -197,4 +197,4 @@ def test_the_command_prints_the_address(evedrop: Evedrop) -> None:
     words = ("--slots", "50", "--view", "off", "--metrics", "127.0.0.1:0", "--out", "run")
     done = evedrop("run", "vehicle", *words)
     assert "metrics are served at http://127.0.0.1:" in done.err
-    assert load_results(evedrop.folder / "run").summary["ended"] == "complete"
+    assert Results.read(evedrop.folder / "run").summary["ended"] == "complete"

@@ -11,7 +11,7 @@ import pytest
 
 from evedrop.live.launch.starter import GRACE_SECONDS
 from evedrop.results.growing_tables import UNFINISHED, last_round
-from evedrop.results.writer import load_results
+from evedrop.results.reading import Results
 from tests.conftest import Evedrop, Live, wait_until
 
 SLOW = """
@@ -102,4 +102,4 @@ def test_a_run_on_a_starved_machine_comes_to_its_end(evedrop: Evedrop) -> None:
             loop.kill()
             loop.wait()
     assert done.returncode == 0, done.stderr
-    assert load_results(evedrop.folder / "run").summary["ended"] == "complete"
+    assert Results.read(evedrop.folder / "run").summary["ended"] == "complete"

@@ -15,7 +15,7 @@ import pytest
 
 from evedrop import montecarlo, run
 from evedrop.results.growing_tables import last_round
-from evedrop.results.writer import Results
+from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
 from tests.builders import digests_of
 from tests.by_hand import as_if_undisturbed

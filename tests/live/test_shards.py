@@ -19,8 +19,7 @@ from evedrop.errors import RunError, UsageError
 from evedrop.live.launch.shard import shards_of
 from evedrop.live.launch.shards import OneProgress
 from evedrop.results.growing_tables import last_round
-from evedrop.results.reading import age_of_figures
-from evedrop.results.writer import Results
+from evedrop.results.reading import Results, age_of_figures
 from evedrop.scenario.loading import load
 from evedrop.scenario.news import News, RunEnded, RunProgress, Started, silent
 from tests.builders import digests_of

@@ -20,7 +20,7 @@ from evedrop.live.launch.preloading import preloaded
 from evedrop.live.network.program import ProgramStates
 from evedrop.live.protocol.brief_parts import ProgramEntry
 from evedrop.results.diff import difference
-from evedrop.results.writer import Results, load_results
+from evedrop.results.reading import Results
 from evedrop.scenario.loading import checked
 from evedrop.scenario.recordings.disturbance_file import table_text
 from evedrop.scenario.tables import Scenario
@@ -171,7 +171,7 @@ def test_a_message_that_is_no_state_ends_the_run(tmp_path: Path) -> None:
     assert len(states) == 31
     kept: dict[str, Any] = {"process__source": "file", "slots": 30}
     again = montecarlo(tmp_path / "live", trials=2, out=tmp_path / "again", plan=Plan(workers=1), **kept)
-    live = load_results(tmp_path / "live")
+    live = Results.read(tmp_path / "live")
     assert (live.summary["slots"], live.trials.num_rows) == (30, 90)
     assert rows_of(again) == rows_of(live)
 

@@ -20,7 +20,7 @@ from evedrop.model.process import Trajectory
 from evedrop.model.receiver import Reception
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.streams import Batch
-from evedrop.results.writer import load_results
+from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.scenario.tables import Scenario
@@ -121,7 +121,7 @@ def test_it_takes_part_in_a_real_run(tmp_path: Path) -> None:
         statuses = {name: process.returncode for name, process in running.items()}
     assert set(statuses.values()) <= {0, 1}, (statuses, said)
     digest = montecarlo(scenario, trials=2, out=tmp_path / "memory").summary["peers"]["legitimate"]["digest"]
-    summary = load_results(out).summary
+    summary = Results.read(out).summary
     assert summary["peers"]["legitimate"]["digest"] == digest
     assert said["legitimate"].strip() == digest
 

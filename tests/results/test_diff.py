@@ -16,7 +16,7 @@ import pytest
 from evedrop.cli.api import montecarlo
 from evedrop.errors import UsageError
 from evedrop.results.diff import difference
-from evedrop.results.writer import Results, load_results
+from evedrop.results.reading import Results
 
 
 @pytest.fixture(scope="module")
@@ -113,10 +113,10 @@ def test_a_run_cut_short_before_its_first_block_is_compared_by_its_rows(
         table = pq.read_table(short / f"{name}.parquet")
         kept = table.filter(pc.less(table["slot"], 20)) if name == "trials" else table.slice(0, 0)
         pq.write_table(kept, short / f"{name}.parquet")
-    difference_found = difference(load_results(short), runs["again"])
+    difference_found = difference(Results.read(short), runs["again"])
     assert difference_found.same, difference_found.text
     assert difference_found.text.startswith("no difference in 80 rows of recorded trials; ")
-    other = difference(load_results(short), runs["other seed"])
+    other = difference(Results.read(short), runs["other seed"])
     assert not other.same
     assert other.text.startswith("first difference: slot 0")
 
@@ -124,17 +124,17 @@ def test_a_run_cut_short_before_its_first_block_is_compared_by_its_rows(
 def test_a_folder_without_results_is_refused(tmp_path: Path, runs: dict[str, Results]) -> None:
     """No folder, an empty one, a broken summary and a broken table each say what is wrong."""
     with pytest.raises(UsageError, match="not a results folder"):
-        load_results(tmp_path / "nowhere")
+        Results.read(tmp_path / "nowhere")
     (tmp_path / "summary.json").write_text("{")
     with pytest.raises(UsageError, match="is not JSON"):
-        load_results(tmp_path)
+        Results.read(tmp_path)
     (tmp_path / "summary.json").write_text("{}")
     with pytest.raises(UsageError, match="is not a run summary"):
-        load_results(tmp_path)
+        Results.read(tmp_path)
     (tmp_path / "summary.json").write_text((next(iter(runs.values())).folder / "summary.json").read_text())
     (tmp_path / "slots.parquet").write_text("PAR1")
     with pytest.raises(UsageError, match=r"slots\.parquet cannot be read"):
-        _ = load_results(tmp_path).slots
+        _ = Results.read(tmp_path).slots
 
 
 def test_only_the_changed_eavesdropper_has_another_digest(runs: dict[str, Results]) -> None:
@@ -155,7 +155,7 @@ def rewritten(results: Results, folder: Path, table: str, change: Callable[[pa.T
     shutil.copytree(results.folder, folder)
     path = folder / f"{table}.parquet"
     pq.write_table(change(pq.read_table(path)), path)
-    return load_results(folder)
+    return Results.read(folder)
 
 
 OTHER = {
@@ -230,7 +230,7 @@ def test_what_a_detector_says_is_compared(tmp_path: Path) -> None:
     summary = json.loads((changed / "summary.json").read_text(encoding="utf-8"))
     summary["integrity"]["digest"] = "0" * 64
     (changed / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
-    found = difference(known, load_results(changed))
+    found = difference(known, Results.read(changed))
     assert not found.same
     assert found.text.startswith("the digest of integrity differs, in trials not recorded; record all trials")
     rows = known.inputs
@@ -238,5 +238,5 @@ def test_what_a_detector_says_is_compared(tmp_path: Path) -> None:
     place = rows.column_names.index("statistic")
     raised = pc.add(rows["statistic"], pc.cast(pc.greater(rows["slot"], 30), pa.float64()))
     pq.write_table(rows.set_column(place, "statistic", raised), changed / "inputs.parquet")
-    found = difference(known, load_results(changed))
+    found = difference(known, Results.read(changed))
     assert found.text.startswith("first difference: slot 31, trial 0, controller: statistic ")

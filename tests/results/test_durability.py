@@ -25,9 +25,10 @@ from hypothesis import strategies as st
 from evedrop.errors import UsageError
 from evedrop.results.ending import note_end
 from evedrop.results.growing_tables import UNFINISHED, goes_on, last_round
+from evedrop.results.reading import Results
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.summary_file import unwritten
-from evedrop.results.writer import Results, ResultsWriter, load_results
+from evedrop.results.writer import ResultsWriter
 from evedrop.scenario.loading import load
 from evedrop.scenario.tables import Scenario
 from evedrop.score.scorekeeper import Ending, summary_of
@@ -139,7 +140,7 @@ def test_a_run_may_be_killed_at_any_moment(evedrop: Evedrop, what: str) -> None:
     if not last_round(live.folder).at and not (live.folder / "summary.json").exists():
         assert what in {"a folder", "streams"}
         with pytest.raises(UsageError, match=r"run the scenario again|give the results folder of a run"):
-            load_results(live.folder)
+            Results.read(live.folder)
         return
     results = live.results
     if results.summary["ended"] != "complete":
@@ -165,7 +166,7 @@ def test_a_folder_may_be_renamed_while_a_run_goes_on(evedrop: Evedrop) -> None:
     assert f"results: {other}" in done.out
     live.nothing_left()
     assert not live.folder.exists()
-    results = load_results(other)
+    results = Results.read(other)
     assert results.summary["ended"] == "complete"
     assert results.trials.num_rows == results.journal.num_rows == 4 * 600
     assert {path.name for path in other.iterdir()} == {
@@ -327,7 +328,7 @@ def test_no_rows_are_on_disk_before_the_first_figures(tmp_path: Path) -> None:
             return last_round(tmp_path).slots == 10
 
         wait_until(on_disk, "rows on disk")
-        assert load_results(tmp_path).summary["ended"] == "the run goes on, at slot 10"
+        assert Results.read(tmp_path).summary["ended"] == "the run goes on, at slot 10"
 
 
 @pytest.mark.long
@@ -370,7 +371,7 @@ def test_the_end_of_a_run_without_figures_keeps_its_rows(tmp_path: Path) -> None
         writer.slot_rows(0, receiver, sums(10), np.zeros(10))
     writer.write_rows("slot 10")
     note_end(tmp_path, scenario, "observer was ended by signal 9")
-    results = load_results(tmp_path)
+    results = Results.read(tmp_path)
     why = "observer was ended by signal 9 (the figures are as of slot 0; the tables have more)"
     assert (results.summary["ended"], results.summary["slots"]) == (why, 10)
     assert results.slots.num_rows == 10 * len(scenario.receivers)
@@ -390,7 +391,7 @@ def test_the_end_of_a_killed_run_says_which_slot_its_figures_are_of(tmp_path: Pa
         else:
             writer.write_rows(at)
     note_end(tmp_path, scenario, "observer was ended by signal 9\nits log:\n    nothing")
-    summary = load_results(tmp_path).summary
+    summary = Results.read(tmp_path).summary
     assert summary["slots"] == 30
     assert summary["ended"].splitlines() == [
         "observer was ended by signal 9 (the figures are as of slot 10; the tables have more)",

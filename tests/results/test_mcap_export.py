@@ -8,7 +8,7 @@ import pytest
 from evedrop import montecarlo, run
 from evedrop.errors import UsageError
 from evedrop.results.mcap_export import export_mcap
-from evedrop.results.reading import Results, load_results
+from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
 from tests.conftest import Evedrop
 
@@ -21,7 +21,7 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Results:
     """A live run of two trials, with events."""
     folder = tmp_path_factory.mktemp("live")
     run("restart", trials=2, slots=700, record_trials=2, out=folder, view="off")
-    return load_results(folder)
+    return Results.read(folder)
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> Results:
     """A closed loop in memory."""
     folder = tmp_path_factory.mktemp("loop")
     montecarlo("heated-room", trials=1, slots=50, out=folder)
-    return load_results(folder)
+    return Results.read(folder)
 
 
 def read_back(path: Path) -> dict[str, list[tuple[int, dict[str, Any]]]]:

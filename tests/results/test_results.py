@@ -15,7 +15,8 @@ from evedrop.cli.api import montecarlo
 from evedrop.model.packet_words import ACTIONS
 from evedrop.results import growing_tables as growing
 from evedrop.results.growing_tables import BATCH_BYTES, UNFINISHED, TableStream, Unfinished, finish
-from evedrop.results.writer import DIGESTS, JOURNAL, Results, load_results
+from evedrop.results.reading import Results
+from evedrop.results.writer import DIGESTS, JOURNAL
 from evedrop.scenario.loading import parse
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -129,4 +130,4 @@ def test_rows_that_come_at_once_are_parted(monkeypatch: pytest.MonkeyPatch, tmp_
 def test_a_summary_is_replaced_as_a_whole(results: Results) -> None:
     """A half-written summary can never be read, and no temporary file is left."""
     assert [path.name for path in results.folder.glob("summary*")] == ["summary.json"]
-    assert load_results(str(results.folder)).summary == results.summary
+    assert Results.read(str(results.folder)).summary == results.summary

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from evedrop.cli.api import montecarlo, run
-from evedrop.results.writer import Results, load_results
+from evedrop.results.reading import Results
 from evedrop.scenario.loading import load, shipped
 from tests.builders import digests_of
 from tests.examples import mostly_long
@@ -174,5 +174,5 @@ def test_simulated_errors_agree_with_theory(tmp_path: Path) -> None:
 def test_results_are_read_back_as_they_were_returned(twins: Callable[[str, str], Pair]) -> None:
     """`load_results` of the folder is what the call gave."""
     live, _ = twins("eavesdroppers", "a later trial")
-    assert load_results(live.folder).summary == live.summary
+    assert Results.read(live.folder).summary == live.summary
     assert live.summary["ended"] == "complete"

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from evedrop.cli.api import montecarlo, run
 from evedrop.model.figures.figure import ScoredSlots
 from evedrop.model.receiver import Action
-from evedrop.results.writer import Results, load_results
+from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
 from evedrop.score.expectations_held import Evidence
 from evedrop.score.summary import Judged, LinkSummary, PeerSummary
@@ -240,7 +240,7 @@ def test_the_printed_command_shows_the_failure_again(evedrop: Evedrop, command: 
         "--set", "expect.1={in_step = 'suspicious', by = 0}", "--out", "a run",
     )  # fmt: skip
     assert (done.status, done.err) == (1, "")
-    first = load_results(evedrop.folder / "a run").summary["expectations"]
+    first = Results.read(evedrop.folder / "a run").summary["expectations"]
     assert [one["held"] for one in first] == [False, False]
     assert "2 of 2 expectations FAILED" in done.out
     said = [line.strip() for line in done.out.splitlines()]

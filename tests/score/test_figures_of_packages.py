@@ -12,7 +12,7 @@ import pytest
 
 from evedrop.model.figures import FIGURES, figure, figures_of
 from evedrop.model.figures.figure import ScoredSlots
-from evedrop.results.writer import load_results
+from evedrop.results.reading import Results
 from tests.conftest import Evedrop
 from tests.packages import install
 
@@ -50,12 +50,12 @@ def test_a_figure_of_a_package_needs_nothing_here(evedrop: Evedrop) -> None:
         done = evedrop.process(*arguments, *EXPECT, "--out", name, env=environment)
         assert done.status == 1, done.err
         assert "largest |x−x̂|²" in done.out
-        summary = load_results(evedrop.folder / name).summary
+        summary = Results.read(evedrop.folder / name).summary
         found[name] = {receiver: peer["largest_error"] for receiver, peer in summary["peers"].items()}
         judged[name] = [(one["held"], one["found"]) for one in summary["expectations"]]
     assert found["live"] == found["memory"] == found["shards"]
     assert judged["live"] == judged["memory"] == judged["shards"]
-    rows = [row for row in load_results(evedrop.folder / "memory").trials.to_pylist() if row["peer"] == "smart"]
+    rows = [row for row in Results.read(evedrop.folder / "memory").trials.to_pylist() if row["peer"] == "smart"]
     errors = np.empty((20, 510))
     for row in rows:
         errors[row["slot"], row["trial"]] = row["squared_error"]
@@ -182,7 +182,7 @@ def test_a_figure_that_fails_costs_no_other(evedrop: Evedrop, case: str, how: st
     assert done.status == 3, done.err
     assert f"the figure largest_error of an installed package failed: {said}" in done.err
     assert "Traceback" not in done.err
-    summary = load_results(evedrop.folder / "run").summary
+    summary = Results.read(evedrop.folder / "run").summary
     assert summary["ended"] in done.err
     assert summary["slots"] == 30
     assert summary["peers"]["smart"]["mean_squared_error"] > 0.0

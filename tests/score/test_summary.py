@@ -14,7 +14,6 @@ from evedrop.errors import UsageError
 from evedrop.model.figures import FIGURES, figure
 from evedrop.results.reading import Results
 from evedrop.results.summary_file import summary_text, write_summary
-from evedrop.results.writer import load_results
 from evedrop.scenario.loading import load
 from evedrop.scenario.news import ConnectionOutage
 from evedrop.score.scorekeeper import Ending, summary_of
@@ -56,7 +55,7 @@ def test_a_summary_that_was_read_is_written_to_the_byte(tmp_path: Path, scenario
     assert [list(peer) for peer in results.summary["peers"].values()] == [order] * len(summary.peers)
     outages = [ConnectionOutage("smart", 3, None, 0.5), ConnectionOutage("router", 4, 9, 1.0, shard=2)]
     write_summary(tmp_path / "run", replace(summary, outages=outages))
-    again = load_results(tmp_path / "run")
+    again = Results.read(tmp_path / "run")
     assert again.typed_summary.outages == outages
     assert list(again.summary["outages"][1]) == ["process", "slot", "until", "seconds", "shard"]
     assert "shard" not in again.summary["outages"][0]

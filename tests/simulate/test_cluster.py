@@ -20,7 +20,7 @@ import pytest
 
 from evedrop.cli.api import compare, cost, learned, montecarlo, sweep
 from evedrop.errors import RunError, UsageError
-from evedrop.results.writer import load_results
+from evedrop.results.reading import Results
 from evedrop.scenario.loading import shipped
 from evedrop.simulate.cluster import Cluster
 from evedrop.simulate.montecarlo import Plan
@@ -148,7 +148,7 @@ def test_a_study_on_the_cluster_is_the_local_one(evedrop: Evedrop, scheduler: st
     assert (here.status, there.status, there.err) == (0, 0, "")
     for key in ("peers", "links", "secrecy", "surprising", "trials", "ended"):
         assert here.summary[key] == there.summary[key]
-    ours, theirs = (load_results(evedrop.folder / name) for name in ("here", "there"))
+    ours, theirs = (Results.read(evedrop.folder / name) for name in ("here", "there"))
     for table in ("slots", "trials", "digests"):
         assert getattr(ours, table).equals(getattr(theirs, table)), table
 
@@ -212,7 +212,7 @@ def test_a_test_in_memory_on_the_cluster_is_the_local_one(evedrop: Evedrop, sche
     base = ("test", "mine.toml", "--in-memory", "--trials", "600", "--out")
     here, there = evedrop(*base, "here"), evedrop(*base, "there", "--scheduler", scheduler)
     assert (here.status, there.status) == (0, 0)
-    ours, theirs = (load_results(evedrop.folder / name / "mine") for name in ("here", "there"))
+    ours, theirs = (Results.read(evedrop.folder / name / "mine") for name in ("here", "there"))
     assert ours.digests.num_rows > 0
     assert ours.digests.equals(theirs.digests)
     live = evedrop("test", "mine.toml", "--scheduler", scheduler)

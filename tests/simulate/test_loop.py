@@ -16,7 +16,7 @@ from evedrop.cli.api import run
 from evedrop.errors import UsageError
 from evedrop.model.figures.standard_error import z_of
 from evedrop.results.diff import difference
-from evedrop.results.writer import Results, load_results
+from evedrop.results.reading import Results
 from evedrop.scenario.loading import checked, load
 from evedrop.scenario.news import silent
 from evedrop.scenario.tables import Scenario
@@ -96,7 +96,7 @@ def scenario_of(**changes: Any) -> Scenario:
 def in_memory(folder: Path, plan: Plan | None = None, **changes: Any) -> Results:
     """Its results."""
     simulate(scenario_of(**changes), folder, silent, plan or Plan(workers=1))
-    return load_results(folder)
+    return Results.read(folder)
 
 
 def digests(results: Results) -> dict[str, str]:
@@ -269,7 +269,7 @@ def test_a_loop_can_be_paused_and_steered(evedrop: Evedrop) -> None:
     results = live.results
     assert results.summary["ended"] == "complete"
     simulate(load(live.folder), evedrop.folder / "memory", silent, Plan(workers=1))
-    assert digests(load_results(evedrop.folder / "memory")) == digests(results)
+    assert digests(Results.read(evedrop.folder / "memory")) == digests(results)
 
 
 def test_what_the_controller_did_differently_is_found(tmp_path: Path) -> None:
@@ -359,7 +359,7 @@ def test_a_plant_without_inputs_needs_no_controller(tmp_path: Path) -> None:
     made = tables(plant=plant)
     del made["controller"]
     simulate(checked(made, "file"), tmp_path / "run", silent, Plan(workers=1))
-    results = load_results(tmp_path / "run")
+    results = Results.read(tmp_path / "run")
     assert results.summary["controller"] is None
     assert results.inputs is None
     x = column(results.trials, "x", trial=0, peer="smart")
@@ -374,7 +374,7 @@ def test_other_modes_say_what_they_make_of_a_loop(tmp_path: Path) -> None:
     made = tables()
     del made["plant"], made["controller"]
     simulate(checked(made, "file"), tmp_path / "none", silent, Plan(Mode.COVARIANCE_ONLY, 1))
-    assert with_loop.summary["peers"] == load_results(tmp_path / "none").summary["peers"]
+    assert with_loop.summary["peers"] == Results.read(tmp_path / "none").summary["peers"]
     assert with_loop.summary["controller"] is None
 
 
@@ -394,5 +394,5 @@ def test_a_results_folder_runs_again_to_the_same_digests(tmp_path: Path) -> None
     from evedrop.scenario.loading import load
 
     simulate(load(tmp_path / "run"), tmp_path / "again", silent, Plan(workers=1))
-    assert digests(load_results(tmp_path / "again")) == digests(first)
+    assert digests(Results.read(tmp_path / "again")) == digests(first)
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["controller"]["strategy"] == "lqr"

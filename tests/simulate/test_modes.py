@@ -18,7 +18,7 @@ from evedrop.cli.api import montecarlo
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.model import streams
 from evedrop.model.theory.covariances import Outcomes, expected_traces
-from evedrop.results.writer import Results
+from evedrop.results.reading import Results
 from evedrop.scenario.link_table import LinkTable
 from evedrop.scenario.loading import checked, load
 from evedrop.scenario.stream_keys import StreamKeys

@@ -18,7 +18,7 @@ from scipy.stats import chi2
 from evedrop import preloaded
 from evedrop.cli.api import montecarlo, run
 from evedrop.errors import UsageError
-from evedrop.results.writer import Results, load_results
+from evedrop.results.reading import Results
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
 from tests.conftest import Evedrop
@@ -180,7 +180,7 @@ def test_the_printed_command_shows_the_surprising_trial_live(evedrop: Evedrop) -
         "montecarlo", "eavesdroppers", "--slots", "300", "--trials", "30", "--record-trials", "2", "--out", "a study"
     )
     assert (done.status, done.err) == (0, "")
-    study = load_results(evedrop.folder / "a study")
+    study = Results.read(evedrop.folder / "a study")
     surprising = study.summary["surprising"]
     line = next(line for line in done.out.splitlines() if "watch it live: " in line)
     words = shlex.split(line.partition("watch it live: ")[2])
@@ -188,7 +188,7 @@ def test_the_printed_command_shows_the_surprising_trial_live(evedrop: Evedrop) -
     assert words[-4:] == ["--first-trial", str(surprising["trial"]), "--trials", "1"]
     again = evedrop(*words[1:], "--pace", "0", "--view", "off", "--out", "live")
     assert (again.status in {0, 1}, again.err) == (True, "")  # 1: its error is too large for the scenario's expectation
-    live = load_results(evedrop.folder / "live")
+    live = Results.read(evedrop.folder / "live")
     assert live.summary["mode"] == "live"
     of_trial = study.digests.filter(pc.equal(study.digests["trial"], surprising["trial"])).to_pylist()
     key = lambda row: (row["peer"], row["block"])  # noqa: E731 - once

@@ -20,7 +20,7 @@ import pytest
 
 from evedrop.cli.api import montecarlo
 from evedrop.errors import Interrupted, UsageError
-from evedrop.results.writer import load_results
+from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
 from evedrop.simulate import kept_tasks
 from evedrop.simulate.kept_tasks import KeptTasks
@@ -130,7 +130,7 @@ def test_an_interrupted_study_ends_like_a_whole_one(
         interrupted_after(patched, 1)
         done = evedrop(*study, "--out", "cut/run")
     assert done.status == 130
-    assert load_results(evedrop.folder / "cut/run").summary["ended"] == "interrupted"
+    assert Results.read(evedrop.folder / "cut/run").summary["ended"] == "interrupted"
     assert len(kept_in(evedrop.folder / "cut/run")) == 1
     (command,) = (line for line in done.err.splitlines() if "go on with: " in line)
     words = shlex.split(command.partition("go on with: ")[2])
@@ -181,7 +181,7 @@ def test_only_what_is_missing_is_computed(cut: Path, evedrop: Evedrop, monkeypat
     assert start == 0
     assert simulated[0].start == stop
     assert sum(map(len, simulated)) == 4700 - stop
-    assert load_results(cut).summary["wall_seconds"] > before > 0
+    assert Results.read(cut).summary["wall_seconds"] > before > 0
 
 
 def flip(path: Path) -> None:

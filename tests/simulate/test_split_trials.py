@@ -17,7 +17,7 @@ from evedrop.cli.api import montecarlo
 from evedrop.cli.report import print_summary
 from evedrop.errors import Interrupted
 from evedrop.model.streams import OWN, Lineage
-from evedrop.results.writer import load_results
+from evedrop.results.reading import Results
 from evedrop.scenario.expected.expectations import expectations_of
 from evedrop.scenario.loading import checked, load
 from evedrop.scenario.tables import Scenario
@@ -164,7 +164,7 @@ def test_results_depend_on_the_seed_alone(tmp_path: Path) -> None:
     assert once == entry("two", Plan(workers=2, rare=True))
     assert once == entry("later", Plan(Mode.COVARIANCE_ONLY, workers=1, rare=True), first_trial=5000)
     assert once != entry("other", Plan(workers=1, rare=True), seed=4)
-    assert load_results(tmp_path / "one").typed_summary.peers["naive"].rare_estimate is not None
+    assert Results.read(tmp_path / "one").typed_summary.peers["naive"].rare_estimate is not None
 
 
 @pytest.mark.long
@@ -212,7 +212,7 @@ def test_an_interrupted_study_has_no_estimates(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(studies, "rare_estimates", stopped_early)
     with pytest.raises(Interrupted):
         montecarlo(scenario_of(), trials=20, plan=Plan(workers=1, rare=True), out=tmp_path / "it")
-    found = load_results(tmp_path / "it").summary
+    found = Results.read(tmp_path / "it").summary
     assert found["trials"] == 20
     assert "rare_estimate" not in found["peers"]["legitimate"]
 

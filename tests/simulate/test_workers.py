@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evedrop.errors import RunError
-from evedrop.results.writer import load_results
+from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
@@ -289,7 +289,7 @@ def test_what_was_merged_before_a_fault_is_kept(monkeypatch: pytest.MonkeyPatch,
     monkeypatch.setattr(sharing, "in_processes", failing)
     with pytest.raises(RunError, match="died"):
         montecarlo("eavesdroppers", trials=1100, slots=20, out=tmp_path / "run", plan=Plan(workers=2))
-    results = load_results(tmp_path / "run")
+    results = Results.read(tmp_path / "run")
     assert results.summary["ended"] == "a worker process died"
     assert set(results.slots["trials"].to_pylist()) == {1000}
     assert results.digests.num_rows == 1000 * 4

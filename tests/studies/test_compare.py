@@ -14,8 +14,7 @@ from evedrop.errors import UsageError
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.theory.closed_forms import encrypted_fraction
-from evedrop.results.comparison import Comparison
-from evedrop.results.comparison_file import read_comparison
+from evedrop.results.comparison import Comparison, read_comparison
 from evedrop.results.summary_file import plain
 from evedrop.scenario.loading import load
 from evedrop.score.verdict import SecrecyKept

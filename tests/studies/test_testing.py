@@ -17,7 +17,7 @@ import pytest
 
 from evedrop.cli import main as cli
 from evedrop.errors import RunError
-from evedrop.results.writer import load_results
+from evedrop.results.reading import Results
 from evedrop.scenario.loading import shipped
 from evedrop.studies import scenario_tests as testing
 from evedrop.studies.junit import junit_of
@@ -77,7 +77,7 @@ def test_a_folder_of_scenarios_is_tested_in_memory(evedrop: Evedrop) -> None:
     assert re.fullmatch(r"MISTAKES  +\d+\.\d s  cases/wrong.toml", lines[5])
     assert [line.split()[0] for line in lines[6:-1]] == ["slots:", "seed:", "sluts:"]
     assert re.fullmatch(r"1 passed, 1 FAILED, 1 MISTAKES, in \d+\.\d s", lines[-1])
-    assert load_results(evedrop.folder / "kept" / "holds").summary["trials"] == 3
+    assert Results.read(evedrop.folder / "kept" / "holds").summary["trials"] == 3
     assert sorted(path.name for path in (evedrop.folder / "kept").iterdir()) == ["fails", "holds"]
 
     suites = ET.parse(evedrop.folder / "reports" / "junit.xml").getroot()  # noqa: S314 - our own
@@ -92,7 +92,7 @@ def test_a_folder_of_scenarios_is_tested_in_memory(evedrop: Evedrop) -> None:
     assert float(str(suite.get("time"))) == pytest.approx(sum(times), abs=0.01)
     assert [[part.tag for part in case] for case in suite] == [["properties", "failure"], ["properties"], ["error"]]
     known = {one.get("name"): one.get("value") for one in suite[0][0]}
-    seed = str(load_results(evedrop.folder / "kept/fails").summary["seed"])
+    seed = str(Results.read(evedrop.folder / "kept/fails").summary["seed"])
     assert known == {"seed": seed, "results": "kept/fails", "report": "kept/fails/report.html"}
     assert "1 of 2 expectations FAILED" in checked(evedrop.folder / "kept/fails").texts
     assert str(suite[0][1].get("message")).startswith(failed)
@@ -294,7 +294,7 @@ def test_pytest_collects_scenarios_as_tests(evedrop: Evedrop) -> None:
     assert failed.endswith(f"see it again: evedrop montecarlo {kept} --trials 3")
     assert "results: kept/fails" in done.out
     assert "sluts: is not an entry of this table; did you mean slots?" in done.out
-    assert load_results(kept).summary["mode"] == "exact"
+    assert Results.read(kept).summary["mode"] == "exact"
     for said in ('name="evedrop_results" value="kept/holds"', 'name="evedrop_report" value="kept/holds/report.html"'):
         assert said in (evedrop.folder / "r.xml").read_text()
 
@@ -307,7 +307,7 @@ def test_pytest_runs_a_named_scenario_live(evedrop: Evedrop) -> None:
     done = pytest_in(evedrop, "holds.toml", "-q")
     assert done.status == 0, done.out
     (folder,) = (evedrop.folder / "runs").iterdir()
-    summary = load_results(folder).summary
+    summary = Results.read(folder).summary
     assert (summary["mode"], summary["trials"]) == ("live", 2)
     assert folder.stat().st_mtime >= began - 1
     done = pytest_in(evedrop, "--collect-only", "-q")

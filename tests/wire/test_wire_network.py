@@ -17,7 +17,7 @@ from evedrop.cli.main import main
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.model.links.link import Fate
 from evedrop.results.diff import difference
-from evedrop.results.writer import Results
+from evedrop.results.reading import Results
 from evedrop.scenario.loading import checked, load
 from evedrop.scenario.tables import Scenario
 from evedrop.simulate.montecarlo import Plan

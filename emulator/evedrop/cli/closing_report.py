@@ -9,7 +9,7 @@ from pathlib import Path
 
 from evedrop.cli.report import print_summary
 from evedrop.errors import UsageError
-from evedrop.results.writer import load_results
+from evedrop.results.reading import Results
 from evedrop.scenario.loading.recorded import recorded
 from evedrop.system.output import print_json, say
 
@@ -19,7 +19,7 @@ def print_results(folder: Path, as_json: bool = False) -> None:
 
     Raises UsageError if it is not a results folder.
     """
-    results = load_results(folder)
+    results = Results.read(folder)
     if as_json:
         print_json(results.summary)
         return

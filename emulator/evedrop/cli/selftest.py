@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from evedrop.model.kernels.choice import KERNELS
-from evedrop.results.writer import load_results
+from evedrop.results.reading import Results
 from evedrop.scenario.news import silent
 from evedrop.scenario.tables import Scenario
 from evedrop.simulate.montecarlo import simulate
@@ -65,7 +65,7 @@ def selftest() -> Check:
     """Compute the golden digests on this machine."""
     with tempfile.TemporaryDirectory(prefix="evedrop-") as folder:
         simulate(Scenario.model_validate(SCENARIO), Path(folder) / "run", silent)
-        peers = load_results(Path(folder) / "run").typed_summary.peers
+        peers = Results.read(Path(folder) / "run").typed_summary.peers
     packages = (
         "evedrop",
         "numpy",

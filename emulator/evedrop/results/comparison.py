@@ -1,4 +1,4 @@
-"""The result of a comparison: for every scheme and adversary the errors, theory, and the verdict.
+"""The result of a comparison, and its file: for every scheme and adversary the errors, theory, and the verdict.
 
 Source: docs/compare.md.
 """
@@ -10,15 +10,21 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+from pydantic import TypeAdapter
 
+from evedrop.errors import UsageError
 from evedrop.results.by_name import ByName
 from evedrop.results.writer import plain
-from evedrop.score.summary import RareEvents
+from evedrop.score.summary import RareEvents, SecrecySummary
 from evedrop.score.verdict import Secrecy, SecrecyKept, Verdict
+from evedrop.system.files import Unreadable, text_of
 
+COMPARISON = "compare.json"
+_MOST_BYTES = 2**26
 _NOT_IN_NAMES, _LONGEST_NAME = re.compile(r"[^a-z0-9_-]"), 32  # of receivers
 _ALIKE = 1e-6  # relative difference of two errors of theory that count as equal: allows for rounding only
 
@@ -335,3 +341,69 @@ def _rows(one: SchemeResult) -> Iterator[dict[str, Any]]:
             "secret_bits_per_slot": one.needs.secret_bits_per_slot,
             "acknowledgements": one.needs.acknowledgements,
         }
+
+
+def read_comparison(folder: Path) -> Comparison:
+    """The comparison in a results folder. Its verdicts lack `windows`, which only sentences have. Raises UsageError."""
+    path = folder / COMPARISON
+    try:
+        return _comparison(json.loads(text_of(path, _MOST_BYTES)))
+    except (OSError, Unreadable, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        why = " ".join(str(error).split()) if isinstance(error, ValueError) else repr(error)
+        raise UsageError(f"{path} is not a comparison of this version ({why}); run it again") from error
+
+
+def _comparison(found: Mapping[str, Any]) -> Comparison:
+    return Comparison(
+        found["scenario"],
+        int(found["slots"]),
+        int(found["trials"]),
+        int(found["seed"]),
+        int(found["first_trial"]),
+        tuple(found["adversaries"]),
+        {
+            name: _scheme(name, one, (int(found["slots"]), int(found["trials"])))
+            for name, one in found["schemes"].items()
+        },
+        {name: tuple(why) for name, why in found["left_out"].items()},
+    )
+
+
+def _scheme(name: str, found: Mapping[str, Any], size: tuple[int, int]) -> SchemeResult:
+    needs = {key: value for key, value in found["needs"].items() if key != "packet_bits"}
+    return SchemeResult(
+        name,
+        found["parameters"],
+        TypeAdapter(Needs).validate_python(needs),
+        _simulated_error(found["legitimate"]),
+        {adversary: _cell(name, adversary, one, size) for adversary, one in found["against"].items()},
+        None if found["leak"] is None else TypeAdapter(PacketLeak).validate_python(found["leak"]),
+    )
+
+
+def _cell(scheme: str, adversary: str, found: Mapping[str, Any], size: tuple[int, int]) -> Cell:
+    if "verdict" not in found:
+        return Cell(Match(scheme, adversary, not_defined=found["not_defined"]))
+    match = Match(scheme, adversary, found["reads_as"], found["attack"], betrayed=bool(found["betrayed"]))
+    said = TypeAdapter(SecrecySummary).validate_python(found["secrecy"])
+    first = found["secrecy"]["ratio_from"]  # results of an older version have none, and are refused
+    secrecy = Secrecy(
+        match.receiver,
+        Verdict(said.relative),
+        Verdict(said.perfect),
+        said.relative_by_theory,
+        said.relative_from,
+        "",
+        said.perfect_by_theory,
+        math.inf if said.ratio is None else said.ratio,
+        size[1],
+        said.judged_by,
+        ratio_error=said.ratio_standard_error,
+        leak=said.leak,
+        ratio_slots=None if first is None else (first, size[0] - 1),
+    )
+    return Cell(match, _simulated_error(found["legitimate"]), _simulated_error(found["eavesdropper"]), secrecy)
+
+
+def _simulated_error(found: Mapping[str, Any]) -> SimulatedError:
+    return TypeAdapter(SimulatedError).validate_python(found)

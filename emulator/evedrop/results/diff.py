@@ -11,7 +11,7 @@ import pyarrow.compute as pc
 
 from evedrop.model.digest import BLOCK_SLOTS
 from evedrop.names import CONTROLLER
-from evedrop.results.writer import Results
+from evedrop.results.reading import Results
 
 _COMPARED = ("sent", "action", "x", "x_hat", "P")
 _INPUTS = ("u", "d", "failed", "watermark", "statistic")

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from evedrop.errors import UsageError
 from evedrop.results.growing_tables import UNFINISHED, finish, is_unfinished, last_round
-from evedrop.results.reading import age_of_figures
-from evedrop.results.writer import ResultsWriter, load_results, write_summary
+from evedrop.results.reading import Results, age_of_figures
+from evedrop.results.writer import ResultsWriter, write_summary
 from evedrop.scenario.tables import Scenario
 from evedrop.score.scorekeeper import Ending, summary_of
 from evedrop.score.summary import Summary
@@ -31,7 +31,7 @@ def note_end(folder: Path, scenario: Scenario, how: str) -> Summary:
     rows = last_round(folder)
     how = noted(how, age_of_figures(folder))
     try:
-        summary = replace(load_results(folder).typed_summary, ended=how)
+        summary = replace(Results.read(folder).typed_summary, ended=how)
     except UsageError:  # there are no figures
         totals = Totals.nothing(scenario, scenario.trials)
         summary = summary_of(scenario, totals, dict.fromkeys(scenario.digested), Ending(0.0, how))

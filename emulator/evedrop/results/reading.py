@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -40,6 +40,24 @@ class Results:
 
     folder: Path
     summary: Mapping[str, Any]
+
+    @classmethod
+    def read(cls, folder: str | Path) -> Self:
+        """Read a results folder, also one of a run that is in progress or was killed: `ended` in its summary says so.
+
+        Raises UsageError naming the missing or broken file if it is not a results folder.
+        """
+        path_argument("folder", folder, "the results folder of a run")
+        place = Path(folder)
+        path = place / "summary.json"
+        if not path.exists() and (place / "shards").is_dir():
+            raise UsageError(
+                f"{folder} is of a run in shards that is in progress or was killed; each of its shards is a results folder "
+                f"by itself, such as {place / 'shards' / '1'}"
+            )
+        if not path.exists() and is_unfinished(place):
+            return cls(place, _cut_short(place))
+        return cls(place, _read_summary(path))
 
     @property
     def typed_summary(self) -> Summary:
@@ -201,24 +219,6 @@ def results_of_this_version(folder: Path) -> Iterator[None]:
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         why = f"{type(error).__name__}: {_one_line(error)}"
         raise UsageError(f"{folder} has results that this version does not write ({why}); run it again") from error
-
-
-def load_results(folder: str | Path) -> Results:
-    """Read a results folder, also one of a run that is in progress or was killed: `ended` in its summary says so.
-
-    Raises UsageError naming the missing or broken file if it is not a results folder.
-    """
-    path_argument("folder", folder, "the results folder of a run")
-    place = Path(folder)
-    path = place / "summary.json"
-    if not path.exists() and (place / "shards").is_dir():
-        raise UsageError(
-            f"{folder} is of a run in shards that is in progress or was killed; each of its shards is a results folder by "
-            f"itself, such as {place / 'shards' / '1'}"
-        )
-    if not path.exists() and is_unfinished(place):
-        return Results(place, _cut_short(place))
-    return Results(place, _read_summary(path))
 
 
 def _read_summary(path: Path) -> dict[str, Any]:

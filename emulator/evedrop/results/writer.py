@@ -27,7 +27,6 @@ from evedrop.model.receiver import Action, Codes, Flags
 from evedrop.names import CONTROLLER
 from evedrop.results.folder import HeldFolder
 from evedrop.results.growing_tables import BATCH_BYTES, UNFINISHED, TableStream, Unfinished, finish, write_figures
-from evedrop.results.reading import Results, load_results
 from evedrop.results.summary_file import plain, summary_text, write_summary
 from evedrop.results.tables import (
     DIGESTS,
@@ -54,8 +53,7 @@ _ROUND_SHARE = 8  # at most this fraction (one in 8) of the bytes on disk is hel
 _FIGURES_SHARE = 50  # after figures took some time, none are computed for 50 times as long
 
 __all__ = [
-    "DIGESTS", "JOURNAL", "NULLABLE", "SLOTS", "Results", "ResultsWriter", "load_results", "plain",
-    "seen_actions", "write_summary",
+    "DIGESTS", "JOURNAL", "NULLABLE", "SLOTS", "ResultsWriter", "plain", "seen_actions", "write_summary",
 ]  # fmt: skip
 
 

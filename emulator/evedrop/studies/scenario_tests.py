@@ -17,8 +17,8 @@ from typing import Any
 from evedrop.errors import Interrupted, RunError, ScenarioError, UsageError
 from evedrop.live.launch.launcher import launch
 from evedrop.results.folder import claimed, default_folder
+from evedrop.results.reading import Results
 from evedrop.results.resolved_scenario import resolved
-from evedrop.results.writer import load_results
 from evedrop.scenario.discovery import scenarios_in
 from evedrop.scenario.loading import load, shipped
 from evedrop.scenario.news import silent
@@ -143,7 +143,7 @@ def carry_out(scenario: str, manner: Manner) -> Finding:
         kept = {"seed": made.seed, "folder": folder, "report": try_report(folder) if has_results(folder) else None}
         return ended(Outcome.BROKEN, str(error).splitlines(), **kept)
     kept = {"seed": made.seed, "folder": folder, "report": try_report(folder)}
-    reasons = list(_reasons(load_results(folder).typed_summary.expectations))
+    reasons = list(_reasons(Results.read(folder).typed_summary.expectations))
     return ended(Outcome.FAILED if reasons else Outcome.PASSED, reasons, **kept)
 
 

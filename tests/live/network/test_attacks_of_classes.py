@@ -19,7 +19,7 @@ from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.eavesdroppers.stand_in import StandIns
 from evedrop.model.process import Process
 from evedrop.model.streams import Batch
-from evedrop.results.writer import load_results
+from evedrop.results.reading import Results
 from tests.conftest import Evedrop, Live, wait_until
 
 SEED = 7318529640182736451
@@ -162,7 +162,7 @@ def test_an_eavesdroppers_class_runs_in_its_own_process_alone(evedrop: Evedrop) 
             assert set(one["environ"]) <= {"LC_CTYPE", "LD_LIBRARY_PATH"}, one
             assert not any(str(evedrop.folder) in word for word in one["words"]), one
     assert by_pid[next(one["pid"] for one in reports if one["when"] == "made" and one["pid"] in by_pid)] == "eve"
-    summary = load_results(live.folder).summary
+    summary = Results.read(live.folder).summary
     assert summary["peers"]["eve"]["expected_trace_covariance"] > 0.0, "theory knows the class all the same"
 
 

@@ -27,7 +27,7 @@ from evedrop.live.protocol.envelope import enclosed
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.model.streams import stream_key
 from evedrop.names import OBSERVER
-from evedrop.results.writer import load_results
+from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.scenario.tables import Scenario
@@ -256,7 +256,7 @@ def test_without_credentials_there_is_no_session(evidence: Evidence) -> None:
 def test_the_attack_left_no_trace_in_the_run(evidence: Evidence, tmp_path: Path) -> None:
     """The run went on until its user ended it, and everything recorded is what the trials give in memory, to the bit."""
     assert evidence.status == 130, evidence.output
-    results = load_results(evidence.folder)
+    results = Results.read(evidence.folder)
     assert results.summary["ended"] == "interrupted"
     assert {link["unexplained"] for link in results.summary["links"].values()} == {0}
     rows = results.trials.to_pylist()

@@ -9,7 +9,7 @@ import pytest
 
 from evedrop import extend
 from evedrop.errors import ScenarioError
-from evedrop.results.writer import load_results
+from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
 from evedrop.scenario.loading.file import with_event
 from tests.builders import digests_of
@@ -54,7 +54,7 @@ def test_the_tutorial_works_as_it_is_typed(tutorial: Evedrop) -> None:
     assert "is not the one" not in (again := tutorial("montecarlo", "live", "--trials", "20", "--out", "again")).err
     assert again.status == 0
     assert digests_of(tutorial.folder / "again") == digests_of(tutorial.folder / "live")
-    peers = load_results(tutorial.folder / "live").summary["peers"]
+    peers = Results.read(tutorial.folder / "live").summary["peers"]
     assert peers["tracker"]["expected_trace_covariance"] is None
     assert peers["legitimate"]["expected_trace_covariance"] == pytest.approx(0.00059, rel=0.02)
 

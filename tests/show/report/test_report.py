@@ -30,7 +30,7 @@ from PIL import Image
 
 from evedrop import montecarlo
 from evedrop.errors import UsageError
-from evedrop.results.writer import load_results
+from evedrop.results.reading import Results
 from evedrop.score.track import LongestSpans, LostSpan, Track, lost_spans, track_of
 from evedrop.show.report import closing
 from evedrop.show.report.chart import Curve, LogChart
@@ -67,7 +67,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_page_says_what_the_terminal_says_and_does_nothing_else(study: Path) -> None:
     """Outcome and verdicts first, every cell of the table, links, spans, the command that repeats it; the title is only text."""
-    page, summary = checked(study), load_results(study).typed_summary
+    page, summary = checked(study), Results.read(study).typed_summary
     said = "".join(page.texts)
     assert page.headings == [
         HOSTILE,
@@ -136,13 +136,13 @@ def test_a_page_has_cautions_events_and_outages_and_does_not_depend_on_the_order
         pq.write_table(table.take(np.random.default_rng(0).permutation(table.num_rows)), tmp_path / name)
     write_report(tmp_path)
     page, before = checked(tmp_path), checked(study)
-    doubts = list(closing.doubts(load_results(tmp_path).typed_summary))
+    doubts = list(closing.doubts(Results.read(tmp_path).typed_summary))
     assert any("smart: 50 % of its expected error" in line for line in doubts)
     assert set(doubts) <= set(page.texts)
     assert {"1,234", "the link of smart is cut", "smart cut off from the network, the run did not continue"} <= set(
         page.texts
     )
-    (failed,) = (one for one in load_results(study).typed_summary.expectations if not one.held)
+    (failed,) = (one for one in Results.read(study).typed_summary.expectations if not one.held)
     assert before.texts[before.texts.index(failed.sentence) + 1] == failed.replay
     for name in ("d", "src"):  # the curves and the lanes
         assert page.values(name) == before.values(name)

@@ -4,7 +4,7 @@ import numpy as np
 
 from evedrop import montecarlo
 from evedrop.model.process import Floats
-from evedrop.results.reading import load_results
+from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
 from evedrop.show.view.telling_slot import most_telling, telling_slot
 
@@ -63,9 +63,9 @@ def test_the_first_recorded_trial_decides(tmp_path: Path) -> None:
     found = []
     for trials in (1, 3):
         montecarlo("vehicle", slots=400, record_trials=trials, trials=trials, out=tmp_path / str(trials))
-        found.append(telling_slot(load_results(tmp_path / str(trials))))
+        found.append(telling_slot(Results.read(tmp_path / str(trials))))
     assert found[0] == found[1]
-    results = load_results(tmp_path / "3")
+    results = Results.read(tmp_path / "3")
     rows = [row for row in results.trials.to_pylist() if row["trial"] == 0]
     errors: dict[str, list[float]] = {}
     traces: dict[str, list[float]] = {}
@@ -80,4 +80,4 @@ def test_the_first_recorded_trial_decides(tmp_path: Path) -> None:
 def test_a_closed_loop_is_shown_to_its_end(tmp_path: Path) -> None:
     """Its panels show the whole run, up to the slot; so there is no slot to choose."""
     montecarlo("heated-room", trials=1, out=tmp_path / "run")
-    assert telling_slot(load_results(tmp_path / "run")) is None
+    assert telling_slot(Results.read(tmp_path / "run")) is None

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from evedrop.cli.api import montecarlo
-from evedrop.results.writer import Results
+from evedrop.results.reading import Results
 from evedrop.scenario.loading import checked, load
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode

@@ -17,7 +17,6 @@ from evedrop.model.figures.text import figure_text
 from evedrop.results.by_name import ByName
 from evedrop.results.comparison import Comparison
 from evedrop.results.reading import Results
-from evedrop.results.reading import load_results as read_results
 from evedrop.score.summary import Judged, LinkSummary, PeerSummary, SecrecySummary, Summary
 from evedrop.show.report import closing
 from evedrop.show.report.comparison import pairs_table, schemes_table
@@ -78,12 +77,6 @@ class RunResults(Results, ReportedResults):
 
     Results in a temporary folder are removed with this object, or when the program ends.
     """
-
-    @classmethod
-    def read(cls, folder: str | Path) -> Self:
-        """Read a results folder. Raises UsageError if it is not one."""
-        found = read_results(folder)
-        return cls(found.folder, found.summary)
 
     @cached_property
     def _typed(self) -> Summary:

@@ -11,9 +11,9 @@ from evedrop.cli.command import Command
 def diff(options: argparse.Namespace) -> int:
     """Compare two runs."""
     from evedrop.results.diff import difference
-    from evedrop.results.writer import load_results
+    from evedrop.results.reading import Results
 
-    runs = [load_results(run) for run in options.runs]
+    runs = [Results.read(run) for run in options.runs]
     found = difference(*runs)
     print(found.text)
     for remark in filter(None, (run.remark for run in runs)):

@@ -16,13 +16,13 @@ _LONGEST = 3600.0  # seconds per slot, as for pace
 def export(options: argparse.Namespace) -> int:
     """Write the results of a run as an MCAP file."""
     from evedrop.results.mcap_export import export_mcap
+    from evedrop.results.reading import Results
     from evedrop.results.wire_folder import is_wire
-    from evedrop.results.writer import load_results
     from evedrop.system.signals import raise_on_signals
 
     if is_wire(options.run):
         raise UsageError(f"{options.run} is the folder of a wire; give the results folder of a run")
-    results = load_results(options.run)
+    results = Results.read(options.run)
     with raise_on_signals():
         counts = export_mcap(results, options.file, options.period)
     if results.remark is not None:

@@ -43,12 +43,12 @@ def view(options: argparse.Namespace) -> int:
             print_results(options.run)
         print_report_line(options.run)
         return 0
-    from evedrop.results.writer import load_results
+    from evedrop.results.reading import Results
     from evedrop.show.view.viewer import WebAddress, open_run
     from evedrop.system.signals import raise_on_signals
 
     web_address = None if options.serve is None else WebAddress.of(options.serve)
-    results = load_results(options.run) if not (options.run / "summary.json").is_file() else None
+    results = Results.read(options.run) if not (options.run / "summary.json").is_file() else None
     if results is not None:
         print(f"evedrop: {results.remark}", file=sys.stderr)
     with raise_on_signals(), tempfile.TemporaryDirectory(prefix="evedrop-view-") as temporary:
@@ -93,9 +93,9 @@ def _slots_of(options: argparse.Namespace) -> Sequence[int]:
     if options.times is not None:
         raise UsageError("--times is for wires; a run has slots, so give --slots")
     if options.slots is None:
-        from evedrop.results.writer import load_results
+        from evedrop.results.reading import Results
 
-        last = int(load_results(options.run).summary["slots"]) - 1
+        last = int(Results.read(options.run).summary["slots"]) - 1
         slot = _chosen_slot(options.run)
         middle = last if slot is None else slot
         return range(max(0, middle - _BEFORE), min(last, middle + _AFTER) + 1)
@@ -143,10 +143,10 @@ def _film(recording: Path, options: argparse.Namespace, moments: Sequence[float]
 
 def _chosen_slot(run: Path) -> int | None:
     """Choose the most telling slot, and print it; None for the last slot."""
-    from evedrop.results.writer import load_results
+    from evedrop.results.reading import Results
     from evedrop.show.view.telling_slot import telling_slot
 
-    slot = telling_slot(load_results(run))
+    slot = telling_slot(Results.read(run))
     if slot is not None:
         print(f"chose slot {slot}, the most telling one")
     return slot

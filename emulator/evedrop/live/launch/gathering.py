@@ -30,10 +30,10 @@ from evedrop.names import LEGITIMATE
 from evedrop.results.ending import noted
 from evedrop.results.folder import make_private
 from evedrop.results.growing_tables import parquet_or_stream
-from evedrop.results.reading import as_of
+from evedrop.results.reading import Results, as_of
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.shard_score import load_score
-from evedrop.results.writer import DIGESTS, ResultsWriter, load_results, write_summary
+from evedrop.results.writer import DIGESTS, ResultsWriter, write_summary
 from evedrop.scenario.news import ConnectionOutage, RunEvent
 from evedrop.scenario.tables import Scenario
 from evedrop.score.expectations_held import replay_of
@@ -148,7 +148,7 @@ def _summaries(shards: Sequence[Shard]) -> dict[int, Summary]:
     found = {}
     for shard in shards:
         with suppress(UsageError):
-            found[shard.number] = load_results(shard.folder).typed_summary
+            found[shard.number] = Results.read(shard.folder).typed_summary
     return found
 
 

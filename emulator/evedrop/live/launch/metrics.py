@@ -21,7 +21,7 @@ from typing import Any, final
 
 from evedrop.errors import UsageError
 from evedrop.model.figures import estimated_figures
-from evedrop.results.reading import load_results
+from evedrop.results.reading import Results
 from evedrop.scenario.application import APPLICATIONS
 from evedrop.scenario.news import ConnectionOutage, FolderMoved, Held, News, RunProgress, Started, Tell
 from evedrop.scenario.tables import Scenario
@@ -161,7 +161,7 @@ class RunMetrics:
 def _summary(folder: Path) -> Mapping[str, Any]:
     """The figures that a run has on disk; empty if there are none yet."""
     try:
-        return load_results(folder).summary
+        return Results.read(folder).summary
     except UsageError:
         return {}
 

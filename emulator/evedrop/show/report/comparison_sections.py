@@ -10,8 +10,7 @@ from typing import final
 from xml.etree import ElementTree as ET
 
 from evedrop.model.figures.text import estimate
-from evedrop.results.comparison import Cell, Comparison
-from evedrop.results.comparison_file import read_comparison
+from evedrop.results.comparison import Cell, Comparison, read_comparison
 from evedrop.score.verdict import SecrecyKept
 from evedrop.show.report.comparison import comparison_lines, pairs_table, schemes_table, verdict
 from evedrop.show.report.markup import Node, element, paragraphs

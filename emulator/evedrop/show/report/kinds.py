@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from evedrop.results.comparison_file import COMPARISON
+from evedrop.results.comparison import COMPARISON
 from evedrop.results.wire_folder import WIRE_FILE
 from evedrop.show.report.closing import amount, outcome
 from evedrop.show.report.comparison import comparison_heading

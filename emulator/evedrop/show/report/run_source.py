@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from evedrop.errors import UsageError
 from evedrop.model.packet_words import NOTHING, SILENT
 from evedrop.model.process import Floats
-from evedrop.results.reading import Results, load_results
+from evedrop.results.reading import Results
 from evedrop.scenario.loading.recorded import recorded_noise
 from evedrop.score.summary import Summary
 from evedrop.score.track import LongestSpans, Track, track_of
@@ -93,7 +93,7 @@ class RunSource:
     @classmethod
     def read(cls, folder: Path) -> RunSource:
         """Read a folder. Raises UsageError if it is not a results folder of this version."""
-        results = load_results(folder)
+        results = Results.read(folder)
         try:
             text = text_of(folder / "scenario.toml", _MOST_BYTES)
         except (OSError, Unreadable):

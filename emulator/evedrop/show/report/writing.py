@@ -9,7 +9,7 @@ from pathlib import Path
 
 from evedrop.errors import UsageError
 from evedrop.results.folder import replace_private
-from evedrop.results.reading import load_results, results_of_this_version
+from evedrop.results.reading import Results, results_of_this_version
 from evedrop.show.report.kinds import page_of
 from evedrop.show.report.page import Page
 from evedrop.system.output import warn
@@ -36,7 +36,7 @@ def write_page(folder: Path, page: Page) -> Path:
 def has_results(folder: Path) -> bool:
     """Whether a run left anything in its folder that a report can show."""
     try:
-        load_results(folder)
+        Results.read(folder)
     except UsageError:
         return False
     return True

@@ -16,7 +16,7 @@ from evedrop.model.integrity.monitor import MonitoredSlots
 from evedrop.model.packet_words import ACTION_OF, INNOVATION, NOTHING
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags
-from evedrop.results.writer import Results, load_results
+from evedrop.results.reading import Results
 from evedrop.scenario.loading.recorded import recorded
 from evedrop.show.view.scene import PeerSlots, SceneSlots
 from evedrop.show.view.scored_slots import open_recording, showing_of
@@ -29,7 +29,7 @@ def replay(folder: Path, path: Path | None = None) -> Path:
 
     Raises UsageError if the folder's tables cannot be read, or hold no recorded trial.
     """
-    results = load_results(folder)
+    results = Results.read(folder)
     looked_at = recorded(folder)
     scenario = looked_at.scenario
     path = folder / "recording.rrd" if path is None else path
