@@ -18,11 +18,12 @@ import pyarrow as pa
 import pytest
 
 from evedrop.errors import UsageError
+from evedrop.model.slot.link import NEVER
 from evedrop.wire import journal as journal_module
 from evedrop.wire.crossing import AGAIN, HELD, RECORD, UNLINKED, Crossing, Kind
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.journal_part import STORED, JournalPart, Records, records_in
-from evedrop.wire.journal_reader import journal_tables, part_names
+from evedrop.wire.journal_part import STORED, JournalPart, Records, Words, records_in, records_of, table_of
+from evedrop.wire.journal_reader import journal_tables, part_names, unfinished_table
 from evedrop.wire.lanes import LinkState
 from tests.conftest import LIMIT, wait_until
 from tests.examples import mostly_long
@@ -434,3 +435,51 @@ def test_on_a_full_disk_the_wire_goes_on(then: str, tmp_path: Path) -> None:
     assert "No space left on device" in incomplete
     assert all("its records stay in" in line for line in last)
     assert len(last) == (then == "full")
+
+
+def records_file(folder: Path, **changes: Any) -> Path:
+    """A file of two records of the first start that are not yet in Parquet; changes: columns of the second."""
+    records = np.zeros(2, RECORD)
+    records["time"], records["n"], records["fate"] = [1000.0, 1001.0], [0, 1], STORED
+    for name, value in changes.items():
+        records[name][1] = value
+    path = folder / "journal" / "unfinished" / "001-0001.rows"
+    path.parent.mkdir(parents=True)
+    records.tofile(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"fate": 10 + STORED}, {"kind": max(Kind) + 1}, {"n": NEVER}, {"link": 1}, {"time": np.nan}, {"time": -np.inf},
+        {"delay": np.nan}, {"delay": 1e15},
+    ],
+)  # fmt: skip
+def test_a_record_that_no_wire_writes_is_named(changes: dict[str, Any], tmp_path: Path) -> None:
+    """With its fate, kind, number, link, time or delay out of range; the same record is read where it is within it."""
+    right = {"n": NEVER - 1, "link": UNLINKED, "kind": Kind.REPLY | AGAIN, "fate": Crossing.UNLINKED + STORED}
+    assert unfinished_table(records_file(tmp_path / "right", **right), {1: ["scan"]}, killed=False).num_rows == 2
+    path = records_file(tmp_path / "wrong", **changes)
+    with pytest.raises(UsageError, match="record 1 is not one of this wire"):
+        unfinished_table(path, {1: ["scan"]}, killed=False)
+
+
+def test_a_table_of_records_gives_them_back() -> None:
+    """Every kind and fate, and what is null; but not their senders."""
+    fates, kinds = [*Crossing], [*Kind, *(kind | AGAIN for kind in Kind)]
+    records = np.zeros(len(fates) * len(kinds), RECORD)
+    records["fate"], records["kind"] = np.repeat(fates, len(kinds)), np.tile(kinds, len(fates))
+    at = np.arange(len(records))
+    records["time"], records["delay"], records["size"] = 1000.0 + at, at / 8.0, at * 2**20
+    records["n"], records["sequence"] = at - 1, 2 * at - 1
+    records["link"], records["key"] = np.where(at % 3 == 2, UNLINKED, at % 3), at % 4
+    words = Words(["scan", "command"], {1: "scan/1", 2: "scan/2", 3: "stop"}, {})
+    table = table_of(records, words)
+    found = records_of(table, {"scan": 0, "command": 1}, {"scan/1": 1, "scan/2": 2, "stop": 3})
+    for name in RECORD.names or ():
+        assert np.array_equal(found[name], records[name]), name
+    assert table["fate"].to_pylist() == [
+        "delivered" if fate is Crossing.DELIVERED else "lost" if fate.emulated else "dropped"
+        for fate in map(Crossing, records["fate"])
+    ]

@@ -105,13 +105,16 @@ def test_quantiles_of_delays_are_right_within_three_per_cent(share: float) -> No
 def test_a_fate_may_change_afterwards() -> None:
     """The message counts for its new fate, whether its step is open or not."""
     rows = traffic(robot_plan(), 1.0, {"scan": 100.0})
-    row = rows[rows["fate"] == Crossing.DELIVERED][:1]
+    row = rows[(rows["fate"] == Crossing.DELIVERED) & (rows["time"] > START + 2.5 * STEP)][:1]
     for closed in (False, True):
         counter = StepCounter(3, STEP, START)
         steps = [*counter.add(rows)]
         steps += [*counter.close(START + 0.5)] if closed else []
         counter.amend(row, Crossing.UNDERWAY)
         steps += [*counter.finish()]
-        total = np.concatenate([one.counts for one in steps]).sum((0, 1))
+        counts = np.concatenate([one.counts for one in steps])
+        total, of_new = counts.sum((0, 1)), counts[:, 0, OUTCOMES.index(Crossing.UNDERWAY)]
+        own = int((row["time"][0] - START) / STEP)
+        assert np.flatnonzero(of_new).tolist() == [5 if closed else own]
         assert total[OUTCOMES.index(Crossing.UNDERWAY)] == 1
         assert total[DELIVERED] == int(np.sum(rows["fate"] == Crossing.DELIVERED)) - 1

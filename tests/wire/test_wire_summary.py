@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import time
 import tomllib
@@ -144,6 +145,25 @@ def test_gaps_of_a_wire_have_first_fates_and_those_of_its_journal_the_last_ones(
 def journal_time(n: int) -> float:
     """When message n is heard, in seconds since 1970."""
     return time.time() + n
+
+
+def test_a_link_on_many_of_whose_messages_no_model_decides_is_judged_as_a_sample(tmp_path: Path) -> None:
+    """The numbers of the others are too scattered to be kept: the model's rate, with bounds that are wide enough for a sample."""
+    plan, messages, quality = wire_plan(link={"loss": {"model": "bernoulli", "quality": 0.7}}), 12_000, 0.7
+    with WireJournal(tmp_path, plan) as journal:
+        keeper = WireScorekeeper(plan, journal)
+        fates, key = KeyFates(plan.links[0], "link/1", "put", 7), journal.key_code("link/1")
+        for n in range(messages):
+            fate = fates.next()[0]
+            fate = Crossing.CUT if n % 4 else fate
+            journal.record(n / 10, n, -1, 0.0, key, 0, 10, 0, Kind.PUT, fate)
+    link, tried = keeper.links()["link"], messages // 4
+    assert link.expected_rate == pytest.approx(quality)
+    assert link.within_bounds is True
+    assert link.bounds is not None
+    # Of all messages the models let a binomial number through, and of those tried it is a sample: (1 + 1/4) times its variance.
+    deviation = math.sqrt(1.25 * quality * (1.0 - quality) / tried)
+    assert link.bounds[1] - link.bounds[0] == pytest.approx(2 * 2.576 * deviation, rel=0.03)
 
 
 def test_what_no_model_decides_is_named_apart(tmp_path: Path) -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evedrop.wire.crossing import RECORD, Crossing
+from evedrop.wire.journal_part import Records
 from evedrop.wire.tallies import LinkTally, StreamTally
 from tests.examples import examples
 
@@ -25,24 +28,47 @@ def by_hand(rows: list[tuple[float, bool]]) -> tuple[int, float]:
     return longest, silence
 
 
+def check_stream(rows: list[tuple[int, int]], records: Records, sizes: list[int]) -> None:
+    """Check a tally against a loop over the messages, of (pause, fate); blocks of these sizes in turn, 0 for one on its own."""
+    stream, first, turn = StreamTally(), 0, 0
+    while first < len(rows):
+        size = sizes[turn % len(sizes)]
+        if size:
+            stream.add(records[first : first + size], True)
+        else:
+            stream.add_one(*(records[name][first].item() for name in ("time", "n", "fate")), True)
+        first, turn = first + max(size, 1), turn + 1
+    pairs = [(float(one["time"]), one["fate"] == 0) for one in records]
+    assert (stream.longest, stream.silence) == by_hand(pairs)
+    decided = [n for n, (_, fate) in enumerate(rows) if fate in {0, 1}]
+    assert [n for start, stop in stream.ranges for n in range(start, stop)] == decided
+    assert all(stop < start for (_, stop), (start, _) in pairwise(stream.ranges))
+    assert (stream.tried, stream.passed) == (len(decided), sum(fate == 0 for _, fate in rows))
+
+
+@pytest.mark.parametrize("sizes", [[0], [5], [0, 0, 3], [1, 0, 7]])
+def test_messages_that_are_added_one_by_one_count_as_those_of_a_block(sizes: list[int]) -> None:
+    """A stream may have both, as many messages of its key come at a time."""
+    rng = np.random.default_rng(28)
+    for _ in range(5):
+        rows = [(int(rng.integers(1, 10)), int(rng.choice([0, 0, 1, 4, 19]))) for _ in range(80)]
+        records = np.zeros(len(rows), RECORD)
+        records["time"], records["fate"] = np.cumsum([pause for pause, _ in rows]), [fate for _, fate in rows]
+        records["n"] = np.arange(len(rows))
+        check_stream(rows, records, sizes)
+
+
 @settings(max_examples=examples(60), deadline=None)
 @given(
     rows=st.lists(st.tuples(st.integers(1, 9), st.sampled_from([0, 0, 1, 4, 19])), min_size=1, max_size=60),
     size=st.integers(1, 6),
 )
 def test_gaps_and_numbers_do_not_depend_on_the_blocks(rows: list[tuple[int, int]], size: int) -> None:
-    """The longest gap, and the numbers on which the models decided, against a loop over the messages."""
+    """The longest gap, and the numbers on which the models decided, against a loop over the messages; also one by one."""
     records = np.zeros(len(rows), RECORD)
     records["time"], records["fate"] = np.cumsum([pause for pause, _ in rows]), [fate for _, fate in rows]
     records["n"] = np.arange(len(rows))
-    stream = StreamTally()
-    for first in range(0, len(rows), size):
-        stream.add(records[first : first + size], True)
-    pairs = [(float(one["time"]), one["fate"] == 0) for one in records]
-    assert (stream.longest, stream.silence) == by_hand(pairs)
-    decided = [n for n, (_, fate) in enumerate(rows) if fate in {0, 1}]
-    assert [n for start, stop in stream.ranges for n in range(start, stop)] == decided
-    assert (stream.tried, stream.passed) == (len(decided), sum(fate == 0 for _, fate in rows))
+    check_stream(rows, records, [size])
 
 
 def test_a_stream_with_many_interruptions_is_judged_as_a_sample() -> None:
