@@ -36,7 +36,8 @@ def check_stream(rows: list[tuple[int, int]], records: Records, sizes: list[int]
         if size:
             stream.add(records[first : first + size], True)
         else:
-            stream.add_one(*(records[name][first].item() for name in ("time", "n", "fate")), True)
+            time, n, fate = (records[name][first].item() for name in ("time", "n", "fate"))
+            stream.add_one(time, n, fate, True)
         first, turn = first + max(size, 1), turn + 1
     pairs = [(float(one["time"]), one["fate"] == 0) for one in records]
     assert (stream.longest, stream.silence) == by_hand(pairs)
