@@ -44,7 +44,7 @@ def test_a_delayed_message_comes_later_and_in_order(tmp_path: Path) -> None:
         for n in range(20):
             robot.put("x", str(n), attachment=b"a", congestion_control=BLOCK)
         robot.delete("x", congestion_control=BLOCK)
-        wait_until(lambda: len(got) == 21, "they come")
+        wait_until(lambda: len(got) == len(come) == 21, "they come")
         assert min(come) - sent >= 0.2
         assert [one.payload.to_string() for one in got] == [*(str(n) for n in range(20)), ""]
         assert got[-1].kind == zenoh.SampleKind.DELETE

@@ -30,12 +30,19 @@ SOON = {"transport": {"link": {"tx": {"queue": {"congestion_control": {"block": 
 
 
 @pytest.fixture
-def goes_on(monkeypatch: pytest.MonkeyPatch) -> Iterator[Event]:
+def held_up() -> Event:
+    """Is set when a wire has a message in hand and does not go on."""
+    return Event()
+
+
+@pytest.fixture
+def goes_on(monkeypatch: pytest.MonkeyPatch, held_up: Event) -> Iterator[Event]:
     """Wires take no further message until this is set."""
     may_go_on = Event()
     way_to = PublicationRelay._way_to
 
     def held(self: PublicationRelay, *arguments: Any) -> Any:
+        held_up.set()
         may_go_on.wait(LIMIT)
         return way_to(self, *arguments)
 
@@ -110,7 +117,7 @@ def test_a_program_that_zenoh_disconnects_because_the_wire_is_behind_is_named(
 
 
 def test_a_program_whose_messages_wait_when_its_connection_ends_is_named(
-    tmp_path: Path, goes_on: Event, asked: Event, linked: Event, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, goes_on: Event, held_up: Event, asked: Event, linked: Event, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With their number; that the wire is held up in the meantime changes nothing."""
     monkeypatch.setattr("evedrop.wire.departures.MANY", 5)
@@ -120,6 +127,7 @@ def test_a_program_whose_messages_wait_when_its_connection_ends_is_named(
             assert linked.wait(LIMIT)
             for _ in range(6):
                 sender.put("scan", b"x", congestion_control=BLOCK)
+            assert held_up.wait(LIMIT)
         assert asked.wait(LIMIT)
         goes_on.set()
         wait_until(lambda: at.happened, "it is named")
