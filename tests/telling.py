@@ -6,7 +6,7 @@ size of the command's files in bytes (0: no limit). A fork finds the modules of 
 
 from __future__ import annotations
 
-from evedrop.system.interrupts import heed_signals
+from evedrop.system.signals import heed_signals
 
 if __name__ == "__main__":
     heed_signals()

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-# The C module under `signal`; see `evedrop.system.interrupts`.
+# The C module under `signal`; see `evedrop.system.signals`.
 import _signal as signal  # type: ignore[import-not-found]
 import os
 import sys
 
-from evedrop.system.interrupts import heed_signals, heeded
+from evedrop.system.signals import heed_signals, heeded
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:

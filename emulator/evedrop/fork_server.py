@@ -22,9 +22,9 @@ from typing import NoReturn
 
 from setproctitle import setproctitle
 
-from evedrop.system.interrupts import SIGNALS, heed_signals
 from evedrop.system.lacks import refuse_scipy_without_room
 from evedrop.system.processes import continue_when_parent_dies
+from evedrop.system.signals import SIGNALS, heed_signals
 
 _MOST_BYTES = 1 << 17
 _FILES = 3

@@ -1,23 +1,32 @@
-"""Handles Ctrl-C, SIGTERM and SIGHUP in a command that has begun its work: by an event, an exception, or at once.
+"""Handles Ctrl-C, SIGTERM and SIGHUP in a command: at its start it exits at once, later an event or an exception ends its work.
 
-The first signal counts: while the block that it ends is left in order, further ones are ignored, unless it says otherwise.
+They end a command with status 130 at any moment: `heed_signals` comes before any slow import. The first signal counts: while the
+block that it ends is left in order, further ones are ignored, unless it says otherwise.
 """
 
 from __future__ import annotations
 
+# The C module under `signal`: `signal` imports enum and more, which takes about as long as the interpreter needs to start.
+import _signal as signal  # type: ignore[import-not-found]
 import _thread
 import faulthandler
 import os
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from types import FrameType
 
-from evedrop.system.interrupts import INTERRUPTED, SIGNALS, heeded, leave
+# Not from typing, whose import would take longer than everything before it; type checkers know the name.
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    import threading
+    from collections.abc import Callable, Iterator
+    from types import FrameType
+    from typing import NoReturn
 
-SHOW_STACKS = signal.SIGUSR1
+INTERRUPTED = 130
+"""The exit status of an interrupted command."""
+SIGNALS: tuple[int, ...] = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""The signals that interrupt a command."""
+SHOW_STACKS: int = signal.SIGUSR1
 """The signal upon which a process of a run writes the stack of every thread to its log."""
 AFTERTHOUGHT_SECONDS = 0.5
 """A signal that ended another process of a run may reach this one as well, within this time: then the run did not fail.
@@ -28,9 +37,28 @@ AGAIN_SECONDS = 1.0
 """A signal that comes within this time of another is not a second one: some programs, and terminals, send several."""
 
 
+def heeded() -> list[int]:
+    """The signals that are not ignored: nohup ignores SIGHUP, and a shell ignores SIGINT for background jobs."""
+    return [number for number in SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
+
+
+def leave(_number: int, _frame: FrameType | None) -> NoReturn:
+    """Exit at once: there is nothing to end in order."""
+    os._exit(INTERRUPTED)
+
+
+def heed_signals() -> None:
+    """Install `leave` as the handler; also handles signals that arrived while the interpreter started."""
+    for number in heeded():
+        signal.signal(number, leave)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)  # the starting process may have blocked them
+
+
 @contextmanager
 def stop_on_signals() -> Iterator[threading.Event]:
     """An event that Ctrl-C, SIGTERM and SIGHUP set while the block runs; has no effect outside the main thread."""
+    import threading  # noqa: PLC0415 - the handlers come first
+
     stop = threading.Event()
     # By a thread: the main thread may hold the lock of the event right now, and would wait for itself.
     with _handled(lambda: _thread.start_new_thread(stop.set, ())):
@@ -44,8 +72,10 @@ def stop_or_leave_on_signals(leave: Callable[[], object]) -> Iterator[threading.
     Both happen on a thread of its own, even while the main thread waits outside Python. Signals within `AGAIN_SECONDS` of the
     first count as one. Has no effect outside the main thread.
     """
+    import threading  # noqa: PLC0415 - the handlers come first
+
     stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
+    if not _in_main_thread():
         yield stop
         return
     ours, theirs = os.pipe()
@@ -103,7 +133,7 @@ def leave_after(act: Callable[[], object]) -> Iterator[None]:
 @contextmanager
 def told_when_suspended(tell: Callable[[], object]) -> Iterator[None]:
     """Call `tell` before Ctrl-Z suspends this process while the block runs; has no effect outside the main thread."""
-    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGTSTP) != signal.SIG_DFL:
+    if not _in_main_thread() or signal.getsignal(signal.SIGTSTP) != signal.SIG_DFL:
         yield
         return
 
@@ -122,7 +152,7 @@ def told_when_suspended(tell: Callable[[], object]) -> Iterator[None]:
 def held_back() -> Iterator[None]:
     """Delay signals to processes that are started in the block until they have handlers.
 
-    An interpreter that is still starting would end with a traceback; `evedrop.system.interrupts` then unblocks pending signals.
+    An interpreter that is still starting would end with a traceback; `heed_signals` then unblocks pending signals.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     try:
@@ -131,13 +161,19 @@ def held_back() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+def _in_main_thread() -> bool:
+    import threading  # noqa: PLC0415 - the handlers come first
+
+    return threading.current_thread() is threading.main_thread()
+
+
 def _ignore(_number: int, _frame: FrameType | None) -> None:
     """The handler of further signals."""
 
 
 @contextmanager
 def _handled(interrupt: Callable[[], object]) -> Iterator[None]:
-    if threading.current_thread() is not threading.main_thread():
+    if not _in_main_thread():
         yield
         return
 
@@ -168,6 +204,8 @@ def leave_on_signals() -> None:
     def wait() -> None:
         os.read(ours, 1)
         os._exit(INTERRUPTED)
+
+    import threading  # noqa: PLC0415 - the handlers come first
 
     threading.Thread(target=wait, name="signals", daemon=True).start()
 

@@ -31,8 +31,8 @@ from evedrop.names import OBSERVER, RELAY, ROUTER, SENSOR, ProcessAction
 from evedrop.results.folder import HeldFolder, private_opener
 from evedrop.scenario.news import News, RunEnded, Started, Tell
 from evedrop.system.environment import SINGLE_THREADED, check_zenoh_runtime, lock_step_environment, own_environment
-from evedrop.system.interrupts import INTERRUPTED
 from evedrop.system.processes import wait_for
+from evedrop.system.signals import INTERRUPTED
 
 ROUTER_RESTARTS = 3  # how often routers that were ended by a signal are restarted in a run
 SILENCE_SECONDS = 30.0  # after which the launcher gives up on a silent observer, which sends a heartbeat every second

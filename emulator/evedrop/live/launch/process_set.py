@@ -27,8 +27,7 @@ from evedrop.results.resolved_scenario import write_resolved
 from evedrop.scenario.news import FolderMoved, RunEnded, Tell, ViewOpened
 from evedrop.scenario.tables import Scenario
 from evedrop.show.view.viewer import Viewer
-from evedrop.system.interrupts import INTERRUPTED
-from evedrop.system.signals import AFTERTHOUGHT_SECONDS
+from evedrop.system.signals import AFTERTHOUGHT_SECONDS, INTERRUPTED
 
 _LOOK_SECONDS = 0.1  # how soon a signal is noticed
 _EARLY_SECONDS = 1.0

@@ -30,8 +30,8 @@ from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.summary_file import unwritten
 from evedrop.scenario.tables import Scenario
 from evedrop.show.view.viewer import WebAddress
-from evedrop.system.interrupts import heeded
 from evedrop.system.lacks import lack_of, preload_within_limit
+from evedrop.system.signals import heeded
 
 _ORPHAN_SECONDS = 30.0  # to write the results once the launcher is gone
 
