@@ -23,7 +23,7 @@ from live_run import measured, slots_on_disk
 from processes import processes_of
 from table import Row, judged, run_alone
 
-_LOOK_SECONDS = 0.1
+_POLL_SECONDS = 0.1
 _FLAT = 10.0  # MB in a million slots, which is ten bytes a slot: less than one number of each slot kept forever
 _PEERS = frozenset({"sensor", "legitimate", "eavesdropper"})
 _BARE = """
@@ -62,7 +62,7 @@ class Looks:
             if slots:
                 self.slots.append(slots)
                 self.megabytes.append(found)
-            time.sleep(_LOOK_SECONDS)
+            time.sleep(_POLL_SECONDS)
 
     @property
     def largest(self) -> tuple[float, str]:

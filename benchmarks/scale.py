@@ -27,7 +27,7 @@ from processes import processes_of
 
 from evedrop.show.view.figure_style import BLUE, GREEN, GREY, ORANGE, RED, panels
 
-_LOOK_SECONDS = 0.03
+_POLL_SECONDS = 0.03
 _STEADY = 0.2  # from this part of the slots on
 _STRATEGIES = ("naive", "suspicious", "smart")
 COLOURS = (BLUE, ORANGE, GREEN, RED, GREY)
@@ -110,7 +110,7 @@ def _measure(trials: int, receivers: int, shards: int, slots: int) -> MeasuredRu
         while process.poll() is None:
             looks.append((time.monotonic(), *look(process.pid)))
             told.append((time.monotonic(), min(slots_on_disk(folder) for folder in folders)))
-            time.sleep(_LOOK_SECONDS)
+            time.sleep(_POLL_SECONDS)
 
     with tempfile.TemporaryDirectory() as folder:
         measured(scenario_file(folder, changes_of(slots, trials, receivers, shards)), watch=watch)

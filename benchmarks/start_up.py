@@ -19,7 +19,7 @@ from table import Row, judged, run_alone
 
 _LIMITS = {"off": 1.2, "web": 1.5}
 _AIM = 0.8
-_LOOK_SECONDS = 0.002
+_POLL_SECONDS = 0.002
 
 
 def first_slot(view: str) -> float:
@@ -27,7 +27,7 @@ def first_slot(view: str) -> float:
     start = time.monotonic()
     with started("eavesdroppers", "--pace", "0", "--slots", "2000", "--view", view) as (process, out):
         while not slots_on_disk(out) and not (out / "summary.json").exists() and process.poll() is None:
-            time.sleep(_LOOK_SECONDS)
+            time.sleep(_POLL_SECONDS)
         return time.monotonic() - start
 
 

@@ -13,7 +13,7 @@ HOST = "observer"
 PORTS = (17450, 17451)
 PROBED = 17449
 """A port on which nobody listens: a host that is there refuses at once, and one that is not says nothing."""
-LOOK_SECONDS = 2.0
+POLL_SECONDS = 2.0
 SILENCES = 3
 
 
@@ -39,7 +39,7 @@ async def forward(port: int, reader: asyncio.StreamReader, writer: asyncio.Strea
 async def is_there() -> bool:
     """Whether the observer's container runs."""
     try:
-        async with asyncio.timeout(LOOK_SECONDS):
+        async with asyncio.timeout(POLL_SECONDS):
             _, writer = await asyncio.open_connection(HOST, PROBED)
         writer.close()
     except ConnectionRefusedError:
@@ -56,7 +56,7 @@ async def main() -> None:
     silent = 0
     while silent < SILENCES:
         silent = 0 if await is_there() else silent + 1
-        await asyncio.sleep(LOOK_SECONDS)
+        await asyncio.sleep(POLL_SECONDS)
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ def steer(brief: Brief[ControllerPart], connect: Callable[[AnyBrief], ProcessSes
         reporter = DecisionReporter(brief, telemetry, plant.inputs, assignment.period)
         session.ready()
         for k in range(0, brief.slots, assignment.period):
-            session.place.slot = k
+            session.status.slot = k
             message = due.take_message(lambda: Reader(key, inbox.recv()), k)
             x = read_known(message, name, k, (process.n, brief.trials))
             made = controller.decide(k, x)

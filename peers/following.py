@@ -60,7 +60,7 @@ class Following:
         self, brief: Brief[ReceiverPart], core: ReceiverCore, replies: ReceiverReplies, session: ProcessSession
     ) -> None:
         name, key = brief.process, session.keys.downlink(brief.process)
-        self._brief, self._core, self._replies, self._place = brief, core, replies, session.place
+        self._brief, self._core, self._replies, self._status = brief, core, replies, session.status
         self._outages = _outages_of(brief)
         self.deliveries = Pending(session.inbox(key), key, most_slots(brief))
         self._put_telemetry = session.kept(session.keys.telemetry(name), brief.flow.window + 1)
@@ -75,7 +75,7 @@ class Following:
     def carry_on(self) -> None:
         """Take all deliveries until the run is over, or until this process is away to its end."""
         while self._k < self._brief.slots:
-            self._place.slot = self._k
+            self._status.slot = self._k
             message = self.deliveries.peek()
             found = message.integer("k")
             if is_barrier(message):

@@ -41,7 +41,7 @@ from evedrop.scenario.conformance.problems import Problem
 
 _PROGRESS_BYTES = 16 * 2**20  # for one follower: far more than are ever under way
 _SETTLE_SECONDS = 2.0
-_LOOK_SECONDS = 0.05  # how soon a request to hold is noticed
+_POLL_SECONDS = 0.05  # how soon a request to hold is noticed
 
 
 @final
@@ -59,7 +59,7 @@ class Window:
         sent: ReplayBuffer,
         clock: Clock = SYSTEM_CLOCK,
     ) -> None:
-        self._window, self._sent, self._place, self._clock = window, sent, session.place, clock
+        self._window, self._sent, self._status, self._clock = window, sent, session.status, clock
         self._done = dict.fromkeys(followers, 0)
         self._absent: Collection[str] = ()
         self._limit = window
@@ -76,7 +76,7 @@ class Window:
     def wait(self, k: int) -> None:
         """Wait until slot k may be sent."""
         while k >= self._limit:
-            with self._place.waiting(
+            with self._status.waiting(
                 *(self._keys[name] for name in self._followed if self._done[name] + self._window <= k)
             ):
                 name, payload = self._news.get()
@@ -143,7 +143,7 @@ class Barriers:
         self._flush(k)
         self._telemetry(k, held(k))
         # The command may arrive more than once, and may belong to an earlier barrier.
-        with self._session.place.waiting(self._session.keys.control(SENSOR)):
+        with self._session.status.waiting(self._session.keys.control(SENSOR)):
             while not isinstance(go := self._session.command(self._window.followers), Go) or go.slot != k:
                 pass
         self._window.go_on(k, go.absent or ())
@@ -263,12 +263,12 @@ class Sensing:
 
     def _wait(self, k: int) -> None:
         """Wait until slot k may be sent and is due; at a barrier before it, report all slots and wait for the conductor."""
-        self._session.place.slot = k
+        self._session.status.slot = k
         self._window.wait(k)
         pace = self._brief.part.pace
         # With a pace, a hold may be requested at any moment before the slot is due; each slot has at most one barrier.
         while not (wanted := self._barriers.wanted(k)) and pace and (left := self._left(k)) > 0.0:
-            self._clock.sleep(min(left, _LOOK_SECONDS))
+            self._clock.sleep(min(left, _POLL_SECONDS))
         if wanted:
             self._report(k)  # before the barrier is sent: at a barrier, nothing else may be on its way
             self._send(k, barrier(k))

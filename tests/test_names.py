@@ -72,7 +72,10 @@ GLOSSARY = ROOT / "docs" / "glossary.md"
 FORMER = {
     "floor plan": "drawing of the packages",
     "floor_plan": "package_drawing",
+    "lifeline": "watchdog",
+    "look_seconds": "poll_seconds",
     "rooms": "packages",
+    "whereabouts": "process status",
 }
 """Former word → the word of the glossary, or the name, in its place. Parts of names count: `open_rooms`, `openRooms`."""
 PROSE = [path for path in ROOT.glob("*.md") if path.name != "CHANGELOG.md"]

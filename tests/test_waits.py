@@ -29,7 +29,7 @@ EXCEPTIONS = {
     "emulator/evedrop/live/network/router_commands.py next self._orders.get": PROCESS,
     "emulator/evedrop/live/network/session.py _send_again self._rounds.get": WORK,
     "emulator/evedrop/live/network/session.py command self._commands.get": PROCESS,
-    "emulator/evedrop/live/protocol/whereabouts.py go_on self._asked.get": WORK,
+    "emulator/evedrop/live/protocol/process_status.py go_on self._requests.get": WORK,
     "emulator/evedrop/simulate/cluster.py _result future.result": "the future is done",
     "emulator/evedrop/simulate/workers.py _talk self._tasks.get": WORK,
     "emulator/evedrop/simulate/workers.py _talk self.pipe.recv": (

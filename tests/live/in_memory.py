@@ -12,7 +12,7 @@ from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import Bounds, ControlCommand, read_command
 from evedrop.live.protocol.keys import RunKeys
-from evedrop.live.protocol.whereabouts import Place
+from evedrop.live.protocol.process_status import StatusReporter
 from tests.conftest import LIMIT
 
 
@@ -75,7 +75,7 @@ class FakeSession:
     def __init__(self, stage: Stage, keys: RunKeys, brief: AnyBrief) -> None:
         self._stage, self._process, self._slots = stage, brief.process, brief.slots
         self.keys = keys
-        self.place = Place()
+        self.status = StatusReporter()
 
     def __enter__(self) -> Self:
         return self

@@ -74,24 +74,24 @@ def test_losses_that_overlap_are_one_outage() -> None:
         0.0,
         said.append,
     )
-    recovery.look(10)
+    recovery.poll(10)
     for lost in (
         ("smart",),
         ("smart", "sensor"),
         ("smart",),
     ):  # lost and back three times, and no slot joined meanwhile
         conducted.lose(*lost)
-        recovery.look(10)
+        recovery.poll(10)
         conducted.lost = {}
-        recovery.look(10)
+        recovery.poll(10)
     assert conducted.rounds == [10, 10, 10]
     assert said == []
-    recovery.look(11)
+    recovery.poll(11)
     conducted.lose("router", "sensor", "smart")
-    recovery.look(12)
+    recovery.poll(12)
     conducted.lost, conducted.another_router = {}, True
-    recovery.look(12)
-    recovery.look(13)
+    recovery.poll(12)
+    recovery.poll(13)
     found = [(one.process, one.slot, one.until) for one in recovery.outages]
     assert found == [("smart", 10, 11), ("sensor", 10, 11), ("router", 12, 13)]
     assert said == recovery.outages
@@ -104,10 +104,10 @@ def test_an_outage_that_is_open_at_the_end_lasts_to_the_last_slot_of_a_complete_
     """A process that has reported all slots holds up nothing; otherwise the run did not go on."""
     conducted = Conducted()
     recovery = recovery_of(conducted, TestClock(), 30.0)
-    recovery.look(10)
+    recovery.poll(10)
     conducted.lose("smart")
-    recovery.look(10)
-    recovery.look(20)
+    recovery.poll(10)
+    recovery.poll(20)
     recovery.give_up(20, complete)
     assert [(one.process, one.slot, one.until) for one in recovery.outages] == [("smart", 10, until)]
 
@@ -129,20 +129,20 @@ def test_a_round_waits_for_processes_that_are_back_and_cannot_be_told_yet() -> N
     """A token that is back may be faster than the subscription behind it; after some seconds the round begins all the same."""
     conducted, clock = Conducted(), TestClock()
     recovery = recovery_of(conducted, clock, 30.0)
-    recovery.look(10)
+    recovery.poll(10)
     for there_after in (1.0, 9.0):
         conducted.rounds.clear()
         conducted.lose("router", "sensor")
-        recovery.look(10)
+        recovery.poll(10)
         conducted.lost, conducted.unreached = {}, ["router"]
-        recovery.look(10)
+        recovery.poll(10)
         clock.now += there_after
         assert conducted.rounds == []
         if there_after < 2.0:
-            recovery.look(10)
+            recovery.poll(10)
             assert conducted.rounds == []
             conducted.unreached = []
-        recovery.look(10)
+        recovery.poll(10)
         assert conducted.rounds == [10]
         conducted.unreached = []
 
@@ -153,12 +153,12 @@ def test_a_round_repeats_the_commands_that_may_have_been_lost(done: int) -> None
     conducted = Conducted()
     recovery = recovery_of(conducted, TestClock(), 30.0)
     if done:
-        recovery.look(done)
+        recovery.poll(done)
     conducted.lose("sensor")
-    recovery.look(done)
+    recovery.poll(done)
     assert conducted.repeated == []
     conducted.lost = {}
-    recovery.look(done)
+    recovery.poll(done)
     assert conducted.rounds == [done]
     assert conducted.repeated == [*(() if done else ("start",)), "the operator's commands", done]
 
@@ -172,18 +172,18 @@ def test_a_round_that_is_lost_is_repeated_before_a_process_counts_as_silent(
     """Also in a run whose slots were joined at long intervals before; with three rounds after an outage."""
     conducted, clock = Conducted(), TestClock()
     recovery = recovery_of(conducted, clock, longest_outage, pace)
-    recovery.look(8)
+    recovery.poll(8)
     clock.now += gap
-    recovery.look(16)
+    recovery.poll(16)
     if lost:
         conducted.lose("router")
-        recovery.look(16)
+        recovery.poll(16)
         conducted.lost = {}
-    recovery.look(16)
+    recovery.poll(16)
     patience, until = patience_of(longest_outage, pace, 8), clock.now
     while clock.now - until < patience:
         clock.now += 0.05
-        recovery.look(16)
+        recovery.poll(16)
     assert len(conducted.rounds) >= (3 if lost else 1)
     assert len(conducted.rounds) <= 6
 

@@ -9,16 +9,16 @@ import pytest
 from evedrop.errors import Silence
 from evedrop.live.observer.stall import Stall, patience_of, silent_of
 from evedrop.live.protocol.keys import RunKeys
-from evedrop.live.protocol.whereabouts import Whereabouts
+from evedrop.live.protocol.process_status import ProcessStatus
 from tests.clock import TestClock
 
 KEYS = RunKeys("r")
 WINDOW = 100
 
 
-def at(slot: int, *waits: str) -> Whereabouts:
+def at(slot: int, *waits: str) -> ProcessStatus:
     """Where a process says to be."""
-    return Whereabouts(slot, waits)
+    return ProcessStatus(slot, waits)
 
 
 SENSOR_WAITS = at(150, KEYS.progress("eve"))
@@ -124,7 +124,7 @@ class Run:
     def __init__(self, patience: float) -> None:
         self.clock = TestClock()
         self.asked = 0
-        self.answers: dict[str, Whereabouts] = {}
+        self.answers: dict[str, ProcessStatus] = {}
         self.places = {"sensor": 60, "router": 60, "eve": 50}
         self.stall = Stall(patience, 10, self.ask, self.clock)
 
@@ -141,7 +141,7 @@ class Run:
         end = self.clock.now + seconds
         while self.clock.now < end:
             self.clock.now += step
-            self.stall.look(done, self.reported, held=held, missing=missing)
+            self.stall.poll(done, self.reported, held=held, missing=missing)
 
     def reported(self) -> Mapping[str, int]:
         """How far everybody is."""

@@ -20,7 +20,7 @@ from evedrop.system.output import say
 REACH_SECONDS = 5.0
 """For a Dask scheduler to answer."""
 _ANSWER_SECONDS = 60.0  # for a scheduler that has answered before; it may be busy
-_LOOK_SECONDS = 0.1
+_POLL_SECONDS = 0.1
 _WORKERS_SECONDS = 1.0  # from one look at the list of workers to the next
 _LONELY_SECONDS = 3.0  # without a worker, before this is said
 
@@ -83,7 +83,7 @@ class Cluster:
         while not self._has_workers(stopped):
             if stopped():
                 return
-            time.sleep(_LOOK_SECONDS)
+            time.sleep(_POLL_SECONDS)
         futures = [self._client.submit(_on_worker, task, pure=False) for task in tasks]
         left = dict(enumerate(futures))
         try:
@@ -93,7 +93,7 @@ class Cluster:
                 self._has_workers(stopped)
                 done = [number for number, future in left.items() if future.done()]
                 if not done:
-                    time.sleep(_LOOK_SECONDS)
+                    time.sleep(_POLL_SECONDS)
                 for number in done:
                     yield number, _result(left.pop(number))
         finally:
@@ -119,7 +119,7 @@ class Cluster:
             if stopped():
                 return None
             with contextlib.suppress(Empty):
-                answer = answers.get(timeout=_LOOK_SECONDS)
+                answer = answers.get(timeout=_POLL_SECONDS)
                 if isinstance(answer, Exception):
                     raise answer
                 return answer

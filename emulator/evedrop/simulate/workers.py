@@ -27,7 +27,7 @@ from evedrop.system.lacks import lack_of
 from evedrop.system.processes import KILLED_SECONDS, SUSPENDED_SECONDS, SuspensionWatch, continue_when_parent_dies, kill
 from evedrop.system.signals import SIGNALS
 
-_LOOK_SECONDS = 0.1
+_POLL_SECONDS = 0.1
 _LAST_SECONDS = 30.0  # after a stop, for the current chunk of slots; only a worker that hangs needs them all
 
 
@@ -172,7 +172,7 @@ def _results(
         if (pid := watch.suspended_for_good(busy)) is not None:
             raise _suspended(busy[pid])
         try:
-            worker, news = inbox.get(timeout=_LOOK_SECONDS)
+            worker, news = inbox.get(timeout=_POLL_SECONDS)
         except Empty:
             continue
         news = _unfailed(worker, news)

@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import final
 
 from evedrop.errors import Interrupted
-from evedrop.live.network.launcher_watch import when_launcher_is_gone
+from evedrop.live.network.launcher_watchdog import when_launcher_is_gone
 from evedrop.studies.scenario_tests import Finding, Manner, Outcome, carry_out
 from evedrop.system.processes import SUSPENDED_SECONDS, SuspensionWatch, continue_when_parent_dies, kill, wait_for
 from evedrop.system.signals import stop_on_signals
 
-_LOOK_SECONDS = 0.1
+_POLL_SECONDS = 0.1
 _END_SECONDS = 60.0
 """For the processes to end their runs, which takes seconds, and to write the results so far."""
 _WORK = "from evedrop.studies.scenario_test_jobs import work; work()"
@@ -39,7 +39,7 @@ def results(scenarios: Sequence[str], manner: Manner, jobs: int) -> Iterator[Fin
         waiting = [threads.submit(crew.carry_out, scenario) for scenario in scenarios]
         try:
             for one in waiting:
-                while not wait([one], _LOOK_SECONDS).done:
+                while not wait([one], _POLL_SECONDS).done:
                     if stop.is_set():
                         raise _interrupted(manner)
                     crew.kill_suspended()

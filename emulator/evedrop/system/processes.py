@@ -16,7 +16,7 @@ KILLED_SECONDS = 10.0
 """How long to wait for a killed process: the next turn of a busy processor ends it, unless it hangs in the system itself."""
 SUSPENDED_SECONDS = 60.0
 """How long a process that others wait for may be suspended."""
-_LOOK_SECONDS = 1.0
+_POLL_SECONDS = 1.0
 _PR_SET_PDEATHSIG = 1
 # The setting survives exec. A parent that died before it was made sends no signal any more. Python ignores SIGPIPE, and a program
 # that it becomes would, too.
@@ -87,9 +87,9 @@ class SuspensionWatch:
         """
         if time.monotonic() < self._next:
             return None
-        self._next = time.monotonic() + _LOOK_SECONDS
+        self._next = time.monotonic() + _POLL_SECONDS
         self._looks = {pid: self._looks.get(pid, 0) + 1 for pid in pids if is_suspended(pid)}
-        return next((pid for pid, looks in self._looks.items() if looks * _LOOK_SECONDS > SUSPENDED_SECONDS), None)
+        return next((pid for pid, looks in self._looks.items() if looks * _POLL_SECONDS > SUSPENDED_SECONDS), None)
 
 
 def continue_when_parent_dies() -> None:

@@ -238,7 +238,7 @@ class WireJournal:
         self._stopped = time.monotonic()
         self.recorded = next(self._number)
         self.flush()
-        self._place.look()
+        self._place.poll()
         if self.removed is not None:
             self.missing = self.recorded
         else:
@@ -321,7 +321,7 @@ class WireJournal:
             self.flush()
             with contextlib.suppress(OSError):  # only a killed wire needs to have noted it
                 self._place.beat()
-            self._place.look()
+            self._place.poll()
             with self._state, contextlib.suppress(OSError):  # `_room` tries again, and reports it
                 part = self._parts.get(self._next)
                 if part is not None and 2 * part.handed > self._rows and self._next + 1 not in self._buffers:

@@ -30,7 +30,7 @@ class JournalPlace:
         self.incomplete_since: float | None = None
         """When something could not be written for the first time, in seconds since 1970; None: the disk always had room."""
         self.removed: Path | None = None
-        """This folder, or the one inside it, if it was removed or moved since the wire began, as of the last `look`."""
+        """This folder, or the one inside it, if it was removed or moved since the wire began, as of the last `poll`."""
         self.unfinished = journal / UNFINISHED
         """The folder inside it for records that are not yet in a Parquet file."""
         make_private(self.unfinished)
@@ -47,8 +47,8 @@ class JournalPlace:
         assert self._alive is not None  # noqa: S101 - it has begun
         os.pwrite(self._alive, struct.pack("<d", time.time()), 0)
 
-    def look(self) -> None:
-        """Look whether the folder is still there, and tell at once that it is not."""
+    def poll(self) -> None:
+        """Check whether the folder is still there, and report at once if it is not."""
         if self.removed is not None:
             return
         self.removed = self._missing()
@@ -61,7 +61,7 @@ class JournalPlace:
 
     def miss(self, error: OSError) -> None:
         """Note that something could not be written, and tell so the first time."""
-        self.look()
+        self.poll()
         if self.incomplete_since is None:
             self.incomplete_since = time.time()
             at = time.strftime("%H:%M:%S", time.localtime(self.incomplete_since))

@@ -35,7 +35,7 @@ from evedrop.wire.side import SideSession
 from evedrop.wire.timeline import Moment
 from evedrop.wire.watchdog import Duty
 
-_LOOK_SECONDS = 0.2
+_POLL_SECONDS = 0.2
 _RECEIVERS = (
     32  # threads of Zenoh: a program that waits for the wire holds one, and with none left all sides would wait
 )
@@ -127,7 +127,7 @@ class WireRelay:
         self._neighbours = Neighbours(self.sides, [*links.values()], self._tell, self._bypasses)
         self._liveliness = LivelinessRelay(self.sides, plan, self._woken.set, EntityLog(journal.folder).add)
         stack.callback(self._liveliness.close)
-        self._look()
+        self._poll()
         self._queries.start()
         for relay in relays:
             relay.start()
@@ -165,7 +165,7 @@ class WireRelay:
         for outlet in outlets:
             outlet.close(deadline)
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         """Follow what programs declare.
 
         Queryables come before tokens: a program that sees a service's token may query it at once.
@@ -183,11 +183,11 @@ class WireRelay:
             self._woken.clear()
             try:
                 with self._duty.busy():
-                    self._look()
+                    self._poll()
                     if time.monotonic() >= due:
                         self._neighbours.update()
                         self._bypasses.update()
-                        due = time.monotonic() + _LOOK_SECONDS
+                        due = time.monotonic() + _POLL_SECONDS
             except Exception as error:  # whatever it is: the next look may succeed
                 if not self._ended.is_set():
                     self._tell(f"Zenoh does not say what programs declare ({error!r}); trying again")

@@ -15,9 +15,9 @@ from evedrop.live.network import operator
 from evedrop.live.protocol import closed_loop as loop_wire
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import commands, envelope, packets, telemetry
+from evedrop.live.protocol.process_status import ProcessStatus, read_process_status
 from evedrop.live.protocol.requests import REQUESTS, read_request
 from evedrop.live.protocol.status import RunStatus
-from evedrop.live.protocol.whereabouts import Whereabouts, read_whereabouts
 from evedrop.model.digest import Blocks
 from evedrop.model.entries import read
 from evedrop.model.flag_bits import packed_flags
@@ -204,10 +204,10 @@ def decode_journal(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> 
     return {"k": journal.first, "c": journal.count, "links": links}
 
 
-def decode_whereabouts(_shape: dict[str, Any], _value: dict[str, Any], raw: bytes) -> dict[str, Any]:
+def decode_process_status(_shape: dict[str, Any], _value: dict[str, Any], raw: bytes) -> dict[str, Any]:
     """As the observer reads it."""
-    where = read_whereabouts(wire.Reader(KEY, raw), SLOTS)
-    return {"k": where.slot, "waits": list(where.waits)}
+    status = read_process_status(wire.Reader(KEY, raw), SLOTS)
+    return {"k": status.slot, "waits": list(status.waits)}
 
 
 def decode_refusal(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
@@ -363,6 +363,9 @@ CODECS: dict[str, tuple[Encode, Decode]] = {
         lambda _shape, value: envelope.enclosed(value["key"], wire.pack(value["message"])),
         lambda _shape, value, raw: decode_envelope(value["key"], raw),
     ),
-    "whereabouts": (lambda _shape, value: Whereabouts(value["k"], tuple(value["waits"])).pack(), decode_whereabouts),
+    "process-status": (
+        lambda _shape, value: ProcessStatus(value["k"], tuple(value["waits"])).pack(),
+        decode_process_status,
+    ),
     "refusal": (lambda _shape, value: wire.refusal(value["refuses"], value["why"]), decode_refusal),
 }

@@ -17,7 +17,7 @@ from evedrop.live.protocol import packets, telemetry
 from evedrop.live.protocol.commands import Again
 from evedrop.live.protocol.envelope import head_of
 from evedrop.live.protocol.message_limits import Sizes
-from evedrop.live.protocol.whereabouts import Whereabouts
+from evedrop.live.protocol.process_status import ProcessStatus
 from evedrop.model.digest import BLOCK_SLOTS
 from evedrop.model.links.link import REASONS
 from evedrop.model.receiver import Belief, Reception
@@ -81,7 +81,7 @@ def largest(sizes: Sizes) -> dict[str, bytes]:
         report.pack(),
         telemetry.leaving(k, Belief(z, np.ones((n, n, R)), np.ones(R, np.uint8))),
         loop_wire.Decisions(k, c, seconds, digests_of((c + sizes.period) // BLOCK_SLOTS + 1, R)).pack(),
-        Whereabouts(k, tuple("evedrop/r0123abcd/progress/" + "n" * 32 for _ in range(sizes.receivers + 1))).pack(),
+        ProcessStatus(k, tuple("evedrop/r0123abcd/progress/" + "n" * 32 for _ in range(sizes.receivers + 1))).pack(),
         wire.refusal("evedrop/r0123abcd/progress/" + "n" * 32, "x" * 1000),
     ]
     names = [f"{i:032}" for i in range(sizes.receivers)]

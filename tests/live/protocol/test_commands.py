@@ -18,9 +18,9 @@ from evedrop.live.protocol.commands import (
     Go,
     Hold,
     LinkChange,
+    ReportStatus,
     Start,
     Unknown,
-    Where,
     read_command,
 )
 from evedrop.model.slot.link import Change
@@ -39,7 +39,7 @@ def read(process: str, payload: bytes) -> ControlCommand:
     [
         ("sensor", Start()),
         ("eve", End()),
-        ("eve", Where()),
+        ("eve", ReportStatus()),
         ("sensor", Hold()),
         ("relay", Abandon("interrupted")),
         ("sensor", Go(7, (), 9)),

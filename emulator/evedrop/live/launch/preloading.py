@@ -37,7 +37,7 @@ from evedrop.system.processes import KILLED_SECONDS, KillableProcess, kill
 from evedrop.system.signals import held_back
 
 _MOST_BYTES = 4096
-_LOOK_SECONDS = 0.25
+_POLL_SECONDS = 0.25
 _REPORT_SECONDS = 5.0
 """For a fork server to report the end of a process: a suspended one never does. Only the launcher's own time counts."""
 _START_SECONDS = 120.0
@@ -118,7 +118,7 @@ class ForkServer:
     """
 
     def __init__(self, channel: socket.socket) -> None:
-        channel.settimeout(_LOOK_SECONDS)
+        channel.settimeout(_POLL_SECONDS)
         self._channel = channel
         self._forks: dict[int, Fork] = {}
         self._asking = threading.Lock()
@@ -200,7 +200,7 @@ class ForkServer:
         deadline = time.monotonic() + _START_SECONDS
         while time.monotonic() < deadline:
             with suppress(Empty):
-                return self._begun.get(timeout=_LOOK_SECONDS)
+                return self._begun.get(timeout=_POLL_SECONDS)
             if stop is not None and stop.is_set():
                 self._give_up()
                 raise Interrupted
@@ -226,7 +226,7 @@ class ForkServer:
                 report, handles, _, _ = socket.recv_fds(self._channel, _MOST_BYTES, 1)
             except TimeoutError:
                 # Not by the clock: this process may have been suspended, too.
-                unreported = unreported + _LOOK_SECONDS if any(fork.over for fork in self._forks.values()) else 0.0
+                unreported = unreported + _POLL_SECONDS if any(fork.over for fork in self._forks.values()) else 0.0
             except OSError:
                 return None
             else:

@@ -29,7 +29,7 @@ from evedrop.scenario.tables import Scenario
 from evedrop.show.view.viewer import Viewer
 from evedrop.system.signals import AFTERTHOUGHT_SECONDS, INTERRUPTED
 
-_LOOK_SECONDS = 0.1  # how soon a signal is noticed
+_POLL_SECONDS = 0.1  # how soon a signal is noticed
 _EARLY_SECONDS = 1.0
 
 
@@ -133,7 +133,7 @@ def _wait_until_listening(children: Children, router: str, stop: threading.Event
     while not children.listens(router):
         if stop.is_set():
             raise Interrupted
-        news = children.news(_LOOK_SECONDS)
+        news = children.news(_POLL_SECONDS)
         if isinstance(news, Exit) and not _meant_us_too(news, stop) and not children.restart_router(news):
             raise RunError(children.failure_report(news, None))
         if time.monotonic() > deadline:
@@ -169,7 +169,7 @@ def follow_to_end(children: Children, stop: threading.Event, tell: Tell) -> int:
             break
         if children.silent_seconds > SILENCE_SECONDS:
             raise RunError(children.failure_report(None, RunEnded(RunError.exit_status, "", [OBSERVER])))
-        news = children.news(_LOOK_SECONDS)
+        news = children.news(_POLL_SECONDS)
         ending = None
         if isinstance(news, Exit):
             if _meant_us_too(news, stop) or (

@@ -30,7 +30,7 @@ from evedrop.scenario.tables import Scenario
 from evedrop.show.view.viewer import Viewer
 from evedrop.system.threads import wait_for_thread
 
-_LOOK_SECONDS = 0.25
+_POLL_SECONDS = 0.25
 
 
 @final
@@ -150,7 +150,7 @@ def launch_shards(
     try:
         for thread in threads:
             while thread.is_alive() and not stop.is_set():  # a run lasts as long as it lasts
-                thread.join(_LOOK_SECONDS)
+                thread.join(_POLL_SECONDS)
             wait_for_thread(thread)
         now = held.now
         if now != folder:

@@ -51,7 +51,7 @@ ANSWER_SECONDS = 60.0
 """How long a host may take to connect and to start Python."""
 _END_SECONDS = 8.0  # for a host to end its processes; they take three at most
 _SEND_SECONDS = 10.0  # for ssh to take some bytes; a suspended one takes none
-_LOOK_SECONDS = 0.05
+_POLL_SECONDS = 0.05
 _MOST_SAID = 2**20
 _ALIVE_SECONDS = 3
 _BEAT_SECONDS = 30.0
@@ -131,13 +131,13 @@ class SshHost:
 
     def _beat(self) -> None:
         """Tell the host from time to time that this launcher is still there."""
-        while not self._lost.wait(self._beat_seconds if self._answered.is_set() else _LOOK_SECONDS):
+        while not self._lost.wait(self._beat_seconds if self._answered.is_set() else _POLL_SECONDS):
             if self._answered.is_set():
                 self.send(LauncherHeartbeat(_SILENCE_SECONDS))
 
     def wait_until_ready(self, deadline: float, stop: threading.Event) -> None:
         """Wait until Evedrop answers there. Raises UsageError if it does not, or has another version; Interrupted if stopped."""
-        while not self._answered.wait(_LOOK_SECONDS):
+        while not self._answered.wait(_POLL_SECONDS):
             if stop.is_set():
                 raise Interrupted("interrupted before the run began; nothing was started")
             if self._lost.is_set():

@@ -86,7 +86,7 @@ class Waiting:
         self._began = self._said = self._clock.monotonic()
         self._what = "lost the connection; waiting again" if again else "waiting"
 
-    def look(self, why: object) -> None:
+    def poll(self, why: object) -> None:
         """Report that the process still waits, if a report is due; why: the result of the last attempt."""
         now = self._clock.monotonic()
         if now - self._said >= _WAITING_SECONDS:
@@ -102,7 +102,7 @@ class Waiting:
         try:
             return connect()
         except (OSError, zenoh.ZError) as error:
-            self.look(_reason(error) if isinstance(error, OSError) else "Zenoh could not connect")
+            self.poll(_reason(error) if isinstance(error, OSError) else "Zenoh could not connect")
             raise
 
 
@@ -151,7 +151,7 @@ def connected(
                     f"no router answered at {address.router} within {patience:.0f} s ({why}); start it there, and check that no "
                     "firewall is in between"
                 ) from error
-            waiting.look(why)
+            waiting.poll(why)
         clock.sleep(pause)
         pause = min(longest, pause * 1.5)
 

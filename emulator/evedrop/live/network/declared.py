@@ -15,7 +15,7 @@ import zenoh
 from zenoh.handlers import FifoChannel
 
 from evedrop.live.protocol.envelope import Dropped, head_of
-from evedrop.live.protocol.whereabouts import Place
+from evedrop.live.protocol.process_status import StatusReporter
 
 
 class Declared(Protocol):
@@ -33,10 +33,10 @@ class InboxClosedError(Exception):
 class Inbox:
     """A subscription to one exact key, read in order with `recv`."""
 
-    def __init__(self, key: str, dropped: Dropped, place: Place, room: int) -> None:
-        """place: of the process, which records there that it waits; room: how many messages the inbox holds."""
+    def __init__(self, key: str, dropped: Dropped, status: StatusReporter, room: int) -> None:
+        """status: of the process, which records there that it waits; room: how many messages the inbox holds."""
         self._room = room
-        self._key, self._head, self._dropped, self._place = key, head_of(key), dropped, place
+        self._key, self._head, self._dropped, self._status = key, head_of(key), dropped, status
         self._waits = (key,)
         self._subscribers: SimpleQueue[zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]] | None] = SimpleQueue()
         self._subscriber: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]] | None = None
@@ -51,9 +51,9 @@ class Inbox:
 
     def recv(self) -> bytes:
         """The next message. Raises InboxClosedError once the connection is closed for good."""
-        self._place.waits = self._waits
+        self._status.waits = self._waits
         payload = self._received()
-        self._place.waits = ()
+        self._status.waits = ()
         return payload
 
     def take(self, most: int) -> list[bytes]:

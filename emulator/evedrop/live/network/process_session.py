@@ -9,7 +9,7 @@ from typing import Protocol, Self
 from evedrop.live.network.resending import ReplayBuffer
 from evedrop.live.protocol.commands import ControlCommand
 from evedrop.live.protocol.keys import RunKeys
-from evedrop.live.protocol.whereabouts import Place
+from evedrop.live.protocol.process_status import StatusReporter
 
 
 class Received(Protocol):
@@ -28,7 +28,7 @@ class ProcessSession(Protocol):
     """A process's session; `Session` says what each method does."""
 
     keys: RunKeys
-    place: Place
+    status: StatusReporter
 
     def __enter__(self) -> Self: ...
 

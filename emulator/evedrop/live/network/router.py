@@ -178,7 +178,7 @@ class AckLink:
         key = brief.stream_keys[f"link/{ACKNOWLEDGEMENTS}"]
         self._channel = AckChannel.from_spec(spec, key, brief.batch)
         self._jammer = spec.jammer
-        self._trials, self._place = brief.trials, session.place
+        self._trials, self._status = brief.trials, session.status
         self._key = session.keys.acknowledged
         self._due = GapDetector(self._key, brief.flow.longest_outage)
         self.sent: SimpleQueue[bytes | None] = SimpleQueue()
@@ -203,7 +203,7 @@ class AckLink:
 
     def _acknowledged(self, k: int, commands: Commands) -> Flags:
         while True:
-            with self._place.waiting(self._key):
+            with self._status.waiting(self._key):
                 payload = self.sent.get()
             if payload is None:
                 commands.check()
@@ -345,7 +345,7 @@ class Routing:
                 self._ack_link.count(first, sent, self._downlinks)
             else:
                 self._ack_link.carry(first, sent, self._downlinks, self._commands)
-        self._k = self._session.place.slot = slots.stop
+        self._k = self._session.status.slot = slots.stop
 
     def _flush(self) -> None:
         for burst in self._bursts:

@@ -92,7 +92,7 @@ class Commands:
     def next(self) -> ControlCommand:
         """The next command of the current round; those of earlier rounds are skipped. Raises ReplayRequested as `check` does."""
         while True:
-            with self._session.place.waiting(self._session.keys.control(ROUTER)):
+            with self._session.status.waiting(self._session.keys.control(ROUTER)):
                 order = self._orders.get()
             self.check()
             if order is not None and order[0] == self._heeded:

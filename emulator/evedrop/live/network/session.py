@@ -27,11 +27,11 @@ from evedrop.errors import Gap, MalformedMessage, RunError
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.network.connecting import Credentials, RouterAddress, Waiting, connected
 from evedrop.live.network.connection import Connection
+from evedrop.live.network.connection_watchdog import ConnectionWatchdog
 from evedrop.live.network.container_heartbeat import HeartbeatFile
 from evedrop.live.network.declared import Funnel, Inbox, Outlet, Question, Questions, Watch
 from evedrop.live.network.launcher_news import tell
-from evedrop.live.network.launcher_watch import when_launcher_is_gone
-from evedrop.live.network.lifeline import Lifeline
+from evedrop.live.network.launcher_watchdog import when_launcher_is_gone
 from evedrop.live.network.listening import listening
 from evedrop.live.network.mailbox import allowance
 from evedrop.live.network.opening import open_session
@@ -40,12 +40,12 @@ from evedrop.live.network.zenoh_log import LOGGED
 from evedrop.live.protocol.brief import AnyBrief, Brief
 from evedrop.live.protocol.brief_parts import Identity, RouterPart, RoutingPart
 from evedrop.live.protocol.codec import Reader, end_report, refusal
-from evedrop.live.protocol.commands import Abandon, Again, Bounds, ControlCommand, End, Where, read_command
+from evedrop.live.protocol.commands import Abandon, Again, Bounds, ControlCommand, End, ReportStatus, read_command
 from evedrop.live.protocol.envelope import Dropped
 from evedrop.live.protocol.keys import RunKeys, ZenohConfig, reader_of
 from evedrop.live.protocol.message_limits import low_pass
 from evedrop.live.protocol.news import RouterListens
-from evedrop.live.protocol.whereabouts import Place
+from evedrop.live.protocol.process_status import StatusReporter
 from evedrop.names import OBSERVER, ROUTER
 
 READY_SECONDS = 30.0
@@ -159,13 +159,13 @@ class Session:
         self._process = brief.process
         self.patience = float(brief.patience)
         """How many seconds to wait for other processes."""
-        self.place = Place()
+        self.status = StatusReporter()
         """The slot this process is at and what it waits for; to be kept up to date."""
         self.allowance = allowance(brief.flow.largest_message, brief.flow.window, brief.flow.batch)
         """How many unread bytes of one sender may wait."""
         self._room = _WINDOWS * (brief.flow.window + 8)
         self._dropped = Dropped(brief.process, self._mistaken)
-        self._lifeline = Lifeline(brief) if brief.role not in ("router", "relay", "observer") else None
+        self._watchdog = ConnectionWatchdog(brief) if brief.role not in ("router", "relay", "observer") else None
         self._waiting = Waiting(brief.process, brief.router, clock)
         if config is None or listen is None:
             address = _once(router_address_of(brief))
@@ -195,8 +195,8 @@ class Session:
     ) -> None:
         if isinstance(error, MalformedMessage | Gap):
             self._complain(error)
-        if self._lifeline is not None:
-            self._lifeline.release()
+        if self._watchdog is not None:
+            self._watchdog.release()
         self._heartbeat.stop()
         self.connection.close()
 
@@ -217,8 +217,8 @@ class Session:
     def _changed(self, connected: bool) -> None:
         """Handle the loss or the return of the connection."""
         self._waiting.begin(again=True)
-        if self._lifeline is not None:
-            self._lifeline.changed(connected)
+        if self._watchdog is not None:
+            self._watchdog.changed(connected)
 
     def _mistaken(self) -> None:
         """Handle a message that arrived under another key: the connection confuses the two keys."""
@@ -231,7 +231,7 @@ class Session:
 
     def inbox(self, key: str) -> Inbox:
         """Subscribe to one exact key; read its messages in order with `recv`."""
-        return self.connection.declare(Inbox(key, self._dropped, self.place, self._room))
+        return self.connection.declare(Inbox(key, self._dropped, self.status, self._room))
 
     def funnel(self, key: str, receive: Callable[[bytes], None]) -> None:
         """Subscribe to one exact key; `receive` is called on a thread of Zenoh's and must only hand the bytes on."""
@@ -283,7 +283,7 @@ class Session:
         deadline = time.monotonic() + self.patience
         self._waiting.begin()
         while not self.linked():
-            self._waiting.look("no link yet")
+            self._waiting.poll("no link yet")
             if time.monotonic() > deadline:
                 raise RunError(
                     f"{self._process}: no link with the router within {self.patience:.0f} s; look at its log"
@@ -313,7 +313,7 @@ class Session:
         """Show that this process is present."""
         outlet = self._reporting
         if outlet is not None:
-            self.place.answer(outlet)
+            self.status.answer(outlet)
         if self._kept:
             threading.Thread(target=self._send_again, name="sends-again", daemon=True).start()
         self.connection.appear(self.keys.alive(self._process))
@@ -353,8 +353,8 @@ class Session:
                     sys.stderr.write(f"evedrop: {self._process}: the observer gave the run up: {why}\n")
                     sys.stderr.flush()
                     os._exit(RunError.exit_status)
-                case Where():
-                    self.place.ask()
+                case ReportStatus():
+                    self.status.request()
                     return
                 case Again() as asked if self._kept:
                     self._rounds.put(asked)
@@ -366,7 +366,7 @@ class Session:
 
     def wait_for(self, kind: type[ControlCommand]) -> None:
         """Wait for one command of the conductor: `Start` or `End`."""
-        with self.place.waiting(self._control):
+        with self.status.waiting(self._control):
             while not isinstance(self.command(), kind):
                 pass
         if kind is End:

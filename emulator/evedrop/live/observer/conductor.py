@@ -19,7 +19,7 @@ from evedrop.names import OBSERVER, RELAY, ROUTER, SENSOR
 from evedrop.system.signals import AFTERTHOUGHT_SECONDS
 
 _ABANDON_SECONDS = 2.0  # for processes to leave when told to
-_LOOK_SECONDS = 0.05  # how soon a signal is noticed
+_POLL_SECONDS = 0.05  # how soon a signal is noticed
 _END_SECONDS = 0.5  # how often a process that is still present is told that the run is over
 _RETURN_SECONDS = 3.0  # within which a process may return that was told to end and vanished without confirming it
 _ROUTERS_SECONDS = 5.0  # for a router to confirm
@@ -229,7 +229,7 @@ class Conductor:
 
     def _next(self) -> tuple[str, bytes | bool] | None:
         try:
-            return self._news.get(timeout=_LOOK_SECONDS)
+            return self._news.get(timeout=_POLL_SECONDS)
         except Empty:
             return None
 

@@ -30,12 +30,12 @@ from evedrop.live.observer.verification import Verifier, extent_of
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.brief_parts import ObserverPart
 from evedrop.live.protocol.codec import Reader, is_refusal, read_refusal
-from evedrop.live.protocol.commands import Where
+from evedrop.live.protocol.commands import ReportStatus
 from evedrop.live.protocol.news import RunOver
+from evedrop.live.protocol.process_status import is_process_status, read_process_status
 from evedrop.live.protocol.requests import StatusRequest, read_request
 from evedrop.live.protocol.status import RunStatus
 from evedrop.live.protocol.telemetry import is_held, is_leaving, read_leaving
-from evedrop.live.protocol.whereabouts import is_whereabouts, read_whereabouts
 from evedrop.model.digest import Blocks
 from evedrop.names import CONTROLLER, OBSERVER, OPERATOR, ROUTER, SENSOR
 from evedrop.results.ending import note_end
@@ -139,7 +139,7 @@ class ObservedRun:
             self._recovery = Recovery(conductor, self._steering, self._brief.flow, self._scenario.pace, tell)
             program = self._scenario.process.source == "zenoh"
             limit = patience_of(patience, self._scenario.pace, self._brief.flow.batch, program)
-            self._stall = Stall(limit, self._brief.flow.batch, lambda: conductor.send_to_all(Where()))
+            self._stall = Stall(limit, self._brief.flow.batch, lambda: conductor.send_to_all(ReportStatus()))
             try:
                 conductor.assemble()
                 self._started = self._ended = time.monotonic()
@@ -152,9 +152,9 @@ class ObservedRun:
                     if news is not None:
                         self._take(conductor, *news)
                     self._steer(conductor)
-                    self._recovery.look(self._joiner.done)
+                    self._recovery.poll(self._joiner.done)
                     self._save()
-                    self._look(conductor)
+                    self._poll(conductor)
                 self._save_rows()  # processes may take long to confirm their end, and this one may be killed meanwhile
             except EvedropError as error:
                 self._suspects = conductor.missing
@@ -175,14 +175,14 @@ class ObservedRun:
                 if session.dropped:
                     self._misdelivered[OBSERVER] = session.dropped
 
-    def _look(self, conductor: Conductor) -> None:
+    def _poll(self, conductor: Conductor) -> None:
         """Check whether the run stands still because of a process that is present. Raises Silence."""
         done, at = self._joiner.done, self._steering.at
         held = at is not None and done >= at
         present = set(self._scenario.digested) - conductor.absent
         unneeded = (CONTROLLER,) if done < self._scenario.slots else ()
         missing = bool(conductor.missing)
-        self._stall.look(done, lambda: self._joiner.places(present), unneeded, held=held, missing=missing)
+        self._stall.poll(done, lambda: self._joiner.places(present), unneeded, held=held, missing=missing)
 
     @property
     def _control(self) -> Control:
@@ -238,8 +238,8 @@ class ObservedRun:
         message = Reader(conductor.keys[source], payload)
         if is_refusal(message):
             raise read_refusal(message, source)
-        if is_whereabouts(message):
-            self._stall.add_answer(source, read_whereabouts(message, self._scenario.slots))
+        if is_process_status(message):
+            self._stall.add_answer(source, read_process_status(message, self._scenario.slots))
             return
         if not self._news(source, message):
             return

@@ -17,7 +17,7 @@ from queue import SimpleQueue
 
 from evedrop.errors import EvedropError, Interrupted, NoAnswer, RunError
 from evedrop.live.network.launcher_news import set_news_apart, tell
-from evedrop.live.network.launcher_watch import launcher_is_gone, when_launcher_is_gone
+from evedrop.live.network.launcher_watchdog import launcher_is_gone, when_launcher_is_gone
 from evedrop.live.network.session import Session
 from evedrop.live.observer.conductor import Stop
 from evedrop.live.observer.observation import ObservedRun, Report

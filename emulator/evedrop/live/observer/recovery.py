@@ -60,7 +60,7 @@ class Recovery:
         self.outages: list[ConnectionOutage] = []
         """All outages so far."""
 
-    def look(self, done: int) -> None:
+    def poll(self, done: int) -> None:
         """Handle lost connections, given that all slots below `done` are joined.
 
         Raises RunError if a process has been missing for too long.

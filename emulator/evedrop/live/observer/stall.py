@@ -16,14 +16,14 @@ from typing import final
 from evedrop.errors import Silence
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.protocol.keys import writer_of
-from evedrop.live.protocol.whereabouts import Whereabouts
+from evedrop.live.protocol.process_status import ProcessStatus
 from evedrop.names import OBSERVER
 
 LEAST_SECONDS = 5.0
 """The least of these: a busy machine may not let a process work for some seconds."""
-_LOOK_SECONDS = 0.25
+_POLL_SECONDS = 0.25
 _STEP_SECONDS = (
-    1.0  # the most that counts between two looks: time in which the observer itself did not run does not count
+    1.0  # the most that counts between two polls: time in which the observer itself did not run does not count
 )
 
 
@@ -40,22 +40,22 @@ class Stall:
     """Notices that a run stands still, and ends it when the process that it waits for has done nothing for too long."""
 
     def __init__(self, patience: float, batch: int, ask: Callable[[], None], clock: Clock = SYSTEM_CLOCK) -> None:
-        """patience: as in `patience_of`; batch: slots of a report; ask: asks every process where it is."""
+        """patience: as in `patience_of`; batch: slots of a report; ask: requests the status of every process."""
         self._patience, self._batch, self._ask = patience, batch, ask
         self._clock = clock
-        self._looked = self._clock.monotonic()
+        self._polled = self._clock.monotonic()
         self._done = 0
         self._stalled = self._asked = 0.0
         """Seconds since slots were last joined, and the value of that count when the processes were last asked."""
-        self._answers: dict[str, Whereabouts] = {}
+        self._answers: dict[str, ProcessStatus] = {}
         self._moved: dict[str, tuple[tuple[int, int], float]] = {}
         """Process → the slot it is at by its answer and by its reports, and when in this stall that last changed."""
 
-    def add_answer(self, process: str, where: Whereabouts) -> None:
+    def add_answer(self, process: str, status: ProcessStatus) -> None:
         """Take a process's answer."""
-        self._answers[process] = where
+        self._answers[process] = status
 
-    def look(
+    def poll(
         self,
         done: int,
         reported: Callable[[], Mapping[str, int]],
@@ -72,12 +72,12 @@ class Stall:
         """
         now = self._clock.monotonic()
         if done > self._done or held:
-            self._done, self._looked, self._stalled, self._asked = done, now, 0.0, 0.0
+            self._done, self._polled, self._stalled, self._asked = done, now, 0.0, 0.0
             self._answers, self._moved = {}, {}
             return
-        if now - self._looked < _LOOK_SECONDS:
+        if now - self._polled < _POLL_SECONDS:
             return
-        step, self._looked = min(now - self._looked, _STEP_SECONDS), now
+        step, self._polled = min(now - self._polled, _STEP_SECONDS), now
         if missing:
             return
         self._stalled += step
@@ -111,16 +111,16 @@ class Stall:
             )
 
 
-def _described(name: str, where: Whereabouts | None) -> str:
-    if where is None:
+def _described(name: str, status: ProcessStatus | None) -> str:
+    if status is None:
         return f"{name} does not say where it is"
-    if not where.waits:
-        return f"{name} is at slot {where.slot} and waits for no process"
-    return f"{name} says that it is at slot {where.slot} and waits on {', '.join(where.waits[:3])}"
+    if not status.waits:
+        return f"{name} is at slot {status.slot} and waits for no process"
+    return f"{name} says that it is at slot {status.slot} and waits on {', '.join(status.waits[:3])}"
 
 
 def silent_of(
-    places: Mapping[str, int], answers: Mapping[str, Whereabouts], unneeded: Collection[str] = ()
+    places: Mapping[str, int], answers: Mapping[str, ProcessStatus], unneeded: Collection[str] = ()
 ) -> list[str]:
     """The processes that a run waits for when it stands still.
 
@@ -132,12 +132,12 @@ def silent_of(
     seen, chain = set(behind), list(behind)
     idle, mute = [], []
     for name in chain:  # grows
-        where = answers.get(name)
-        if where is None:
+        status = answers.get(name)
+        if status is None:
             mute.append(name)
-        elif not where.waits:
+        elif not status.waits:
             idle.append(name)
-        for key in () if where is None else where.waits:
+        for key in () if status is None else status.waits:
             writer = writer_of(key)
             if writer in places and writer not in seen:
                 seen.add(writer)

@@ -56,8 +56,8 @@ class End(ControlCommand):
 
 
 @dataclass(frozen=True)
-class Where(ControlCommand):
-    """To all: report where you are."""
+class ReportStatus(ControlCommand):
+    """To all: report your status."""
 
     do = "where"
 
@@ -199,7 +199,7 @@ def _changes(found: Reader, name: str, slots: int) -> tuple[Change, ...]:
 
 
 _KINDS: Mapping[str, type[ControlCommand]] = {
-    kind.do: kind for kind in (Start, End, Where, Hold, Abandon, Go, LinkChange, Again)
+    kind.do: kind for kind in (Start, End, ReportStatus, Hold, Abandon, Go, LinkChange, Again)
 }
 
 

@@ -16,7 +16,7 @@ import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
-_LOOK_SECONDS = 0.05  # between two checks of whether the server is to stop
+_POLL_SECONDS = 0.05  # between two checks of whether the server is to stop
 _REQUEST_SECONDS = 10.0  # for a reader to send its request
 _MOST_READERS = 32  # at a time; further ones are turned away, so another user can use up all places
 
@@ -60,7 +60,7 @@ class BoundedServer(ThreadingHTTPServer):
 
     def start(self) -> None:
         """Accept readers, on a thread of its own."""
-        threading.Thread(target=self.serve_forever, args=(_LOOK_SECONDS,), name="http server", daemon=True).start()
+        threading.Thread(target=self.serve_forever, args=(_POLL_SECONDS,), name="http server", daemon=True).start()
 
     def stop(self) -> None:
         """Accept no more readers. Those in progress continue by themselves."""

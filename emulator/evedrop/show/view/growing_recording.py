@@ -19,7 +19,7 @@ from typing import IO, final
 from evedrop.errors import UsageError
 from evedrop.show.view.bounded_http import BoundedServer, QuietHandler
 
-_LOOK_SECONDS = 0.05  # between two checks of whether the file has grown
+_POLL_SECONDS = 0.05  # between two checks of whether the file has grown
 _PIECE = 2**18
 
 
@@ -54,7 +54,7 @@ class Followed:
             elif over:
                 return
             else:
-                self._over.wait(_LOOK_SECONDS)
+                self._over.wait(_POLL_SECONDS)
 
     def _read(self, at: int) -> bytes:
         try:

@@ -20,8 +20,8 @@ _MOST_KEYS = 4096
 
 
 @dataclass(frozen=True)
-class Whereabouts:
-    """A process's report of where it is."""
+class ProcessStatus:
+    """What a process reports of itself."""
 
     slot: int
     """The slot that it is at."""
@@ -33,29 +33,29 @@ class Whereabouts:
         return pack({"k": self.slot, "waits": list(self.waits)})
 
 
-def is_whereabouts(message: Reader) -> bool:
-    """Whether a message on telemetry or journal is a process's whereabouts."""
+def is_process_status(message: Reader) -> bool:
+    """Whether a message on telemetry or journal is a process's status."""
     return message.has("waits")
 
 
-def read_whereabouts(message: Reader, slots: int) -> Whereabouts:
-    """Decode a process's whereabouts; slots: of the run."""
+def read_process_status(message: Reader, slots: int) -> ProcessStatus:
+    """Decode a process's status; slots: of the run."""
     waits = message.names("waits")
     if len(waits) > _MOST_KEYS:
         raise message.malformed(f"{len(waits)} keys in waits", f"{_MOST_KEYS} at most")
-    return Whereabouts(message.integer("k", 0, slots), waits)
+    return ProcessStatus(message.integer("k", 0, slots), waits)
 
 
 @final
-class Place:
-    """Where a process is: updated by the working thread, read by the answering thread."""
+class StatusReporter:
+    """Reports the status of its process: the working thread updates it, another thread answers requests."""
 
     def __init__(self) -> None:
         self.slot = 0
         """The slot that it is at."""
         self.waits: tuple[str, ...] = ()
-        """As in `Whereabouts`."""
-        self._asked: SimpleQueue[None] = SimpleQueue()
+        """As in `ProcessStatus`."""
+        self._requests: SimpleQueue[None] = SimpleQueue()
 
     @contextmanager
     def waiting(self, *keys: str) -> Iterator[None]:
@@ -66,16 +66,16 @@ class Place:
         finally:
             self.waits = ()
 
-    def ask(self) -> None:
-        """Take a question from the observer."""
-        self._asked.put(None)
+    def request(self) -> None:
+        """Take a request from the observer."""
+        self._requests.put(None)
 
     def answer(self, put: Callable[[bytes], None]) -> None:
-        """Start a thread that answers the questions; put: sends an answer."""
+        """Start a thread that answers the requests; put: sends an answer."""
 
         def go_on() -> None:
             while True:
-                self._asked.get()
-                put(Whereabouts(self.slot, self.waits).pack())
+                self._requests.get()
+                put(ProcessStatus(self.slot, self.waits).pack())
 
-        threading.Thread(target=go_on, name="whereabouts", daemon=True).start()
+        threading.Thread(target=go_on, name="status", daemon=True).start()

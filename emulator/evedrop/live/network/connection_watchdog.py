@@ -12,7 +12,7 @@ from evedrop.live.protocol.brief import AnyBrief
 
 
 @final
-class Lifeline:
+class ConnectionWatchdog:
     """Ends its process after `flow.longest_outage` without a connection."""
 
     def __init__(self, brief: AnyBrief) -> None:

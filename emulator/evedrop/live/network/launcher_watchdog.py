@@ -23,7 +23,7 @@ def when_launcher_is_gone(then: Callable[[], None], said: Callable[[bytes], None
                 said(line)
         then()
 
-    threading.Thread(target=wait, name="launcher-watch", daemon=True).start()
+    threading.Thread(target=wait, name="launcher-watchdog", daemon=True).start()
 
 
 def launcher_is_gone() -> bool:
