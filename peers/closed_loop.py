@@ -7,7 +7,7 @@ from typing import final
 from evedrop.live.network.process_session import ProcessSession
 from evedrop.live.network.resending import GapDetector, ReplayBuffer
 from evedrop.live.protocol.brief import AnyBrief
-from evedrop.live.protocol.brief_closed_loop import EstimatorLoop, SensorLoop
+from evedrop.live.protocol.brief_closed_loop import EstimatorLoopPart, SensorLoopPart
 from evedrop.live.protocol.closed_loop import known, read_decided
 from evedrop.live.protocol.codec import Reader
 from evedrop.model.input_aware import InputAwareEstimator
@@ -46,7 +46,7 @@ class Steered:
     inputs: how many the controller decides.
     """
 
-    def __init__(self, brief: AnyBrief, inputs: int, loop: SensorLoop, session: ProcessSession) -> None:
+    def __init__(self, brief: AnyBrief, inputs: int, loop: SensorLoopPart, session: ProcessSession) -> None:
         self._period = loop.period
         self._decided = Decided(session, loop.period, (inputs, brief.trials), brief.flow.longest_outage)
         on_truth = loop.acts_on == "truth"
@@ -67,7 +67,7 @@ class Steered:
 class Consultation:
     """The closed loop at the legitimate estimator: sends its estimate, and may receive the inputs."""
 
-    def __init__(self, brief: AnyBrief, loop: EstimatorLoop, session: ProcessSession, receiver: Receiver) -> None:
+    def __init__(self, brief: AnyBrief, loop: EstimatorLoopPart, session: ProcessSession, receiver: Receiver) -> None:
         self._period = loop.period
         self._put = (
             kept_decisive(session, session.keys.estimate, brief, self._period) if loop.acts_on == "estimate" else None

@@ -10,7 +10,7 @@ from evedrop.live.protocol.brief import AnyBrief, Brief
 from evedrop.live.protocol.brief_parts import EavesdropperPart
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
-from evedrop.peers.following import follow
+from evedrop.peers.receiver_loop import follow
 from evedrop.scenario.conformance.checked import checked_eavesdropper
 from evedrop.scenario.conformance.problems import Problem
 

@@ -12,7 +12,7 @@ from evedrop.live.protocol.brief_parts import LegitimatePart
 from evedrop.model.input_aware import InputAwareEstimator
 from evedrop.model.schemes import scheme_of
 from evedrop.peers.closed_loop import Consultation
-from evedrop.peers.following import follow
+from evedrop.peers.receiver_loop import follow
 from evedrop.scenario.conformance.checked import checked_estimator
 from evedrop.scenario.conformance.problems import Problem
 

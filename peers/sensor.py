@@ -169,7 +169,7 @@ class Acknowledgements:
 
 
 @final
-class Sensing:
+class SensorLoop:
     """The sensor's work on a session that is being opened.
 
     It makes many slots at once, and sends one after the other. It makes one at a time where each is due at a certain time, or
@@ -325,8 +325,8 @@ def sense(
     patience = brief.flow.longest_outage
     source = None if entry is None else listen(entry, bool(brief.part.pace), patience)
     with source or contextlib.nullcontext() as program, connect(brief) as session:
-        sensing = Sensing(brief, scheme, _core_of(brief, scheme, program), session, program, clock)
+        loop = SensorLoop(brief, scheme, _core_of(brief, scheme, program), session, program, clock)
         session.ready()
         session.wait_for(Start)
-        sensing.carry_on()
+        loop.carry_on()
         session.wait_for(End)

@@ -40,7 +40,7 @@ IN_A_NAMESPACE = ("unshare", "--mount", "--propagation", "private")
 
 
 @final
-class Making:
+class StartedDebootstrap:
     """What is known of a stand-in of debootstrap that was started."""
 
     def __init__(self, folder: Path) -> None:
@@ -73,7 +73,7 @@ class Making:
 
 
 @pytest.fixture
-def making(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Making]:
+def started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[StartedDebootstrap]:
     """A stand-in for debootstrap that mounts what debootstrap mounts, and never ends; the machine's mounts stay as they are."""
     try:
         prepare({})
@@ -85,7 +85,7 @@ def making(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Making]:
     program.chmod(0o755)
     monkeypatch.setenv("PATH", str(program.parent), prepend=os.pathsep)
     with unharmed(tmp_path):
-        one = Making(tmp_path)
+        one = StartedDebootstrap(tmp_path)
         for name, value in one.environment.items():
             monkeypatch.setenv(name, value)
         yield one
@@ -107,35 +107,35 @@ def unharmed(folder: Path) -> Iterator[None]:
     assert Path("/proc/1/stat").exists()
 
 
-def test_a_slow_debootstrap_is_given_up_and_leaves_nothing(making: Making, tmp_path: Path) -> None:
+def test_a_slow_debootstrap_is_given_up_and_leaves_nothing(started: StartedDebootstrap, tmp_path: Path) -> None:
     """It is said that it was slow; neither a mount nor a process nor a file is left."""
     folder = tmp_path / "temporary"
     folder.mkdir()
     with pytest.raises(CannotRun, match="debootstrap: did not end within 2 s"):
         bootstrap(folder, "http://mirror.invalid", "bookworm", folder / "base.tar", seconds=2.0)
-    assert making.mounted(), "it must be given up in the middle"
-    wait_until(making.over, "the end of all that it started")
+    assert started.mounted(), "it must be given up in the middle"
+    wait_until(started.over, "the end of all that it started")
     assert mounted_below(folder) == []
     assert [path.name for path in folder.rglob("*")] == ["system"]
     remove(folder)
     assert not folder.exists()
 
 
-def test_killed_tests_leave_no_mount_and_no_process(making: Making, tmp_path: Path) -> None:
+def test_killed_tests_leave_no_mount_and_no_process(started: StartedDebootstrap, tmp_path: Path) -> None:
     """Kill -9 of the process that makes the base, in the middle: debootstrap ends with it, and so do its mounts."""
     folder = tmp_path / "temporary"
     folder.mkdir()
     command = (sys.executable, "-c", MAKES, folder)
     with subprocess.Popen(command, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}) as maker:
-        wait_until(making.mounted, "a debootstrap under way")
+        wait_until(started.mounted, "a debootstrap under way")
         maker.send_signal(signal.SIGKILL)
-    wait_until(making.over, "the end of all that it started")
+    wait_until(started.over, "the end of all that it started")
     assert mounted_below(folder) == []
     assert [path.name for path in folder.rglob("*")] == ["system"]
 
 
 def test_a_debootstrap_that_fails_is_no_failure_of_ours(
-    making: Making, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    started: StartedDebootstrap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What it said is the reason why nothing is tested."""
     (tmp_path / "bin" / "debootstrap").write_text("#!/bin/sh\necho 'E: no such mirror' >&2\nexit 1\n")
@@ -144,7 +144,9 @@ def test_a_debootstrap_that_fails_is_no_failure_of_ours(
         bootstrap(tmp_path / "temporary", "http://mirror.invalid", "bookworm", tmp_path / "base.tar")
 
 
-def test_apts_proxies_are_for_debootstrap_too(making: Making, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_apts_proxies_are_for_debootstrap_too(
+    started: StartedDebootstrap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """They are in a configuration of its own; a variable of the environment outranks them."""
     programs = {
         "apt-config": "echo \"http_proxy='http://a b.invalid:1'\"; echo \"https_proxy='http://apt.invalid:2'\"",
@@ -184,7 +186,7 @@ assert not folder.exists()
 
 
 @pytest.mark.parametrize("kind", ["another file system", "the same file system"])
-def test_a_folder_with_a_mount_in_it_is_not_removed(making: Making, kind: str, tmp_path: Path) -> None:
+def test_a_folder_with_a_mount_in_it_is_not_removed(started: StartedDebootstrap, kind: str, tmp_path: Path) -> None:
     """Not by a byte, be it a bind mount, whose device is the folder's own; and removed when nothing is mounted any more."""
     folder, kept = tmp_path / "temporary", tmp_path / "kept"
     for made in (folder / "a place", folder / "other", kept):

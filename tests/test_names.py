@@ -50,6 +50,34 @@ def test_no_two_public_classes_have_one_name() -> None:
     assert {name: where for name, where in real.items() if len(where) > 1} == {}
 
 
+GERUNDS = {
+    "Colluding": "a strategy of scenario files",
+    "Ending": "a noun: how a run ended",
+    "Finding": "a noun",
+    "Finishing": "news of the end of a run, as RunOver",
+    "Greeting": "a noun",
+    "Jamming": "an attack by the field's name",
+    "Nothing": "no gerund",
+    "Pending": "an adjective: the messages not handled yet",
+    "Recording": "a noun",
+    "Resting": "an example of a scheme",
+    "Spoofing": "an attack by the field's name",
+    "Steering": "a noun: of a run",
+    "Wiring": "a noun",
+    "Withholding": "a scheme of scenario files",
+}
+"""Last word of a class's name → why it is no gerund, or may be one."""
+
+
+def test_no_class_is_named_by_a_gerund() -> None:
+    """A class is a thing: a loop, a rule, a reporter."""
+    tests = {path: path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("*.py")}
+    names = re.compile(r"^ *class _?((?:[A-Z]\w*?)??)([A-Z][a-z]*ing)\b", re.MULTILINE)
+    found = {word for text in (texts() | tests).values() for _, word in names.findall(text)}
+    assert len(found & set(GERUNDS)) > 5
+    assert found - set(GERUNDS) == set()
+
+
 def test_classes_say_that_they_are_final_by_the_decorator() -> None:
     """`@final` is checked by mypy; a sentence in a docstring is not. Only modules with such words are parsed."""
     said = re.compile(r"(?:^|[.;] )Final(?:\.|;)")
@@ -72,6 +100,7 @@ GLOSSARY = ROOT / "docs" / "glossary.md"
 FORMER = {
     "floor plan": "drawing of the packages",
     "floor_plan": "package_drawing",
+    "heeding": "heed rule",
     "lifeline": "watchdog",
     "look_seconds": "poll_seconds",
     "rooms": "packages",

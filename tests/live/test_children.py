@@ -53,7 +53,7 @@ class Ended:
 
 
 @dataclass
-class Starting:
+class FakeStarter:
     """Starts processes that end at once; an observer writes these lines first."""
 
     lines: bytes = b""
@@ -78,7 +78,7 @@ class Bench:
         self.private.mkdir()
         (self.results / "logs").mkdir(exist_ok=True)
         self.briefs = briefs_of(scenario_of(), "tcp/127.0.0.1:1", ObserverTask(self.results, False))
-        self.starter = Starting()
+        self.starter = FakeStarter()
         self.held = HeldFolder(self.results)
         self.children = Children(self.held, self.private, starter=self.starter)
 

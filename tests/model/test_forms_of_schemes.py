@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop.model.acknowledgements import Heeding
+from evedrop.model.acknowledgements import HeedRule
 from evedrop.model.process import Process
 from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.theory.closed_form import ClosedForm, Hijack, ReceiverConditions
@@ -18,7 +18,7 @@ from evedrop.model.theory.covariances import LARGEST_OPERATOR
 STABLE = Process(np.array([[0.9, 0.3], [0.0, 0.8]]), np.eye(2), np.eye(2))
 UNSTABLE = Process(np.array([[1.2, 0.1], [0.0, 0.5]]), np.eye(2), np.eye(2))
 HEARS = ReceiverConditions(6, False, 0.7, None, (0.56, 0.16))
-HIJACK = Hijack(0.8, 0.5, Heeding(1, 0.5), lambda user, served: float(served))  # noqa: ARG005 - the served eavesdropper's own
+HIJACK = Hijack(0.8, 0.5, HeedRule(1, 0.5), lambda user, served: float(served))  # noqa: ARG005 - the served eavesdropper's own
 CHAINS = [("scheduled", "naive"), ("encrypted-schedule", "selective"), ("quantised-schedule", "selective")]
 
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evedrop.model.acknowledgements import AckChannel, Heeding, heeding_of, rates_of
+from evedrop.model.acknowledgements import AckChannel, HeedRule, heed_rule_of, rates_of
 from evedrop.model.streams import Batch, stream_key
 from evedrop.model.theory.closed_form import Hears
 from evedrop.model.theory.closed_forms import hijacked_schedule, scheduled
@@ -32,12 +32,12 @@ def hears(whose: str) -> Hears:
 
 def limits(alpha: float, attack: str, threshold: int = 4) -> dict[str, float]:
     """The traces of user's and eavesdropper's limit under `scheduled`."""
-    rates, heeding = rates_of(attack, MU, MU_E, alpha), heeding_of(attack, alpha, MU_E)
+    rates, heed_rule = rates_of(attack, MU, MU_E, alpha), heed_rule_of(attack, alpha, MU_E)
     found = {}
     for whose, split in (("user", rates.user), ("eve", rates.eavesdropper)):
         chain = scheduled(threshold, 0.9, split)
-        if heeding is not None:
-            chain = hijacked_schedule(threshold, MU, MU_E, heeding, hears(whose))
+        if heed_rule is not None:
+            chain = hijacked_schedule(threshold, MU, MU_E, heed_rule, hears(whose))
         found[whose] = float(np.trace(chain.limit(UNSTABLE)))
     return found
 
@@ -45,30 +45,30 @@ def limits(alpha: float, attack: str, threshold: int = 4) -> dict[str, float]:
 @given(alpha=st.floats(0.0, 1.0), overheard=st.one_of(st.just(0.0), st.floats(0.01, 1.0)))
 def test_as_many_are_heeded_as_before(alpha: float, overheard: float) -> None:
     """Of all packets, those after n misses in a row being (1−μ_e)^n μ_e of them: α, and never more after more misses."""
-    heeding = Heeding.of(alpha, overheard)
-    if heeding is None:
+    heed_rule = HeedRule.of(alpha, overheard)
+    if heed_rule is None:
         assert alpha == 1.0 or overheard == 0.0
         return
-    shares = [heeding.share_of(missed) for missed in (0, heeding.patience, heeding.patience + 1)]
+    shares = [heed_rule.share_of(missed) for missed in (0, heed_rule.patience, heed_rule.patience + 1)]
     assert shares == sorted(shares, reverse=True)
-    assert 0.0 <= heeding.share <= 1.0
+    assert 0.0 <= heed_rule.share <= 1.0
     assert shares[2] == 0.0
-    left = (1.0 - overheard) ** heeding.patience
+    left = (1.0 - overheard) ** heed_rule.patience
     if left > 1e-9:
-        assert 1.0 - left + heeding.share * overheard * left == pytest.approx(alpha, abs=1e-9)
+        assert 1.0 - left + heed_rule.share * overheard * left == pytest.approx(alpha, abs=1e-9)
 
 
 def test_what_it_heeds_of_some_links() -> None:
     """α ≤ μ_e: a share of what was heard. Else all after few misses; with a deaf eavesdropper or without losses, no choice."""
     cases = {(0.6, 0.9): (0, 0.6 / 0.9), (0.6, 1.0): (0, 0.6), (0.95, 0.9): (1, 0.05 / 0.09), (0.9, 0.5): (3, 0.4)}
     for (alpha, overheard), (patience, share) in cases.items():
-        heeding = Heeding.of(alpha, overheard)
-        assert heeding is not None
-        assert heeding.patience == patience
-        assert heeding.share == pytest.approx(share)
-    assert Heeding.of(0.0, 0.5) == Heeding(0, 0.0)
-    assert Heeding.of(1.0, 0.5) is Heeding.of(0.5, 0.0) is None
-    assert heeding_of("critical", 0.5, 0.5) is None
+        heed_rule = HeedRule.of(alpha, overheard)
+        assert heed_rule is not None
+        assert heed_rule.patience == patience
+        assert heed_rule.share == pytest.approx(share)
+    assert HeedRule.of(0.0, 0.5) == HeedRule(0, 0.0)
+    assert HeedRule.of(1.0, 0.5) is HeedRule.of(0.5, 0.0) is None
+    assert heed_rule_of("critical", 0.5, 0.5) is None
 
 
 @given(mu=st.floats(0.0, 1.0), mu_e=st.floats(0.01, 1.0), alpha=st.floats(0.0, 1.0))
@@ -84,21 +84,21 @@ def test_the_rates_are_those_of_the_honest_sensor(mu: float, mu_e: float, alpha:
 def test_acknowledgements_are_heeded_by_misses(alpha: float, overheard: float) -> None:
     """Trial by trial: after few misses all, after many none; silent slots do not count, and asking twice counts once."""
     gamma, gamma_e, sent = (coins(quality, 60, 300, seed) for seed, quality in ((1, 0.8), (2, overheard), (3, 0.6)))
-    channel, heeding = (
+    channel, heed_rule = (
         AckChannel("hijack", alpha, KEY, Batch(60, 300), overheard=overheard),
-        Heeding.of(alpha, overheard),
+        HeedRule.of(alpha, overheard),
     )
-    assert heeding is not None
+    assert heed_rule is not None
     missed, at_share = np.zeros(300, int), []
     for k in range(60):
         arrived = channel.arrived(k, sent[k], gamma[k] & sent[k], gamma_e[k] & sent[k])
         assert np.array_equal(arrived, channel.arrived(k, sent[k], gamma[k] & sent[k], gamma_e[k] & sent[k]))
         missed = np.where(sent[k], np.where(gamma_e[k], 0, missed + 1), missed)
         due = gamma[k] & sent[k]
-        assert arrived[due & (missed < heeding.patience)].all()
-        assert not arrived[~due | (missed > heeding.patience)].any()
-        at_share += arrived[due & (missed == heeding.patience)].tolist()
-    assert abs(np.mean(at_share) - heeding.share) < 5.0 * np.sqrt(0.25 / len(at_share))
+        assert arrived[due & (missed < heed_rule.patience)].all()
+        assert not arrived[~due | (missed > heed_rule.patience)].any()
+        at_share += arrived[due & (missed == heed_rule.patience)].tolist()
+    assert abs(np.mean(at_share) - heed_rule.share) < 5.0 * np.sqrt(0.25 / len(at_share))
 
 
 def test_without_lost_acknowledgements_it_is_the_honest_sensor() -> None:
@@ -139,11 +139,11 @@ def test_perfect_secrecy_needs_an_acknowledgement_channel_that_loses_nothing(
     assert after["eve"] == pytest.approx(hijacked, rel=1e-3)
     if alpha <= MU_E:
         assert after["eve"] == pytest.approx(after["user"])
-    heeding = Heeding.of(alpha, MU_E)
-    if heeding is not None:
-        chain = hijacked_schedule(threshold, MU, MU_E, heeding, hears("user"))
+    heed_rule = HeedRule.of(alpha, MU_E)
+    if heed_rule is not None:
+        chain = hijacked_schedule(threshold, MU, MU_E, heed_rule, hears("user"))
         assert np.allclose((chain.reset + chain.carried).sum(axis=1), 1.0)
-        in_last = chain.law[(threshold - 1) * (heeding.patience + 2) :].sum()
+        in_last = chain.law[(threshold - 1) * (heed_rule.patience + 2) :].sum()
         assert in_last == pytest.approx(1.0 / (MU * alpha) / (threshold - 1 + 1.0 / (MU * alpha)))
 
 

@@ -236,7 +236,7 @@ def test_a_report_is_kept_for_a_window(name: str, stage: Stage) -> None:
     assert stage.all(RunKeys("r").progress(name)) == [wire.progress(SLOTS)]
 
 
-class Sensing:
+class SensorThread:
     """A sensor in a thread of its own."""
 
     def __init__(self, stage: Stage, brief: AnyBrief) -> None:
@@ -270,10 +270,10 @@ class Sensing:
 def test_sensor_sends_as_its_followers_let_it(stage: Stage) -> None:
     """It waits for `start`, sends a window, then what the slowest of receivers and observer lets it, and ends on `end`."""
     brief = briefs()["sensor"]
-    sensing = Sensing(stage, brief)
+    sensor = SensorThread(stage, brief)
     assert stage.put.empty()
     stage.commands.put(Start().pack())
-    sensing.packets(0, WINDOW)
+    sensor.packets(0, WINDOW)
     everybody = [*part_of(brief, SensorPart).receivers, "observer"]
     assert len(everybody) == 5
     sent = WINDOW
@@ -285,11 +285,11 @@ def test_sensor_sends_as_its_followers_let_it(stage: Stage) -> None:
         40,
     ):  # the observer alone is behind: each of its reports lets exactly as many slots through
         for name in everybody[:-1]:
-            sensing.progress(name, sent)
-        sensing.progress("observer", done)
-        sensing.packets(sent, sent := min(SLOTS, done + WINDOW))
+            sensor.progress(name, sent)
+        sensor.progress("observer", done)
+        sensor.packets(sent, sent := min(SLOTS, done + WINDOW))
     stage.commands.put(End().pack())
-    sensing.thread.join(LIMIT)
+    sensor.thread.join(LIMIT)
     assert stage.put.get(timeout=LIMIT) == ("closed", b"")
     assert stage.put.empty()
 
@@ -298,21 +298,21 @@ def test_sensor_sends_once_more_what_is_not_done(stage: Stage) -> None:
     """All packets from the slot that is asked for on, and as many before it as the router needs, after a word of them."""
     brief = briefs()["sensor"]
     brief = replace(brief, part=replace(part_of(brief, SensorPart), history=3))
-    sensing = Sensing(stage, brief)
+    sensor = SensorThread(stage, brief)
     stage.commands.put(Start().pack())
-    sensing.packets(0, WINDOW)
+    sensor.packets(0, WINDOW)
     for name in (*part_of(brief, SensorPart).receivers, "observer"):
-        sensing.progress(name, 8)
-    sensing.packets(WINDOW, WINDOW + 8)
-    stage.kept[sensing.keys.uplink].again(4, 10)
-    key, payload = sensing.next()
-    assert (key, payload) == (sensing.keys.uplink, packets.resend(4, 10, 7))
+        sensor.progress(name, 8)
+    sensor.packets(WINDOW, WINDOW + 8)
+    stage.kept[sensor.keys.uplink].again(4, 10)
+    key, payload = sensor.next()
+    assert (key, payload) == (sensor.keys.uplink, packets.resend(4, 10, 7))
     for k in range(7, WINDOW + 8):
-        packets.read_uplink(wire.Reader(*sensing.next()), k, (2, 3))
-    stage.kept[sensing.keys.uplink].again(5, 8)
-    assert wire.Reader(*sensing.next()).integer("k") == 5
+        packets.read_uplink(wire.Reader(*sensor.next()), k, (2, 3))
+    stage.kept[sensor.keys.uplink].again(5, 8)
+    assert wire.Reader(*sensor.next()).integer("k") == 5
     for k in range(5, WINDOW + 8):
-        packets.read_uplink(wire.Reader(*sensing.next()), k, (2, 3))
+        packets.read_uplink(wire.Reader(*sensor.next()), k, (2, 3))
     assert stage.put.empty()
 
 

@@ -50,7 +50,7 @@ ATTACKS: Mapping[str, Attack] = {
 }
 """critical blocks acknowledgements where γ = 1 and γᵉ = 0; forge sends one in the user's name where γ = 0; flip does either.
 
-hijack leaves them as they are, and decides which ones the sensor heeds: see `Heeding`.
+hijack leaves them as they are, and decides which ones the sensor heeds: see `HeedRule`.
 """
 OVERHEARING = frozenset({"critical", "hijack"})
 """The attacks that depend on what a jammer hears."""
@@ -58,7 +58,7 @@ FORGING = frozenset({"forge", "flip"})
 """The attacks that make a reference of a packet that the user has not heard."""
 
 
-class Heeding(NamedTuple):
+class HeedRule(NamedTuple):
     """Which acknowledgements a hijacked sensor heeds, by how many packets in a row its eavesdropper has missed."""
 
     patience: int
@@ -67,7 +67,7 @@ class Heeding(NamedTuple):
     """The share that is heeded of those after exactly this many misses."""
 
     @classmethod
-    def of(cls, quality: float, overheard: float) -> Heeding | None:
+    def of(cls, quality: float, overheard: float) -> HeedRule | None:
         """The rule that heeds a share `quality` of all, if the eavesdropper hears packets with the probability `overheard`.
 
         1 − (1−μ_e)^J (1 − μ_e a) = α, with the patience J and the share a. None if there is no choice: where no acknowledgement
@@ -100,9 +100,9 @@ def _power(base: float, exponent: int) -> float:
     return found
 
 
-def heeding_of(attack: str, quality: float, overheard: float) -> Heeding | None:
+def heed_rule_of(attack: str, quality: float, overheard: float) -> HeedRule | None:
     """What the sensor heeds under an attack; None if it heeds all that reach it."""
-    return Heeding.of(quality, overheard) if attack == "hijack" else None
+    return HeedRule.of(quality, overheard) if attack == "hijack" else None
 
 
 @dataclass(frozen=True)
@@ -122,8 +122,8 @@ class AckChannelSpec:
     @property
     def memory(self) -> int:
         """How many packets before its own decide on an acknowledgement: those that the jammer may have missed in a row."""
-        heeding = heeding_of(self.attack, self.quality, self.overheard)
-        return 0 if heeding is None else heeding.patience
+        heed_rule = heed_rule_of(self.attack, self.quality, self.overheard)
+        return 0 if heed_rule is None else heed_rule.patience
 
 
 @final
@@ -148,8 +148,8 @@ class AckChannel:
         self._spans = spans
         # The first of two words is that of a reader of one.
         reader = BlockReader(key, batch, 2)
-        self._heeding = heeding_of(attack, quality, overheard)
-        share = 0.0 if self._heeding is None else self._heeding.share
+        self._heed_rule = heed_rule_of(attack, quality, overheard)
+        share = 0.0 if self._heed_rule is None else self._heed_rule.share
         words, limits = [0, 1, 0], np.array([quality, flip, share])[:, None]
         self._drawn = Ahead(reader.ahead, lambda slots: reader.uniforms(slots)[:, words] < limits)
         self._missed: NDArray[np.int64] = np.zeros(batch.trials, np.int64)
@@ -170,10 +170,10 @@ class AckChannel:
         through, flips, shared = self._drawn.at(k)
         on_the_air = self._attack(gamma, gamma_e, flips) if attacked else gamma
         arrived: Flags = on_the_air & through
-        if self._heeding is not None:
+        if self._heed_rule is not None:
             self.count(k, sent, gamma_e)
             if attacked:
-                few, as_many = self._missed < self._heeding.patience, self._missed == self._heeding.patience
+                few, as_many = self._missed < self._heed_rule.patience, self._missed == self._heed_rule.patience
                 arrived = on_the_air & (few | (as_many & shared))
         return arrived if sent is None else arrived & sent
 
@@ -210,9 +210,9 @@ def rates_of(attack: str, mu: float, mu_e: float, quality: float = 1.0, flip: fl
     """
     gamma, gamma_e, flips = (np.arange(8) >> bit & 1 == 0 for bit in range(3))
     chances = np.where(gamma, mu, 1.0 - mu) * np.where(gamma_e, mu_e, 1.0 - mu_e) * np.where(flips, flip, 1.0 - flip)
-    heeding, heeded = heeding_of(attack, quality, mu_e), np.full(8, quality)
-    if heeding is not None:
-        share = heeding.share_of(0)
+    heed_rule, heeded = heed_rule_of(attack, quality, mu_e), np.full(8, quality)
+    if heed_rule is not None:
+        share = heed_rule.share_of(0)
         heeded = np.where(gamma_e, share, max(0.0, quality - mu_e * share) / max(1.0 - mu_e, np.finfo(float).tiny))
     arrives = heeded * chances * ATTACKS[attack](gamma, gamma_e, flips)
 

@@ -29,7 +29,7 @@ from evedrop.score.histogram import LEVELS
 from evedrop.score.leak import HeardBitsStream
 from evedrop.score.rare_events import rare_events_of, z_of_error
 from evedrop.score.slots import Slots
-from evedrop.score.summary import PeerSummary, Summary, Surprising, Verification
+from evedrop.score.summary import PeerSummary, Summary, SurprisingTrial, Verification
 from evedrop.score.sums import SlotSums, Tally, slot_sums, squared_errors, trial_means
 from evedrop.score.totals import Totals
 from evedrop.score.verdict import Secrecy, secrecy
@@ -222,12 +222,12 @@ def _quantiles(tally: Tally) -> dict[str, float] | None:
     return {f"{level:g}": float(np.quantile(trial_means(tally), level)) for level in LEVELS}
 
 
-def _surprising(scenario: Scenario, tallies: Mapping[str, Tally]) -> Surprising | None:
+def _surprising(scenario: Scenario, tallies: Mapping[str, Tally]) -> SurprisingTrial | None:
     """The trial whose mean error, for any receiver, is least probable, given what happened to its own packets.
 
     None without such a trial: the run was cut short, has too few trials, or no receiver with such expectations.
     """
-    found: Surprising | None = None
+    found: SurprisingTrial | None = None
     for name, tally in tallies.items():
         own = tally.conditional
         if own is None or not own.slots or tally.done != tally.slots or tally.trials < _ENOUGH_TO_SURPRISE:
@@ -238,7 +238,7 @@ def _surprising(scenario: Scenario, tallies: Mapping[str, Tally]) -> Surprising 
         least = int(np.lexsort((-means, np.nan_to_num(probability, nan=1.0)))[0])
         if expected[least] > 0.0 and (found is None or probability[least] < found.probability):
             trial = scenario.first_trial + least
-            found = Surprising(trial, name, *(float(one[least]) for one in (means, expected, probability)))
+            found = SurprisingTrial(trial, name, *(float(one[least]) for one in (means, expected, probability)))
     return found
 
 

@@ -251,7 +251,7 @@ class FilterSummary:
 
 
 @dataclass(frozen=True)
-class Surprising:
+class SurprisingTrial:
     """The most surprising trial: the one whose error is least probable, given what happened to its own packets."""
 
     trial: int
@@ -332,7 +332,7 @@ class Summary:
     filter: FilterSummary | None
     applications: Mapping[str, application.Summary]
     """Application → its entry, which is at the top level of summary.json."""
-    surprising: Surprising | None
+    surprising: SurprisingTrial | None
     expectations: Sequence[Judged]
     directions: Mapping[str, Mapping[str, DirectionSummary]] = field(default_factory=dict)
     """Receiver → direction → its entry; empty without directions, and in modes without estimates."""

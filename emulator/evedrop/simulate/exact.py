@@ -96,10 +96,10 @@ class ExactSimulation:
         self._ack_channel = (
             None if ack_channel is None else AckChannel.from_spec(ack_channel, keys.acknowledgements, batch)
         )
-        self._steering = None
+        self._control_loop = None
         if scenario.controller is not None and scenario.assignment is not None:
             controller = ControllerCore(scenario.controller.strategy, scenario.assignment, disturbances, batch.trials)
-            self._steering = _Steering(roles, controller, self._sensor, digests[CONTROLLER], times)
+            self._control_loop = _ControlLoop(roles, controller, self._sensor, digests[CONTROLLER], times)
         self._receivers = {
             name: LinkedReceiver(one, scenario.window(name), scenario.timeline.outages[name])
             for name, one in roles.receivers.items()
@@ -114,11 +114,11 @@ class ExactSimulation:
 
     def play(self, chunk: range, links: Mapping[str, LinkCore]) -> Chunk:
         """Simulate the next slots, which are those that the links have planned. No receiver leaves or returns among them."""
-        answered = self._ack_channel is not None or self._steering is not None
+        answered = self._ack_channel is not None or self._control_loop is not None
         sent: list[Sent] = []
         alarms: list[Flags] = []
         users: list[FollowedSlots] = []
-        inputs = None if self._steering is None else self._steering.room(len(chunk))
+        inputs = None if self._control_loop is None else self._control_loop.room(len(chunk))
         for slots in [range(k, k + 1) for k in chunk] if answered else [chunk]:
             with self._guard.asking(LEGITIMATE, slots):
                 made = self._sensor.send(slots)
@@ -129,11 +129,11 @@ class ExactSimulation:
             if self._ack_channel is not None:
                 alarm = self._acknowledge(self._ack_channel, slots.start, made.packets.sent, links)
                 alarms += [] if alarm is None else [alarm]
-            if self._steering is not None and inputs is not None:
-                if self._steering.awaits_estimate:
+            if self._control_loop is not None and inputs is not None:
+                if self._control_loop.awaits_estimate:
                     users.append(self._follow(LEGITIMATE, slots, links[LEGITIMATE], made))
                 x_hat = users[-1].beliefs.x_hat[0] if users else None
-                self._steering.act(slots.start, slots.start - chunk.start, made.true[0], x_hat, inputs)
+                self._control_loop.act(slots.start, slots.start - chunk.start, made.true[0], x_hat, inputs)
         whole = Sent.joined(sent)
         with self._guard.asking(LEGITIMATE, chunk):
             self._packets.add_slots(self._roles.scheme.encrypted(whole.packets), whole.packets.sent)
@@ -201,7 +201,7 @@ class ExactSimulation:
 
 
 @final
-class _Steering:
+class _ControlLoop:
     """The controller of a scenario, and the way of its inputs to the sensor and to an estimator that knows them."""
 
     def __init__(

@@ -19,7 +19,7 @@ from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
 
 from evedrop.errors import RunError
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
-from evedrop.live.network.router import Routing
+from evedrop.live.network.router import RouterLoop
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
 from evedrop.live.protocol.brief import Brief, Flow
@@ -73,8 +73,8 @@ class MemoryBench:
         self.journal = Ear(self, self.keys.journal)
 
     def __enter__(self) -> Self:
-        self._routing = Routing(self.brief, self.stage.session(self.brief))
-        self._thread = threading.Thread(target=self._routing.carry_on, daemon=True)
+        self._loop = RouterLoop(self.brief, self.stage.session(self.brief))
+        self._thread = threading.Thread(target=self._loop.carry_on, daemon=True)
         self._thread.start()
         return self
 
@@ -173,10 +173,10 @@ def test_bad_packet_is_refused(name: str) -> None:
     """A gap that is not closed, or a malformed packet, ends the router's work with an error that says which."""
     messages, line = BAD[name]
     bench = MemoryBench(longest_outage=0.0)
-    routing = Routing(bench.brief, bench.stage.session(bench.brief))
+    loop = RouterLoop(bench.brief, bench.stage.session(bench.brief))
     bench.stage.fill(bench.keys.uplink, messages)
     with pytest.raises(RunError, match=line) as found:
-        routing.carry_on()
+        loop.carry_on()
     bench.stage.commands.put(End().pack())  # ends the thread that reads commands
     assert found.value.exit_status == 3
 

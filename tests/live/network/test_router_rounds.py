@@ -11,7 +11,7 @@ import pytest
 
 from evedrop.errors import MalformedMessage
 from evedrop.live.launch.briefs import history_of
-from evedrop.live.network.router import Routing
+from evedrop.live.network.router import RouterLoop
 from evedrop.live.protocol import packets, telemetry
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import Again, Go, LinkChange
@@ -145,10 +145,10 @@ def test_a_round_that_the_sensor_announces_first_begins_as_soon_as_the_conductor
 def test_a_malformed_command_ends_the_router() -> None:
     """With the error that says so, although its thread for packets has nothing to do."""
     bench = MemoryBench(**LATE)
-    routing = Routing(bench.brief, bench.stage.session(bench.brief))
+    loop = RouterLoop(bench.brief, bench.stage.session(bench.brief))
     bench.stage.commands.put(b"\xc1")
     with pytest.raises(MalformedMessage, match="control/router: not msgpack"):
-        routing.carry_on()
+        loop.carry_on()
 
 
 @pytest.mark.parametrize("kept", [True, False])

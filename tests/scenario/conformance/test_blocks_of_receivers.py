@@ -16,7 +16,7 @@ from evedrop.model.receiver import Belief, Beliefs, Codes, Flags, Reception
 from evedrop.model.schemes.plain import PlainEstimator
 from evedrop.scenario.conformance.blocks import divisions
 from evedrop.scenario.conformance.eavesdroppers import eavesdropper_verdicts
-from tests.scenario.conformance.breaking import blocks_of_eavesdropper, blocks_of_scheme, broken, listening, plain_with
+from tests.scenario.conformance.breaking import blocks_of_eavesdropper, blocks_of_scheme, broken, plain_with, setup_of
 
 
 class Follows(PlainEstimator):
@@ -295,7 +295,7 @@ def test_a_block_with_a_betrayed_state_is_taken_slot_by_slot() -> None:
 
 def test_the_rule_is_one_of_those_that_are_checked() -> None:
     """An eavesdropper whose blocks are right keeps it; one whose blocks are wrong breaks this rule alone."""
-    right, wrong = (eavesdropper_verdicts(listening(kind)) for kind in (EvenBlocks, Odd))
+    right, wrong = (eavesdropper_verdicts(setup_of(kind)) for kind in (EvenBlocks, Odd))
     assert "many slots at once" in [verdict.rule for verdict in right]
     assert "many slots at once" not in broken(right)
     assert broken(wrong).keys() - broken(right).keys() == {"many slots at once"}

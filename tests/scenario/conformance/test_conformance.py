@@ -19,7 +19,7 @@ from evedrop.model.registry import asked
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.schemes.innovation import Innovation
 from evedrop.scenario.conformance import eavesdroppers
-from evedrop.scenario.conformance.eavesdroppers import Listening, eavesdropper_verdicts
+from evedrop.scenario.conformance.eavesdroppers import EavesdropperSetup, eavesdropper_verdicts
 from evedrop.scenario.conformance.examine import examined
 from evedrop.scenario.conformance.links import LossChecks
 from evedrop.scenario.conformance.problems import Problem, small
@@ -114,10 +114,10 @@ def test_an_eavesdropper_that_breaks_a_rule_is_told_which(kind: Any, rule: str, 
     """As a scheme is."""
     parameters = dict(kind.parameters)
     name = "suspicious" if kind is Forgetful else "naive"
-    listening = Listening(name, kind, parameters, lambda process: Innovation(process, 0.6), Innovation)
+    setup = EavesdropperSetup(name, kind, parameters, lambda process: Innovation(process, 0.6), Innovation)
     if kind is Boastful:
-        listening = replace(listening, name=f"{__name__}:Boastful")
-    assert said in broken(eavesdropper_verdicts(listening))[rule]
+        setup = replace(setup, name=f"{__name__}:Boastful")
+    assert said in broken(eavesdropper_verdicts(setup))[rule]
 
 
 @pytest.mark.parametrize(
@@ -180,9 +180,9 @@ def test_whatever_a_class_says_of_itself_is_a_verdict() -> None:
     (verdict,) = LossChecks(lambda: Chained(0.9), Chained).verdicts()
     assert verdict.rule == "shapes and types"
     assert "'int' object has no attribute 'transitions'" in str(verdict.broken)
-    listening = Listening("anywhen", Anywhen, {}, lambda process: Innovation(process, 0.6), Innovation)
+    setup = EavesdropperSetup("anywhen", Anywhen, {}, lambda process: Innovation(process, 0.6), Innovation)
     with pytest.raises(Broken, match=r"betrayed\(\) is 'three'; expected a slot"):
-        eavesdropper_verdicts(listening)
+        eavesdropper_verdicts(setup)
     assert asked(Silent, {"depth": 3}) == [
         (
             "depth",

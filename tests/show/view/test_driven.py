@@ -8,7 +8,7 @@ import pytest
 from evedrop import load_results, montecarlo
 from evedrop.errors import UsageError
 from evedrop.scenario.loading import checked, load
-from evedrop.show.view.plant_slots import Showing
+from evedrop.show.view.plant_slots import LoopValues
 from evedrop.show.view.replay import replay
 from tests.show.view.drawn import panels_are_filled
 from tests.show.view.read_back import rows
@@ -75,10 +75,10 @@ def test_slots_may_come_in_any_pieces() -> None:
     estimates = {name: 0.1 * rng.standard_normal((SLOTS, 2)) for name in scenario.receivers}
     found = []
     for cuts in ([0, SLOTS], [0, 1, 60, 61, 130, SLOTS]):
-        showing = Showing.of(scenario)
-        assert showing is not None
+        loop_values = LoopValues.of(scenario)
+        assert loop_values is not None
         pieces = [slice(first, end) for first, end in pairwise(cuts)]
-        moves = [showing.take(u[rows], {name: x[rows] for name, x in estimates.items()}) for rows in pieces]
+        moves = [loop_values.take(u[rows], {name: x[rows] for name, x in estimates.items()}) for rows in pieces]
         curves = {path: np.concatenate([one.curves[path] for one in moves], axis=1) for path in moves[0].curves}
         energies = np.stack([curves["energy/bought"][1], curves["energy/sold"][1]], axis=1)
         found.append((np.concatenate([one.values for one in moves]), energies, curves["guesses/naive"]))

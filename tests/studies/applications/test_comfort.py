@@ -13,7 +13,7 @@ from evedrop.errors import ScenarioError
 from evedrop.scenario.application import APPLICATIONS
 from evedrop.scenario.controlled import controlled_plant
 from evedrop.scenario.loading import load
-from evedrop.show.view.plant_slots import Showing, driven_scene
+from evedrop.show.view.plant_slots import LoopValues, driven_scene
 from evedrop.simulate.montecarlo import Plan
 from tests.conftest import Evedrop
 from tests.packages import install
@@ -70,7 +70,7 @@ def test_the_view_is_given_every_curve_of_its_panels() -> None:
     rng = np.random.default_rng(1)
     u = rng.normal(size=(40, 1))
     estimates = {name: rng.normal(size=(40, 2)) for name in scenario.receivers}
-    whole, parts = Showing.of(scenario), Showing.of(scenario)
+    whole, parts = LoopValues.of(scenario), LoopValues.of(scenario)
     assert whole is not None
     assert parts is not None
     at_once = whole.take(u, estimates).curves

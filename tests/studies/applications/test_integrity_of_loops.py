@@ -13,7 +13,7 @@ from evedrop.errors import ScenarioError
 from evedrop.model.integrity.monitor import MonitoredSlots
 from evedrop.scenario.controlled import controlled_plant, monitor_of
 from evedrop.scenario.loading import load
-from evedrop.show.view.plant_slots import Showing, driven_scene
+from evedrop.show.view.plant_slots import LoopValues, driven_scene
 from evedrop.show.view.replay import replay
 from evedrop.simulate.montecarlo import Plan
 from evedrop.studies.applications.integrity.integrity import Integrity
@@ -112,7 +112,7 @@ def test_the_view_is_given_every_curve_of_its_panels() -> None:
     u, statistic = np.zeros((6, 1)), np.array([0.0, 1.0, 9.0, 9.0, 9.0, 9.0])[:, None]
     monitored = MonitoredSlots(statistic, np.arange(6.0)[:, None, None])
     estimates = {name: np.zeros((6, 1)) for name in scenario.receivers}
-    whole, parts = Showing.of(scenario), Showing.of(scenario)
+    whole, parts = LoopValues.of(scenario), LoopValues.of(scenario)
     assert whole is not None
     assert parts is not None
     at_once = whole.take(u, estimates, monitored).curves

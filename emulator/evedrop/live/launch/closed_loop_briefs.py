@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, final
 
 from evedrop.live.protocol.brief_closed_loop import (
     AssignmentEntry,
-    EstimatorLoop,
+    EstimatorLoopPart,
     MonitorEntry,
     PlantEntry,
-    SensorLoop,
+    SensorLoopPart,
     SensorPlantEntry,
     Wiring,
     encoded,
@@ -36,7 +36,7 @@ class LoopBriefs:
         table, driven = scenario.controller, scenario.driven
         self.wiring = None if table is None else Wiring(table.acts_on, scenario.legitimate.knows_input)
         """The controller's connections, for the router."""
-        self.of_sensor = None if table is None else SensorLoop(table.period, table.acts_on)
+        self.of_sensor = None if table is None else SensorLoopPart(table.period, table.acts_on)
         """For the sensor: the slots in which it waits for inputs, and whether it sends the state to the controller."""
         self.plant = None if driven is None else SensorPlantEntry.of(driven, disturbances=self._disturbances)
         """The plant with its disturbances, for the sensor."""
@@ -52,13 +52,13 @@ class LoopBriefs:
         return {"process": keys.process, **({"measurement": keys.measurement} if measures else {}), **monitors}
 
     @property
-    def of_legitimate(self) -> EstimatorLoop | None:
+    def of_legitimate(self) -> EstimatorLoopPart | None:
         """For the legitimate estimator: when it sends its estimate, and the plant if it knows the inputs; None if neither."""
         wiring, loop, driven = self.wiring, self.of_sensor, self._scenario.driven
         if wiring is None or loop is None or (wiring.on_truth and not wiring.knows_input):
             return None
         plant = PlantEntry.of(driven) if wiring.knows_input and driven is not None else None
-        return EstimatorLoop(loop.period, loop.acts_on, plant)
+        return EstimatorLoopPart(loop.period, loop.acts_on, plant)
 
     @property
     def of_controller(self) -> ControllerPart | None:

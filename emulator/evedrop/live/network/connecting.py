@@ -74,7 +74,7 @@ class RouterAddress:
 
 
 @final
-class Waiting:
+class WaitReporter:
     """Reports every few seconds on standard error that a process waits for its router."""
 
     def __init__(self, process: str, router: str, clock: Clock = SYSTEM_CLOCK) -> None:
@@ -123,7 +123,7 @@ def connected(
     """
     endpoint = endpoint_of(address.router, address.identity)
     began = clock.monotonic()
-    failures, waiting = Failures(clock, endpoint.secure), Waiting(address.process, address.router, clock)
+    failures, wait = Failures(clock, endpoint.secure), WaitReporter(address.process, address.router, clock)
     pause, longest = _AGAIN_SECONDS
     while True:
         meanwhile()
@@ -151,7 +151,7 @@ def connected(
                     f"no router answered at {address.router} within {patience:.0f} s ({why}); start it there, and check that no "
                     "firewall is in between"
                 ) from error
-            waiting.poll(why)
+            wait.poll(why)
         clock.sleep(pause)
         pause = min(longest, pause * 1.5)
 

@@ -220,13 +220,13 @@ def route(brief: Brief[RouterPart]) -> None:
     let_in = table if brief.part.zid is None else at_router(brief.run, table)
     with _opened(brief, access_control(let_in, brief.identity is not None)) as session:
         present = session.presence(grant.process for grant in table if grant.token is not None)
-        Routing(brief, session).carry_on()
+        RouterLoop(brief, session).carry_on()
         session.conclude()
         until_all_left(present, session.linked)
 
 
 @final
-class Routing:
+class RouterLoop:
     """The router's work on an open session."""
 
     def __init__(self, brief: Brief[RouterPart], session: ProcessSession) -> None:

@@ -25,7 +25,7 @@ import zenoh
 
 from evedrop.errors import Gap, MalformedMessage, RunError
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
-from evedrop.live.network.connecting import Credentials, RouterAddress, Waiting, connected
+from evedrop.live.network.connecting import Credentials, RouterAddress, WaitReporter, connected
 from evedrop.live.network.connection import Connection
 from evedrop.live.network.connection_watchdog import ConnectionWatchdog
 from evedrop.live.network.container_heartbeat import HeartbeatFile
@@ -166,12 +166,12 @@ class Session:
         self._room = _WINDOWS * (brief.flow.window + 8)
         self._dropped = Dropped(brief.process, self._mistaken)
         self._watchdog = ConnectionWatchdog(brief) if brief.role not in ("router", "relay", "observer") else None
-        self._waiting = Waiting(brief.process, brief.router, clock)
+        self._wait = WaitReporter(brief.process, brief.router, clock)
         if config is None or listen is None:
             address = _once(router_address_of(brief))
             once = zenoh.Config.from_json5(json.dumps(address.config))
             first = connected(address, self.patience, meanwhile, clock, opened)
-            self.connection = Connection(first, lambda: self._waiting.attempt(lambda: opened(once)), self._changed)
+            self.connection = Connection(first, lambda: self._wait.attempt(lambda: opened(once)), self._changed)
         else:
             self.connection = Connection(listening(listen, brief.identity, config), None)
             if brief.ends_with_stdin:
@@ -216,7 +216,7 @@ class Session:
 
     def _changed(self, connected: bool) -> None:
         """Handle the loss or the return of the connection."""
-        self._waiting.begin(again=True)
+        self._wait.begin(again=True)
         if self._watchdog is not None:
             self._watchdog.changed(connected)
 
@@ -281,9 +281,9 @@ class Session:
     def wait_for_link(self) -> None:
         """Wait until there is a link with another router. Raises RunError after the brief's patience."""
         deadline = time.monotonic() + self.patience
-        self._waiting.begin()
+        self._wait.begin()
         while not self.linked():
-            self._waiting.poll("no link yet")
+            self._wait.poll("no link yet")
             if time.monotonic() > deadline:
                 raise RunError(
                     f"{self._process}: no link with the router within {self.patience:.0f} s; look at its log"

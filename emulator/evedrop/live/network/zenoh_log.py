@@ -47,13 +47,13 @@ def zenoh_log_apart() -> Iterator[None]:
             stack.enter_context(stdout.at(former, of=_STDOUT))
         log = _new_file()
         os.dup2(log, _STDOUT)
-        passing = _Passing(log, former)
-        stack.callback(passing.end)
-        passing.start()
+        forwarder = _LogForwarder(log, former)
+        stack.callback(forwarder.end)
+        forwarder.start()
         yield
 
 
-class _Passing(threading.Thread):
+class _LogForwarder(threading.Thread):
     """Passes the lines of the file `log` on; it closes the file when it ends.
 
     `former` is where descriptor 1 leads when the block is over. From the last line that is passed on until then it leads nowhere.

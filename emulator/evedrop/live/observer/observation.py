@@ -50,11 +50,11 @@ from evedrop.scenario.tables import Scenario
 from evedrop.score.expectations_held import replay_of
 from evedrop.score.scorekeeper import Ending, Scored, Scorekeeper, digest_of, summary_of
 from evedrop.score.summary import Summary
-from evedrop.show.view.scored_slots import open_recording, showing_of, shown
+from evedrop.show.view.scored_slots import loop_values_of, open_recording, shown
 from evedrop.show.view.viewer import Viewer, WebAddress
 
 if TYPE_CHECKING:
-    from evedrop.show.view.plant_slots import Showing
+    from evedrop.show.view.plant_slots import LoopValues
     from evedrop.show.view.recording import ViewRecording
 
 Report = Callable[[Path, int, str], None]
@@ -90,7 +90,7 @@ class ObservedRun:
         self._stand_ins: dict[str, StandIn] = {}
         self._keeper = Scorekeeper(scenario, scenario.trials)
         self._recording: ViewRecording | None = None
-        self._showing: Showing | None = None
+        self._loop_values: LoopValues | None = None
         self._writer: ResultsWriter
         self._started = self._ended = self._told = time.monotonic()
         self._suspects: list[str] = []
@@ -128,7 +128,7 @@ class ObservedRun:
         with Session(self._brief, meanwhile=stop.check) as session:
             conductor = Conductor(session, self._scenario.digested, stop, self._scenario.relayed)
             if self._brief.part.recording:
-                self._showing = showing_of(self._scenario)
+                self._loop_values = loop_values_of(self._scenario)
                 path = self.folder / "recording.rrd"
                 self._recording = open_recording(
                     self._scenario, self._brief.run, path, lambda text: tell(ViewOpened(None, text))
@@ -265,7 +265,7 @@ class ObservedRun:
         write_rows(self._writer, slots, scored, self._scenario.first_trial)
         self._digest_rows.write(self._writer)
         if self._recording is not None:
-            self._recording.add(shown(slots, scored, self._scenario.process.around, self._showing))
+            self._recording.add(shown(slots, scored, self._scenario.process.around, self._loop_values))
         conductor.report_progress(self._joiner.done)
         self._progress(scored)
 

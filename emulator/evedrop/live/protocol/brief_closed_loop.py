@@ -217,7 +217,7 @@ class Wiring:
 
 
 @dataclass(frozen=True)
-class SensorLoop:
+class SensorLoopPart:
     """The sensor's part in the loop."""
 
     period: int = field(metadata=entry(whole(1)))
@@ -227,7 +227,7 @@ class SensorLoop:
 
 
 @dataclass(frozen=True)
-class EstimatorLoop(SensorLoop):
+class EstimatorLoopPart(SensorLoopPart):
     """The legitimate estimator's part in the loop."""
 
     plant: PlantEntry | None = field(metadata=inner(PlantEntry, or_null=True))

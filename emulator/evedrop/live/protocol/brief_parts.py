@@ -11,10 +11,10 @@ from typing import Any, ClassVar
 
 from evedrop.live.protocol.brief_closed_loop import (
     AssignmentEntry,
-    EstimatorLoop,
+    EstimatorLoopPart,
     MonitorEntry,
     PlantEntry,
-    SensorLoop,
+    SensorLoopPart,
     SensorPlantEntry,
     Wiring,
 )
@@ -194,7 +194,7 @@ class SensorPart:
     chart: Chart | None = field(metadata=entry(_CHART, lambda found: None if found is None else Chart(**found)))
     """The chart with which it detects attacks on acknowledgements; None if it does not."""
     plant: SensorPlantEntry | None = field(metadata=inner(SensorPlantEntry, or_null=True))
-    controller: SensorLoop | None = field(metadata=inner(SensorLoop, or_null=True))
+    controller: SensorLoopPart | None = field(metadata=inner(SensorLoopPart, or_null=True))
     modules: str | None = field(default=None, metadata=entry(maybe(text), left_out=True))
     """As the router's."""
     monitor: MonitorEntry | None = field(default=None, metadata=inner(MonitorEntry, left_out=True))
@@ -216,7 +216,7 @@ class LegitimatePart:
     """Slots by which a packet may be late."""
     outages: Sequence[tuple[int, int, bool]] = field(metadata=entry(_OUTAGES))
     """For each: first slot, first slot after, and whether it keeps its state."""
-    controller: EstimatorLoop | None = field(metadata=inner(EstimatorLoop, or_null=True))
+    controller: EstimatorLoopPart | None = field(metadata=inner(EstimatorLoopPart, or_null=True))
     """None if it has no part in the loop."""
     modules: str | None = field(default=None, metadata=entry(maybe(text), left_out=True))
     """As the router's."""

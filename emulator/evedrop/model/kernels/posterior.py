@@ -23,7 +23,7 @@ _SURE = 1e300  # stands for all larger odds
 _IMPOSSIBLE = -700.0  # an exponent at which it certainly is not, still far from underflow
 
 
-class Weighing(NamedTuple):
+class MixtureModel(NamedTuple):
     """What does not change from slot to slot."""
 
     A: Floats
@@ -37,7 +37,7 @@ class Weighing(NamedTuple):
 
 
 def step(
-    model: Weighing, of: Mixture, gamma: _Flags, z: Floats, leak: Leak | None, rounding: Floats
+    model: MixtureModel, of: Mixture, gamma: _Flags, z: Floats, leak: Leak | None, rounding: Floats
 ) -> tuple[Mixture, Floats]:
     """The mixture one slot later, and the probability that the packet is the state, (R,).
 
@@ -53,7 +53,7 @@ def step(
 
 
 def _weighed(
-    model: Weighing, of: Mixture, gamma: _Flags, z: Floats, leak: Leak, rounding: Floats
+    model: MixtureModel, of: Mixture, gamma: _Flags, z: Floats, leak: Leak, rounding: Floats
 ) -> tuple[Mixture, Floats]:
     """The components one slot later, without the packet's own, and the probability that the packet is the state, (R,).
 

@@ -293,7 +293,7 @@ def follow_mixture(
     initial: the first slot is slot 0, in which a packet is the state.
     """
     expect_mixture(A, G, leaks, rounding, before, gamma, z, capacity)
-    model = posterior.Weighing(A, Factor.of_triangular(G.tolist()), state_probability, capacity)
+    model = posterior.MixtureModel(A, Factor.of_triangular(G.tolist()), state_probability, capacity)
     mixture, (slots, n, trials) = mixtures.Mixture(*before), z.shape
     x_hat, P, action = np.empty(z.shape), np.empty((slots, n, n, trials)), np.empty((slots, trials), np.uint8)
     for row, heard in enumerate(gamma):

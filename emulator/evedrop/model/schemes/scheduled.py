@@ -45,9 +45,9 @@ def _chain_form(scheme: Scheduled, conditions: ReceiverConditions) -> ChainForm 
         return None
     if hijack is None:
         return ChainForm(process, conditions.slots, scheduled(threshold, received, acknowledged))
-    if threshold * (hijack.heeding.patience + 2) * process.n**2 > LARGEST_OPERATOR:
+    if threshold * (hijack.heed_rule.patience + 2) * process.n**2 > LARGEST_OPERATOR:
         return None
-    chain = hijacked_schedule(threshold, hijack.mu, hijack.mu_e, hijack.heeding, hijack.hears)
+    chain = hijacked_schedule(threshold, hijack.mu, hijack.mu_e, hijack.heed_rule, hijack.hears)
     return ChainForm(process, conditions.slots, chain)
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from evedrop.model.acknowledgements import Heeding
+from evedrop.model.acknowledgements import HeedRule
 from evedrop.model.process import Floats
 from evedrop.model.theory.directions import Growth
 
@@ -53,7 +53,7 @@ class Hijack:
     """Quality of the user's link."""
     mu_e: float
     """Quality of the link of the eavesdropper that the sensor serves."""
-    heeding: Heeding
+    heed_rule: HeedRule
     hears: Hears
     """For the receiver whose closed form is made."""
 

@@ -12,7 +12,7 @@ from itertools import product
 
 import numpy as np
 
-from evedrop.model.acknowledgements import Heeding
+from evedrop.model.acknowledgements import HeedRule
 from evedrop.model.process import Floats, Process
 from evedrop.model.theory.closed_form import Hears
 from evedrop.model.theory.covariances import LARGEST_OPERATOR, Outcomes, limit_trace, radius
@@ -194,7 +194,7 @@ def scheduled(threshold: int, received: float, acknowledged: tuple[float, float]
     return SensorChain(start, reset, carried)
 
 
-def hijacked_schedule(threshold: int, mu: float, mu_e: float, heeding: Heeding, hears: Hears) -> SensorChain:
+def hijacked_schedule(threshold: int, mu: float, mu_e: float, heed_rule: HeedRule, hears: Hears) -> SensorChain:
     """The chain for a receiver of the scheme `scheduled` whose sensor is hijacked.
 
     A state is a holding time, as for `scheduled`, and how many packets in a row the eavesdropper has missed that the sensor
@@ -203,7 +203,7 @@ def hijacked_schedule(threshold: int, mu: float, mu_e: float, heeding: Heeding, 
 
     Source: docs/mathematics.md, the hijacked sensor.
     """
-    counts, top = heeding.patience + 2, threshold - 1
+    counts, top = heed_rule.patience + 2, threshold - 1
     start, reset, carried = _blank(threshold * counts)
     start[:] = 0.0
     start[top * counts] = 1.0
@@ -214,7 +214,7 @@ def hijacked_schedule(threshold: int, mu: float, mu_e: float, heeding: Heeding, 
         for user, served in product((True, False), repeat=2):
             now = 0 if served else min(missed + 1, counts - 1)
             chance = (mu if user else 1.0 - mu) * (mu_e if served else 1.0 - mu_e)
-            heeded = heeding.share_of(now) if user else 0.0
+            heeded = heed_rule.share_of(now) if user else 0.0
             for after, odds in ((now, heeded), (top * counts + now, 1.0 - heeded)):
                 reset[before, after] += chance * odds * hears(user, served)
                 carried[before, after] += chance * odds * (1.0 - hears(user, served))

@@ -39,7 +39,7 @@ _TAKES_OTHERWISE = (
 
 
 @dataclass(frozen=True)
-class Listening:
+class EavesdropperSetup:
     """An eavesdropper's class with its parameters, and the scheme it hears."""
 
     name: str
@@ -85,10 +85,10 @@ class Listening:
             belief = after
 
 
-def eavesdropper_verdicts(listening: Listening) -> list[RuleVerdict]:
+def eavesdropper_verdicts(setup: EavesdropperSetup) -> list[RuleVerdict]:
     """Check every rule for eavesdroppers, on small problems."""
-    checks = EavesdropperChecks(listening)
-    at = listening.betrayed
+    checks = EavesdropperChecks(setup)
+    at = setup.betrayed
     slots = 0 if at is None else min(at + 3, 200)
     exact = [
         ("shapes and types", checks.shapes),
@@ -108,14 +108,14 @@ class EavesdropperChecks(ReceiverChecks):
 
     state = "keep no state outside of Belief, and take random numbers from the streams alone"
 
-    def __init__(self, listening: Listening) -> None:
-        self._listening = listening
+    def __init__(self, setup: EavesdropperSetup) -> None:
+        self._setup = setup
         self._heard: dict[int, tuple[Problem, list[Step]]] = {}
         """Its steps on a problem, by the problem's id."""
 
     def rows(self, problem: Problem, rubbish: float = 0.0) -> Iterator[Row]:
         """Its beliefs."""
-        return (row_of(step[2]) for _, step in self._listening.steps(problem, rubbish))
+        return (row_of(step[2]) for _, step in self._setup.steps(problem, rubbish))
 
     def undisturbed(self, problem: Problem) -> list[Row]:
         """Its beliefs, computed once."""
@@ -123,12 +123,12 @@ class EavesdropperChecks(ReceiverChecks):
 
     def _steps(self, problem: Problem) -> list[Step]:
         if id(problem) not in self._heard:
-            self._heard[id(problem)] = (problem, [step for _, step in self._listening.steps(problem)])
+            self._heard[id(problem)] = (problem, [step for _, step in self._setup.steps(problem)])
         return self._heard[id(problem)][1]
 
     def shapes(self, problem: Problem) -> None:
         """All results have the right shapes and types, and no input is changed."""
-        kind, parameters = self._listening.kind, self._listening.parameters
+        kind, parameters = self._setup.kind, self._setup.parameters
         with calling("streams()", kind):
             streams = kind.streams(parameters)
         expect_names("streams()", streams)
@@ -153,30 +153,30 @@ class EavesdropperChecks(ReceiverChecks):
 
     def again(self, problem: Problem) -> None:
         """It gives the same answer for a slot after later slots."""
-        expect_pure(self._listening.made(problem), self._steps(problem), problem, self._listening.kind)
+        expect_pure(self._setup.made(problem), self._steps(problem), problem, self._setup.kind)
 
     def actions(self, problem: Problem) -> None:
         """If it follows γ, γ alone determines its actions, and so its beliefs."""
-        kind = self._listening.kind
-        if kind.follows_gamma(self._listening.parameters):
+        kind = self._setup.kind
+        if kind.follows_gamma(self._setup.parameters):
             remedy = "let follows_gamma() return False"
-            expect_actions(self._listening.made(problem), self._steps(problem), problem, kind, remedy)
+            expect_actions(self._setup.made(problem), self._steps(problem), problem, kind, remedy)
 
     def blocks(self, problem: Problem) -> None:
         """Blocks of slots give the same beliefs as single slots."""
-        listening = self._listening
-        expect_same_followed(lambda: listening.made(problem), self._steps(problem), problem, listening.kind)
+        setup = self._setup
+        expect_same_followed(lambda: setup.made(problem), self._steps(problem), problem, setup.kind)
 
     def theory(self, problem: Problem) -> None:
         """The outcomes it states are the observed ones, if it states any for this scheme."""
-        listening = self._listening
-        scheme = made(listening.scheme_of, problem, listening.scheme)
-        with calling("outcomes()", listening.kind):
-            outcomes_at = eavesdropper_outcomes(scheme, listening.name, listening.parameters)
+        setup = self._setup
+        scheme = made(setup.scheme_of, problem, setup.scheme)
+        with calling("outcomes()", setup.kind):
+            outcomes_at = eavesdropper_outcomes(scheme, setup.name, setup.parameters)
         if outcomes_at is not None:
-            errors = [((slot.x - step[2].x_hat) ** 2).sum(axis=0) for slot, step in listening.steps(problem)]
+            errors = [((slot.x - step[2].x_hat) ** 2).sum(axis=0) for slot, step in setup.steps(problem)]
             found = [np.asarray(one) for one in errors]
-            if issubclass(listening.kind, PacketTaker):
+            if issubclass(setup.kind, PacketTaker):
                 expect_expected(problem, outcomes_at, found, _TAKES_OTHERWISE)
             else:
                 expect_expected(problem, outcomes_at, found)

@@ -16,7 +16,7 @@ from evedrop.model.eavesdroppers import READERS, STRATEGIES
 from evedrop.model.links import LOSS_MODELS
 from evedrop.model.registry import Registry, asked
 from evedrop.model.schemes import PAPERS_SCHEME, SCHEMES, scheme_of
-from evedrop.scenario.conformance.eavesdroppers import Listening, eavesdropper_verdicts
+from evedrop.scenario.conformance.eavesdroppers import EavesdropperSetup, eavesdropper_verdicts
 from evedrop.scenario.conformance.links import DelayChecks, LossChecks
 from evedrop.scenario.conformance.rules import Broken, RuleVerdict, calling
 from evedrop.scenario.conformance.schemes import scheme_verdicts
@@ -110,9 +110,9 @@ def _listened(one: _Named, scheme: _Named) -> list[RuleVerdict]:
             f"{', '.join(scheme.kind.secret_streams) or 'no keys'}; give another --scheme, or take it out of streams()"
         )
     spec = {"scheme": scheme.name, **scheme.parameters}
-    listening = Listening(one.name, one.kind, one.parameters, lambda process: scheme_of(process, spec), scheme.kind)
+    setup = EavesdropperSetup(one.name, one.kind, one.parameters, lambda process: scheme_of(process, spec), scheme.kind)
     try:
-        return eavesdropper_verdicts(listening)
+        return eavesdropper_verdicts(setup)
     except Broken as error:
         return [RuleVerdict("facts on the class", str(error))]
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import final
 
-from evedrop.model.acknowledgements import FORGING, heeding_of, rates_of
+from evedrop.model.acknowledgements import FORGING, heed_rule_of, rates_of
 from evedrop.model.outcomes import uses_of
 from evedrop.model.process import Floats
 from evedrop.model.schemes import SCHEMES, scheme_of
@@ -89,8 +89,8 @@ def _hijack(scenario: Scenario, receiver: str) -> Hijack | None:
     if table is None or table.jammer is None:
         return None
     jammer = table.jammer
-    heeding = heeding_of(table.attack, table.link.quality, quality[jammer])
-    if heeding is None or heeding.patience == 0:
+    heed_rule = heed_rule_of(table.attack, table.link.quality, quality[jammer])
+    if heed_rule is None or heed_rule.patience == 0:
         return None
 
     def hears(user: bool, served: bool) -> float:
@@ -98,7 +98,7 @@ def _hijack(scenario: Scenario, receiver: str) -> Hijack | None:
             return float(user)
         return float(served) if receiver == jammer else quality[receiver]
 
-    return Hijack(quality[LEGITIMATE], quality[jammer], heeding, hears)
+    return Hijack(quality[LEGITIMATE], quality[jammer], heed_rule, hears)
 
 
 def _split(scenario: Scenario, receiver: str) -> Split:

@@ -84,7 +84,7 @@ def series_of(arrivals: MessageArrivals, longest: float | None = None, wrap: int
 
     Raises ValueError for more than ten million outcomes.
     """
-    return _Reading(arrivals, longest, wrap).series()
+    return _SenderNumbers(arrivals, longest, wrap).series()
 
 
 def numbers_of_times(times: Floats, period: float) -> tuple[NDArray[np.int64], float]:
@@ -98,7 +98,7 @@ def numbers_of_times(times: Floats, period: float) -> tuple[NDArray[np.int64], f
     return np.concatenate([[0], np.cumsum(whole)]).astype(np.int64), off
 
 
-class _Reading:
+class _SenderNumbers:
     """Reads the numbers of one sender once, and cuts them into parts where they are not consecutive."""
 
     def __init__(self, arrivals: MessageArrivals, longest: float | None, wrap: int | None) -> None:

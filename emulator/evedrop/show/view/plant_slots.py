@@ -19,7 +19,7 @@ from evedrop.show.view.scene import Moved
 
 
 @final
-class Showing:
+class LoopValues:
     """Follows one trial of a closed loop, whose slots come in order, and gives the view its values."""
 
     def __init__(self, loop: ControlledPlant, scenario: Scenario) -> None:
@@ -29,7 +29,7 @@ class Showing:
         self._next = 0
 
     @classmethod
-    def of(cls, scenario: Scenario) -> Showing | None:
+    def of(cls, scenario: Scenario) -> LoopValues | None:
         """An instance for a scenario; None without a controller."""
         loop = controlled_plant(scenario)
         return None if loop is None else cls(loop, scenario)

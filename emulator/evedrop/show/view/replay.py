@@ -19,7 +19,7 @@ from evedrop.model.receiver import Flags
 from evedrop.results.reading import Results
 from evedrop.scenario.loading.recorded import recorded
 from evedrop.show.view.scene import PeerSlots, SceneSlots
-from evedrop.show.view.scored_slots import open_recording, showing_of
+from evedrop.show.view.scored_slots import loop_values_of, open_recording
 
 _CHUNK = 1000  # slots recorded at once
 
@@ -38,8 +38,8 @@ def replay(folder: Path, path: Path | None = None) -> Path:
     if not len(x):
         raise UsageError(f"{folder} has no recorded trial to show; run it again, for example in the exact mode")
     _check_shapes(folder, len(scenario.process.A), x, peers)
-    inputs, monitored, showing = _inputs(results), _monitored(results), showing_of(scenario)
-    if showing is not None and len(inputs) != len(x):
+    inputs, monitored, loop_values = _inputs(results), _monitored(results), loop_values_of(scenario)
+    if loop_values is not None and len(inputs) != len(x):
         raise UsageError(f"{folder}: inputs.parquet does not have the slots of trials.parquet; run the scenario again")
     around = np.array(scenario.process.around)
     recording = open_recording(
@@ -50,7 +50,7 @@ def replay(folder: Path, path: Path | None = None) -> Path:
             rows = slice(first, min(first + _CHUNK, len(x)))
             deviations = {name: peer.x_hat[rows] - around for name, peer in peers.items()}
             some = None if monitored is None else monitored.rows(rows)
-            moved = None if showing is None else showing.take(inputs[rows], deviations, some)
+            moved = None if loop_values is None else loop_values.take(inputs[rows], deviations, some)
             shown = {name: peer.mapped(itemgetter(rows)) for name, peer in peers.items()}
             recording.add(SceneSlots(first, x[rows], nu[rows], shown, moved, sent[rows]))
         for event in results.events:

@@ -15,15 +15,15 @@ from evedrop.score.slots import Slots
 from evedrop.system.output import warn
 
 if TYPE_CHECKING:
-    from evedrop.show.view.plant_slots import Showing
+    from evedrop.show.view.plant_slots import LoopValues
     from evedrop.show.view.recording import ViewRecording
 
 
-def showing_of(scenario: Scenario) -> Showing | None:
+def loop_values_of(scenario: Scenario) -> LoopValues | None:
     """An object that follows the trial of a closed loop that the view shows; None without a controller."""
-    from evedrop.show.view.plant_slots import Showing  # noqa: PLC0415 - only with a view
+    from evedrop.show.view.plant_slots import LoopValues  # noqa: PLC0415 - only with a view
 
-    return Showing.of(scenario)
+    return LoopValues.of(scenario)
 
 
 def open_recording(
@@ -75,10 +75,12 @@ def open_recording(
     return ViewRecording(path, scene, warn)
 
 
-def shown(slots: Slots, scored: Mapping[str, Scored], around: Sequence[float], showing: Showing | None = None) -> Any:
+def shown(
+    slots: Slots, scored: Mapping[str, Scored], around: Sequence[float], loop_values: LoopValues | None = None
+) -> Any:
     """Some slots as `SceneSlots`: the first recorded trial, in absolute values, and means over all trials.
 
-    around: the reference from which states are deviations, (n,); showing: follows the same trial of a closed loop.
+    around: the reference from which states are deviations, (n,); loop_values: follows the same trial of a closed loop.
     """
     from evedrop.show.view.scene import PeerSlots, SceneSlots  # noqa: PLC0415 - only with a view
 
@@ -95,9 +97,9 @@ def shown(slots: Slots, scored: Mapping[str, Scored], around: Sequence[float], s
         for name, receiver in slots.receivers.items()
     }
     moved = None
-    if showing is not None and slots.inputs is not None:
+    if loop_values is not None and slots.inputs is not None:
         estimates = {name: receiver.x_hat[:, :, 0] for name, receiver in slots.receivers.items()}
         monitored = None if slots.inputs.monitored is None else slots.inputs.monitored.part(slice(0, 1))
-        moved = showing.take(slots.inputs.u[:, :, 0], estimates, monitored)
+        moved = loop_values.take(slots.inputs.u[:, :, 0], estimates, monitored)
     sent = None if slots.sent is None else slots.sent[:, 0]
     return SceneSlots(slots.first, slots.x[:, :, 0] + around, slots.nu[:, 0], peers, moved, sent)

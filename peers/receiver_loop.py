@@ -42,15 +42,15 @@ def follow(
     core = _core_of(brief, receiver)
     with connect(brief) as session:
         replies = ReceiverReplies(brief, session, acknowledges, None if consult is None else consult(session))
-        following = Following(brief, core, replies, session)
+        loop = ReceiverLoop(brief, core, replies, session)
         session.ready()
-        following.carry_on()
-        replies.acknowledge_after_end(following.deliveries)
+        loop.carry_on()
+        replies.acknowledge_after_end(loop.deliveries)
         session.wait_for(End)
 
 
 @final
-class Following:
+class ReceiverLoop:
     """A receiver's work on a session that is being opened: it takes all deliveries that have arrived at once.
 
     Where another process waits for an answer to each of them, it takes them one by one.
