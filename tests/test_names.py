@@ -98,12 +98,16 @@ def test_no_two_test_files_have_the_same_name() -> None:
 
 GLOSSARY = ROOT / "docs" / "glossary.md"
 FORMER = {
+    "filter_noise_read": "replace_filter_noise",
     "floor plan": "drawing of the packages",
     "floor_plan": "package_drawing",
     "heeding": "heed rule",
     "lifeline": "watchdog",
     "look_seconds": "poll_seconds",
+    "recordings_located": "locate_recordings",
     "rooms": "packages",
+    "tables_located": "locate_tables",
+    "tables_read": "read_tables",
     "whereabouts": "process status",
 }
 """Former word → the word of the glossary, or the name, in its place. Parts of names count: `open_rooms`, `openRooms`."""

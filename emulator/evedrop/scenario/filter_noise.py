@@ -28,7 +28,7 @@ _CERTAINLY, _NEARLY = (
 _SMALLEST = 1e-300
 
 
-def filter_noise_read(tables: Mapping[str, Any]) -> list[str]:
+def replace_filter_noise(tables: Mapping[str, Any]) -> list[str]:
     """Replace "filter" by what the sensor's filter makes of it: as `initial_covariance`, as `Q`, and as a scheme's noise.
 
     This is done in place. Returns mistakes, with their paths.

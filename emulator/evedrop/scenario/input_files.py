@@ -29,7 +29,7 @@ _TABLES = {"plant": ("disturbance", "disturbances", "disturbance_units"), "proce
 """Table that may name a file of numbers → the first word of its entries, and its entries with names and units."""
 
 
-def tables_located(tables: Mapping[str, Any], folder: Path) -> None:
+def locate_tables(tables: Mapping[str, Any], folder: Path) -> None:
     """Replace the names of the files of states and disturbances with their paths, in place; folder: that of the scenario."""
     for name, (kind, *_) in _TABLES.items():
         table = tables.get(name)
@@ -37,7 +37,7 @@ def tables_located(tables: Mapping[str, Any], folder: Path) -> None:
             table[f"{kind}_file"] = str(found_file(table[f"{kind}_file"], folder))
 
 
-def tables_read(tables: Mapping[str, Any]) -> list[str]:
+def read_tables(tables: Mapping[str, Any]) -> list[str]:
     """Replace the names of the files of states and disturbances with the numbers in them, in place.
 
     A file of states is left alone unless states come from it. Returns the mistakes, with their paths.
@@ -104,7 +104,7 @@ def disturbances_of(scenario: Scenario) -> Floats:
 _STAND_IN = "1"  # the outcomes of a recording that cannot be read: later checks then find no further mistake
 
 
-def recordings_located(tables: Mapping[str, Any], folder: Path) -> None:
+def locate_recordings(tables: Mapping[str, Any], folder: Path) -> None:
     """Replace the name of every recording with its path, in place; folder: that of the scenario."""
     for _, trace, _ in _recorded(tables):
         if isinstance(trace.get("file"), str):

@@ -14,7 +14,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from evedrop.errors import ScenarioError, UsageError
-from evedrop.scenario.input_files import read_recordings, recordings_located
+from evedrop.scenario.input_files import locate_recordings, read_recordings
 from evedrop.scenario.loading import set_entry, tables_in
 from evedrop.scenario.loading.line_numbers import with_line_numbers
 from evedrop.scenario.sentences import sentences
@@ -58,7 +58,7 @@ def wire_of(
     folder: where the recordings and certificates are that the tables name; files that a change names are in the current folder.
     """
     made = copy.deepcopy({**tables})
-    _located(made, folder)
+    _locate_files(made, folder)
     for key, value in (changes or {}).items():
         set_entry(made, key, value)
     if wrong := list(unusable(made)):
@@ -104,9 +104,9 @@ def _by_number(key: str, tables: Mapping[str, Any]) -> str:
     return f"link.{names.index(name)}{dot}{entry}"
 
 
-def _located(tables: dict[str, Any], folder: Path) -> None:
+def _locate_files(tables: dict[str, Any], folder: Path) -> None:
     """Replace the names of recordings and certificates with their paths, in place."""
-    recordings_located(tables, folder)
+    locate_recordings(tables, folder)
     sides = tables.get("side")
     for side in sides.values() if isinstance(sides, dict) else ():
         tls = side.get("tls") if isinstance(side, dict) else None

@@ -19,12 +19,12 @@ from evedrop.model.registry import place_of
 from evedrop.scenario.drawn import with_faults
 from evedrop.scenario.dry_run import dry_run, foreign
 from evedrop.scenario.events import EVENTS
-from evedrop.scenario.filter_noise import filter_noise_read
+from evedrop.scenario.filter_noise import replace_filter_noise
 from evedrop.scenario.input_files import (
+    locate_recordings,
+    locate_tables,
     read_recordings,
-    recordings_located,
-    tables_located,
-    tables_read,
+    read_tables,
 )
 from evedrop.scenario.loading.line_numbers import given_twice, with_line_numbers
 from evedrop.scenario.loading.mistakes import mistakes_across
@@ -103,8 +103,8 @@ def parse(
 
 def located(tables: dict[str, Any], folder: Path) -> None:
     """Replace the names of files in tables with their paths, in place; folder: that of the scenario."""
-    recordings_located(tables, folder)
-    tables_located(tables, folder)
+    locate_recordings(tables, folder)
+    locate_tables(tables, folder)
     for entry in ("secret_file", "modules"):
         if isinstance(tables.get(entry), str):
             tables[entry] = str((folder / tables[entry]).absolute())
@@ -160,7 +160,7 @@ def checked(
         tables.setdefault("modules", str(folder))
     if isinstance(tables.get("modules"), str):
         tables["modules"] = str(Path(tables["modules"]).absolute())
-    recordings = [*read_recordings(tables), *tables_read(tables), *filter_noise_read(tables)]
+    recordings = [*read_recordings(tables), *read_tables(tables), *replace_filter_noise(tables)]
     try:
         scenario = Scenario.read(tables)
     except ValidationError as error:

@@ -22,8 +22,8 @@ from evedrop.model.registry import no_modules
 from evedrop.model.schemes import SCHEMES
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.dry_run import foreign
-from evedrop.scenario.filter_noise import filter_noise_read
-from evedrop.scenario.input_files import read_recordings, tables_read
+from evedrop.scenario.filter_noise import replace_filter_noise
+from evedrop.scenario.input_files import read_recordings, read_tables
 from evedrop.scenario.loading.file import checked, located, read, tables_in
 from evedrop.scenario.loading.mistakes import horizon_mistakes
 from evedrop.scenario.sentences import sentences
@@ -72,7 +72,7 @@ def recorded(folder: Path, *, beyond_horizon: bool = True) -> RecordedScenario:
             return RecordedScenario(scenario, _words(tables), frozenset(), complete=True)
         words = _words(tables)
         unknown = _without_classes(tables)
-        mistakes = [*read_recordings(tables), *tables_read(tables), *filter_noise_read(tables)]
+        mistakes = [*read_recordings(tables), *read_tables(tables), *replace_filter_noise(tables)]
         try:
             scenario = Scenario.model_validate(tables)
         except ValidationError as error:
