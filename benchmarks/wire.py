@@ -34,11 +34,11 @@ from evedrop.live.network.control_file import read_control
 from evedrop.live.network.operator import ask
 from evedrop.live.protocol.requests import StatusRequest
 from evedrop.live.protocol.wire_status import WireStatus
-from evedrop.wire.crossing import Crossing
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_part import Records
 from evedrop.wire.law import bounds, expected
 from evedrop.wire.plan import Side, WireLink, WirePlan
+from evedrop.wire.record import WireFate
 from evedrop.wire.relay import WireRelay
 from evedrop.wire.side import SideSession
 
@@ -81,7 +81,7 @@ class MeasuredWire:
         self._journal.flush()
         self.fates, self.first, self.last = {}, float("inf"), 0.0
 
-    def count(self, *fates: Crossing) -> int:
+    def count(self, *fates: WireFate) -> int:
         """How many messages had one of these fates, or any."""
         self._journal.flush()
         return sum(count for (_, fate), count in self.fates.items() if not fates or fate in fates)
@@ -201,7 +201,7 @@ def accounted(count: int) -> Iterator[Row]:
     """All messages of a sender are in the journal, and those that were delivered arrive."""
     with a_wire(("robot/**", BURSTS)) as wire:
         received = carry(wire.robot, wire.base, Traffic(count, 64), patience=60 + count / 5000).received
-        heard, delivered = wire.count(), wire.count(Crossing.DELIVERED)
+        heard, delivered = wire.count(), wire.count(WireFate.DELIVERED)
     missing = abs(count - heard) + abs(delivered - received)
     yield Row(
         f"wire, messages unaccounted for, of {count:,}",
@@ -226,7 +226,7 @@ def losses(count: int) -> Iterator[Row]:
     outside, said = [], []
     for at, (name, model) in enumerate(models.items()):
         low, high = bounds(*expected({"loss": model}, (), [range(count)]), count)
-        found = fates.get((at, Crossing.DELIVERED), 0)
+        found = fates.get((at, WireFate.DELIVERED), 0)
         said.append(f"{name} {found / count:.4f}")
         if not low <= found <= high:
             outside.append(f"{name} outside {low / count:.4f} to {high / count:.4f}")

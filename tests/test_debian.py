@@ -18,7 +18,7 @@ from tests.debian import ROOT, bootstrap
 from tests.folders import mounted_below, remove
 from tests.privileged import CannotRun, prepare, run, skip
 
-STAND_IN = """#!/bin/sh
+DEBOOTSTRAP = """#!/bin/sh
 # As debootstrap does it: arguments --variant, --include, release, folder, mirror.
 exec 3>"$ALIVE"
 mkdir "$4/proc" "$4/sys" && mount -t proc proc "$4/proc" && mount -t sysfs sys "$4/sys" || exit
@@ -81,7 +81,7 @@ def started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Started
         skip(error)
     program = tmp_path / "bin" / "debootstrap"
     program.parent.mkdir()
-    program.write_text(STAND_IN)
+    program.write_text(DEBOOTSTRAP)
     program.chmod(0o755)
     monkeypatch.setenv("PATH", str(program.parent), prepend=os.pathsep)
     with unharmed(tmp_path):

@@ -98,6 +98,8 @@ def test_no_two_test_files_have_the_same_name() -> None:
 
 GLOSSARY = ROOT / "docs" / "glossary.md"
 FORMER = {
+    "Crossing": "WireFate",
+    "StandIn": "RemoteClass, AbsenceReporter",
     "filter_noise_read": "replace_filter_noise",
     "floor plan": "drawing of the packages",
     "floor_plan": "package_drawing",
@@ -106,6 +108,7 @@ FORMER = {
     "look_seconds": "poll_seconds",
     "recordings_located": "locate_recordings",
     "rooms": "packages",
+    "stand_in": "remote_class, absence_reporter",
     "tables_located": "locate_tables",
     "tables_read": "read_tables",
     "whereabouts": "process status",

@@ -133,15 +133,15 @@ def test_a_name_that_two_packages_use_is_refused(folder: Path, tmp_path: Path, m
     )
 
 
-def test_a_class_that_must_not_run_here_has_a_stand_in(folder: Path) -> None:
-    """Its module is not imported, but by `imported`; a name that cannot be a class has no stand-in."""
+def test_a_class_that_must_not_run_here_has_a_remote_class(folder: Path) -> None:
+    """Its module is not imported, but by `imported`; a name that cannot be a class has no remote class."""
     asked_for: list[str] = []
 
-    def stand_in(name: str) -> type[LossModel]:
+    def remote_class(name: str) -> type[LossModel]:
         asked_for.append(name)
         return type("Elsewhere", (Bernoulli,), {"parameters": {"model": 1} if name.endswith("Taken") else {}})
 
-    found = registry(stand_in=stand_in)
+    found = registry(remote_class=remote_class)
     assert found["mine"].__name__ == "Elsewhere"
     assert found["bernoulli"] is Bernoulli
     assert "registered" not in sys.modules

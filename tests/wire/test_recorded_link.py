@@ -13,11 +13,11 @@ import pytest
 
 from evedrop.errors import TraceError, UsageError
 from evedrop.scenario.fitting.message_fit import fit_messages
-from evedrop.wire.crossing import AGAIN, Crossing, Kind
 from evedrop.wire.fates import KeyFates
 from evedrop.wire.file import resolved_wire, wire_of
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.plan import WirePlan
+from evedrop.wire.record import AGAIN, Kind, WireFate
 from evedrop.wire.recorded_link import journal_recording
 from tests.conftest import Evedrop
 
@@ -40,7 +40,7 @@ def plan_of(settings: Mapping[str, Any], seed: int = 7) -> WirePlan:
 
 
 def carried(
-    folder: Path, plan: WirePlan, counts: Mapping[str, int], hidden: Mapping[int, Crossing] | None = None
+    folder: Path, plan: WirePlan, counts: Mapping[str, int], hidden: Mapping[int, WireFate] | None = None
 ) -> None:
     """A journal of messages of some keys on the link `scan`, ten a second each, as a wire keeps it.
 
@@ -53,8 +53,8 @@ def carried(
             fates = KeyFates(plan.links[0], key, "put", plan.seed)
             for n in range(count):
                 fate, delay, again = fates.next()
-                fate = (hidden or {}).get(n, Crossing(fate))
-                kind = Kind.PUT | (AGAIN if again and fate == Crossing.DELIVERED else 0)
+                fate = (hidden or {}).get(n, WireFate(fate))
+                kind = Kind.PUT | (AGAIN if again and fate == WireFate.DELIVERED else 0)
                 row = (
                     1e9 + 0.1 * n,
                     n,
@@ -68,7 +68,7 @@ def carried(
                     fate,
                 )
                 journal.record(*row)
-            journal.record(1e9, 0, 1, 0.0, journal.key_code(key), 0, 64, 1, Kind.PUT, Crossing.DELIVERED)
+            journal.record(1e9, 0, 1, 0.0, journal.key_code(key), 0, 64, 1, Kind.PUT, WireFate.DELIVERED)
 
 
 def test_the_models_of_a_link_are_found_again(tmp_path: Path) -> None:
@@ -99,7 +99,7 @@ def test_a_fitted_link_in_a_wire_loses_as_the_recorded_one(tmp_path: Path) -> No
     sides = {"robot": {"listen": "tcp/127.0.0.1:0"}, "base": {"listen": "tcp/127.0.0.1:0"}}
     again = wire_of({"seed": 8, "side": sides, "link": [link]})
     fates = KeyFates(again.links[0], "0/scan/b", "put", 8)
-    lost = np.array([fates.next()[0] == Crossing.LOST for _ in range(20_000)])
+    lost = np.array([fates.next()[0] == WireFate.LOST for _ in range(20_000)])
     recorded = found.recording.series.outcomes == 0
     assert lost.mean() == pytest.approx(recorded.mean(), rel=0.1)
 
@@ -113,15 +113,15 @@ def test_what_hides_the_loss_model_cuts_the_messages_into_parts(tmp_path: Path) 
     """Cuts and full queues are neither losses nor deliveries; what the wire could not hold was not lost by the model."""
     settings = {"loss": {"model": "pattern", "outcomes": "1" * 29 + "0"}}
     hidden = {
-        **dict.fromkeys(range(100, 130), Crossing.CUT), 200: Crossing.OVERFLOW, 300: Crossing.HELD_UP, 399: Crossing.UNDERWAY,
+        **dict.fromkeys(range(100, 130), WireFate.CUT), 200: WireFate.OVERFLOW, 300: WireFate.HELD_UP, 399: WireFate.UNDERWAY,
     }  # fmt: skip
     carried(tmp_path, plan_of(settings), {"0/scan/a": 400}, hidden)
     found = journal_recording(tmp_path, "scan")
-    expected = [0 if n % 30 == 29 else 1 for n in range(400) if hidden.get(n) not in {Crossing.CUT, Crossing.OVERFLOW}]
+    expected = [0 if n % 30 == 29 else 1 for n in range(400) if hidden.get(n) not in {WireFate.CUT, WireFate.OVERFLOW}]
     assert found.series.outcomes.tolist() == expected
     assert found.series.parts == 3
     assert any("31 messages met a cut" in note for note in found.notes)
-    carried(tmp_path / "all", plan_of(settings), {"0/scan/a": 200}, dict.fromkeys(range(0, 200, 5), Crossing.CUT))
+    carried(tmp_path / "all", plan_of(settings), {"0/scan/a": 200}, dict.fromkeys(range(0, 200, 5), WireFate.CUT))
     with pytest.raises(TraceError, match="cuts, queues and limits hide"):
         journal_recording(tmp_path / "all", "scan")
 
@@ -136,10 +136,10 @@ def test_missing_numbers_are_what_was_lost_before_the_wire(tmp_path: Path) -> No
         for (key, source), word in words.items():
             for number in np.flatnonzero(word).tolist():
                 codes = (journal.key_code(key), journal.source_code(source))
-                fate = Crossing.LOST if n % 3 == 0 else Crossing.DELIVERED
+                fate = WireFate.LOST if n % 3 == 0 else WireFate.DELIVERED
                 journal.record(1e9 + 0.1 * number, n, number + 1, 0.0, *codes, 64, 0, Kind.PUT, fate)
                 n += 1
-        journal.record(1e9, 0, 5, 0.0, journal.key_code("0/scan/q"), 0, 64, 0, Kind.QUERY, Crossing.DELIVERED)
+        journal.record(1e9, 0, 5, 0.0, journal.key_code("0/scan/q"), 0, 64, 0, Kind.QUERY, WireFate.DELIVERED)
     found = journal_recording(tmp_path, gaps=True)
     expected: list[int] = []
     for word in words.values():

@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 import zenoh
 
-from evedrop.wire.crossing import Crossing
 from evedrop.wire.plan import Side
+from evedrop.wire.record import WireFate
 from tests.conftest import wait_until
 from tests.wire.wire_at_work import ANYWHERE, WireAtWork, at_work, both_ways, link, plan_of
 
@@ -109,8 +109,8 @@ def test_sides_that_routers_join_outside_the_wire_carry_nothing(tmp_path: Path, 
                 "messages pass between the sides robot and base outside the wire, through the routers" in wire.told[0]
             )
             robot.put("a", b"x")
-            wait_until(lambda: Crossing.LOOPED in wire.fates("robot-base"), "the journal calls it looped")
-            assert all(fate == Crossing.LOOPED for fate in wire.fates())
+            wait_until(lambda: WireFate.LOOPED in wire.fates("robot-base"), "the journal calls it looped")
+            assert all(fate == WireFate.LOOPED for fate in wire.fates())
 
 
 def test_a_program_cannot_say_that_sides_are_joined(tmp_path: Path) -> None:
@@ -140,7 +140,7 @@ def test_a_program_cannot_say_that_sides_are_joined(tmp_path: Path) -> None:
             wait_until(lambda: len(probes) > count + 3, "the wire looks again")
             spy.put("a", b"x")
             wait_until(lambda: len(wire.rows_of("a")) == 1, "the wire hears")
-            assert wire.rows_of("a")["fate"].tolist() == [Crossing.DELIVERED]
+            assert wire.rows_of("a")["fate"].tolist() == [WireFate.DELIVERED]
             assert not wire.told
 
 
@@ -159,7 +159,7 @@ def test_a_program_that_passes_probes_on_joins_no_side_without_a_router(tmp_path
             assert neighbours._passes("robot", "third")
             spy.put("a", b"x")
             wait_until(lambda: len(wire.fates("robot-third")) == 1, "the wire hears")
-            assert wire.fates("robot-third") == [Crossing.DELIVERED]
+            assert wire.fates("robot-third") == [WireFate.DELIVERED]
             assert not wire.told
 
 
@@ -177,4 +177,4 @@ def test_routers_that_do_not_join_sides_are_no_loop(tmp_path: Path) -> None:
 
             wait_until(crossed, "a message crosses from router to router")
             assert not wire.told
-            assert set(wire.fates()) == {Crossing.DELIVERED}
+            assert set(wire.fates()) == {WireFate.DELIVERED}

@@ -15,9 +15,9 @@ from zenoh.ext import declare_advanced_publisher as advanced_publisher
 from zenoh.ext import declare_advanced_subscriber as advanced_subscriber
 
 from evedrop.wire.conductor import WireConductor
-from evedrop.wire.crossing import AGAIN, Crossing, Kind
 from evedrop.wire.journal_reader import journal_tables
 from evedrop.wire.plan import WireEvent
+from evedrop.wire.record import AGAIN, Kind, WireFate
 from tests.conftest import wait_until
 from tests.wire.test_wire_publications import reader, ready
 from tests.wire.wire_at_work import LOSSY, PERFECT, at_work, both_ways, is_declared, link, plan_of
@@ -106,7 +106,7 @@ def test_a_link_of_limited_rate_queues_messages_and_drops_what_does_not_fit(tmp_
             robot.put("x", b"x" * 100, congestion_control=BLOCK)
         wait_until(lambda: len(wire.rows_of("x")) == 8, "the wire hears")
         rows = wire.rows_of("x")
-        assert rows["fate"].tolist() == [Crossing.DELIVERED] * 5 + [Crossing.OVERFLOW] * 3
+        assert rows["fate"].tolist() == [WireFate.DELIVERED] * 5 + [WireFate.OVERFLOW] * 3
         assert [round(one) for one in rows["delay"].tolist()] == [1, 2, 3, 4, 5, 0, 0, 0]
 
 
@@ -123,13 +123,13 @@ def test_events_cut_and_part_links_and_change_them_while_the_wire_runs(tmp_path:
         ready(wire, robot, base)
         got = reader(base, "stop/**")
         assert conductor.change({"partition": ["robot", "base"]}) == "partition robot, base"
-        wait_until(lambda: robot.put("x", b"") or Crossing.CUT in wire.fates(), "nothing passes")
+        wait_until(lambda: robot.put("x", b"") or WireFate.CUT in wire.fates(), "nothing passes")
         wait_until(lambda: robot.put("stop/now", b"") or got, "but what is lossless does")
         conductor.end_partition("robot", "base")
         count = len(wire.fates())
         wait_until(lambda: robot.put("x", b"") or 0 in wire.fates()[count + 1 :], "it passes again")
         conductor.change({"link": "robot-base", "set": {"quality": 0.0}})
-        wait_until(lambda: robot.put("x", b"") or Crossing.LOST in wire.fates(), "the link loses everything")
+        wait_until(lambda: robot.put("x", b"") or WireFate.LOST in wire.fates(), "the link loses everything")
     assert [line.partition(": ")[2] for line in said][:3] == ["go", "partition robot, base", "heal robot, base"]
 
 
@@ -173,10 +173,10 @@ def test_an_advanced_reader_recovers_what_a_link_lost(tmp_path: Path) -> None:
             def delivered() -> int:
                 rows = wire.rows
                 of_scan = (rows["key"] == wire.journal.key_code("scan")) & (rows["kind"] == Kind.PUT)
-                return int((of_scan & (rows["fate"] == Crossing.DELIVERED)).sum())
+                return int((of_scan & (rows["fate"] == WireFate.DELIVERED)).sum())
 
             wait_until(lambda: len(wire.rows) >= 30 and len(got) > delivered(), "it gets lost ones too")
-            assert Crossing.LOST in wire.fates()
+            assert WireFate.LOST in wire.fates()
             subscriber.undeclare()
 
 

@@ -20,11 +20,11 @@ import pytest
 from evedrop.errors import UsageError
 from evedrop.model.slot.link import NEVER
 from evedrop.wire import journal as journal_module
-from evedrop.wire.crossing import AGAIN, HELD, RECORD, UNLINKED, Crossing, Kind
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_part import STORED, JournalPart, Records, Words, records_in, records_of, table_of
 from evedrop.wire.journal_reader import journal_tables, part_names, unfinished_table
 from evedrop.wire.lanes import LinkState
+from evedrop.wire.record import AGAIN, HELD, RECORD, UNLINKED, Kind, WireFate
 from tests.conftest import LIMIT, wait_until
 from tests.examples import mostly_long
 from tests.wire.wire_plans import wire_plan
@@ -64,7 +64,7 @@ def read_as_the_page(lines: str) -> pa.Table:
 
 
 def put(
-    journal: WireJournal, n: int, fate: Crossing = Crossing.DELIVERED, *, key: str = "scan/1", delay: float = 0.0
+    journal: WireJournal, n: int, fate: WireFate = WireFate.DELIVERED, *, key: str = "scan/1", delay: float = 0.0
 ) -> int:
     """Record a put on the first link."""
     return int(journal.record(1000.0 + n, n, -1, delay, journal.key_code(key), 0, 64, 0, Kind.PUT, fate))
@@ -126,9 +126,9 @@ def test_a_row_says_all_that_was_recorded(tmp_path: Path) -> None:
     """Names in place of codes, null where there is nothing, and sizes that do not fit as the largest."""
     with WireJournal(tmp_path, wire_plan()) as journal:
         key, source = journal.key_code("scan/ä"), journal.source_code("gid")
-        journal.record(1.5, 3, 2**40, 0.25, key, source, 64, 0, Kind.PUT | AGAIN, Crossing.DELIVERED)
-        journal.record(2.5, -1, -1, 0.0, key, 0, 2**33, UNLINKED, Kind.QUERY, Crossing.UNLINKED)
-        journal.record(3.5, 4, -1, 0.0, key, 0, 0, 0, Kind.DELETE, Crossing.LOST)
+        journal.record(1.5, 3, 2**40, 0.25, key, source, 64, 0, Kind.PUT | AGAIN, WireFate.DELIVERED)
+        journal.record(2.5, -1, -1, 0.0, key, 0, 2**33, UNLINKED, Kind.QUERY, WireFate.UNLINKED)
+        journal.record(3.5, 4, -1, 0.0, key, 0, 0, 0, Kind.DELETE, WireFate.LOST)
     first = {"time": 1.5, "link": "scan", "key": "scan/ä", "size": 64, "source": "gid", "sequence": 2**40, "fate": "delivered",
              "reason": None, "delay": 0.25, "n": 3, "kind": "put", "again": True}  # fmt: skip
     second = {"time": 2.5, "link": None, "key": "scan/ä", "size": 2**32 - 1, "source": None, "sequence": None,
@@ -156,16 +156,16 @@ def test_another_wire_on_the_same_folder_is_refused(tmp_path: Path) -> None:
 def test_amended_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Before the listeners had the row, after, and when it is in Parquet already: they add up to what the journal says."""
     monkeypatch.setattr(journal_module, "_PATIENCE", 0.0)
-    tally = dict.fromkeys(Crossing, 0)
+    tally = dict.fromkeys(WireFate, 0)
 
     def add(block: Records) -> None:
         for fate in block["fate"]:
-            tally[Crossing(fate)] += 1
+            tally[WireFate(fate)] += 1
 
-    def amend(records: Records, fate: Crossing) -> None:
+    def amend(records: Records, fate: WireFate) -> None:
         for record in records:
             assert (record["n"], journal.key_of(record["key"]), record["size"]) == (2, "scan/1", 64)
-            tally[Crossing(record["fate"])] -= 1
+            tally[WireFate(record["fate"])] -= 1
             tally[fate] += 1
 
     with WireJournal(tmp_path, wire_plan(), part_rows=4) as journal:
@@ -173,16 +173,16 @@ def test_amended_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         journal.amendment_listeners.append(amend)
         late = [put(journal, 2) for _ in range(4)]
         wait_until((tmp_path / "journal" / "001-0001.parquet").exists, "a Parquet file")
-        journal.amend(late[1], Crossing.REFUSED)
+        journal.amend(late[1], WireFate.REFUSED)
         handed, fresh = put(journal, 2), put(journal, 2)
         journal.flush()
-        journal.amend(handed, Crossing.UNDERWAY)
-        journal.amend(fresh, Crossing.REFUSED)
-        journal.amend(put(journal, 2), Crossing.UNDERWAY)
+        journal.amend(handed, WireFate.UNDERWAY)
+        journal.amend(fresh, WireFate.REFUSED)
+        journal.amend(put(journal, 2), WireFate.UNDERWAY)
     reasons = [row["reason"] for row in rows_of(tmp_path)]
     assert reasons == [None, "refused", None, None, "underway", "refused", "underway"]
     assert {fate: count for fate, count in tally.items() if count} == {
-        Crossing.DELIVERED: 3, Crossing.REFUSED: 2, Crossing.UNDERWAY: 2,
+        WireFate.DELIVERED: 3, WireFate.REFUSED: 2, WireFate.UNDERWAY: 2,
     }  # fmt: skip
 
 
@@ -193,7 +193,7 @@ def test_numbers_go_on_after_a_kill_whatever_the_killed_wire_heard(tmp_path: Pat
         for n in range(5):
             put(journal, n, key="scan/old")
     with WireJournal(folder, wire_plan()) as journal:
-        journal.record(1.0, 3, -1, 0.0, journal.key_code("scan/new"), 0, 0, 0, Kind.DELETE, Crossing.LOST)
+        journal.record(1.0, 3, -1, 0.0, journal.key_code("scan/new"), 0, 0, 0, Kind.DELETE, WireFate.LOST)
         shutil.copytree(folder, killed)  # as the disk is when the wire is killed now
     with WireJournal(killed, wire_plan()) as journal:
         assert journal.counts == {("scan", "scan/old", "put"): 5, ("scan", "scan/new", "put"): 4}
@@ -216,7 +216,7 @@ def test_what_a_killed_wire_had_not_sent_is_underway(tmp_path: Path) -> None:
     with WireJournal(folder, wire_plan()) as journal:
         for n, delay in enumerate((3600.0, 3600.0, 0.0, 0.0)):
             code = journal.key_code("scan/1")
-            row = journal.record(time.time(), n, -1, delay, code, 0, 0, 0, Kind.PUT, Crossing.DELIVERED | HELD)
+            row = journal.record(time.time(), n, -1, delay, code, 0, 0, 0, Kind.PUT, WireFate.DELIVERED | HELD)
             if n % 2:
                 journal.sent(row)
         assert [row["reason"] for row in rows_of(folder)] == [None] * 4
@@ -232,7 +232,7 @@ def test_a_file_of_rows_stays_while_one_of_them_was_not_sent(tmp_path: Path, mon
     with WireJournal(tmp_path, wire_plan(), part_rows=2) as journal:
         rows = []
         for n in range(6):
-            fate = Crossing.DELIVERED | HELD if n in (0, 4) else Crossing.DELIVERED
+            fate = WireFate.DELIVERED | HELD if n in (0, 4) else WireFate.DELIVERED
             rows.append(journal.record(time.time() - 60.0, n, -1, 0.0, journal.key_code("a"), 0, 0, 0, Kind.PUT, fate))
         made = tmp_path / "journal"
         wait_until((made / "001-0002.parquet").exists, "the file of the rows that are sent")
@@ -261,7 +261,7 @@ def test_a_record_that_is_torn_is_not_read(tmp_path: Path) -> None:
     """At whichever byte the process ended while it wrote the last record."""
     part = JournalPart(tmp_path / "001-0001.rows", 60)
     record = np.zeros(1, RECORD)
-    record["n"], record["fate"] = 5, Crossing.LOST + STORED
+    record["n"], record["fate"] = 5, WireFate.LOST + STORED
     for size in range(RECORD.itemsize):
         part.buffer[: RECORD.itemsize] = record.tobytes()
         part.buffer[RECORD.itemsize : 2 * RECORD.itemsize] = record.tobytes()[:size] + bytes(RECORD.itemsize - size)
@@ -297,7 +297,7 @@ def test_a_history_goes_on_although_its_session_has_another_id(killed: bool, tmp
     with WireJournal(folder, plan) as first:
         code = first.key_code("scan/1/@adv/pub/aa/1/_")
         for n in range(3):
-            first.record(time.time(), n, -1, 0.0, code, 0, 8, 0, Kind.QUERY, Crossing.DELIVERED)
+            first.record(time.time(), n, -1, 0.0, code, 0, 8, 0, Kind.QUERY, WireFate.DELIVERED)
         first.change("scan", BETTER, {("scan/1/@adv", "query"): 2})
         if killed:
             shutil.copytree(folder, tmp_path / "killed")
@@ -313,7 +313,7 @@ import mmap, os, random, signal, sys, time
 from pathlib import Path
 import numpy as np
 import pyarrow as pa
-from evedrop.wire.crossing import HELD, Kind
+from evedrop.wire.record import HELD, Kind
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_reader import journal_tables
 from tests.wire.wire_plans import wire_plan
@@ -375,7 +375,7 @@ ON_SMALL_DISK = """
 import subprocess, sys, time
 from pathlib import Path
 import pyarrow as pa
-from evedrop.wire.crossing import Kind
+from evedrop.wire.record import Kind
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_reader import journal_tables
 from tests.wire.wire_plans import wire_plan
@@ -458,7 +458,7 @@ def records_file(folder: Path, **changes: Any) -> Path:
 )  # fmt: skip
 def test_a_record_that_no_wire_writes_is_named(changes: dict[str, Any], tmp_path: Path) -> None:
     """With its fate, kind, number, link, time or delay out of range; the same record is read where it is within it."""
-    right = {"n": NEVER - 1, "link": UNLINKED, "kind": Kind.REPLY | AGAIN, "fate": Crossing.UNLINKED + STORED}
+    right = {"n": NEVER - 1, "link": UNLINKED, "kind": Kind.REPLY | AGAIN, "fate": WireFate.UNLINKED + STORED}
     assert unfinished_table(records_file(tmp_path / "right", **right), {1: ["scan"]}, killed=False).num_rows == 2
     path = records_file(tmp_path / "wrong", **changes)
     with pytest.raises(UsageError, match="record 1 is not one of this wire"):
@@ -467,7 +467,7 @@ def test_a_record_that_no_wire_writes_is_named(changes: dict[str, Any], tmp_path
 
 def test_a_table_of_records_gives_them_back() -> None:
     """Every kind and fate, and what is null; but not their senders."""
-    fates, kinds = [*Crossing], [*Kind, *(kind | AGAIN for kind in Kind)]
+    fates, kinds = [*WireFate], [*Kind, *(kind | AGAIN for kind in Kind)]
     records = np.zeros(len(fates) * len(kinds), RECORD)
     records["fate"], records["kind"] = np.repeat(fates, len(kinds)), np.tile(kinds, len(fates))
     at = np.arange(len(records))
@@ -480,6 +480,6 @@ def test_a_table_of_records_gives_them_back() -> None:
     for name in RECORD.names or ():
         assert np.array_equal(found[name], records[name]), name
     assert table["fate"].to_pylist() == [
-        "delivered" if fate is Crossing.DELIVERED else "lost" if fate.emulated else "dropped"
-        for fate in map(Crossing, records["fate"])
+        "delivered" if fate is WireFate.DELIVERED else "lost" if fate.emulated else "dropped"
+        for fate in map(WireFate, records["fate"])
     ]

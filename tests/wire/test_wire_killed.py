@@ -17,12 +17,12 @@ from evedrop.cli.main import main
 from evedrop.errors import UsageError
 from evedrop.results.wire_folder import WIRE_FILE
 from evedrop.wire import journal as journal_module
-from evedrop.wire.crossing import HELD, Crossing, Kind
 from evedrop.wire.file import resolved_wire
 from evedrop.wire.history import WireHistory
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_on_disk import summary_of_wire
 from evedrop.wire.journal_recovery import is_in_use, recover
+from evedrop.wire.record import HELD, Kind, WireFate
 from evedrop.wire.run import _begin_results, run_wire
 from tests.pages import checked
 from tests.wire.wire_at_work import LOSSY, both_ways
@@ -36,10 +36,10 @@ def folders(tmp_path: Path) -> Iterator[dict[str, Path]]:
     plan, out = both_ways(LOSSY), tmp_path / "running"
     found = {"running": out, "killed": tmp_path / "killed"}
     with WireJournal(out, plan) as journal:
-        journal.record(time.time(), 0, -1, 0.0, journal.key_code("scan"), 0, 8, 0, Kind.PUT, Crossing.LOST)
+        journal.record(time.time(), 0, -1, 0.0, journal.key_code("scan"), 0, 8, 0, Kind.PUT, WireFate.LOST)
     with WireJournal(out, plan) as journal:
         (out / WIRE_FILE).write_text(resolved_wire(plan))
-        fates = [Crossing.DELIVERED] * (DELIVERED + DELAYED) + [Crossing.LOST] * LOST
+        fates = [WireFate.DELIVERED] * (DELIVERED + DELAYED) + [WireFate.LOST] * LOST
         for n, fate in enumerate(fates):
             delay, held = (1000.0, HELD) if n < DELAYED else (0.0, 0)
             journal.record(time.time(), 1 + n, -1, delay, journal.key_code("scan"), 0, 8, 0, Kind.PUT, fate | held)

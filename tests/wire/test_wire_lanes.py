@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
-from evedrop.wire.crossing import Crossing
 from evedrop.wire.fates import KeyFates
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.lanes import Decision, LinkState
+from evedrop.wire.record import WireFate
 from tests.wire.wire_at_work import DEAD, LOSSY, PERFECT, both_ways, link, plan_of
 
 LARGEST = 100
@@ -36,11 +36,11 @@ def test_the_reasons_have_an_order(lossy: LinkState) -> None:
     due = [fates.next()[0] for _ in range(100)]
     assert decide(0.0, 40)[:2] == (0, due[0])
     lossy.cut = lossy.looped = True
-    assert decide(0.0, LARGEST + 1)[:2] == (1, Crossing.OVERFLOW)
-    assert decide(1.0, LARGEST + 1)[:2] == (2, Crossing.TOO_LARGE)
-    assert decide(2.0, 1)[:2] == (3, Crossing.LOOPED)
+    assert decide(0.0, LARGEST + 1)[:2] == (1, WireFate.OVERFLOW)
+    assert decide(1.0, LARGEST + 1)[:2] == (2, WireFate.TOO_LARGE)
+    assert decide(2.0, 1)[:2] == (3, WireFate.LOOPED)
     lossy.looped = False
-    assert decide(3.0, 1)[:2] == (4, Crossing.CUT)
+    assert decide(3.0, 1)[:2] == (4, WireFate.CUT)
     lossy.cut = False
     assert [decide(4.0 + n, 1)[:2] for n in range(95)] == [(5 + n, fate) for n, fate in enumerate(due[5:])]
 
@@ -50,10 +50,10 @@ def test_what_is_lossless_is_not_cut_but_does_not_go_round(lossy: LinkState) -> 
     lossy.change(DEAD)
     decide = lossy.lane("put", "stop", lossless=True)
     lossy.cut = True
-    assert [decide(0.0, LARGEST) for _ in range(3)] == [(n, Crossing.DELIVERED, 0.0, False) for n in range(3)]
-    assert decide(0.0, LARGEST + 1) == (3, Crossing.TOO_LARGE, 0.0, False)
+    assert [decide(0.0, LARGEST) for _ in range(3)] == [(n, WireFate.DELIVERED, 0.0, False) for n in range(3)]
+    assert decide(0.0, LARGEST + 1) == (3, WireFate.TOO_LARGE, 0.0, False)
     lossy.looped = True
-    assert decide(0.0, 1) == (4, Crossing.LOOPED, 0.0, False)
+    assert decide(0.0, 1) == (4, WireFate.LOOPED, 0.0, False)
 
 
 SLOW: dict[str, Any] = {
@@ -75,10 +75,10 @@ def test_a_message_waits_for_those_before_it(tmp_path: Path) -> None:
     assert [decision[:2] for decision in sent] == [
         (0, 0),
         (1, 0),
-        (2, Crossing.OVERFLOW),
+        (2, WireFate.OVERFLOW),
         (3, 0),
         (4, 0),
-        (5, Crossing.OVERFLOW),
+        (5, WireFate.OVERFLOW),
     ]
     assert [decision[2] for decision in sent] == pytest.approx([0.3, 0.35, 0.0, 0.35, 0.35, 0.0])
     assert [decision[3] for decision in sent] == [True, True, False, True, True, False]
@@ -90,15 +90,15 @@ def test_what_is_not_delivered_has_no_delay_and_no_copy(tmp_path: Path) -> None:
     with WireJournal(tmp_path, plan) as journal:
         state = LinkState(plan.links[0], plan, journal)
         decide = state.lane("put", "scan", lossless=False)
-        assert [decide(0.0, LARGEST) for _ in range(2)] == [(n, Crossing.DELIVERED, 0.25, True) for n in range(2)]
-        assert decide(0.0, LARGEST + 1) == (2, Crossing.TOO_LARGE, 0.0, False)
+        assert [decide(0.0, LARGEST) for _ in range(2)] == [(n, WireFate.DELIVERED, 0.25, True) for n in range(2)]
+        assert decide(0.0, LARGEST + 1) == (2, WireFate.TOO_LARGE, 0.0, False)
         state.looped = True
-        assert decide(0.0, 1) == (3, Crossing.LOOPED, 0.0, False)
+        assert decide(0.0, 1) == (3, WireFate.LOOPED, 0.0, False)
         state.looped, state.cut = False, True
-        assert decide(0.0, 1) == (4, Crossing.CUT, 0.0, False)
+        assert decide(0.0, 1) == (4, WireFate.CUT, 0.0, False)
         state.cut = False
         state.change({**SLOW, **DEAD})
-        assert decide(0.0, 1) == (5, Crossing.LOST, 0.0, False)
+        assert decide(0.0, 1) == (5, WireFate.LOST, 0.0, False)
 
 
 def test_other_settings_hold_from_the_next_message_on(tmp_path: Path) -> None:
@@ -125,7 +125,7 @@ def test_a_key_that_comes_after_a_change_has_the_new_settings_alone(lossy: LinkS
         lossy.change(settings)
         expected.append(KeyFates(link("robot", "base", settings), f"key/{n}", "put", 7).next()[0])
         assert lossy.lane("put", f"key/{n}", lossless=False)(float(n), 1)[1] == expected[-1]
-    assert expected[1:] == [Crossing.LOST, Crossing.DELIVERED]
+    assert expected[1:] == [WireFate.LOST, WireFate.DELIVERED]
 
 
 def test_two_who_ask_for_a_key_share_its_messages(lossy: LinkState) -> None:

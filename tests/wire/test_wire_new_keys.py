@@ -11,13 +11,13 @@ import pyarrow as pa
 import pytest
 import zenoh
 
-from evedrop.wire.crossing import Crossing, Kind
 from evedrop.wire.journal_on_disk import scorekeeper_on_disk
 from evedrop.wire.journal_reader import journal_tables
 from evedrop.wire.key_limit import KeyLimit
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.publications import PublicationRelay
 from evedrop.wire.publishers import Publishers
+from evedrop.wire.record import Kind, WireFate
 from evedrop.wire.scorekeeper import WireScorekeeper
 from tests.conftest import LIMIT, wait_until
 from tests.wire.test_wire_publications import reader, ready
@@ -154,12 +154,12 @@ def test_keys_beyond_the_limit_are_dropped_and_the_wire_says_so(tmp_path: Path) 
         for n in [*range(8), *range(8)]:
             robot.put(f"key/{n}", b"xyz", congestion_control=BLOCK)
         wait_until(lambda: len(wire.rows) == 16, "the wire hears all")
-        assert wire.fates() == 2 * ([Crossing.DELIVERED] * 5 + [Crossing.TOO_MANY_KEYS] * 3)
+        assert wire.fates() == 2 * ([WireFate.DELIVERED] * 5 + [WireFate.TOO_MANY_KEYS] * 3)
         assert wire.rows["n"].tolist() == [*[0] * 5, *[-1] * 3, *[1] * 5, *[-1] * 3]
         for n in range(5):
             base.put(f"order/{n}", b"", congestion_control=BLOCK)
         wait_until(lambda: len(wire.rows) == 21, "the wire hears all")
-        assert wire.fates("base-robot") == [Crossing.DELIVERED] * 5
+        assert wire.fates("base-robot") == [WireFate.DELIVERED] * 5
         assert len(wire.told) == 1
         assert "the side robot have used 5 keys of 25 characters" in wire.told[0]
         summary = scorekeeper.links()["robot-base"]
@@ -180,7 +180,7 @@ def test_the_keys_of_earlier_starts_keep_their_places(tmp_path: Path) -> None:
                 robot.put(f"key/{n}", b"", congestion_control=BLOCK)
             wait_until(lambda: len(wire.rows) == 6, "the wire hears all")
             assert wire.rows["n"].tolist() == [start] * 5 + [-1]
-            assert wire.fates() == [Crossing.DELIVERED] * 5 + [Crossing.TOO_MANY_KEYS]
+            assert wire.fates() == [WireFate.DELIVERED] * 5 + [WireFate.TOO_MANY_KEYS]
 
 
 def test_long_keys_need_more_room(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -215,7 +215,7 @@ def test_a_query_with_a_new_key_beyond_the_limit_is_not_asked(tmp_path: Path) ->
         base.declare_queryable("question", lambda query: query.reply("question", b"yes"))
         wait_until(lambda: is_declared(wire, "base", "queryable", "question"), "the queryable is declared")
         assert [*robot.get("question")] == []
-        assert wire.fates()[-1] == Crossing.TOO_MANY_KEYS
+        assert wire.fates()[-1] == WireFate.TOO_MANY_KEYS
         assert wire.rows[-1]["kind"] == Kind.QUERY
 
 
@@ -231,7 +231,7 @@ def test_what_waits_when_the_wire_ends_is_underway(tmp_path: Path, relays: list[
         for key in ("scan", "new"):
             robot.put(key, b"", congestion_control=BLOCK)
         wait_until(lambda: len(wire.rows) == 3, "the wire hears all")
-        assert wire.fates() == [Crossing.DELIVERED, Crossing.UNDERWAY, Crossing.UNDERWAY]
+        assert wire.fates() == [WireFate.DELIVERED, WireFate.UNDERWAY, WireFate.UNDERWAY]
         assert wire.rows["n"].tolist() == [0, 1, -1]
     assert len(got) == 1
     with at_work(both_ways(), tmp_path) as wire, wire.program("robot") as robot:

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evedrop.wire.crossing import Crossing
 from evedrop.wire.graph import loss_of
 from evedrop.wire.lane_states import LaneState, legend, share_of, state_of
 from evedrop.wire.notices import CutWatcher, LinkWatcher
+from evedrop.wire.record import WireFate
 from evedrop.wire.step_counts import DELIVERED, OUTCOMES, WireSteps
 from tests.wire.wire_rows import plan_of, robot_plan
 
 
-def steps_of(*counts: dict[Crossing, int]) -> WireSteps:
+def steps_of(*counts: dict[WireFate, int]) -> WireSteps:
     """Steps of one link."""
     made = np.zeros((len(counts), 2, len(OUTCOMES)), np.int64)
     for k, one in enumerate(counts):
@@ -25,7 +25,7 @@ def steps_of(*counts: dict[Crossing, int]) -> WireSteps:
 def test_losses_of_the_wire_itself_are_told_once() -> None:
     """For each reason, and as errors: they are not what the file asked for."""
     steps = steps_of(
-        {Crossing.HELD_UP: 3}, {Crossing.HELD_UP: 3, Crossing.REFUSED: 1}, {Crossing.LOST: 4, Crossing.CONGESTED: 1}
+        {WireFate.HELD_UP: 3}, {WireFate.HELD_UP: 3, WireFate.REFUSED: 1}, {WireFate.LOST: 4, WireFate.CONGESTED: 1}
     )
     watcher = LinkWatcher(["scan"], 0.2)
     lines = watcher.watch(steps)
@@ -41,7 +41,7 @@ def test_losses_of_the_wire_itself_are_told_once() -> None:
 def test_frequent_stretches_get_few_lines() -> None:
     """A link that fails for a second out of two gets a few lines in an hour, not thousands."""
     watcher = LinkWatcher(["scan"], 0.2)
-    lines = watcher.watch(steps_of(*([{Crossing.DELIVERED: 5}] * 5 + [{Crossing.LOST: 5}] * 5) * 1800))
+    lines = watcher.watch(steps_of(*([{WireFate.DELIVERED: 5}] * 5 + [{WireFate.LOST: 5}] * 5) * 1800))
     assert 2 <= len(lines) < 200
 
 
@@ -50,11 +50,11 @@ def test_pairs_of_sides_are_cut_when_all_their_links_are() -> None:
     plan = plan_of(("up", "a", "b", {}), ("down", "b", "a", {}), ("tap", "a", "c", {}))
     watcher = CutWatcher(plan.links)
     counts = np.zeros((4, len(OUTCOMES)), np.int64)
-    counts[0, OUTCOMES.index(Crossing.CUT)] = counts[1, DELIVERED] = counts[2, DELIVERED] = 5
+    counts[0, OUTCOMES.index(WireFate.CUT)] = counts[1, DELIVERED] = counts[2, DELIVERED] = 5
     watcher.watch(counts)
     assert watcher.cut() == ["up"]
     counts[:] = 0
-    counts[1, OUTCOMES.index(Crossing.CUT)] = 5
+    counts[1, OUTCOMES.index(WireFate.CUT)] = 5
     watcher.watch(counts)
     assert watcher.cut() == ["a|b"]
 
@@ -67,7 +67,7 @@ def test_pairs_of_sides_are_cut_when_all_their_links_are() -> None:
 def test_shares_are_rounded_but_never_to_nothing_or_all(heard: int, lost: int, text: str) -> None:
     """A link that lost one message of many has not lost 0 %."""
     counts = np.zeros(len(OUTCOMES), np.int64)
-    counts[DELIVERED], counts[OUTCOMES.index(Crossing.LOST)] = heard - lost, lost
+    counts[DELIVERED], counts[OUTCOMES.index(WireFate.LOST)] = heard - lost, lost
     assert loss_of(counts) == text
 
 
@@ -77,16 +77,16 @@ def test_a_lane_tells_how_much_was_lost() -> None:
         (9, 1, 0, LaneState.SOME), (3, 2, 0, LaneState.SOME), (2, 2, 0, LaneState.MOST), (0, 5, 0, LaneState.MOST),
         (9, 1, 20, LaneState.SOME), (2, 2, 20, LaneState.MOST), (4, 0, 20, LaneState.DELIVERED),
     ):  # fmt: skip
-        counts = steps_of({Crossing.DELIVERED: delivered, Crossing.LOST: lost, Crossing.UNDERWAY: underway}).counts
+        counts = steps_of({WireFate.DELIVERED: delivered, WireFate.LOST: lost, WireFate.UNDERWAY: underway}).counts
         assert state_of(counts[0, 0]) is state, (delivered, lost, underway)
 
 
 def test_the_share_of_a_link_counts_every_message() -> None:
     """For whatever reason it was not delivered; a silent link has no share."""
     for stretch, state in (
-        ({}, LaneState.QUIET), ({Crossing.DELIVERED: 3}, LaneState.DELIVERED),
-        ({Crossing.DELIVERED: 3, Crossing.REFUSED: 2}, LaneState.SOME),
-        ({Crossing.DELIVERED: 2, Crossing.CUT: 1, Crossing.LOST: 1}, LaneState.MOST),
+        ({}, LaneState.QUIET), ({WireFate.DELIVERED: 3}, LaneState.DELIVERED),
+        ({WireFate.DELIVERED: 3, WireFate.REFUSED: 2}, LaneState.SOME),
+        ({WireFate.DELIVERED: 2, WireFate.CUT: 1, WireFate.LOST: 1}, LaneState.MOST),
     ):  # fmt: skip
         assert share_of(steps_of(stretch).counts[0, 0]) is state
 
@@ -94,12 +94,12 @@ def test_the_share_of_a_link_counts_every_message() -> None:
 def test_the_main_reason_decides_on_a_lane() -> None:
     """Also for a full queue and for losses of the wire's own; the legend has the queue only for links with a rate."""
     expected = {
-        Crossing.CORRUPTED: LaneState.SOME, Crossing.OVERFLOW: LaneState.FULL, Crossing.CUT: LaneState.CUT,
-        Crossing.REFUSED: LaneState.OWN, Crossing.HELD_UP: LaneState.OWN, Crossing.TOO_MANY_KEYS: LaneState.OWN,
-        Crossing.CONGESTED: LaneState.OWN,
+        WireFate.CORRUPTED: LaneState.SOME, WireFate.OVERFLOW: LaneState.FULL, WireFate.CUT: LaneState.CUT,
+        WireFate.REFUSED: LaneState.OWN, WireFate.HELD_UP: LaneState.OWN, WireFate.TOO_MANY_KEYS: LaneState.OWN,
+        WireFate.CONGESTED: LaneState.OWN,
     }  # fmt: skip
     for fate, state in expected.items():
-        assert state_of(steps_of({Crossing.DELIVERED: 9, Crossing.LOST: 1, fate: 3}).counts[0, 0]) is state
-    assert state_of(steps_of({Crossing.UNDERWAY: 3}).counts[0, 0]) is LaneState.QUIET
+        assert state_of(steps_of({WireFate.DELIVERED: 9, WireFate.LOST: 1, fate: 3}).counts[0, 0]) is state
+    assert state_of(steps_of({WireFate.UNDERWAY: 3}).counts[0, 0]) is LaneState.QUIET
     assert "queue" not in legend(robot_plan())
     assert "purple: queue full" in legend(plan_of(("a", "b", "c", {"rate": 1000.0})))

@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from evedrop.wire.crossing import HELD, Crossing, Kind
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_part import records_in
 from evedrop.wire.outlet import SideOutlet
+from evedrop.wire.record import HELD, Kind, WireFate
 from tests.conftest import LIMIT, wait_until
 from tests.wire.wire_at_work import both_ways
 
@@ -38,7 +38,7 @@ class Queue:
         """Send a message; returns its row."""
         n, self._count = self._count, self._count + 1
         code = self.journal.key_code("scan")
-        row = self.journal.record(time.time(), n, -1, delay, code, 0, size, 0, Kind.PUT, Crossing.DELIVERED | HELD)
+        row = self.journal.record(time.time(), n, -1, delay, code, 0, size, 0, Kind.PUT, WireFate.DELIVERED | HELD)
 
         def task() -> None:
             if not self._takes.acquire(timeout=LIMIT):
@@ -53,10 +53,10 @@ class Queue:
         for _ in range(count):
             self._takes.release()
 
-    def fates(self, killed: bool = False) -> list[Crossing]:
+    def fates(self, killed: bool = False) -> list[WireFate]:
         """The fates on the disk. killed: as they are if the process were killed now."""
         rows = records_in(self.folder / "journal" / "unfinished" / "001-0001.rows", killed)
-        return [Crossing(fate) for fate in rows["fate"].tolist()]
+        return [WireFate(fate) for fate in rows["fate"].tolist()]
 
 
 @pytest.fixture
@@ -81,15 +81,15 @@ def test_messages_are_sent_in_order_and_a_killed_wire_knows_which_were(queue: Qu
     busy(queue)
     for _ in range(3):
         queue.give()
-    assert queue.fates() == [Crossing.DELIVERED] * 4
-    assert queue.fates(killed=True) == [Crossing.UNDERWAY] * 4
+    assert queue.fates() == [WireFate.DELIVERED] * 4
+    assert queue.fates(killed=True) == [WireFate.UNDERWAY] * 4
     queue.takes(2)
-    wait_until(lambda: queue.fates(killed=True)[1] is Crossing.DELIVERED, "two are sent")
-    assert queue.fates(killed=True) == [Crossing.DELIVERED] * 2 + [Crossing.UNDERWAY] * 2
+    wait_until(lambda: queue.fates(killed=True)[1] is WireFate.DELIVERED, "two are sent")
+    assert queue.fates(killed=True) == [WireFate.DELIVERED] * 2 + [WireFate.UNDERWAY] * 2
     queue.takes(2)
     wait_until(lambda: queue.outlet.is_free, "all are sent")
     assert queue.sent == [0, 1, 2, 3]
-    assert queue.fates(killed=True) == [Crossing.DELIVERED] * 4
+    assert queue.fates(killed=True) == [WireFate.DELIVERED] * 4
 
 
 def test_no_message_goes_past_a_message_that_is_being_sent(queue: Queue) -> None:
@@ -107,7 +107,7 @@ def test_a_message_that_does_not_wait_is_congested_when_there_is_no_room(queue: 
     busy(queue)
     for _ in range(4):
         queue.give()
-    assert queue.fates() == [Crossing.DELIVERED] * 4 + [Crossing.CONGESTED]
+    assert queue.fates() == [WireFate.DELIVERED] * 4 + [WireFate.CONGESTED]
     assert queue.lost == [4]
     queue.takes(4)
     wait_until(lambda: queue.outlet.is_free, "all are sent")
@@ -169,12 +169,12 @@ def test_a_delayed_message_is_held_up_or_congested(tmp_path: Path) -> None:
     for _ in range(3):
         queue.give(delay=LONG)
     assert queue.lost == [2, 5]
-    assert queue.fates()[2:] == [Crossing.CONGESTED, Crossing.DELIVERED, Crossing.DELIVERED, Crossing.HELD_UP]
+    assert queue.fates()[2:] == [WireFate.CONGESTED, WireFate.DELIVERED, WireFate.DELIVERED, WireFate.HELD_UP]
     queue.takes(2)
     queue.outlet.end()
     queue.outlet.close(time.monotonic() + LIMIT)
-    assert queue.fates() == [Crossing.DELIVERED] * 2 + [
-        Crossing.CONGESTED, Crossing.UNDERWAY, Crossing.UNDERWAY, Crossing.HELD_UP
+    assert queue.fates() == [WireFate.DELIVERED] * 2 + [
+        WireFate.CONGESTED, WireFate.UNDERWAY, WireFate.UNDERWAY, WireFate.HELD_UP
     ]  # fmt: skip
     queue.journal.close()
 
@@ -182,7 +182,7 @@ def test_a_delayed_message_is_held_up_or_congested(tmp_path: Path) -> None:
 def test_an_error_stops_one_message_only(queue: Queue) -> None:
     """What must follow is carried out in its turn."""
     code, order = queue.journal.key_code("scan"), list[str]()
-    row = queue.journal.record(time.time(), 0, -1, 0.0, code, 0, 1, 0, Kind.PUT, Crossing.DELIVERED | HELD)
+    row = queue.journal.record(time.time(), 0, -1, 0.0, code, 0, 1, 0, Kind.PUT, WireFate.DELIVERED | HELD)
     queue.outlet.send(0.0, 1, row, lambda: 1 / 0, patient=False)
     queue.outlet.follow(lambda: 1 / 0)
     queue.give()
@@ -190,7 +190,7 @@ def test_an_error_stops_one_message_only(queue: Queue) -> None:
     queue.takes(1)
     wait_until(lambda: order, "it is carried out")
     assert queue.sent == [0]
-    assert queue.fates() == [Crossing.REFUSED, Crossing.DELIVERED]
+    assert queue.fates() == [WireFate.REFUSED, WireFate.DELIVERED]
 
 
 def test_the_end_does_not_wait_for_a_side_that_takes_nothing(tmp_path: Path) -> None:
@@ -206,7 +206,7 @@ def test_the_end_does_not_wait_for_a_side_that_takes_nothing(tmp_path: Path) -> 
     sender.join(LIMIT)
     assert queue.lost == [3]
     queue.outlet.close(time.monotonic())
-    assert queue.fates() == [Crossing.UNDERWAY] * 4
+    assert queue.fates() == [WireFate.UNDERWAY] * 4
     queue.takes(10)
     queue.outlet._thread.join(LIMIT)
     assert not queue.outlet._thread.is_alive()
@@ -257,7 +257,7 @@ def test_a_message_that_comes_after_the_end_is_under_way(tmp_path: Path) -> None
     queue.give(delay=LONG)
     queue.outlet.follow(lambda: queue.sent.append(-1))
     assert queue.lost == [0, 1]
-    assert queue.fates() == [Crossing.UNDERWAY, Crossing.UNDERWAY]
+    assert queue.fates() == [WireFate.UNDERWAY, WireFate.UNDERWAY]
     assert queue.sent == []
     queue.journal.close()
 

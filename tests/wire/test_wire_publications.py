@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 import zenoh
 
-from evedrop.wire.crossing import UNLINKED, Crossing, Kind
 from evedrop.wire.fates import KeyFates
+from evedrop.wire.record import UNLINKED, Kind, WireFate
 from tests.conftest import wait_until
 from tests.wire.wire_at_work import DEAD, LOSSY, PERFECT, WireAtWork, at_work, both_ways, link, plan_of
 
@@ -125,7 +125,7 @@ def test_a_message_that_no_link_takes_is_recorded_as_unlinked(tmp_path: Path) ->
     with at_work(plan, tmp_path) as wire, wire.program("robot") as sender:
         wait_until(lambda: sender.put("pose", b"123") or len(wire.rows), "the wire hears")
         row = wire.rows[0]
-        assert (row["fate"], row["link"], row["n"], row["size"]) == (Crossing.UNLINKED, UNLINKED, -1, 3)
+        assert (row["fate"], row["link"], row["n"], row["size"]) == (WireFate.UNLINKED, UNLINKED, -1, 3)
 
 
 def test_the_first_link_that_matches_takes_a_message_and_a_tap_has_losses_of_its_own(tmp_path: Path) -> None:
@@ -150,7 +150,7 @@ def test_the_first_link_that_matches_takes_a_message_and_a_tap_has_losses_of_its
         wait_until(lambda: "pose" in [str(one.key_expr) for one in at_base], "the other link carries it")
         wait_until(lambda: "scan/1" in [str(one.key_expr) for one in at_listener], "the tap carries it")
         assert "scan/1" not in [str(one.key_expr) for one in at_base]
-        assert wire.fates("scan") == [Crossing.LOST]
+        assert wire.fates("scan") == [WireFate.LOST]
 
 
 def test_deletes_puts_and_sizes_are_recorded(tmp_path: Path) -> None:
@@ -170,14 +170,14 @@ def test_deletes_puts_and_sizes_are_recorded(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "fields", "fate"),
     [
-        (PERFECT, {"largest": 10}, Crossing.TOO_LARGE),
-        ({**PERFECT, "delay": {"model": "constant", "value": 1000.0}}, {"held_messages": 0}, Crossing.HELD_UP),
-        ({**PERFECT, "delay": {"model": "constant", "value": 1000.0}}, {"held_bytes": 10}, Crossing.HELD_UP),
-        ({**PERFECT, "corrupt": 1.0}, {}, Crossing.CORRUPTED),
+        (PERFECT, {"largest": 10}, WireFate.TOO_LARGE),
+        ({**PERFECT, "delay": {"model": "constant", "value": 1000.0}}, {"held_messages": 0}, WireFate.HELD_UP),
+        ({**PERFECT, "delay": {"model": "constant", "value": 1000.0}}, {"held_bytes": 10}, WireFate.HELD_UP),
+        ({**PERFECT, "corrupt": 1.0}, {}, WireFate.CORRUPTED),
     ],
 )
 def test_why_a_message_does_not_cross(
-    tmp_path: Path, settings: dict[str, Any], fields: dict[str, Any], fate: Crossing
+    tmp_path: Path, settings: dict[str, Any], fields: dict[str, Any], fate: WireFate
 ) -> None:
     """The journal says so."""
     with at_work(both_ways(settings, **fields), tmp_path) as wire, wire.program("robot") as sender:
@@ -191,7 +191,7 @@ def test_a_message_that_waits_takes_more_room_than_its_payload(tmp_path: Path, k
     with at_work(both_ways(delayed, held_bytes=3000), tmp_path) as wire, wire.program("robot") as sender:
         for _ in range(4):
             sender.put(key, b"", congestion_control=zenoh.CongestionControl.BLOCK)
-        wait_until(lambda: [*wire.fates(), *wire.amended].count(Crossing.HELD_UP) == 4 - held, "those beyond it")
+        wait_until(lambda: [*wire.fates(), *wire.amended].count(WireFate.HELD_UP) == 4 - held, "those beyond it")
         assert len(wire.rows) == 4
 
 

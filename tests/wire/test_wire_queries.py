@@ -13,7 +13,7 @@ from zenoh.ext import declare_advanced_publisher as advanced_publisher
 from zenoh.ext import declare_advanced_subscriber as advanced_subscriber
 
 from evedrop.wire.advanced import LOST_HISTORY_SECONDS
-from evedrop.wire.crossing import Crossing, Kind
+from evedrop.wire.record import Kind, WireFate
 from tests.conftest import wait_until
 from tests.wire.wire_at_work import DEAD, PERFECT, WireAtWork, at_work, both_ways, is_declared, link, plan_of
 
@@ -115,9 +115,9 @@ def test_nobody_waits_for_a_queryable_that_is_not_there(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("lost", "fate"), [("there", Crossing.LOST), ("back", Crossing.LOST), ("large", Crossing.TOO_LARGE)]
+    ("lost", "fate"), [("there", WireFate.LOST), ("back", WireFate.LOST), ("large", WireFate.TOO_LARGE)]
 )
-def test_the_asker_of_a_lost_query_or_reply_waits(lost: str, fate: Crossing, tmp_path: Path) -> None:
+def test_the_asker_of_a_lost_query_or_reply_waits(lost: str, fate: WireFate, tmp_path: Path) -> None:
     """For as long as the wire does: a radio that loses a reply does not say that there was none."""
     plan = plan_of(
         link("robot", "base", DEAD, "there/**", name="there"),
@@ -154,7 +154,7 @@ def test_the_asker_waits_after_a_lost_reply_and_has_the_others(tmp_path: Path) -
         asked = time.monotonic()
         assert answers(asker, "map/*", timeout=60.0) == [b"not"]
         assert time.monotonic() - asked >= WAIT
-        assert wire.fates("dead") == [Crossing.LOST]
+        assert wire.fates("dead") == [WireFate.LOST]
 
 
 @pytest.mark.parametrize(("full", "fates"), [("base", ["congested"]), ("robot", ["delivered", "congested"])])
@@ -185,7 +185,7 @@ def test_a_lost_question_for_a_history_ends_soon(lost: str, tmp_path: Path) -> N
         asked = time.monotonic()
         assert not list(asker.get("map/@adv/*/1a/**", timeout=1000.0))
         assert time.monotonic() - asked >= LOST_HISTORY_SECONDS
-        assert wire.fates(lost) == [Crossing.LOST]
+        assert wire.fates(lost) == [WireFate.LOST]
 
 
 def test_a_lost_question_does_not_stop_an_advanced_subscriber(tmp_path: Path) -> None:
@@ -212,13 +212,13 @@ def test_a_lost_question_does_not_stop_an_advanced_subscriber(tmp_path: Path) ->
         publisher.put(lost)
 
         def is_lost() -> bool:  # that one, and not only a heartbeat
-            return any(row["size"] >= len(lost) and row["fate"] == Crossing.LOST for row in wire.rows)
+            return any(row["size"] >= len(lost) and row["fate"] == WireFate.LOST for row in wire.rows)
 
         wait_until(is_lost, "a message is lost")
         back.change(DEAD)  # before anything can make the subscriber ask
         there.change(PERFECT)
         publisher.put("next")
-        wait_until(lambda: Crossing.LOST in wire.fates("base-robot"), "the question for it is lost")
+        wait_until(lambda: WireFate.LOST in wire.fates("base-robot"), "the question for it is lost")
         wait_until(lambda: "next" in got, "what follows comes")
         assert lost not in got
         subscriber.undeclare()

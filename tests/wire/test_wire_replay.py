@@ -18,10 +18,10 @@ from evedrop.cli.main import main
 from evedrop.errors import UsageError
 from evedrop.results.wire_folder import WIRE_FILE
 from evedrop.wire import replay
-from evedrop.wire.crossing import UNLINKED, Crossing, Kind
 from evedrop.wire.file import resolved_wire
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.lane_states import LaneState
+from evedrop.wire.record import UNLINKED, Kind, WireFate
 from evedrop.wire.replay import PICTURE_SIZE, replay_wire
 from tests.conftest import LIMIT
 from tests.privileged import CannotRun, skip
@@ -47,7 +47,7 @@ def folder(tmp_path: Path, rows: NDArray[Any]) -> Path:
                 journal.record(now + later, n, sequence, delay, key, 0, size, link, kind, fate)
             journal.note("partition robot, base")
             journal.note("heal robot, base")
-            journal.record(START + later + 1.0, -1, -1, 0.0, key, 0, 5, UNLINKED, Kind.PUT, Crossing.UNLINKED)
+            journal.record(START + later + 1.0, -1, -1, 0.0, key, 0, 5, UNLINKED, Kind.PUT, WireFate.UNLINKED)
     return tmp_path
 
 

@@ -15,8 +15,8 @@ from evedrop.errors import UsageError
 from evedrop.live.launch.authority import Authority
 from evedrop.system.lacks import lack_of
 from evedrop.system.ports import free_port
-from evedrop.wire.crossing import Crossing
 from evedrop.wire.plan import Side, SideTls
+from evedrop.wire.record import WireFate
 from evedrop.wire.side import PROBES, SideSession, side_config
 from tests.conftest import wait_until
 from tests.wire.test_wire_publications import reader, ready
@@ -124,10 +124,10 @@ def test_a_router_that_joins_two_sides_is_reported_and_nothing_goes_round(tmp_pa
             wait_until(
                 lambda: any("outside the wire, through the router " in line for line in wire.told), "it is reported"
             )
-            wait_until(lambda: robot.put("x", b"") or Crossing.LOOPED in wire.fates(), "messages do not go round")
+            wait_until(lambda: robot.put("x", b"") or WireFate.LOOPED in wire.fates(), "messages do not go round")
             robot.put("stop", b"")
             wait_until(lambda: len(wire.rows_of("stop")), "the wire hears a lossless one")
-            assert set(wire.rows_of("stop")["fate"]) == {Crossing.LOOPED}
+            assert set(wire.rows_of("stop")["fate"]) == {WireFate.LOOPED}
             (bypass,) = [event.line for event in wire.journal.events if event.bypass]  # programs speak past the wire
             assert "outside the wire, through the router " in bypass
         wait_until(lambda: any("no longer pass between the sides" in line for line in wire.told), "its end is reported")

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from evedrop.wire.crossing import RECORD, UNLINKED, Crossing
+from evedrop.wire.record import RECORD, UNLINKED, WireFate
 from evedrop.wire.step_counts import DELIVERED, OUTCOMES, StepCounter, WireSteps, quantile
 from tests.examples import examples
 from tests.wire.wire_rows import START, robot_plan, traffic
@@ -43,7 +43,7 @@ rows_of_any_time = st.lists(
     st.tuples(
         st.floats(-5.0, 1e5, allow_nan=False),
         st.sampled_from([0, 1, 2, UNLINKED]),
-        st.sampled_from([int(fate) for fate in Crossing]),
+        st.sampled_from([int(fate) for fate in WireFate]),
     ),
     max_size=60,
 )
@@ -91,7 +91,7 @@ def test_quantiles_of_delays_are_right_within_three_per_cent(share: float) -> No
     rows["time"], rows["link"] = START, np.repeat(np.arange(4), 5000)
     rows["delay"] = 10.0 ** rng.uniform(-4.5, 2.5, 20_000)
     rows["delay"][rows["link"] == 1] = 0.0
-    rows["fate"][rows["link"] == 2] = Crossing.LOST
+    rows["fate"][rows["link"] == 2] = WireFate.LOST
     rows["delay"][rows["link"] == 3] = rng.normal(0.02, 0.005, 5000)
     delays = counted([rows], 4)[0].delays[0]
     shown = quantile(delays, share)
@@ -105,16 +105,16 @@ def test_quantiles_of_delays_are_right_within_three_per_cent(share: float) -> No
 def test_a_fate_may_change_afterwards() -> None:
     """The message counts for its new fate, whether its step is open or not."""
     rows = traffic(robot_plan(), 1.0, {"scan": 100.0})
-    row = rows[(rows["fate"] == Crossing.DELIVERED) & (rows["time"] > START + 2.5 * STEP)][:1]
+    row = rows[(rows["fate"] == WireFate.DELIVERED) & (rows["time"] > START + 2.5 * STEP)][:1]
     for closed in (False, True):
         counter = StepCounter(3, STEP, START)
         steps = [*counter.add(rows)]
         steps += [*counter.close(START + 0.5)] if closed else []
-        counter.amend(row, Crossing.UNDERWAY)
+        counter.amend(row, WireFate.UNDERWAY)
         steps += [*counter.finish()]
         counts = np.concatenate([one.counts for one in steps])
-        total, of_new = counts.sum((0, 1)), counts[:, 0, OUTCOMES.index(Crossing.UNDERWAY)]
+        total, of_new = counts.sum((0, 1)), counts[:, 0, OUTCOMES.index(WireFate.UNDERWAY)]
         own = int((row["time"][0] - START) / STEP)
         assert np.flatnonzero(of_new).tolist() == [5 if closed else own]
-        assert total[OUTCOMES.index(Crossing.UNDERWAY)] == 1
-        assert total[DELIVERED] == int(np.sum(rows["fate"] == Crossing.DELIVERED)) - 1
+        assert total[OUTCOMES.index(WireFate.UNDERWAY)] == 1
+        assert total[DELIVERED] == int(np.sum(rows["fate"] == WireFate.DELIVERED)) - 1

@@ -21,11 +21,11 @@ from evedrop.live.network.control_file import read_control
 from evedrop.live.network.operator import ask
 from evedrop.live.protocol.requests import StatusRequest
 from evedrop.live.protocol.wire_status import WireStatus
-from evedrop.wire.crossing import Crossing
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_on_disk import scorekeeper_on_disk
 from evedrop.wire.outlet import SideOutlet
 from evedrop.wire.publishers import Message
+from evedrop.wire.record import WireFate
 from evedrop.wire.relay import WireRelay
 from evedrop.wire.scorekeeper import WireScorekeeper
 from evedrop.wire.side import ZenohConfig, side_config
@@ -116,7 +116,7 @@ def test_a_stopped_reader_at_a_third_side_holds_up_nobody(tap: bool, tmp_path: P
             robot.put("scan", str(n).encode().ljust(LARGE), congestion_control=BLOCK)
         wait_until(lambda: len(got) == COUNT, "the base has all")
         assert [int(sample.payload.to_bytes()) for sample in got] == [*range(COUNT)]
-        assert wire.fates("robot-base") == [Crossing.DELIVERED] * COUNT
+        assert wire.fates("robot-base") == [WireFate.DELIVERED] * COUNT
 
 
 def test_a_stopped_asker_holds_up_nobody_at_the_side_that_answers(tmp_path: Path) -> None:

@@ -18,7 +18,6 @@ from evedrop.results.wire_summary import WireLinkSummary, WireSummary
 from evedrop.show.report.wire import WITHOUT_MODEL, wire_failures, wire_sentences, wire_table
 from evedrop.show.report.writing import write_report
 from evedrop.wire.closing import closing_lines
-from evedrop.wire.crossing import AGAIN, UNLINKED, Crossing, Kind
 from evedrop.wire.expect import WireExpectTable
 from evedrop.wire.fates import KeyFates
 from evedrop.wire.figures import WIRE_FIGURES
@@ -26,6 +25,7 @@ from evedrop.wire.file import resolved_wire, wire_of
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_on_disk import scorekeeper_on_disk
 from evedrop.wire.plan import Side, WirePlan
+from evedrop.wire.record import AGAIN, UNLINKED, Kind, WireFate
 from evedrop.wire.scorekeeper import WireScorekeeper
 from evedrop.wire.tallies import LinkTally
 from tests.pages import checked
@@ -115,7 +115,7 @@ def test_changes_and_cuts_are_part_of_the_law(tmp_path: Path) -> None:
                 journal.change("link", other, {("link/1", "put"): fates.change(other)})
             fate = fates.next()[0]
             if 1000 <= n < 1500:
-                fate = Crossing.CUT
+                fate = WireFate.CUT
             journal.record(time.time(), n, -1, 0.0, key, 0, 10, 0, Kind.PUT, fate)
     link = keeper.links()["link"]
     assert link.expected_rate == pytest.approx((1500 * 0.2 / 0.22 + 2000 * 0.3) / 3500)
@@ -133,7 +133,7 @@ def test_gaps_of_a_wire_have_first_fates_and_those_of_its_journal_the_last_ones(
         rows = [journal.record(journal_time(n), n, -1, 0.1, key, 0, 1, 0, Kind.PUT, 0) for n in range(9)]
         journal.flush()
         for row in rows[4:]:
-            journal.amend(row, Crossing.UNDERWAY)
+            journal.amend(row, WireFate.UNDERWAY)
     keeper.finish(tmp_path)
     written, later = read(tmp_path).links["link"], scorekeeper_on_disk(tmp_path, plan).summary().links["link"]
     for link in (written, later):
@@ -155,7 +155,7 @@ def test_a_link_on_many_of_whose_messages_no_model_decides_is_judged_as_a_sample
         fates, key = KeyFates(plan.links[0], "link/1", "put", 7), journal.key_code("link/1")
         for n in range(messages):
             fate = fates.next()[0]
-            fate = Crossing.CUT if n % 4 else fate
+            fate = WireFate.CUT if n % 4 else fate
             journal.record(n / 10, n, -1, 0.0, key, 0, 10, 0, Kind.PUT, fate)
     link, tried = keeper.links()["link"], messages // 4
     assert link.expected_rate == pytest.approx(quality)
@@ -174,13 +174,13 @@ def test_what_no_model_decides_is_named_apart(tmp_path: Path) -> None:
     with WireJournal(tmp_path, plan) as journal:
         keeper = WireScorekeeper(plan, journal)
         keys = [journal.key_code(key) for key in ("link/1", "link/stop", "other")]
-        for n, fate in enumerate(Crossing):
+        for n, fate in enumerate(WireFate):
             journal.record(1.0 * n, n, -1, 0.1, keys[0], 0, 1, 0, Kind.DELETE if n % 2 else Kind.PUT, fate)
-            journal.record(1.0 * n, n, -1, 0.0, keys[1], 0, 1, 0, Kind.PUT, Crossing.DELIVERED)
-        journal.record(20.0, -1, -1, 0.0, keys[2], 0, 1, UNLINKED, Kind.QUERY, Crossing.UNLINKED)
-        row = journal.record(21.0, len(Crossing), -1, 0.2, keys[0], 0, 1, 0, Kind.PUT | AGAIN, Crossing.DELIVERED)
+            journal.record(1.0 * n, n, -1, 0.0, keys[1], 0, 1, 0, Kind.PUT, WireFate.DELIVERED)
+        journal.record(20.0, -1, -1, 0.0, keys[2], 0, 1, UNLINKED, Kind.QUERY, WireFate.UNLINKED)
+        row = journal.record(21.0, len(WireFate), -1, 0.2, keys[0], 0, 1, 0, Kind.PUT | AGAIN, WireFate.DELIVERED)
         journal.flush()
-        journal.amend(row, Crossing.REFUSED)
+        journal.amend(row, WireFate.REFUSED)
     assert keeper.finish(tmp_path) == 0
     found = json.loads((tmp_path / "summary.json").read_text())
     link = found["links"]["link"]
@@ -294,11 +294,11 @@ link = "scan"
 @pytest.mark.parametrize(
     ("fate", "text", "why"),
     [
-        (Crossing.LOST, '[[expect]]\nfigure = "scan.latency"\nquantile = 0.5\nbelow = 1', "no message was delivered"),
-        (Crossing.CUT, '[[expect]]\nlink = "scan"', "the link's models decided on no message"),
+        (WireFate.LOST, '[[expect]]\nfigure = "scan.latency"\nquantile = 0.5\nbelow = 1', "no message was delivered"),
+        (WireFate.CUT, '[[expect]]\nlink = "scan"', "the link's models decided on no message"),
     ],
 )
-def test_a_figure_without_a_value_has_failed(fate: Crossing, text: str, why: str, tmp_path: Path) -> None:
+def test_a_figure_without_a_value_has_failed(fate: WireFate, text: str, why: str, tmp_path: Path) -> None:
     """With the reason, on a link that heard something."""
     plan = expecting(text)
     with WireJournal(tmp_path, plan) as journal:
@@ -426,7 +426,7 @@ def test_a_latency_is_that_of_its_quantile(tmp_path: Path) -> None:
     with WireJournal(tmp_path, plan) as journal:
         keeper = WireScorekeeper(plan, journal)
         for n in range(100):
-            journal.record(1.0, n, -1, (n + 1) / 1000, journal.key_code("a"), 0, 0, 0, Kind.PUT, Crossing.DELIVERED)
+            journal.record(1.0, n, -1, (n + 1) / 1000, journal.key_code("a"), 0, 0, 0, Kind.PUT, WireFate.DELIVERED)
     (judged,) = keeper.judged(keeper.links())
     assert judged.found == 0.09
 
@@ -475,4 +475,4 @@ def test_the_page_lists_every_figure_of_a_link() -> None:
 
 def test_the_report_names_the_reasons_on_which_no_model_decided() -> None:
     """As a fate says of itself, so that a new one is not forgotten."""
-    assert {fate.name.lower() for fate in Crossing if not fate.decided} == WITHOUT_MODEL
+    assert {fate.name.lower() for fate in WireFate if not fate.decided} == WITHOUT_MODEL

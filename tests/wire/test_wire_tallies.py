@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evedrop.wire.crossing import RECORD, Crossing
 from evedrop.wire.journal_part import Records
+from evedrop.wire.record import RECORD, WireFate
 from evedrop.wire.tallies import LinkTally, StreamTally
 from tests.examples import examples
 
@@ -76,7 +76,7 @@ def test_a_stream_with_many_interruptions_is_judged_as_a_sample() -> None:
     """Numbers that are too scattered to be kept count as one range."""
     stream, records = StreamTally(), np.zeros(6000, RECORD)
     records["n"] = np.arange(6000)
-    records["fate"][::2] = Crossing.OVERFLOW
+    records["fate"][::2] = WireFate.OVERFLOW
     stream.add(records, True)
     assert (stream.scattered, stream.ranges, stream.tried) == (True, [(1, 6000)], 3000)
 
@@ -101,7 +101,7 @@ def test_the_delays_that_are_kept_are_evenly_spaced() -> None:
     records = np.zeros(count, RECORD)
     records["delay"] = np.arange(count)
     lost = np.zeros(count, RECORD)
-    lost["fate"], lost["delay"] = Crossing.LOST, -1.0
+    lost["fate"], lost["delay"] = WireFate.LOST, -1.0
     for places in np.split(np.arange(count), np.cumsum(rng.integers(1, 9000, 150))):
         tally.add(np.concatenate([records[places], lost[places]]))
     kept = np.arange(0, count, 8)

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from evedrop.cli.main import main
 from evedrop.errors import UsageError
 from evedrop.show.view import recording
-from evedrop.wire.crossing import Crossing
 from evedrop.wire.live_view import live_view
 from evedrop.wire.panels import Pace
 from evedrop.wire.plan import WireEvent
+from evedrop.wire.record import WireFate
 from evedrop.wire.replay import replay_wire
 from evedrop.wire.run import run_wire
 from evedrop.wire.view import WireView
@@ -106,7 +106,7 @@ def test_lanes_say_what_became_of_messages(rows: NDArray[Any], rrd: Path) -> Non
             fates = rows[(at == k) & (rows["link"] == link)]["fate"]
             lost = np.mean(fates != 0)
             word = "all delivered" if not lost else "some lost" if lost < 0.5 else "most lost"
-            words.append("cut" if (fates == Crossing.CUT).any() else word)
+            words.append("cut" if (fates == WireFate.CUT).any() else word)
         assert states(rrd, f"{link + 1}_{name}", 0.2, 60) == words
         assert set(words) >= ({"all delivered", "some lost", "cut"} if link == 0 else {"some lost"})
         assert shown(rrd, f"links/{link + 1}_{name}", "StateChange:state")[-1][1] == ["no message"]
@@ -121,7 +121,7 @@ def test_rates_and_delays_are_those_of_the_messages(rows: NDArray[Any], rrd: Pat
         recent = rows[(rows["time"] - START >= end - 0.6) & (rows["time"] - START < end)]
         for link in range(3):
             of = recent[recent["link"] == link]
-            there = of[of["fate"] == Crossing.DELIVERED]
+            there = of[of["fate"] == WireFate.DELIVERED]
             np.testing.assert_allclose([rate[3 + link], rate[link]], np.array([len(of), len(there)]) / 0.6)
             if not len(there):
                 assert np.isnan([delay[link], delay[3 + link]]).all()
@@ -137,7 +137,7 @@ def test_graph_and_table_state_the_losses(rows: NDArray[Any], rrd: Path) -> None
     assert label[:3] == ["robot", "base", "listener"]
     for link, name in enumerate(RATES):
         fates = rows[rows["link"] == link]["fate"]
-        cut, lost = int(np.sum(fates == Crossing.CUT)), int(np.sum(fates == Crossing.LOST))
+        cut, lost = int(np.sum(fates == WireFate.CUT)), int(np.sum(fates == WireFate.LOST))
         assert label[3 + link] == f"{name}: {100 * (cut + lost) / len(fates):.0f} % lost"
         (line,) = [one for one in table.splitlines() if one.startswith(f"| {name} ")]
         assert f"| {len(fates):,} |" in line
@@ -215,7 +215,7 @@ def test_the_graph_of_a_running_wire_forgets_what_is_old(pause: float, tmp_path:
     clocks, path = Clocks(), tmp_path / "r.rrd"
     rows = traffic(robot_plan(), 6.0, {"scan": 100.0})
     early, late = rows[:300], rows[300:]
-    early["fate"], late["fate"] = Crossing.LOST, Crossing.DELIVERED
+    early["fate"], late["fate"] = WireFate.LOST, WireFate.DELIVERED
     late["time"] += pause
     if pause:  # so that only the silence is longer than the window
         late = late[:50]
@@ -235,7 +235,7 @@ def test_a_disk_that_takes_nothing_harms_only_the_view(tmp_path: Path, rows: NDA
     added, amended, note = rows.copy(), rows[:1].copy(), Text("a note")
     kept = [weakref.ref(one) for one in (added, amended, note)]
     view.add(added)
-    view.amend(amended, Crossing.UNDERWAY)
+    view.amend(amended, WireFate.UNDERWAY)
     view.note(START, "INFO", note)
     del added, amended, note
     assert [one() for one in kept] == [None] * 3
@@ -272,7 +272,7 @@ def test_amended_fates_are_in_the_table(tmp_path: Path) -> None:
     clocks.advance(1.0)
     view.add(rows)
     for row in np.flatnonzero(rows["fate"] == 0)[-5:]:
-        view.amend(rows[row : row + 1], Crossing.UNDERWAY)
+        view.amend(rows[row : row + 1], WireFate.UNDERWAY)
     assert view.close()
     table = shown(tmp_path / "r.rrd", "table", "TextDocument:text")[-1][1][0]
     assert "5 underway" in table

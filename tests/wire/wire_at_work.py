@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from evedrop.wire.crossing import RECORD, Crossing
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_part import Records
 from evedrop.wire.plan import Side, WireLink, WirePlan
+from evedrop.wire.record import RECORD, WireFate
 from evedrop.wire.relay import WireRelay
 from tests.conftest import LIMIT, wait_until
 
@@ -51,7 +51,7 @@ class WireAtWork:
         self, relay: WireRelay, journal: WireJournal, told: list[str], happened: list[str], rows: list[Records]
     ) -> None:
         self.relay, self.journal, self.told, self.happened = relay, journal, told, happened
-        self.amended: list[Crossing] = []
+        self.amended: list[WireFate] = []
         """Fates that rows were given after they had been handed to listeners."""
         journal.amendment_listeners.append(lambda _, fate: self.amended.append(fate))
         self._rows = rows
@@ -73,14 +73,14 @@ class WireAtWork:
         found: Records = rows[rows["key"] == self.journal.key_code(key)]
         return found
 
-    def fates(self, link_name: str | None = None) -> list[Crossing]:
+    def fates(self, link_name: str | None = None) -> list[WireFate]:
         """The fates of all messages so far, or of those on one link."""
         rows = self.rows
         if link_name is not None:
             rows = rows[rows["link"] == self.relay.links[link_name].link.number]
-        return [Crossing(one) for one in rows["fate"].tolist()]
+        return [WireFate(one) for one in rows["fate"].tolist()]
 
-    def when_heard(self, count: int) -> list[Crossing]:
+    def when_heard(self, count: int) -> list[WireFate]:
         """The fates, once there are that many."""
         wait_until(lambda: len(self.rows) >= count, f"{count} rows in the journal")
         return self.fates()

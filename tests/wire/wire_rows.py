@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from evedrop.model.slot.link import NEVER, Link, LinkSchedule, streams_of
 from evedrop.model.streams import Batch, root_of_seed, stream_key
-from evedrop.wire.crossing import RECORD, Crossing
 from evedrop.wire.plan import Side, WireLink, WirePlan
+from evedrop.wire.record import RECORD, WireFate
 
 START = 1_800_000_000.0
 """When the wires of these tests start, in seconds since 1970."""
@@ -48,7 +48,7 @@ def rows_of(link: WireLink, seconds: float, rate: float, cut: tuple[float, float
     if fates.delays is not None and fates.rests is not None:
         rows["delay"] = fates.delays[:, 0] + fates.rests
     elapsed = rows["time"] - START
-    rows["fate"][(elapsed >= cut[0]) & (elapsed < cut[1])] = Crossing.CUT
+    rows["fate"][(elapsed >= cut[0]) & (elapsed < cut[1])] = WireFate.CUT
     return rows
 
 

@@ -76,8 +76,8 @@ class Registry(Mapping[str, type[T]], Generic[T]):
     """Name → class, for one kind of class. Iteration covers only the built-in classes; any other can be looked up.
 
     kind: its name in messages; base: the base class; group: the entry points of installed packages; reserved: entries that a
-    scenario's table has besides the class's parameters; stand_in: makes a stand-in for a class that is not built in, which is
-    itself loaded only by `imported`.
+    scenario's table has besides the class's parameters; remote_class: makes the remote class of one that is not built in, which
+    is itself loaded only by `imported`.
 
     `[name]` raises NotRegistered, which is a KeyError.
     """
@@ -89,10 +89,10 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         group: str,
         built_in: Mapping[str, type[T]],
         reserved: tuple[str, ...] = (),
-        stand_in: Callable[[str], type[T]] | None = None,
+        remote_class: Callable[[str], type[T]] | None = None,
     ) -> None:
         self.kind, self.base, self.group = kind, base, group
-        self._stand_in = stand_in
+        self._remote_class = remote_class
         self._built_in = built_in
         self._reserved = reserved
 
@@ -103,10 +103,10 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         return len(self._built_in)
 
     def __getitem__(self, name: str) -> type[T]:
-        if name in self._built_in or self._stand_in is None:
+        if name in self._built_in or self._remote_class is None:
             return self.imported(name)
         self._target(name)
-        return self._with_free_parameters(name, self._stand_in(name), "")
+        return self._with_free_parameters(name, self._remote_class(name), "")
 
     def imported(self, name: str) -> type[T]:
         """The class itself, imported into this process with its module. Raises NotRegistered."""

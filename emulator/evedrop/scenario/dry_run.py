@@ -11,7 +11,7 @@ from typing import Any
 
 from evedrop.errors import NoAnswer
 from evedrop.model.delays import DELAY_MODELS, delay_of
-from evedrop.model.eavesdroppers import ANSWERS, STRATEGIES
+from evedrop.model.eavesdroppers import REMOTE_CALLS, STRATEGIES
 from evedrop.model.links import LOSS_MODELS, POOLED, loss_of, single_specs
 from evedrop.model.process import Process
 from evedrop.model.schemes import SCHEMES, scheme_of
@@ -82,7 +82,7 @@ def _eavesdropper_broken(scenario: Scenario, table: EavesdropperTable, entry: st
     registry = "STRATEGIES" if entry == "strategy" else "READERS"
     try:
         drawn = (batch.slots, batch.trials, batch.first_trial)
-        found = ANSWERS.ask(name, "dry_run", registry, table.strategy, table.parameters, spec, process, drawn)
+        found = REMOTE_CALLS.call(name, "dry_run", registry, table.strategy, table.parameters, spec, process, drawn)
         if found is None:
             _ask_for_theory(scenario, table)
     except NoAnswer as error:

@@ -101,7 +101,7 @@ def disturbances_of(scenario: Scenario) -> Floats:
     return np.array((table.disturbance_values or [])[: scenario.slots])
 
 
-_STAND_IN = "1"  # the outcomes of a recording that cannot be read: later checks then find no further mistake
+_PLACEHOLDER = "1"  # the outcomes of a recording that cannot be read: later checks then find no further mistake
 
 
 def locate_recordings(tables: Mapping[str, Any], folder: Path) -> None:
@@ -169,7 +169,7 @@ def _replace(trace: dict[str, Any], model: type[LossModel | DelayModel], of_dela
         extra = next((name for name, value in names if value is not None), None)
         return [(extra, f"is given together with {entry}; expected one of them")] if extra else []
     misnamed = set(trace) - {"model", *model.parameters}  # perhaps the file, and a mistake of its own
-    trace[entry] = [0.0] if of_delays else _STAND_IN
+    trace[entry] = [0.0] if of_delays else _PLACEHOLDER
     if file is None:
         return [] if misnamed else [("file", f'is missing; expected file = "walk.csv", or {entry}')]
     wrong = [

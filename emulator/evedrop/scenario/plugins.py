@@ -19,7 +19,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, final
 
-from evedrop.model.eavesdroppers import ANSWERS
+from evedrop.model.eavesdroppers import REMOTE_CALLS
 from evedrop.model.registry import is_own
 
 _TRUSTED = ("scheme", "model")
@@ -104,7 +104,7 @@ def elsewhere(folder: str, tables: Any) -> Iterator[str]:
     for name in dict.fromkeys(named_in(tables)):
         top = name.partition(":")[0].partition(".")[0]
         there = PathFinder.find_spec(top, [folder])
-        asked_in = ANSWERS.folder_of(name)
+        asked_in = REMOTE_CALLS.folder_of(name)
         known = getattr(sys.modules.get(top), "__spec__", None)
         if known is None and asked_in is not None:
             known = PathFinder.find_spec(top, [asked_in])

@@ -67,8 +67,8 @@ class ProcessTable(Table):
                 )
         if matrices:
             known = matrices.get("A", next(iter(matrices.values())))
-            stand_in = np.eye(len(known))
-            A, Q, initial = (matrices.get(name, stand_in) for name in _MATRICES)
+            placeholder = np.eye(len(known))
+            A, Q, initial = (matrices.get(name, placeholder) for name in _MATRICES)
             singular = table.get("singular_noise") is True
             found += [(name, what) for name, what in mistakes_of(A, Q, initial, singular) if name in matrices]
             found += _direction_mistakes(table.get("directions"), len(known))

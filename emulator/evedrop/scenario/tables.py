@@ -25,7 +25,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from evedrop.errors import UsageError
 from evedrop.model.controllers import Assignment
-from evedrop.model.eavesdroppers import ANSWERS, STRATEGIES
+from evedrop.model.eavesdroppers import REMOTE_CALLS, STRATEGIES
 from evedrop.model.energy import EnergyModel
 from evedrop.model.plant import Plant
 from evedrop.model.slot.link import LinkSchedule
@@ -189,13 +189,13 @@ class Scenario(Table):
     def read(cls, tables: Mapping[str, Any]) -> Self:
         """The scenario that tables describe. From now on modules are found in its folder of modules. Raises ValidationError.
 
-        This process imports such modules only for schemes and links: see `evedrop.model.answers` for eavesdroppers.
+        This process imports such modules only for schemes and links: see `evedrop.model.remote_calls` for eavesdroppers.
         """
         folder = tables.get("modules")
         if isinstance(folder, str) and Path(folder).is_dir():
-            ANSWERS.folder = str(Path(folder).absolute())
+            REMOTE_CALLS.folder = str(Path(folder).absolute())
             if any(trusted_in(tables)):
-                look_in(ANSWERS.folder)
+                look_in(REMOTE_CALLS.folder)
         return cls.model_validate(tables)
 
     @classmethod

@@ -1,4 +1,4 @@
-"""A receiver with its link in memory: the work of a live run's router, receiver process and stand-in.
+"""A receiver with its link in memory: the work of a live run's router, receiver process and absence reporter.
 
 Source: docs/results.md, summary.json.
 """

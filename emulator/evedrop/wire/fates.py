@@ -20,7 +20,7 @@ from evedrop.wire.advanced import numbered_as
 from evedrop.wire.plan import WireLink
 
 MessageFate = tuple[int, float, bool]
-"""`Crossing` code, delay in seconds, and whether a second copy arrives with the first."""
+"""`WireFate` code, delay in seconds, and whether a second copy arrives with the first."""
 _FIRST_BLOCK, _LARGEST_BLOCK = 8, 2048  # fates made at once: a key with few messages needs little time and memory
 _LITTLE = 64  # messages after which a key is not new any more
 _PASSED_AT_ONCE = 65_536

@@ -27,7 +27,6 @@ from evedrop.model.slot.link import Change
 from evedrop.results.wire_summary import JournalState
 from evedrop.system.output import warn
 from evedrop.system.threads import wait_for_thread
-from evedrop.wire.crossing import HELD, RECORD, Crossing, next_numbers
 from evedrop.wire.history import NotedEvent, Numbered, WireHistory, highest
 from evedrop.wire.journal_part import (
     STORED,
@@ -44,6 +43,7 @@ from evedrop.wire.journal_recovery import recover
 from evedrop.wire.journal_words import JournalWords
 from evedrop.wire.key_limit import KeyLimit
 from evedrop.wire.plan import WirePlan
+from evedrop.wire.record import HELD, RECORD, WireFate, next_numbers
 
 PART_ROWS = 2**17
 """Records in a file: at 70 000 messages a second it is full after two seconds."""
@@ -52,7 +52,7 @@ _PATIENCE = 10.0  # seconds after the last delay of a part, until its Parquet fi
 
 Listener = Callable[[Records], None]
 """Gets each block of new records."""
-AmendmentListener = Callable[[Records, Crossing], None]
+AmendmentListener = Callable[[Records, WireFate], None]
 """Gets records that it got before, and the fate that they have now."""
 EventListener = Callable[[float, str], None]
 """Gets the time of an event, in seconds since 1970, and a line about it."""
@@ -91,10 +91,10 @@ class WireJournal:
         self._parts: dict[int, JournalPart] = {}
         self._buffers: dict[int, Any] = {}
         self._next = 0  # the part whose rows are handed over now
-        self._amended: deque[tuple[Records, Crossing]] = deque()
+        self._amended: deque[tuple[Records, WireFate]] = deque()
         self._number = itertools.count()
         self._stopped, self._convert_after = math.inf, 0.0
-        self._amended_late: deque[tuple[int, Crossing]] = deque()
+        self._amended_late: deque[tuple[int, WireFate]] = deque()
         try:
             self._place = JournalPlace(self._folder, tell)
             try:
@@ -191,7 +191,7 @@ class WireJournal:
                 self._place.miss(error)
         self._hear(self.event_listeners, now, line)
 
-    def amend(self, row: int, fate: Crossing) -> None:
+    def amend(self, row: int, fate: WireFate) -> None:
         """Change the fate of a row that was recorded."""
         at, place = divmod(row, self._rows)
         with self._state:
@@ -382,7 +382,7 @@ class WireJournal:
 
     def _amend_converted(self) -> None:
         """Change fates in Parquet files. Raises OSError if the disk is full."""
-        parts: dict[int, dict[int, Crossing]] = {}
+        parts: dict[int, dict[int, WireFate]] = {}
         for row, fate in [self._amended_late.popleft() for _ in range(len(self._amended_late))]:
             at, place = divmod(row, self._rows)
             parts.setdefault(at, {})[place] = fate

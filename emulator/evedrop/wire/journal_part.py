@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from evedrop.results.folder import private_replacement
-from evedrop.wire.crossing import AGAIN, HELD, RECORD, UNLINKED, Crossing, Kind
+from evedrop.wire.record import AGAIN, HELD, RECORD, UNLINKED, Kind, WireFate
 
 Records = NDArray[Any]
 """Structured, of the type `RECORD`."""
@@ -30,17 +30,17 @@ STORED = 1
 """Added to fates in memory and in files of records."""
 _POPULATE = getattr(mmap, "MAP_POPULATE", 0)
 
-REASONS: dict[Crossing, str] = {
-    one: "loss" if one is Crossing.LOST else one.name.lower() for one in Crossing if one is not Crossing.DELIVERED
+REASONS: dict[WireFate, str] = {
+    one: "loss" if one is WireFate.LOST else one.name.lower() for one in WireFate if one is not WireFate.DELIVERED
 }
 """The reason for each fate, as it is called in tables."""
 _FATES = {reason: int(fate) for fate, reason in REASONS.items()}
 _WORDS = ("delivered", "lost", "dropped")
 
 
-def word_of(fate: Crossing) -> str:
+def word_of(fate: WireFate) -> str:
     """`delivered`, `lost` by the emulated link, or `dropped` by the wire itself."""
-    return _WORDS[0] if fate is Crossing.DELIVERED else _WORDS[1] if fate.emulated else _WORDS[2]
+    return _WORDS[0] if fate is WireFate.DELIVERED else _WORDS[1] if fate.emulated else _WORDS[2]
 
 
 _WORD_CODES = np.zeros(256, np.int8)
@@ -168,14 +168,14 @@ def records_in(path: Path, killed: bool = False) -> Records:
     """
     stored = np.fromfile(path, RECORD)
     if killed:
-        stored["fate"][(stored["fate"] & HELD) != 0] = Crossing.UNDERWAY + STORED
+        stored["fate"][(stored["fate"] & HELD) != 0] = WireFate.UNDERWAY + STORED
     return _whole(stored)
 
 
 def table_of(records: Records, words: Words) -> pa.Table:
     """Records as a table with the columns `PARQUET`."""
     fates = records["fate"]
-    none, unlinked = fates == Crossing.DELIVERED, records["link"] == UNLINKED
+    none, unlinked = fates == WireFate.DELIVERED, records["link"] == UNLINKED
     links = np.where(unlinked, 0, records["link"]).astype(np.int32)
     columns = (
         pa.array(records["time"]),
@@ -213,7 +213,7 @@ def records_of(table: pa.Table, links: Mapping[str, int], keys: Mapping[str, int
         rows[name] = column.to_numpy()
     rows["key"] = 0 if keys is None else _codes(table["key"], keys, 0)
     rows["link"] = _codes(table["link"], links, UNLINKED)
-    rows["fate"] = _codes(table["reason"], _FATES, Crossing.DELIVERED)
+    rows["fate"] = _codes(table["reason"], _FATES, WireFate.DELIVERED)
     rows["kind"] = _codes(table["kind"], _KINDS, Kind.PUT) | np.where(table["again"].to_numpy(), AGAIN, 0)
     return rows
 
@@ -233,7 +233,7 @@ def write_parquet(path: Path, table: pa.Table) -> None:
         pq.write_table(table, file, compression="zstd", compression_level=1)
 
 
-def amend_parquet(path: Path, fates: Mapping[int, Crossing]) -> pa.Table:
+def amend_parquet(path: Path, fates: Mapping[int, WireFate]) -> pa.Table:
     """Change the fates of some rows of a Parquet file; returns the rows as they were. Raises OSError if it cannot be written."""
     table = pq.read_table(path)
     before = table.take(list(fates))

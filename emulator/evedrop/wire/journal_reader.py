@@ -17,10 +17,10 @@ import pyarrow.parquet as pq
 
 from evedrop.errors import UsageError
 from evedrop.model.slot.link import NEVER
-from evedrop.wire.crossing import UNLINKED, Crossing, Kind
 from evedrop.wire.history import WireHistory
 from evedrop.wire.journal_part import PARQUET, records_in, table_of
 from evedrop.wire.journal_words import words_in
+from evedrop.wire.record import UNLINKED, Kind, WireFate
 
 JOURNAL_FOLDER = "journal"
 """The folder inside a wire's folder that contains its journal."""
@@ -81,7 +81,7 @@ def unfinished_table(path: Path, links: Mapping[int, list[str]], killed: bool) -
     """
     start = _start_of(path.stem)
     words, records = words_in(path.parent, start, links.get(start, [])), records_in(path, killed)
-    wrong = ~np.isin(records["fate"], [*Crossing]) | ((records["kind"] & 0x7F) > max(Kind)) | (records["n"] >= NEVER)
+    wrong = ~np.isin(records["fate"], [*WireFate]) | ((records["kind"] & 0x7F) > max(Kind)) | (records["n"] >= NEVER)
     wrong |= (records["link"] != UNLINKED) & (records["link"] >= len(words.links))
     for name in ("time", "delay"):
         wrong |= ~(np.abs(records[name]) < _LATEST)  # not a number, too

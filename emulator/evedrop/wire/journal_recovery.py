@@ -14,10 +14,10 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from evedrop.errors import UsageError
-from evedrop.wire.crossing import Kind
 from evedrop.wire.history import Numbered, WireHistory, highest
 from evedrop.wire.journal_part import write_parquet
 from evedrop.wire.journal_reader import UNFINISHED, damaged, last_beat, parquet_path, part_names, unfinished_table
+from evedrop.wire.record import Kind
 
 
 def locked(folder: Path) -> int:

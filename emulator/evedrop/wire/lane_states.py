@@ -9,8 +9,8 @@ from enum import Enum
 
 from evedrop.show.view import palette
 from evedrop.show.view.palette import Colour
-from evedrop.wire.crossing import Crossing
 from evedrop.wire.plan import WirePlan
+from evedrop.wire.record import WireFate
 from evedrop.wire.step_counts import DELIVERED, OUTCOMES, UNDERWAY, Counts
 
 
@@ -43,9 +43,9 @@ def state_of(counts: Counts) -> LaneState:
     if not reasons.any():
         return LaneState.DELIVERED if counts[DELIVERED] else LaneState.QUIET
     reason = OUTCOMES[int(reasons.argmax())]
-    if reason is Crossing.CUT:
+    if reason is WireFate.CUT:
         return LaneState.CUT
-    if reason is Crossing.OVERFLOW:
+    if reason is WireFate.OVERFLOW:
         return LaneState.FULL
     return share_of(ended) if reason.emulated else LaneState.OWN
 

@@ -15,17 +15,17 @@ from typing import Any, final
 
 from evedrop.model.slot.link import Change
 from evedrop.wire.advanced import numbered_as
-from evedrop.wire.crossing import Crossing
 from evedrop.wire.fates import KeyFates, KeyLaw
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.plan import WireLink, WirePlan
+from evedrop.wire.record import WireFate
 from evedrop.wire.scheduler import KeyOrder
 
-_CUT, _OVERFLOW, _TOO_LARGE = int(Crossing.CUT), int(Crossing.OVERFLOW), int(Crossing.TOO_LARGE)
-_LOOPED = int(Crossing.LOOPED)
+_CUT, _OVERFLOW, _TOO_LARGE = int(WireFate.CUT), int(WireFate.OVERFLOW), int(WireFate.TOO_LARGE)
+_LOOPED = int(WireFate.LOOPED)
 
 Decision = tuple[int, int, float, bool]
-"""Number of the message, `Crossing` code, delay in seconds, whether it is delivered twice."""
+"""Number of the message, `WireFate` code, delay in seconds, whether it is delivered twice."""
 _Stream = tuple[str, str]
 """Kind and key, as in `numbered_as`."""
 Lane = Callable[[float, int], Decision]

@@ -10,23 +10,23 @@ from typing import NamedTuple, final
 
 import numpy as np
 
-from evedrop.wire.crossing import Crossing
 from evedrop.wire.plan import WireLink, WirePlan
+from evedrop.wire.record import WireFate
 from evedrop.wire.step_counts import CUT, DELIVERED, OUTCOMES, UNDERWAY, Counts, WireSteps
 
 WORDS = {
-    Crossing.LOST: "lost",
-    Crossing.CORRUPTED: "corrupted",
-    Crossing.OVERFLOW: "queue full",
-    Crossing.CUT: "cut",
-    Crossing.UNLINKED: "no link",
-    Crossing.TOO_LARGE: "too large",
-    Crossing.HELD_UP: "too many held",
-    Crossing.LOOPED: "looped",
-    Crossing.UNDERWAY: "underway",
-    Crossing.REFUSED: "refused by Zenoh",
-    Crossing.TOO_MANY_KEYS: "too many keys",
-    Crossing.CONGESTED: "not taken by readers",
+    WireFate.LOST: "lost",
+    WireFate.CORRUPTED: "corrupted",
+    WireFate.OVERFLOW: "queue full",
+    WireFate.CUT: "cut",
+    WireFate.UNLINKED: "no link",
+    WireFate.TOO_LARGE: "too large",
+    WireFate.HELD_UP: "too many held",
+    WireFate.LOOPED: "looped",
+    WireFate.UNDERWAY: "underway",
+    WireFate.REFUSED: "refused by Zenoh",
+    WireFate.TOO_MANY_KEYS: "too many keys",
+    WireFate.CONGESTED: "not taken by readers",
 }
 """What became of messages that were not delivered, in a word or two."""
 
@@ -66,9 +66,9 @@ class LinkWatcher:
         """A line when a link loses a message for a reason that is not emulated, for the first time."""
         for at, link, outcome in np.argwhere(steps.counts).tolist():
             fate = OUTCOMES[outcome]
-            if not fate.emulated and fate is not Crossing.UNDERWAY and (link, outcome) not in self._known:
+            if not fate.emulated and fate is not WireFate.UNDERWAY and (link, outcome) not in self._known:
                 self._known.add((link, outcome))
-                level = "INFO" if fate is Crossing.UNLINKED else "ERROR"
+                level = "INFO" if fate is WireFate.UNLINKED else "ERROR"
                 text = f"{self._names[link]}: the first message that does not cross: {WORDS[fate]}"
                 yield Notice((steps.first + at) * self._step, level, text)
 

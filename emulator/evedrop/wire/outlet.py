@@ -15,9 +15,9 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final, final
 
-from evedrop.wire.crossing import Crossing
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.plan import WirePlan
+from evedrop.wire.record import WireFate
 from evedrop.wire.scheduler import KeyOrder, Scheduler
 from evedrop.wire.watchdog import Duty
 
@@ -108,7 +108,7 @@ class SideOutlet:
         if not delay and order is None:
             self._hand(size, row, task, patient, lost)
         elif not self._delays.hold(delay, size, row, lambda: self._hand(size, row, task, patient, lost), order):
-            self._journal.amend(row, Crossing.UNDERWAY if self._ending else Crossing.HELD_UP)
+            self._journal.amend(row, WireFate.UNDERWAY if self._ending else WireFate.HELD_UP)
             if lost is not None:
                 lost()
 
@@ -144,7 +144,7 @@ class SideOutlet:
             self._ending = True
             self._room.set()
         for row in self._delays.close():
-            self._journal.amend(row, Crossing.UNDERWAY)
+            self._journal.amend(row, WireFate.UNDERWAY)
         with self._lock:
             self._over = True
             self._wake()
@@ -156,7 +156,7 @@ class SideOutlet:
             self._ended = True
             for _, row, _ in self._queue:
                 if row != _NO_ROW:
-                    self._journal.amend(row, Crossing.UNDERWAY)
+                    self._journal.amend(row, WireFate.UNDERWAY)
 
     def _put(self, size: int, row: int, task: Task) -> None:
         """Add to the queue. The lock is held."""
@@ -187,7 +187,7 @@ class SideOutlet:
                 trust = self._trust
             if not self._gets_room(trust * (self._patience + waiting / _SLOW)):
                 self._stop()
-        self._journal.amend(row, Crossing.UNDERWAY if self._ending else Crossing.CONGESTED)
+        self._journal.amend(row, WireFate.UNDERWAY if self._ending else WireFate.CONGESTED)
         if lost is not None:
             lost()
 
@@ -216,7 +216,7 @@ class SideOutlet:
         )
 
     def _refused(self, row: int) -> None:
-        self._journal.amend(row, Crossing.REFUSED)
+        self._journal.amend(row, WireFate.REFUSED)
 
     def _run(self) -> None:
         queue, lock, sent = self._queue, self._lock, self._journal.sent

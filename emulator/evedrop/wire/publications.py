@@ -18,12 +18,12 @@ import zenoh
 
 from evedrop.system.threads import wait_for_thread
 from evedrop.wire.backlog import Backlog
-from evedrop.wire.crossing import AGAIN, HELD, UNLINKED, Crossing, Kind
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.lanes import Lane, LinkState
 from evedrop.wire.outlet import LONG_SECONDS, SideOutlet, waiting_bytes
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.publishers import OFTEN, REMOTE, Message, Publishers
+from evedrop.wire.record import AGAIN, HELD, UNLINKED, Kind, WireFate
 from evedrop.wire.ros2 import SourceReader
 from evedrop.wire.side import SideSession, expressions_of
 from evedrop.wire.watchdog import Duty
@@ -197,8 +197,8 @@ class PublicationRelay:
         record, amend = self._journal.record, self._journal.amend
         read = SourceReader(self._journal.source_code)
         put, put_kind, delete_kind = zenoh.SampleKind.PUT, int(Kind.PUT), int(Kind.DELETE)
-        unlinked, underway, zenoh_error = int(Crossing.UNLINKED), int(Crossing.UNDERWAY), zenoh.ZError
-        refused = Crossing.REFUSED
+        unlinked, underway, zenoh_error = int(WireFate.UNLINKED), int(WireFate.UNDERWAY), zenoh.ZError
+        refused = WireFate.REFUSED
 
         def take(sample: zenoh.Sample) -> None:
             heard = now()
@@ -292,9 +292,9 @@ class PublicationRelay:
         return ways, code
 
 
-def _undecided(fate: Crossing) -> Lane:
+def _undecided(fate: WireFate) -> Lane:
     """The lane of messages with a fate that is not the link's, which get no numbers."""
     return lambda _now, _size: (-1, int(fate), 0.0, False)
 
 
-_UNDERWAY, _TOO_MANY_KEYS = _undecided(Crossing.UNDERWAY), _undecided(Crossing.TOO_MANY_KEYS)
+_UNDERWAY, _TOO_MANY_KEYS = _undecided(WireFate.UNDERWAY), _undecided(WireFate.TOO_MANY_KEYS)

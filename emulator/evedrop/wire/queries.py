@@ -20,12 +20,12 @@ import zenoh
 
 from evedrop.system.threads import wait_for_thread
 from evedrop.wire.advanced import LOST_HISTORY_SECONDS, published_key
-from evedrop.wire.crossing import AGAIN, HELD, UNLINKED, Crossing, Kind
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.lanes import Decision, Lane, LinkState
 from evedrop.wire.outlet import SideOutlet, waiting_bytes
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.publications import READY_KEYS
+from evedrop.wire.record import AGAIN, HELD, UNLINKED, Kind, WireFate
 from evedrop.wire.ros2 import SourceReader, reply_seconds
 from evedrop.wire.scheduler import Scheduler
 from evedrop.wire.side import SideSession, expressions_of
@@ -256,9 +256,9 @@ class QueryRelay:
         code = self._journal.key_code(key, way[0])
         state = self._link(*way, expression)
         if state is None:
-            self._journal.record(now, -1, sequence, 0.0, code, sender, size, UNLINKED, kind, Crossing.UNLINKED)
+            self._journal.record(now, -1, sequence, 0.0, code, sender, size, UNLINKED, kind, WireFate.UNLINKED)
             return
-        n, fate, delay, again = -1, int(Crossing.TOO_MANY_KEYS), 0.0, False
+        n, fate, delay, again = -1, int(WireFate.TOO_MANY_KEYS), 0.0, False
         if code:
             n, fate, delay, again = self._decided(state, kind.stream, key, expression, now, size)
         mark = int(kind) | AGAIN if again else int(kind)

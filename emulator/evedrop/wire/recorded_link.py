@@ -21,16 +21,16 @@ from evedrop.errors import TraceError, UsageError
 from evedrop.scenario.recordings.message_numbers import MessageArrivals, MessageSeries, joined, series_of
 from evedrop.scenario.recordings.message_recording import MessageRecording, check_parts
 from evedrop.wire.advanced import numbered_as
-from evedrop.wire.crossing import Crossing, Kind
 from evedrop.wire.file import load_wire
 from evedrop.wire.history import WireHistory
 from evedrop.wire.journal_part import REASONS
 from evedrop.wire.journal_reader import JOURNAL_FOLDER, journal_tables
 from evedrop.wire.plan import WireLink
+from evedrop.wire.record import Kind, WireFate
 
 _COLUMNS = ["time", "link", "key", "source", "sequence", "reason", "delay", "n", "kind", "again"]
 _MOST_SHOWN = 10  # links or keys that a message lists
-_HIDDEN = {Crossing.OVERFLOW, Crossing.CUT, Crossing.TOO_LARGE, Crossing.LOOPED}
+_HIDDEN = {WireFate.OVERFLOW, WireFate.CUT, WireFate.TOO_LARGE, WireFate.LOOPED}
 """The fates of messages that the loss model may have lost as well: nobody can tell."""
 
 
@@ -100,8 +100,8 @@ class _Reader:
         follows = (np.diff(streams) == 0) & (np.diff(n) == 1)
         heard = _floats(rows["time"])[order]
         goes_on = np.concatenate([[False], follows & known[:-1]])
-        survived = ~np.isin(fates, [Crossing.LOST])
-        delivered, corrupted = known & (fates == Crossing.DELIVERED), fates == Crossing.CORRUPTED
+        survived = ~np.isin(fates, [WireFate.LOST])
+        delivered, corrupted = known & (fates == WireFate.DELIVERED), fates == WireFate.CORRUPTED
         series = MessageSeries(
             survived[known].astype(np.uint8),
             parts=int((known & ~goes_on).sum()),
@@ -220,10 +220,10 @@ def _groups(codes: NDArray[np.int64]) -> Iterator[NDArray[np.intp]]:
 
 
 def _fates(rows: pa.Table) -> NDArray[np.uint8]:
-    """`Crossing` of each row."""
+    """`WireFate` of each row."""
     by_reason = {reason: fate for fate, reason in REASONS.items()}
     texts = rows["reason"].cast(pa.string()).combine_chunks().dictionary_encode()
-    table = np.array([*(by_reason[one] for one in texts.dictionary.to_pylist()), Crossing.DELIVERED], np.uint8)
+    table = np.array([*(by_reason[one] for one in texts.dictionary.to_pylist()), WireFate.DELIVERED], np.uint8)
     found: NDArray[np.uint8] = table[texts.indices.fill_null(len(table) - 1).to_numpy(zero_copy_only=False)]
     return found
 

@@ -32,7 +32,6 @@ from evedrop.results.wire_summary import (
 )
 from evedrop.score.summary import Judged
 from evedrop.system.output import warn
-from evedrop.wire.crossing import UNLINKED, Crossing, Kind
 from evedrop.wire.expect import WireExpectTable
 from evedrop.wire.figures import WIRE_FIGURES
 from evedrop.wire.history import NotedEvent
@@ -40,6 +39,7 @@ from evedrop.wire.journal import AmendmentListener, Listener
 from evedrop.wire.journal_part import REASONS, Records
 from evedrop.wire.law import bounds, expected
 from evedrop.wire.plan import WireLink, WirePlan
+from evedrop.wire.record import UNLINKED, Kind, WireFate
 from evedrop.wire.tallies import LinkTally, StreamTally
 
 _FEW = 8  # messages of a key in a block; more are added as arrays
@@ -124,7 +124,7 @@ class WireScorekeeper:
                     for at in range(start, stop):
                         stream.add_one(times[at], numbers[at], fates[at], decided)
 
-    def amend(self, records: Records, fate: Crossing) -> None:
+    def amend(self, records: Records, fate: WireFate) -> None:
         """Count records of the journal that were added with another fate."""
         with self._lock:
             for code in np.unique(records["link"]).tolist():

@@ -14,15 +14,15 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.wire.crossing import UNLINKED, Crossing
+from evedrop.wire.record import UNLINKED, WireFate
 
 Counts = NDArray[np.int64]
 
-OUTCOMES: tuple[Crossing, ...] = tuple(Crossing)
+OUTCOMES: tuple[WireFate, ...] = tuple(WireFate)
 """The last axis of `WireSteps.counts`."""
-DELIVERED = OUTCOMES.index(Crossing.DELIVERED)
-CUT = OUTCOMES.index(Crossing.CUT)
-UNDERWAY = OUTCOMES.index(Crossing.UNDERWAY)
+DELIVERED = OUTCOMES.index(WireFate.DELIVERED)
+CUT = OUTCOMES.index(WireFate.CUT)
+UNDERWAY = OUTCOMES.index(WireFate.UNDERWAY)
 
 _SPAN = 64  # steps that may be open at a time
 _BY_CODE = np.zeros(256, np.int64)

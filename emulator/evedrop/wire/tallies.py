@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.model.process import Floats
-from evedrop.wire.crossing import AGAIN, Crossing
 from evedrop.wire.journal_part import Records
+from evedrop.wire.record import AGAIN, WireFate
 
 _SAMPLE = 2**17  # delays of a link that are kept; of more, every second, fourth and so on
 _MOST_RANGES = 2048
 _TRIED = np.zeros(256, bool)  # of fates: the link's models decided, and that decision is known
 _PASSED = np.zeros(256, bool)
-for _fate in Crossing:
+for _fate in WireFate:
     _TRIED[_fate], _PASSED[_fate] = _fate.decided, _fate.passed
 
 
@@ -60,7 +60,7 @@ class StreamTally:
             self.passed += int(_PASSED[fate])
             self._add_range(n, n + 1)
         since = time if self._since is None else self._since
-        delivered = fate == Crossing.DELIVERED
+        delivered = fate == WireFate.DELIVERED
         if self._missing or not delivered:
             self.silence = max(self.silence, time - since)
         self._missing = 0 if delivered else self._missing + 1
@@ -75,7 +75,7 @@ class StreamTally:
             self.tried += int(tried.sum())
             self.passed += int(_PASSED[fates[tried]].sum())
             self._add_numbers(np.sort(records["n"][tried]))
-        places = np.flatnonzero(fates == Crossing.DELIVERED)
+        places = np.flatnonzero(fates == WireFate.DELIVERED)
         since = float(times[0]) if self._since is None else self._since
         runs = np.diff(places, prepend=-1) - 1
         last = len(records) - 1 - (int(places[-1]) if len(places) else -1)  # missing at the end
@@ -135,7 +135,7 @@ class LinkTally:
         self.bytes += int(records["size"].sum(dtype=np.int64))
         self.again += int(np.count_nonzero(records["kind"] & AGAIN))
         self.fates += np.bincount(records["fate"], minlength=256)
-        delays = records["delay"][records["fate"] == Crossing.DELIVERED]
+        delays = records["delay"][records["fate"] == WireFate.DELIVERED]
         taken = delays[self._skip :: self._step].copy()
         self._skip = (self._skip - len(delays)) % self._step
         self._delays.append(taken)
@@ -146,7 +146,7 @@ class LinkTally:
             self._delays, self._step = [thinned[::2]], 2 * self._step
             self._kept = len(self._delays[0])
 
-    def amend(self, records: Records, fate: Crossing) -> None:
+    def amend(self, records: Records, fate: WireFate) -> None:
         """Messages that were added have another fate."""
         self.fates -= np.bincount(records["fate"], minlength=256)
         self.fates[fate] += len(records)
@@ -154,12 +154,12 @@ class LinkTally:
     @property
     def delivered(self) -> int:
         """Messages given to Zenoh on the other side."""
-        return int(self.fates[Crossing.DELIVERED])
+        return int(self.fates[WireFate.DELIVERED])
 
-    def lost_by(self) -> Iterator[tuple[Crossing, int]]:
+    def lost_by(self) -> Iterator[tuple[WireFate, int]]:
         """Each reason for which messages were not delivered, and how many."""
-        for fate in Crossing:
-            if fate is not Crossing.DELIVERED and self.fates[fate]:
+        for fate in WireFate:
+            if fate is not WireFate.DELIVERED and self.fates[fate]:
                 yield fate, int(self.fates[fate])
 
     def delay_quantile(self, level: float) -> float | None:

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from evedrop.errors import NoAnswer
-from evedrop.model.answers import Answers
-from evedrop.model.eavesdroppers import ANSWERS
+from evedrop.model.eavesdroppers import REMOTE_CALLS
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
-from evedrop.model.eavesdroppers.stand_in import StandIns
+from evedrop.model.eavesdroppers.remote_class import RemoteClasses
 from evedrop.model.process import Process
+from evedrop.model.remote_calls import RemoteCalls
 from evedrop.model.streams import Batch
 from evedrop.results.reading import Results
 from tests.conftest import Evedrop, Live, wait_until
@@ -169,7 +169,7 @@ def test_an_eavesdroppers_class_runs_in_its_own_process_alone(evedrop: Evedrop) 
 def test_no_process_finds_it_where_it_only_asks(evedrop: Evedrop) -> None:
     """Commands that ask a class about itself, and read results made with it, import it into none of their own processes."""
     written(evedrop.folder)
-    ANSWERS.forget()
+    REMOTE_CALLS.forget()
     for shadow in evedrop.folder.glob("*.py"):
         if shadow.stem != "spy":
             shadow.unlink()
@@ -192,7 +192,7 @@ def test_what_a_class_says_of_itself_is_checked(evedrop: Evedrop) -> None:
         "raise OSError('no way')": "OSError: no way, spy.py line",
     }
     for body, said in wrong.items():
-        ANSWERS.forget()
+        REMOTE_CALLS.forget()
         text = (
             "import os\nfrom evedrop.model.eavesdroppers.naive import Naive\n\n\nclass Spy(Naive):\n    @classmethod\n"
         )
@@ -201,7 +201,7 @@ def test_what_a_class_says_of_itself_is_checked(evedrop: Evedrop) -> None:
         assert done.status == 2, (body, done.err)
         assert said in done.err
         assert not (evedrop.folder / "run").exists()
-    ANSWERS.forget()
+    REMOTE_CALLS.forget()
 
 
 FACTS = {"parameters": {}, "pools_links": False, "takes": True, "own_outcomes": True}
@@ -217,8 +217,8 @@ LIES: dict[str, tuple[Any, Callable[[Any], Any]]] = {
 
 
 def said_by(lies: dict[str, Any]) -> Any:
-    """The stand-in for a class that gives these answers, right or wrong."""
-    answers = Answers()
+    """The remote class of a class that gives these answers, right or wrong."""
+    calls = RemoteCalls()
     truth = {"mistakes": [], "streams": [], "betrayed": None, "follows_gamma": True, "use_probabilities": [1.0, 1.0]}
     said = {**truth, "outcomes": True, "outcomes_at": SHARES, **lies}
     given: dict[str, list[Any]] = {
@@ -230,8 +230,8 @@ def said_by(lies: dict[str, Any]) -> Any:
         json.dumps(["spy:Spy", do, *given.get(do, ["STRATEGIES", {}])]): {"is": answer}
         for do, answer in {"class": FACTS, **said}.items()
     }
-    answers.learn(known)
-    return StandIns(answers, "STRATEGIES")("spy:Spy")
+    calls.learn(known)
+    return RemoteClasses(calls, "STRATEGIES")("spy:Spy")
 
 
 @pytest.mark.parametrize("lie", LIES)
@@ -243,7 +243,7 @@ def test_an_answer_that_is_none_is_refused(lie: str) -> None:
         asked(said_by({lie: answer}))
 
 
-def test_a_stand_in_runs_nowhere() -> None:
+def test_a_remote_class_runs_nowhere() -> None:
     """What stands for a class cannot be put to work in its place."""
     process = Process(np.eye(1), np.eye(1), np.eye(1))
     with pytest.raises(TypeError, match="runs in the eavesdropper's process alone"):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from evedrop.model.eavesdroppers import ANSWERS
+from evedrop.model.eavesdroppers import REMOTE_CALLS
 from tests.conftest import Evedrop
 from tests.scenario.conformance.own_classes import BLOCK, PAGE
 
@@ -17,10 +17,10 @@ from tests.scenario.conformance.own_classes import BLOCK, PAGE
 def imports_forgotten(tmp_path: Path) -> Iterator[None]:
     """Modules that a test imports from its folder are not visible to other tests."""
     before = list(sys.path)
-    ANSWERS.forget()
+    REMOTE_CALLS.forget()
     yield
     sys.path[:] = before
-    ANSWERS.forget()
+    REMOTE_CALLS.forget()
     for name, module in list(sys.modules.items()):
         if str(getattr(module, "__file__", None) or "").startswith(str(tmp_path)):
             del sys.modules[name]

@@ -25,7 +25,7 @@ from evedrop.live.protocol.brief_parts import (
     SensorPart,
 )
 from evedrop.live.protocol.message_limits import Sizes
-from evedrop.model.eavesdroppers import ANSWERS, STRATEGIES
+from evedrop.model.eavesdroppers import REMOTE_CALLS, STRATEGIES
 from evedrop.model.schemes import scheme_of
 from evedrop.model.slot.account import COUNTED_BURSTS
 from evedrop.names import ACKNOWLEDGEMENTS, CONTROLLER, LEGITIMATE, OBSERVER, OPERATOR, RELAY, ROUTER, SENSOR
@@ -262,7 +262,7 @@ def _answers(scenario: Scenario) -> dict[str, Any]:
                     _ = expectation.limit, expectation.infinite_variance
                 except NoAnswer as error:
                     raise UsageError(f"eavesdroppers.{name}: its class cannot give its theory ({error})") from error
-    return ANSWERS.of(foreign)
+    return REMOTE_CALLS.of(foreign)
 
 
 def _outages(scenario: Scenario, receiver: str) -> list[tuple[int, int, bool]]:

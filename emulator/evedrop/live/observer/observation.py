@@ -18,12 +18,12 @@ from evedrop.live.network.launcher_news import tell
 from evedrop.live.network.operator import Answer
 from evedrop.live.network.resending import GapDetector
 from evedrop.live.network.session import Session
+from evedrop.live.observer.absence_reporter import AbsenceReporter
 from evedrop.live.observer.conductor import Conductor, Stop
 from evedrop.live.observer.joiner import Joiner
 from evedrop.live.observer.operator_orders import Order
 from evedrop.live.observer.recovery import Recovery
 from evedrop.live.observer.stall import Stall, patience_of
-from evedrop.live.observer.stand_in import StandIn
 from evedrop.live.observer.status import status_of
 from evedrop.live.observer.steering import Steering
 from evedrop.live.observer.verification import Verifier, extent_of
@@ -87,7 +87,7 @@ class ObservedRun:
         self._confirmations = confirmations
         self._steering: Steering
         self._events: list[RunEvent] = []
-        self._stand_ins: dict[str, StandIn] = {}
+        self._absent: dict[str, AbsenceReporter] = {}
         self._keeper = Scorekeeper(scenario, scenario.trials)
         self._recording: ViewRecording | None = None
         self._loop_values: LoopValues | None = None
@@ -256,7 +256,7 @@ class ObservedRun:
             self._steering.held(message.slot(self._joiner.sent))
         else:
             self._joiner.add_truth(message)
-        self._stand_in()
+        self._report_absences()
         slots = self._joiner.take_slots()
         if slots is None:
             return
@@ -269,13 +269,13 @@ class ObservedRun:
         conductor.report_progress(self._joiner.done)
         self._progress(scored)
 
-    def _stand_in(self) -> None:
+    def _report_absences(self) -> None:
         """Report on behalf of receivers that are away."""
-        for name, stand_in in list(self._stand_ins.items()):
-            if self._joiner.reported(name) == stand_in.next:
-                stand_in.follow(self._joiner.sent)
-            if stand_in.over:
-                del self._stand_ins[name]
+        for name, reporter in list(self._absent.items()):
+            if self._joiner.reported(name) == reporter.next:
+                reporter.follow(self._joiner.sent)
+            if reporter.over:
+                del self._absent[name]
 
     def _news(self, source: str, message: Reader) -> bool:
         """Whether a message is the next one from its source; after losses, earlier and later ones arrive, too."""
@@ -304,7 +304,7 @@ class ObservedRun:
 
         self._verifier.left(name, k, left)
         self._steering.left(name, k)
-        self._stand_ins[name] = StandIn(self._brief, self._scenario, name, away, left, put)
+        self._absent[name] = AbsenceReporter(self._brief, self._scenario, name, away, left, put)
 
     def _progress(self, scored: Mapping[str, Scored]) -> None:
         now = time.monotonic()

@@ -24,7 +24,7 @@ from evedrop.live.observer.observation import ObservedRun, Report
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.brief_parts import ObserverPart
 from evedrop.live.protocol.news import Finishing
-from evedrop.model.eavesdroppers import ANSWERS
+from evedrop.model.eavesdroppers import REMOTE_CALLS
 from evedrop.results.folder import new_folder
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.summary_file import unwritten
@@ -52,7 +52,7 @@ def observe(brief: Brief[ObserverPart], report: Report, serve: str | None = None
     if not by_hand:
         when_launcher_is_gone(_end_orphaned, confirmations.put)
         brief = replace(brief, ends_with_stdin=False)
-    ANSWERS.learn(brief.part.classes)  # so that the observer need not import the classes themselves
+    REMOTE_CALLS.learn(brief.part.classes)  # so that the observer need not import the classes themselves
     scenario = Scenario.read(brief.part.scenario)
     observation = ObservedRun(brief, scenario, confirmations, by_hand)
     if by_hand:

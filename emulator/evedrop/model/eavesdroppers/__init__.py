@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 from evedrop.model.eavesdroppers.colluding import Colluding
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper
-from evedrop.model.eavesdroppers.readers import ANSWERS, GROUP, READERS, RESERVED
+from evedrop.model.eavesdroppers.readers import GROUP, READERS, REMOTE_CALLS, RESERVED
+from evedrop.model.eavesdroppers.remote_class import RemoteClasses
 from evedrop.model.eavesdroppers.replay_informed import ReplayInformed
-from evedrop.model.eavesdroppers.stand_in import StandIns
 from evedrop.model.registry import Registry
 
 _BUILT_IN: Mapping[str, type[Eavesdropper]] = {
@@ -22,7 +22,7 @@ STRATEGIES: Registry[Eavesdropper] = Registry(
     GROUP,
     _BUILT_IN,
     RESERVED,
-    StandIns(ANSWERS, "STRATEGIES"),
+    RemoteClasses(REMOTE_CALLS, "STRATEGIES"),
 )
 
-__all__ = ["ANSWERS", "READERS", "STRATEGIES"]
+__all__ = ["READERS", "REMOTE_CALLS", "STRATEGIES"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from evedrop.model.answers import Answers
 from evedrop.model.eavesdroppers.bayesian import Bayesian
 from evedrop.model.eavesdroppers.clear_states import ClearStates
 from evedrop.model.eavesdroppers.constant import ConstantEstimate
@@ -16,12 +15,13 @@ from evedrop.model.eavesdroppers.likelihood import Likelihood
 from evedrop.model.eavesdroppers.naive import Naive
 from evedrop.model.eavesdroppers.power_test import PowerTest
 from evedrop.model.eavesdroppers.reference import Reference
+from evedrop.model.eavesdroppers.remote_class import RemoteClasses
 from evedrop.model.eavesdroppers.selective import Selective
 from evedrop.model.eavesdroppers.smart import Smart
-from evedrop.model.eavesdroppers.stand_in import StandIns
 from evedrop.model.eavesdroppers.suspicious import Suspicious
 from evedrop.model.eavesdroppers.tracker import Tracker
 from evedrop.model.registry import Registry
+from evedrop.model.remote_calls import RemoteCalls
 
 GROUP = "evedrop.eavesdroppers"
 RESERVED = ("strategy", "link", "links", "window")
@@ -43,13 +43,13 @@ _BUILT_IN: Mapping[str, type[Eavesdropper]] = {
     "learning-em": LearningEm,
     "learning-particle": LearningParticle,
 }
-ANSWERS = Answers()
-"""The answers of eavesdropper classes that are not built in, in this process."""
+REMOTE_CALLS = RemoteCalls()
+"""The calls of eavesdropper classes that are not built in, from this process."""
 READERS: Registry[Eavesdropper] = Registry(
     "eavesdropper",
     Eavesdropper,  # type: ignore[type-abstract]
     GROUP,
     _BUILT_IN,
     (*RESERVED, "reads_as"),
-    StandIns(ANSWERS, "READERS"),
+    RemoteClasses(REMOTE_CALLS, "READERS"),
 )

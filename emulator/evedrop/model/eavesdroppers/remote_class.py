@@ -1,4 +1,4 @@
-"""Stand-ins for eavesdroppers' classes where these must not run: they give the classes' answers and cannot be instantiated.
+"""Remote classes, for eavesdroppers' classes that must not run here: they give the classes' answers and cannot be instantiated.
 
 Source: docs/your-own.md, where a class runs.
 """
@@ -10,9 +10,9 @@ from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Self, final
 
 from evedrop.errors import NoAnswer, NotRegistered
-from evedrop.model.answers import Answers
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, PacketTaker
 from evedrop.model.kernels.elementary import sum_in_order
+from evedrop.model.remote_calls import RemoteCalls
 from evedrop.model.theory.covariances import Outcomes, OutcomesAt
 
 _ROUNDING = 1e-9
@@ -21,31 +21,31 @@ _SHARES = ("predicted", "state", "misled", "decoded", "leaked")
 
 
 @final
-class StandIns:
-    """Makes stand-ins for classes that `answers` knows or asks."""
+class RemoteClasses:
+    """Makes remote classes, whose class methods are calls of `calls`."""
 
-    def __init__(self, answers: Answers, registry: str) -> None:
+    def __init__(self, calls: RemoteCalls, registry: str) -> None:
         """registry: the attribute of `evedrop.model.eavesdroppers` that contains the classes."""
-        self.answers = answers
+        self.calls = calls
         self._registry = registry
 
     def __call__(self, name: str) -> type[Eavesdropper]:
-        """The stand-in for the class of a name. Raises NotRegistered if there is no such class."""
+        """The remote class of a name. Raises NotRegistered if there is no such class."""
         try:
-            facts = self.answers.ask(name, "class", self._registry)
+            facts = self.calls.call(name, "class", self._registry)
         except NoAnswer as error:
             raise NotRegistered(name, f", and {error}; expected a class that can be asked about itself") from error
         parameters = facts.get("parameters") if isinstance(facts, dict) else None
         if not isinstance(parameters, dict):
             raise NotRegistered(name, ", whose answer is invalid; expected a class that declares its parameters")
-        base = _TakerElsewhere if facts.get("takes") is True else _Elsewhere
+        base = _RemoteTaker if facts.get("takes") is True else _RemoteEavesdropper
         said = {
             "parameters": parameters,
             "pools_links": facts.get("pools_links") is True,
             **{name: facts.get(name) is True for name in ("inverts_noise", "reads_leaks", "tests_range")},
             "only_against": _only_against(facts.get("only_against")),
             "_own_outcomes": facts.get("own_outcomes") is not False,
-            "_ask": staticmethod(lambda do, *given: self.answers.ask(name, do, self._registry, *given)),
+            "_ask": staticmethod(lambda do, *given: self.calls.call(name, do, self._registry, *given)),
             "__module__": __name__,
         }
         return type(name.rpartition(":")[2], (base,), said)
@@ -64,14 +64,14 @@ def _wrong(what: str, found: Any, expected: str) -> NoAnswer:
     return NoAnswer(f"{what} is {found!r}; expected {expected}")
 
 
-class _Elsewhere(Eavesdropper):
+class _RemoteEavesdropper(Eavesdropper):
     """The class methods, answered by the class itself. Abstract."""
 
     _ask: ClassVar[Callable[..., Any]]
     _own_outcomes: ClassVar[bool]
 
     def __new__(cls, *_: object) -> Self:
-        """Raises TypeError: this is a stand-in for a class that must not run here."""
+        """Raises TypeError: this is a remote class, of a class that must not run here."""
         raise TypeError(f"{cls.__name__} runs in the eavesdropper's process alone; take Registry.imported there")
 
     @classmethod
@@ -127,7 +127,7 @@ class _Elsewhere(Eavesdropper):
         return at
 
 
-class _TakerElsewhere(_Elsewhere, PacketTaker):
+class _RemoteTaker(_RemoteEavesdropper, PacketTaker):
     """The same for a class that uses packets as the state or ignores them. Abstract."""
 
     @classmethod

@@ -17,7 +17,7 @@ from evedrop.scenario.timeline import Away
 
 
 @final
-class StandIn:
+class AbsenceReporter:
     """Reports the beliefs of a receiver that is away, computed from its belief when it left.
 
     brief: of the observer; put: takes the reports as if they were the receiver's own.

@@ -1,4 +1,4 @@
-"""Answers about classes that must not run in this process; each class is asked in a process of its own.
+"""Calls of classes that must not run in this process: each class answers in a process of its own.
 
 Anybody may write an eavesdropper's class, and launcher and observer hold the seed and the truth. So they do not import it.
 A child process imports it; the child has an empty environment and is told the class's name, its parameters in the
@@ -36,8 +36,8 @@ _PYTHON = str(Path(os.__file__).parent)
 
 
 @final
-class Answers:
-    """The known answers of classes, and the child processes that answer. Usable from any thread.
+class RemoteCalls:
+    """Calls of classes in child processes, and the answers so far. Usable from any thread.
 
     Children are asked one after the other, one for each class, and end by themselves when no more questions can come.
 
@@ -53,7 +53,7 @@ class Answers:
         self.folder: str | None = None
         """The folder in which modules are looked for first."""
 
-    def ask(self, name: str, do: str, *given: Any) -> Any:
+    def call(self, name: str, do: str, *given: Any) -> Any:
         """The answer of the class `name` to one question, as decoded JSON.
 
         Raises NotRegistered if no class has this name, NoAnswer if the class does not give a valid answer.

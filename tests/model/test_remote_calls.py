@@ -1,4 +1,4 @@
-"""Answers about classes that must not run here: each from a process of its own, whatever the class does in it."""
+"""Calls of classes that must not run here: each in a process of its own, whatever the class does in it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from evedrop.errors import NoAnswer, NotRegistered
-from evedrop.model.answers import Answers
+from evedrop.model.remote_calls import RemoteCalls
 
 HEAD = "import os, signal, time\nfrom pathlib import Path\nfrom evedrop.extend import Naive\n\n\nclass Mine(Naive):\n"
 
@@ -45,9 +45,9 @@ def started(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
 
 
 @pytest.fixture
-def answers(tmp_path: Path, started: list[subprocess.Popen[bytes]]) -> Iterator[Answers]:
+def calls(tmp_path: Path, started: list[subprocess.Popen[bytes]]) -> Iterator[RemoteCalls]:
     """Of classes in a folder; afterwards no process is left."""
-    found = Answers()
+    found = RemoteCalls()
     found.folder = str(tmp_path)
     yield found
     found.forget()
@@ -55,42 +55,42 @@ def answers(tmp_path: Path, started: list[subprocess.Popen[bytes]]) -> Iterator[
 
 
 def test_a_class_answers_once_and_its_answers_are_kept(
-    answers: Answers, tmp_path: Path, started: list[subprocess.Popen[bytes]]
+    calls: RemoteCalls, tmp_path: Path, started: list[subprocess.Popen[bytes]]
 ) -> None:
     """One process answers all questions; a process that is given the answers asks none."""
     name = written(tmp_path, method("betrayed", "return parameters['slot']"))
-    assert answers.folder_of(name) is None
-    assert answers.ask(name, "class", "STRATEGIES")["parameters"] == {}
-    assert [answers.ask(name, "betrayed", "STRATEGIES", {"slot": slot}) for slot in (3, 4, 3)] == [3, 4, 3]
+    assert calls.folder_of(name) is None
+    assert calls.call(name, "class", "STRATEGIES")["parameters"] == {}
+    assert [calls.call(name, "betrayed", "STRATEGIES", {"slot": slot}) for slot in (3, 4, 3)] == [3, 4, 3]
     assert len(started) == 1
     assert started[0].poll() is None
-    assert answers.folder_of(name) == str(tmp_path)
-    known = answers.of([name])
+    assert calls.folder_of(name) == str(tmp_path)
+    known = calls.of([name])
     assert len(known) == 3
-    assert answers.of(["other:Class"]) == {}
-    told = Answers()
+    assert calls.of(["other:Class"]) == {}
+    told = RemoteCalls()
     told.learn(known)
-    assert told.ask(name, "betrayed", "STRATEGIES", {"slot": 4}) == 4
+    assert told.call(name, "betrayed", "STRATEGIES", {"slot": 4}) == 4
     assert len(started) == 1
 
 
 def test_a_refusal_that_somebody_else_was_given_is_one_here() -> None:
     """And no process is started for it."""
-    answers = Answers()
-    answers.learn({json.dumps(["mine:Class", "class"]): {"raised": "it is broken"}})
+    calls = RemoteCalls()
+    calls.learn({json.dumps(["mine:Class", "class"]): {"raised": "it is broken"}})
     with pytest.raises(NoAnswer, match="it is broken"):
-        answers.ask("mine:Class", "class")
+        calls.call("mine:Class", "class")
 
 
 def test_a_process_that_ended_is_started_again(
-    answers: Answers, tmp_path: Path, started: list[subprocess.Popen[bytes]]
+    calls: RemoteCalls, tmp_path: Path, started: list[subprocess.Popen[bytes]]
 ) -> None:
     """It ends by itself when it was not asked for a while, and the next question does not notice."""
     name = written(tmp_path, method("betrayed", "return 7"))
-    answers.ask(name, "class", "STRATEGIES")
+    calls.call(name, "class", "STRATEGIES")
     started[0].kill()
     started[0].wait()
-    assert answers.ask(name, "betrayed", "STRATEGIES", {}) == 7
+    assert calls.call(name, "betrayed", "STRATEGIES", {}) == 7
     assert len(started) == 2
 
 
@@ -112,47 +112,47 @@ BROKEN = {
 
 @pytest.mark.parametrize("case", BROKEN)
 def test_a_class_that_gives_no_answer_is_said_to(
-    case: str, answers: Answers, tmp_path: Path, started: list[subprocess.Popen[bytes]]
+    case: str, calls: RemoteCalls, tmp_path: Path, started: list[subprocess.Popen[bytes]]
 ) -> None:
     """With the reason. Its process ends, nothing is kept, and a corrected class answers the same question."""
     code, said = BROKEN[case]
     name = written(tmp_path, method("betrayed", code), f"answering_{case}")
     with pytest.raises(NoAnswer) as refused:
-        answers.ask(name, "betrayed", "STRATEGIES", {})
+        calls.call(name, "betrayed", "STRATEGIES", {})
     assert said in str(refused.value)
     assert started[-1].poll() is not None
-    assert answers.of([name]) == {}
+    assert calls.of([name]) == {}
     if case == "raises":
         written(tmp_path, method("betrayed", "return 11"), f"answering_{case}")
-        assert answers.ask(name, "betrayed", "STRATEGIES", {}) == 11
+        assert calls.call(name, "betrayed", "STRATEGIES", {}) == 11
 
 
 def test_a_class_that_does_not_answer_in_time_is_said_to(tmp_path: Path) -> None:
     """The limit is in the message."""
-    answers = Answers(seconds=0.5)
-    answers.folder = str(tmp_path)
+    calls = RemoteCalls(seconds=0.5)
+    calls.folder = str(tmp_path)
     name = written(tmp_path, method("betrayed", "time.sleep(600)"), "answering_slow")
     with pytest.raises(NoAnswer, match=r"it did not answer within 0.5 s"):
-        answers.ask(name, "betrayed", "STRATEGIES", {})
+        calls.call(name, "betrayed", "STRATEGIES", {})
 
 
-def test_a_name_without_a_class_is_said_to_have_none(answers: Answers, tmp_path: Path) -> None:
+def test_a_name_without_a_class_is_said_to_have_none(calls: RemoteCalls, tmp_path: Path) -> None:
     """With the reason that the registry gives in the other process."""
     name = written(tmp_path, "pass").replace("Mine", "Other")
     with pytest.raises(NotRegistered) as refused:
-        answers.ask(name, "class", "STRATEGIES")
+        calls.call(name, "class", "STRATEGIES")
     assert re.search(r"and the module answering_mine .* has no Other; expected one of Mine", refused.value.why)
 
 
-def test_without_a_process_there_is_no_answer(monkeypatch: pytest.MonkeyPatch, answers: Answers) -> None:
+def test_without_a_process_there_is_no_answer(monkeypatch: pytest.MonkeyPatch, calls: RemoteCalls) -> None:
     """Where none can be started."""
     monkeypatch.setattr(sys, "executable", "/nowhere/python")
     with pytest.raises(NoAnswer, match=r"it cannot be asked: no process can be started \(.*No such file or directory"):
-        answers.ask("mine:Class", "class", "STRATEGIES")
+        calls.call("mine:Class", "class", "STRATEGIES")
 
 
 def test_an_interrupt_ends_the_process_that_was_asked(
-    monkeypatch: pytest.MonkeyPatch, answers: Answers, started: list[subprocess.Popen[bytes]]
+    monkeypatch: pytest.MonkeyPatch, calls: RemoteCalls, started: list[subprocess.Popen[bytes]]
 ) -> None:
     """And is not taken for an answer."""
 
@@ -161,6 +161,6 @@ def test_an_interrupt_ends_the_process_that_was_asked(
 
     monkeypatch.setattr(select, "select", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        answers.ask("mine:Class", "class", "STRATEGIES")
+        calls.call("mine:Class", "class", "STRATEGIES")
     assert started[-1].poll() is not None
-    assert json.dumps(answers.of(["mine:Class"])) == "{}"
+    assert json.dumps(calls.of(["mine:Class"])) == "{}"

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from evedrop.model.links.link import Fate
 
 
-class Crossing(IntEnum):
+class WireFate(IntEnum):
     """The outcome of a message on a link. Up to `CUT` as `Fate`; the rest is not emulated but happens to the wire itself."""
 
     DELIVERED = Fate.DELIVERED
@@ -48,17 +48,17 @@ class Crossing(IntEnum):
     @property
     def emulated(self) -> bool:
         """Whether a link's settings decide this outcome."""
-        return self <= Crossing.CUT
+        return self <= WireFate.CUT
 
     @property
     def decided(self) -> bool:
         """Whether the loss and corruption models of a link decided on such a message, and how is known."""
-        return self.passed or self in {Crossing.LOST, Crossing.CORRUPTED}
+        return self.passed or self in {WireFate.LOST, WireFate.CORRUPTED}
 
     @property
     def passed(self) -> bool:
         """Whether these models let such a message pass."""
-        return self in {Crossing.DELIVERED, Crossing.HELD_UP, Crossing.UNDERWAY, Crossing.REFUSED, Crossing.CONGESTED}
+        return self in {WireFate.DELIVERED, WireFate.HELD_UP, WireFate.UNDERWAY, WireFate.REFUSED, WireFate.CONGESTED}
 
 
 class Kind(IntEnum):
@@ -90,12 +90,12 @@ RECORD = np.dtype(
         ("n", "<i8"),  # its number among the messages of its key and kind on its link, from 0; -1 if it has none
         ("sequence", "<i8"),  # its sender's own number for it; -1 if it has none
         ("delay", "<f8"),  # seconds that the link holds it back, its queue included
-        ("key", "<u4"),  # code of the key; 0 if it is not kept, `Crossing.TOO_MANY_KEYS`
+        ("key", "<u4"),  # code of the key; 0 if it is not kept, `WireFate.TOO_MANY_KEYS`
         ("source", "<u4"),  # code of the sender; 0 if it is not known
         ("size", "<u4"),  # bytes of payload and attachment
         ("link", "<u2"),  # code of the link
         ("kind", "u1"),  # `Kind`, with `AGAIN`
-        ("fate", "u1"),  # `Crossing`, with `HELD`
+        ("fate", "u1"),  # `WireFate`, with `HELD`
     ]
 )
 """A row of the journal while the wire runs, 48 bytes; codes of keys and sources are in another file."""

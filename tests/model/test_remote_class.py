@@ -1,4 +1,4 @@
-"""Stand-ins for eavesdroppers' classes: they check every answer of the class."""
+"""Remote classes of eavesdroppers: they check every answer of the class."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from evedrop.errors import NoAnswer, NotRegistered
-from evedrop.model.answers import Answers
 from evedrop.model.eavesdroppers.naive import Naive
-from evedrop.model.eavesdroppers.stand_in import StandIns
+from evedrop.model.eavesdroppers.remote_class import RemoteClasses
+from evedrop.model.remote_calls import RemoteCalls
 from evedrop.model.theory.covariances import Outcomes
 
 NAME, REGISTRY = "mine:Eve", "STRATEGIES"
@@ -19,31 +19,31 @@ FACTS = {"parameters": GIVEN, "own_outcomes": True}
 OUTCOMES = {"predicted": 0.1, "state": 0.4, "misled": 0.25, "decoded": 0.25, "leaked": 0.0, "initial": 1.0}
 
 
-def stand_in(facts: Any = FACTS, at: Any = OUTCOMES, **said: Any) -> Any:
-    """The stand-in for a class that answers these questions so, without a process; at: its outcomes at μ_d = 0.5, μ_e = 0.25."""
-    answers = Answers()
+def remote_class(facts: Any = FACTS, at: Any = OUTCOMES, **said: Any) -> Any:
+    """The remote class of a class with these answers, without a process; at: its outcomes at μ_d = 0.5, μ_e = 0.25."""
+    calls = RemoteCalls()
     known: list[tuple[list[Any], Any]] = [
         (["class", REGISTRY], facts),
         *(([do, REGISTRY, GIVEN], found) for do, found in said.items()),
     ]
     known += [(["outcomes", REGISTRY, GIVEN, 0.5], bool(at)), (["outcomes_at", REGISTRY, GIVEN, 0.5, 0.25], at)]
-    answers.learn({json.dumps([NAME, *question]): {"is": found} for question, found in known})
-    return StandIns(answers, REGISTRY)(NAME)
+    calls.learn({json.dumps([NAME, *question]): {"is": found} for question, found in known})
+    return RemoteClasses(calls, REGISTRY)(NAME)
 
 
 def test_it_says_what_the_class_says() -> None:
-    """Facts and answers, in the types that the rest of the program expects."""
+    """Facts and calls, in the types that the rest of the program expects."""
     facts = {**FACTS, "pools_links": True, "only_against": ["innovation", "it needs innovations"]}
-    kind = stand_in(facts, mistakes=[["threshold", "is 3"]], streams=["noise"], betrayed=4, follows_gamma=False)
+    kind = remote_class(facts, mistakes=[["threshold", "is 3"]], streams=["noise"], betrayed=4, follows_gamma=False)
     assert (kind.__name__, kind.parameters, kind.pools_links, kind.inverts_noise) == ("Eve", GIVEN, True, False)
     assert kind.only_against == ("innovation", "it needs innovations")
     assert kind.mistakes(GIVEN) == [("threshold", "is 3")]
     assert kind.streams(GIVEN) == ("noise",)
     assert kind.betrayed(GIVEN) == 4
     assert kind.follows_gamma(GIVEN) is False
-    assert stand_in({**FACTS, "only_against": [["a", "b"], "why"]}).only_against == (("a", "b"), "why")
+    assert remote_class({**FACTS, "only_against": [["a", "b"], "why"]}).only_against == (("a", "b"), "why")
     for nothing in (None, [["a", 3], "why"], [3, "why"], ["a", 3]):
-        assert stand_in({**FACTS, "only_against": nothing}).only_against is None
+        assert remote_class({**FACTS, "only_against": nothing}).only_against is None
 
 
 @pytest.mark.parametrize(
@@ -60,7 +60,7 @@ def test_it_says_what_the_class_says() -> None:
 def test_an_answer_of_another_kind_is_refused(do: str, found: Any, said: str) -> None:
     """With the method and what it was expected to return."""
     with pytest.raises(NoAnswer) as refused:
-        getattr(stand_in(**{do: found}), do)(GIVEN)
+        getattr(remote_class(**{do: found}), do)(GIVEN)
     assert said in str(refused.value)
 
 
@@ -68,35 +68,35 @@ def test_an_answer_of_another_kind_is_refused(do: str, found: Any, said: str) ->
 def test_a_class_that_declares_nothing_is_not_taken(facts: Any) -> None:
     """Its parameters must be a table."""
     with pytest.raises(NotRegistered, match="whose answer is invalid"):
-        stand_in(facts)
+        remote_class(facts)
 
 
 def test_it_does_not_run() -> None:
     """The class runs in the process of its eavesdropper alone."""
     with pytest.raises(TypeError, match="Eve runs in the eavesdropper's process alone"):
-        stand_in()()
+        remote_class()()
 
 
 @pytest.mark.parametrize("found", [None, [0.5], [0.5, 1.5], [0.5, float("nan")], [True, 0.5]])
 def test_probabilities_of_use_are_probabilities(found: Any) -> None:
     """Two of them."""
-    kind = stand_in({**FACTS, "takes": True, "own_outcomes": False}, use_probabilities=found)
+    kind = remote_class({**FACTS, "takes": True, "own_outcomes": False}, use_probabilities=found)
     with pytest.raises(NoAnswer, match="expected two probabilities"):
         kind.use_probabilities(GIVEN)
-    assert stand_in({**FACTS, "takes": True}, use_probabilities=[0.5, 1]).use_probabilities(GIVEN) == (0.5, 1)
+    assert remote_class({**FACTS, "takes": True}, use_probabilities=[0.5, 1]).use_probabilities(GIVEN) == (0.5, 1)
 
 
 @pytest.mark.parametrize("takes", [True, False])
 def test_its_own_theory_is_asked_at_every_quality(takes: bool) -> None:
     """None if it has none."""
-    kind = stand_in({**FACTS, "takes": takes})
+    kind = remote_class({**FACTS, "takes": takes})
     assert kind.outcomes(GIVEN, 0.5)(0.25) == Outcomes(**OUTCOMES)
-    assert stand_in({**FACTS, "takes": takes}, at=None).outcomes(GIVEN, 0.5) is None
+    assert remote_class({**FACTS, "takes": takes}, at=None).outcomes(GIVEN, 0.5) is None
 
 
 def test_without_a_theory_of_its_own_the_probabilities_of_use_give_the_outcomes() -> None:
     """As for a built-in class that uses every packet as the state."""
-    kind = stand_in({**FACTS, "takes": True, "own_outcomes": False}, at=None, use_probabilities=[1.0, 1.0])
+    kind = remote_class({**FACTS, "takes": True, "own_outcomes": False}, at=None, use_probabilities=[1.0, 1.0])
     naive = Naive.outcomes({}, 0.5)
     assert naive is not None
     assert kind.outcomes(GIVEN, 0.5)(0.25) == naive(0.25)
@@ -114,7 +114,7 @@ def test_without_a_theory_of_its_own_the_probabilities_of_use_give_the_outcomes(
 def test_outcomes_that_are_no_probabilities_are_refused(change: dict[str, Any], said: str) -> None:
     """Of each entry, of their sum, and of no others."""
     with pytest.raises(NoAnswer) as refused:
-        stand_in(at={**OUTCOMES, **change}).outcomes(GIVEN, 0.5)(0.25)
+        remote_class(at={**OUTCOMES, **change}).outcomes(GIVEN, 0.5)(0.25)
     assert said in str(refused.value)
 
 
@@ -124,11 +124,11 @@ def test_a_class_that_cannot_be_asked_is_not_registered() -> None:
     class Silent:
         """No class answers."""
 
-        def ask(self, *_: object) -> Any:
+        def call(self, *_: object) -> Any:
             """Never."""
             raise NoAnswer("it did not answer within 60 s")
 
     silent: Any = Silent()
     with pytest.raises(NotRegistered) as refused:
-        StandIns(silent, REGISTRY)(NAME)
+        RemoteClasses(silent, REGISTRY)(NAME)
     assert refused.value.why == (", and it did not answer within 60 s; expected a class that can be asked about itself")
