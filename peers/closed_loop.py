@@ -17,7 +17,7 @@ from evedrop.model.receiver import Belief, Flags, Receiver
 
 def kept_decisive(session: ProcessSession, key: str, brief: AnyBrief, period: int) -> ReplayBuffer:
     """A replay buffer for messages of decision slots: each may be needed until the next decision slot."""
-    return session.kept(key, brief.flow.window + 1 + period, back=period)
+    return session.replaying_publisher(key, brief.flow.window + 1 + period, back=period)
 
 
 @final
@@ -27,14 +27,14 @@ class Decided:
     def __init__(self, session: ProcessSession, period: int, shape: tuple[int, int], patience: float) -> None:
         self._period, self._shape = period, shape
         self._key = session.keys.input
-        self._inbox = session.inbox(self._key)
+        self._subscription = session.subscribe(self._key)
         self._due = GapDetector(self._key, patience)
         self._now: tuple[Floats, Flags]
 
     def of(self, k: int) -> tuple[Floats, Flags]:
         """The inputs (m, R) of slot k, and where the decision failed, (R,); call it for slots in order."""
         if k % self._period == 0:
-            message = self._due.take_message(lambda: Reader(self._key, self._inbox.recv()), k)
+            message = self._due.take_message(lambda: Reader(self._key, self._subscription.recv()), k)
             self._now = read_decided(message, k, self._shape)
         return self._now
 

@@ -29,16 +29,16 @@ def steer(brief: Brief[ControllerPart], connect: Callable[[AnyBrief], ProcessSes
     on_truth = part.acts_on == "truth"
     with connect(brief) as session:
         key, name = (session.keys.state, "x") if on_truth else (session.keys.estimate, "x_hat")
-        inbox, put = session.inbox(key), kept_decisive(session, session.keys.input, brief, assignment.period)
+        subscription, put = session.subscribe(key), kept_decisive(session, session.keys.input, brief, assignment.period)
         # The observer joins slots without the controller's reports, so all kept reports are sent again.
         kept = brief.flow.window + 1 + assignment.period
-        telemetry = session.kept(session.keys.telemetry(CONTROLLER), kept, back=kept)
+        telemetry = session.replaying_publisher(session.keys.telemetry(CONTROLLER), kept, back=kept)
         due = GapDetector(key, brief.flow.longest_outage)
         reporter = DecisionReporter(brief, telemetry, plant.inputs, assignment.period)
         session.ready()
         for k in range(0, brief.slots, assignment.period):
             session.status.slot = k
-            message = due.take_message(lambda: Reader(key, inbox.recv()), k)
+            message = due.take_message(lambda: Reader(key, subscription.recv()), k)
             x = read_known(message, name, k, (process.n, brief.trials))
             made = controller.decide(k, x)
             put(k, decided(k, made.u, made.failed))

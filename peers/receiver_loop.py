@@ -62,10 +62,10 @@ class ReceiverLoop:
         name, key = brief.process, session.keys.downlink(brief.process)
         self._brief, self._core, self._replies, self._status = brief, core, replies, session.status
         self._outages = _outages_of(brief)
-        self.deliveries = Pending(session.inbox(key), key, most_slots(brief))
-        self._put_telemetry = session.kept(session.keys.telemetry(name), brief.flow.window + 1)
+        self.deliveries = Pending(session.subscribe(key), key, most_slots(brief))
+        self._put_telemetry = session.replaying_publisher(session.keys.telemetry(name), brief.flow.window + 1)
         cuts = [slot for start, (stop, _) in self._outages.items() for slot in (start, stop)]
-        put_progress = session.kept(session.keys.progress(name), 0)
+        put_progress = session.replaying_publisher(session.keys.progress(name), 0)
         self._reporter = BeliefReporter(
             brief, self._put_telemetry, put_progress, cuts, brief.first, brief.part.window > 0
         )
@@ -139,7 +139,7 @@ class ReceiverReplies:
         self, brief: AnyBrief, session: ProcessSession, acknowledges: bool, consultation: Consultation | None
     ) -> None:
         self._trials = brief.trials
-        self._acknowledge = session.outlet(session.keys.acknowledged) if acknowledges else None
+        self._acknowledge = session.publisher(session.keys.acknowledged) if acknowledges else None
         self._consultation = consultation
 
     def acknowledge_again(self, k: int, delivery: Reader) -> None:

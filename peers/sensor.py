@@ -66,7 +66,7 @@ class Window:
         self._keys = {name: session.keys.progress(name) for name in followers}
         self._news = Mailbox(self._keys, _PROGRESS_BYTES, clock)
         for name, key in self._keys.items():
-            session.funnel(key, partial(self._news.put, name))
+            session.subscribe_with(key, partial(self._news.put, name))
 
     @property
     def followers(self) -> tuple[str, ...]:
@@ -159,12 +159,12 @@ class Acknowledgements:
     def __init__(self, brief: Brief[SensorPart], session: ProcessSession) -> None:
         self._trials = brief.trials
         self._key = session.keys.acknowledgements
-        self._inbox = session.inbox(self._key)
+        self._subscription = session.subscribe(self._key)
         self._due = GapDetector(self._key, brief.flow.longest_outage)
 
     def wait(self, k: int) -> Flags:
         """The acknowledgements of slot k, (R,)."""
-        message = self._due.take_message(lambda: Reader(self._key, self._inbox.recv()), k)
+        message = self._due.take_message(lambda: Reader(self._key, self._subscription.recv()), k)
         return read_acknowledgement(message, k, self._trials)
 
 
@@ -189,7 +189,7 @@ class SensorLoop:
         part = brief.part
         self._program, self._clock = program, clock
         self._brief, self._session, self._core = brief, session, core
-        self._send = session.kept(session.keys.uplink, head=resend, back=part.history)
+        self._send = session.replaying_publisher(session.keys.uplink, head=resend, back=part.history)
         self._window = Window(session, (*part.receivers, OBSERVER), brief.flow.window, self._send)
         self._back = Acknowledgements(brief, session) if scheme.needs_acknowledgements else None
         self._steered = None
@@ -197,7 +197,7 @@ class SensorLoop:
         if part.plant is not None and part.controller is not None:
             inputs = part.plant.plant.inputs
             self._steered = Steered(brief, inputs, part.controller, session)
-        telemetry = session.kept(session.keys.telemetry(SENSOR), brief.flow.window + 1)
+        telemetry = session.replaying_publisher(session.keys.telemetry(SENSOR), brief.flow.window + 1)
         self._reporter = TruthReporter(
             brief, telemetry, scheme.may_be_silent, self._core.watches, inputs, self._core.filters, self._core.monitors
         )

@@ -103,6 +103,7 @@ FORMER = {
     "filter_noise_read": "replace_filter_noise",
     "floor plan": "drawing of the packages",
     "floor_plan": "package_drawing",
+    "funnel": "callback subscription",
     "heeding": "heed rule",
     "lifeline": "watchdog",
     "look_seconds": "poll_seconds",

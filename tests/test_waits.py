@@ -40,10 +40,10 @@ EXCEPTIONS = {
     "emulator/evedrop/studies/scenario_test_jobs.py carry_out process.wait": "the process has closed its output, or is killed",
     "emulator/evedrop/wire/outlet.py _wait self._bell.acquire": WORK,
     "emulator/evedrop/wire/queries.py _run self._heard.get": WORK,
-    "peers/closed_loop.py of self._inbox.recv": PROCESS,
-    "peers/controller.py steer inbox.recv": PROCESS,
+    "peers/closed_loop.py of self._subscription.recv": PROCESS,
+    "peers/controller.py steer subscription.recv": PROCESS,
     "peers/sensor.py wait self._news.get": PROCESS,
-    "peers/sensor.py wait self._inbox.recv": PROCESS,
+    "peers/sensor.py wait self._subscription.recv": PROCESS,
 }
 """File, function and call → why it needs no limit."""
 CONTEXT = {"TAKEN", "_NO_MODULES"}

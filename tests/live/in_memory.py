@@ -18,10 +18,10 @@ from tests.conftest import LIMIT
 
 @dataclass
 class Stage:
-    """What a peer's session would carry: the test fills the inboxes and reads what was put."""
+    """What a peer's session would carry: the test fills the queues and reads what was put."""
 
-    inboxes: dict[str, SimpleQueue[bytes]] = field(default_factory=dict)
-    funnels: dict[str, Callable[[bytes], None]] = field(default_factory=dict)
+    queues: dict[str, SimpleQueue[bytes]] = field(default_factory=dict)
+    callbacks: dict[str, Callable[[bytes], None]] = field(default_factory=dict)
     put: SimpleQueue[tuple[str, bytes]] = field(default_factory=SimpleQueue)
     kept: dict[str, ReplayBuffer] = field(default_factory=dict)
     commands: SimpleQueue[bytes] = field(default_factory=SimpleQueue)
@@ -32,8 +32,8 @@ class Stage:
         return FakeSession(self, RunKeys(brief.run), brief)
 
     def fill(self, key: str, messages: list[bytes]) -> None:
-        """Put messages into an inbox."""
-        queue = self.inboxes.setdefault(key, SimpleQueue())
+        """Put messages into a subscription."""
+        queue = self.queues.setdefault(key, SimpleQueue())
         for message in messages:
             queue.put(message)
 
@@ -47,8 +47,8 @@ class Stage:
         return found
 
 
-class FakeInbox:
-    """The part of an inbox that peers use."""
+class FakeSubscription:
+    """The part of a subscription that peers use."""
 
     def __init__(self, queue: SimpleQueue[bytes]) -> None:
         self._queue = queue
@@ -83,25 +83,25 @@ class FakeSession:
     def __exit__(self, *_: object) -> None:
         self._stage.put.put(("closed", b""))
 
-    def inbox(self, key: str) -> FakeInbox:
-        """An inbox whose `recv` never waits for longer than a test may."""
-        queue = self._stage.inboxes.setdefault(key, SimpleQueue())
+    def subscribe(self, key: str) -> FakeSubscription:
+        """A subscription whose `recv` never waits for longer than a test may."""
+        queue = self._stage.queues.setdefault(key, SimpleQueue())
 
-        return FakeInbox(queue)
+        return FakeSubscription(queue)
 
-    def funnel(self, key: str, receive: Callable[[bytes], None]) -> None:
+    def subscribe_with(self, key: str, receive: Callable[[bytes], None]) -> None:
         """As the real one, called by the test."""
-        self._stage.funnels[key] = receive
+        self._stage.callbacks[key] = receive
 
-    def outlet(self, key: str) -> Callable[[bytes], None]:
+    def publisher(self, key: str) -> Callable[[bytes], None]:
         """Puts into the stage; what the process puts for itself comes back to it."""
-        if key in self._stage.inboxes:
-            return self._stage.inboxes[key].put
+        if key in self._stage.queues:
+            return self._stage.queues[key].put
         return lambda payload: self._stage.put.put((key, payload))
 
-    def kept(self, key: str, *how: Any, **more: Any) -> ReplayBuffer:
+    def replaying_publisher(self, key: str, *how: Any, **more: Any) -> ReplayBuffer:
         """The same, kept to be sent again."""
-        self._stage.kept[key] = kept = ReplayBuffer(self.outlet(key), *how, **more)
+        self._stage.kept[key] = kept = ReplayBuffer(self.publisher(key), *how, **more)
         return kept
 
     def ready(self) -> None:

@@ -33,7 +33,7 @@ class Told(Network):
         if name not in self.absent:
             changed(True)
 
-    def outlet(self, key: str) -> Callable[[bytes], None]:
+    def publisher(self, key: str) -> Callable[[bytes], None]:
         """Whatever is said is noted."""
         return lambda payload: self.said.append((key.rpartition("/")[2], payload, self.clock.now - 1000.0))
 

@@ -31,7 +31,7 @@ class Network:
         self.unread: set[str] = set()
         """Keys without a reader."""
 
-    def funnel(self, key: str, receive: Callable[[bytes], None]) -> None:
+    def subscribe_with(self, key: str, receive: Callable[[bytes], None]) -> None:
         """Remember who reads."""
         self.reads[key] = receive
 
@@ -43,7 +43,7 @@ class Network:
     def asked(self, key: str, receive: Callable[[Any], None]) -> None:
         """Nobody asks."""
 
-    def outlet(self, key: str) -> Callable[[bytes], None]:
+    def publisher(self, key: str) -> Callable[[bytes], None]:
         """What is said to a process reaches it at once."""
         name = key.rpartition("/")[2]
 

@@ -264,7 +264,7 @@ class SensorThread:
 
     def progress(self, name: str, k: int) -> None:
         """Somebody reports progress."""
-        self.stage.funnels[self.keys.progress(name)](wire.progress(k))
+        self.stage.callbacks[self.keys.progress(name)](wire.progress(k))
 
 
 def test_sensor_sends_as_its_followers_let_it(stage: Stage) -> None:
@@ -343,7 +343,7 @@ def test_sensor_is_never_a_window_ahead_of_the_slowest(slowest: str, stage: Stag
             window.wait(limit)
 
     def report(name: str, k: int) -> None:
-        stage.funnels[session.keys.progress(name)](wire.progress(k))
+        stage.callbacks[session.keys.progress(name)](wire.progress(k))
 
     reaches(10)
     for name in set(followers) - {slowest}:
@@ -362,7 +362,7 @@ def test_sensor_refuses_malformed_progress(k: float, stage: Stage) -> None:
     """Progress that is not as documented, or beyond what was sent, is an error that names its key and its sender."""
     session = stage.session(briefs()["sensor"])
     window = Window(session, ("a",), 1, ReplayBuffer(print))
-    stage.funnels[session.keys.progress("a")](msgpack.packb({"k": k}))
+    stage.callbacks[session.keys.progress("a")](msgpack.packb({"k": k}))
     with pytest.raises(MalformedMessage, match=rf"progress/a: k = {k}.*Check that a speaks") as found:
         window.wait(2)
     assert found.value.at_fault == ("a",)

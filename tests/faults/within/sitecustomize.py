@@ -74,26 +74,26 @@ if LAUNCHES or (CONFUSED and "evedrop.fork_server" in sys.orig_argv):
 
     def _confused(module: ModuleType) -> None:
         number, _, place = (CONFUSED or "").partition(":")
-        put, every, before, count = module.Outlet.__call__, int(number), [None], [0]
+        put, every, before, count = module.Publisher.__call__, int(number), [None], [0]
 
-        def confuse(outlet: Any, payload: bytes) -> None:
-            put(outlet, payload)
-            if "/downlink/" not in outlet.key:
+        def confuse(publisher: Any, payload: bytes) -> None:
+            put(publisher, payload)
+            if "/downlink/" not in publisher.key:
                 return
             count[0] += 1
             other: Any = before[0]
             if (
                 other is not None
-                and other.key != outlet.key
+                and other.key != publisher.key
                 and count[0] % every == 0
                 and count[0] <= MOST_CONFUSED * every
             ):
-                other._publisher.put(outlet._head + payload)
+                other._publisher.put(publisher._head + payload)
                 with open(place, "w"):
                     pass
-            before[0] = outlet
+            before[0] = publisher
 
-        module.Outlet.__call__ = confuse
+        module.Publisher.__call__ = confuse
 
     _CHANGES = (
         {

@@ -16,7 +16,7 @@ import zenoh
 from evedrop.errors import MalformedMessage
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.network.control_file import Control
-from evedrop.live.network.declared import InboxClosedError, Question
+from evedrop.live.network.declared import Question, SubscriptionClosedError
 from evedrop.live.network.operator import Answer, ask
 from evedrop.live.network.router_users import users_file
 from evedrop.live.network.session import Session
@@ -90,23 +90,23 @@ def test_a_message_names_its_key() -> None:
         assert named_in(message) is None
 
 
-def test_an_inbox_drops_what_names_another_key(stage: Stage, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_subscription_drops_what_names_another_key(stage: Stage, capfd: pytest.CaptureFixture[str]) -> None:
     """Only what names its own key is read; the rest is counted, and standard error says which key was named."""
     key = stage.keys.downlink("eve")
     with Session(stage.eve) as session:
-        inbox = session.inbox(key)
+        subscription = session.subscribe(key)
         stage.put(key, [*foreign(stage.keys, key), enclosed(key, GOOD)])
-        assert inbox.recv() == GOOD
+        assert subscription.recv() == GOOD
         assert session.dropped == len(foreign(stage.keys, key))
     said = capfd.readouterr().err
     assert f"eve: dropped a message that came on {key} and names {stage.keys.control('smart')} (number 1)" in said
 
 
-def test_a_funnel_drops_what_names_another_key(stage: Stage) -> None:
-    """As an inbox, whatever the key is."""
+def test_a_callback_subscription_drops_what_names_another_key(stage: Stage) -> None:
+    """As an subscription, whatever the key is."""
     key, heard = stage.keys.telemetry("eve"), SimpleQueue[bytes]()
     with Session(stage.briefs["observer"]) as session:
-        session.funnel(key, heard.put)
+        session.subscribe_with(key, heard.put)
         stage.put(key, [*foreign(stage.keys, key), enclosed(key, GOOD)])
         assert heard.get(timeout=LIMIT) == GOOD
         assert heard.empty()
@@ -160,33 +160,33 @@ def test_a_malformed_message_of_its_own_key_is_an_error(stage: Stage) -> None:
     """Bytes that name their key but are not a message are not dropped: the error names the key, and with it the sender."""
     key = stage.keys.downlink("eve")
     with Session(stage.eve) as session:
-        inbox = session.inbox(key)
+        subscription = session.subscribe(key)
         stage.put(key, [enclosed(key, b"\xc1")])
         with pytest.raises(MalformedMessage, match=f"malformed message on {key}"):
-            Reader(key, inbox.recv())
+            Reader(key, subscription.recv())
         assert session.dropped == 0
 
 
 def test_a_lost_connection_is_replaced(stage: Stage) -> None:
-    """By another session with another id, on which everything is declared again: inbox, funnel, outlet, watch and token."""
+    """By another session with another id, on which subscriptions, publisher, watch and token are declared again."""
     keys, watched, tokens = stage.keys, SimpleQueue[bool](), SimpleQueue[bool]()
-    heard, funnelled = SimpleQueue[bytes](), SimpleQueue[bytes]()
+    heard, handed_on = SimpleQueue[bytes](), SimpleQueue[bytes]()
     stage.router.declare_subscriber(keys.progress("eve"), lambda sample: heard.put(sample.payload.to_bytes()))
     token = stage.router.liveliness().declare_token(keys.alive("router"))
     stage.router.liveliness().declare_subscriber(
         keys.alive("eve"), lambda sample: tokens.put(sample.kind == zenoh.SampleKind.PUT)
     )
     with Session(stage.eve) as session:
-        inbox = session.inbox(keys.downlink("eve"))
-        session.funnel(keys.telemetry("eve"), funnelled.put)
-        put = session.outlet(keys.progress("eve"))
+        subscription = session.subscribe(keys.downlink("eve"))
+        session.subscribe_with(keys.telemetry("eve"), handed_on.put)
+        put = session.publisher(keys.progress("eve"))
         session.watch("router", watched.put)
         session.ready()
         assert watched.get(timeout=LIMIT)
         assert tokens.get(timeout=LIMIT)
         stage.put(keys.downlink("eve"), [enclosed(keys.downlink("eve"), progress(1))])
         stage.put(keys.telemetry("eve"), [enclosed(keys.telemetry("eve"), progress(0))])
-        assert funnelled.get(timeout=LIMIT) == progress(0)  # so the one before it has arrived too
+        assert handed_on.get(timeout=LIMIT) == progress(0)  # so the one before it has arrived too
         ids = {str(session.connection.session.zid())}
         for _ in range(3):
             stage.cable.flap()
@@ -197,8 +197,8 @@ def test_a_lost_connection_is_replaced(stage: Stage) -> None:
             ids.add(str(session.connection.session.zid()))
         stage.put(keys.downlink("eve"), [enclosed(keys.downlink("eve"), progress(2))])
         stage.put(keys.telemetry("eve"), [enclosed(keys.telemetry("eve"), progress(3))])
-        assert [inbox.recv(), inbox.recv()] == [progress(1), progress(2)]
-        assert funnelled.get(timeout=LIMIT) == progress(3)
+        assert [subscription.recv(), subscription.recv()] == [progress(1), progress(2)]
+        assert handed_on.get(timeout=LIMIT) == progress(3)
         until(lambda: session.reaches(keys.progress("eve")), "the reader of its progress")
         put(GOOD)
         assert heard.get(timeout=LIMIT) == enclosed(keys.progress("eve"), GOOD)
@@ -210,29 +210,29 @@ def test_a_connection_that_takes_one_key_for_another_is_replaced(stage: Stage) -
     """A message of another key makes a process open another session: nothing of the old one is trusted any more."""
     key, other = stage.keys.downlink("eve"), stage.keys.downlink("mallory")
     with Session(stage.eve) as session:
-        inbox = session.inbox(key)
+        subscription = session.subscribe(key)
 
         def renewed() -> bool:
             stage.router.put(key, enclosed(other, GOOD))
             return session.connection.openings > 1
 
-        reads = threading.Thread(target=lambda: list(inbox))
+        reads = threading.Thread(target=lambda: list(subscription))
         reads.start()
         until(renewed, "another session")
     reads.join(LIMIT)
     assert not reads.is_alive()
 
 
-def test_an_inbox_that_is_closed_says_so(stage: Stage) -> None:
+def test_a_subscription_that_is_closed_says_so(stage: Stage) -> None:
     """Nobody waits forever for what cannot arrive any more."""
     with Session(stage.eve) as session:
-        inbox = session.inbox(stage.keys.downlink("eve"))
+        subscription = session.subscribe(stage.keys.downlink("eve"))
         caught: list[Any] = []
 
         def read() -> None:
             try:
-                inbox.recv()
-            except InboxClosedError as error:
+                subscription.recv()
+            except SubscriptionClosedError as error:
                 caught.append(error)
 
         reads = threading.Thread(target=read)

@@ -136,7 +136,7 @@ def test_a_round_that_the_sensor_announces_first_begins_as_soon_as_the_conductor
         send(bench, range(16))
         before = deliveries(bench, range(16))
         announce(bench, 1, 8, 5)
-        wait_until(bench.stage.inboxes[bench.keys.uplink].empty, "a router that has read the announcement")
+        wait_until(bench.stage.queues[bench.keys.uplink].empty, "a router that has read the announcement")
         bench.stage.commands.put(Again(1, 8, {}).pack())
         send(bench, range(5, 16))
         assert deliveries(bench, range(8, 16)) == {name: some[8:] for name, some in before.items()}
@@ -254,7 +254,7 @@ def acknowledged(
             gammas.append(packets.read_delivery(Reader(*bench.downlinks[name].hear()), k, SHAPE, rows).heard.gamma)
             assert sent is None or not (gammas[-1] & ~sent).any()
         for slot in (max(k - 1, 0), k):  # one that comes twice is ignored
-            bench.stage.funnels[bench.keys.acknowledged](packets.acknowledgement(slot, gammas[0]))
+            bench.stage.callbacks[bench.keys.acknowledged](packets.acknowledgement(slot, gammas[0]))
         arrived = Reader(*Ear(bench, bench.keys.acknowledgements).hear())
         found[k] = (gammas[0], gammas[1], packets.read_acknowledgement(arrived, k, 5))
     return found

@@ -19,7 +19,7 @@ from typing import TypeVar, final
 import zenoh
 
 from evedrop.errors import EvedropError
-from evedrop.live.network.declared import Declared, Inbox, Watch
+from evedrop.live.network.declared import Declared, Subscription, Watch
 
 _AGAIN_SECONDS = 0.02, 0.25  # between attempts, the first and the longest
 _ANSWER_SECONDS = 1.0
@@ -96,7 +96,7 @@ class Connection:
             self._keeper.join(_LINGER_SECONDS)  # it may be opening a session that nobody needs any more
         _close(self.session)
         for one in self._declared:
-            if isinstance(one, Inbox):
+            if isinstance(one, Subscription):
                 one.close()
 
     def _declare(self, session: zenoh.Session, one: Declared) -> None:

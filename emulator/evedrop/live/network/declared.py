@@ -1,6 +1,6 @@
 """Publishers, subscribers and other entities that a process declares on its session, and again on each later session.
 
-The process keeps one object: it reads an inbox without a break while another subscriber replaces the inbox's own.
+The process keeps one object: it reads a subscription without a break while another subscriber replaces the subscription's own.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ class Declared(Protocol):
         """Declare it on this session; the previous session is closed."""
 
 
-class InboxClosedError(Exception):
+class SubscriptionClosedError(Exception):
     """The process has closed its connection: nothing will arrive any more."""
 
 
 @final
-class Inbox:
+class Subscription:
     """A subscription to one exact key, read in order with `recv`."""
 
     def __init__(self, key: str, dropped: Dropped, status: StatusReporter, room: int) -> None:
-        """status: of the process, which records there that it waits; room: how many messages the inbox holds."""
+        """status: of the process, which records there that it waits; room: how many messages it holds."""
         self._room = room
         self._key, self._head, self._dropped, self._status = key, head_of(key), dropped, status
         self._waits = (key,)
@@ -46,11 +46,11 @@ class Inbox:
         self._subscribers.put(session.declare_subscriber(self._key, FifoChannel(self._room)))
 
     def close(self) -> None:
-        """End the inbox: there will be no other session."""
+        """End the subscription: there will be no other session."""
         self._subscribers.put(None)
 
     def recv(self) -> bytes:
-        """The next message. Raises InboxClosedError once the connection is closed for good."""
+        """The next message. Raises SubscriptionClosedError once the connection is closed for good."""
         self._status.waits = self._waits
         payload = self._received()
         self._status.waits = ()
@@ -59,7 +59,7 @@ class Inbox:
     def take(self, most: int) -> list[bytes]:
         """Wait for the next message; then it, and those that have arrived after it, up to `most` in all.
 
-        Raises InboxClosedError as `recv` does.
+        Raises SubscriptionClosedError as `recv` does.
         """
         found = [self.recv()]
         while len(found) < most and self._subscriber is not None:
@@ -79,7 +79,7 @@ class Inbox:
             if self._subscriber is None:
                 self._subscriber = self._subscribers.get()
                 if self._subscriber is None:
-                    raise InboxClosedError(self._key)
+                    raise SubscriptionClosedError(self._key)
             try:
                 message = self._subscriber.recv().payload.to_bytes()
             except zenoh.ZError:  # its session is closed, and all messages that had arrived are read
@@ -90,13 +90,13 @@ class Inbox:
                 return payload
 
     def __iter__(self) -> Iterator[bytes]:
-        with suppress(InboxClosedError):
+        with suppress(SubscriptionClosedError):
             while True:
                 yield self.recv()
 
 
 @final
-class Funnel:
+class CallbackSubscription:
     """A subscription to one exact key; a thread of Zenoh's hands its messages on."""
 
     def __init__(self, key: str, dropped: Dropped, receive: Callable[[bytes], None]) -> None:
@@ -113,7 +113,7 @@ class Funnel:
 
 
 @final
-class Outlet:
+class Publisher:
     """A publisher for one exact key. Messages put without a connection are lost, and sent again in a later round."""
 
     def __init__(self, key: str) -> None:

@@ -26,7 +26,7 @@ class DelayedSender:
         threading.Thread(target=self._go_round, name="delayed-sender", daemon=True).start()
 
     def round(self, put: Put) -> Callable[[bytes, float], None]:
-        """An outlet that sends each message the given seconds later, but never before the previous message."""
+        """A publisher that sends each message the given seconds later, but never before the previous message."""
         last = 0.0
 
         def send(payload: bytes, seconds: float) -> None:

@@ -22,17 +22,17 @@ def most_slots(brief: AnyBrief) -> int:
 
 @final
 class Pending:
-    """Reads an inbox of packets, or of deliveries, with the barriers between them, as many messages ahead as have arrived."""
+    """Reads packets, or deliveries, and the barriers between them from a subscription, as many messages ahead as have arrived."""
 
-    def __init__(self, inbox: Received, key: str, most: int) -> None:
+    def __init__(self, subscription: Received, key: str, most: int) -> None:
         """most: how many messages to read ahead."""
-        self._inbox, self._key, self._most = inbox, key, most
+        self._subscription, self._key, self._most = subscription, key, most
         self._messages: deque[Reader] = deque()
 
     def peek(self) -> Reader:
         """The next message, which stays the next until it is taken or dropped; waits for it if need be."""
         if not self._messages:
-            self._messages.extend(Reader(self._key, payload) for payload in self._inbox.take(self._most))
+            self._messages.extend(Reader(self._key, payload) for payload in self._subscription.take(self._most))
         return self._messages[0]
 
     def drop(self) -> None:
@@ -56,5 +56,5 @@ class Pending:
         """All messages that still come, until the connection is closed."""
         while self._messages:
             yield self._messages.popleft()
-        for payload in self._inbox:
+        for payload in self._subscription:
             yield Reader(self._key, payload)

@@ -36,16 +36,16 @@ class ProcessSession(Protocol):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None: ...
 
-    def inbox(self, key: str) -> Received:
+    def subscribe(self, key: str) -> Received:
         """Subscribe to a key."""
 
-    def funnel(self, key: str, receive: Callable[[bytes], None]) -> None:
+    def subscribe_with(self, key: str, receive: Callable[[bytes], None]) -> None:
         """Subscribe to a key, with a function that takes its messages."""
 
-    def outlet(self, key: str) -> Callable[[bytes], None]:
+    def publisher(self, key: str) -> Callable[[bytes], None]:
         """A publisher for a key."""
 
-    def kept(
+    def replaying_publisher(
         self,
         key: str,
         span: int | None = None,

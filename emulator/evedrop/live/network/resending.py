@@ -20,7 +20,7 @@ from evedrop.live.protocol.codec import Reader
 
 @final
 class ReplayBuffer:
-    """An outlet that keeps the messages sent through it; thread-safe.
+    """A publisher that keeps the messages sent through it; thread-safe.
 
     span: messages older than this many slots are forgotten; None: only `forget` forgets.
     head: makes the message that precedes the resent ones, from (round, first slot that is not done, first slot that is

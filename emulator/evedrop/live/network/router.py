@@ -58,7 +58,7 @@ from evedrop.names import ACKNOWLEDGEMENTS, LEGITIMATE, ROUTER
 
 @final
 class Downlink:
-    """One receiver's link, whose fates are decided a batch of slots ahead, and its outlet."""
+    """One receiver's link, whose fates are decided a batch of slots ahead, and its publisher."""
 
     def __init__(
         self, name: str, schedule: LinkSchedule, brief: Brief[RouterPart], put: Callable[[bytes, float], None]
@@ -183,8 +183,8 @@ class AckLink:
         self._due = GapDetector(self._key, brief.flow.longest_outage)
         self.sent: SimpleQueue[bytes | None] = SimpleQueue()
         """The legitimate estimator's acknowledgements; None: the conductor sent a command that may end the waiting."""
-        session.funnel(self._key, self.sent.put)
-        self._put = session.outlet(session.keys.acknowledgements)
+        session.subscribe_with(self._key, self.sent.put)
+        self._put = session.publisher(session.keys.acknowledgements)
 
     def carry(self, k: int, sent: Flags | None, downlinks: Mapping[str, Downlink], commands: Commands) -> None:
         """Wait for the acknowledgements of slot k, and send on those that reach the sensor; sent (R,): as in `PacketExtras`.
@@ -232,14 +232,14 @@ class RouterLoop:
     def __init__(self, brief: Brief[RouterPart], session: ProcessSession) -> None:
         self._brief, self._session = brief, session
         self._shape = (len(brief.model.A), brief.trials)
-        self._uplink = Pending(session.inbox(session.keys.uplink), session.keys.uplink, most_slots(brief))
+        self._uplink = Pending(session.subscribe(session.keys.uplink), session.keys.uplink, most_slots(brief))
         self._due = GapDetector(session.keys.uplink, brief.flow.longest_outage)
-        self._put_journal = session.outlet(session.keys.journal)
+        self._put_journal = session.publisher(session.keys.journal)
         delayed_sender = DelayedSender() if brief.part.pace else None
         self._bursts: list[Burst] = []
 
-        def outlet(name: str, schedule: LinkSchedule) -> Callable[[bytes, float], None]:
-            put = session.outlet(session.keys.downlink(name))
+        def publisher(name: str, schedule: LinkSchedule) -> Callable[[bytes, float], None]:
+            put = session.publisher(session.keys.downlink(name))
             wiring = brief.part.controller
             if delayed_sender is None and wiring is not None and not self._is_waited_for(name, wiring):
                 self._bursts.append(Burst(put))
@@ -250,11 +250,11 @@ class RouterLoop:
             )
 
         self._schedules = {name: entry.schedule for name, entry in brief.part.links.items()}
-        self._outlets = {name: outlet(name, schedule) for name, schedule in self._schedules.items()}
+        self._publishers = {name: publisher(name, schedule) for name, schedule in self._schedules.items()}
         acknowledgements = brief.part.acknowledgements
         self._ack_link = AckLink(brief, session, acknowledgements) if acknowledgements is not None else None
         # A message to the router's own uplink wakes the thread that waits there: only the conductor ends a router.
-        knock = session.outlet(session.keys.uplink)
+        knock = session.publisher(session.keys.uplink)
         waiting = [] if self._ack_link is None else [self._ack_link.sent]
         self._commands = Commands(
             session, tuple(self._schedules), lambda: knock(barrier(brief.slots)), waiting, brief.flow.longest_outage
@@ -287,7 +287,7 @@ class RouterLoop:
         self._flush()  # nobody needs these messages, but they must not mix with the following ones
         self._k, self._done, self._journaled = start, done, start
         self._downlinks = {
-            name: Downlink(name, schedule, self._brief, self._outlets[name])
+            name: Downlink(name, schedule, self._brief, self._publishers[name])
             for name, schedule in self._schedules.items()
         }
         for first in range(0, start + 1, self._brief.flow.batch):

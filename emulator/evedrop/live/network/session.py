@@ -29,7 +29,7 @@ from evedrop.live.network.connecting import Credentials, RouterAddress, WaitRepo
 from evedrop.live.network.connection import Connection
 from evedrop.live.network.connection_watchdog import ConnectionWatchdog
 from evedrop.live.network.container_heartbeat import HeartbeatFile
-from evedrop.live.network.declared import Funnel, Inbox, Outlet, Question, Questions, Watch
+from evedrop.live.network.declared import CallbackSubscription, Publisher, Question, Questions, Subscription, Watch
 from evedrop.live.network.launcher_news import tell
 from evedrop.live.network.launcher_watchdog import when_launcher_is_gone
 from evedrop.live.network.listening import listening
@@ -57,7 +57,7 @@ _NEVER_MS = 86_400_000
 # Of what Zenoh sends at once. A message that waits to be read keeps the whole batch in memory that it came in.
 _BATCH_PACKETS, _LEAST_BATCH_BYTES, _LARGEST_BATCH_BYTES = 64, 1 << 14, (1 << 16) - 1
 _ANSWER_BYTES = 64 * 2**20  # for the operator
-_WINDOWS = 8  # how many windows an inbox holds: messages that were sent again in some rounds wait there, too
+_WINDOWS = 8  # how many windows a subscription holds: messages that were sent again in some rounds wait there, too
 ATTEMPT: ZenohConfig = {"open_timeout": int(_LEASE_SECONDS * 1000)}
 """Zenoh's limit of one attempt to connect again: one that a cut connection has swallowed holds up the next for so long."""
 _LOGGED = f"{LOGGED},zenoh_transport::unicast::establishment::open=off"  # the program reports a refusal itself
@@ -176,8 +176,8 @@ class Session:
             self.connection = Connection(listening(listen, brief.identity, config), None)
             if brief.ends_with_stdin:
                 tell(RouterListens(brief.process))
-        self._outlets: dict[str, Outlet] = {}
-        self._kept: list[ReplayBuffer] = []
+        self._publishers: dict[str, Publisher] = {}
+        self._replays: list[ReplayBuffer] = []
         self._commands: SimpleQueue[bytes] = SimpleQueue()
         self._rounds: SimpleQueue[Again] = SimpleQueue()
         self._slots = brief.slots
@@ -185,7 +185,7 @@ class Session:
         self._by_hand = not brief.ends_with_stdin
         # A router connects to no other process, so it is always on its network.
         self._heartbeat = HeartbeatFile((lambda: True) if brief.role in ("router", "relay") else self.linked)
-        self.funnel(self._control, self._sort_command)
+        self.subscribe_with(self._control, self._sort_command)
 
     def __enter__(self) -> Self:
         return self
@@ -202,17 +202,17 @@ class Session:
 
     def _complain(self, error: MalformedMessage | Gap) -> None:
         """Tell the observer which message cannot be read, and why; wait a moment for it to end the run."""
-        outlet = self._reporting
-        if outlet is not None and outlet.matched:
-            outlet(refusal(error.key, str(error)))
+        publisher = self._reporting
+        if publisher is not None and publisher.matched:
+            publisher(refusal(error.key, str(error)))
             with suppress(Empty):
                 self._commands.get(timeout=_HEARD_SECONDS)
 
     @property
-    def _reporting(self) -> Outlet | None:
-        """The outlet for reports to the observer, if this process has one."""
+    def _reporting(self) -> Publisher | None:
+        """The publisher for reports to the observer, if this process has one."""
         key = self.keys.journal if self._process == ROUTER else self.keys.telemetry(self._process)
-        return self._outlets.get(key)
+        return self._publishers.get(key)
 
     def _changed(self, connected: bool) -> None:
         """Handle the loss or the return of the connection."""
@@ -229,30 +229,30 @@ class Session:
         """How many messages this process has dropped because they arrived under another key than they name."""
         return self._dropped.count
 
-    def inbox(self, key: str) -> Inbox:
+    def subscribe(self, key: str) -> Subscription:
         """Subscribe to one exact key; read its messages in order with `recv`."""
-        return self.connection.declare(Inbox(key, self._dropped, self.status, self._room))
+        return self.connection.declare(Subscription(key, self._dropped, self.status, self._room))
 
-    def funnel(self, key: str, receive: Callable[[bytes], None]) -> None:
+    def subscribe_with(self, key: str, receive: Callable[[bytes], None]) -> None:
         """Subscribe to one exact key; `receive` is called on a thread of Zenoh's and must only hand the bytes on."""
-        self.connection.declare(Funnel(key, self._dropped, receive))
+        self.connection.declare(CallbackSubscription(key, self._dropped, receive))
 
-    def outlet(self, key: str) -> Callable[[bytes], None]:
+    def publisher(self, key: str) -> Callable[[bytes], None]:
         """A publisher for one exact key."""
-        self._outlets[key] = self.connection.declare(Outlet(key))
-        return self._outlets[key]
+        self._publishers[key] = self.connection.declare(Publisher(key))
+        return self._publishers[key]
 
-    def kept(
+    def replaying_publisher(
         self, key: str, span: int | None = None, head: Callable[[int, int, int], bytes] | None = None, back: int = 0
     ) -> ReplayBuffer:
         """A publisher for one exact key, whose messages are sent again after a lost connection; as in `ReplayBuffer`."""
-        kept = ReplayBuffer(self.outlet(key), span, head, back)
-        self._kept.append(kept)
-        return kept
+        replay = ReplayBuffer(self.publisher(key), span, head, back)
+        self._replays.append(replay)
+        return replay
 
     def reaches(self, key: str) -> bool:
         """Whether a key that this process publishes has a reader: such a reader has opened its session."""
-        return key in self._outlets and self._outlets[key].matched
+        return key in self._publishers and self._publishers[key].matched
 
     def asked(self, key: str, receive: Callable[[Question], None]) -> None:
         """Answer questions at one exact key; a thread of Zenoh's calls `receive`, which must only hand the question on."""
@@ -311,10 +311,10 @@ class Session:
 
     def appear(self) -> None:
         """Show that this process is present."""
-        outlet = self._reporting
-        if outlet is not None:
-            self.status.answer(outlet)
-        if self._kept:
+        publisher = self._reporting
+        if publisher is not None:
+            self.status.answer(publisher)
+        if self._replays:
             threading.Thread(target=self._send_again, name="sends-again", daemon=True).start()
         self.connection.appear(self.keys.alive(self._process))
         self._heartbeat.start()
@@ -324,15 +324,15 @@ class Session:
 
         The relay, which reports nothing, withdraws its token instead.
         """
-        outlet = self._reporting
-        if outlet is not None:
-            outlet(end_report(self.dropped))
+        publisher = self._reporting
+        if publisher is not None:
+            publisher(end_report(self.dropped))
         else:
             self.connection.disappear()
 
     def _unread(self) -> list[str]:
         """The keys that have no reader."""
-        return [key for key, outlet in self._outlets.items() if not outlet.matched]
+        return [key for key, publisher in self._publishers.items() if not publisher.matched]
 
     def _send_again(self) -> None:
         """Send messages again as asked; on a thread of its own, since the working thread may be waiting for the effect."""
@@ -341,8 +341,8 @@ class Session:
             deadline = time.monotonic() + _HEARD_SECONDS
             while self._unread() and time.monotonic() < deadline:
                 time.sleep(_POLL_SECONDS)
-            for kept in self._kept:
-                kept.again(asked.round, asked.slot)
+            for replay in self._replays:
+                replay.again(asked.round, asked.slot)
 
     def _sort_command(self, payload: bytes) -> None:
         """Sort the conductor's commands; a malformed one is left to the reader of the commands, which raises the error."""
@@ -356,7 +356,7 @@ class Session:
                 case ReportStatus():
                     self.status.request()
                     return
-                case Again() as asked if self._kept:
+                case Again() as asked if self._replays:
                     self._rounds.put(asked)
                     return
         self._commands.put(payload)

@@ -69,7 +69,7 @@ class Conductor:
         self.keys.update({name: keys.telemetry(name) for name in reporters})
         self._news = Mailbox(self.keys, session.allowance, clock)
         for source, key in self.keys.items():
-            session.funnel(key, partial(self._news.put, source))
+            session.subscribe_with(key, partial(self._news.put, source))
         for name in self._present:
             session.watch(name, partial(self._news.put, name))
         self.misdelivered: dict[str, int] = {}
@@ -79,8 +79,8 @@ class Conductor:
         self.questions: SimpleQueue[Question] = SimpleQueue()
         """The operator's questions."""
         session.asked(keys.control(OBSERVER), self.questions.put)
-        self._commands = {name: session.outlet(keys.control(name)) for name in self._present}
-        self._progress = session.outlet(keys.progress(OBSERVER))
+        self._commands = {name: session.publisher(keys.control(name)) for name in self._present}
+        self._progress = session.publisher(keys.progress(OBSERVER))
 
     @property
     def missing(self) -> list[str]:
