@@ -314,7 +314,7 @@ def test_a_lack_of_workers_is_said_and_the_first_worker_begins(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """One line with the command that starts a worker, once; the task waits for it."""
-    for name in ("LONELY", "WORKERS", "LOOK"):
+    for name in ("LONELY", "WORKERS", "POLL"):
         monkeypatch.setattr(f"evedrop.simulate.cluster._{name}_SECONDS", 0.01)
     told: list[str] = []
 
