@@ -67,6 +67,18 @@ def same(one: Fates, other: Fates) -> bool:
 
 
 @pytest.mark.parametrize("name", SCHEDULES)
+def test_a_link_like_another_is_one_of_its_own(name: str) -> None:
+    """With other keys it has their fates, whatever becomes of the link that it was made from, and the other way round."""
+    schedule, batch = SCHEDULES[name], Batch(70, 6, 3)
+    keys = {stream: stream_key(root_of_seed(78), stream) for stream in streams_of("it", schedule)}
+    first = link(schedule, batch)
+    second = first.like(keys)
+    expected = Link(schedule, "it", keys, batch).fates(range(70))
+    assert same(first.fates(range(70)), link(schedule, batch).fates(range(70)))
+    assert same(second.fates(range(70)), expected)
+
+
+@pytest.mark.parametrize("name", SCHEDULES)
 def test_bits_do_not_depend_on_pieces_or_on_the_batch(name: str) -> None:
     """However slots are asked for, and alone or among others, a trial's packets have the same fates."""
     schedule, batch = SCHEDULES[name], Batch(70, 6, 3)
