@@ -132,7 +132,7 @@ def feed(joiner: Joiner, sender: str, start: int, stop: int) -> None:
 def in_turns(order: tuple[str, ...]) -> Iterator[tuple[str, int, int]]:
     """All messages: one of each sender, then the second of each, and so on."""
     pairs = {sender: list(pairwise(CUTS[sender])) for sender in order}
-    for turn in range(max(len(one) for one in pairs.values())):
+    for turn in range(max(map(len, pairs.values()))):
         for sender in order:
             if turn < len(pairs[sender]):
                 yield (sender, *pairs[sender][turn])
@@ -155,9 +155,9 @@ def test_every_number_is_joined_in_its_place(messages: list[tuple[str, int, int]
         feed(joiner, sender, start, stop)
         ends[sender] = stop
         while (slots := joiner.take_slots()) is not None:
-            assert slots.first == sum(one.count for one in joined)
+            assert slots.first == sum(part.count for part in joined)
             joined.append(slots)
-        assert joiner.done == min(ends.values()) == sum(one.count for one in joined)
+        assert joiner.done == min(ends.values()) == sum(part.count for part in joined)
         assert (joiner.sent, joiner.journaled) == (ends["truth"], ends["journal"])
         assert joiner.places(["eve", "legitimate"]) == {
             "sensor": ends["truth"],
@@ -166,24 +166,24 @@ def test_every_number_is_joined_in_its_place(messages: list[tuple[str, int, int]
             "legitimate": ends["legitimate"],
         }
     for name in ("x", "nu", "sent", "alarms", "true"):
-        assert np.array_equal(np.concatenate([getattr(one, name) for one in joined]), getattr(TRUTH, name)), name
-    inputs = [one.inputs for one in joined if one.inputs is not None]
-    monitored = [one.monitored for one in inputs if one.monitored is not None]
+        assert np.array_equal(np.concatenate([getattr(slots, name) for slots in joined]), getattr(TRUTH, name)), name
+    inputs = [slots.inputs for slots in joined if slots.inputs is not None]
+    monitored = [slots.monitored for slots in inputs if slots.monitored is not None]
     for name, parts in (("u", inputs), ("failed", inputs), ("statistic", monitored), ("watermark", monitored)):
-        assert np.array_equal(np.concatenate([getattr(one, name) for one in parts]), getattr(TRUTH, name)), name
+        assert np.array_equal(np.concatenate([getattr(part, name) for part in parts]), getattr(TRUTH, name)), name
     for name in WINDOWS:
-        check_receiver(name, [one.receivers[name] for one in joined])
+        check_receiver(name, [slots.receivers[name] for slots in joined])
 
 
 def check_receiver(name: str, joined: list[ReceiverSlots]) -> None:
     """Check one receiver's columns against its report and the journal."""
-    said, account = REPORTS[name], ACCOUNTS[name]
+    reported, account = REPORTS[name], ACCOUNTS[name]
 
     def whole(column: str) -> np.ndarray:
-        return np.concatenate([getattr(one, column) for one in joined])
+        return np.concatenate([getattr(slots, column) for slots in joined])
 
     for column in ("x_hat", "action", "P", "trace"):
-        assert np.array_equal(whole(column), getattr(said, column)), column
+        assert np.array_equal(whole(column), getattr(reported, column)), column
     assert np.array_equal(whole("delivered"), account.delivered)
     bare = {"report": slice(BARE, 48 if name == "legitimate" else 60), "journal": slice(BARE, 90)}
     unsent = account.unsent
@@ -192,21 +192,21 @@ def check_receiver(name: str, joined: list[ReceiverSlots]) -> None:
         counts = account.lost[reason].copy()
         if reason == "lost":
             counts[bare["journal"]] += unsent[bare["journal"]]
-        assert np.array_equal(np.concatenate([one.lost[reason] for one in joined]), counts), reason
+        assert np.array_equal(np.concatenate([slots.lost[reason] for slots in joined]), counts), reason
     for column, source, of in (
-        ("late", said.late, "report"),
-        ("late_used", said.late_used, "report"),
+        ("late", reported.late, "report"),
+        ("late_used", reported.late_used, "report"),
         ("late_delivered", account.late, "journal"),
     ):
         if source is None:
-            assert {getattr(one, column) for one in joined} == {None}, column
+            assert {getattr(slots, column) for slots in joined} == {None}, column
             continue
         wanted = source.copy()
         wanted[bare[of]] = 0
         assert np.array_equal(whole(column), wanted), column
     counted = unsent.copy()
     counted[bare["journal"]] = 0
-    parts = [np.zeros(len(one.x_hat), np.uint32) if one.unsent is None else one.unsent for one in joined]
+    parts = [np.zeros(len(slots.x_hat), np.uint32) if slots.unsent is None else slots.unsent for slots in joined]
     assert np.array_equal(np.concatenate(parts), counted)
 
 
@@ -216,11 +216,11 @@ def test_digests_and_sums_are_those_of_all_blocks() -> None:
     for name in WINDOWS:
         for start, stop in pairwise(CUTS[name]):
             feed(joiner, name, start, stop)
-        said = REPORTS[name]
-        assert {block: one.tobytes() for block, one in joiner.digests[name].items()} == {
-            block: one.tobytes() for block, one in said.digests.items()
+        reported = REPORTS[name]
+        assert {block: digest.tobytes() for block, digest in joiner.digests[name].items()} == {
+            block: digest.tobytes() for block, digest in reported.digests.items()
         }
-        assert np.array_equal(joiner.trace_sums[name], said.trace_sums[0] + said.trace_sums[256])
+        assert np.array_equal(joiner.trace_sums[name], reported.trace_sums[0] + reported.trace_sums[256])
     assert set(joiner.trace_sums) == set(WINDOWS)
 
 

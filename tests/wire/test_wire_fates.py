@@ -104,7 +104,7 @@ def test_keys_that_share_a_law_have_fates_of_their_own(changes: tuple[Change, ..
     """However they come in turns: no key's losses go on with the memory of another one."""
     law = KeyLaw(wire_link(FULL), SEED, changes)
     shared = [of_scan(FULL, key=f"robot/{n}", law=law) for n in range(4)]
-    in_turn = list(zip(*([one.next() for one in shared] for _ in range(100)), strict=True))
+    in_turn = list(zip(*([fates.next() for fates in shared] for _ in range(100)), strict=True))
     assert [list(fates) for fates in in_turn] == [
         taken(of_scan(FULL, key=f"robot/{n}", changes=changes), 100) for n in range(4)
     ]

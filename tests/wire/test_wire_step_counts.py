@@ -29,7 +29,7 @@ def test_steps_hold_the_messages_of_their_time() -> None:
     rows = traffic(robot_plan(), 20.0, {"scan": 200.0, "command": 20.0, "listener": 50.0}, (5.0, 7.0))
     for pieces in (1, 7, 300):
         steps = counted(np.array_split(rows, pieces))
-        counts = np.concatenate([one.counts for one in steps])
+        counts = np.concatenate([step.counts for step in steps])
         assert [one.first for one in steps] == np.cumsum([0, *(len(one.counts) for one in steps)])[:-1].tolist()
         assert len(counts) == 200
         for link in range(3):
@@ -112,7 +112,7 @@ def test_a_fate_may_change_afterwards() -> None:
         steps += [*counter.close(START + 0.5)] if closed else []
         counter.amend(row, WireFate.UNDERWAY)
         steps += [*counter.finish()]
-        counts = np.concatenate([one.counts for one in steps])
+        counts = np.concatenate([step.counts for step in steps])
         total, of_new = counts.sum((0, 1)), counts[:, 0, OUTCOMES.index(WireFate.UNDERWAY)]
         own = int((row["time"][0] - START) / STEP)
         assert np.flatnonzero(of_new).tolist() == [5 if closed else own]

@@ -124,7 +124,7 @@ def test_changes_and_cuts_are_part_of_the_law(tmp_path: Path) -> None:
 
 
 def test_gaps_of_a_wire_have_first_fates_and_those_of_its_journal_the_last_ones(tmp_path: Path) -> None:
-    """As docs/wire.md says of the summary; counts and rate are the same in both."""
+    """A running wire's summary and its journal may differ in gaps (docs/wire.md), but never in counts or in the rate."""
     plan = wire_plan(link=BURSTS)
     (tmp_path / WIRE_FILE).write_text(resolved_wire(plan))
     with WireJournal(tmp_path, plan) as journal:

@@ -39,7 +39,7 @@ def check_stream(rows: list[tuple[int, int]], records: Records, sizes: list[int]
             time, n, fate = (records[name][first].item() for name in ("time", "n", "fate"))
             stream.add_one(time, n, fate, True)
         first, turn = first + max(size, 1), turn + 1
-    pairs = [(float(one["time"]), one["fate"] == 0) for one in records]
+    pairs = [(float(record["time"]), record["fate"] == 0) for record in records]
     assert (stream.longest, stream.silence) == by_hand(pairs)
     decided = [n for n, (_, fate) in enumerate(rows) if fate in {0, 1}]
     assert [n for start, stop in stream.ranges for n in range(start, stop)] == decided

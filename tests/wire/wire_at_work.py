@@ -78,7 +78,7 @@ class WireAtWork:
         rows = self.rows
         if link_name is not None:
             rows = rows[rows["link"] == self.relay.links[link_name].link.number]
-        return [WireFate(one) for one in rows["fate"].tolist()]
+        return [WireFate(fate) for fate in rows["fate"].tolist()]
 
     def when_heard(self, count: int) -> list[WireFate]:
         """The fates, once there are that many."""

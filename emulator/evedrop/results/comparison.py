@@ -353,57 +353,57 @@ def read_comparison(folder: Path) -> Comparison:
         raise UsageError(f"{path} is not a comparison of this version ({why}); run it again") from error
 
 
-def _comparison(found: Mapping[str, Any]) -> Comparison:
+def _comparison(data: Mapping[str, Any]) -> Comparison:
     return Comparison(
-        found["scenario"],
-        int(found["slots"]),
-        int(found["trials"]),
-        int(found["seed"]),
-        int(found["first_trial"]),
-        tuple(found["adversaries"]),
+        data["scenario"],
+        int(data["slots"]),
+        int(data["trials"]),
+        int(data["seed"]),
+        int(data["first_trial"]),
+        tuple(data["adversaries"]),
         {
-            name: _scheme(name, one, (int(found["slots"]), int(found["trials"])))
-            for name, one in found["schemes"].items()
+            name: _scheme(name, table, (int(data["slots"]), int(data["trials"])))
+            for name, table in data["schemes"].items()
         },
-        {name: tuple(why) for name, why in found["left_out"].items()},
+        {name: tuple(why) for name, why in data["left_out"].items()},
     )
 
 
-def _scheme(name: str, found: Mapping[str, Any], size: tuple[int, int]) -> SchemeResult:
-    needs = {key: value for key, value in found["needs"].items() if key != "packet_bits"}
+def _scheme(name: str, data: Mapping[str, Any], size: tuple[int, int]) -> SchemeResult:
+    needs = {key: value for key, value in data["needs"].items() if key != "packet_bits"}
     return SchemeResult(
         name,
-        found["parameters"],
+        data["parameters"],
         TypeAdapter(Needs).validate_python(needs),
-        _simulated_error(found["legitimate"]),
-        {adversary: _cell(name, adversary, one, size) for adversary, one in found["against"].items()},
-        None if found["leak"] is None else TypeAdapter(PacketLeak).validate_python(found["leak"]),
+        _simulated_error(data["legitimate"]),
+        {adversary: _cell(name, adversary, table, size) for adversary, table in data["against"].items()},
+        None if data["leak"] is None else TypeAdapter(PacketLeak).validate_python(data["leak"]),
     )
 
 
-def _cell(scheme: str, adversary: str, found: Mapping[str, Any], size: tuple[int, int]) -> Cell:
-    if "verdict" not in found:
-        return Cell(Match(scheme, adversary, not_defined=found["not_defined"]))
-    match = Match(scheme, adversary, found["reads_as"], found["attack"], betrayed=bool(found["betrayed"]))
-    said = TypeAdapter(SecrecySummary).validate_python(found["secrecy"])
-    first = found["secrecy"]["ratio_from"]  # results of an older version have none, and are refused
+def _cell(scheme: str, adversary: str, data: Mapping[str, Any], size: tuple[int, int]) -> Cell:
+    if "verdict" not in data:
+        return Cell(Match(scheme, adversary, not_defined=data["not_defined"]))
+    match = Match(scheme, adversary, data["reads_as"], data["attack"], betrayed=bool(data["betrayed"]))
+    summary = TypeAdapter(SecrecySummary).validate_python(data["secrecy"])
+    first = data["secrecy"]["ratio_from"]  # results of an older version have none, and are refused
     secrecy = Secrecy(
         match.receiver,
-        Verdict(said.relative),
-        Verdict(said.perfect),
-        said.relative_by_theory,
-        said.relative_from,
+        Verdict(summary.relative),
+        Verdict(summary.perfect),
+        summary.relative_by_theory,
+        summary.relative_from,
         "",
-        said.perfect_by_theory,
-        math.inf if said.ratio is None else said.ratio,
+        summary.perfect_by_theory,
+        math.inf if summary.ratio is None else summary.ratio,
         size[1],
-        said.judged_by,
-        ratio_error=said.ratio_standard_error,
-        leak=said.leak,
+        summary.judged_by,
+        ratio_error=summary.ratio_standard_error,
+        leak=summary.leak,
         ratio_slots=None if first is None else (first, size[0] - 1),
     )
-    return Cell(match, _simulated_error(found["legitimate"]), _simulated_error(found["eavesdropper"]), secrecy)
+    return Cell(match, _simulated_error(data["legitimate"]), _simulated_error(data["eavesdropper"]), secrecy)
 
 
-def _simulated_error(found: Mapping[str, Any]) -> SimulatedError:
-    return TypeAdapter(SimulatedError).validate_python(found)
+def _simulated_error(data: Mapping[str, Any]) -> SimulatedError:
+    return TypeAdapter(SimulatedError).validate_python(data)

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from evedrop.results.folder import make_private, private_opener, replace_private
 from evedrop.results.tables import NULLABLE
+from evedrop.system.files import write_all
 
 UNFINISHED = "unfinished"
 """The folder inside a results folder that contains unfinished tables."""
@@ -171,8 +172,7 @@ class Unfinished:
         before()
         tables = {name: (stream.file, stream.rows) for name, stream in streams.items()}
         line = json.dumps({"at": at, "slots": slots, "tables": tables}).encode() + b"\n"
-        if os.write(self._rounds, line) != len(line):
-            raise OSError(28, os.strerror(28), _ROUNDS)  # ENOSPC: only a full disk accepts part of a line
+        write_all(self._rounds, line, _ROUNDS)
 
     def close(self) -> None:
         """Release the lock; the files stay."""

@@ -8,10 +8,9 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping
-from itertools import groupby
 
 from evedrop.errors import UsageError
-from evedrop.names import KERNELS_VARIABLE
+from evedrop.names import KERNELS_VARIABLE, RELAY, ROUTER
 
 _NEEDED = frozenset(
     {
@@ -67,7 +66,7 @@ _PASSES_ON = (
 
 def lock_step_environment(role: str) -> dict[str, str]:
     """For a process whose messages come one by one: few threads of Zenoh, since each message must wake each of them."""
-    return {"ZENOH_RUNTIME": _PASSES_ON if role in {"router", "relay"} else _CLIENT}
+    return {"ZENOH_RUNTIME": _PASSES_ON if role in {ROUTER, RELAY} else _CLIENT}
 
 
 _THREADS = "(?:(?:worker|max_blocking)_threads *: *[0-9]{1,9}|handover *: *(?:rx|tx|net|acc|app))"
@@ -89,8 +88,8 @@ def check_zenoh_runtime() -> None:
 def _names_twice(given: str) -> bool:
     """Whether a well-formed value names a part twice, or an entry of a part."""
     parts = re.findall(r"(\w+) *: *\(([^)]*)\)", given)
-    names = [sorted(name for name, _ in parts), *(sorted(re.findall(r"(\w+) *:", inside)) for _, inside in parts)]
-    return any(len([*same]) > 1 for some in names for _, same in groupby(some))
+    names = [[name for name, _ in parts], *(re.findall(r"(\w+) *:", inside) for _, inside in parts)]
+    return any(len({*some}) < len(some) for some in names)
 
 
 def viewer_environment() -> Mapping[str, str]:

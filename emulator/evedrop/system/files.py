@@ -6,6 +6,7 @@ stops as soon as it has read more than its limit, and reports the limit.
 
 from __future__ import annotations
 
+import errno
 import gzip
 import io
 import os
@@ -160,6 +161,12 @@ def whole_file(path: Path) -> Iterator[Path]:
         raise UsageError(f"{path} cannot be written ({error.strerror or error}); give another file") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_all(file: int, data: bytes, path: object = None) -> None:
+    """Write bytes to a file's end, all of them or, on a full disk, perhaps some. Raises OSError, for `path`."""
+    if os.write(file, data) != len(data):  # only a full disk accepts a part
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path)
 
 
 def _mask() -> int:

@@ -21,6 +21,7 @@ from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.links import LOSS_MODELS
 from evedrop.model.slot.link import NEVER, Change
 from evedrop.scenario.table import model_mistakes
+from evedrop.system.files import write_all
 from evedrop.wire.advanced import numbered_as
 from evedrop.wire.plan import WirePlan
 
@@ -115,11 +116,11 @@ class WireHistory:
 
     def changes_of(self, link: str, key: str, kind: str) -> tuple[Change, ...]:
         """The settings of a stream's messages: the first from message 0 on, then the changes. For `KeyFates`."""
-        stream, known = (numbered_as(key), kind), self._settings.get(link, [])
-        if any(stream in one.since for one in known):
-            return _changes((one.since.get(stream, 0), one.settings) for one in known)
+        stream, versions = (numbered_as(key), kind), self._settings.get(link, [])
+        if any(stream in version.since for version in versions):
+            return _changes((version.since.get(stream, 0), version.settings) for version in versions)
         if link not in self._of_new_keys:
-            self._of_new_keys[link] = _changes((0, one.settings) for one in known)
+            self._of_new_keys[link] = _changes((0, version.settings) for version in versions)
         return self._of_new_keys[link]
 
     def expect_laws(self) -> None:
@@ -149,9 +150,11 @@ class WireHistory:
         with os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600), "r+b", buffering=0) as file:
             whole = file.readall().rfind(b"\n") + 1
             file.truncate(whole)  # a line that was torn must not begin this one
-            if file.write(line) != len(line):
+            try:
+                write_all(file.fileno(), line, str(path))
+            except OSError:
                 file.truncate(whole)
-                raise OSError(28, os.strerror(28), str(path))  # ENOSPC: only a full disk accepts part of a line
+                raise
         self._take(json.loads(line))
 
     def _take(self, entry: Mapping[str, Any]) -> None:

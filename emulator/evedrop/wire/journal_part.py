@@ -22,6 +22,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from evedrop.results.folder import private_replacement
+from evedrop.system.files import write_all
 from evedrop.wire.record import AGAIN, HELD, RECORD, UNLINKED, Kind, WireFate
 
 Records = NDArray[Any]
@@ -31,7 +32,7 @@ STORED = 1
 _POPULATE = getattr(mmap, "MAP_POPULATE", 0)
 
 REASONS: dict[WireFate, str] = {
-    one: "loss" if one is WireFate.LOST else one.name.lower() for one in WireFate if one is not WireFate.DELIVERED
+    fate: "loss" if fate is WireFate.LOST else fate.name.lower() for fate in WireFate if fate is not WireFate.DELIVERED
 }
 """The reason for each fate, as it is called in tables."""
 _FATES = {reason: int(fate) for fate, reason in REASONS.items()}
@@ -147,10 +148,8 @@ def mapped_end(file: int, start: int, length: int, *, populate: bool = False) ->
     """
     if hasattr(os, "posix_fallocate"):  # not on macOS
         os.posix_fallocate(file, start, length)
-    else:
-        lacking = start + length - os.fstat(file).st_size
-        if lacking > 0 and os.pwrite(file, bytes(lacking), start + length - lacking) != lacking:
-            raise OSError(28, os.strerror(28))  # ENOSPC: only a full disk accepts part of it
+    elif (lacking := start + length - os.lseek(file, 0, os.SEEK_END)) > 0:
+        write_all(file, bytes(lacking))
     return mmap.mmap(file, length, flags=mmap.MAP_SHARED | (_POPULATE if populate else 0), offset=start)
 
 

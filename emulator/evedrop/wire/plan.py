@@ -5,7 +5,7 @@ Source: docs/wire.md, the file.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -77,14 +77,11 @@ class WireLink:
 
         The history of an advanced publisher, `KEY/@adv/…`, goes where its key goes.
         """
-        if self.expression.intersects(key):
-            return True
-        published = published_key(str(key))
-        return published is not None and self.expression.intersects(zenoh.KeyExpr(published))
+        return any(self.expression.intersects(each) for each in _with_published(key))
 
     def takes_all(self, key: zenoh.KeyExpr) -> bool:
         """Whether all messages with this key, which may contain wildcards, are this link's."""
-        return any(self.expression.includes(one) for one in _with_published(key))
+        return any(self.expression.includes(each) for each in _with_published(key))
 
 
 @dataclass(frozen=True)
@@ -144,7 +141,7 @@ class WirePlan:
         """Whether messages with this key are never lost: it is named, or it is `KEY/@adv/…` and KEY is named."""
         if not self.lossless:
             return False
-        return any(one.includes(each) for one in self._never_lost for each in _with_published(key))
+        return any(lossless.includes(each) for each in _with_published(key) for lossless in self._never_lost)
 
     @cached_property
     def _between(self) -> Mapping[tuple[str, str], tuple[WireLink, ...]]:
@@ -157,7 +154,8 @@ class WirePlan:
         return tuple(map(zenoh.KeyExpr, self.lossless))
 
 
-def _with_published(key: zenoh.KeyExpr) -> tuple[zenoh.KeyExpr, ...]:
+def _with_published(key: zenoh.KeyExpr) -> Iterator[zenoh.KeyExpr]:
     """The key; and KEY as well if it is the history of an advanced publisher, `KEY/@adv/…`."""
-    published = published_key(str(key))
-    return (key,) if published is None else (key, zenoh.KeyExpr(published))
+    yield key
+    if (published := published_key(str(key))) is not None:
+        yield zenoh.KeyExpr(published)

@@ -47,22 +47,21 @@ def announce(bench: MemoryBench, number: int, done: int, first: int) -> None:
 
 def deliveries(bench: MemoryBench, slots: range) -> dict[str, list[bytes]]:
     """The next deliveries to each receiver, which must be of these slots."""
-    found = {name: [ear.hear()[1] for _ in slots] for name, ear in bench.downlinks.items()}
-    for name, payloads in found.items():
+    heard = {name: [ear.hear()[1] for _ in slots] for name, ear in bench.downlinks.items()}
+    for name, payloads in heard.items():
         assert [Reader(name, payload).integer("k") for payload in payloads] == [*slots]
-    return found
+    return heard
 
 
 def journals(bench: MemoryBench, start: int, stop: int, windows: Mapping[str, int]) -> dict[int, telemetry.Journal]:
     """First slot → journal, of the next journals, which must cover these slots."""
-    found = {}
+    heard = {}
     while start < stop:
         message = Reader(*bench.journal.hear())
-        one = telemetry.read_journal(message, start, windows, telemetry.Extent(SLOTS, BATCH, *SHAPE))
-        found[start] = one
-        start += one.count
+        heard[start] = telemetry.read_journal(message, start, windows, telemetry.Extent(SLOTS, BATCH, *SHAPE))
+        start += heard[start].count
     assert start == stop
-    return found
+    return heard
 
 
 def same_fates(journal: telemetry.Journal, other: telemetry.Journal, rows: slice) -> None:
@@ -88,7 +87,9 @@ def test_packets_that_are_sent_again_have_the_same_fates(done: int, restarted: b
         send(bench, range(SLOTS))
         before = deliveries(bench, range(SLOTS))
         wanted = journals(bench, 0, SLOTS, WINDOWS)
-        assert any(packets.read_delivery(Reader("d", one), k, SHAPE).late for k, one in enumerate(before["legitimate"]))
+        assert any(
+            packets.read_delivery(Reader("d", payload), k, SHAPE).late for k, payload in enumerate(before["legitimate"])
+        )
         if not restarted:
             check_round(bench, done, before, wanted)
     if restarted:
@@ -105,14 +106,14 @@ def check_round(
     announce(bench, 1, done, first)
     send(bench, range(first, SLOTS))
     assert deliveries(bench, range(done, SLOTS)) == {name: all_of[done:] for name, all_of in before.items()}
-    found = journals(bench, done, SLOTS, WINDOWS)
-    for start, journal in found.items():
+    journaled = journals(bench, done, SLOTS, WINDOWS)
+    for start, journal in journaled.items():
         if start in wanted:
             assert journal.pack() == wanted[start].pack()
         else:  # the first slot that is not done is in the middle of a batch
             batch = start - start % BATCH
             same_fates(journal, wanted[batch], slice(start - batch, BATCH))
-    assert any(link.bursts[BATCH:].any() for journal in found.values() for link in journal.links.values())
+    assert any(link.bursts[BATCH:].any() for journal in journaled.values() for link in journal.links.values())
 
 
 def test_packets_before_a_round_that_the_conductor_wants_are_ignored() -> None:
@@ -181,7 +182,7 @@ def test_a_barrier_is_passed_on_and_a_changed_link_is_changed_from_there_on(kept
         for k, payload in enumerate(after["eve"], at):
             assert not packets.read_delivery(Reader("d", payload), k, SHAPE).heard.gamma.any()
         wanted = journals(bench, at, 40, WINDOWS)
-        assert {int(one.links["eve"].lost["cut"].min()) for one in wanted.values()} == {5}
+        assert {int(journal.links["eve"].lost["cut"].min()) for journal in wanted.values()} == {5}
         if kept:
             check_later(bench, done, {}, after)
     if not kept:
@@ -214,12 +215,12 @@ def test_who_is_away_gets_neither_deliveries_nor_barriers() -> None:
             for _ in range(count):
                 message = Reader(*bench.downlinks[name].hear())
                 heard[name].append((packets.is_barrier(message), message.integer("k")))
-        found = journals(bench, 0, 24, WINDOWS)
+        journaled = journals(bench, 0, 24, WINDOWS)
     marks = {name: [k for barrier, k in all_of if barrier] for name, all_of in heard.items()}
     assert marks == {"legitimate": [10, 15, 20, 24], "eve": [10, 24]}
     slots = {name: [k for barrier, k in all_of if not barrier] for name, all_of in heard.items()}
     assert slots == {"legitimate": [*range(24)], "eve": [*range(10), *range(20, 24)]}
-    down = np.concatenate([one.links["eve"].lost["down"] for one in found.values()])
+    down = np.concatenate([journal.links["eve"].lost["down"] for journal in journaled.values()])
     assert down.tolist() == [5 if k in away else 0 for k in range(24)]
 
 
@@ -242,7 +243,7 @@ def acknowledged(
     A scheme without a header is silent in some trials of each slot. Returns slot → the trials in which the legitimate estimator
     received, those in which eve did, and the acknowledgements that come.
     """
-    rows, found = bench.brief.model.header, {}
+    rows, carried = bench.brief.model.header, {}
     for k in slots:
         sent = None if rows else (np.arange(5) + k) % 3 > 0
         header = np.zeros((rows, 5), np.int64) if rows else None
@@ -256,8 +257,8 @@ def acknowledged(
         for slot in (max(k - 1, 0), k):  # one that comes twice is ignored
             bench.stage.callbacks[bench.keys.acknowledged](packets.acknowledgement(slot, gammas[0]))
         arrived = Reader(*Ear(bench, bench.keys.acknowledgements).hear())
-        found[k] = (gammas[0], gammas[1], packets.read_acknowledgement(arrived, k, 5))
-    return found
+        carried[k] = (gammas[0], gammas[1], packets.read_acknowledgement(arrived, k, 5))
+    return carried
 
 
 def channel(attack: str, quality: float) -> dict[str, Any]:
@@ -288,5 +289,5 @@ def test_a_restarted_router_lets_the_same_acknowledgements_through(scheme: str) 
             first = max(0, done - history)
             announce(other, 1, done, first)
             again = acknowledged(other, range(first, 40), done)
-        for k, found in again.items():
-            assert all(np.array_equal(one, wanted) for one, wanted in zip(found, before[k], strict=True)), (done, k)
+        for k, flags in again.items():
+            assert all(np.array_equal(*pair) for pair in zip(flags, before[k], strict=True)), (done, k)
