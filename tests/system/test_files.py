@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from evedrop.errors import UsageError
-from evedrop.system.files import whole_file
+from evedrop.system.files import whole_file, write_all
 
 
 def test_a_file_appears_when_it_is_complete(tmp_path: Path) -> None:
@@ -25,6 +25,21 @@ def test_a_file_appears_when_it_is_complete(tmp_path: Path) -> None:
     assert link.is_symlink()
     assert path.stat().st_mode & 0o777 == 0o640
     assert sorted(tmp_path.iterdir()) == [path, link]
+
+
+def test_a_line_of_which_only_a_part_fits_is_an_error(tmp_path: Path) -> None:
+    """A pipe that nobody reads has only so much room, as a full disk has."""
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    try:
+        write_all(writing, b"whole\n")
+        assert os.read(reading, 100) == b"whole\n"
+        with pytest.raises(OSError, match="No space left") as caught:
+            write_all(writing, bytes(2**22), tmp_path)
+    finally:
+        os.close(reading)
+        os.close(writing)
+    assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, tmp_path)
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), ValueError("no")])

@@ -61,7 +61,8 @@ def test_words_of_any_length_and_number_are_kept(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr("evedrop.wire.journal_words._ROOM", mmap.ALLOCATIONGRANULARITY)
     words = JournalWords(tmp_path, 1, lambda _: None)
     keys = {words.key_code(key): key for n in range(300) for key in (f"key/{n}", f"{n}/{'ö' * 40 * n}")}
-    assert len(keys) == 600
+    keys[words.key_code("last")] = "last"  # after which the file has room for more
+    assert len(keys) == 601
     assert words_in(tmp_path, 1, LINKS) == Words(LINKS, keys, {})
     words.close()
     assert words_in(tmp_path, 1, LINKS) == Words(LINKS, keys, {})

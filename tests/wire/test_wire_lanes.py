@@ -120,12 +120,15 @@ def test_other_settings_hold_from_the_next_message_on(tmp_path: Path) -> None:
 
 def test_a_key_that_comes_after_a_change_has_the_new_settings_alone(lossy: LinkState) -> None:
     """From its first message on, each time that the settings change; the keys before it had others."""
-    expected = []
-    for n, settings in enumerate([lossy.link.settings, DEAD, PERFECT]):
+    some = {WireFate.LOST, WireFate.DELIVERED}
+    before = lossy.link.settings
+    changes = [(before, some), (DEAD, {WireFate.LOST}), (PERFECT, {WireFate.DELIVERED}), (before, some)]
+    for n, (settings, fates) in enumerate(changes):
         lossy.change(settings)
-        expected.append(KeyFates(link("robot", "base", settings), f"key/{n}", "put", 7).next()[0])
-        assert lossy.lane("put", f"key/{n}", lossless=False)(float(n), 1)[1] == expected[-1]
-    assert expected[1:] == [WireFate.LOST, WireFate.DELIVERED]
+        keys = [f"key/{n}/{at}" for at in range(20)]
+        expected = [KeyFates(link("robot", "base", settings), key, "put", 7).next()[0] for key in keys]
+        assert [lossy.lane("put", key, lossless=False)(float(n), 1)[1] for key in keys] == expected
+        assert {*expected} == fates
 
 
 def test_two_who_ask_for_a_key_share_its_messages(lossy: LinkState) -> None:
