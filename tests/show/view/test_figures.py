@@ -75,22 +75,22 @@ def test_every_figure_is_drawn(name: str, request: pytest.FixtureRequest) -> Non
 
 
 def test_numbers_are_judged(report: Path) -> None:
-    """The table says agree or erratum for each number of the paper, with a reason for the latter."""
+    """The table says agrees or erratum for each number of the paper, with a reason for the latter."""
     rows = [
         [cell.strip() for cell in line.strip("|").split("|")]
         for line in report.read_text(encoding="utf-8").splitlines()
         if line.startswith(("| numerical illustration |", "| microgrid |"))
     ]
-    verdicts = {(row[1], row[2]): row[4] for row in rows}
-    assert verdicts[("ρ(A)", "1.3878")] == "agree"
-    assert verdicts[("legitimate stability bound", "0.5342")] == "agree"
-    assert verdicts[("upper end of perfect secrecy, μ_e = 0.85", "0.5656")] == "agree"
-    assert verdicts[("slots in a day of one-second slots", "86400")] == "agree"
+    verdicts = {(row[1], row[2]): row[5] for row in rows}
+    assert verdicts[("ρ(A)", "1.3878")] == "agrees"
+    assert verdicts[("legitimate stability bound", "0.5342")] == "agrees"
+    assert verdicts[("upper end of perfect secrecy, μ_e = 0.85", "0.5656")] == "agrees"
+    assert verdicts[("slots in a day of one-second slots", "86400")] == "agrees"
     errata = {what: verdict for what, verdict in verdicts.items() if verdict.startswith("erratum: ")}
     assert len(errata) == 7
     assert all(len(verdict) > 30 for verdict in errata.values())
-    assert sum(verdict == "agree" for verdict in verdicts.values()) == 5
-    assert sum(verdict.startswith("not checkable: ") for verdict in verdicts.values()) == 2
+    assert sum(verdict == "agrees" for verdict in verdicts.values()) == 5
+    assert sum(verdict.startswith("not comparable: ") for verdict in verdicts.values()) == 2
 
 
 def test_formulas_are_shown_as_printed_and_corrected(report: Path) -> None:

@@ -12,7 +12,7 @@ from evedrop.studies.papers.crimson2023 import Crimson2023
 from evedrop.studies.papers.kennedy2022 import Kennedy2022
 from evedrop.studies.papers.luecke2022 import Luecke2022
 from evedrop.studies.papers.naha2021 import Naha2021
-from evedrop.studies.papers.paper import Paper, Progress
+from evedrop.studies.papers.paper import Paper, Progress, silent
 from evedrop.studies.papers.reproduction import Reproduction
 from evedrop.system.hints import near
 
@@ -31,10 +31,6 @@ def paper(name: str) -> type[Paper]:
         hint = near(name, PAPERS) or f"; expected one of {', '.join(PAPERS)}"
         raise UsageError(f"paper {name}: no such paper{hint}")
     return PAPERS[name]
-
-
-def silent(_: str) -> None:
-    """Ignore a progress report."""
 
 
 def reproduce(name: str, quick: bool = False, progress: Progress = silent) -> Reproduction:

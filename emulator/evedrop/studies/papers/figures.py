@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from evedrop.studies.papers import chain, microgrid, numbers, numerical, strategies
+from evedrop.studies.papers.paper import silent
+from evedrop.studies.papers.reproduction import markdown_table
 
 
 @dataclass(frozen=True)
@@ -26,11 +28,7 @@ class Size:
 DEFAULT_SIZE = Size()
 
 
-def _silent(_: str) -> None:
-    """Ignore a progress report."""
-
-
-def figures(directory: Path, progress: Callable[[str], None] = _silent, size: Size = DEFAULT_SIZE) -> Path:
+def figures(directory: Path, progress: Callable[[str], None] = silent, size: Size = DEFAULT_SIZE) -> Path:
     """Draw every figure into `directory`, created if necessary, as PNG and PDF, and write `figures.md` there.
 
     progress receives a line for each step. Takes less than a minute on two cores at the default size.
@@ -48,7 +46,8 @@ def figures(directory: Path, progress: Callable[[str], None] = _silent, size: Si
     report = directory / "figures.md"
     progress("numbers")
     day_means = day.theory if day.slots == microgrid.DAY else microgrid.theory(microgrid.DAY)
-    report.write_text(_report(captions, numbers.table(designs, day_means), numbers.formulas()), encoding="utf-8")
+    rows = (*numbers.numerical_illustration(designs), *numbers.microgrid_application(day_means))
+    report.write_text(_report(captions, markdown_table(rows), numbers.formulas()), encoding="utf-8")
     return report
 
 

@@ -1,11 +1,9 @@
-"""Every number that the paper prints, with ours: agreement, erratum, or the reason why it cannot be checked.
+"""Every number that the founding paper prints, with ours: agreement, erratum, or the reason why it cannot be compared.
 
 Source: docs/errata.md.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,29 +12,10 @@ from evedrop.model.theory.adversary import Adversary, adversary_bound
 from evedrop.model.theory.covariances import Outcomes, expected_traces, stability_bound
 from evedrop.model.theory.design import Against
 from evedrop.studies.papers import numerical
+from evedrop.studies.papers.reproduction import NumberVerdict, PublishedNumber
 
 _INTERCHANGED = "the paper gives the other eavesdropper's value: the figures for 0.95 and 0.99 are interchanged"
 _LOWER_END = "0.5342 is the legitimate stability bound; just above it J → ∞ while J_e stays finite, so J_r < 0"
-
-
-@dataclass(frozen=True)
-class Number:
-    """One number of the paper."""
-
-    where: str
-    what: str
-    paper: str
-    ours: str
-    verdict: str = "agree"
-    """agree, or "erratum" or "not checkable" with the reason."""
-
-
-def table(designs: dict[float, Against], day: Floats) -> str:
-    """The numbers as a Markdown table; `day`: `microgrid.theory` for a whole day."""
-    lines = ["| where | what | paper | ours | verdict |", "|---|---|---|---|---|"]
-    for number in (*numerical_illustration(designs), *microgrid_application(day)):
-        lines.append(f"| {number.where} | {number.what} | {number.paper} | {number.ours} | {number.verdict} |")
-    return "\n".join(lines)
 
 
 def formulas() -> str:
@@ -63,7 +42,7 @@ def formulas() -> str:
     return "\n".join(lines)
 
 
-def numerical_illustration(designs: dict[float, Against]) -> list[Number]:
+def numerical_illustration(designs: dict[float, Against]) -> list[PublishedNumber]:
     """The numbers of the numerical illustration."""
     where = "numerical illustration"
     process = numerical.process()
@@ -87,38 +66,41 @@ def numerical_illustration(designs: dict[float, Against]) -> list[Number]:
         ]
     peak = designs[0.99].best_ratio
     numbers.append(
-        Number(
+        PublishedNumber.stated(
             where, "J_r > 0 for μ_e = 0.99", '"not apparent" in the figure',
-            f"J_r/J up to {numerical.gain(0.99, peak):.3f}" if peak is not None else "none",
-            "not checkable: the paper's axis is not known; of the J_r/J that the text names it would be plain to see",
+            f"J_r/J up to {numerical.gain(0.99, peak):.3f}" if peak is not None else "none", NumberVerdict.NOT_COMPARABLE,
+            "the paper's axis is not known; of the J_r/J that the text names it would be plain to see",
         )
     )  # fmt: skip
     return numbers
 
 
-def microgrid_application(day: Floats) -> list[Number]:
+def microgrid_application(day: Floats) -> list[PublishedNumber]:
     """The numbers of the microgrid application."""
     where = "microgrid"
     legitimate, smart, naive = day
     ratio = float((smart / legitimate).max())
     return [
-        Number(where, "slots in a day of one-second slots", "86400", str(24 * 3600)),
-        Number(where, "legitimate day mean", "less than 10⁰", f"{legitimate.max():.3e} … {legitimate.min():.3e}"),
-        Number(
+        _compared(where, "slots in a day of one-second slots", "86400", 24 * 3600),
+        PublishedNumber.stated(
+            where, "legitimate day mean", "less than 10⁰", f"{legitimate.max():.3e} … {legitimate.min():.3e}",
+            NumberVerdict.AGREES,
+        ),
+        PublishedNumber.stated(
             where, "eavesdropper day mean, smart as the text says", "greater than 10³",
-            f"{smart.max():.3e} … {smart.min():.3e}",
-            f"erratum: impossible for smart: its ratio to the legitimate one is at most {ratio:.2f}; the naive one with "
+            f"{smart.max():.3e} … {smart.min():.3e}", NumberVerdict.ERRATUM,
+            f"impossible for smart: its ratio to the legitimate one is at most {ratio:.2f}; the naive one with "
             f"Σ0 = 2500 I gives {naive.max():.1e} … {naive.min():.1e}, which may be what was plotted (an inference)",
         ),
-        Number(
-            where, "change of grid power flow at μ_d = 0.1", "below 1.58 %", "not computed",
-            "not checkable: the day of solar and load data is no longer published; for a day of our own see docs/microgrid.md",
+        PublishedNumber.stated(
+            where, "change of grid power flow at μ_d = 0.1", "below 1.58 %", "not computed", NumberVerdict.NOT_COMPARABLE,
+            "the day of solar and load data is no longer published; for a day of our own see docs/microgrid.md",
         ),
     ]  # fmt: skip
 
 
-def _compared(where: str, what: str, paper: str, ours: float, reason: str = "") -> Number:
+def _compared(where: str, what: str, paper: str, ours: float, erratum: str = "") -> PublishedNumber:
+    """Ours, rounded to our six decimals, within half a unit of the last digit that the paper prints."""
     digits = len(paper.partition(".")[2])
-    if f"{ours:.{digits}f}" == paper:
-        return Number(where, what, paper, f"{ours:.6f}")
-    return Number(where, what, paper, f"{ours:.6f}", f"erratum: {reason or 'differs'}")
+    half = 0.5 * 10.0**-digits
+    return PublishedNumber.compared(where, what, float(paper), round(ours, 6), absolute=half, erratum=erratum)

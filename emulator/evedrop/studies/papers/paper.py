@@ -15,6 +15,10 @@ Progress: TypeAlias = Callable[[str], None]
 """Receives a line for each step of a computation."""
 
 
+def silent(_: str) -> None:
+    """Ignore a progress report."""
+
+
 class Paper(ABC):
     """A paper whose numbers can be computed. A subclass has no arguments; it is registered in `PAPERS`."""
 

@@ -6,6 +6,7 @@ Source: docs/papers.md, how to read a verdict.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Any, Self, TypeAlias
@@ -192,11 +193,16 @@ class Reproduction:
             "",
             self.scope,
             "",
-            "| where | what | theirs | ours | tolerance | verdict |",
-            "|---|---|---|---|---|---|",
+            markdown_table(self.rows),
         ]
-        for row in self.rows:
-            verdict = f"{row.verdict}: {row.reason}" if row.reason else str(row.verdict)
-            cells = (row.where, row.what, row.their_text, row.our_text, row.tolerance or "–", verdict)
-            lines.append(f"| {' | '.join(cell.replace('|', '∣') for cell in cells)} |")
         return "\n".join(lines) + "\n"
+
+
+def markdown_table(rows: Iterable[PublishedNumber]) -> str:
+    """The numbers with their verdicts and reasons."""
+    lines = ["| where | what | theirs | ours | tolerance | verdict |", "|---|---|---|---|---|---|"]
+    for row in rows:
+        verdict = f"{row.verdict}: {row.reason}" if row.reason else str(row.verdict)
+        cells = (row.where, row.what, row.their_text, row.our_text, row.tolerance or "–", verdict)
+        lines.append(f"| {' | '.join(cell.replace('|', '∣') for cell in cells)} |")
+    return "\n".join(lines)
