@@ -34,28 +34,14 @@ __all__ = [
     "montecarlo", "preloaded", "run", "sweep", "wire",
 ]  # fmt: skip
 
-_HOMES = {
-    "Scenario": "evedrop.scenario.loading",
-    "compare": "evedrop.cli.api",
-    "cost": "evedrop.cli.api",
-    "design": "evedrop.cli.api",
-    "design_budget": "evedrop.cli.api",
-    "design_policy": "evedrop.cli.api",
-    "design_schedule": "evedrop.cli.api",
-    "learned": "evedrop.cli.api",
-    "load_results": "evedrop.cli.api",
-    "montecarlo": "evedrop.cli.api",
-    "preloaded": "evedrop.live.launch.preloading",
-    "run": "evedrop.cli.api",
-    "sweep": "evedrop.cli.api",
-}
-
 
 def __getattr__(name: str) -> Any:
-    if name in __all__:
+    if name == "wire":
         import importlib  # noqa: PLC0415 - as above
 
-        if name == "wire":
-            return importlib.import_module("evedrop.wire")
-        return getattr(importlib.import_module(_HOMES[name]), name)
+        return importlib.import_module("evedrop.wire")
+    if name in __all__:
+        from evedrop.system.later import imported_later  # noqa: PLC0415 - as above
+
+        return imported_later(__name__, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -7,7 +7,6 @@ Source: docs/your-own.md.
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from evedrop.cli.command import Command
@@ -31,6 +30,7 @@ from evedrop.model.streams import Batch, BlockReader
 from evedrop.model.theory.closed_form import ClosedForm, ReceiverConditions
 from evedrop.model.theory.covariances import Outcomes, OutcomesAt
 from evedrop.names import ProcessAction
+from evedrop.system.later import imported_later
 
 if TYPE_CHECKING:
     from evedrop.scenario.application import (
@@ -145,40 +145,10 @@ __all__ = [
     "whole_run",
 ]
 
-_LATER = {
-    "evedrop.scenario.application": (
-        "Application",
-        "ApplicationTally",
-        "ControlledPlant",
-        "Panel",
-        "PanelCurve",
-        "PanelFeed",
-        "PowerFeed",
-    ),
-    "evedrop.scenario.events.effects": (
-        "Jamming",
-        "Leave",
-        "LinkCut",
-        "LinkHealed",
-        "LinkSettings",
-        "Nothing",
-        "Return",
-        "Spoofing",
-    ),
-    "evedrop.scenario.events.event": ("Act", "EventKind"),
-    "evedrop.scenario.table": ("Table",),
-    "evedrop.show.view.column": ("Column", "scalars"),
-    "evedrop.show.view.palette": ("colour",),
-    "evedrop.show.view.panels.curves": ("curves_view", "line_style", "recent_slots", "whole_run"),
-    "evedrop.show.view.panels.panel": ("PlacedView", "ViewPanel"),
-    "evedrop.show.view.scene": ("PeerSlots", "Scene", "SceneSlots", "Shown"),
-}
-_MODULES = {name: module for module, names in _LATER.items() for name in names}
-"""Name → the module it is imported from when it is first used. Pydantic and Rerun, which these modules import, are slow to load,
-and a receiver whose class is not built in does not need them."""
-
 
 def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_MODULES[name]), name)
+    """Import what stands under TYPE_CHECKING when it is first used.
+
+    These modules import Pydantic and Rerun, which are slow to load, and a receiver whose class is not built in needs neither.
+    """
+    return imported_later(__name__, name)
