@@ -11,7 +11,8 @@ EvedropError                    exit status
 │   ├── Gap                     3   a slot is missing, doubled or out of order
 │   ├── Refusal                 3   another process could not read a message
 │   ├── Contradiction           3   a process contradicts itself, or another process
-│   └── Silence                 3   a process is on the network and does nothing
+│   ├── Silence                 3   a process is on the network and does nothing
+│   └── MissingProcesses        3   processes did not appear
 └── Interrupted               130   the user ended the run; results so far are written
 """
 
@@ -123,6 +124,7 @@ class Refusal(RunError):
     def __init__(self, process: str, key: str, sender: str, why: str) -> None:
         """process: that refused the message; key, sender: of the message; why: the process's reason."""
         self.at_fault = (sender,)
+        self.key = key
         about = "" if key in why else f"malformed message on {key}: "
         super().__init__(f"{about}{why} (refused by {process})")
 
@@ -143,6 +145,15 @@ class Silence(RunError):
     def __init__(self, processes: tuple[str, ...], what: str) -> None:
         self.at_fault = processes
         super().__init__(f"{' and '.join(processes)}: {what}")
+
+
+class MissingProcesses(RunError):
+    """Processes that did not appear on the network: `missing`."""
+
+    def __init__(self, process: str, missing: tuple[str, ...], what: str) -> None:
+        """process: that waited for them; what: the rest of the sentence."""
+        self.missing = missing
+        super().__init__(f"{process}: {', '.join(missing)} did not appear {what}")
 
 
 class Interrupted(EvedropError):

@@ -13,10 +13,12 @@ from typing import IO
 
 import pytest
 
-from evedrop.errors import Interrupted
+from evedrop.errors import Interrupted, MalformedMessage, MissingProcesses
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.launch.children import Children, Exit
 from evedrop.live.launch.process_set import follow_to_end
+from evedrop.live.protocol.brief import read_brief
+from evedrop.live.protocol.last_word import Cause, LastWord, last_word_file, protocol_breaker, read_last_word
 from evedrop.live.protocol.news import ProcessRequest, RouterListens, read_news
 from evedrop.names import ProcessAction
 from evedrop.results.folder import HeldFolder, new_folder
@@ -82,6 +84,10 @@ class Bench:
         self.held = HeldFolder(self.results)
         self.children = Children(self.held, self.private, starter=self.starter)
 
+    def leaves(self, name: str, word: LastWord) -> None:
+        """A process leaves its last word."""
+        word.leave(last_word_file(self.private, name))
+
     def tells(self, *lines: bytes) -> list[News]:
         """The observer writes these lines and ends: what the launcher shows of them."""
         self.starter.lines = b"".join(lines)
@@ -121,7 +127,8 @@ def test_a_signal_that_comes_when_the_run_is_complete_changes_nothing(bench: Ben
         follow_to_end(bench.children, stop, silent)
 
 
-MISSED = "evedrop: eve: legitimate, observer did not appear within 30 s, and nobody reads evedrop/r/telemetry/eve; start them\n"
+MISSED = LastWord.about(MissingProcesses("eve", ("legitimate", "observer"), "within 30 s; start them"))
+CUT_OFF = LastWord(Cause.NO_CONNECTION, "it has had no connection with the router for 30 s")
 
 
 PANIC = """
@@ -149,7 +156,7 @@ def test_who_ends_for_lack_of_an_observer_is_not_at_fault(bench: Bench, first: E
     for name in ("eve", "observer"):
         bench.starter.status = 3
         bench.children.start(bench.briefs[name])
-    (bench.results / "logs" / "eve.log").write_text(MISSED)
+    bench.leaves("eve", MISSED)
     report = bench.children.failure_report(first, RunEnded(3, "no router answered at tcp/127.0.0.1:1 within 30 s"))
     assert report.startswith("observer"), report
     assert "logs/observer.log" in report
@@ -170,10 +177,32 @@ def test_the_sender_of_a_malformed_message_is_named(bench: Bench, key: str, send
     """By the key that the message was put on, no matter which process complains."""
     for name in ("legitimate", "router", "sensor", "eve", "observer"):
         bench.children.start(bench.briefs[name])
-    said = f"malformed message on evedrop/r1/{key}: 3; expected 4"
-    (bench.results / "logs" / "naive.log").write_text(f"evedrop: {said}\n")
-    report = bench.children.failure_report(Exit("naive", 3), RunEnded(3, said))
-    assert report.startswith(f"{sender} broke the protocol: malformed message on evedrop/r1/{key}"), report
+    error = MalformedMessage(f"evedrop/r1/{key}", "3", "4", b"")
+    bench.leaves("naive", LastWord.about(error))
+    said = f"{sender} broke the protocol: malformed message on evedrop/r1/{key}"
+    assert bench.children.failure_report(Exit("naive", 3), RunEnded(3, "naive left")).startswith(said)
+    ending = RunEnded(3, str(error), broken_by=protocol_breaker(error))
+    assert bench.children.failure_report(None, ending).startswith(said)
+
+
+def test_a_router_that_all_have_lost_is_at_fault(bench: Bench) -> None:
+    """Not the process that gave up first; it is, if the others still have their connections."""
+    bench.starter.status = 3
+    for name in bench.briefs:
+        bench.children.start(bench.briefs[name])
+    bench.leaves("eve", CUT_OFF)
+    assert bench.children.failure_report(Exit("eve", 3), RunEnded(3, "", suspects=["eve"])).startswith("eve ended with")
+    for name in bench.briefs.keys() - {"router", "observer"}:
+        bench.leaves(name, CUT_OFF)
+    assert bench.children.failure_report(Exit("eve", 3), None).startswith("router ended with")
+
+
+def test_a_process_that_is_started_again_has_not_said_why_it_ends(bench: Bench) -> None:
+    """What its predecessor said is gone, and its brief says where it may."""
+    bench.leaves("eve", CUT_OFF)
+    bench.children.start(bench.briefs["eve"])
+    assert read_last_word(last_word_file(bench.private, "eve")) is None
+    assert read_brief(bench.private / "eve.json").last_word == str(last_word_file(bench.private, "eve"))
 
 
 def test_a_process_starts_again_only_when_its_router_listens(bench: Bench) -> None:
@@ -212,7 +241,9 @@ def test_no_news_deletes_the_brief_of_a_process_that_may_not_have_read_it(bench:
     assert router.exists()
 
 
-@pytest.mark.parametrize("news", [PROGRESS, OUTAGE, RunEnded(3, "é", ["eve"], ["eve"], "why"), RunEnded(0, "complete")])
+@pytest.mark.parametrize(
+    "news", [PROGRESS, OUTAGE, RunEnded(3, "é", ["eve"], ["eve"], "why", "eve"), RunEnded(0, "complete")]
+)
 def test_news_are_read_as_they_were_written(news: News) -> None:
     """Whatever their entries."""
     found = read_news(news.line)

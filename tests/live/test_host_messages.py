@@ -21,6 +21,7 @@ from evedrop.live.launch.host_messages import (
     line_of,
     order_in,
 )
+from evedrop.live.protocol.last_word import Cause, LastWord
 from tests.live.network.bench import brief_of_eve
 
 START = StartProcess(2**32, brief_of_eve(modules="/srv"), {"A": "ä\n"})
@@ -35,6 +36,7 @@ DEEP = b"[" * 100_000
         (LauncherHeartbeat(600.0), order_in),
         (LogText(7, "two\nlines\n"), answer_in),
         (ProcessEnded(7, -9), answer_in),
+        (ProcessEnded(7, 3, LastWord(Cause.BROKEN_PROTOCOL, "ä", ("eve",))), answer_in),
         (Greeting("1.2.3"), greeting_in),
     ],
 )

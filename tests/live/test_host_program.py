@@ -20,6 +20,7 @@ from evedrop.live.launch.host_messages import LogText, ProcessEnded, SendSignal,
 from evedrop.live.launch.host_program import HostProcesses
 from evedrop.live.launch.starter import FORK_SERVER_LOST, StartedProcess
 from evedrop.live.protocol.brief import brief_from
+from evedrop.live.protocol.last_word import Cause, LastWord
 from tests.conftest import LIMIT, Evedrop, wait_until
 from tests.examples import mostly_long
 from tests.live.network.bench import brief_of_eve
@@ -62,7 +63,7 @@ class Process:
 
 
 def test_a_process_has_its_files_in_the_private_folder(tmp_path: Path) -> None:
-    """Its brief, its state and its temporary files; its log and its end are sent."""
+    """Its brief, its state, its last word and its temporary files; its log and its end are sent."""
     started: list[tuple[dict[str, Any], Mapping[str, str], int]] = []
     sent: list[bytes] = []
 
@@ -77,16 +78,24 @@ def test_a_process_has_its_files_in_the_private_folder(tmp_path: Path) -> None:
         return len(sent[-1])
 
     host = HostProcesses(tmp_path, start, send)
-    given = brief_of_eve(state_file="/launcher/eve.state")
+    given = replace(brief_of_eve(state_file="/launcher/eve.state"), last_word="/launcher/eve.last-word")
+    word = LastWord(Cause.NO_CONNECTION, "why")
+    word.leave(tmp_path / "eve.last-word")  # of an earlier start
     host.obey(StartProcess(7, given, {"TMPDIR": "/launcher", "A": "1"}))
     ((brief, environment, mode),) = started
     assert brief["part"]["state_file"] == str(tmp_path / "eve.state")
+    assert brief["last_word"] == str(tmp_path / "eve.last-word")
+    assert not Path(brief["last_word"]).exists()
+    word.leave(brief["last_word"])
     assert brief_from(brief).keys == given.keys
     assert (environment["TMPDIR"], environment["A"], mode) == (str(tmp_path), "1", 0o600)
     wait_until(lambda: b"".join(sent).endswith(b"\n"), "the log")
     host.obey(SendSignal(7, signal.SIGTERM))
     wait_until(lambda: b"".join(sent).count(b"\n") == 2, "the end")
-    assert [answer_in(line) for line in b"".join(sent).splitlines()] == [LogText(7, "a line\n"), ProcessEnded(7, -15)]
+    assert [answer_in(line) for line in b"".join(sent).splitlines()] == [
+        LogText(7, "a line\n"),
+        ProcessEnded(7, -15, word),
+    ]
 
 
 def test_what_the_program_itself_ends_is_not_reported(tmp_path: Path) -> None:

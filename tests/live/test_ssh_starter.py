@@ -7,6 +7,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from evedrop.live.launch.host_messages import (
 from evedrop.live.launch.hosts_file import HostTable
 from evedrop.live.launch.ssh_starter import SshHost
 from evedrop.live.launch.starter import CONNECTION_LOST, FORK_SERVER_LOST
+from evedrop.live.protocol.last_word import last_word_file, read_last_word
 from evedrop.system.environment import own_environment
 from tests.conftest import LIMIT, wait_until
 from tests.live.network.bench import brief_of_eve
@@ -97,12 +99,16 @@ def test_a_process_whose_fork_server_is_gone_is_lost_with_its_host(connect: Conn
     """Its log names the host. A process that is to be started on a host that is gone names it, too, as a failure of the run."""
     host = connect(GREETING)
     ready(host)
-    path, log = brief_of_eve().write(tmp_path), tmp_path / "eve.log"
+    word = last_word_file(tmp_path, "eve")
+    path, log = replace(brief_of_eve(), last_word=str(word)).write(tmp_path), tmp_path / "eve.log"
     with log.open("wb") as file:
         process = host.start(7, path, file, {})
         host._take(answer_in(line_of(ProcessEnded(7, FORK_SERVER_LOST))))
         assert process.poll() == CONNECTION_LOST
         assert log.read_text().startswith("evedrop: the fork server on host beta ended or stopped responding")
+        left = read_last_word(word)
+        assert left is not None
+        assert log.read_text() == f"evedrop: {left.sentence}\n"
         host.hang_up()
         wait_until(host._lost.is_set, "the end of the connection")
         with pytest.raises(RunError, match=r"^eve cannot be started: the connection with host beta ended: ssh ended"):

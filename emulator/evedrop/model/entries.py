@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, fields
+from enum import StrEnum
 from functools import partial
 from itertools import islice
 from typing import Any, TypeVar
@@ -69,6 +70,16 @@ def not_negative(path: str, found: Any) -> Iterator[str]:
     """Check that a value is a finite number, 0 or more."""
     wrong = list(number(path, found))
     yield from wrong or (_wrong(path, found, "a number of 0 or more") if found < 0 else ())
+
+
+def choice(kind: type[StrEnum]) -> Check:
+    """A check for one of the values of an enumeration."""
+
+    def check(path: str, found: Any) -> Iterator[str]:
+        if found not in [*kind]:
+            yield from _wrong(path, found, f"one of {', '.join(kind)}")
+
+    return check
 
 
 def maybe(check: Check) -> Check:

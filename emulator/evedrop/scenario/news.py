@@ -104,6 +104,8 @@ class RunEnded(News):
     """Processes whose misbehaviour ended the run."""
     view: str | None = field(default=None, metadata=entry(maybe(text)))
     """Why the view stopped early, if it did."""
+    broken_by: str | None = field(default=None, metadata=entry(maybe(text), left_out=True))
+    """The process whose message broke the protocol, if that ended the run."""
 
     @property
     def well(self) -> bool:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from evedrop.cli.command import Command, Option
 from evedrop.cli.commands import ROLES
 from evedrop.cli.options import argument, changes_of, entries, loaded, scenario, served
-from evedrop.errors import BriefError, UsageError
+from evedrop.errors import BriefError, EvedropError, UsageError
 
 if TYPE_CHECKING:
     from evedrop.live.protocol.brief import AnyBrief, Brief
@@ -99,8 +99,13 @@ def process(options: argparse.Namespace) -> int:
         look_in(brief.part.modules)
     try:
         return _play(brief, getattr(options, "serve", None))
-    except BriefError as error:
-        raise BriefError(f"{options.brief}: {error}") from error
+    except EvedropError as error:
+        from evedrop.live.protocol.last_word import LastWord
+
+        LastWord.about(error).leave(brief.last_word)
+        if isinstance(error, BriefError):
+            raise BriefError(f"{options.brief}: {error}") from error
+        raise
 
 
 def _play(brief: AnyBrief, serve: str | None) -> int:

@@ -25,7 +25,7 @@ from evedrop.live.launch.starter import (
 )
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.brief_parts import ReceiverPart, RoutingPart
-from evedrop.live.protocol.keys import writer_of
+from evedrop.live.protocol.last_word import Cause, LastWord, last_word_file, read_last_word
 from evedrop.live.protocol.news import Alive, Finishing, ProcessRequest, RouterListens, RunOver, read_news
 from evedrop.names import OBSERVER, RELAY, ROUTER, SENSOR, ProcessAction
 from evedrop.results.folder import HeldFolder, private_opener
@@ -41,21 +41,11 @@ _FINISH_SECONDS = 600.0  # for it to write them: 10⁶ slots take some seconds
 _GONE_SECONDS = 5.0  # for a process that has left the network to end, and to say why in its log
 _AGAIN_SECONDS = 0.02  # until a request that cannot be carried out yet is looked at again
 _LOG_LINES = 12
-_COMPLAINT = "evedrop: "
 _HUBS = frozenset({ROUTER, RELAY, OBSERVER})
-_ROUTER_LOST = "has had no connection with the router"
-_NOT_THERE = re.compile(rf"evedrop: \S+: .*\b{OBSERVER}\b.* did not appear within")
 _FRAME = re.compile(r"stack backtrace:$|\s+\d+: |\s+at \S+:\d+")
 """A line of a stack that Zenoh shows when it panics; the line before them says why."""
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 _ZENOH_CLOSES = "Received Data for unknown expr_id"
-_REFUSED = re.compile(r"(?:malformed message|gap) on (evedrop/[^/\s]+/[a-z0-9_/-]+)")
-
-
-def _sender(complaint: str) -> str | None:
-    """The sender of the message that a complaint is about, by its key."""
-    found = _REFUSED.search(complaint)
-    return None if found is None else writer_of(found[1])
 
 
 @dataclass(frozen=True)
@@ -124,6 +114,8 @@ class Children:
         if isinstance(brief.part, ReceiverPart) and brief.part.outages:
             state_file = str((self._private / f"{brief.process}.state").absolute())
             brief = replace(brief, part=replace(brief.part, state_file=state_file))
+        last_word = last_word_file(self._private, brief.process)
+        brief = replace(brief, last_word=str(last_word))
         environment = {
             **(lock_step_environment(brief.role) if self._lock_step else {}),
             **own_environment(),
@@ -132,6 +124,7 @@ class Children:
         if isinstance(brief.part, RoutingPart):
             environment["TMPDIR"] = str(self._private)  # their password files are removed with the briefs
         try:
+            last_word.unlink(missing_ok=True)  # of an earlier start
             path = brief.write(self._private)
             log_file = self._folder.now / "logs" / f"{brief.process}.log"
             with open(log_file, "ab" if again else "wb", opener=private_opener) as log:
@@ -171,7 +164,7 @@ class Children:
             contextlib.suppress(OSError),
             (self._folder.now / "logs" / f"{name}.log").open("a", encoding="utf-8") as log,
         ):
-            log.write(f"{_COMPLAINT}the launcher refused malformed news: {error}\n")
+            log.write(f"evedrop: the launcher refused malformed news: {error}\n")
 
     def listens(self, router: str) -> bool:
         """Whether a router or relay has said that it listens; true for one that cannot say so, or is not there."""
@@ -302,22 +295,24 @@ class Children:
             )
         if not accused and (first is None or (first.process == OBSERVER and first.status > 0)):
             first = self._first_failure(suspects) or first
+        broken_by = None if ending is None else ending.broken_by
         if accused and why:
             named, head = [name for name in accused if name in self._processes], why
         elif first is not None:
             named, head = [first.process], f"{first.process} {first.manner}"
-            words = reversed(self._log(first.process))
-            why = next((line for line in words if line.startswith(_COMPLAINT)), "")
-            if first.status == CONNECTION_LOST and why:
-                head = f"{first.process} was lost: {why.removeprefix(_COMPLAINT)}"
+            word = self._last_word(first.process)
+            broken_by = None
+            if word is not None and first.status == CONNECTION_LOST:
+                head = f"{first.process} was lost: {word.sentence}"
+            elif word is not None and word.cause is Cause.BROKEN_PROTOCOL:
+                broken_by, why = next(iter(word.blamed), None), word.sentence
         elif suspects:
             named, head = suspects, f"{', '.join(suspects)} stopped responding: hung, suspended or cut off"
         else:
             named, head = [], f"the run failed: {why}"
-        at_fault = _sender(why)
-        if at_fault is not None and at_fault in self._processes and (at_fault not in named or accused):
-            named = list(dict.fromkeys([at_fault, *named]))
-            head = f"{at_fault} broke the protocol: {why.removeprefix(_COMPLAINT)}"
+        if broken_by in self._processes and (broken_by not in named or accused):
+            named = list(dict.fromkeys([broken_by, *named]))
+            head = f"{broken_by} broke the protocol: {why}"
         return "\n".join([head, *(line for name in named for line in self._log_lines(name))])
 
     def _first_failure(self, suspects: list[str]) -> Exit | None:
@@ -343,11 +338,13 @@ class Children:
 
     def _missed_observer(self, name: str) -> bool:
         """Whether a process ended because the observer did not appear."""
-        return any(_NOT_THERE.match(line) for line in self._log(name))
+        word = self._last_word(name)
+        return word is not None and word.cause is Cause.MISSING_PROCESSES and OBSERVER in word.blamed
 
     def _lost_router(self, name: str) -> bool:
         """Whether a process ended because it could no longer reach its router."""
-        return any(_ROUTER_LOST in line for line in self._log(name))
+        word = self._last_word(name)
+        return word is not None and word.cause is Cause.NO_CONNECTION
 
     def _lost_by_all(self, name: str, suspects: list[str]) -> str | None:
         """The router that a process gave up on, if the observer or all its other users miss it, too; otherwise None."""
@@ -363,6 +360,10 @@ class Children:
                 return RELAY if RELAY in self._processes and name != SENSOR else ROUTER
             time.sleep(0.05)
         return None
+
+    def _last_word(self, name: str) -> LastWord | None:
+        """Why a process ended, if it said so."""
+        return read_last_word(last_word_file(self._private, name))
 
     def _log(self, name: str) -> list[str]:
         """The lines of a log, without Zenoh's lines about messages that arrive while its session closes."""

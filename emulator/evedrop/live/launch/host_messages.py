@@ -16,11 +16,13 @@ from typing import Any, ClassVar, TypeVar
 
 from evedrop.live.launch.starter import FORK_SERVER_LOST
 from evedrop.live.protocol.brief import AnyBrief, brief_from
+from evedrop.live.protocol.last_word import LastWord
 from evedrop.model.entries import (
     SLOT,
     anything,
     entry,
     expect,
+    inner,
     named,
     not_negative,
     plain,
@@ -100,6 +102,8 @@ class ProcessEnded(HostMessage):
     number: int = field(metadata=_NUMBER)
     status: int = field(metadata=entry(whole(-64, FORK_SERVER_LOST)))
     """Negative: the signal that ended it. `FORK_SERVER_LOST`: it ended with its fork server."""
+    last_word: LastWord | None = field(default=None, metadata=inner(LastWord, left_out=True))
+    """Why it ended, if it could tell."""
 
 
 Order = StartProcess | SendSignal | LauncherHeartbeat

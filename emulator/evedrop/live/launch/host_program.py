@@ -37,6 +37,7 @@ from evedrop.live.launch.private_folder import private_folder
 from evedrop.live.launch.starter import FORK_SERVER_LOST, StartedProcess, Starter, end_all
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.brief_parts import ReceiverPart
+from evedrop.live.protocol.last_word import last_word_file, read_last_word
 from evedrop.system.environment import own_environment
 from evedrop.system.processes import continue_when_parent_dies
 from evedrop.system.signals import raise_on_signals
@@ -137,6 +138,7 @@ class HostProcesses:
         try:
             with os.fdopen(write, "wb") as log:
                 path = brief.write(self._private)
+                last_word_file(self._private, brief.process).unlink(missing_ok=True)
                 self._processes[number] = self._start(brief.role, path, log, environment)
         except OSError as error:
             os.close(read)
@@ -147,16 +149,18 @@ class HostProcesses:
         news = self._processes[number].stdout
         if news is not None:
             news.close()  # the launcher waits for no router on another host
-        threading.Thread(target=self._follow, args=(number, read), daemon=True).start()
+        threading.Thread(target=self._follow, args=(number, brief.process, read), daemon=True).start()
 
     def _kept_here(self, brief: AnyBrief) -> AnyBrief:
-        """The same brief for a process that keeps its state in a file: the file is in the private folder of this host."""
+        """The same brief with the files of the process in the private folder of this host."""
+        if brief.last_word is not None:
+            brief = replace(brief, last_word=str(last_word_file(self._private, brief.process)))
         if not isinstance(brief.part, ReceiverPart) or brief.part.state_file is None:
             return brief
         state_file = str((self._private / f"{brief.process}.state").absolute())
         return replace(brief, part=replace(brief.part, state_file=state_file))
 
-    def _follow(self, number: int, log: int) -> None:
+    def _follow(self, number: int, name: str, log: int) -> None:
         """Send what a process writes to its log, and how it ended."""
         reader = threading.Thread(target=self._read, args=(number, log), daemon=True)
         reader.start()
@@ -166,7 +170,7 @@ class HostProcesses:
             process.stdin.close()
         reader.join(_LAST_LINES_SECONDS)
         if not self._ending:
-            self.answer(ProcessEnded(number, status))
+            self.answer(ProcessEnded(number, status, read_last_word(last_word_file(self._private, name))))
 
     def _read(self, number: int, log: int) -> None:
         with os.fdopen(log, "rb", buffering=0) as lines:

@@ -44,6 +44,7 @@ from evedrop.live.launch.hosts_file import HostsPlan, HostTable
 from evedrop.live.launch.starter import CONNECTION_LOST, FORK_SERVER_LOST, ReportedProcess, StartedProcess, Starter
 from evedrop.live.protocol.brief import read_brief
 from evedrop.live.protocol.brief_parts import ImportingPart
+from evedrop.live.protocol.last_word import Cause, LastWord
 from evedrop.system.environment import own_environment
 from evedrop.system.processes import kill, signalled_when_parent_dies, wait_for
 
@@ -73,15 +74,29 @@ _OPTIONS = (
 class HostedProcess(ReportedProcess):
     """A process on another host."""
 
-    def __init__(self, number: int, host: SshHost, log: int) -> None:
-        """number: distinguishes it from all other processes of the run; log: the file descriptor of its log, which it owns."""
+    def __init__(self, number: int, host: SshHost, log: int, last_word: str | None) -> None:
+        """number: distinguishes it from all other processes of the run.
+
+        log: the file descriptor of its log, which it owns; last_word: the launcher's file for its last word.
+        """
         super().__init__(number)
-        self._host, self._log = host, log
+        self._host, self._log, self._last_word = host, log, last_word
 
     def write(self, text: str) -> None:
         """Write to its log."""
         with contextlib.suppress(OSError):  # the disk is full
             os.write(self._log, text.encode())
+
+    def lose(self, why: str) -> None:
+        """Note that it was lost with its host, and write why into its log."""
+        self.write(f"evedrop: {why}\n")
+        self.end(CONNECTION_LOST, LastWord(Cause.FAILURE, why))
+
+    def end(self, status: int, last_word: LastWord | None) -> None:
+        """Note that it ended with this status and this last word."""
+        if last_word is not None:
+            last_word.leave(self._last_word)
+        self.ended(status)
 
     def _close(self) -> None:
         os.close(self._log)
@@ -159,7 +174,7 @@ class SshHost:
         path.unlink()  # its keys should not stay on disk
         if self._table.modules is not None and isinstance(brief.part, ImportingPart) and brief.part.modules is not None:
             brief = replace(brief, part=replace(brief.part, modules=self._table.modules))
-        process = HostedProcess(number, self, os.dup(log.fileno()))
+        process = HostedProcess(number, self, os.dup(log.fileno()), brief.last_word)
         with self._guard:
             if self._lost.is_set():
                 process.ended(CONNECTION_LOST)
@@ -222,12 +237,11 @@ class SshHost:
         if isinstance(answer, LogText):
             process.write(answer.written)
         elif answer.status == FORK_SERVER_LOST:
-            process.write(
-                f"evedrop: the fork server on host {self.name} ended or stopped responding (killed, suspended or out of memory)\n"
+            process.lose(
+                f"the fork server on host {self.name} ended or stopped responding (killed, suspended or out of memory)"
             )
-            process.ended(CONNECTION_LOST)
         else:
-            process.ended(answer.status)
+            process.end(answer.status, answer.last_word)
 
     def _lose(self) -> None:
         self.hang_up()
@@ -236,8 +250,7 @@ class SshHost:
             self._lost.set()
             left, self._processes = list(self._processes.values()), {}
         for process in left:
-            process.write(f"evedrop: {self._ending()}\n")
-            process.ended(CONNECTION_LOST)
+            process.lose(self._ending())
 
     def _ending(self) -> str:
         """Why the host can be used no more."""

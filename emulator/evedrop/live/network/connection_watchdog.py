@@ -9,6 +9,8 @@ from typing import final
 
 from evedrop.errors import RunError
 from evedrop.live.protocol.brief import AnyBrief
+from evedrop.live.protocol.last_word import Cause, LastWord
+from evedrop.system.output import say
 
 
 @final
@@ -41,9 +43,11 @@ class ConnectionWatchdog:
                 self._timer.start()
 
     def _give_up(self) -> None:
-        sys.stderr.write(
-            f"evedrop: {self._brief.process} has had no connection with the router at {self._brief.router} for "
-            f"{self._brief.flow.longest_outage:g} s; check that the router runs and can be reached\n"
+        sentence = (
+            f"{self._brief.process} has had no connection with the router at {self._brief.router} for "
+            f"{self._brief.flow.longest_outage:g} s; check that the router runs and can be reached"
         )
+        say(sentence)
         sys.stderr.flush()
+        LastWord(Cause.NO_CONNECTION, sentence).leave(self._brief.last_word)
         os._exit(RunError.exit_status)

@@ -23,7 +23,7 @@ from typing import Self, final
 
 import zenoh
 
-from evedrop.errors import Gap, MalformedMessage, RunError
+from evedrop.errors import Gap, MalformedMessage, MissingProcesses, RunError
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.network.connecting import Credentials, RouterAddress, WaitReporter, connected
 from evedrop.live.network.connection import Connection
@@ -293,7 +293,7 @@ class Session:
     def ready(self) -> None:
         """Wait until every publisher has a reader, then show that this process is present.
 
-        Raises RunError after the brief's patience, naming the missing processes and the keys without a reader. While the
+        Raises MissingProcesses after the brief's patience, naming them and the keys without a reader. While the
         observer is present, this process waits on: the observer reports the missing processes.
         """
         deadline = time.monotonic() + self.patience
@@ -302,9 +302,10 @@ class Session:
             if OBSERVER not in missing and self._process != OBSERVER:
                 deadline = time.monotonic() + self.patience
             if time.monotonic() > deadline:
-                raise RunError(
-                    f"{self._process}: {', '.join(missing)} did not appear within {self.patience:.0f} s, and nobody reads "
-                    f"{', '.join(unread)}; start them, or look at their logs"
+                raise MissingProcesses(
+                    self._process,
+                    tuple(missing),
+                    f"within {self.patience:.0f} s, and nobody reads {', '.join(unread)}; start them, or look at their logs",
                 )
             time.sleep(_POLL_SECONDS)
         self.appear()

@@ -31,6 +31,7 @@ from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.brief_parts import ObserverPart
 from evedrop.live.protocol.codec import Reader, is_refusal, read_refusal
 from evedrop.live.protocol.commands import ReportStatus
+from evedrop.live.protocol.last_word import protocol_breaker
 from evedrop.live.protocol.news import RunOver
 from evedrop.live.protocol.process_status import is_process_status, read_process_status
 from evedrop.live.protocol.requests import StatusRequest, read_request
@@ -96,6 +97,8 @@ class ObservedRun:
         self._suspects: list[str] = []
         self._accused: tuple[str, ...] = ()
         """Processes whose misbehaviour ended the run."""
+        self._broken_by: str | None = None
+        """The process whose message broke the protocol, if that ended the run."""
         self._recovery: Recovery
         self._stall: Stall
         self._outages: list[ConnectionOutage] = []
@@ -157,8 +160,7 @@ class ObservedRun:
                     self._poll(conductor)
                 self._save_rows()  # processes may take long to confirm their end, and this one may be killed meanwhile
             except EvedropError as error:
-                self._suspects = conductor.missing
-                self._accused = error.at_fault if isinstance(error, RunError) else ()
+                self._blame(conductor.missing, error)
                 if self._by_hand:  # a launcher ends them itself
                     conductor.abandon("interrupted" if isinstance(error, Interrupted) else str(error))
                 raise
@@ -174,6 +176,12 @@ class ObservedRun:
                 self._misdelivered = {name: count for name, count in conductor.misdelivered.items() if count}
                 if session.dropped:
                     self._misdelivered[OBSERVER] = session.dropped
+
+    def _blame(self, missing: list[str], error: EvedropError) -> None:
+        """Note which processes are at fault for the end of the run, as far as this process can know."""
+        self._suspects = missing
+        self._accused = error.at_fault if isinstance(error, RunError) else ()
+        self._broken_by = protocol_breaker(error)
 
     def _poll(self, conductor: Conductor) -> None:
         """Check whether the run stands still because of a process that is present. Raises Silence."""
@@ -394,7 +402,7 @@ class ObservedRun:
         except OSError as error:
             status, how = RunError.exit_status, unwritten(error)
         view = self._recording.failure if self._recording is not None else None
-        tell(RunEnded(status, how, self._suspects, self._accused, view))
+        tell(RunEnded(status, how, self._suspects, self._accused, view, self._broken_by))
         if self._by_hand:
             with suppress(FileNotFoundError):
                 report(self.folder, status, how)

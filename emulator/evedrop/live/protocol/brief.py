@@ -26,6 +26,7 @@ from evedrop.model.entries import (
     flag,
     inner,
     key,
+    maybe,
     named,
     not_negative,
     number,
@@ -114,6 +115,8 @@ class Brief(Generic[P_co]):
     """Seconds for which it waits for the other processes to appear."""
     identity: Identity | None = field(default=None, metadata=inner(Identity, or_null=True))
     """Its identity, if the run's router takes certificates."""
+    last_word: str | None = field(default=None, metadata=entry(maybe(text), left_out=True))
+    """The file for its last word (`evedrop.live.protocol.last_word`); None for a process that is started by hand."""
 
     @property
     def batch(self) -> Batch:

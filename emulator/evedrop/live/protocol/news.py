@@ -6,18 +6,12 @@ Kinds that only the launcher needs are defined here; it passes the others, which
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
-from evedrop.model.entries import SLOT, entry, expect, read, table_of, text
+from evedrop.model.entries import SLOT, choice, entry, expect, read, table_of, text
 from evedrop.names import ProcessAction
 from evedrop.scenario.news import ConnectionOutage, Held, News, RunEnded, RunProgress, Started, ViewOpened
-
-
-def _action(path: str, found: Any) -> Iterator[str]:
-    if found not in [*ProcessAction]:
-        yield f"{path} is {found!r:.40}, expected one of {', '.join(ProcessAction)}"
 
 
 @dataclass(frozen=True)
@@ -40,7 +34,7 @@ class ProcessRequest(News):
     """The observer asks the launcher to act on a process, and to confirm it."""
 
     event = "act"
-    do: ProcessAction = field(metadata=entry(_action, ProcessAction))
+    do: ProcessAction = field(metadata=entry(choice(ProcessAction), ProcessAction))
     process: str = field(metadata=entry(text))
     first: int = field(metadata=entry(SLOT))
     """The first slot that a restarted process handles."""
