@@ -68,8 +68,10 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> Iterat
     say_what_was_skipped(terminalreporter)
 
 
-def wait_until(condition: Callable[[], Any], what: str, limit: float = LIMIT) -> Any:
+def wait_until(condition: Callable[[], Any], what: str | Callable[[], str], limit: float = LIMIT) -> Any:
     """The first true value of a condition; fails the test if it stays false for this number of seconds.
+
+    what: the condition in words, or a function that gives them, with what is known by then.
 
     It sleeps longer between looks that take long, for what it waits for needs a processor, too.
     """
@@ -80,7 +82,7 @@ def wait_until(condition: Callable[[], Any], what: str, limit: float = LIMIT) ->
             return found
         looked = time.monotonic()
         if looked > deadline:
-            pytest.fail(f"within {limit:g} s: {what}")
+            pytest.fail(f"within {limit:g} s: {what if isinstance(what, str) else what()}")
         time.sleep(min(0.1, max(0.01, 4 * (looked - began))))
 
 

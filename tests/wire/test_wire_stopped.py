@@ -38,6 +38,9 @@ COUNT, LARGE = 100, 200_000
 """More than the buffers of a connection hold."""
 FOREVER = 10**9
 """Microseconds."""
+PATIENT = {"link": {"tx": {"lease": 10**6, "queue": {"congestion_control": {"block": {"wait_before_close": FOREVER}}}}}}
+"""The transport of a program that does not give its connection up, however slow the machine is: by default Zenoh does so if a
+message waits for 5 s, or if nothing comes for 10 s."""
 PROGRAM = """
 import os, signal, sys
 import zenoh
@@ -91,7 +94,7 @@ def _patient_zenoh(monkeypatch: pytest.MonkeyPatch) -> None:
     def patient(*arguments: Any) -> ZenohConfig:
         config = side_config(*arguments)
         queue = {"congestion_control": {"block": {"wait_before_close": FOREVER}}}
-        link = {**config["transport"]["link"], "tx": {"queue": queue}, "tcp": {"so_sndbuf": 65536}}
+        link = {**config["transport"]["link"], "tx": {"lease": 10**6, "queue": queue}, "tcp": {"so_sndbuf": 65536}}
         return {**config, "transport": {**config["transport"], "link": link}}
 
     monkeypatch.setattr("evedrop.wire.side.side_config", patient)
@@ -103,8 +106,8 @@ def test_a_stopped_reader_at_a_third_side_holds_up_nobody(tap: bool, tmp_path: P
     plan = plan_of(link("robot", "base"), link("robot", "third", tap=tap), link("base", "robot"))
     with (
         at_work(plan, tmp_path) as wire,
-        wire.program("robot") as robot,
-        wire.program("base") as base,
+        wire.program("robot", transport=PATIENT) as robot,
+        wire.program("base", transport=PATIENT) as base,
         contextlib.ExitStack() as readers,
     ):
         got = reader(base, "scan")
@@ -114,7 +117,7 @@ def test_a_stopped_reader_at_a_third_side_holds_up_nobody(tap: bool, tmp_path: P
         wait_until(lambda: is_declared(wire, "third", "subscriber", "scan"), "the others read")
         for n in range(COUNT):
             robot.put("scan", str(n).encode().ljust(LARGE), congestion_control=BLOCK)
-        wait_until(lambda: len(got) == COUNT, "the base has all")
+        wait_until(lambda: len(got) == COUNT, lambda: f"the base has all, not {len(got)}; {wire.fates('robot-base')}")
         assert [int(sample.payload.to_bytes()) for sample in got] == [*range(COUNT)]
         assert wire.fates("robot-base") == [WireFate.DELIVERED] * COUNT
 
@@ -124,7 +127,11 @@ def test_a_stopped_asker_holds_up_nobody_at_the_side_that_answers(tmp_path: Path
     plan = plan_of(
         link("base", "robot"), link("robot", "base"), link("base", "third"), link("third", "base"), query_seconds=LIMIT
     )
-    with at_work(plan, tmp_path) as wire, wire.program("robot") as robot, wire.program("base") as base:
+    with (
+        at_work(plan, tmp_path) as wire,
+        wire.program("robot", transport=PATIENT) as robot,
+        wire.program("base", transport=PATIENT) as base,
+    ):
         got = reader(robot, "pose")
         wait_until(lambda: is_declared(wire, "robot", "subscriber", "pose"), "the robot reads")
         answered: list[int] = []
