@@ -16,12 +16,13 @@ import pytest
 from evedrop.cli.main import main
 from evedrop.errors import UsageError
 from evedrop.results.wire_folder import WIRE_FILE
+from evedrop.system.files import is_locked
 from evedrop.wire import journal as journal_module
 from evedrop.wire.file import resolved_wire
 from evedrop.wire.history import WireHistory
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_on_disk import summary_of_wire
-from evedrop.wire.journal_recovery import is_in_use, recover
+from evedrop.wire.journal_recovery import recover
 from evedrop.wire.record import HELD, Kind, WireFate
 from evedrop.wire.run import _begin_results, run_wire
 from tests.pages import checked
@@ -163,10 +164,10 @@ def test_two_readers_at_once_do_not_take_each_other_for_a_wire(folders: dict[str
     reader = os.open(folders["killed"] / "journal", os.O_RDONLY)
     try:
         fcntl.flock(reader, fcntl.LOCK_SH)
-        assert not is_in_use(folders["killed"] / "journal")
+        assert not is_locked(folders["killed"] / "journal")
     finally:
         os.close(reader)
-    assert is_in_use(folders["running"] / "journal")
+    assert is_locked(folders["running"] / "journal")
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ Source: docs/results.md, while a run goes on.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import os
 import shutil
@@ -27,7 +26,7 @@ from numpy.typing import NDArray
 
 from evedrop.results.folder import make_private, private_opener, replace_private
 from evedrop.results.tables import NULLABLE
-from evedrop.system.files import write_all
+from evedrop.system.files import is_locked, try_lock, write_all
 
 UNFINISHED = "unfinished"
 """The folder inside a results folder that contains unfinished tables."""
@@ -156,8 +155,7 @@ class Unfinished:
         place = folder / UNFINISHED
         make_private(place, exist_ok=False)
         self._descriptor = os.open(place, os.O_RDONLY)
-        with contextlib.suppress(OSError):  # on a file system without locks, a run in progress looks killed
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        try_lock(self._descriptor)  # on a file system without locks, a run in progress looks killed
         self._rounds = os.open(place / _ROUNDS, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o600)
 
     def round(
@@ -187,19 +185,7 @@ def is_unfinished(folder: Path) -> bool:
 
 def goes_on(folder: Path) -> bool:
     """Whether a process still writes to an unfinished results folder."""
-    try:
-        descriptor = os.open(folder / UNFINISHED, os.O_RDONLY)
-    except OSError:
-        return False
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:
-        return False
-    finally:
-        os.close(descriptor)
-    return False
+    return is_locked(folder / UNFINISHED)
 
 
 def last_round(folder: Path) -> TableRound:

@@ -9,7 +9,6 @@ Source: docs/results.md, an interrupted study.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import math
 import os
@@ -31,6 +30,7 @@ from evedrop.results.object_data import NotData, packed, unpacked
 from evedrop.results.resolved_scenario import made_with
 from evedrop.scenario.tables import Scenario
 from evedrop.simulate.tasks import R, Task
+from evedrop.system.files import try_lock
 from evedrop.system.output import say
 
 KEPT = "kept"
@@ -163,13 +163,9 @@ class KeptTasks:
         self._examples: dict[str, Any] = {}
         self._began, self._before = time.monotonic(), _seconds(place)
         self._lock = os.open(place, os.O_RDONLY)
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+        if not try_lock(self._lock):
             self.close()
-            raise UsageError(f"{place.parent} belongs to a study in progress; wait for its end") from None
-        except OSError:  # a file system without locks
-            pass
+            raise UsageError(f"{place.parent} belongs to a study in progress; wait for its end")
         self._files = {path.name for path in place.iterdir() if _NAME.fullmatch(path.name)}
 
     @property

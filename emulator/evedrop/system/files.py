@@ -7,6 +7,7 @@ stops as soon as it has read more than its limit, and reports the limit.
 from __future__ import annotations
 
 import errno
+import fcntl
 import gzip
 import io
 import os
@@ -167,6 +168,32 @@ def write_all(file: int, data: bytes, path: object = None) -> None:
     """Write bytes to a file's end, all of them or, on a full disk, perhaps some. Raises OSError, for `path`."""
     if os.write(file, data) != len(data):  # only a full disk accepts a part
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path)
+
+
+def try_lock(descriptor: int, *, shared: bool = False) -> bool:
+    """Lock an open folder until it is closed; False if another process has it locked. A file system without locks locks nothing.
+
+    shared: whether others may lock it so, too.
+    """
+    try:
+        fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        pass
+    return True
+
+
+def is_locked(folder: Path) -> bool:
+    """Whether a process has locked a folder; False for one that cannot be opened, and on a file system without locks."""
+    try:
+        descriptor = os.open(folder, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        return not try_lock(descriptor, shared=True)  # shared: two readers at once do not see each other
+    finally:
+        os.close(descriptor)
 
 
 def _mask() -> int:

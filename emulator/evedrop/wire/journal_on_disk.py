@@ -16,12 +16,12 @@ from evedrop.model.checks import as_toml
 from evedrop.model.slot.link import Change
 from evedrop.results.wire_folder import WIRE_FILE
 from evedrop.results.wire_summary import WIRE_SUMMARY_FILE, JournalState, WireSummary
+from evedrop.system.files import is_locked
 from evedrop.wire.file import load_wire
 from evedrop.wire.history import NotedEvent, WireHistory
 from evedrop.wire.journal import AmendmentListener, Listener
 from evedrop.wire.journal_part import records_of
 from evedrop.wire.journal_reader import JOURNAL_FOLDER, UNFINISHED, journal_tables, last_beat
-from evedrop.wire.journal_recovery import is_in_use
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.scorekeeper import WireScorekeeper
 
@@ -61,7 +61,7 @@ class JournalOnDisk:
         """Until the wire was last alive, or heard its last message, as far as these were read."""
         self.state: JournalState = "ended"
         if not self._history.ended:
-            self.state = "running" if is_in_use(folder / JOURNAL_FOLDER) else "killed"
+            self.state = "running" if is_locked(folder / JOURNAL_FOLDER) else "killed"
         self._keys = [""]  # code 0 stands for all keys beyond the limit
         self._codes = {"": 0}
 

@@ -5,7 +5,6 @@ Source: docs/wire.md, a wire that starts again.
 
 from __future__ import annotations
 
-import fcntl
 import os
 from pathlib import Path
 
@@ -14,6 +13,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from evedrop.errors import UsageError
+from evedrop.system.files import try_lock
 from evedrop.wire.history import Numbered, WireHistory, highest
 from evedrop.wire.journal_part import write_parquet
 from evedrop.wire.journal_reader import UNFINISHED, damaged, last_beat, parquet_path, part_names, unfinished_table
@@ -23,30 +23,10 @@ from evedrop.wire.record import Kind
 def locked(folder: Path) -> int:
     """The descriptor of a folder that this process alone may use until it closes it. Raises UsageError if another one does."""
     descriptor = os.open(folder, os.O_RDONLY)
-    if not _takes_lock(descriptor, fcntl.LOCK_EX):
+    if not try_lock(descriptor):
         os.close(descriptor)
         raise UsageError(f"another wire writes to {folder.parent}; end it, or give another folder")
     return descriptor
-
-
-def is_in_use(folder: Path) -> bool:
-    """Whether a wire uses a folder, as `locked` says; False on a file system without locks."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        return not _takes_lock(descriptor, fcntl.LOCK_SH)  # shared: two readers at once do not see each other
-    finally:
-        os.close(descriptor)
-
-
-def _takes_lock(descriptor: int, kind: int) -> bool:
-    """Lock a folder; False if another process has a lock that excludes this one. True on a file system without locks."""
-    try:
-        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:
-        pass
-    return True
 
 
 def recover(journal: Path, history: WireHistory) -> int:
