@@ -7,8 +7,7 @@ from typing import Any
 
 import pytest
 
-from evedrop.live.network.operator import Answer, read_answer
-from evedrop.live.observer.operator_orders import Order
+from evedrop.live.network.operator import Answer, Order, read_answer
 from evedrop.live.observer.steering import Steering
 from evedrop.live.protocol.commands import ControlCommand, Go, Hold, LinkChange
 from evedrop.live.protocol.requests import REQUESTS

@@ -17,15 +17,17 @@ from typing import Self, final
 
 import zenoh
 
-from evedrop.errors import MalformedMessage, ScenarioError
+from evedrop.errors import ScenarioError
 from evedrop.live.network.access import Grant, access_control
 from evedrop.live.network.control_file import Control, remove_control
+from evedrop.live.network.declared import Question, Questions
 from evedrop.live.network.opening import open_session
-from evedrop.live.network.operator import Answer
+from evedrop.live.network.operator import Answer, Order
 from evedrop.live.network.router_users import users_file
-from evedrop.live.protocol.envelope import enclosed, payload_of
+from evedrop.live.network.session import listening_config
+from evedrop.live.protocol.envelope import Dropped
 from evedrop.live.protocol.keys import RunKeys, ZenohConfig
-from evedrop.live.protocol.requests import LinkRequest, OperatorRequest, StatusRequest, read_request
+from evedrop.live.protocol.requests import LinkRequest, OperatorRequest, StatusRequest
 from evedrop.live.protocol.wire_status import WireLinkStatus, WireStatus
 from evedrop.names import OBSERVER, OPERATOR
 from evedrop.system.output import warn
@@ -36,7 +38,7 @@ from evedrop.wire.relay import WireRelay
 from evedrop.wire.scorekeeper import WireScorekeeper
 
 _ATTEMPTS = 5  # another program may take a port between its choice and its use
-_LARGEST = 2**20
+_TRANSPORT: ZenohConfig = {"link": {"rx": {"max_message_size": 2**20}}}
 
 
 @final
@@ -64,7 +66,7 @@ class WireControl:
             password = secrets.token_urlsafe(24)
             session, router = self._open(password)
             stack.enter_context(session)
-            session.declare_queryable(self._key, self._answer)
+            Questions(self._key, Dropped("the wire"), self._answer).declare(session)
             stack.callback(remove_control, self._folder)
             try:
                 Control(self._run, router, OPERATOR, password).write(self._folder)
@@ -82,7 +84,8 @@ class WireControl:
         for attempt in range(_ATTEMPTS):
             router = f"tcp/127.0.0.1:{free_port()}"
             with users_file({OPERATOR: password}) as users:
-                config = _router_config(self._key, router, users)
+                access = access_control([Grant(OPERATOR, writes=(), reads=(), token=None, asks=(self._key,))])
+                config = listening_config(router, str(users), access, _TRANSPORT)
                 try:
                     return open_session(zenoh.Config.from_json5(json.dumps(config))), router
                 except zenoh.ZError:
@@ -90,22 +93,17 @@ class WireControl:
                         raise
         raise AssertionError
 
-    def _answer(self, query: zenoh.Query) -> None:
+    def _answer(self, question: Question) -> None:
         """Carry out a request. Zenoh only logs what is raised here."""
-        with query:
-            payload = b"" if query.payload is None else query.payload.to_bytes()
-            message = payload_of(self._key, payload)
-            if message is None:
-                return
-            try:
-                answer = self._carry_out(read_request(self._key, message))
-            except MalformedMessage as error:
-                answer = Answer(refused=(str(error),))
-            except ScenarioError as error:
-                answer = Answer(refused=tuple(error.mistakes))
-            except Exception as error:  # the operator must not wait in vain
-                answer = Answer(refused=(f"the wire failed to do so: {error!r}",))
-            query.reply(self._key, enclosed(self._key, answer.pack()))
+        order = Order.of(question)
+        if order is None:
+            return
+        try:
+            order.answer(self._carry_out(order.request))
+        except ScenarioError as error:
+            order.refuse(*error.mistakes)
+        except Exception as error:  # the operator must not wait in vain
+            order.refuse(f"the wire failed to do so: {error!r}")
 
     def _carry_out(self, request: OperatorRequest) -> Answer:
         if isinstance(request, StatusRequest):
@@ -134,17 +132,3 @@ class WireControl:
         complete = "complete" if whole else "incomplete, because its folder could not be written"
         bypasses = [event.line for event in self._journal.events if event.bypass]
         return WireStatus(self._conductor.seconds, sides, links, list(self._events), complete, bypasses)
-
-
-def _router_config(key: str, listen: str, users: Path) -> ZenohConfig:
-    """The configuration of a router to which only the operator may connect, and only to ask at one key."""
-    return {
-        "mode": "router",
-        "listen": {"endpoints": [listen], "exit_on_failure": True},
-        "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "transport": {
-            "link": {"rx": {"max_message_size": _LARGEST}},
-            "auth": {"usrpwd": {"dictionary_file": str(users)}},
-        },
-        "access_control": access_control([Grant(OPERATOR, writes=(), reads=(), token=None, asks=(key,))]),
-    }

@@ -1,4 +1,4 @@
-"""How the operator asks a run in progress, and the answers: a Zenoh query to the observer.
+"""How the operator asks a run or wire in progress, and how it answers: by a Zenoh query.
 
 Source: docs/protocol.md, request and answer.
 """
@@ -8,20 +8,23 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from typing import final
 
 import zenoh
 
+from evedrop.errors import MalformedMessage
 from evedrop.live.network.control_file import Control
+from evedrop.live.network.declared import Question
 from evedrop.live.network.opening import open_session
 from evedrop.live.network.session import client_config
 from evedrop.live.protocol.codec import Reader, pack
 from evedrop.live.protocol.envelope import enclosed, payload_of
 from evedrop.live.protocol.keys import RunKeys
-from evedrop.live.protocol.requests import OperatorRequest
+from evedrop.live.protocol.requests import OperatorRequest, read_request
 from evedrop.live.protocol.status import RunStatus
 from evedrop.live.protocol.wire_status import WireStatus
 from evedrop.model.entries import expect, read, table_of
-from evedrop.names import OBSERVER
+from evedrop.names import OBSERVER, OPERATOR
 
 _STATUSES: Mapping[str, type[RunStatus | WireStatus]] = {"status": RunStatus, "wire": WireStatus}
 
@@ -46,6 +49,36 @@ class Answer:
         if self.status is not None:
             return pack({"wire" if isinstance(self.status, WireStatus) else "status": asdict(self.status)})
         return pack({"k": self.slot, "said": self.said})
+
+
+@final
+@dataclass(frozen=True)
+class Order:
+    """A request with the Zenoh question that brought it, to be answered once."""
+
+    request: OperatorRequest
+    _question: Question
+
+    @classmethod
+    def of(cls, question: Question) -> Order | None:
+        """The order in an operator's question; None if it is malformed, which is then refused."""
+        try:
+            return cls(read_request(OPERATOR, question.payload), question)
+        except MalformedMessage as error:
+            question.answer(Answer(refused=(str(error),)).pack())
+            return None
+
+    def answer(self, answer: Answer) -> None:
+        """Send the answer."""
+        self._question.answer(answer.pack())
+
+    def done(self, slot: int, said: str) -> None:
+        """Answer that the request takes effect from this slot on; said: what was done, in words."""
+        self.answer(Answer(slot, said))
+
+    def refuse(self, *mistakes: str) -> None:
+        """Answer that the request is refused, and that nothing was changed."""
+        self.answer(Answer(refused=mistakes))
 
 
 def read_answer(key: str, payload: bytes) -> Answer:

@@ -121,16 +121,23 @@ def _once(address: RouterAddress) -> RouterAddress:
     return replace(address, config=config)
 
 
-def router_config(brief: Brief[RoutingPart], users_file: str, access: ZenohConfig, listen: str) -> ZenohConfig:
-    """Zenoh configuration of a router: it listens, asks for user and password, and drops messages not granted or too large."""
-    transport = _transport(brief.identity, brief.flow.largest_message, _packet_bytes(brief), listens=True)
+def listening_config(listen: str, users_file: str, access: ZenohConfig, transport: ZenohConfig) -> ZenohConfig:
+    """Zenoh configuration of any router of ours: it finds nobody by itself, and asks for user and password."""
     return {
         "mode": "router",
-        **({"id": brief.part.zid} if isinstance(brief.part, RouterPart) and brief.part.zid is not None else {}),
         "listen": {"endpoints": [listen], "exit_on_failure": True},
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {**transport, "auth": {"usrpwd": {"dictionary_file": users_file}}},
         "access_control": access,
+    }
+
+
+def router_config(brief: Brief[RoutingPart], users_file: str, access: ZenohConfig, listen: str) -> ZenohConfig:
+    """Zenoh configuration of a router: it listens, asks for user and password, and drops messages not granted or too large."""
+    transport = _transport(brief.identity, brief.flow.largest_message, _packet_bytes(brief), listens=True)
+    return {
+        **listening_config(listen, users_file, access, transport),
+        **({"id": brief.part.zid} if isinstance(brief.part, RouterPart) and brief.part.zid is not None else {}),
         "low_pass_filter": low_pass(brief.run, brief.part.limits),
     }
 

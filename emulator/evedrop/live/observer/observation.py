@@ -11,17 +11,16 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, final
 
-from evedrop.errors import EvedropError, Interrupted, MalformedMessage, NoAnswer, RunError
+from evedrop.errors import EvedropError, Interrupted, NoAnswer, RunError
 from evedrop.live.network.control_file import Control, remove_control
 from evedrop.live.network.declared import Question
 from evedrop.live.network.launcher_news import tell
-from evedrop.live.network.operator import Answer
+from evedrop.live.network.operator import Answer, Order
 from evedrop.live.network.resending import GapDetector
 from evedrop.live.network.session import Session
 from evedrop.live.observer.absence_reporter import AbsenceReporter
 from evedrop.live.observer.conductor import Conductor, Stop
 from evedrop.live.observer.joiner import Joiner
-from evedrop.live.observer.operator_orders import Order
 from evedrop.live.observer.recovery import Recovery
 from evedrop.live.observer.stall import Stall, patience_of
 from evedrop.live.observer.status import status_of
@@ -34,7 +33,7 @@ from evedrop.live.protocol.commands import ReportStatus
 from evedrop.live.protocol.last_word import protocol_breaker
 from evedrop.live.protocol.news import RunOver
 from evedrop.live.protocol.process_status import is_process_status, read_process_status
-from evedrop.live.protocol.requests import StatusRequest, read_request
+from evedrop.live.protocol.requests import StatusRequest
 from evedrop.live.protocol.status import RunStatus
 from evedrop.live.protocol.telemetry import is_held, is_leaving, read_leaving
 from evedrop.model.digest import Blocks
@@ -216,13 +215,11 @@ class ObservedRun:
 
     def _answer(self, conductor: Conductor, question: Question) -> None:
         """Take a question from the operator; a malformed one is refused and does not harm the run."""
-        try:
-            order = Order(read_request(OPERATOR, question.payload), question)
-        except MalformedMessage as error:
-            question.answer(Answer(refused=(str(error),)).pack())
+        order = Order.of(question)
+        if order is None:
             return
         if isinstance(order.request, StatusRequest):
-            order.tell(self._status(conductor))
+            order.answer(Answer(status=self._status(conductor)))
         elif self._brief.part.shard:
             order.refuse("this run is in shards, which cannot be steered; run it with --set shards=1 to steer it")
         else:

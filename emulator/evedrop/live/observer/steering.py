@@ -11,12 +11,13 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any, final
 
 from evedrop.errors import RunError, ScenarioError
+from evedrop.live.network.operator import Order
 from evedrop.live.network.session import READY_SECONDS
 from evedrop.live.observer.conductor import Conductor
-from evedrop.live.observer.operator_orders import OperatorStep, Order
 from evedrop.live.protocol.commands import Go, Hold, LinkChange
 from evedrop.live.protocol.news import ProcessRequest
 from evedrop.live.protocol.requests import LinkRequest, PauseRequest, ResumeRequest, StepRequest
@@ -26,6 +27,22 @@ from evedrop.scenario.events.event import Act
 from evedrop.scenario.loading.file import with_event
 from evedrop.scenario.news import Held, RunEvent, Tell
 from evedrop.scenario.tables import Scenario
+
+
+@dataclass(frozen=True)
+class OperatorStep:
+    """A step: the run continues from `first`, before which it was held, and is held again before `until`."""
+
+    order: Order
+    first: int
+    until: int
+
+    def passed(self, end: int) -> str:
+        """The slots of the step that have passed, in words, when all slots below `end` have passed."""
+        last = end - 1
+        if last < self.first:
+            return "no slot passed"
+        return f"slot {last} passed" if last == self.first else f"slots {self.first} to {last} passed"
 
 
 @final
