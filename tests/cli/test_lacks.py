@@ -46,6 +46,7 @@ LACKS: list[tuple[BaseException, str]] = [
         ImportError("Original error was: libx.so: failed to map segment from shared object"),
         "there is not enough memory; ",
     ),
+    (SystemError("error return without exception set"), "there is not enough memory; "),
 ]
 STUDY = ("montecarlo", "eavesdroppers", "--trials", "2", "--slots", "5")
 
@@ -67,7 +68,14 @@ def test_a_study_without_resources_is_no_failed_expectation(
 
 
 @pytest.mark.parametrize(
-    "error", [RuntimeError("other"), ImportError("no module named x"), OSError(errno.ENOSPC, "No space"), ValueError()]
+    "error",
+    [
+        RuntimeError("other"),
+        ImportError("no module named x"),
+        OSError(errno.ENOSPC, "No space"),
+        SystemError("other"),
+        ValueError(),
+    ],
 )
 def test_other_errors_are_no_lack(error: Exception) -> None:
     """A mistake in the program keeps its traceback."""

@@ -26,7 +26,7 @@ from tests.faults import ours, studies, wires
 from tests.faults.cases import PATIENT_SECONDS, AnyCase, Case, case_of
 from tests.faults.disturbed import FORK_SERVERS, Disturbed, disturbed
 from tests.faults.facilities import Facilities, facilities
-from tests.faults.judge import OUTCOMES, misses, outcome_of
+from tests.faults.judge import OUTCOMES, misses, outcome_of, status_of
 from tests.faults.kinds import KINDS, Fault
 from tests.faults.moments import Usual
 from tests.faults.reference import Reference, in_memory
@@ -134,7 +134,7 @@ class Campaign:
                 run.free()
                 complaints = misses(run, hits, case.longest_outage, reference, before) if not hung else [hung]
                 ours.end_all(ours.none_left(before, 5.0 if hung else 0.0))
-        return self._verdict(case, tuple(hits), complaints, outcome_of(run.launcher.returncode), seconds)
+        return self._verdict(case, tuple(hits), complaints, outcome_of(status_of(run)), seconds)
 
     def _disk(self, case: Case) -> str | None:
         return case.disk if case.disk != "full" or self.facilities.small_disks else None

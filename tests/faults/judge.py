@@ -30,6 +30,7 @@ _HEEDED_SECONDS = 1.0
 """After a signal to the launcher a run that has slots to come does not complete."""
 _LEAVE_SECONDS = 40.0
 """For processes whose launcher was killed to write the results and end; and for all others. An observer takes 30 at most."""
+_OF_C_LIBRARY, _ENDED_BY_C_LIBRARY = 127, "cannot allocate memory for thread-local data: ABORT"
 _OF_ZENOH = re.compile(r"panicked at \S*/zenoh[^\s/]*/\S+\.rs")
 
 
@@ -42,6 +43,15 @@ def outcome_of(status: int) -> str:
         INTERRUPTED: OUTCOMES[2],
         KILLED: OUTCOMES[3],
     }.get(status, OUTCOMES[4])
+
+
+def status_of(run: Run) -> int:
+    """The exit status of a run's launcher. If the C library ended it, that of a launcher that was killed.
+
+    It does so where it has no memory for the variables of a thread, with a status and a line of its own.
+    """
+    status = run.launcher.returncode
+    return KILLED if status == _OF_C_LIBRARY and _ENDED_BY_C_LIBRARY in run.text("stderr") else status
 
 
 class Launcher(Protocol):
@@ -106,7 +116,7 @@ def misses(
     left = ours.none_left(before, _LEAVE_SECONDS, *run.temporaries.values())
     found = [f"process {one.pid} is left: {' '.join(one.words)}; {ours.doing(one.pid)}" for one in left]
     ours.end_all(left)
-    status = run.launcher.returncode
+    status = status_of(run)
     found += _of_status(status, run, hits, longest_outage, int(reference.summary["slots"]))
     found += _of_what_is_said(run, any(map(_of_limits, hits)))
     for host, folder in run.temporaries.items():
@@ -149,7 +159,10 @@ def _of_status(status: int, run: Run, hits: Mapping[Fault, float], longest_outag
         if not any(fault.kind in SIGNALS and not host_of(fault.target) for fault in fatal):
             yield "status 130, but no signal asked for the end"
     elif status == KILLED:
-        if not any(fault.kind in KILLING and fault.target == "launcher" for fault in fatal):
+        killed = any(fault.kind in KILLING and fault.target == "launcher" for fault in fatal)
+        if not killed and (
+            run.launcher.returncode == KILLED or not any(fault.kind == "little memory" for fault in fatal)
+        ):
             yield "the launcher was killed by something else"
     elif status != 0:
         yield f"status {status}: {_first_line(run)}"

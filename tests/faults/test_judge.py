@@ -284,6 +284,16 @@ def test_a_panic_of_zenoh_is_no_mistake_where_threads_are_few(ended: Ended, refe
     assert [line for line in ended.misses(reference, KILL) if "smart.log has a traceback" in line]
 
 
+def test_a_launcher_may_be_ended_by_the_c_library_where_memory_is_short(ended: Ended, reference: Reference) -> None:
+    """It counts as killed: no process may be left, and what was measured must be there. Elsewhere it is a mistake."""
+    ended.launcher.returncode = 127
+    short = Fault("little memory", "launcher", Moment("start", 0.0), count=490)
+    assert [line for line in ended.misses(reference, short) if "status 127" in line]
+    (ended.folder / "stderr").write_text("cannot allocate memory for thread-local data: ABORT\n")
+    assert not [line for line in ended.misses(reference, short) if "status" in line or "killed" in line]
+    assert [line for line in ended.misses(reference, KILL) if "killed by something else" in line]
+
+
 @pytest.mark.parametrize("without", ["a row", "a receiver", "a block"])
 def test_digests_that_are_not_those_of_the_rows_are_seen(without: str, ended: Ended) -> None:
     """The reference is computed by the same code, so that a mistake in the rows would be in both."""

@@ -17,6 +17,8 @@ _SCIPY_BYTES, _THREAD_BYTES = 160_000_000, 45_000_000
 _MOST_THREADS = 64
 _WITHOUT_ROOM = ("failed to map segment", "cannot allocate memory")
 """What the system says in an ImportError about a library that found no memory."""
+_WITHOUT_REASON = ("without exception set", "without setting an exception")
+"""What Python says in a SystemError if its own code, or an extension's, found no memory and raised no exception for it."""
 _WITHOUT_THREAD = ("can't start new thread", "can't spawn worker thread", "Failed to launch worker thread")
 """What Python, Zenoh (in a PanicException, which does not derive from Exception) and Arrow say."""
 _LACKS = {
@@ -27,8 +29,10 @@ _LACKS = {
 
 def lack_of(error: BaseException) -> str | None:
     """What the machine lacks and what to do, as a message; None if the error says something else."""
-    if isinstance(error, MemoryError) or (
-        isinstance(error, ImportError) and any(words in str(error).lower() for words in _WITHOUT_ROOM)
+    if (
+        isinstance(error, MemoryError)
+        or (isinstance(error, ImportError) and any(words in str(error).lower() for words in _WITHOUT_ROOM))
+        or (isinstance(error, SystemError) and any(words in str(error) for words in _WITHOUT_REASON))
     ):
         lack = _LACKS[errno.ENOMEM]
     elif any(words in str(error) for words in _WITHOUT_THREAD):
