@@ -60,16 +60,16 @@ def rows_of(family: Family, quick: bool) -> Iterator[Row]:
     )
     limit = max(120.0, family.seconds / 10) if quick else family.seconds
     try:
-        out, said = process.communicate(timeout=limit)
+        out, errors = process.communicate(timeout=limit)
         late = ""
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
-        out, said = process.communicate()
+        out, errors = process.communicate()
         late = f"did not end within {limit:.0f} s"
     for line in out.splitlines():
         yield read_row(line)
     if late or process.returncode:
-        last = "\n".join(said.splitlines()[-_SAID_LINES:])
+        last = "\n".join(errors.splitlines()[-_SAID_LINES:])
         raise Failure(f"{family.program.name} {late or f'ended with status {process.returncode}'}\n{last}".strip())
 
 

@@ -38,9 +38,9 @@ def whole(trials: int, slots: int) -> None:
     workers = usable_cores()
     with tempfile.TemporaryDirectory() as folder:
         started = time.monotonic()
-        found = compare(MARGINAL, trials=trials, slots=slots, out=Path(folder) / "run", plan=Plan(workers=workers))
+        comparison = compare(MARGINAL, trials=trials, slots=slots, out=Path(folder) / "run", plan=Plan(workers=workers))
         seconds = time.monotonic() - started
-    played = sum(cell.ratio is not None for one in found.schemes.values() for cell in one.cells.values())
+    played = sum(cell.ratio is not None for scheme in comparison.schemes.values() for cell in scheme.cells.values())
     print(f"compare, {trials} trials of {slots} slots, {workers} workers: {seconds:.1f} s for {played} pairs")
 
 
@@ -65,11 +65,11 @@ def packets(scenario: Scenario, batch: Batch) -> list[Reception]:
     trajectory = Trajectory(process, keys.process, batch)
     schedule = scenario.schedule("smart")
     fates = Link(schedule, "smart", keys.link("smart", schedule), batch).fates(range(batch.slots)).in_time
-    found = []
+    receptions = []
     for k in range(batch.slots):
         x = trajectory.advance()
-        found.append(Reception(fates[k], encoder.encode(k, x, trajectory.predicted).z))
-    return found
+        receptions.append(Reception(fates[k], encoder.encode(k, x, trajectory.predicted).z))
+    return receptions
 
 
 def read(scenario: Scenario, strategy: str, batch: Batch, heard: list[Reception]) -> float:

@@ -23,12 +23,12 @@ WAYS: dict[str, Callable[[], tuple[str, ...]]] = {
 def main(quick: bool) -> None:
     """One trial and a thousand."""
     for slots, trials in ((300, 1),) if quick else ((10_000, 1), (1_000, 1000)):
-        found: dict[str, list[float]] = {name: [] for name in WAYS}
+        rates_of: dict[str, list[float]] = {name: [] for name in WAYS}
         for _ in range(1 if quick else 3):
             for name, options in WAYS.items():
-                found[name].append(rate("eavesdroppers", "--slots", str(slots), "--trials", str(trials), *options()))
-        for name, rates in found.items():
-            ratio = statistics.median(a / b for a, b in zip(rates, found["in clear"], strict=True))
+                rates_of[name].append(rate("eavesdroppers", "--slots", str(slots), "--trials", str(trials), *options()))
+        for name, rates in rates_of.items():
+            ratio = statistics.median(a / b for a, b in zip(rates, rates_of["in clear"], strict=True))
             print(f"{trials:>5} trials, {name}: {statistics.median(rates):>8,.0f} slots/s; ratio {ratio:.2f}")
 
 

@@ -95,15 +95,15 @@ def scored(scenario: Scenario) -> None:
 
 def measured(quick: bool) -> dict[str, Any]:
     """In a process of its own: the kernels in use, and of each case the seconds of the simulation and of PCG64."""
-    found: dict[str, Any] = {"kernels": KERNELS, "cases": {}}
+    measurements: dict[str, Any] = {"kernels": KERNELS, "cases": {}}
     for name, n, trials, slots in cases(quick):
         scenario = scenario_of(n, trials, slots)
         work = scored if "scored" in name else simulated
         work(scenario_of(n, trials, max(1, slots // 16)))  # so that nothing is imported while it counts
         drawn(n, 1, 1)
         both = partial(work, scenario), partial(drawn, n, trials, slots)
-        found["cases"][name] = [processor_time(one) for one in both]
-    return found
+        measurements["cases"][name] = [processor_time(work_of) for work_of in both]
+    return measurements
 
 
 def child(kernels: str, quick: bool) -> dict[str, Any]:
@@ -114,14 +114,14 @@ def child(kernels: str, quick: bool) -> dict[str, Any]:
         environment[KERNELS_VARIABLE] = kernels
     command = [sys.executable, __file__, "--measure", *(["--quick"] if quick else [])]
     done = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True)
-    found: dict[str, Any] = json.loads(done.stdout)
-    return found
+    measurements: dict[str, Any] = json.loads(done.stdout)
+    return measurements
 
 
 def against_random_numbers(rounds: Sequence[dict[str, Any]], case: Case) -> tuple[float, float, float]:
     """Nanoseconds a trial-slot of a case and of PCG64, and the ratio."""
     name, _, trials, slots = case
-    times = [one["cases"][name] for one in rounds]
+    times = [measurements["cases"][name] for measurements in rounds]
     ours, theirs = (statistics.median(column) / trials / slots * 1e9 for column in zip(*times, strict=True))
     return ours, theirs, statistics.median(seconds / bare for seconds, bare in times)
 
@@ -161,7 +161,7 @@ def main(quick: bool) -> None:
         for of_kernels in zip(*rounds, strict=True):
             each, _, ratio = against_random_numbers(of_kernels, case)
             print(f"    {of_kernels[0]['kernels']:<46} {each:>12,.0f} ns a trial-slot, {ratio:>8.2f} times PCG64")
-        gain = statistics.median(two["cases"][name][0] / one["cases"][name][0] for one, two in rounds)
+        gain = statistics.median(two["cases"][name][0] / compiled["cases"][name][0] for compiled, two in rounds)
         print(f"    {gain:.2f} times as fast")
 
 

@@ -40,8 +40,8 @@ def started(scenario: str | Path, *options: str) -> Iterator[tuple[subprocess.Po
                 process.wait()
         if process.returncode not in _MEASURED:
             errors.seek(0)
-            said = errors.read().decode(errors="replace").strip()
-            raise RuntimeError(f"{' '.join(command[1:])} ended with status {process.returncode}: {said}")
+            complaint = errors.read().decode(errors="replace").strip()
+            raise RuntimeError(f"{' '.join(command[1:])} ended with status {process.returncode}: {complaint}")
 
 
 def measured(
@@ -53,8 +53,8 @@ def measured(
             watch(process, out)
         process.wait()
         summary = out / "summary.json"
-        found: dict[str, Any] = json.loads(summary.read_text(encoding="utf-8")) if summary.exists() else {}
-    return found
+        values: dict[str, Any] = json.loads(summary.read_text(encoding="utf-8")) if summary.exists() else {}
+    return values
 
 
 def rate(scenario: str | Path, *options: str) -> float:

@@ -52,16 +52,16 @@ class Looks:
     def look(self, process: subprocess.Popen[bytes], out: Path) -> None:
         """Look again and again until all slots are on disk."""
         while process.poll() is None and (slots := slots_on_disk(out)) < self.total:
-            found = dict[str, float]()
-            for one in processes_of(process.pid):
+            megabytes = dict[str, float]()
+            for usage in processes_of(process.pid):
                 try:
-                    found[one.name] = one.private
+                    megabytes[usage.name] = usage.private
                 except OSError:
                     continue
-                self.roles[one.name] = one.role
+                self.roles[usage.name] = usage.role
             if slots:
                 self.slots.append(slots)
-                self.megabytes.append(found)
+                self.megabytes.append(megabytes)
             time.sleep(_POLL_SECONDS)
 
     @property
@@ -73,14 +73,14 @@ class Looks:
     def quarters(self) -> tuple[list[dict[str, float]], list[dict[str, float]]] | None:
         """What was seen in the second quarter of the slots and in the last; None if there was no look in one of them."""
         # Peers leave before the last slots are on disk: a look that misses one of them is not compared.
-        all_there = max((len(found) for found in self.megabytes), default=0)
+        all_there = max((len(sizes) for sizes in self.megabytes), default=0)
         looks = [
-            (slots / self.total, found)
-            for slots, found in zip(self.slots, self.megabytes, strict=True)
-            if len(found) == all_there
+            (slots / self.total, sizes)
+            for slots, sizes in zip(self.slots, self.megabytes, strict=True)
+            if len(sizes) == all_there
         ]
-        before = [found for share, found in looks if 0.25 <= share < 0.5]
-        after = [found for share, found in looks if share >= 0.75]
+        before = [sizes for share, sizes in looks if 0.25 <= share < 0.5]
+        after = [sizes for share, sizes in looks if share >= 0.75]
         return (before, after) if before and after else None
 
     @property
@@ -94,7 +94,7 @@ class Looks:
         before, after = self.quarters
         apart = 0.5 * self.total / 1e6
         return {
-            name: (median(one[name] for one in after) - median(one[name] for one in before)) / apart
+            name: (median(sizes[name] for sizes in after) - median(sizes[name] for sizes in before)) / apart
             for name in after[0]
         }
 
@@ -104,9 +104,9 @@ def bare_interpreter() -> float:
     command = [sys.executable, "-c", _BARE.format(folder=str(Path(__file__).parent))]
     with ExitStack() as stack:
         pair = [stack.enter_context(subprocess.Popen(command, stdin=PIPE, stdout=PIPE)) for _ in range(2)]
-        for one in pair:
-            assert one.stdout is not None
-            one.stdout.readline()
+        for interpreter in pair:
+            assert interpreter.stdout is not None
+            interpreter.stdout.readline()
         return processes_of(pair[0].pid)[0].private
 
 
@@ -129,7 +129,7 @@ def rows(quick: bool) -> Iterator[Row]:
         judged(size <= 40, size <= 25),
     )
     growth = looks.growth
-    name = max(growth, key=lambda one: growth[one])
+    name = max(growth, key=lambda process: growth[process])
     yield Row(
         f"growth of private memory over {slots:,} slots, the largest of {len(growth)} processes",
         f"{growth[name]:.1f} MB in 10⁶ slots ({name})",

@@ -146,10 +146,10 @@ def against_filterpy(slots: int, rounds: int) -> None:
         for _ in range(trials):
             filters = []
             for _ in range(2):
-                one = KalmanFilter(dim_x=2, dim_z=2, dim_u=2)
-                one.F, one.Q, one.H, one.B = process.A, process.Q, np.eye(2), np.eye(2)
-                one.R, one.P = np.zeros((2, 2)), process.initial_covariance
-                filters.append(one)
+                kalman = KalmanFilter(dim_x=2, dim_z=2, dim_u=2)
+                kalman.F, kalman.Q, kalman.H, kalman.B = process.A, process.Q, np.eye(2), np.eye(2)
+                kalman.R, kalman.P = np.zeros((2, 2)), process.initial_covariance
+                filters.append(kalman)
             legitimate, smart = filters
             x = random.standard_normal((2, 1))
             nothing = np.zeros((2, 2))

@@ -40,7 +40,7 @@ def processes_of(launcher: int) -> list[ProcessUsage]:
     inside = {launcher} & stats.keys()
     while more := {pid for pid, fields in stats.items() if int(fields[1]) in inside} - inside:
         inside |= more
-    found = []
+    usages = []
     for pid in sorted(inside):
         fields = stats[pid]
         try:
@@ -48,8 +48,8 @@ def processes_of(launcher: int) -> list[ProcessUsage]:
         except OSError:
             continue
         seconds = (int(fields[11]) + int(fields[12])) / _TICK
-        found.append(ProcessUsage(pid, name, role, seconds, int(fields[21]) * _PAGE / 1e6))
-    return found
+        usages.append(ProcessUsage(pid, name, role, seconds, int(fields[21]) * _PAGE / 1e6))
+    return usages
 
 
 def _stats() -> Iterator[tuple[int, list[str]]]:
@@ -74,6 +74,6 @@ def watch_cpu(process: subprocess.Popen[bytes], interval: float = 0.05) -> dict[
     """Watch a command until it ends: process name → its processor seconds."""
     seconds: dict[str, float] = {}
     while process.poll() is None:
-        seconds.update({one.name: one.cpu_seconds for one in processes_of(process.pid)})
+        seconds.update({usage.name: usage.cpu_seconds for usage in processes_of(process.pid)})
         time.sleep(interval)
     return seconds

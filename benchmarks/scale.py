@@ -115,7 +115,7 @@ def _measure(trials: int, receivers: int, shards: int, slots: int) -> MeasuredRu
     with tempfile.TemporaryDirectory() as folder:
         measured(scenario_file(folder, changes_of(slots, trials, receivers, shards)), watch=watch)
     steady = [(at, done) for at, done in told if done >= _STEADY * slots]
-    if not steady or steady[0][1] == (last := max(steady, key=lambda one: one[1]))[1]:
+    if not steady or steady[0][1] == (last := max(steady, key=lambda moment: moment[1]))[1]:
         return _measure(trials, receivers, shards, 4 * slots)  # it was over before it was looked at twice
     begin, done = steady[0]
     end = next(at for at, now in steady if now == last[1])
@@ -134,9 +134,9 @@ def _measure(trials: int, receivers: int, shards: int, slots: int) -> MeasuredRu
 def look(launcher: int) -> tuple[float, dict[str, list[float]]]:
     """Resident megabytes of a command and its children together; role → processor seconds so far, by process id."""
     resident, seconds = 0.0, dict[str, list[float]]()
-    for one in processes_of(launcher):
-        resident += one.resident
-        seconds.setdefault(one.role, []).append(one.cpu_seconds)
+    for usage in processes_of(launcher):
+        resident += usage.resident
+        seconds.setdefault(usage.role, []).append(usage.cpu_seconds)
     return resident, seconds
 
 
@@ -165,66 +165,66 @@ def named(power: float) -> str:
     return words[int(np.searchsorted((-0.1, 0.1, 0.9, 1.1), power))]
 
 
-def laws(found: list[MeasuredRun]) -> None:
+def laws(runs: list[MeasuredRun]) -> None:
     """Growth along each axis, and what a slot costs."""
-    alone = [one for one in found if one.shards == 1]
-    axes = {"trials": sorted({one.trials for one in alone}), "receivers": sorted({one.receivers for one in alone})}
+    alone = [run for run in runs if run.shards == 1]
+    axes = {"trials": sorted({run.trials for run in alone}), "receivers": sorted({run.receivers for run in alone})}
     print("\ngrowth without shards, exponents of a power law between two sizes:")
     for axis, sizes in axes.items():
         other = "receivers" if axis == "trials" else "trials"
         for fixed in axes[other]:
-            line = [one for one in alone if getattr(one, other) == fixed]
+            line = [run for run in alone if getattr(run, other) == fixed]
             for low, high in pairwise(sizes):
-                ends = [one for one in line if getattr(one, axis) in (low, high)]
-                rate = exponent([(getattr(one, axis), one.rate) for one in ends])
-                memory = exponent([(getattr(one, axis), one.megabytes) for one in ends])
+                ends = [run for run in line if getattr(run, axis) in (low, high)]
+                rate = exponent([(getattr(run, axis), run.rate) for run in ends])
+                memory = exponent([(getattr(run, axis), run.megabytes) for run in ends])
                 print(
                     f"    {axis} {low:>4} to {high:>4}, {fixed:>4} {other}: deliveries/s {rate:5.2f} ({named(rate)}), "
                     f"memory {memory:5.2f} ({named(memory)})"
                 )
     if len(alone) > 4:
-        terms = np.array([[1.0, one.receivers, one.trials, one.trials * one.receivers] for one in alone])
-        for what, values, unit in (
-            ("a slot costs", [1e6 * one.cores / one.slots_per_second for one in alone], "µs of processor"),
-            ("memory is", [one.megabytes for one in alone], "MB"),
+        terms = np.array([[1.0, run.receivers, run.trials, run.trials * run.receivers] for run in alone])
+        for subject, values, unit in (
+            ("a slot costs", [1e6 * run.cores / run.slots_per_second for run in alone], "µs of processor"),
+            ("memory is", [run.megabytes for run in alone], "MB"),
         ):
             weights = 1.0 / np.array(values)  # relative errors
             law, *_ = np.linalg.lstsq(terms * weights[:, None], np.ones(len(alone)), rcond=None)
             off = float(np.max(np.abs(terms @ law * weights - 1.0)))
             print(
-                f"{what} about {law[0]:.3g} + {law[1]:.3g} · receivers + {law[2]:.3g} · trials + {law[3]:.3g} · trials · "
+                f"{subject} about {law[0]:.3g} + {law[1]:.3g} · receivers + {law[2]:.3g} · trials + {law[3]:.3g} · trials · "
                 f"receivers {unit}, within {100 * off:.0f} %"
             )
 
 
-def draw(found: list[MeasuredRun], picture: Path) -> None:
+def draw(runs: list[MeasuredRun], picture: Path) -> None:
     """Three panels: deliveries a second and memory against trials, and what shards change."""
-    receivers = sorted({one.receivers for one in found})
+    receivers = sorted({run.receivers for run in runs})
     with panels(picture, 3, 13.0, 4.2) as (speed, memory, gain):
         for colour, count in zip(COLOURS, receivers, strict=False):
-            line = [one for one in found if one.shards == 1 and one.receivers == count]
+            line = [run for run in runs if run.shards == 1 and run.receivers == count]
             word = f"{count} receiver" + ("s" if count > 1 else "")
-            for axes, values in ((speed, [one.rate for one in line]), (memory, [one.megabytes for one in line])):
-                axes.loglog([one.trials for one in line], values, "o-", color=colour, markersize=4, label=word)
-        low, first = min(one.trials for one in found), min(one.rate for one in found if one.shards == 1)
-        high = max(one.trials for one in found)
+            for axes, values in ((speed, [run.rate for run in line]), (memory, [run.megabytes for run in line])):
+                axes.loglog([run.trials for run in line], values, "o-", color=colour, markersize=4, label=word)
+        low, first = min(run.trials for run in runs), min(run.rate for run in runs if run.shards == 1)
+        high = max(run.trials for run in runs)
         speed.loglog([low, high], [first, first * high / low], ":", color=GREY, linewidth=1.0, label="linear")
-        speed.set_ylim(top=2.5 * max(one.rate for one in found))
-        many = [one for one in found if one.receivers == receivers[1]]
-        for colour, trials in zip(COLOURS, sorted({one.trials for one in many if one.trials > 1}), strict=False):
-            line = [one for one in many if one.trials == trials]
+        speed.set_ylim(top=2.5 * max(run.rate for run in runs))
+        many = [run for run in runs if run.receivers == receivers[1]]
+        for colour, trials in zip(COLOURS, sorted({run.trials for run in many if run.trials > 1}), strict=False):
+            line = [run for run in many if run.trials == trials]
             base = _alone(many, trials)
             gain.plot(
-                [one.shards for one in line],
-                [one.rate / base for one in line],
+                [run.shards for run in line],
+                [run.rate / base for run in line],
                 "o-",
                 color=colour,
                 markersize=4,
                 label=f"{trials:,} trials",
             )
         gain.axhline(1.0, color=GREY, linewidth=1.0)
-        gain.set_ylim(0.0, 1.25 * max(one.rate / _alone(many, one.trials) for one in many))
-        gain.set_xticks(sorted({one.shards for one in found}))
+        gain.set_ylim(0.0, 1.25 * max(run.rate / _alone(many, run.trials) for run in many))
+        gain.set_xticks(sorted({run.shards for run in runs}))
         for axes, title, x in (
             (speed, "Deliveries a second, 1 shard", "trials"),
             (memory, "Memory of all processes, MB, 1 shard", "trials"),
@@ -237,14 +237,14 @@ def draw(found: list[MeasuredRun], picture: Path) -> None:
             which(lambda value, _: f"{value:,.0f}" if f"{value:g}"[0] in "1257" else "")
 
 
-def _alone(found: list[MeasuredRun], trials: int) -> float:
+def _alone(runs: list[MeasuredRun], trials: int) -> float:
     """The rate of this number of trials in one shard."""
-    return next(one.rate for one in found if one.shards == 1 and one.trials == trials)
+    return next(run.rate for run in runs if run.shards == 1 and run.trials == trials)
 
 
 def load_now() -> str:
     """How busy the machine is."""
-    return " ".join(f"{one:.1f}" for one in os.getloadavg())
+    return " ".join(f"{load:.1f}" for load in os.getloadavg())
 
 
 def main(quick: bool, picture: Path | None) -> None:
@@ -252,19 +252,19 @@ def main(quick: bool, picture: Path | None) -> None:
     grid = QUICK if quick else FULL
     print(f"{os.cpu_count()} cores, load before: {load_now()}")
     print("trials  receivers  shards    slots   slots/s  deliveries/s   µs each  cores used  busiest process      MB")
-    found = []
+    runs = []
     for point in grid.points:
-        one = measure(*point, grid.seconds)
-        found.append(one)
+        run = measure(*point, grid.seconds)
+        runs.append(run)
         print(
-            f"{one.trials:>6} {one.receivers:>10} {one.shards:>7} {one.slots:>8,} {one.slots_per_second:>9,.0f} "
-            f"{one.rate:>13,.0f} {one.cost:>9.3f} {one.cores:>11.2f}  {one.busiest:<11} {one.share:.2f} {one.megabytes:>9,.0f}",
+            f"{run.trials:>6} {run.receivers:>10} {run.shards:>7} {run.slots:>8,} {run.slots_per_second:>9,.0f} "
+            f"{run.rate:>13,.0f} {run.cost:>9.3f} {run.cores:>11.2f}  {run.busiest:<11} {run.share:.2f} {run.megabytes:>9,.0f}",
             flush=True,
         )
-    laws(found)
+    laws(runs)
     print(f"load after: {load_now()}")
     if picture is not None:
-        draw(found, picture)
+        draw(runs, picture)
 
 
 if __name__ == "__main__":

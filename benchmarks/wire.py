@@ -69,8 +69,8 @@ class MeasuredWire:
     def _hear(self, block: Records) -> None:
         block = block[(block["link"] == 0) | (block["size"] > 10)]
         for link in np.unique(block["link"]).tolist():
-            found, counts = np.unique(block["fate"][block["link"] == link], return_counts=True)
-            for fate, count in zip(found.tolist(), counts.tolist(), strict=True):
+            fates, counts = np.unique(block["fate"][block["link"] == link], return_counts=True)
+            for fate, count in zip(fates.tolist(), counts.tolist(), strict=True):
                 self.fates[link, fate] = self.fates.get((link, fate), 0) + count
         if len(block):
             self.first = min(self.first, float(block["time"].min()))
@@ -104,13 +104,13 @@ def a_wire(*links: tuple[str, Mapping[str, Any]]) -> Iterator[MeasuredWire]:
 @contextmanager
 def bare_relay() -> Iterator[tuple[str, str]]:
     """Two router sessions and a loop between them; the endpoints."""
-    with SideSession(Side("a", _ANYWHERE), 2**30) as one, SideSession(Side("b", _ANYWHERE), 2**30) as other:
+    with SideSession(Side("a", _ANYWHERE), 2**30) as first, SideSession(Side("b", _ANYWHERE), 2**30) as second:
         channel: Any = zenoh.handlers.FifoChannel(8192)
-        heard = one.session.declare_subscriber("**", channel, allowed_origin=zenoh.Locality.REMOTE)
+        heard = first.session.declare_subscriber("**", channel, allowed_origin=zenoh.Locality.REMOTE)
 
         def pass_on() -> None:
             for sample in heard:
-                other.session.put(
+                second.session.put(
                     sample.key_expr,
                     sample.payload,
                     encoding=sample.encoding,
@@ -120,7 +120,7 @@ def bare_relay() -> Iterator[tuple[str, str]]:
 
         thread = threading.Thread(target=pass_on, daemon=True)
         thread.start()
-        yield one.endpoints[0], other.endpoints[0]
+        yield first.endpoints[0], second.endpoints[0]
         heard.undeclare()
         thread.join()
 
@@ -128,8 +128,8 @@ def bare_relay() -> Iterator[tuple[str, str]]:
 @contextmanager
 def a_router() -> Iterator[str]:
     """Zenoh's router alone; its endpoint."""
-    with SideSession(Side("a", _ANYWHERE), 2**30) as one:
-        yield one.endpoints[0]
+    with SideSession(Side("a", _ANYWHERE), 2**30) as router:
+        yield router.endpoints[0]
 
 
 def per_second(carried: Carried) -> float:
@@ -145,8 +145,8 @@ def rates(rounds: int, count: int) -> Iterator[Row]:
             carry(wire.robot, wire.base, Traffic(count, 64))
             heard = wire.count()
             wires.append(heard / (wire.last - wire.first))
-        with bare_relay() as (one, other):
-            relays.append(per_second(carry(one, other, Traffic(count, 64))))
+        with bare_relay() as (sender_at, receiver_at):
+            relays.append(per_second(carry(sender_at, receiver_at, Traffic(count, 64))))
     rate, ratio = statistics.median(wires), statistics.median(w / r for w, r in zip(wires, relays, strict=True))
     yield Row(
         "wire, 64 bytes through a lossy link, journal on",
@@ -216,23 +216,23 @@ def accounted(count: int) -> Iterator[Row]:
 def losses(count: int) -> Iterator[Row]:
     """The messages that each model lets through, next to its 99 % bounds."""
     models = {
-        name: {"model": name, **found} for name, found in tomllib.loads(_LOSSES.read_text(encoding="utf-8")).items()
+        name: {"model": name, **table} for name, table in tomllib.loads(_LOSSES.read_text(encoding="utf-8")).items()
     }
     links = {f"robot/{name}": {"loss": model} for name, model in models.items()}
     with a_wire(*links.items()) as wire:
         carry(wire.robot, wire.base, Traffic(count, 64, keys=tuple(links)))
         wire.count()
         fates = dict(wire.fates)
-    outside, said = [], []
+    outside, fractions = [], []
     for at, (name, model) in enumerate(models.items()):
         low, high = bounds(*expected({"loss": model}, (), [range(count)]), count)
-        found = fates.get((at, WireFate.DELIVERED), 0)
-        said.append(f"{name} {found / count:.4f}")
-        if not low <= found <= high:
+        delivered = fates.get((at, WireFate.DELIVERED), 0)
+        fractions.append(f"{name} {delivered / count:.4f}")
+        if not low <= delivered <= high:
             outside.append(f"{name} outside {low / count:.4f} to {high / count:.4f}")
     yield Row(
         f"wire, delivered by each model, of {count:,}",
-        ", ".join(said),
+        ", ".join(fractions),
         "99 % bounds",
         "all within",
         "all within",
@@ -263,14 +263,14 @@ def new_keys(count: int) -> Iterator[Row]:
         finally:
             process.kill()
             process.wait()
-    (known, _), (new, kept) = [
+    (old, _), (new, kept) = [
         ((after[0] - before[0]) / count * 1e6, (after[1] - before[1]) / count * 1e3)
         for before, after in pairwise(costs)
     ]
     yield Row(
         f"wire, a message on each of {count:,} new keys",
         f"{new:.0f} µs of the processor and {kept:.1f} kB a key; ended in {ended:.1f} s",
-        f"{known:.0f} µs a message of one key",
+        f"{old:.0f} µs a message of one key",
         "100 µs and 2 kB; 5 s",
         "50 µs and 1 kB; 5 s",
         judged(new < 100 and kept < 2 and ended < 5, new < 50 and kept < 1 and ended < 5),

@@ -70,8 +70,8 @@ def carry(sender_at: str, receiver_at: str, traffic: Traffic, patience: float = 
         sender.stdin.write("go\n")
         sender.stdin.flush()
         out, _ = receiver.communicate(timeout=patience)
-        found: dict[str, Any] = json.loads(out)
-        return Carried(**found)
+        results: dict[str, Any] = json.loads(out)
+        return Carried(**results)
     finally:
         for process in (sender, receiver):
             if process.poll() is None:

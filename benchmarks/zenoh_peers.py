@@ -60,11 +60,11 @@ class Times:
 
     def delay(self, fraction: float) -> float:
         """A quantile of the one-way latency in microseconds: the largest over receivers."""
-        found = []
+        quantiles = []
         for times in self.received:
             delays = sorted(there - here for here, there in zip(self.sent, times, strict=True))
-            found.append(delays[min(int(len(delays) * fraction), len(delays) - 1)] * 1e6)
-        return max(found)
+            quantiles.append(delays[min(int(len(delays) * fraction), len(delays) - 1)] * 1e6)
+        return max(quantiles)
 
 
 def session_of(mode: str, endpoint: str, user: str = "", password: str = "") -> zenoh.Session:
@@ -186,8 +186,8 @@ def _receive(session: zenoh.Session, peer: Peer, load: Load) -> list[float]:
         unpacker = msgpack.Unpacker()
         unpacker.feed(payload)
         unpacker.skip()
-        if (found := unpacker.unpack()["k"]) != k:
-            raise RuntimeError(f"{peer.key}: slot {found} came where slot {k} was expected")
+        if (received := unpacker.unpack()["k"]) != k:
+            raise RuntimeError(f"{peer.key}: slot {received} came where slot {k} was expected")
     token.undeclare()
     return times
 

@@ -77,25 +77,25 @@ class ReceiverLoop:
         while self._k < self._brief.slots:
             self._status.slot = self._k
             message = self.deliveries.peek()
-            found = message.integer("k")
+            slot = message.integer("k")
             if is_barrier(message):
                 self.deliveries.drop()
-                if found == self._k:
+                if slot == self._k:
                     self._hold()
-                    if self._outages.get(found, (0, False))[0] >= self._brief.slots:
+                    if self._outages.get(slot, (0, False))[0] >= self._brief.slots:
                         break
                 else:
-                    self._due.missed(self._k, found)
+                    self._due.missed(self._k, slot)
                 continue
-            if self._k in self._outages and found >= self._k:  # back from a pause
+            if self._k in self._outages and slot >= self._k:  # back from a pause
                 self._return()
-            if found == self._k:
+            if slot == self._k:
                 self._take()
                 continue
             self.deliveries.drop()
-            if found < self._k:
-                self._replies.acknowledge_again(found, message)
-            self._due.missed(self._k, found)
+            if slot < self._k:
+                self._replies.acknowledge_again(slot, message)
+            self._due.missed(self._k, slot)
 
     def _hold(self) -> None:
         """Report all slots before this one; if this process is away from now on, its belief, too."""

@@ -81,7 +81,11 @@ class Progress:
 def packages_of(lock: str) -> set[str]:
     """The names of the packages that a locked list has for this machine and this Python, in the form of folders' names."""
     requirements = [Requirement(entry) for entry in re.findall(r"^(?![\s#-])[^\\\n]+", lock, re.MULTILINE)]
-    return {_normal(one.name) for one in requirements if one.marker is None or one.marker.evaluate()}
+    return {
+        _normal(requirement.name)
+        for requirement in requirements
+        if requirement.marker is None or requirement.marker.evaluate()
+    }
 
 
 def _normal(name: str) -> str:

@@ -19,17 +19,17 @@ def commands_page() -> str:
 
     parser = parser_of()
     parts = [_HEAD, _block(parser)]
-    for one in _commands(parser):
-        parts += [f"## {one.prog}\n", _block(one)]
+    for command in _commands(parser):
+        parts += [f"## {command.prog}\n", _block(command)]
     return "\n".join(parts)
 
 
 def _commands(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
-            for one in action.choices.values():
-                yield one
-                yield from _commands(one)
+            for command in action.choices.values():
+                yield command
+                yield from _commands(command)
 
 
 def _block(parser: argparse.ArgumentParser) -> str:

@@ -19,6 +19,6 @@ class Doctests(Extension):
             obj.docstring.value = _EXAMPLE.sub(_fenced, obj.docstring.value)
 
 
-def _fenced(found: re.Match[str]) -> str:
-    code = re.sub(r" +# doctest: .*", "", found[0].rstrip())
+def _fenced(match: re.Match[str]) -> str:
+    code = re.sub(r" +# doctest: .*", "", match[0].rstrip())
     return f"```python\n{code}\n```\n"

@@ -45,10 +45,10 @@ def description(name: str) -> str:
     if comment is None:
         return ""
     sentences = re.split(r"(?<=[.!?]) (?=[A-Z`])", " ".join(re.sub("^# ?", "", comment[0], flags=re.MULTILINE).split()))
-    said = sentences.pop(0)
-    while len(said) < _LEAST_DESCRIPTION and sentences:
-        said += f" {sentences.pop(0)}"
-    return said
+    text = sentences.pop(0)
+    while len(text) < _LEAST_DESCRIPTION and sentences:
+        text += f" {sentences.pop(0)}"
+    return text
 
 
 def pictures() -> dict[str, bytes]:

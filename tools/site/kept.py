@@ -13,7 +13,7 @@ PICTURES = ROOT / "build" / "gallery"
 @cache
 def program_digest() -> bytes:
     """A digest of the program's source."""
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for path in sorted((ROOT / "emulator").rglob("*.py")):
-        found.update(path.read_bytes())
-    return found.digest()
+        digest.update(path.read_bytes())
+    return digest.digest()

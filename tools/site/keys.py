@@ -76,19 +76,19 @@ def _type(field: Schema) -> str:
         name = field["$ref"].rpartition("/")[2]
         return f"[table](#{_title(name).lower().replace(' ', '-')})"
     if "anyOf" in field:
-        return " or ".join(dict.fromkeys(_type(one) for one in field["anyOf"] if one.get("type") != "null"))
+        return " or ".join(dict.fromkeys(_type(choice) for choice in field["anyOf"] if choice.get("type") != "null"))
     if "allOf" in field:
         return _type(field["allOf"][0])
     if "enum" in field or "const" in field:
-        return ", ".join(f"`{one}`" for one in field.get("enum", [field.get("const")]))
-    said = _TYPES.get(str(field.get("type")), "any value")
+        return ", ".join(f"`{choice}`" for choice in field.get("enum", [field.get("const")]))
+    words = _TYPES.get(str(field.get("type")), "any value")
     if field.get("type") == "array" and field.get("items"):
-        said = f"list of: {_type(field['items'])}"
+        words = f"list of: {_type(field['items'])}"
     if field.get("type") == "object" and isinstance(field.get("additionalProperties"), dict):
-        said = f"table of names, each: {_type(field['additionalProperties'])}"
+        words = f"table of names, each: {_type(field['additionalProperties'])}"
     limits = [f"{sign} {_number(field[name])}" for name, sign in _LIMITS if name in field]
-    limits += [f"at most {_number(field[name])} {what}" for name, what in _MOST if name in field]
-    return f"{said}, {', '.join(limits)}" if limits else said
+    limits += [f"at most {_number(field[name])} {unit}" for name, unit in _MOST if name in field]
+    return f"{words}, {', '.join(limits)}" if limits else words
 
 
 _MOST = (("maxLength", "characters"), ("maxItems", "entries"), ("maxProperties", "entries"))

@@ -59,7 +59,7 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
         markdown = re.sub(r"\]\(docs/", "](", markdown)
         markdown = _OF_THE_REPOSITORY.sub(_named, markdown)
     markdown = re.sub(r"^```golden .*$", "```text", markdown, flags=re.MULTILINE)
-    return _ENTRY.sub(lambda found: found[1] or "]&#91;", markdown)
+    return _ENTRY.sub(lambda match: match[1] or "]&#91;", markdown)
 
 
 def _named(link: re.Match[str]) -> str:
@@ -73,9 +73,9 @@ def on_page_content(page_html: str, **_: Any) -> str:
     return re.sub(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', _formula, page_html, flags=re.DOTALL)
 
 
-def _formula(found: re.Match[str]) -> str:
-    display = "block" if found[2] == "[" else "inline"
-    return f'<{found[1]} class="formula">{convert(html.unescape(found[3]), display=display)}</{found[1]}>'
+def _formula(match: re.Match[str]) -> str:
+    display = "block" if match[2] == "[" else "inline"
+    return f'<{match[1]} class="formula">{convert(html.unescape(match[3]), display=display)}</{match[1]}>'
 
 
 def layers(source: str, *_: Any, **__: Any) -> str:
@@ -116,5 +116,7 @@ def on_post_build(config: MkDocsConfig, **_: Any) -> None:
         if requests.found:
             raise PluginError(f"{page}: loads {', '.join(requests.found)}; pages may ask no other host for anything")
     for sheet in site.rglob("*.css"):
-        if found := re.findall(r"(?:url\(|@import )[\"']?((?:https?:)?//[^)\"']+)", sheet.read_text(encoding="utf-8")):
-            raise PluginError(f"{sheet}: loads {', '.join(found)}; pages may ask no other host for anything")
+        if addresses := re.findall(
+            r"(?:url\(|@import )[\"']?((?:https?:)?//[^)\"']+)", sheet.read_text(encoding="utf-8")
+        ):
+            raise PluginError(f"{sheet}: loads {', '.join(addresses)}; pages may ask no other host for anything")

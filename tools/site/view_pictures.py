@@ -33,9 +33,9 @@ def view_section() -> str:
     ]
     for name in _names():
         state, size = name.split("-")
-        said = f"{_STATES[state]}, {size.replace('x', ' × ')} pixels"
+        caption = f"{_STATES[state]}, {size.replace('x', ' × ')} pixels"
         parts.append(
-            f"### The view {state}, {size.replace('x', ' × ')}\n\n![The view, {said}](gallery/view-{name}.png)\n"
+            f"### The view {state}, {size.replace('x', ' × ')}\n\n![The view, {caption}](gallery/view-{name}.png)\n"
         )
     return "\n".join(parts)
 
