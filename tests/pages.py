@@ -38,8 +38,8 @@ class Checked(HTMLParser):
         assert self.open.pop() == tag
 
     def handle_data(self, data: str) -> None:
-        """Keep a text."""
-        if self.open and self.open[-1] != "style":
+        """Keep a text that is not blank."""
+        if self.open and self.open[-1] != "style" and data.strip():
             self.texts.append(data)
         if self.open and self.open[-1] in {"h1", "h2"}:
             self.headings.append(data)
@@ -65,6 +65,7 @@ def checked(folder: Path) -> Checked:
     assert {link.removeprefix("#") for link in page.values("href")} <= set(ids)
     assert page.tags["img"] == sum(bool(words) for words in page.values("alt"))
     assert page.tags["svg"] == len([one for one in page.attributes if one == ("svg", "aria-hidden", "true")])
-    assert page.values("role").count("region") == page.values("tabindex").count("0") == page.tags["table"]
+    scrolling = page.tags["table"] + page.tags["svg"]
+    assert page.values("role").count("region") == page.values("tabindex").count("0") == scrolling
     assert page.headings[0]
     return page

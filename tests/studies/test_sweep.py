@@ -22,6 +22,7 @@ from evedrop.model.figures import expectable_figures
 from evedrop.scenario.loading import load
 from evedrop.show.report.sweep import sweep_table
 from evedrop.show.report.writing import write_report
+from evedrop.show.view.palette import colour, hexadecimal
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode, Simulation
 from evedrop.studies.sweep import grid_of, sweep_over
@@ -188,7 +189,8 @@ def test_words_whole_numbers_and_other_modes_can_be_swept(tmp_path: Path) -> Non
     assert f"{command} --trials 5 --covariance-only" in page.texts
     assert "All 4 points were done" in page.texts
     assert "4 points of eavesdroppers.smart.strategy, slots · 10 to 20 slots · 5 trials" in page.texts
-    assert ("path", "class", "bar") in page.attributes
+    inks = {f"fill: none; stroke: {hexadecimal(colour(i))}; stroke-width: 2" for i in range(4)}
+    assert inks & {*page.values("style")}, "there are no error bars"
 
 
 def test_the_page_quotes_all_values_of_an_entry_if_one_needs_it(tmp_path: Path) -> None:

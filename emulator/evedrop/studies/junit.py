@@ -11,7 +11,7 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 from evedrop.errors import UsageError
-from evedrop.show.report.markup import printable
+from evedrop.show.report.page import printable
 from evedrop.studies.scenario_tests import Finding, Outcome
 
 

@@ -13,6 +13,7 @@ import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
@@ -35,12 +36,13 @@ from evedrop.score.track import LongestSpans, LostSpan, Track, lost_spans, track
 from evedrop.show.report import closing
 from evedrop.show.report.chart import Curve, LogChart
 from evedrop.show.report.groups import GroupCounts, GroupMeans
-from evedrop.show.report.markup import element, written
-from evedrop.show.report.run_sections import LostTrackSection
-from evedrop.show.report.run_source import OUTCOMES, RecordedTrial, RunSource
+from evedrop.show.report.page import Page, Part, made
+from evedrop.show.report.run_sections import RUN_SECTIONS, lane_picture
+from evedrop.show.report.run_source import OUTCOMES, PIXELS, RecordedTrial, RunSource
 from evedrop.show.report.slot_rows import RowExtent
-from evedrop.show.report.strip import PIXELS, strip
+from evedrop.show.report.text_table import TextTable
 from evedrop.show.report.writing import REPORT, try_report, write_report
+from evedrop.show.view.lanes import Lane
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
 from tests.conftest import LIMIT, Evedrop
@@ -218,9 +220,8 @@ def test_the_longest_spans_are_listed_in_the_order_of_time() -> None:
     rows = {"sent": pa.array(["state"] * 1400), "action": words, "squared_error": errors, "trace_covariance": traces}
     trial.add(pa.table(rows))
     source: Any = SimpleNamespace(summary=SimpleNamespace(first_trial=0), trial={"smart": trial})
-    nodes = [node for node in LostTrackSection.nodes(source) if not isinstance(node, str) and node.tag == "details"]
-    (listed,) = nodes
-    said = [str(item.text).partition(":")[0] for item in listed.iter("li")]
+    (listed,) = (node for node in RUN_SECTIONS["Lost track"](source) if "<details>" in node)
+    said = [text.partition(":")[0] for text in Checked(listed).texts if text.startswith("slots ")]
     assert said == [f"slots {one.first:,} to {one.last:,}" for one in spans if one.slots > 2]
 
 
@@ -309,15 +310,15 @@ def test_means_and_counts_do_not_depend_on_the_pieces(lengths: list[int], most: 
 
 def test_a_lane_has_a_pixel_for_every_slot_or_the_worst_of_several() -> None:
     """The PNG says what the codes say; in a lane that is too long no lost slot disappears."""
-    colours = [(1, 2, 3), (200, 0, 9), (0, 0, 255)]
+    colours = ((1, 2, 3), (200, 0, 9), (0, 0, 255))
+    lane = Lane(("good", "bad", "worse"), colours)
 
     def pixels(codes: np.ndarray, worst: bool) -> list[list[int]]:
-        lane = GroupCounts(len(codes), PIXELS, len(colours))
+        counts = GroupCounts(len(codes), PIXELS, len(colours))
         for part in np.array_split(codes, 7):
-            lane.add(part)
-        image = strip(lane.highest if worst else lane.commonest, colours, "label")
-        assert not isinstance(image, str)
-        data = base64.b64decode(str(image.get("src")).partition(",")[2])
+            counts.add(part)
+        image = lane_picture(lane, counts.highest if worst else counts.commonest, "label")
+        data = base64.b64decode(Checked(image).values("src")[0].partition(",")[2])
         return list(np.asarray(Image.open(BytesIO(data)).convert("RGB"))[0].reshape(-1, 3).tolist())
 
     codes = np.array([0, 2, 1, 1, 0], np.uint8)
@@ -328,21 +329,41 @@ def test_a_lane_has_a_pixel_for_every_slot_or_the_worst_of_several() -> None:
     assert pixels(long, worst=False).count(list(colours[1])) == 0
 
 
+def drawn(chart: LogChart) -> ET.Element:
+    """A chart that shows something, as a tree."""
+    figure = chart.figure
+    assert figure is not None
+    return ET.fromstring(figure)  # noqa: S314 - our own
+
+
+def outlines(figure: ET.Element, ink: str) -> list[str]:
+    """The paths that are drawn with this ink, such as "stroke: #123456"."""
+    paths = (path for path in figure.iter("path") if ink in str(path.get("style")))
+    return [" ".join(str(path.get("d")).split()) for path in paths]
+
+
+def uses(figure: ET.Element, ink: str) -> list[str]:
+    """The ids of the paths that are drawn with this ink, once for each place where they are."""
+    return [str(use.get("href")).removeprefix("#") for use in figure.iter("use") if ink in str(use.get("style"))]
+
+
 def test_a_chart_has_gaps_where_nothing_is_known_and_few_points() -> None:
     """A curve of 10⁵ slots is drawn with 400 points; no chart is drawn of nothing; zeros and ∞ do not break the axis."""
     x = np.arange(100_000.0)
-    node = LogChart("label", "slot", "error", [Curve("one", "#123456", x, 1.0 + x, x, 2.0 + x, theory=1.0 + x)]).node
-    assert isinstance(node, ET.Element)
-    (band,) = [path for path in node.iter("path") if path.get("class") == "band"]
-    assert str(band.get("d")).count("L") == 799
-    (curve,) = [path for path in node.iter("path") if path.get("class") == "curve"]
-    assert str(curve.get("d")).count("L") == 399
+    curve = Curve("one", "#123456", x, 1.0 + x, 0.5 + x, 2.0 + x, theory=1.0 + x)
+    figure = drawn(LogChart("label", "slot", "error", [curve]))
+    (band,) = (path for path in figure.iter("path") if path.get("id") in uses(figure, "fill: #123456"))
+    assert 798 < str(band.get("d")).count("L") < 804
+    (line,) = outlines(figure, "stroke: #123456")
+    assert (line.count("M"), line.count("L")) == (1, 399)
+    (theory,) = outlines(figure, "stroke: var(--ink)")
+    assert theory == line
     broken = np.array([1.0, np.nan, 0.0, 10.0, np.inf, 5.0, 6.0])
-    node = LogChart("label", "slot", "error", [Curve("one", "#123456", x[:7], broken)]).node
-    assert isinstance(node, ET.Element)
-    (curve,) = [path for path in node.iter("path") if path.get("class") == "curve"]
-    assert str(curve.get("d")).count("M") == 3
-    assert LogChart("label", "slot", "error", [Curve("one", "#123456", x[:2], np.zeros(2))]).node is None
+    figure = drawn(LogChart("label", "slot", "error", [Curve("one", "#123456", x[:7], broken)]))
+    line, _ = outlines(figure, "stroke: #123456")
+    assert line.count("L") == 2
+    assert len(uses(figure, "#123456")) == 1
+    assert LogChart("label", "slot", "error", [Curve("one", "#123456", x[:2], np.zeros(2))]).figure is None
 
 
 def test_values_below_the_floor_lie_on_the_lower_edge_and_the_chart_says_so() -> None:
@@ -350,25 +371,39 @@ def test_values_below_the_floor_lie_on_the_lower_edge_and_the_chart_says_so() ->
     errors = np.array([1e-30, 0.0, 5.0, 0.02])
     for values, words in ((errors, "error; values below 0.01 lie on the lower edge"), (errors[2:], "error")):
         curve = Curve("one", "#123456", np.arange(float(len(values))), values)
-        node = LogChart("label", "slot", "error", [curve], floor=0.01).node
-        assert isinstance(node, ET.Element)
-        assert node[0].text == words
-        ticks = [float(str(one.text)) for one in node.iter("span") if one.get("class") == "y"]
-        assert min(ticks) >= 0.01
-        edge = [one.get("style") for one in node.iter("span") if one.text == "0.01"]
-        assert edge == (["top:100.00%"] if len(values) == 4 else [])
-        (path,) = [one for one in node.iter("path") if one.get("class") == "curve"]
-        assert str(path.get("d")).count(" 1000") == (2 if len(values) == 4 else 0)
-    assert LogChart("", "", "", [Curve("", "", errors[:2], np.zeros(2))], floor=0.01).node is not None
+        figure = drawn(LogChart("label", "slot", "error", [curve], floor=0.01))
+        assert figure[0].text == words
+        ticks = [float(str(text.text)) for text in figure.iter("text") if "end" in str(text.get("style"))]
+        assert min(ticks) == (0.01 if len(values) == 4 else 0.1)
+        frame = [outline.split()[2] for outline in outlines(figure, "stroke: var(--line)")]
+        (line,) = outlines(figure, "stroke: #123456")
+        assert line.split()[2::3].count(max(frame, key=float)) == (2 if len(values) == 4 else 0)
+    assert LogChart("", "", "", [Curve("", "#123456", errors[:2], np.zeros(2))], floor=0.01).figure is not None
+
+
+def test_a_chart_of_any_size_has_an_axis() -> None:
+    """One slot is a dot; errors of 1e300 and intervals that reach below 0 or to infinity are drawn as far as the axis goes."""
+    dot = drawn(LogChart("label", "slot", "error", [Curve("one", "#123456", np.array([3.0]), np.array([0.5]))]))
+    assert len(list(dot.iter("use"))) == 1
+    x, y = np.arange(4.0), np.array([1e-300, 2.0, 1e307, 1.7e308])
+    bars = Curve("one", "#123456", x, y, y - 3.0, np.full(4, np.inf), theory=y, bars=True)
+    for curve in (bars, replace(bars, bars=False)):
+        assert outlines(drawn(LogChart("label", "key", "error", [curve], ["a", "b", "c", "d"])), "#123456")
 
 
 def test_texts_are_escaped_wherever_they_stand() -> None:
-    """In text, in attributes, and after other elements; characters that HTML does not allow are replaced."""
-    texts = ("<b>\x00", "</p>", '"><x onload="y">')
-    page = Checked(written(element("p", texts[0], element("i", "&"), texts[1], title=texts[2])))
-    assert page.tags == {"p": 1, "i": 1}
-    assert page.texts == ["<b>\ufffd", "&", texts[1]]
-    assert page.attributes == [("p", "title", texts[2])]
+    """In text, in attributes and in drawings; characters that HTML does not allow are replaced."""
+    texts = ("<b>\x00 中 $x$", "</p>", '"><i onload="y">')
+    table = TextTable.headed([texts[0]], [texts[1]])
+    table.add(texts[2], "&")
+    curve = Curve(texts[0], "#123456", np.arange(3.0), np.ones(3))
+    chart = LogChart(texts[2], texts[0], texts[1], [curve], texts)
+    assert chart.figure is not None
+    page = Checked(Page(*texts, None, [Part("part", [made("table", table, texts[2]), chart.figure])]).html)
+    assert not {"b", "i"} & page.tags.keys()
+    assert page.tags["p"] == 4
+    assert Counter({"<b>\ufffd 中 $x$": 5, "</p>": 4, texts[2]: 4, "&": 1}) <= Counter(page.texts)
+    assert page.values("aria-label").count(texts[2]) == 3
 
 
 def with_other_values(found: Any, others: tuple[Any, ...]) -> Iterator[Any]:

@@ -10,8 +10,6 @@ from importlib import import_module
 
 from evedrop.scenario.arguments import refuse_unless
 from evedrop.scenario.news import News, RunProgress, Tell, silent
-from evedrop.show.report.markup import element, fragment, paragraphs, printable
-from evedrop.show.report.tables import html_table
 from evedrop.show.report.text_table import TextTable
 
 _TELL_SECONDS = 0.2
@@ -52,12 +50,13 @@ def progress(tell: Tell | None, total: int) -> Iterator[Tell]:
 
 def bar_text(done: int, total: int, label: str) -> str:
     """A progress bar in HTML."""
-    share = min(1.0, done / total) if total else 0.0
-    bar = element("progress", max="1", value=f"{share:.4f}")
-    bar.tail = printable(f" {share:.0%} · {label}")
-    return fragment(bar)
+    from evedrop.show.report.page import made, printable
+
+    return printable(made("progress", min(1.0, done / total) if total else 0.0, label))
 
 
 def table_text(title: str, table: TextTable, notes: Iterable[str] = ()) -> str:
     """A table in HTML, as the page of a report has it, with notes below it."""
-    return fragment(element("div", html_table(table, title), *paragraphs(notes)))
+    from evedrop.show.report.page import made, printable
+
+    return printable(made("block", made("table", table, title), made("sentences", list(notes))))

@@ -1,28 +1,34 @@
-"""Charts as HTML and SVG, written without a plotting library, in a hundredth of a second.
-
-Only the curves are SVG, stretched to the width of the page; the words around them are HTML, so that they stay readable at any
-width.
-"""
+"""Charts with a logarithmic axis for the page, drawn by matplotlib as SVG that takes its inks and its font from the page."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+import re
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from xml.etree import ElementTree as ET
+from io import StringIO
+from typing import TYPE_CHECKING
 
 import numpy as np
+from markupsafe import Markup
 
 from evedrop.model.process import Floats
 from evedrop.show.report.groups import GroupMeans
-from evedrop.show.report.markup import Node, element
-from evedrop.show.view.error_floor import floor_words
+from evedrop.show.report.page import made, printable
+from evedrop.show.view.error_floor import ErrorAxis, floor_words
+from evedrop.show.view.figure_style import drawing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 POINTS = 400
 """The most points of a curve."""
-_WIDE, _HIGH = 2000, 1000  # of the drawing, in its own units
-_MOST_DECADES = 30  # shown below the highest value
-_TICKS = 6
+_WIDTH, _HEIGHT = 9.6, 3.1  # inches
+_INK, _DIM, _LINE = "#16191d", "#5a6068", "#d5d9de"
+_THEME: Mapping[str, str] = {_INK: "var(--ink)", _DIM: "var(--dim)", _LINE: "var(--line)"}
+"""Ink of the drawing → that of the page, which is another one in its dark theme and on paper."""
+_DOTTED = (0, (0.1, 3.0))
+_CLOSE = 100.0  # limits of an axis whose ratio is less have 2 and 5 times the powers of ten, too
 
 
 @dataclass(frozen=True)
@@ -45,7 +51,7 @@ class LogChart:
     """Curves over a common x axis, with a logarithmic y axis."""
 
     label: str
-    """A sentence that says what the chart shows, for screen readers."""
+    """A sentence that says what the chart shows, for screen readers. Charts of one page have different ones."""
     x_name: str
     y_name: str
     curves: Sequence[Curve] = field(default_factory=list)
@@ -57,128 +63,115 @@ class LogChart:
     """Lesser values lie on the lower edge, and the chart says so. 0: all are shown that are not too far below the highest."""
 
     @property
-    def node(self) -> Node | None:
-        """The chart; None if it has nothing to show."""
-        curves = [one if one.bars else _thinned(one) for one in self.curves]
-        heights = [part for one in curves for part in (one.y, one.theory) if part is not None]
-        known = np.concatenate([part[np.isfinite(part)] for part in heights]) if heights else np.empty(0)
-        below = bool((known < self.floor).any())
-        positive = np.maximum(known, self.floor)
-        positive = positive[positive > 0.0]
-        if not positive.size:
+    def figure(self) -> Markup | None:
+        """The chart as a figure of the page; None if it has nothing to show."""
+        curves = [curve if curve.bars else _thinned(curve) for curve in self.curves]
+        heights = [part for curve in curves for part in (curve.y, curve.theory) if part is not None]
+        axis = ErrorAxis.of(heights, self.floor)
+        if axis is None:
             return None
-        top = float(np.log10(positive.max()))
-        bottom = max(float(np.log10(positive.min())), top - _MOST_DECADES)
-        top = max(top, bottom + 1.0) if below else top
-        x = np.concatenate([one.x for one in self.curves])
+        above = f"{self.y_name}; {floor_words(self.floor)}" if axis.below else self.y_name
+        names = [(curve.name, curve.colour) for curve in curves]
+        return made("chart", self.label, above, self._drawing(curves, axis), self.x_name, names)
+
+    def _drawing(self, curves: Sequence[Curve], axis: ErrorAxis) -> Markup:
+        style = {
+            "axes.edgecolor": _LINE,
+            "axes.grid.axis": "y",
+            "grid.color": _LINE,
+            "path.simplify": False,
+            "svg.fonttype": "none",
+            "svg.hashsalt": self.label,
+            "text.parse_math": False,
+            "xtick.bottom": False,
+            "xtick.labelcolor": _DIM,
+            "ytick.left": False,
+            "ytick.labelcolor": _DIM,
+        }
+        svg = StringIO()
+        with warnings.catch_warnings(), np.errstate(over="ignore"), drawing(_WIDTH, _HEIGHT, style) as figure:
+            warnings.filterwarnings("ignore", message="Glyph")  # the page's font draws it
+            axes = figure.subplots()
+            self._set_axes(axes, curves, axis)
+            for curve in curves:
+                _draw(axes, curve, axis)
+            for curve in curves:  # over the curves, so that it stays visible
+                if curve.theory is not None:
+                    axes.plot(
+                        curve.x,
+                        axis.inside(curve.theory),
+                        color=_INK,
+                        linestyle=_DOTTED,
+                        linewidth=1.3,
+                        dash_capstyle="round",
+                        clip_on=False,
+                    )
+            figure.savefig(svg, format="svg", transparent=True, metadata={"Date": None})
+        return _embedded(svg.getvalue())
+
+    def _set_axes(self, axes: Axes, curves: Sequence[Curve], axis: ErrorAxis) -> None:
+        from matplotlib.ticker import LogLocator  # noqa: PLC0415 - with the figure
+
+        x = np.concatenate([curve.x for curve in self.curves])
         left, right = (float(x.min()), float(x.max())) if self.x_range is None else self.x_range
-        room = 0.05 * (top - bottom + 0.2)
-        axes = _Axes(left, right, bottom - (0.0 if below else room), top + room)
-        if any(one.bars for one in curves):  # room for the marks
-            room = 0.04 * (axes.right - axes.left)
-            axes = _Axes(axes.left - room, axes.right + room, axes.bottom, axes.top)
         if self.x_words is not None:
-            axes = _Axes(-0.5, len(self.x_words) - 0.5, axes.bottom, axes.top)
-        drawing = element(
-            "svg", viewBox=f"0 0 {_WIDE} {_HIGH}", preserveAspectRatio="none", aria_hidden="true", focusable="false"
-        )
-        labels = []
-        for text, at in _log_ticks(axes.bottom, axes.top):
-            place = axes.v(np.array([10.0**at]))[0]
-            drawing.append(element("path", d=f"M0 {place}H{_WIDE}", class_="grid"))
-            labels.append(element("span", text, class_="y", style=f"top:{place / _HIGH:.2%}"))
-        words = [(word, float(i)) for i, word in enumerate(self.x_words)] if self.x_words is not None else None
-        for text, at in words or _ticks(axes.left, axes.right):
-            labels.append(element("span", text, class_="x", style=f"left:{axes.h(np.array([at]))[0] / _WIDE:.2%}"))
-        for one in curves:
-            drawing.extend(_drawn(one, axes))
-        for one in curves:  # drawn over the curves, so that it stays visible
-            if one.theory is not None:
-                parts = _parts(axes.h(one.x), axes.v(one.theory), np.isfinite(one.theory))
-                drawing.append(element("path", d=_path(parts), class_="theory"))
-        plot = element("div", drawing, *labels, class_="plot", role="img", aria_label=self.label)
-        return element(
-            "figure",
-            element("div", f"{self.y_name}; {floor_words(self.floor)}" if below else self.y_name, class_="axis"),
-            plot,
-            element("div", self.x_name, class_="axis below"),
-            element("figcaption", *legend([(one.name, one.colour) for one in curves])),
-            class_="chart",
-        )
+            axes.set_xticks(range(len(self.x_words)), list(map(printable, self.x_words)))
+            left, right = -0.5, len(self.x_words) - 0.5
+        else:
+            axes.xaxis.set_major_formatter(lambda at, _: f"{round(at, 12):,g}")
+        room = 0.04 * (right - left) if self.x_words is None and any(curve.bars for curve in curves) else 0.0
+        room = room or (0.0 if right > left else 0.5)
+        axes.set_xlim(left - room, right + room)
+        axes.set_yscale("log")
+        axes.set_ylim(axis.low, axis.high)
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if axis.high / axis.low < _CLOSE else (1,)))
+        axes.yaxis.set_major_formatter(lambda at, _: f"{at:g}")
+        axes.minorticks_off()
+        for line in axes.get_ygridlines():
+            line.set_clip_on(False)
 
 
-def legend(entries: Sequence[tuple[str, str]]) -> list[Node]:
-    """Names with their colours."""
-    return [
-        element("span", element("span", class_="swatch", style=f"background:{colour}"), name, class_="key")
-        for name, colour in entries
-    ]
+def _draw(axes: Axes, curve: Curve, axis: ErrorAxis) -> None:
+    """Draw a curve; a value that is not finite interrupts it. Nothing is clipped, for everything is inside."""
+    x, y, ink = curve.x, axis.inside(curve.y), curve.colour
+    known = np.isfinite(curve.y)
+    if curve.low is not None and curve.high is not None:
+        low, high = axis.inside(curve.low), axis.inside(curve.high)
+        bounded = known & np.isfinite(low) & np.isfinite(high)
+        if curve.bars:
+            bounded &= low < high
+            axes.vlines(x[bounded], low[bounded], high[bounded], colors=ink, linewidths=2.0, clip_on=False)
+        else:
+            axes.fill_between(x, low, high, where=bounded, color=ink, alpha=0.25, linewidth=0.0, clip_on=False)
+    if not curve.bars:
+        axes.plot(x, y, color=ink, linewidth=2.0, clip_on=False)
+    between = np.concatenate([[False], known, [False]])
+    marked = known if curve.bars else known & ~between[:-2] & ~between[2:]  # a line through one point cannot be seen
+    if marked.any():
+        axes.plot(x[marked], y[marked], "o", color=ink, markersize=6.5 if curve.bars else 4.0, clip_on=False)
 
 
-@dataclass(frozen=True)
-class _Axes:
-    left: float
-    right: float
-    bottom: float
-    """The decimal logarithm of the lowest value shown."""
-    top: float
-
-    def h(self, x: Floats) -> list[int]:
-        """Places from the left, in the units of the drawing."""
-        span = self.right - self.left or 1.0
-        return [round(_WIDE * float(one - self.left) / span) for one in x]
-
-    def v(self, y: Floats) -> list[int]:
-        """Places from the top; values below the lowest one lie on the lower border."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            share = np.clip((np.log10(y) - self.bottom) / (self.top - self.bottom), 0.0, 1.0)
-        return [round(_HIGH * (1.0 - float(one))) for one in np.nan_to_num(share)]
+def _embedded(svg: str) -> Markup:
+    """A drawing of matplotlib as a part of a page: in its inks and its font, and without names of its groups."""
+    size = re.search(r'viewBox="[^"]*"', svg)
+    assert size is not None  # noqa: S101 - matplotlib writes it
+    groups = svg[svg.index('<g id="figure_1">') : svg.rindex("</svg>")]
+    groups = re.sub(r'<g id="[\w.]+_\d+">', "<g>", groups).replace("xlink:href=", "href=")
+    groups = re.sub(r'(<text style="[^"]*)font-family: [^;"]*; ', r"\1", groups)
+    groups = re.sub(
+        r'(<text style=")font: ([\d.]+px)[^;"]*', r"\1font-size: \2", groups
+    )  # matplotlib 3.10 writes it so
+    for ink, of_page in _THEME.items():
+        groups = groups.replace(f": {ink}", f": {of_page}")
+    return Markup(f'<svg {size[0]} aria-hidden="true" focusable="false">\n{groups}</svg>')  # noqa: S704 - escaped by matplotlib
 
 
-def _drawn(one: Curve, axes: _Axes) -> list[ET.Element]:
-    """The elements of a curve; a value that is not finite interrupts it."""
-    across, found = axes.h(one.x), list[ET.Element]()
-    bounds = None if one.low is None or one.high is None else (axes.v(one.low), axes.v(one.high))
-    known = np.isfinite(one.y)
-    if bounds is not None and not one.bars:
-        some = [i for i in np.flatnonzero(known) if np.isfinite(one.low[i]) and np.isfinite(one.high[i])]  # type: ignore[index]
-        if len(some) > 1:
-            edge = [(across[i], bounds[1][i]) for i in some] + [(across[i], bounds[0][i]) for i in reversed(some)]
-            found.append(element("path", d=_path([edge]) + "Z", class_="band", style=f"fill:{one.colour}"))
-    down = axes.v(one.y)
-    if not one.bars:
-        path = _path(_parts(across, down, known))
-        found.append(element("path", d=path, class_="curve", style=f"stroke:{one.colour}"))
-        return found
-    for i in np.flatnonzero(known):
-        if bounds is not None and bounds[0][i] != bounds[1][i]:
-            bar = f"M{across[i]} {bounds[0][i]}V{bounds[1][i]}"
-            found.append(element("path", d=bar, class_="bar", style=f"stroke:{one.colour}"))
-        found.append(element("path", d=f"M{across[i]} {down[i]}h0", class_="mark", style=f"stroke:{one.colour}"))
-    return found
-
-
-def _parts(across: Sequence[int], down: Sequence[int], known: np.ndarray) -> list[list[tuple[int, int]]]:
-    """The points of a curve, in a list for each stretch without a gap."""
-    parts: list[list[tuple[int, int]]] = [[]]
-    for i, there in enumerate(known):
-        if there:
-            parts[-1].append((across[i], down[i]))
-        elif parts[-1]:
-            parts.append([])
-    return [part for part in parts if part]
-
-
-def _path(parts: Sequence[Sequence[tuple[int, int]]]) -> str:
-    return "".join(f"M{part[0][0]} {part[0][1]}" + "".join(f"L{x} {y}" for x, y in part[1:] or part) for part in parts)
-
-
-def _thinned(one: Curve) -> Curve:
+def _thinned(curve: Curve) -> Curve:
     """The curve with at most `POINTS` points, each the mean of its neighbours."""
-    count = len(one.x)
+    count = len(curve.x)
     if count <= POINTS:
-        return one
-    rows = [one.x, one.y, one.low, one.high, one.theory]
+        return curve
+    rows = [curve.x, curve.y, curve.low, curve.high, curve.theory]
     given = [row for row in rows if row is not None]
     groups = GroupMeans(count, POINTS, len(given))
     groups.add(np.stack(given))
@@ -186,28 +179,4 @@ def _thinned(one: Curve) -> Curve:
     x, y, low, high, theory = (None if row is None else next(means) for row in rows)
     assert x is not None  # noqa: S101 - it was given
     assert y is not None  # noqa: S101 - the same
-    return Curve(one.name, one.colour, x, y, low, high, theory)
-
-
-def _ticks(low: float, high: float) -> list[tuple[str, float]]:
-    """Round numbers between two limits."""
-    if not high > low:
-        return [(f"{low:g}", low)]
-    step = 10.0 ** math.floor(math.log10((high - low) / _TICKS))
-    step *= next(factor for factor in (1, 2, 5, 10) if (high - low) / (factor * step) <= _TICKS)
-    places = range(math.ceil(low / step), math.floor(high / step + 1e-9) + 1)
-    return [(f"{round(i * step, 12):,g}" if abs(i * step) < 1e6 else f"{i * step:g}", i * step) for i in places]
-
-
-def _log_ticks(low: float, high: float) -> list[tuple[str, float]]:
-    """Powers of ten between two limits, given as decimal logarithms; with 2 and 5 times them between close limits."""
-    step = max(1, math.ceil((high - low) / _TICKS))
-    factors = (1, 2, 5) if high - low < 2.0 else (1,)
-    found = [
-        (f"{factor * 10.0**power:g}", power + math.log10(factor))
-        for power in range(math.floor(low), math.ceil(high) + 1)
-        if power % step == 0
-        for factor in factors
-    ]
-    inside = [(text, at) for text, at in found if low <= at <= high]
-    return inside or [(f"{10.0**at:.3g}", at) for at in (low, high)]
+    return Curve(curve.name, curve.colour, x, y, low, high, theory)

@@ -1,21 +1,19 @@
-"""The sections of the report of a comparison. To add one, write a class and add it to `COMPARISON_SECTIONS`."""
+"""The sections of the report of a comparison. To add one, write a function and add it to `COMPARISON_SECTIONS`."""
 
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
-from xml.etree import ElementTree as ET
+
+from markupsafe import Markup
 
 from evedrop.model.figures.text import estimate
 from evedrop.results.comparison import Cell, Comparison, read_comparison
 from evedrop.score.verdict import SecrecyKept
 from evedrop.show.report.comparison import comparison_lines, pairs_table, schemes_table, verdict
-from evedrop.show.report.markup import Node, element, paragraphs
-from evedrop.show.report.section import Section
-from evedrop.show.report.tables import captioned, html_table
+from evedrop.show.report.page import made
 from evedrop.show.view import palette
 from evedrop.show.view.palette import hexadecimal
 
@@ -50,84 +48,59 @@ class ComparisonSource:
         return f"Secrecy of {sum(count for _, count in counts):,} pairs of scheme and adversary: {said}"
 
 
-@final
-class MatrixSection(Section[ComparisonSource]):
+def _matrix(of: ComparisonSource) -> Iterator[Markup]:
     """The verdict on each scheme against each adversary."""
-
-    title = "Verdicts"
-
-    @classmethod
-    def nodes(cls, of: ComparisonSource) -> Iterator[Node]:
-        """A table of verdicts, each with the ratio of the errors."""
-        found = of.found
-        caption = "The adversary's error over the legitimate one, and the verdict on secrecy; ·: not defined"
-        heads = [element("th", one, scope="col") for one in ("scheme", *found.adversaries)]
-        body = element("tbody")
-        for name, one in found.schemes.items():
-            row = element("tr", element("th", name, scope="row"))
-            row.extend(_cell(one.cells[adversary]) for adversary in found.adversaries)
-            body.append(row)
-        yield captioned(element("tr", *heads), body, caption)
+    found = of.found
+    caption = "The adversary's error over the legitimate one, and the verdict on secrecy; ·: not defined"
+    rows = [
+        (name, [_cell(scheme.cells[adversary]) for adversary in found.adversaries])
+        for name, scheme in found.schemes.items()
+    ]
+    yield made("matrix", ["scheme", *found.adversaries], rows, caption)
 
 
-def _cell(cell: Cell) -> ET.Element:
+def _cell(cell: Cell) -> Mapping[str, str | None]:
+    """What the matrix shows of a pair."""
     kept = cell.verdict
     if kept is None:
-        return element("td", "·", class_="verdict", title=cell.match.not_defined)
-    colours = f"background:{hexadecimal(_GROUND[kept])};color:{_INK.get(kept, _DARK)}"
-    ratio = f"{estimate(cell.ratio, None, '.3g')}×"
-    return element("td", element("b", verdict(cell)), ratio, class_="verdict", style=colours)
+        return {"verdict": None, "why": cell.match.not_defined}
+    return {
+        "verdict": verdict(cell),
+        "ratio": f"{estimate(cell.ratio, None, '.3g')}×",
+        "ground": hexadecimal(_GROUND[kept]),
+        "ink": _INK.get(kept, _DARK),
+    }
 
 
-@final
-class SchemesSection(Section[ComparisonSource]):
+def _schemes(of: ComparisonSource) -> Iterator[Markup]:
     """What each scheme costs, and its closest adversary."""
-
-    title = "Schemes"
-
-    @classmethod
-    def nodes(cls, of: ComparisonSource) -> Iterator[Node]:
-        """The table that the terminal shows, and its notes."""
-        yield html_table(schemes_table(of.found), "Cost and secrecy of each scheme; errors ± standard errors")
-        yield from paragraphs(comparison_lines(of.found))
+    yield made("table", schemes_table(of.found), "Cost and secrecy of each scheme; errors ± standard errors")
+    yield made("sentences", list(comparison_lines(of.found)))
 
 
-@final
-class PairsSection(Section[ComparisonSource]):
+def _pairs(of: ComparisonSource) -> Iterator[Markup]:
     """The errors of every pair, with theory and z."""
-
-    title = "Pairs"
-
-    @classmethod
-    def nodes(cls, of: ComparisonSource) -> Iterator[Node]:
-        """The table that the terminal shows."""
-        yield html_table(pairs_table(of.found), "Errors ± standard errors, with theory; z: the z-score against theory")
+    yield made("table", pairs_table(of.found), "Errors ± standard errors, with theory; z: the z-score against theory")
 
 
-@final
-class ComparisonRepeat(Section[ComparisonSource]):
+def _repeat(of: ComparisonSource) -> Iterator[Markup]:
     """How to repeat the simulations."""
-
-    title = "Repeat it"
-
-    @classmethod
-    def nodes(cls, of: ComparisonSource) -> Iterator[Node]:
-        """A command for each simulated scenario."""
-        found = of.found
-        yield element(
-            "p", f"Seed {found.seed}, trials from {found.first_trial:,} on. Each simulation of the comparison again:"
-        )
-        commands = [
-            f"evedrop montecarlo {shlex.quote(str(path.absolute()))} --trials {found.trials}"
-            for path in sorted((of.folder / "scenarios").glob("*.toml"))
-        ]
-        yield element("pre", element("code", "\n".join(commands)))
+    found = of.found
+    yield made(
+        "paragraph",
+        f"Seed {found.seed}, trials from {found.first_trial:,} on. Each simulation of the comparison again:",
+    )
+    commands = [
+        f"evedrop montecarlo {shlex.quote(str(path.absolute()))} --trials {found.trials}"
+        for path in sorted((of.folder / "scenarios").glob("*.toml"))
+    ]
+    yield made("code", "\n".join(commands))
 
 
-COMPARISON_SECTIONS: tuple[type[Section[ComparisonSource]], ...] = (
-    MatrixSection,
-    SchemesSection,
-    PairsSection,
-    ComparisonRepeat,
-)
-"""In the order of the page."""
+COMPARISON_SECTIONS: Mapping[str, Callable[[ComparisonSource], Iterator[Markup]]] = {
+    "Verdicts": _matrix,
+    "Schemes": _schemes,
+    "Pairs": _pairs,
+    "Repeat it": _repeat,
+}
+"""Title → the function that makes the contents, in the order of the page."""

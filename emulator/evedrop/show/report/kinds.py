@@ -10,10 +10,9 @@ from evedrop.results.wire_folder import WIRE_FILE
 from evedrop.show.report.closing import amount, outcome
 from evedrop.show.report.comparison import comparison_heading
 from evedrop.show.report.comparison_sections import COMPARISON_SECTIONS, ComparisonSource
-from evedrop.show.report.page import Page
+from evedrop.show.report.page import Page, parts_of
 from evedrop.show.report.run_sections import RUN_SECTIONS
 from evedrop.show.report.run_source import RunSource
-from evedrop.show.report.section import parts_of
 from evedrop.show.report.sweep_sections import SWEEP_SECTIONS, SWEEP_TABLE, SweepSource
 from evedrop.show.report.wire_sections import WIRE_SECTIONS, WireSource
 

@@ -24,7 +24,6 @@ from evedrop.score.track import LongestSpans, Track, track_of
 from evedrop.show.report.chart import POINTS
 from evedrop.show.report.groups import GroupCounts, GroupMeans
 from evedrop.show.report.slot_rows import RowExtent, SlotRows
-from evedrop.show.report.strip import PIXELS
 from evedrop.show.view import palette
 from evedrop.show.view.lanes import EAVESDROPPER
 from evedrop.system.files import Unreadable, text_of
@@ -34,6 +33,8 @@ OUTCOMES = EAVESDROPPER.words
 """The fates of a packet; the index of a word is its code."""
 MOST_SPANS = 12
 """The most spans without track that a report lists for a receiver."""
+PIXELS = 2000
+"""The most pixels of a lane. Each of a long run stands for several slots: for their most frequent code, or the highest."""
 _INTERVAL = 1.96  # standard errors on either side: 95 %
 
 
@@ -159,7 +160,3 @@ def _words(column: pa.ChunkedArray) -> tuple[NDArray[np.intp], list[str]]:
     if isinstance(whole, pa.ChunkedArray):  # without rows
         whole = whole.chunk(0) if whole.num_chunks else pa.array([], pa.string()).dictionary_encode()
     return whole.indices.to_numpy(zero_copy_only=False).astype(np.intp), whole.dictionary.to_pylist()
-
-
-TRACK_COLOURS = dict(zip(Track, palette.KNOWLEDGE, strict=True))
-"""The colours of the lanes that say what a receiver knows."""

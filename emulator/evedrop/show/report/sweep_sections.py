@@ -1,4 +1,4 @@
-"""The sections of the report of a sweep. To add one, write a class and add it to `SWEEP_SECTIONS`."""
+"""The sections of the report of a sweep. To add one, write a function and add it to `SWEEP_SECTIONS`."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import json
 import math
 import shlex
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
+from markupsafe import Markup
 
 from evedrop.errors import UsageError
 from evedrop.model.checks import toml_of
@@ -20,10 +21,8 @@ from evedrop.model.figures import all_figures, error_column, shown_figure
 from evedrop.model.process import Floats
 from evedrop.scenario.loading import value_of
 from evedrop.show.report.chart import Curve, LogChart
-from evedrop.show.report.markup import Node, element, paragraphs
-from evedrop.show.report.section import Section
+from evedrop.show.report.page import made
 from evedrop.show.report.sweep import sweep_table
-from evedrop.show.report.tables import html_table
 from evedrop.show.view import palette
 from evedrop.system.files import text_of
 
@@ -70,50 +69,36 @@ def _size(counts: Sequence[int], of: str) -> str:
     return f"{least:,} {of}" if least == most else f"{least:,} to {most:,} {of}"
 
 
-@final
-class SweepVerdicts(Section[SweepSource]):
+def _verdicts(of: SweepSource) -> Iterator[Markup]:
     """The number of points in which secrecy held."""
-
-    title = "Verdicts"
-
-    @classmethod
-    def nodes(cls, of: SweepSource) -> Iterator[Node]:
-        """A sentence for each eavesdropper."""
-        found, lines = dict[str, Counter[str]](), list[str]()
-        for row in of.rows:
-            if row["relative_secrecy"] is not None:
-                found.setdefault(row["peer"], Counter())[row["relative_secrecy"]] += 1
-        for name, counts in found.items():
-            said = ", ".join(f"{said} at {count:,} point{'' if count == 1 else 's'}" for said, count in counts.items())
-            lines.append(f"{name}: relative secrecy: {said}")
-        yield from paragraphs(lines)
+    found, lines = dict[str, Counter[str]](), list[str]()
+    for row in of.rows:
+        if row["relative_secrecy"] is not None:
+            found.setdefault(row["peer"], Counter())[row["relative_secrecy"]] += 1
+    for name, counts in found.items():
+        said = ", ".join(f"{said} at {count:,} point{'' if count == 1 else 's'}" for said, count in counts.items())
+        lines.append(f"{name}: relative secrecy: {said}")
+    yield made("sentences", lines)
 
 
-@final
-class SweepErrors(Section[SweepSource]):
+def _errors(of: SweepSource) -> Iterator[Markup]:
     """The error of every receiver against the first entry, in a chart for each combination of the others."""
-
-    title = "Errors"
-
-    @classmethod
-    def nodes(cls, of: SweepSource) -> Iterator[Node]:
-        """The charts: marks with 95 % intervals, and theory as lines."""
-        first, *others = of.grid
-        for values in list(dict.fromkeys(tuple(row[key] for key in others) for row in of.rows))[:_MOST_CHARTS]:
-            rows = [row for row in of.rows if tuple(row[key] for key in others) == values]
-            where = ", ".join(f"{key} = {value}" for key, value in zip(others, values, strict=True))
-            words = None
-            if not all(isinstance(row[first], (int, float)) for row in rows):
-                words = list(dict.fromkeys(str(row[first]) for row in rows))
-            curves = [
-                _curve(name, i, [row for row in rows if row["peer"] == name], first, words)
-                for i, name in enumerate(dict.fromkeys(row["peer"] for row in rows))
-            ]
-            label = f"Mean error of every receiver against {first}, with what theory expects. The table has the values. {where}"
-            shown = f"Mean error with its 95 % interval; dotted: theory{'; ' if where else ''}{where}"
-            node = LogChart(label, first, shown, curves, words).node
-            if node is not None:
-                yield node
+    first, *others = of.grid
+    for values in list(dict.fromkeys(tuple(row[key] for key in others) for row in of.rows))[:_MOST_CHARTS]:
+        rows = [row for row in of.rows if tuple(row[key] for key in others) == values]
+        where = ", ".join(f"{key} = {value}" for key, value in zip(others, values, strict=True))
+        words = None
+        if not all(isinstance(row[first], (int, float)) for row in rows):
+            words = list(dict.fromkeys(str(row[first]) for row in rows))
+        curves = [
+            _curve(name, i, [row for row in rows if row["peer"] == name], first, words)
+            for i, name in enumerate(dict.fromkeys(row["peer"] for row in rows))
+        ]
+        label = (
+            f"Mean error of every receiver against {first}, with what theory expects. The table has the values. {where}"
+        )
+        shown = f"Mean error with its 95 % interval; dotted: theory{'; ' if where else ''}{where}"
+        yield LogChart(label, first, shown, curves, words).figure or Markup()
 
 
 def _curve(name: str, i: int, rows: Sequence[Mapping[str, Any]], key: str, words: Sequence[str] | None) -> Curve:
@@ -134,39 +119,25 @@ def _values(rows: Sequence[Mapping[str, Any]], names: list[str]) -> Floats:
     return np.array([math.nan if one is None else one for one in found], np.float64)
 
 
-@final
-class SweepFigures(Section[SweepSource]):
+def _figures(of: SweepSource) -> Iterator[Markup]:
     """The figures of all points, with their standard errors, theory, and z."""
-
-    title = "Figures"
-
-    @classmethod
-    def nodes(cls, of: SweepSource) -> Iterator[Node]:
-        """The table that the terminal shows."""
-        caption = (
-            "A row for each point and receiver: means ± standard errors; z: the z-score of the error against theory; "
-            "ratio: an eavesdropper's error over the legitimate one, in the second half of the run"
-        )
-        yield html_table(sweep_table(of.rows, tuple(of.grid)), caption)
+    caption = (
+        "A row for each point and receiver: means ± standard errors; z: the z-score of the error against theory; "
+        "ratio: an eavesdropper's error over the legitimate one, in the second half of the run"
+    )
+    yield made("table", sweep_table(of.rows, tuple(of.grid)), caption)
 
 
-@final
-class SweepRepeat(Section[SweepSource]):
+def _repeat(of: SweepSource) -> Iterator[Markup]:
     """How to repeat the sweep."""
-
-    title = "Repeat it"
-
-    @classmethod
-    def nodes(cls, of: SweepSource) -> Iterator[Node]:
-        """The command."""
-        given = of.folder / "scenario.toml"  # of a scenario that was made in Python, whose name is only its title
-        words = ["evedrop", "sweep", str(given.absolute()) if given.exists() else of.scenario]
-        for key, values in of.grid.items():
-            words += ["--over", f"{key}={','.join(_listed(values))}"]
-        for key, value in of.changes.items():
-            words += [f"--{key}", _toml(value)] if key == "trials" else ["--set", f"{key}={_toml(value)}"]
-        words += _MODES.get(of.mode, [])
-        yield element("pre", element("code", shlex.join(words)))
+    given = of.folder / "scenario.toml"  # of a scenario that was made in Python, whose name is only its title
+    words = ["evedrop", "sweep", str(given.absolute()) if given.exists() else of.scenario]
+    for key, values in of.grid.items():
+        words += ["--over", f"{key}={','.join(_listed(values))}"]
+    for key, value in of.changes.items():
+        words += [f"--{key}", _toml(value)] if key == "trials" else ["--set", f"{key}={_toml(value)}"]
+    words += _MODES.get(of.mode, [])
+    yield made("code", shlex.join(words))
 
 
 def _listed(values: Sequence[Any]) -> list[str]:
@@ -184,10 +155,10 @@ def _is_plain(value: Any) -> bool:
     return isinstance(value, str) and value_of(value) == value and not {",", ":"} & set(value)
 
 
-SWEEP_SECTIONS: tuple[type[Section[SweepSource]], ...] = (
-    SweepVerdicts,
-    SweepErrors,
-    SweepFigures,
-    SweepRepeat,
-)
-"""In the order of the page."""
+SWEEP_SECTIONS: Mapping[str, Callable[[SweepSource], Iterator[Markup]]] = {
+    "Verdicts": _verdicts,
+    "Errors": _errors,
+    "Figures": _figures,
+    "Repeat it": _repeat,
+}
+"""Title → the function that makes the contents, in the order of the page."""

@@ -1,21 +1,20 @@
-"""The sections of the report of a wire. To add one, write a class and add it to `WIRE_SECTIONS`."""
+"""The sections of the report of a wire. To add one, write a function and add it to `WIRE_SECTIONS`."""
 
 from __future__ import annotations
 
 import shlex
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, final
+from typing import Any
+
+from markupsafe import Markup
 
 from evedrop.errors import UsageError
 from evedrop.results.wire_folder import WIRE_FILE
 from evedrop.results.wire_summary import WIRE_SUMMARY_FILE, WireSummary
-from evedrop.show.report.markup import Node, element, paragraphs
-from evedrop.show.report.run_sections import marked_sentences
-from evedrop.show.report.section import Section
-from evedrop.show.report.tables import facts_table, html_table
+from evedrop.show.report.page import facts_table, made
 from evedrop.show.report.text_table import TextTable
 from evedrop.show.report.wire import reasons_table, unlinked_sentence, wire_faults, wire_outcome, wire_table, wire_title
 from evedrop.system.files import Unreadable, text_of
@@ -73,100 +72,66 @@ def _model(loss: Mapping[str, Any]) -> str:
     return said if len(said) <= _MOST_WORDS else f"{said[:_MOST_WORDS]}…"
 
 
-@final
-class WireExpectations(Section[WireSource]):
+def _expectations(of: WireSource) -> Iterator[Markup]:
     """The expectations of the wire file, with their outcomes."""
-
-    title = "Expectations"
-
-    @classmethod
-    def nodes(cls, of: WireSource) -> Iterator[Node]:
-        """A sentence for each."""
-        yield from marked_sentences(of.summary.expectations)
+    yield made("expectations", of.summary.expectations)
 
 
-@final
-class WireLinks(Section[WireSource]):
+def _links(of: WireSource) -> Iterator[Markup]:
     """What became of the messages of each link, against its models."""
-
-    title = "Links"
-
-    @classmethod
-    def nodes(cls, of: WireSource) -> Iterator[Node]:
-        """The table that the terminal shows, the bounds, and what went wrong."""
-        yield from paragraphs([*wire_faults(of.summary), *unlinked_sentence(of.summary)])
-        yield html_table(
-            wire_table(of.summary),
-            "Messages; the share that the models let through, and what they predict; whether it is within their bounds of 99 %; "
-            "the median delay; the most messages in a row that did not arrive",
-        )
-        table = TextTable.headed(["link", "from", "to", "keys"], ["99 % bounds"], ["loss model"])
-        for name, link in of.summary.links.items():
-            bounds = "–" if link.bounds is None else "{:.4f} to {:.4f}".format(*link.bounds)
-            table.add(name, link.source, link.target, link.keys, bounds, of.models.get(name, "–"))
-        yield html_table(
-            table, "The links as the file gives them, and the bounds of 99 % for the messages that they took"
-        )
+    yield made("sentences", [*wire_faults(of.summary), *unlinked_sentence(of.summary)])
+    yield made(
+        "table",
+        wire_table(of.summary),
+        "Messages; the share that the models let through, and what they predict; whether it is within their bounds of 99 %; "
+        "the median delay; the most messages in a row that did not arrive",
+    )
+    table = TextTable.headed(["link", "from", "to", "keys"], ["99 % bounds"], ["loss model"])
+    for name, link in of.summary.links.items():
+        bounds = "–" if link.bounds is None else "{:.4f} to {:.4f}".format(*link.bounds)
+        table.add(name, link.source, link.target, link.keys, bounds, of.models.get(name, "–"))
+    yield made(
+        "table", table, "The links as the file gives them, and the bounds of 99 % for the messages that they took"
+    )
 
 
-@final
-class WireLosses(Section[WireSource]):
+def _losses(of: WireSource) -> Iterator[Markup]:
     """Why messages did not arrive."""
-
-    title = "Losses by reason"
-
-    @classmethod
-    def nodes(cls, of: WireSource) -> Iterator[Node]:
-        """A row for each link and reason."""
-        table = reasons_table(of.summary)
-        if table.rows:
-            yield html_table(table, "Messages that did not arrive")
+    table = reasons_table(of.summary)
+    if table.rows:
+        yield made("table", table, "Messages that did not arrive")
 
 
-@final
-class WireEvents(Section[WireSource]):
+def _events(of: WireSource) -> Iterator[Markup]:
     """Cuts, partitions and changes, of the file and of operators."""
-
-    title = "Events"
-
-    @classmethod
-    def nodes(cls, of: WireSource) -> Iterator[Node]:
-        """A row for each."""
-        table = TextTable.headed([], ["at"], ["event"])
-        for one in of.events[:_MOST_EVENTS]:
-            table.add(*one)
-        if table.rows:
-            more = f"; the first {_MOST_EVENTS} of {len(of.events):,}" if len(of.events) > _MOST_EVENTS else ""
-            yield html_table(table, f"Cuts, partitions and changes, in seconds since the start{more}")
+    table = TextTable.headed([], ["at"], ["event"])
+    for one in of.events[:_MOST_EVENTS]:
+        table.add(*one)
+    if table.rows:
+        more = f"; the first {_MOST_EVENTS} of {len(of.events):,}" if len(of.events) > _MOST_EVENTS else ""
+        yield made("table", table, f"Cuts, partitions and changes, in seconds since the start{more}")
 
 
-@final
-class WireRepeat(Section[WireSource]):
+def _repeat(of: WireSource) -> Iterator[Markup]:
     """How to start the wire again, and with which versions it was made."""
-
-    title = "Repeat it"
-
-    @classmethod
-    def nodes(cls, of: WireSource) -> Iterator[Node]:
-        """Commands, seed and versions; not the file, which contains passwords."""
-        where = of.folder.absolute()
-        yield element("p", "A wire whose messages have the same fates, and a look at this one:")
-        commands = [["evedrop", "wire", str(where / WIRE_FILE)], ["evedrop", "view", str(where)]]
-        yield element("pre", element("code", "\n".join(map(shlex.join, commands))))
-        facts = {
-            "seed": of.summary.seed,
-            "start": f"{of.summary.start:,} in this folder",
-            "time": f"{of.summary.seconds:,.1f} s",
-            **of.summary.made_with,
-        }
-        yield facts_table(facts, "Seed and versions")
+    where = of.folder.absolute()
+    yield made("paragraph", "A wire whose messages have the same fates, and a look at this one:")
+    commands = [["evedrop", "wire", str(where / WIRE_FILE)], ["evedrop", "view", str(where)]]
+    yield made("code", "\n".join(map(shlex.join, commands)))
+    facts = {
+        "seed": of.summary.seed,
+        "start": f"{of.summary.start:,} in this folder",
+        "time": f"{of.summary.seconds:,.1f} s",
+        **of.summary.made_with,
+    }
+    yield facts_table(facts, "Seed and versions")
 
 
-WIRE_SECTIONS: tuple[type[Section[WireSource]], ...] = (
-    WireExpectations,
-    WireLinks,
-    WireLosses,
-    WireEvents,
-    WireRepeat,
-)
-"""In the order of the page."""
+WIRE_SECTIONS: Mapping[str, Callable[[WireSource], Iterator[Markup]]] = {
+    "Expectations": _expectations,
+    "Links": _links,
+    "Losses by reason": _losses,
+    "Events": _events,
+    "Repeat it": _repeat,
+}
+"""Title → the function that makes the contents, in the order of the page."""

@@ -1,4 +1,4 @@
-"""How far down errors are drawn on a logarithmic axis: one rule for the view, the figures from Python, and the report.
+"""The logarithmic axis of errors: one rule for the view, the figures from Python, and the report.
 
 A receiver that has just decoded a state has no error but that of rounding, such as 1e-30. Drawn as it is, it would leave a
 hundredth of the axis for the errors that matter.
@@ -7,6 +7,16 @@ hundredth of the axis for the errors that matter.
 from __future__ import annotations
 
 import math
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from evedrop.model.process import Floats
+
+_ROOM = 1.6  # the factor by which the axis goes beyond the errors
+_MOST = 1e30  # times the lowest value shown is the highest
 
 
 def error_floor(noise: float, trials: int) -> float:
@@ -21,3 +31,30 @@ def error_floor(noise: float, trials: int) -> float:
 def floor_words(floor: float) -> str:
     """What a caption says if a value is below the floor."""
     return f"values below {floor:g} lie on the lower edge"
+
+
+@dataclass(frozen=True)
+class ErrorAxis:
+    """The ends of a logarithmic axis."""
+
+    low: float
+    high: float
+    below: bool
+    """Whether values lie below the floor."""
+
+    @classmethod
+    def of(cls, heights: Sequence[Floats], floor: float) -> ErrorAxis | None:
+        """The axis on which to draw these values; None if none of them is positive."""
+        finite = np.concatenate([np.empty(0), *(part[np.isfinite(part)] for part in heights)])
+        shown = np.maximum(finite, floor)
+        shown = shown[shown > 0.0]
+        if not shown.size:
+            return None
+        below, high = bool((finite < floor).any()), float(shown.max())
+        low = max(float(shown.min()), high / _MOST)
+        most = min(max(high * _ROOM, 10.0 * floor), sys.float_info.max)
+        return cls(low if below else low / _ROOM, most, below)
+
+    def inside(self, values: Floats) -> Floats:
+        """The values; those beyond the ends of the axis lie on its edges, and those that are not finite are NaN."""
+        return np.clip(np.where(np.isfinite(values), values, np.nan), self.low, self.high)

@@ -41,13 +41,16 @@ _STYLE: Any = {
 
 
 @contextmanager
-def drawing(width: float, height: float) -> Iterator[ShownFigure]:
-    """A figure to draw on, in inches. Needs no display, and leaves no global state changed."""
+def drawing(width: float, height: float, style: Any = None) -> Iterator[ShownFigure]:
+    """A figure to draw on, in inches; style: what differs from other figures, as a mapping of matplotlib's settings.
+
+    Needs no display, and leaves no global state changed.
+    """
     import matplotlib as mpl  # noqa: PLC0415 - slow to import, and needed only for figures
 
     from evedrop.show.view.shown_figure import ShownFigure  # noqa: PLC0415 - as above
 
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(_STYLE | (style or {})):
         yield ShownFigure(figsize=(width, height), layout="constrained")
 
 

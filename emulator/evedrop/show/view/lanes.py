@@ -1,13 +1,16 @@
-"""The outcome of each packet, as the coloured lanes show it. Does not use Rerun."""
+"""The coloured lanes: what became of each packet, and what each receiver knows. Does not use Rerun."""
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evedrop.model.packet_words import DISCARDED, DROPPED, INNOVATION, MISLED, SILENT, STATE
 from evedrop.model.receiver import Action, Codes
+from evedrop.score.track import Track
 from evedrop.show.view import palette
 from evedrop.show.view.palette import Colour
 from evedrop.show.view.scene import SceneSlots, Shown
@@ -24,10 +27,19 @@ _LEGEND = (
 
 @dataclass(frozen=True)
 class Lane:
-    """The words of a lane; a word's index is its code."""
+    """The words of a lane and their colours; a word's index is its code."""
 
     words: tuple[str, ...]
     colours: tuple[Colour, ...]
+
+    def pixels(self, codes: Codes) -> NDArray[np.uint8]:
+        """The colours of codes (…), (…, 3)."""
+        return np.array(self.colours, np.uint8)[codes]
+
+    def legend(self, codes: Collection[int] | None = None) -> list[tuple[str, str]]:
+        """The words of some codes, or of all, each with its colour as matplotlib and HTML write it."""
+        some = range(len(self.words)) if codes is None else sorted(codes)
+        return [(self.words[code], palette.hexadecimal(self.colours[code])) for code in some]
 
 
 SENT = Lane((STATE, INNOVATION, SILENT), (palette.STATE, palette.DISCARDED, palette.SILENT))
@@ -36,6 +48,8 @@ LEGITIMATE = Lane(
     (palette.DROPPED, palette.STATE, palette.DECODED, palette.DISCARDED, palette.SILENT),
 )
 EAVESDROPPER = Lane((*LEGITIMATE.words, MISLED), (*LEGITIMATE.colours, palette.MISLED))
+KNOWLEDGE = Lane(tuple(track.word for track in Track), palette.KNOWLEDGE)
+"""What a receiver knows; a `Track` is its code."""
 SILENT_CODE = np.uint8(EAVESDROPPER.words.index(SILENT))
 """Code of a slot in which nothing was sent, so that nothing could be lost."""
 MISLED_CODE = np.uint8(EAVESDROPPER.words.index(MISLED))

@@ -19,7 +19,7 @@ from evedrop.model.process import Floats
 from evedrop.results.reading import Results
 from evedrop.scenario.arguments import refuse_unless
 from evedrop.scenario.loading.recorded import recorded, recorded_noise
-from evedrop.show.view.error_floor import error_floor, floor_words
+from evedrop.show.view.error_floor import ErrorAxis, error_floor, floor_words
 from evedrop.show.view.figure_style import drawing
 from evedrop.show.view.lanes import EAVESDROPPER
 from evedrop.show.view.palette import RECEIVERS, TRUTH_CURVE, colour, hexadecimal
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
 _WIDTH = 8.4
 _LAST = 300  # slots of lanes and plane unless told otherwise
-_ROOM = 1.6  # the factor by which the axis of errors goes beyond them
 _MARGIN = 0.25  # around the truth in the plane, as a share of its extent
 _LINES, _DOTS = ("-", "-.", ":"), (".", "x", "+")
 """Of the first receivers with different colours, of the next ones, whose colours are the same, and so on."""
@@ -98,17 +97,13 @@ def _errors(axes: Axes, rows: pa.Table, receivers: list[str], slots: range | Non
                 )  # symmetric on the logarithmic axis, and never below 0
             edges = (np.maximum(edge, floor) for edge in (error / share, error * share))
             axes.fill_between(found["slot"], *edges, color=ink, alpha=0.25, linewidth=0)
-    known = np.concatenate(heights)
-    known = known[np.isfinite(known)]
-    below = bool((known < floor).any())
-    shown = np.maximum(known, floor)
-    shown = shown[shown > 0.0]
-    if shown.size:  # otherwise the axis has nothing to show, and no logarithms
+    axis = ErrorAxis.of(heights, floor)
+    if axis is not None:  # otherwise the axis has nothing to show, and no logarithms
         axes.set_yscale("log")
-        axes.set_ylim(shown.min() / (1.0 if below else _ROOM), max(shown.max() * _ROOM, 10.0 * floor))
+        axes.set_ylim(axis.low, axis.high)
     axes.set_xlabel("slot")
     title = "squared error" + (", mean ± 2 standard errors" if many else "") + "; dashed: theory"
-    axes.set_title(f"{title}; {floor_words(floor)}" if below else title)
+    axes.set_title(f"{title}; {floor_words(floor)}" if axis is not None and axis.below else title)
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 
@@ -136,21 +131,9 @@ class _RecordedTrial:
 
     def lanes(self, axes: Axes) -> None:
         """What became of each packet, a lane for each receiver."""
-        from matplotlib.colors import ListedColormap  # noqa: PLC0415 - with the figure
-
-        words = EAVESDROPPER.words
         codes = np.array([self._codes(rows) for rows in self.rows.values()])
-        inks = [hexadecimal(one) for one in EAVESDROPPER.colours]
         extent = (self.slots[0] - 0.5, self.slots[-1] + 0.5, len(codes) - 0.5, -0.5)
-        axes.imshow(
-            codes,
-            ListedColormap(inks),
-            aspect="auto",
-            interpolation="nearest",
-            vmin=-0.5,
-            vmax=len(words) - 0.5,
-            extent=extent,
-        )
+        axes.imshow(EAVESDROPPER.pixels(codes), aspect="auto", interpolation="nearest", extent=extent)
         axes.set_yticks(range(len(codes)), list(self.rows))
         axes.set_yticks(np.arange(len(codes) - 1) + 0.5, minor=True)
         axes.grid(visible=False)
@@ -158,7 +141,7 @@ class _RecordedTrial:
         axes.tick_params(which="minor", length=0)
         axes.set_xlabel("slot")
         axes.set_title(f"packets; {self.title}")
-        marks = [Patch(color=inks[code], label=words[code]) for code in np.unique(codes)]
+        marks = [Patch(color=ink, label=word) for word, ink in EAVESDROPPER.legend(np.unique(codes).tolist())]
         axes.legend(handles=marks, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
     @staticmethod
