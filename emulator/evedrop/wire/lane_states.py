@@ -8,6 +8,7 @@ from __future__ import annotations
 from enum import Enum
 
 from evedrop.show.view import palette
+from evedrop.show.view.lanes import Lane
 from evedrop.show.view.palette import Colour
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.record import WireFate
@@ -29,6 +30,10 @@ class LaneState(Enum):
         self.word = word
         self.colour = colour
         self.name_of_colour = name_of_colour
+
+
+LANE = Lane(tuple(state.word for state in LaneState), tuple(state.colour for state in LaneState))
+"""The lane of a link."""
 
 
 def state_of(counts: Counts) -> LaneState:

@@ -18,8 +18,9 @@ from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
 from evedrop.model.process import Floats
 from evedrop.show.view.column import ELAPSED
 from evedrop.show.view.palette import colour, dim
+from evedrop.show.view.panels.state_lanes import StateLanes
 from evedrop.wire.graph import GRAPH, WireGraph, loss_of
-from evedrop.wire.lane_states import LaneState, legend, state_of
+from evedrop.wire.lane_states import LANE, LaneState, legend, state_of
 from evedrop.wire.notices import CutWatcher, LinkWatcher, Notice, why
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.step_counts import DELIVERED, Counts, WireSteps, quantile
@@ -63,18 +64,13 @@ class WirePanels:
         self._plan, self._pace = plan, pace
         self._names = [link.name for link in plan.links]
         digits = len(str(len(self._names)))
-        self._lane_paths = [
-            f"{_LANES}/{rr.escape_entity_path_part(f'{i:0{digits}d}_{name}')}"
-            for i, name in enumerate(self._names, start=1)
-        ]
+        self._lanes = StateLanes(_LANES, [(name, LANE) for name in self._names], first=1)
         self._cut_path = f"{_LANES}/{'0' * digits}_cut"
         self._graph = WireGraph(plan)
         self._watcher = LinkWatcher(self._names, pace.step)
         self._cuts = CutWatcher(plan.links)
         self._cut_word = ""
         self._cut_words: dict[str, str] = {}
-        self._lane = [-1] * len(self._names)
-        self._states = list(LaneState)
         self._next = 0
         self._last_counts: Counts | None = None
         self._last_delays: Counts | None = None
@@ -128,10 +124,8 @@ class WirePanels:
 
     def style(self, to: rr.RecordingStream) -> None:
         """Record names and colours, once."""
-        words, blank = [state.word for state in self._states], [" "] * len(self._states)
-        lanes = rr.StateConfiguration(values=words, labels=blank, colors=[state.colour for state in self._states])
-        for path in self._lane_paths:
-            to.log(path, lanes, static=True, strict=True)
+        for path, lane in self._lanes.styles().items():
+            to.log(path, lane, static=True, strict=True)
         bright = [colour(i) for i in range(len(self._names))]
         colours = [*bright, *(dim(one, _DIM) for one in bright)]
         widths = [2.0] * len(bright) + [1.2] * len(bright)
@@ -160,7 +154,7 @@ class WirePanels:
 
     def end(self, to: rr.RecordingStream) -> None:
         """Record that nothing follows: otherwise the last state of a lane would continue."""
-        last = [(path, LaneState.QUIET.word) for path in self._lane_paths]
+        last = [(path, LaneState.QUIET.word) for path in self._lanes.paths]
         for path, word in (*last, (self._cut_path, _WHOLE)):
             _send(to, path, [self._next * self._pace.step], rr.StateChange.columns(state=[word]))
 
@@ -192,13 +186,10 @@ class WirePanels:
 
     def _send_lanes(self, counts: Counts, begins: Floats, to: rr.RecordingStream) -> None:
         self._send_cuts(counts, begins, to)
-        for link, path in enumerate(self._lane_paths):
-            codes = np.array([self._states.index(state_of(one)) for one in counts[:, link]])
-            at = np.flatnonzero(np.diff(codes, prepend=self._lane[link]))
-            self._lane[link] = int(codes[-1])
-            if len(at):
-                words = [self._states[code].word for code in codes[at].tolist()]
-                _send(to, path, begins[at], rr.StateChange.columns(state=words))
+        states = list(LaneState)
+        codes = (np.array([states.index(state_of(one)) for one in counts[:, i]]) for i in range(len(self._names)))
+        for path, at, words in self._lanes.changes(codes):
+            _send(to, path, begins[at], words)
 
     def _send_cuts(self, counts: Counts, begins: Floats, to: rr.RecordingStream) -> None:
         for begin, one in zip(begins, counts, strict=True):

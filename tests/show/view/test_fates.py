@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from evedrop.score.track import Track
 from evedrop.show.view import lanes
-from evedrop.show.view.knowledge import KNOWLEDGE, knowledge
+from evedrop.show.view.knowledge import knowledge
 from evedrop.show.view.palette import DROPPED_TEXT, IN_TRACK_TEXT, MISLED, RUN_TEXTS, STATE, TRUTH, TRUTH_CURVE, Colour
 from evedrop.show.view.panels.fates import FATES, KNOWN, LastPacket
 from evedrop.show.view.panels.packets import Packets
@@ -51,10 +52,10 @@ def test_the_graph_tells_fates_and_errors(simulated: Callable[..., Simulated], t
             peer = run.slots.peers[one.name]
             word = lanes.lane_of(one).words[int(lanes.received(one, run.slots)[k])]
             assert shown[2 + i] == word
-            known = KNOWLEDGE[int(knowledge(run.scene, run.slots.x, peer)[k])]
+            track = Track(knowledge(run.scene, run.slots.x, peer)[k])
             name, _, rest = shown[2 + len(receivers) + i].partition(": ")
             what, _, off = rest.partition(", ")
-            assert (name, what) == (one.name, known.word)
+            assert (name, what) == (one.name, track.word)
             inks = [coloured(colours[k][at + i]) for at in (2, 2 + len(receivers))]
             assert inks == [COLOURS[word], COLOURS[what]]
             distance = float(off.removesuffix(" off").replace(",", ""))
@@ -64,7 +65,7 @@ def test_the_graph_tells_fates_and_errors(simulated: Callable[..., Simulated], t
 def test_every_fate_and_state_has_a_colour_of_the_table() -> None:
     """The graph can show everything that a lane shows."""
     assert {*lanes.LEGITIMATE.words, *lanes.EAVESDROPPER.words} == set(FATES)
-    assert set(KNOWN) == set(KNOWLEDGE)
+    assert set(KNOWN) == set(Track)
     assert {*FATES.values(), *KNOWN.values()} <= set(RUN_TEXTS)
 
 

@@ -12,9 +12,10 @@ import pytest
 from scipy import stats
 
 from evedrop.model.process import Floats
-from evedrop.score.track import FACTOR
+from evedrop.score.track import FACTOR, Track
 from evedrop.show.view.glyphs import drawable
-from evedrop.show.view.knowledge import KNOWLEDGE, ErrorDistance, KnowledgeState, knowledge
+from evedrop.show.view.knowledge import ErrorDistance, knowledge
+from evedrop.show.view.lanes import KNOWLEDGE
 from evedrop.show.view.panels.knowledge import WhoKnowsWhat
 from evedrop.show.view.panels.title import Title
 from evedrop.show.view.recording import ViewRecording
@@ -25,30 +26,30 @@ from tests.show.view.simulated_run import Simulated
 SCENE = Scene("", "r", 10, 1, 2, 0.0, (Shown("smart", "eavesdropper", "smart", 1.0),), noise=0.05, units=("m", "m"))
 
 
-def known(error: float, trace: float, scene: Scene = SCENE) -> KnowledgeState:
+def known(error: float, trace: float, scene: Scene = SCENE) -> Track:
     """What a receiver knows with this squared error and tr P, shared by two states."""
     none = np.zeros(1)
     P = np.diag([trace / 4, 3 * trace / 4])[None]
     off = np.sqrt(error / 4), -np.sqrt(3 * error / 4)
     peer = PeerSlots(np.array([off]), P, none.astype(np.uint8), none, none, none, none)
-    return KNOWLEDGE[int(knowledge(scene, np.zeros((1, 2)), peer)[0])]
+    return Track(knowledge(scene, np.zeros((1, 2)), peer)[0])
 
 
 @pytest.mark.parametrize(
     ("error", "trace", "expected"),
     [
-        (0.0, 0.0, KnowledgeState.IN_TRACK),
-        (0.99, 0.0, KnowledgeState.IN_TRACK),  # 20 times the noise of a step is 1
-        (1.01, 0.0, KnowledgeState.FOOLED),
-        (1.01, 0.1, KnowledgeState.DRIFTING),
-        (0.0, 1.01, KnowledgeState.DRIFTING),  # near the truth by chance
-        (99.0, 5.0, KnowledgeState.DRIFTING),
-        (101.0, 5.0, KnowledgeState.FOOLED),
-        (np.nan, 5.0, KnowledgeState.FOOLED),
-        (np.inf, 5.0, KnowledgeState.FOOLED),
+        (0.0, 0.0, Track.IN_TRACK),
+        (0.99, 0.0, Track.IN_TRACK),  # 20 times the noise of a step is 1
+        (1.01, 0.0, Track.FOOLED),
+        (1.01, 0.1, Track.DRIFTING),
+        (0.0, 1.01, Track.DRIFTING),  # near the truth by chance
+        (99.0, 5.0, Track.DRIFTING),
+        (101.0, 5.0, Track.FOOLED),
+        (np.nan, 5.0, Track.FOOLED),
+        (np.inf, 5.0, Track.FOOLED),
     ],
 )
-def test_a_word_for_error_and_covariance(error: float, trace: float, expected: KnowledgeState) -> None:
+def test_a_word_for_error_and_covariance(error: float, trace: float, expected: Track) -> None:
     """The bounds of docs/view.md."""
     assert known(error, trace) is expected
 
@@ -64,7 +65,7 @@ def walk(errors: list[float], levels: list[int], distance: ErrorDistance) -> lis
     """The words for distances along the first state."""
     x: Floats = np.array([[one, 0.0] for one in errors])
     codes = distance.codes(np.array(levels, np.uint8), distance.of(x, np.zeros_like(x)))
-    return [distance.words[code] for code in codes]
+    return [distance.lane.words[code] for code in codes]
 
 
 def test_words_say_the_largest_distance_of_a_stretch() -> None:
@@ -80,8 +81,10 @@ def test_words_say_the_largest_distance_of_a_stretch() -> None:
         f"drifting, {more} 1 m",
     ]
     assert walk([np.inf, np.nan], [2, 2], distance)[0] == f"fooled, {more} 1e+09 m"
-    assert len(set(distance.words)) == len(distance.words) == len(distance.meanings)
-    assert all(word.startswith(what.word) for word, what in zip(distance.words, distance.meanings, strict=True))
+    words, colours = distance.lane.words, distance.lane.colours
+    assert len(set(words)) == len(words)
+    inks = dict(zip(KNOWLEDGE.words, KNOWLEDGE.colours, strict=True))
+    assert [inks[word.partition(",")[0]] for word in words] == list(colours)
 
 
 def test_distances_have_a_unit() -> None:
@@ -116,7 +119,7 @@ def test_the_strip_shows_who_knows_what(simulated: Callable[..., Simulated], tmp
         changes = rows(tmp_path / "7.rrd", f"knows/{i}_{shown.name}", "StateChange:state")
         assert [word for _, (word,) in sorted(changes.items())] == [word for word, _ in groupby(lanes[shown.name, 7])]
         expected = knowledge(run.scene, run.slots.x, run.slots.peers[shown.name])
-        assert [word.split(",")[0] for word in lanes[shown.name, 7]] == [KNOWLEDGE[code].word for code in expected]
+        assert [word.split(",")[0] for word in lanes[shown.name, 7]] == [KNOWLEDGE.words[code] for code in expected]
     words = {name: " ".join(found) for (name, _), found in lanes.items()}
     assert "fooled" in words["naive"]
     assert "fooled" not in words["smart"]

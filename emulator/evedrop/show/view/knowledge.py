@@ -6,7 +6,6 @@ Source: docs/view.md, who knows what.
 from __future__ import annotations
 
 import math
-from enum import Enum
 from typing import final
 
 import numpy as np
@@ -15,27 +14,12 @@ from numpy.typing import NDArray
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes
 from evedrop.score.track import FACTOR, Track, track_of
-from evedrop.show.view import palette
+from evedrop.show.view.lanes import KNOWLEDGE, Lane
 from evedrop.show.view.scene import PeerSlots, Scene
 
 
-class KnowledgeState(Enum):
-    """What a receiver knows, as a word, and the colour of its lane."""
-
-    IN_TRACK = Track.IN_TRACK
-    DRIFTING = Track.DRIFTING
-    FOOLED = Track.FOOLED
-
-    def __init__(self, track: Track) -> None:
-        self.word = track.word
-        self.colour = palette.KNOWLEDGE[track]
-
-
-KNOWLEDGE = tuple(KnowledgeState)
-
-
 def knowledge(scene: Scene, x: Floats, peer: PeerSlots) -> Codes:
-    """Indices into `KNOWLEDGE`, (c,), in the first recorded trial, by the rule of `track_of`; x: true states, (c, n)."""
+    """Codes of the lane `KNOWLEDGE`, (c,), in the first recorded trial, by the rule of `track_of`; x: true states, (c, n)."""
     with np.errstate(all="ignore"):
         squared = np.sum((x - peer.x_hat) ** 2, axis=1)
         trace = np.trace(peer.P, axis1=1, axis2=2)
@@ -62,20 +46,15 @@ class ErrorDistance:
         self._steps = np.array([self._near, *(10.0**decade for decade in range(first, first + _DECADES))])
 
     @property
-    def words(self) -> tuple[str, ...]:
-        """All words of `codes`, such as "drifting, off by more than 10 m", by index."""
+    def lane(self) -> Lane:
+        """All words of `codes`, such as "drifting, off by more than 10 m", in the colours of what they say."""
         near = self._text(self._near)
-        found = [f"{KnowledgeState.IN_TRACK.word}, within {near}"]
-        for one in KNOWLEDGE[1:]:
-            found.append(f"{one.word}, off by less than {near}")
-            found += [f"{one.word}, off by more than {self._text(step)}" for step in self._steps]
-        return tuple(found)
-
-    @property
-    def meanings(self) -> tuple[KnowledgeState, ...]:
-        """What each of the words says."""
-        each = len(self._steps) + 1
-        return (KnowledgeState.IN_TRACK, *[KnowledgeState.DRIFTING] * each, *[KnowledgeState.FOOLED] * each)
+        words, colours = [f"{Track.IN_TRACK.word}, within {near}"], [KNOWLEDGE.colours[Track.IN_TRACK]]
+        for track in (Track.DRIFTING, Track.FOOLED):
+            words.append(f"{track.word}, off by less than {near}")
+            words += [f"{track.word}, off by more than {self._text(step)}" for step in self._steps]
+            colours += [KNOWLEDGE.colours[track]] * (1 + len(self._steps))
+        return Lane(tuple(words), tuple(colours))
 
     def of(self, x: Floats, x_hat: Floats) -> Floats:
         """The distances of estimates from true states, (c,)."""
@@ -84,7 +63,7 @@ class ErrorDistance:
         return distances
 
     def codes(self, known: Codes, distances: Floats) -> NDArray[np.int64]:
-        """Indices into `words` of the next slots, (c,), for what is known and distances, (c,).
+        """Codes of `lane` in the next slots, (c,), for what is known and distances, (c,).
 
         A word names the largest distance since this stretch of equal knowledge began, so that it does not flicker.
         """

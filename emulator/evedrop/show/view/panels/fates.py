@@ -9,10 +9,11 @@ import rerun.blueprint as rrb
 from rerun import AsComponents
 
 from evedrop.model import packet_words
+from evedrop.score.track import Track
 from evedrop.show.view import lanes
 from evedrop.show.view.column import Column
 from evedrop.show.view.drawn_graph import LETTER, LINE, DrawnGraph, Place
-from evedrop.show.view.knowledge import KNOWLEDGE, ErrorDistance, KnowledgeState, knowledge
+from evedrop.show.view.knowledge import ErrorDistance, knowledge
 from evedrop.show.view.palette import DROPPED_TEXT, IN_TRACK_TEXT, MISLED, STATE, TRUTH, TRUTH_CURVE, Colour
 from evedrop.show.view.panels.heights import crowded, lanes_height
 from evedrop.show.view.panels.panel import PlacedView, ViewPanel
@@ -31,7 +32,7 @@ FATES = {
     packet_words.SILENT: TRUTH_CURVE,
 }
 """The colour of each word of a lane."""
-KNOWN = {KnowledgeState.IN_TRACK: IN_TRACK_TEXT, KnowledgeState.DRIFTING: MISLED, KnowledgeState.FOOLED: DROPPED_TEXT}
+KNOWN = {Track.IN_TRACK: IN_TRACK_TEXT, Track.DRIFTING: MISLED, Track.FOOLED: DROPPED_TEXT}
 """The colour of what a receiver knows."""
 
 
@@ -97,8 +98,8 @@ class LastPacket(ViewPanel):
     def _known(self, shown: Shown, slots: SceneSlots, at: list[int]) -> list[tuple[str, Colour]]:
         peer = slots.peers[shown.name]
         distances = self._distance.of(slots.x[at], peer.x_hat[at]).tolist()
-        states = [KNOWLEDGE[code] for code in knowledge(self.scene, slots.x, peer)[at].tolist()]
+        tracks = [Track(code) for code in knowledge(self.scene, slots.x, peer)[at].tolist()]
         return [
-            (f"{shown.name}: {state.word}, {self._distance.text(distance)} off", KNOWN[state])
-            for state, distance in zip(states, distances, strict=True)
+            (f"{shown.name}: {track.word}, {self._distance.text(distance)} off", KNOWN[track])
+            for track, distance in zip(tracks, distances, strict=True)
         ]

@@ -28,8 +28,8 @@ class WhoKnowsWhat(ViewPanel):
     def __init__(self, scene: Scene) -> None:
         super().__init__(scene)
         self._distances = {shown.name: ErrorDistance(scene) for shown in scene.receivers}
-        words = ((name, distance.words) for name, distance in self._distances.items())
-        self._lanes = StateLanes(_PATH, words, first=1)
+        named = [(name, distance.lane) for name, distance in self._distances.items()]
+        self._lanes = StateLanes(_PATH, named, first=1, labelled=True)
 
     def views(self) -> Iterator[PlacedView]:
         """One view, at the top."""
@@ -38,17 +38,13 @@ class WhoKnowsWhat(ViewPanel):
 
     def styles(self) -> dict[str, rr.StateConfiguration]:
         """Words and colours."""
-        found = {}
-        for path, distance in zip(self._lanes.paths, self._distances.values(), strict=True):
-            colours = [one.colour for one in distance.meanings]
-            found[path] = rr.StateConfiguration(values=distance.words, colors=colours)
-        return found
+        return self._lanes.styles()
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
         """The lanes' changes."""
-        yield from self._lanes.columns(
-            slots.numbers, (self._codes(shown.name, slots) for shown in self.scene.receivers)
-        )
+        codes = (self._codes(shown.name, slots) for shown in self.scene.receivers)
+        for path, at, words in self._lanes.changes(codes):
+            yield Column(path, slots.numbers[at], words)
 
     def _codes(self, name: str, slots: SceneSlots) -> NDArray[np.int64]:
         peer, distance = slots.peers[name], self._distances[name]

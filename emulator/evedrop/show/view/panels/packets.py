@@ -26,9 +26,8 @@ class Packets(ViewPanel):
     def __init__(self, scene: Scene) -> None:
         super().__init__(scene)
         names = ["sent", *(shown.name for shown in scene.receivers)]
-        self._lanes = [lanes.SENT, *(lanes.lane_of(shown) for shown in scene.receivers)]
-        words = [lane.words for lane in self._lanes]
-        self._shown = StateLanes(_PATH, zip(names, words, strict=True), first=0)
+        shown_lanes = [lanes.SENT, *(lanes.lane_of(shown) for shown in scene.receivers)]
+        self._lanes = StateLanes(_PATH, zip(names, shown_lanes, strict=True), first=0)
 
     def views(self) -> Iterator[PlacedView]:
         """One view, as high as the lanes need: above the events, or, with many receivers or a closed loop, at the top."""
@@ -42,13 +41,11 @@ class Packets(ViewPanel):
             yield PlacedView(view, "left", height / (column - height))
 
     def styles(self) -> dict[str, rr.StateConfiguration]:
-        """Blank labels: a slot is too narrow for a word, and the legend says what the colours mean."""
-        return {
-            path: rr.StateConfiguration(values=lane.words, labels=[" "] * len(lane.words), colors=lane.colours)
-            for path, lane in zip(self._shown.paths, self._lanes, strict=True)
-        }
+        """Colours; the legend says what they mean."""
+        return self._lanes.styles()
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
         """The lanes' changes."""
         found = [lanes.sent(slots), *(lanes.received(shown, slots) for shown in self.scene.receivers)]
-        yield from self._shown.columns(slots.numbers, found)
+        for path, at, words in self._lanes.changes(found):
+            yield Column(path, slots.numbers[at], words)
