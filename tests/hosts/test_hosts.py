@@ -15,9 +15,8 @@ import pytest
 
 from evedrop.live.protocol.brief import read_brief
 from evedrop.results.reading import Results
-from evedrop.scenario.loading import checked
 from evedrop.scenario.tables import Scenario
-from tests.builders import MARGINAL, process_table
+from tests.builders import MARGINAL, listener, scenario_of
 from tests.by_hand import ByHand, as_if_undisturbed, by_hand
 from tests.conftest import wait_until
 from tests.hosts.lan import Lan, lan
@@ -26,19 +25,13 @@ PORT = 7447
 HOSTS = ("router", "sensor", "legitimate", "eve", "observer")
 
 
-def scenario_of(**changes: Any) -> Scenario:
+def on_hosts(**changes: Any) -> Scenario:
     """Some seconds of a state that is sent as it is, so that a payload can be told."""
-    tables = {
-        "title": "On hosts of their own",
-        "slots": 500,
-        "seed": 31,
-        "pace": 0.01,
-        "process": process_table(MARGINAL),
-        "encoding": {"scheme": "plain"},
-        "legitimate": {"link": {"quality": 0.8}},
-        "eavesdroppers": {"eve": {"strategy": "naive", "link": {"quality": 0.7}}},
-    }
-    return checked({**tables, **changes}, "hosts")
+    plain = {"encoding": {"scheme": "plain"}, "legitimate": {"link": {"quality": 0.8}}}
+    eavesdroppers = {"eve": listener("naive", 0.7)}
+    return scenario_of(
+        MARGINAL, **{**plain, "eavesdroppers": eavesdroppers, "slots": 500, "seed": 31, "pace": 0.01, **changes}
+    )
 
 
 @contextmanager
@@ -109,7 +102,7 @@ for host in sys.argv[2:]:
 
 def test_hosts_of_their_own_change_nothing_and_show_nothing(tmp_path: Path) -> None:
     """Digests are those in memory; a scan finds the router's port alone, and a capture neither payload nor password."""
-    scenario = scenario_of()
+    scenario = on_hosts()
     with apart(tmp_path, scenario) as (network, run), captured(network, "router", tmp_path / "capture"):
         run.start()
         run.running()
@@ -132,7 +125,7 @@ def test_hosts_of_their_own_change_nothing_and_show_nothing(tmp_path: Path) -> N
 
 def test_in_clear_everything_can_be_read(tmp_path: Path) -> None:
     """With --insecure the same capture has the payloads in it: so it would have shown them."""
-    scenario = scenario_of(slots=100)
+    scenario = on_hosts(slots=100)
     with apart(tmp_path, scenario, "tcp") as (network, run), captured(network, "router", tmp_path / "capture"):
         run.start()
         assert set(run.statuses().values()) == {0}
@@ -149,7 +142,7 @@ def test_in_clear_everything_can_be_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize("host", ["eve", "router"])
 def test_a_pulled_cable_is_an_outage(host: str, tmp_path: Path) -> None:
     """Unplugged for longer than a connection's lease, and plugged in again: the run reaches the bits of an undisturbed one."""
-    scenario = scenario_of()
+    scenario = on_hosts()
     with apart(tmp_path, scenario) as (network, run):
         run.start()
         run.running(50)
@@ -170,7 +163,7 @@ def test_a_pulled_cable_is_an_outage(host: str, tmp_path: Path) -> None:
 
 def test_a_killed_router_is_started_again_on_its_host(tmp_path: Path) -> None:
     """The others find it again at its address, under its certificate."""
-    scenario = scenario_of()
+    scenario = on_hosts()
     with apart(tmp_path, scenario) as (_, run):
         run.start()
         run.running(50)
@@ -183,7 +176,7 @@ def test_a_killed_router_is_started_again_on_its_host(tmp_path: Path) -> None:
 
 def test_two_routers_lose_each_other(tmp_path: Path) -> None:
     """The router's cable is pulled, and later the router is killed: sensor and relay find it again, and the bits are the same."""
-    scenario = scenario_of(network={"routers": 2})
+    scenario = on_hosts(network={"routers": 2})
     with apart(tmp_path, scenario) as (network, run):
         run.start()
         run.running(50)

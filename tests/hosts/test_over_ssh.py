@@ -19,7 +19,7 @@ from evedrop.scenario.tables import Scenario
 from tests.by_hand import as_if_undisturbed
 from tests.conftest import wait_until, with_mark
 from tests.hosts.lan import Lan, lan
-from tests.hosts.test_hosts import scenario_of
+from tests.hosts.test_hosts import on_hosts
 from tests.privileged import CannotRun, skip
 from tests.sshd import sshd
 
@@ -95,7 +95,7 @@ def nothing_left(folder: Path) -> None:
 
 def test_over_ssh_hosts_give_the_same_run(tmp_path: Path) -> None:
     """Also if a host is cut off for a while: the run goes on to the digests of an undisturbed one, and nothing is left."""
-    scenario = scenario_of(slots=1500)
+    scenario = on_hosts(slots=1500)
     with launched(tmp_path, scenario) as (network, launcher):
         under_way(tmp_path, launcher)
         network.unplug("beta")
@@ -111,7 +111,7 @@ def test_over_ssh_hosts_give_the_same_run(tmp_path: Path) -> None:
 
 def test_a_host_that_stays_away_is_named(tmp_path: Path) -> None:
     """Its cable is pulled for good: the run ends, says which host is gone, and the other host has no process left."""
-    scenario = scenario_of(slots=100_000, longest_outage=8.0)
+    scenario = on_hosts(slots=100_000, longest_outage=8.0)
     with launched(tmp_path, scenario) as (network, launcher):
         under_way(tmp_path, launcher)
         network.unplug("beta")

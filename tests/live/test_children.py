@@ -24,7 +24,7 @@ from evedrop.names import ProcessAction
 from evedrop.results.folder import HeldFolder, new_folder
 from evedrop.scenario.news import ConnectionOutage, News, RunEnded, RunProgress, Started, silent
 from tests.conftest import wait_until
-from tests.live.network.bench import scenario_of
+from tests.live.network.bench import small_network
 
 
 @dataclass
@@ -79,7 +79,7 @@ class Bench:
         self.private, self.results = folder / "private", new_folder(folder / "run")
         self.private.mkdir()
         (self.results / "logs").mkdir(exist_ok=True)
-        self.briefs = briefs_of(scenario_of(), "tcp/127.0.0.1:1", ObserverTask(self.results, False))
+        self.briefs = briefs_of(small_network(), "tcp/127.0.0.1:1", ObserverTask(self.results, False))
         self.starter = FakeStarter()
         self.held = HeldFolder(self.results)
         self.children = Children(self.held, self.private, starter=self.starter)

@@ -72,7 +72,7 @@ KINDS = (
 """Of a run: with no acknowledgement channel, with one from slot to slot, and with a closed loop."""
 
 
-def scenario_of(folder: Path, kind: dict[str, str]) -> Scenario:
+def flapping(folder: Path, kind: dict[str, str]) -> Scenario:
     """A scenario with some eavesdroppers, whose deliveries can be mistaken for each other's."""
     path = folder / "flapping.toml"
     path.write_text(SCENARIO.format(**kind))
@@ -88,7 +88,7 @@ def flaps(seed: int, bursts: int = 2) -> list[list[float]]:
 def disturbed(seed: int, evedrop: Evedrop, how: str) -> None:
     """A run in which all connections with the router are cut in bursts, and back at once, is as if nothing had been."""
     folder = evedrop.folder
-    scenario = scenario_of(folder, KINDS[seed % len(KINDS)])
+    scenario = flapping(folder, KINDS[seed % len(KINDS)])
     port = free_port()
     with ExitStack() as stack:
         wire = stack.enter_context(cable(port))
@@ -138,7 +138,7 @@ def test_connections_that_are_reset_change_nothing(seed: int, evedrop: Evedrop) 
 @pytest.mark.long
 def test_a_message_of_another_key_is_dropped_counted_and_sent_again(evedrop: Evedrop, tmp_path: Path) -> None:
     """A delivery that arrives on another receiver's key changes no figure: the summary says who dropped how many."""
-    scenario = scenario_of(tmp_path, PLAIN)
+    scenario = flapping(tmp_path, PLAIN)
     with by_hand(scenario, tmp_path, f"tcp/127.0.0.1:{free_port()}", paused=True) as run:
         run.write()
         run.start()

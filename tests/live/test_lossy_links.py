@@ -17,7 +17,7 @@ from evedrop.results.reading import Results
 from evedrop.scenario.expected.estimates import warnings_of
 from evedrop.scenario.loading import load
 from evedrop.scenario.tables import Scenario
-from tests.builders import MARGINAL, digests_of, process_table
+from tests.builders import MARGINAL, digests_of, tables_of
 from tests.conftest import Evedrop
 
 LOSSES: dict[str, dict[str, Any]] = {
@@ -41,32 +41,31 @@ UNKNOWN = ("distance", "pattern", "trace")
 """Those that no theory covers."""
 
 
-def scenario(**changes: Any) -> dict[str, Any]:
+def lossy(**changes: Any) -> dict[str, Any]:
     """An eavesdropper behind each loss model, the legitimate estimator behind bursts."""
     eavesdroppers = {
         name: {"strategy": "smart", "link": {"loss": loss}} for name, loss in LOSSES.items() if name != "bernoulli"
     }
     suspicious = {"strategy": "suspicious", "use_state": 0.8, "use_innovation": 0.1}
-    return {
-        "title": "Every loss model",
-        "slots": 300,
-        "process": process_table(MARGINAL),
-        "encoding": {"scheme": "innovation", "state_probability": 0.3},
-        "legitimate": {"link": {"loss": LOSSES["gilbert-elliott"]}},
-        "eavesdroppers": {
+    tables = tables_of(
+        MARGINAL,
+        slots=300,
+        encoding={"scheme": "innovation", "state_probability": 0.3},
+        legitimate={"link": {"loss": LOSSES["gilbert-elliott"]}},
+        eavesdroppers={
             "bernoulli": {**suspicious, "link": {"loss": LOSSES["bernoulli"]}},
             **eavesdroppers,
             "guesser": {**suspicious, "link": {"loss": LOSSES["markov"]}},
         },
-        **changes,
-    }
+    )
+    return {**tables, **changes}
 
 
 @pytest.fixture(scope="module")
 def every_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The scenario's file."""
     path = tmp_path_factory.mktemp("scenario") / "every.toml"
-    path.write_text(tomli_w.dumps(scenario()), encoding="utf-8")
+    path.write_text(tomli_w.dumps(lossy()), encoding="utf-8")
     return path
 
 
@@ -141,7 +140,7 @@ def test_design_is_for_independent_losses(every_model: Path, evedrop: Evedrop) -
     quality = {"quality": 0.9}
     with pytest.raises(UsageError, match=r"such as eavesdroppers\.distance\.link="):
         design(every_model, changes={"legitimate.link": quality})
-    links = {f"eavesdroppers.{name}.link": quality for name in scenario()["eavesdroppers"]}
+    links = {f"eavesdroppers.{name}.link": quality for name in lossy()["eavesdroppers"]}
     found = design(every_model, changes={"legitimate.link": quality, **links})
     # A scenario that is checked already takes the same changes.
     assert design(load(every_model), changes={"legitimate.link": quality, **links}).trace == found.trace
@@ -153,7 +152,7 @@ def test_bursts_that_last_too_long_are_a_warning() -> None:
     (warning,) = warnings_of(load("numerical", {"legitimate.link": link}))
     assert "grows without bound" in warning
     assert warnings_of(load("numerical", {"legitimate.link": {"loss": {**link["loss"], "r": 0.9}}})) == []
-    assert warnings_of(Scenario.model_validate(scenario())) == []
+    assert warnings_of(Scenario.model_validate(lossy())) == []
 
 
 @pytest.mark.long

@@ -17,7 +17,7 @@ from evedrop.model.slot.link import NEVER
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.scenario.loading import checked, load
 from evedrop.scenario.tables import Scenario
-from tests.builders import scalar_tables
+from tests.builders import listener, scalar_tables
 from tests.examples import examples
 
 NEMESIS: dict[str, Any] = {"faults": ["kill", "pause", "cut"], "every": 20, "lasting": 8}
@@ -27,11 +27,11 @@ LOOP: dict[str, Any] = {
 }
 
 
-def tables(nemesis: dict[str, Any] | None = None, **more: Any) -> dict[str, Any]:
+def disturbed(nemesis: dict[str, Any] | None = None, **more: Any) -> dict[str, Any]:
     """A scenario with this nemesis."""
     eavesdroppers = {
-        "eve": {"strategy": "smart", "link": {"quality": 0.9}},
-        "mallory": {"strategy": "naive", "link": {"quality": 0.9}},
+        "eve": listener("smart", 0.9),
+        "mallory": listener("naive", 0.9),
     }
     made = scalar_tables(0.9, 0.1, slots=1000, seed=4, eavesdroppers=eavesdroppers)
     return {**made, "nemesis": {**NEMESIS, **(nemesis or {})}, **more}
@@ -39,7 +39,7 @@ def tables(nemesis: dict[str, Any] | None = None, **more: Any) -> dict[str, Any]
 
 def right(nemesis: dict[str, Any] | None = None, **more: Any) -> Scenario:
     """A scenario with which nothing is wrong."""
-    return checked(tables(nemesis, **more), "file")
+    return checked(disturbed(nemesis, **more), "file")
 
 
 def happening(scenario: Scenario, name: str) -> list[tuple[int, int | None, str]]:
@@ -136,7 +136,7 @@ def test_nobody_draws_for_anybody_else() -> None:
     """A further eavesdropper, or one less, moves no fault of others; the seed of the nemesis, if it has one, decides alone."""
     every = {"faults": ["kill", "pause", "cut", "partition"]}
     all_of_them = right(every)
-    alone = right(every, eavesdroppers={"mallory": tables()["eavesdroppers"]["mallory"]})
+    alone = right(every, eavesdroppers={"mallory": disturbed()["eavesdroppers"]["mallory"]})
     for name in ("legitimate", "mallory"):
         assert happening(alone, name) == happening(all_of_them, name)
     assert happening(right({"targets": ["eve"]}), "eve") == happening(right(), "eve")

@@ -31,7 +31,7 @@ from evedrop.scenario.tables import Scenario
 from evedrop.system.ports import free_port
 from tests.conftest import LIMIT, Evedrop, Live, with_mark
 from tests.examples import mostly_long
-from tests.live.network.bench import scenario_of
+from tests.live.network.bench import small_network
 from tests.live.test_children import Ended
 from tests.privileged import CannotRun, skip
 
@@ -173,7 +173,7 @@ def launch(
     """Run the small scenario with this starter."""
     with contextlib.chdir(folder):
         launch_one(
-            scenario or scenario_of(),
+            scenario or small_network(),
             folder / "run",
             "off",
             endpoints,
@@ -257,7 +257,7 @@ def test_no_process_starts_before_the_routers_say_that_they_listen(
     """In a run with two, the relay after the router, and all others after the relay; nothing else counts as their word."""
     routers = Routers(lines)
     with pytest.raises(RunError, match=f"{started[-1]} did not listen within 1 s"):
-        launch(tmp_path, routers, endpoints_at(*TWO), scenario=scenario_of(network={"routers": 2}), patience=1)
+        launch(tmp_path, routers, endpoints_at(*TWO), scenario=small_network(network={"routers": 2}), patience=1)
     assert routers.started == started
 
 
@@ -265,7 +265,7 @@ def test_the_processes_start_once_the_routers_listen(tmp_path: Path) -> None:
     """All of them, the observer last."""
     routers = Routers({name: RouterListens(name).line for name in ("router", "relay")})
     with pytest.raises(RunError):
-        launch(tmp_path, routers, endpoints_at(*TWO), scenario=scenario_of(network={"routers": 2}))
+        launch(tmp_path, routers, endpoints_at(*TWO), scenario=small_network(network={"routers": 2}))
     assert routers.started[:2] == ["router", "relay"]
     assert routers.started[-1] == "observer"
     assert len(routers.started) > 4

@@ -22,7 +22,7 @@ from evedrop.live.launch.starter import FORK_SERVER_LOST, StartedProcess, Starte
 from evedrop.names import KERNELS_VARIABLE
 from evedrop.system.environment import own_environment
 from tests.conftest import LIMIT, wait_until
-from tests.live.network.bench import scenario_of
+from tests.live.network.bench import small_network
 from tests.processes import parent_of, words_of
 
 OTHER_KERNELS = "" if os.environ.get(KERNELS_VARIABLE) == "numpy" else "numpy"
@@ -38,7 +38,9 @@ class Bench:
     def start(self, role: str = "router", brief: Path | None = None, **environment: str) -> StartedProcess:
         """Start a process; brief: None for that of a router with a port of its own."""
         if brief is None:
-            briefs = briefs_of(scenario_of(), loopback_endpoints(None, None, False), ObserverTask(self._folder, False))
+            briefs = briefs_of(
+                small_network(), loopback_endpoints(None, None, False), ObserverTask(self._folder, False)
+            )
             brief = briefs["router"].write(Path(mkdtemp(dir=self._folder)))  # which it removes
         with process_starter() as starter, self.log.open("wb") as log:
             process = starter(role, brief, log, {**own_environment(), **environment})

@@ -21,36 +21,30 @@ from evedrop.live.network.program import ProgramStates
 from evedrop.live.protocol.brief_parts import ProgramEntry
 from evedrop.results.diff import difference
 from evedrop.results.reading import Results
-from evedrop.scenario.loading import checked
 from evedrop.scenario.recordings.disturbance_file import table_text
 from evedrop.scenario.tables import Scenario
 from evedrop.simulate.montecarlo import Plan
 from evedrop.system.ports import free_port
-from tests.builders import MARGINAL, digests_of, process_table
+from tests.builders import MARGINAL, digests_of, listener, process_table, scenario_of
 from tests.conftest import wait_until
 
 PLAYER = Path(__file__).parents[2] / "docs" / "examples" / "csv_player.py"
 ROWS = np.random.default_rng(5).standard_normal((80, 2)).cumsum(axis=0).tolist()
 
 
-def scenario_of(slots: int, process: dict[str, Any], **more: Any) -> Scenario:
+def given(slots: int, process: dict[str, Any], **more: Any) -> Scenario:
     """A scenario whose states are given, with a reference and two eavesdroppers."""
-    link = {"link": {"quality": 0.8}}
     own = {**process_table(MARGINAL), "states": ["x", "v"], "reference": [0.1, -0.7]}
-    return checked(
-        {
-            "title": "A program",
-            "slots": slots,
-            "trials": 2,
-            "longest_outage": 5.0,
-            "process": {**own, **process},
-            "encoding": {"scheme": "innovation", "state_probability": 0.4},
-            "legitimate": link,
-            "eavesdroppers": {"smart": {"strategy": "smart", **link}, "naive": {"strategy": "naive", **link}},
-            **more,
-        },
-        "file",
-    )
+    tables = {
+        "slots": slots,
+        "trials": 2,
+        "longest_outage": 5.0,
+        "process": {**own, **process},
+        "encoding": {"scheme": "innovation", "state_probability": 0.4},
+        "legitimate": {"link": {"quality": 0.8}},
+        "eavesdroppers": {name: listener(name, 0.8) for name in ("smart", "naive")},
+    }
+    return scenario_of(MARGINAL, **{**tables, **more})
 
 
 def program(**entries: Any) -> dict[str, Any]:
@@ -93,9 +87,9 @@ def test_a_run_over_a_program_can_be_repeated(tmp_path: Path) -> None:
     """At the program's own pace, each message is a slot: the digests are those of its file, and of the recorded run."""
     source = program()
     with playing(tmp_path, source, lines_of(ROWS)):
-        live = run(scenario_of(60, source), out=tmp_path / "live")
+        live = run(given(60, source), out=tmp_path / "live")
     assert live.summary["ended"] == "complete"
-    of_file = scenario_of(60, {"source": "file", "state_values": ROWS})
+    of_file = given(60, {"source": "file", "state_values": ROWS})
     memory = montecarlo(of_file, trials=2, out=tmp_path / "memory", plan=Plan(workers=1))
     again = montecarlo(tmp_path / "live", trials=2, out=tmp_path / "again", plan=Plan(workers=1))
     assert digests_of(live) == digests_of(memory) == digests_of(again)
@@ -110,7 +104,7 @@ def test_a_paced_run_takes_the_newest_state(tmp_path: Path) -> None:
     source = program()
     rows = [[float(k), -float(k)] for k in range(4000)]
     with playing(tmp_path, source, lines_of(rows), every=0.002):
-        live = run(scenario_of(20, source, pace=0.02), out=tmp_path / "live")
+        live = run(given(20, source, pace=0.02), out=tmp_path / "live")
     assert live.summary["ended"] == "complete"
     taken = np.loadtxt(tmp_path / "live" / "states.csv", delimiter=",", skiprows=1)[:, 0]
     assert len(taken) == 20
@@ -163,7 +157,7 @@ def test_a_message_that_is_no_state_ends_the_run(tmp_path: Path) -> None:
     source = program()
     lines = [*lines_of(ROWS[:30]), "nan,1.0", *lines_of(ROWS[30:])]
     with playing(tmp_path, source, lines), pytest.raises(RunError) as caught:
-        run(scenario_of(60, source), out=tmp_path / "live")
+        run(given(60, source), out=tmp_path / "live")
     where = source["zenoh"]["listen"]
     assert f"robot/pose at {where}: the message of slot 30 has x = nan; expected a finite number" in str(caught.value)
     states = (tmp_path / "live" / "states.csv").read_text().splitlines()
@@ -181,6 +175,6 @@ def test_a_program_that_dies_ends_the_run(tmp_path: Path) -> None:
     """So does one that never starts: the sensor names the slot."""
     source = program()
     with playing(tmp_path, source, lines_of(ROWS[:30])), pytest.raises(RunError, match="after that of slot 29 for 5 s"):
-        run(scenario_of(60, source), out=tmp_path / "died")
+        run(given(60, source), out=tmp_path / "died")
     with pytest.raises(RunError, match=r"robot/pose at .*: no state came for 5 s; check that its program runs"):
-        run(scenario_of(60, program()), out=tmp_path / "absent")
+        run(given(60, program()), out=tmp_path / "absent")

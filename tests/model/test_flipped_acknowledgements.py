@@ -23,7 +23,7 @@ from evedrop.model.theory.closed_forms import reference_covariances, reference_l
 from evedrop.model.theory.covariances import Outcomes, expected_covariances
 from evedrop.scenario.loading import checked
 from evedrop.studies.papers.luecke2022 import TransmissionPolicy, mean_traces
-from tests.builders import UNSTABLE, digests_of
+from tests.builders import UNSTABLE, digests_of, listener, tables_of
 from tests.examples import mostly_long
 from tests.model.acknowledged_runs import MIXED, carried
 from tests.model.mixed_runs import covariances
@@ -212,26 +212,25 @@ PUBLISHED = [
 """The eavesdropper's link, the policy, and the mean traces of user and eavesdropper: A = 0.9, Q = 1, μ = 0.8, p = 0.1."""
 
 
-def tables(mu_e: float, policy: dict[str, float], **more: Any) -> dict[str, Any]:
+def flipped(mu_e: float, policy: dict[str, float], **more: Any) -> dict[str, Any]:
     """The published example as a scenario."""
     random = "plain_probability" in policy
     encoding = {"scheme": "random-code"} if random else {"scheme": "threshold-code", "assumed_quality": 0.8}
-    return {
-        "title": "Flipped acknowledgements",
-        "process": {"A": [[0.9]], "Q": [[1.0]], "initial_covariance": [[1.0 / 0.19]]},
-        "encoding": {**encoding, **({} if random else {"assumed_flip": 0.1}), **policy},
-        "acknowledgements": {"link": {"quality": 1.0}, "attack": "flip", "flip": 0.1},
-        "legitimate": {"link": {"quality": 0.8}},
-        "eavesdroppers": {"eve": {"strategy": "reference", "link": {"quality": mu_e}}},
-        **more,
-    }
+    tables = tables_of(
+        Process(np.array([[0.9]]), np.eye(1), np.array([[1.0 / 0.19]])),
+        encoding={**encoding, **({} if random else {"assumed_flip": 0.1}), **policy},
+        acknowledgements={"link": {"quality": 1.0}, "attack": "flip", "flip": 0.1},
+        legitimate={"link": {"quality": 0.8}},
+        eavesdroppers={"eve": listener("reference", mu_e)},
+    )
+    return {**tables, **more}
 
 
 def traces_of(
     mu_e: float, policy: dict[str, float], slots: int, trials: int, out: Path
 ) -> tuple[np.ndarray, np.ndarray]:
     """The mean of tr P over the slots, user and eavesdropper, and its standard error, by the means over slots of each."""
-    found = montecarlo(checked(tables(mu_e, policy, slots=slots, seed=3), "it"), trials=trials, out=out)
+    found = montecarlo(checked(flipped(mu_e, policy, slots=slots, seed=3), "it"), trials=trials, out=out)
     table = found.slots.to_pydict()
     means = {name: [] for name in ("legitimate", "eve")}  # type: dict[str, list[float]]
     for peer, trace, slot in zip(table["peer"], table["mean_trace_covariance"], table["slot"], strict=True):
@@ -268,7 +267,7 @@ def test_live_and_memory_are_the_same_bits(tmp_path: Path) -> None:
 
     for number, policy in enumerate(({"plain_probability": 0.4}, {"lost_belief": 0.1})):
         jam = {"from": 10, "to": 50, "jam": "acknowledgements"}
-        scenario = checked(tables(0.7, policy, slots=60, trials=3, event=[jam]), "it")
+        scenario = checked(flipped(0.7, policy, slots=60, trials=3, event=[jam]), "it")
         live = run(scenario, out=tmp_path / f"live{number}")
         memory = montecarlo(scenario, trials=3, out=tmp_path / f"memory{number}")
         assert digests_of(live) == digests_of(memory)
@@ -289,7 +288,7 @@ def test_live_and_memory_are_the_same_bits(tmp_path: Path) -> None:
 )
 def test_flips_are_checked(more: dict[str, Any], said: str) -> None:
     """A probability, for the attack that flips, and for no other."""
-    wrong = tables(0.8, {"plain_probability": 0.4}, slots=60)
+    wrong = flipped(0.8, {"plain_probability": 0.4}, slots=60)
     wrong["acknowledgements"] = {"link": {"quality": 1.0}, **more}
     with pytest.raises(ScenarioError) as raised:
         checked(wrong, "it")
@@ -311,6 +310,6 @@ def test_flips_are_checked(more: dict[str, Any], said: str) -> None:
 def test_a_policy_that_never_sends_the_state_is_refused(policy: dict[str, float], said: str) -> None:
     """With the bound, and what to write instead."""
     with pytest.raises(ScenarioError) as raised:
-        checked(tables(0.8, policy, slots=60), "it")
+        checked(flipped(0.8, policy, slots=60), "it")
     assert said in str(raised.value)
     assert "expected a number" in str(raised.value)

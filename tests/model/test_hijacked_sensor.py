@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evedrop.model.acknowledgements import AckChannel, HeedRule, heed_rule_of, rates_of
+from evedrop.model.process import Process
 from evedrop.model.streams import Batch, stream_key
 from evedrop.model.theory.closed_form import Hears
 from evedrop.model.theory.closed_forms import hijacked_schedule, scheduled
@@ -18,7 +19,7 @@ from evedrop.scenario.expected.expectations import expectations_of
 from evedrop.scenario.loading import checked
 from evedrop.score.acknowledging import chart_of
 from evedrop.simulate.simulation import Simulation
-from tests.builders import UNSTABLE
+from tests.builders import UNSTABLE, listener, tables_of
 from tests.model.slot_loop import ROOT, coins
 
 KEY = stream_key(ROOT, "link/acknowledgements")
@@ -149,7 +150,7 @@ def test_perfect_secrecy_needs_an_acknowledgement_channel_that_loses_nothing(
 
 def test_where_few_are_lost_only_the_schedule_has_a_closed_form() -> None:
     """Of α > μ_e: for other schemes the sensor's memory is in no theory; nor is a chain that is too long."""
-    tables = scenario_of("hijack")
+    tables = attacked("hijack")
     known = {name: one.known for name, one in expectations_of(checked(tables, "it")).items()}
     assert known == {"legitimate": True, "eve": True}
     tables["encoding"] = {"scheme": "scheduled", "threshold": 60}
@@ -161,30 +162,25 @@ def test_where_few_are_lost_only_the_schedule_has_a_closed_form() -> None:
     assert expectations_of(checked(tables, "it"))["eve"].known
 
 
-def scenario_of(attack: str) -> dict[str, Any]:
+def attacked(attack: str) -> dict[str, Any]:
     """`scheduled` on a stable process, whose means are estimated well."""
     jammer = {"jammer": "eve"} if attack == "hijack" else {}
-    return {
-        "title": attack,
-        "slots": 100,
-        "trials": 400,
-        "process": {
-            "A": [[0.95, 0.3], [0.0, 0.9]],
-            "Q": [[1e-3, 0.0], [0.0, 1e-3]],
-            "initial_covariance": [[1e-3, 0.0], [0.0, 1e-3]],
-        },
-        "encoding": {"scheme": "scheduled", "threshold": 4},
-        "legitimate": {"link": {"quality": 0.8}},
-        "eavesdroppers": {"eve": {"strategy": "naive", "link": {"quality": 0.7}}},
-        "acknowledgements": {"link": {"quality": 0.75}, "attack": attack, **jammer},
-    }
+    return tables_of(
+        Process(np.array([[0.95, 0.3], [0.0, 0.9]]), 1e-3 * np.eye(2), 1e-3 * np.eye(2)),
+        slots=100,
+        trials=400,
+        encoding={"scheme": "scheduled", "threshold": 4},
+        legitimate={"link": {"quality": 0.8}},
+        eavesdroppers={"eve": listener("naive", 0.7)},
+        acknowledgements={"link": {"quality": 0.75}, "attack": attack, **jammer},
+    )
 
 
 def test_it_sends_as_often_and_the_eavesdropper_gains() -> None:
     """In 400 trials of 100 slots: equal rates and user's errors within five standard errors, an error below by more."""
     sent, errors = {}, {}
     for attack in ("none", "hijack"):
-        scenario = checked(scenario_of(attack), attack)
+        scenario = checked(attacked(attack), attack)
         simulation = Simulation(scenario, range(400))
         chunks = list(simulation.chunks())
         sent[attack] = simulation.packets.sent / 100.0

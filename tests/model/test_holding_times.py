@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
 
@@ -19,16 +17,11 @@ from evedrop.model.streams import Batch, stream_key
 from evedrop.model.theory import closed_forms
 from evedrop.model.theory.covariances import limit
 from tests.builders import DRIFTING, UNSTABLE
+from tests.model.acknowledged_runs import all_events
 from tests.model.slot_loop import ROOT, STABLE, Played, coins, play
 
 MU, MU_E, ARRIVES = 0.7, 0.6, 0.8
 READERS = {"scheduled": "naive", "encrypted-schedule": "selective"}
-
-
-def all_events(slots: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Every course that γ, γᵉ and the acknowledgement channel may take, one a trial: three of (slots, 8^slots)."""
-    courses = np.array(list(itertools.product(range(8), repeat=slots))).T
-    return courses % 2 == 1, courses // 2 % 2 == 1, courses // 4 == 1
 
 
 def played_over(

@@ -14,7 +14,7 @@ from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.theory.lost_reference import growth_by_coin, growth_by_phases, most_coded
 from evedrop.scenario.expected.estimates import warnings_of
 from evedrop.scenario.loading import checked
-from tests.builders import DRIFTING, UNSTABLE
+from tests.builders import DRIFTING, UNSTABLE, tables_of
 from tests.model.acknowledged_runs import MIXED
 from tests.model.mixed_runs import covariances
 from tests.model.slot_loop import STABLE
@@ -107,41 +107,40 @@ def test_which_schemes_have_references() -> None:
     assert always.growth == growth_by_phases(MIXED, 0, 0.8, USER)
 
 
-def tables(process: Process, attack: dict[str, Any], **encoding: Any) -> dict[str, Any]:
+def attacked(process: Process, attack: dict[str, Any], **encoding: Any) -> dict[str, Any]:
     """A scenario whose acknowledgements are attacked."""
-    return {
-        "title": "Lost references",
-        "slots": 40,
-        "process": {"A": process.A.tolist(), "Q": process.Q.tolist(), "initial_covariance": np.eye(process.n).tolist()},
-        "encoding": encoding,
-        "acknowledgements": {"link": {"quality": 1.0}, **attack},
-        "legitimate": {"link": {"quality": 0.8}},
-    }
+    return tables_of(
+        Process(process.A, process.Q, np.eye(process.n)),
+        slots=40,
+        encoding=encoding,
+        acknowledgements={"link": {"quality": 1.0}, **attack},
+        legitimate={"link": {"quality": 0.8}},
+    )
 
 
 def test_a_user_that_loses_the_reference_for_too_long_is_a_warning() -> None:
     """With the bound and the remedy; not if nothing is forged, nor for a stable process, a parameter inside, or another link."""
     flips = {"attack": "flip", "flip": 0.1}
     outside = {"scheme": "random-code", "plain_probability": 0.3}
-    (warning,) = warnings_of(checked(tables(MIXED, flips, **outside), "it"))
+    (warning,) = warnings_of(checked(attacked(MIXED, flips, **outside), "it"))
     assert (
         "grows without bound unless plain_probability exceeds 0.381944: acknowledgements of packets that it missed"
         in warning
     )
     assert "link quality 0.8 and spectral radius 1.2" in warning
-    (warning,) = warnings_of(checked(tables(MIXED, flips, scheme="acknowledged"), "it"))
+    (warning,) = warnings_of(checked(attacked(MIXED, flips, scheme="acknowledged"), "it"))
     assert "unless random-code or threshold-code is used" in warning
-    (warning,) = warnings_of(checked(tables(MIXED, {"attack": "forge"}, scheme="open-loop"), "it"))
+    (warning,) = warnings_of(checked(attacked(MIXED, {"attack": "forge"}, scheme="open-loop"), "it"))
     assert "grows without bound" in warning
-    varying = tables(MIXED, flips, **outside)
+    varying = attacked(MIXED, flips, **outside)
     varying["legitimate"] = {"link": {"loss": {"model": "gilbert-elliott", "p": 0.1, "r": 0.5}}}
     for quiet in (
-        tables(MIXED, flips, scheme="random-code", plain_probability=0.4),
-        tables(MIXED, {"attack": "none"}, **outside),
-        tables(MIXED, {"attack": "flip", "flip": 0.0}, **outside),
-        tables(STABLE, flips, **outside),
-        tables(STABLE, flips, scheme="acknowledged"),
-        tables(MIXED, flips, scheme="scheduled", threshold=2),
+        attacked(MIXED, flips, scheme="random-code", plain_probability=0.4),
+        attacked(MIXED, {"attack": "none"}, **outside),
+        attacked(MIXED, {"attack": "flip", "flip": 0.0}, **outside),
+        attacked(STABLE, flips, **outside),
+        attacked(STABLE, flips, scheme="acknowledged"),
+        attacked(MIXED, flips, scheme="scheduled", threshold=2),
         varying,
     ):
         assert warnings_of(checked(quiet, "it")) == []

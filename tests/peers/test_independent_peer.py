@@ -7,6 +7,7 @@ import subprocess
 import sys
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,50 +17,36 @@ from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
 from evedrop.model.digest import BlockDigests, Blocks, Digests, RunDigest
-from evedrop.model.process import Trajectory
+from evedrop.model.process import Process, Trajectory
 from evedrop.model.receiver import Reception
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.streams import Batch
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
 from evedrop.scenario.stream_keys import StreamKeys
-from evedrop.scenario.tables import Scenario
 from evedrop.system.ports import free_port
-from tests.builders import DRIFTING, one_slot, process_table
+from tests.builders import DRIFTING, one_slot, scenario_of
 from tests.conftest import LIMIT
 from tests.peers.independent_legitimate import Estimator
 
 PEER = Path(__file__).with_name("independent_legitimate.py")
-UNSTABLE = {
-    "A": [[1.0, 0.3], [0.5, 1.001]],
-    "Q": [[1e-3, 2e-4], [2e-4, 1e-3]],
-    "initial_covariance": [[1.0, 0.5], [0.5, 1.0]],
-}
-
-
-def scenario_of(process: dict[str, list[list[float]]], slots: int, first_trial: int) -> Scenario:
-    """A scenario without eavesdroppers."""
-    return Scenario.model_validate(
-        {
-            "title": "Independent",
-            "slots": slots,
-            "seed": 5,
-            "trials": 9,
-            "first_trial": first_trial,
-            "record_trials": 2,
-            "process": process,
-            "encoding": {"scheme": "innovation", "state_probability": 0.4},
-            "legitimate": {"link": {"quality": 0.7}},
-        }
-    )
-
-
-@pytest.mark.parametrize(
-    ("process", "slots", "first_trial"), [(process_table(DRIFTING), 300, 0), (UNSTABLE, 60, 12_345)]
+UNSTABLE = Process(
+    np.array([[1.0, 0.3], [0.5, 1.001]]), np.array([[1e-3, 2e-4], [2e-4, 1e-3]]), np.array([[1.0, 0.5], [0.5, 1.0]])
 )
-def test_same_deliveries_same_bits(process: dict[str, list[list[float]]], slots: int, first_trial: int) -> None:
+TABLES: dict[str, Any] = {
+    "seed": 5,
+    "trials": 9,
+    "record_trials": 2,
+    "encoding": {"scheme": "innovation", "state_probability": 0.4},
+    "legitimate": {"link": {"quality": 0.7}},
+}
+"""Of a scenario without eavesdroppers."""
+
+
+@pytest.mark.parametrize(("process", "slots", "first_trial"), [(DRIFTING, 300, 0), (UNSTABLE, 60, 12_345)])
+def test_same_deliveries_same_bits(process: Process, slots: int, first_trial: int) -> None:
     """Fed with the deliveries of a run, it has our digest, and reports what we report."""
-    scenario = scenario_of(process, slots, first_trial)
+    scenario = scenario_of(process, slots=slots, first_trial=first_trial, **TABLES)
     keys, batch = StreamKeys.from_scenario(scenario), Batch(slots, 9, first_trial)
     made = briefs_of(scenario, "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False))
     peer = Estimator(json.loads(made["legitimate"].text))
@@ -90,7 +77,7 @@ def test_same_deliveries_same_bits(process: dict[str, list[list[float]]], slots:
 
 def test_it_refuses_a_gap() -> None:
     """A slot that is not due is an error, as the protocol says."""
-    scenario = scenario_of(UNSTABLE, 10, 0)
+    scenario = scenario_of(UNSTABLE, slots=10, **TABLES)
     made = briefs_of(scenario, "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False))
     peer = Estimator(json.loads(made["legitimate"].text))
     with pytest.raises(ValueError, match="slot 1 arrived, slot 0 was due"):

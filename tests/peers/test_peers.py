@@ -25,44 +25,36 @@ from evedrop.live.protocol.commands import End, Start
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.model.digest import Blocks, Digests
 from evedrop.model.flag_bits import packed_flags
+from evedrop.model.process import Process
 from evedrop.peers.eavesdropper import eavesdrop
 from evedrop.peers.legitimate import estimate
 from evedrop.peers.sensor import Window, sense
-from evedrop.scenario.tables import Scenario
-from tests.builders import part_of
+from tests.builders import listener, part_of, scenario_of
 from tests.clock import T, TestClock
 from tests.conftest import LIMIT
 from tests.live.in_memory import Stage
 
 WINDOW, BATCH, SLOTS = 12, 4, 50
 EXTENT = telemetry.Extent(SLOTS, 300, 2, 3)
-
-
-def scenario_of(**changes: Any) -> Scenario:
-    """A small scenario with one eavesdropper of each strategy."""
-    table = {
-        "title": "Peers",
-        "slots": SLOTS,
-        "trials": 3,
-        "process": {
-            "A": [[1.0, 0.1], [0.0, 1.0]],
-            "Q": [[1e-3, 0.0], [0.0, 1e-3]],
-            "initial_covariance": [[1.0, 0.0], [0.0, 1.0]],
-        },
-        "encoding": {"scheme": "innovation", "state_probability": 0.5},
-        "legitimate": {"link": {"quality": 0.8}},
-        "eavesdroppers": {
-            "naive": {"strategy": "naive", "link": {"quality": 0.8}},
-            "smart": {"strategy": "smart", "link": {"quality": 0.8}},
-            "suspicious": {"strategy": "suspicious", "use_state": 0.9, "use_innovation": 0.1, "link": {"quality": 0.8}},
-        },
-    }
-    return Scenario.model_validate({**table, **changes})
+PROCESS = Process(np.array([[1.0, 0.1], [0.0, 1.0]]), 1e-3 * np.eye(2), np.eye(2))
+TABLES: dict[str, Any] = {
+    "slots": SLOTS,
+    "trials": 3,
+    "legitimate": {"link": {"quality": 0.8}},
+    "eavesdroppers": {
+        "naive": listener("naive", 0.8),
+        "smart": listener("smart", 0.8),
+        "suspicious": listener("suspicious", 0.8, use_state=0.9, use_innovation=0.1),
+    },
+}
+"""Of a small scenario with one eavesdropper of each strategy."""
 
 
 def briefs(**changes: Any) -> dict[str, AnyBrief]:
     """Briefs with a small window."""
-    made = briefs_of(scenario_of(**changes), "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False))
+    made = briefs_of(
+        scenario_of(PROCESS, **{**TABLES, **changes}), "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False)
+    )
     return {name: replace(brief, flow=Flow(WINDOW, BATCH)) for name, brief in made.items()}
 
 

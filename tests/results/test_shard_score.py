@@ -29,7 +29,7 @@ class Evil:
         return os.mkdir, (str(self.path),)
 
 
-def scenario_of(name: str) -> Scenario:
+def short(name: str) -> Scenario:
     """A shipped scenario, with few slots and trials."""
     return load(name, {"slots": 12, "trials": 5, "record_trials": 1, "expect": []})
 
@@ -37,7 +37,7 @@ def scenario_of(name: str) -> Scenario:
 @pytest.mark.parametrize("name", ["eavesdroppers", "microgrid", "measured", "acknowledged"])
 def test_totals_come_back(name: str, tmp_path: Path) -> None:
     """With a controller, an application, a filter, acknowledgements; the file is private, and an empty folder has no totals."""
-    scenario = scenario_of(name)
+    scenario = short(name)
     (task,) = tasks_of(scenario, Mode.EXACT, 1)
     totals = task.carry_out(lambda _: None, lambda: False).blocks[0].totals
     dump_score(totals, tmp_path, scenario)
@@ -49,7 +49,7 @@ def test_totals_come_back(name: str, tmp_path: Path) -> None:
 
 def test_a_file_of_somebody_else_runs_nothing(tmp_path: Path) -> None:
     """A pickle is refused in a sentence, as are bytes without totals."""
-    scenario = scenario_of("eavesdroppers")
+    scenario = short("eavesdroppers")
     for content in (pickle.dumps(Evil(tmp_path / "ran")), b"", packed(5), packed([1])):
         (tmp_path / "score").write_bytes(content)
         with pytest.raises(RunError, match=r"score is damaged \(.*run again"):

@@ -6,31 +6,22 @@ from typing import Any
 
 import pytest
 
-from evedrop.errors import ScenarioError
 from evedrop.model.links.link import Fate
 from evedrop.model.slot.link import NEVER
 from evedrop.scenario.loading import checked
 from evedrop.scenario.tables import Scenario
-from tests.builders import scalar_tables
+from tests.builders import listener, mistakes_of, scalar_tables
 
 
-def tables(*events: dict[str, Any], **more: Any) -> dict[str, Any]:
+def eventful(*events: dict[str, Any], **more: Any) -> dict[str, Any]:
     """A scenario with these events."""
-    eve = {"strategy": "smart", "link": {"quality": 0.9}}
+    eve = listener("smart", 0.9)
     return {**scalar_tables(1.0, 0.1, slots=100, eavesdroppers={"eve": eve}, event=list(events)), **more}
-
-
-def mistakes(*events: dict[str, Any], **more: Any) -> list[str]:
-    """What is wrong with a scenario."""
-    with pytest.raises(ScenarioError) as caught:
-        checked(tables(*events, **more), "file")
-    assert caught.value.exit_status == 2
-    return caught.value.mistakes
 
 
 def right(*events: dict[str, Any], **more: Any) -> Scenario:
     """A scenario with which nothing is wrong."""
-    return checked(tables(*events, **more), "file")
+    return checked(eventful(*events, **more), "file")
 
 
 WRONG: dict[str, tuple[list[dict[str, Any]], str]] = {
@@ -112,13 +103,14 @@ WRONG: dict[str, tuple[list[dict[str, Any]], str]] = {
 def test_a_wrong_event_is_named(name: str) -> None:
     """With its number, what was found and what was expected; exit status 2."""
     events, line = WRONG[name]
-    found = mistakes(*events)
+    found = mistakes_of(right, *events)
     assert any(one.startswith(line) for one in found), found
 
 
 def test_all_wrong_events_are_named_at_once() -> None:
     """A line for each, among mistakes of other tables."""
-    found = mistakes(
+    found = mistakes_of(
+        right,
         {"at": 100, "cut": "eve"},
         {"at": 1, "kill": "nobody"},
         {"at": 1},
@@ -164,7 +156,7 @@ def test_all_wrong_events_are_named_at_once() -> None:
 def test_a_wrong_link_is_named(link: dict[str, Any], line: str) -> None:
     """With its path."""
     eve = {"eve": {"strategy": "smart", "link": {"quality": 0.9, **link}}}
-    found = mistakes(eavesdroppers=eve)
+    found = mistakes_of(right, eavesdroppers=eve)
     assert any(one.startswith(f"eavesdroppers.eve.link.{line}") for one in found), found
 
 
@@ -172,13 +164,15 @@ def test_correlation_needs_links_that_lose_alike() -> None:
     """The same model on both, and no correlation of the other's own."""
     bursts = {"model": "gilbert-elliott", "p": 0.1, "r": 0.5}
     tie = {"with": "legitimate", "strength": 0.5}
-    (line,) = mistakes(eavesdroppers={"eve": {"strategy": "smart", "link": {"loss": bursts, "correlation": tie}}})
+    (line,) = mistakes_of(
+        right, eavesdroppers={"eve": {"strategy": "smart", "link": {"loss": bursts, "correlation": tie}}}
+    )
     assert "the loss models differ (bernoulli there and gilbert-elliott here)" in line
     chained = {
         "eve": {"strategy": "smart", "link": {"quality": 0.9, "correlation": tie}},
         "mallory": {"strategy": "smart", "link": {"quality": 0.9, "correlation": {"with": "eve", "strength": 1.0}}},
     }
-    (line,) = mistakes(eavesdroppers=chained)
+    (line,) = mistakes_of(right, eavesdroppers=chained)
     assert "is eve, whose own losses are tied to another link's" in line
 
 
@@ -256,7 +250,7 @@ def test_an_expectation_that_events_leave_without_theory_is_refused(
     """Figures that would be null are refused, even where link and strategy by themselves have a theory."""
     figure = f"{receiver}.expected_trace_covariance"
     expect = [{"figure": figure, "below": 1.0}]
-    (line,) = mistakes(event, expect=expect, **more)
+    (line,) = mistakes_of(right, event, expect=expect, **more)
     why = f"no theory covers {receiver} with these links, attacks and events together"
     assert line == f'expect.0.figure: is "{figure}", but {why}; expected another figure'
     assert right(expect=expect, **more)
@@ -279,5 +273,5 @@ def test_who_is_told_a_state_must_be_there(event: dict[str, Any], away: str | No
     if away is None:
         assert right(event, eavesdroppers={"spy": spy}).leaks == {"spy": 15}
     else:
-        (line,) = mistakes(event, eavesdroppers={"spy": spy})
+        (line,) = mistakes_of(right, event, eavesdroppers={"spy": spy})
         assert line == f"eavesdroppers.spy.learns_at: is 15, when spy is {away}; expected a slot in which it is present"

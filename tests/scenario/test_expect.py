@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from typing import Any
 
 import pytest
@@ -11,9 +10,9 @@ import tomli_w
 from evedrop.errors import ScenarioError
 from evedrop.scenario.loading import parse
 from evedrop.scenario.tables import Scenario
-from tests.builders import scalar_tables
+from tests.builders import mistakes_of, scalar_tables
 
-GOOD = scalar_tables(
+CERTAIN = scalar_tables(
     1.0,
     1e-3,
     slots=50,
@@ -23,17 +22,10 @@ GOOD = scalar_tables(
 ERROR = "legitimate.mean_squared_error"
 
 
-def scenario(*expectations: dict[str, Any], **changes: Any) -> Scenario:
+def expecting(*expectations: dict[str, Any], **changes: Any) -> Scenario:
     """The good scenario with these expectations."""
-    tables = {**copy.deepcopy(GOOD), "expect": list(expectations)}
+    tables = {**CERTAIN, "expect": list(expectations)}
     return parse(tomli_w.dumps(tables), "scenario", changes)
-
-
-def mistakes(*expectations: dict[str, Any], **changes: Any) -> list[str]:
-    """What is said of the good scenario with these expectations."""
-    with pytest.raises(ScenarioError) as caught:
-        scenario(*expectations, **changes)
-    return caught.value.mistakes
 
 
 @pytest.mark.parametrize(
@@ -85,13 +77,14 @@ def mistakes(*expectations: dict[str, Any], **changes: Any) -> list[str]:
 )  # fmt: skip
 def test_a_mistake_of_an_expectation_is_named(expectation: dict[str, Any], said: str) -> None:
     """Its path, what was found, what was expected."""
-    found = mistakes(expectation)
+    found = mistakes_of(expecting, expectation)
     assert [line for line in found if line.startswith("expect.0.") and said in line], found
 
 
 def test_all_mistakes_of_expectations_are_named_at_once() -> None:
     """Mistakes of several tables, and of one table with wrong entries and wrong combinations, are reported together."""
-    found = mistakes(
+    found = mistakes_of(
+        expecting,
         {"figure": "smart.mean_eror", "near": 1, "slots": [3, 99], "quantile": 2.0},
         {"secrecy": "relative", "against": "nobody", "by": 3},
         {"link": "nobody"},
@@ -106,7 +99,7 @@ def test_all_mistakes_of_expectations_are_named_at_once() -> None:
 
 def test_without_eavesdroppers_there_is_nobody_to_be_secret_from() -> None:
     """The message says so, and offers no empty choice."""
-    tables = {**copy.deepcopy(GOOD), "expect": [{"secrecy": "perfect", "against": "smart"}]}
+    tables = {**CERTAIN, "expect": [{"secrecy": "perfect", "against": "smart"}]}
     del tables["eavesdroppers"]
     with pytest.raises(ScenarioError, match="there is no eavesdropper; add one"):
         parse(tomli_w.dumps(tables), "scenario")
@@ -118,8 +111,8 @@ def test_without_eavesdroppers_there_is_nobody_to_be_secret_from() -> None:
 def test_a_quantile_needs_a_trial_beyond_it(quantile: float, least: int) -> None:
     """The least number of trials is 1 over the share of trials beyond the quantile."""
     expectation = {"figure": ERROR, "below": 1.0, "quantile": quantile}
-    assert scenario(expectation, trials=least).trials == least
-    (said,) = mistakes(expectation, trials=least - 1)
+    assert expecting(expectation, trials=least).trials == least
+    (said,) = mistakes_of(expecting, expectation, trials=least - 1)
     assert said.partition(" (line")[0].endswith(f"expected trials = {least} or more")
 
 
@@ -146,7 +139,7 @@ def test_what_is_wanted_of_a_figure(
     expectation: dict[str, Any], text: str, holds: tuple[float, ...], fails: tuple[float, ...]
 ) -> None:
     """The sentence, and the figures that are as wanted: bounds are not, distances are."""
-    (made,) = scenario(expectation).expect
+    (made,) = expecting(expectation).expect
     assert made.text == text
     assert text.endswith(made.wanted)
     assert all(made.holds(found) for found in holds)
@@ -164,4 +157,4 @@ def test_what_is_wanted_of_a_figure(
 )  # fmt: skip
 def test_what_is_wanted_of_other_things(expectation: dict[str, Any], text: str) -> None:
     """Each is a sentence."""
-    assert scenario(expectation).expect[0].text == text
+    assert expecting(expectation).expect[0].text == text

@@ -18,22 +18,17 @@ from evedrop.scenario.loading import checked, load
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
 from evedrop.studies.matchups import matchups_of
-from tests.builders import MARGINAL, process_table
+from tests.builders import MARGINAL, listener, process_table, tables_of
 
 PROGRAM = {"key": "robot/pose", "connect": "tcp/127.0.0.1:7447"}
 
 
-def tables(entries: dict[str, Any], **more: Any) -> dict[str, Any]:
+def given(entries: dict[str, Any], **more: Any) -> dict[str, Any]:
     """A scenario of two states, with these entries of `[process]`."""
-    return {
-        "title": "Given",
-        "slots": 3,
-        "process": {**process_table(MARGINAL), "states": ["x", "v"], **entries},
-        "encoding": {"scheme": "innovation", "state_probability": 0.5},
-        "legitimate": {"link": {"quality": 0.9}},
-        "eavesdroppers": {"eve": {"strategy": "smart", "link": {"quality": 0.8}}},
-        **more,
-    }
+    process = {**process_table(MARGINAL), "states": ["x", "v"], **entries}
+    return tables_of(
+        MARGINAL, slots=3, **{"eavesdroppers": {"eve": listener("smart", 0.8)}, **more, "process": process}
+    )
 
 
 ROWS = [[0.1, 2.0], [0.2, 2.5], [0.7, -1.0]]
@@ -92,7 +87,7 @@ ROWS = [[0.1, 2.0], [0.2, 2.5], [0.7, -1.0]]
 def test_mistakes_are_reported(entries: dict[str, Any], more: dict[str, Any], said: str) -> None:
     """Each with the entry that has it."""
     with pytest.raises(ScenarioError) as caught:
-        checked(tables(entries, **more), "file")
+        checked(given(entries, **more), "file")
     assert any(said in line for line in caught.value.mistakes), caught.value.mistakes
 
 
@@ -106,7 +101,7 @@ def test_a_file_is_read_and_kept(tmp_path: Path) -> None:
         "units": ["m", "m/s"],
         "reference": [0.3, 0.1],
     }
-    scenario = checked(tables(entries, slot_seconds=0.1), "file")
+    scenario = checked(given(entries, slot_seconds=0.1), "file")
     assert scenario.process.state_values == ROWS
     folder = tmp_path / "results"
     folder.mkdir()
@@ -122,7 +117,7 @@ def test_times_that_miss_a_slot_are_reported(tmp_path: Path) -> None:
     """Measured times may scatter by a tenth of a slot, and no more."""
     (tmp_path / "pose.csv").write_text("time,x,v\n5,1,1\n6.08,1,1\n7.3,1,1\n")
     with pytest.raises(ScenarioError) as caught:
-        checked(tables({"source": "file", "state_file": str(tmp_path / "pose.csv")}), "file")
+        checked(given({"source": "file", "state_file": str(tmp_path / "pose.csv")}), "file")
     assert len(caught.value.mistakes) == 1
     assert "line 4: the time is 7.3 s after 6.08 s" in caught.value.mistakes[0]
 
@@ -131,7 +126,7 @@ def test_theory_is_there_only_if_the_model_is_said_to_hold() -> None:
     """And then it is of a model: there is no z."""
     for theory in (None, False, True):
         entries = {"source": "file", "state_values": ROWS, "theory": theory}
-        found = expectations_of(checked(tables(entries), "file"))["eve"]
+        found = expectations_of(checked(given(entries), "file"))["eve"]
         assert found.of_model
         assert found.known is (theory is True)
         assert found.assumed is (theory is not True)
@@ -140,7 +135,7 @@ def test_theory_is_there_only_if_the_model_is_said_to_hold() -> None:
 
 def test_the_results_of_given_states(tmp_path: Path) -> None:
     """No theory, and a sentence that says so; the folder repeats the run."""
-    scenario = checked(tables({"source": "file", "state_values": ROWS}), "file")
+    scenario = checked(given({"source": "file", "state_values": ROWS}), "file")
     found = montecarlo(scenario, trials=12, out=tmp_path / "one", plan=Plan(workers=1))
     peer = found.summary["peers"]["eve"]
     assert peer["expected_trace_covariance"] is None
@@ -154,7 +149,7 @@ def test_the_results_of_given_states(tmp_path: Path) -> None:
 
 def test_a_recording_is_enough_for_other_schemes_and_for_covariances(tmp_path: Path) -> None:
     """`twin-track` is left out of comparisons; error coordinates are refused."""
-    scenario = checked(tables({"source": "file", "state_values": ROWS}), "file")
+    scenario = checked(given({"source": "file", "state_values": ROWS}), "file")
     assert "twin-track" not in {group.scenario.encoding.scheme for group in matchups_of(scenario).groups}
     plan = Plan(Mode.COVARIANCE_ONLY, workers=1)
     assert montecarlo(scenario, trials=2, out=tmp_path / "covariances", plan=plan).summary["ended"] == "complete"
@@ -164,7 +159,7 @@ def test_a_recording_is_enough_for_other_schemes_and_for_covariances(tmp_path: P
 
 def test_the_scenarios_of_a_comparison_can_be_run(tmp_path: Path) -> None:
     """They name the file of states in their folder."""
-    scenario = checked(tables({"source": "file", "state_values": ROWS}), "file")
+    scenario = checked(given({"source": "file", "state_values": ROWS}), "file")
     found = compare(scenario, schemes=["plain"], adversaries=["naive"], trials=2, out=tmp_path, plan=Plan(workers=1))
     cell = found.cell("plain", "naive").eavesdropper
     assert cell is not None
@@ -177,10 +172,10 @@ def test_a_program_cannot_be_asked_in_memory(tmp_path: Path) -> None:
     """The message says what can be done; a file that the scenario names as well is used if it says so."""
     entries = {"source": "zenoh", "zenoh": PROGRAM, "state_file": str(tmp_path / "pose.csv")}  # not read, nor there
     with pytest.raises(UsageError, match="only a live run can take states from a program"):
-        montecarlo(checked(tables(entries), "file"), trials=2, out=tmp_path / "refused")
+        montecarlo(checked(given(entries), "file"), trials=2, out=tmp_path / "refused")
     assert not (tmp_path / "refused").exists()
     with pytest.raises(UsageError, match="the states are given"):
-        montecarlo(checked(tables(entries), "file"), out=tmp_path / "refused", plan=Plan(Mode.ERROR_COORDINATES))
+        montecarlo(checked(given(entries), "file"), out=tmp_path / "refused", plan=Plan(Mode.ERROR_COORDINATES))
     (tmp_path / "pose.csv").write_text("x,v\n" + "".join(f"{x},{v}\n" for x, v in ROWS))
-    found = states_of(checked(tables({**entries, "source": "file"}), "file"))
+    found = states_of(checked(given({**entries, "source": "file"}), "file"))
     assert np.array_equal(np.array(found), ROWS)

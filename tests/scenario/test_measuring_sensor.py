@@ -2,48 +2,18 @@
 
 from __future__ import annotations
 
-import copy
 import tomllib
 from typing import Any
 
 import numpy as np
 import pytest
 
-from evedrop.errors import ScenarioError
 from evedrop.model.local_filter import settled
 from evedrop.scenario.loading import checked, shipped
-from evedrop.scenario.tables import Scenario
+from tests.builders import changed, mistakes_of
 
 MEASURED = {**tomllib.loads(shipped()["measured"].read_text(encoding="utf-8")), "expect": []}
 FORCE = [[2.5e-5, 5e-4], [5e-4, 1e-2]]
-
-
-def changed(**changes: Any) -> dict[str, Any]:
-    """The shipped scenario with entries by dotted key, `__` for the dot; None leaves an entry out."""
-    tables: dict[str, Any] = copy.deepcopy(MEASURED)
-    for key, value in changes.items():
-        *path, last = key.split("__")
-        table = tables
-        for name in path:
-            table = table.setdefault(name, {})
-        table[last] = value
-        if value is None:
-            del table[last]
-    return tables
-
-
-def mistakes(**changes: Any) -> list[str]:
-    """The mistakes that are found."""
-    try:
-        checked(changed(**changes), "file")
-    except ScenarioError as error:
-        return [line.strip() for line in str(error).splitlines()[1:]]
-    return []
-
-
-def scenario_of(**changes: Any) -> Scenario:
-    """The scenario, checked."""
-    return checked(changed(**changes), "file")
 
 
 EVE = {"eve": {"strategy": "bayesian", "link": {"quality": 0.9}}}
@@ -139,13 +109,13 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
 def test_a_mistake_says_where_what_and_what_instead(case: str) -> None:
     """Path, what was found, what was expected."""
     changes, sentence = WRONG[case]
-    assert any(line.startswith(sentence) for line in mistakes(**changes)), mistakes(**changes)
+    assert any(line.startswith(sentence) for line in mistakes_of(checked, changed(MEASURED, **changes), "file"))
 
 
 @pytest.mark.parametrize("noise", [[[-1.0, 0.1]], [[1.0], [1.0]], [[-1.0, 0.0], [0.0, 1.0]], [[1.0, 0.5], [0.0, 1.0]]])
 def test_a_plants_noise_that_is_no_covariance_is_the_only_mistake(noise: list[list[float]]) -> None:
     """No filter is computed with it, so nothing is said of the filter's measurements."""
-    (line,) = mistakes(plant__noise=noise)
+    (line,) = mistakes_of(checked, changed(MEASURED, plant__noise=noise), "file")
     assert line.startswith("plant.noise: ")
 
 
@@ -174,12 +144,14 @@ def test_a_strategy_that_cannot_use_a_singular_Q_is_refused_with_what_can_be_don
     refused: dict[str, Any], strategy: str, more: dict[str, Any]
 ) -> None:
     """Another strategy, noise in every direction, or as many measurements as states: what the message names works."""
-    (line,) = mistakes(**refused)
+    (line,) = mistakes_of(checked, changed(MEASURED, **refused), "file")
     assert strategy in line.partition("; expected ")[2]
     assert "add a small variance to the diagonal of Q and leave out singular_noise" in line
     assert "as many measurements as states" in line
-    assert mistakes(**{**refused, "eavesdroppers": {"eve": {**EVE["eve"], "strategy": strategy}}}) == []
-    assert mistakes(**{**refused, **more}) == []
+    assert checked(
+        changed(MEASURED, **{**refused, "eavesdroppers": {"eve": {**EVE["eve"], "strategy": strategy}}}), "file"
+    )
+    assert checked(changed(MEASURED, **{**refused, **more}), "file")
 
 
 RIGHT: dict[str, dict[str, Any]] = {
@@ -202,12 +174,12 @@ RIGHT: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("case", RIGHT)
 def test_what_is_right_is_not_refused(case: str) -> None:
     """Neither the eavesdroppers nor the filter."""
-    assert mistakes(**RIGHT[case]) == []
+    assert checked(changed(MEASURED, **RIGHT[case]), "file")
 
 
 def test_a_filter_may_begin_settled() -> None:
     """`initial_covariance = "filter"` is the covariance before a measurement in the steady state, and Q its innovations' own."""
-    scenario = scenario_of()
+    scenario = checked(changed(MEASURED), "file")
     process, plant = scenario.process.process, scenario.driven
     assert plant is not None
     assert plant.output_matrix is not None

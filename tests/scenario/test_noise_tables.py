@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop.errors import ScenarioError
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.protocol.brief_parts import EavesdropperPart
 from evedrop.model.local_filter import settled
@@ -16,7 +15,7 @@ from evedrop.model.noise_law import PACKETS, NoiseLaw
 from evedrop.scenario.expected.expectations import expectations_of
 from evedrop.scenario.loading import checked, load
 from evedrop.scenario.tables import Scenario
-from tests.builders import part_of
+from tests.builders import mistakes_of, part_of
 
 _TASK = ObserverTask(Path("nowhere"), False)
 
@@ -43,27 +42,20 @@ def test_filter_is_the_covariance_of_its_error() -> None:
     assert Scenario.model_validate(again.model_dump(mode="json")) == again
 
 
-def mistakes(tables: dict[str, Any]) -> list[str]:
-    """What is wrong with a scenario."""
-    with pytest.raises(ScenarioError) as caught:
-        checked(tables, "file")
-    return caught.value.mistakes
-
-
 def test_a_covariance_that_does_not_fit_is_refused() -> None:
     """A sensor without a filter, other dimensions, and a filter with a mistake of its own, which alone is reported."""
     encoding = {"scheme": "noise", "state_probability": 0.5, "noise_covariance": "filter"}
     bare = noise_tables(encoding=encoding)
     del bare["plant"]
-    (found,) = mistakes(bare)
+    (found,) = mistakes_of(checked, bare, "file")
     assert found.startswith(
         'encoding.noise_covariance: is "filter", but the sensor has no filter; expected output_matrix and'
     )
     small = noise_tables(encoding={**encoding, "noise_covariance": [[0.1]]})
-    assert mistakes(small) == ["encoding.noise_covariance: is 1 × 1; expected 2 × 2, as A is"]
+    assert mistakes_of(checked, small, "file") == ["encoding.noise_covariance: is 1 × 1; expected 2 × 2, as A is"]
     torn = noise_tables(encoding=encoding)
     torn["plant"]["measurement_noise"] = [[0.01]]
-    assert [line.partition(":")[0] for line in mistakes(torn)] == ["plant.measurement_noise"]
+    assert [line.partition(":")[0] for line in mistakes_of(checked, torn, "file")] == ["plant.measurement_noise"]
 
 
 def test_an_eavesdropper_knows_the_law_of_the_noise_and_no_more() -> None:

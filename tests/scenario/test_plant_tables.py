@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import os
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from evedrop.results.resolved_scenario import write_resolved
 from evedrop.scenario.input_files import disturbances_of
 from evedrop.scenario.loading import checked, load
 from evedrop.scenario.tables import Scenario
+from tests.builders import changed, mistakes_of
 
 LOOP: dict[str, Any] = {
     "title": "Loop",
@@ -53,29 +53,6 @@ LOOP: dict[str, Any] = {
     "encoding": {"scheme": "innovation", "state_probability": 0.5},
     "legitimate": {"link": {"quality": 0.9}, "knows_input": True},
 }
-
-
-def changed(**changes: Any) -> dict[str, Any]:
-    """The scenario with entries by dotted key, `__` for the dot; None takes one out."""
-    tables = copy.deepcopy(LOOP)
-    for key, value in changes.items():
-        *path, last = key.split("__")
-        inner = tables
-        for name in path:
-            inner = inner[name]
-        if value is None:
-            del inner[last]
-        else:
-            inner[last] = value
-    return tables
-
-
-def mistakes(**changes: Any) -> list[str]:
-    """What is wrong with the scenario so changed."""
-    with pytest.raises(ScenarioError) as caught:
-        checked(changed(**changes), "file")
-    assert caught.value.exit_status == 2
-    return caught.value.mistakes
 
 
 WRONG: dict[str, tuple[dict[str, Any], str]] = {
@@ -230,12 +207,12 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
 def test_a_mistake_says_where_what_and_what_instead(case: str) -> None:
     """Path, what was found, what was expected."""
     changes, sentence = WRONG[case]
-    assert any(line.startswith(sentence) for line in mistakes(**changes)), mistakes(**changes)
+    assert any(line.startswith(sentence) for line in mistakes_of(checked, changed(LOOP, **changes), "file"))
 
 
 def paths(**changes: Any) -> list[str]:
     """Where the mistakes are."""
-    return [line.partition(":")[0] for line in mistakes(**changes)]
+    return [line.partition(":")[0] for line in mistakes_of(checked, changed(LOOP, **changes), "file")]
 
 
 def test_all_mistakes_are_told_at_once() -> None:
@@ -251,13 +228,13 @@ def test_all_mistakes_are_told_at_once() -> None:
 
 def test_states_are_deviations_from_the_reference() -> None:
     """Start and limits of the states are levels in the file, and deviations in the plant."""
-    scenario = checked(changed(), "file")
+    scenario = checked(changed(LOOP), "file")
     assert scenario.driven is not None
     assert np.array_equal(scenario.driven.start, [-1.0, 0.5])
     assert np.array_equal(scenario.driven.state_upper, [35.0, 40.0])
     assert scenario.assignment is not None
     assert np.array_equal(scenario.assignment.rate_limits, [0.1, 6.0]), "per slot in the file, per decision in the loop"
-    bare = checked(changed(plant__start=None, plant__noise=None, plant__state_lower=None), "file")
+    bare = checked(changed(LOOP, plant__start=None, plant__noise=None, plant__state_lower=None), "file")
     assert bare.driven is not None
     assert np.array_equal(bare.driven.start, [0.0, 0.0])
     assert np.array_equal(bare.driven.noise, np.zeros((2, 2)))
@@ -271,7 +248,7 @@ def scenario_file(folder: Path, text: str = CSV) -> Path:
     """A scenario file with its disturbances in the same folder."""
     import tomli_w
 
-    tables = changed(plant__disturbance_values=None, plant__disturbance_file="day.csv")
+    tables = changed(LOOP, plant__disturbance_values=None, plant__disturbance_file="day.csv")
     (folder / "loop.toml").write_text(tomli_w.dumps(tables))
     (folder / "day.csv").write_text(text)
     return folder / "loop.toml"
@@ -316,17 +293,23 @@ def test_a_file_that_will_not_do_is_told(text: str, what: str, tmp_path: Path) -
 def test_what_may_never_end_is_not_read(tmp_path: Path) -> None:
     """A pipe without a writer is refused at once."""
     os.mkfifo(tmp_path / "pipe.csv")
-    (mistake,) = mistakes(plant__disturbance_values=None, plant__disturbance_file=str(tmp_path / "pipe.csv"))
+    (mistake,) = mistakes_of(
+        checked,
+        changed(LOOP, plant__disturbance_values=None, plant__disturbance_file=str(tmp_path / "pipe.csv")),
+        "file",
+    )
     assert "pipe.csv cannot be read (it is a pipe or a device, not a file); expected a CSV file" in mistake
 
 
 def test_a_file_that_is_not_there_is_told() -> None:
     """A file is refused, too, if the numbers themselves are also given."""
-    missing = mistakes(plant__disturbance_values=None, plant__disturbance_file="none.csv")
+    missing = mistakes_of(
+        checked, changed(LOOP, plant__disturbance_values=None, plant__disturbance_file="none.csv"), "file"
+    )
     assert len(missing) == 1
     assert missing[0].startswith(
         "plant.disturbance_file: none.csv cannot be read (No such file or directory); expected"
     )
-    assert mistakes(plant__disturbance_file="none.csv") == [
+    assert mistakes_of(checked, changed(LOOP, plant__disturbance_file="none.csv"), "file") == [
         "plant.disturbance_file: is given together with disturbance_values; expected one of them"
     ]

@@ -10,7 +10,7 @@ import tomli_w
 from evedrop.results.resolved_scenario import resolved
 from evedrop.scenario.loading import parse
 from evedrop.scenario.tables import Scenario
-from tests.scenario.good import GOOD, mistakes
+from tests.builders import GOOD, mistakes_in_good
 
 POOL = {"strategy": "colluding", "links": [{"quality": 0.6}, {"quality": 0.5}], "reads_as": "smart"}
 SPY = {"strategy": "replay-informed", "learns_at": 5, "reads_as": "bayesian", "link": {"quality": 0.5}}
@@ -37,7 +37,7 @@ SPY = {"strategy": "replay-informed", "learns_at": 5, "reads_as": "bayesian", "l
 def test_a_mistake_of_an_eavesdropper_is_named(table: dict[str, Any], said: list[str]) -> None:
     """Missing, superfluous and wrong entries of a strategy: a line each."""
     given = {name: value for name, value in table.items() if value is not None}
-    found = mistakes({"eavesdroppers.eve": given})
+    found = mistakes_in_good({"eavesdroppers.eve": given})
     assert len(found) == len(said), found
     for line, start in zip(sorted(found), sorted(said), strict=True):
         assert line.startswith(f"eavesdroppers.eve.{start}")
@@ -65,7 +65,7 @@ def test_eavesdroppers_that_are_right_are_taken() -> None:
 def test_who_needs_a_schedule_is_refused_where_there_is_none(strategy: str, entry: str) -> None:
     """Told with the strategies that can do without."""
     table = {"strategy": strategy, "link": {"quality": 0.8}} if entry == "strategy" else {**POOL, "reads_as": strategy}
-    (line,) = mistakes({"encoding": {"scheme": "plain"}, "eavesdroppers": {"eve": table}})
+    (line,) = mistakes_in_good({"encoding": {"scheme": "plain"}, "eavesdroppers": {"eve": table}})
     assert line == (
         f'eavesdroppers.eve.{entry}: is "{strategy}", which is defined by its knowledge of the schedule, and the scheme '
         "plain has none; expected bayesian, clear-states, constant, learning-em, likelihood, naive, power-test, reference, "
@@ -109,13 +109,13 @@ CHAIN = {"model": "markov", "transitions": [[0.9, 0.1], [0.5, 0.5]], "loss": [0.
 def test_a_mistake_of_a_link_is_named(link: dict[str, Any], said: str) -> None:
     """A mistake in the legitimate link or in an eavesdropper's link gets one line, with the path of the entry."""
     for receiver in ("legitimate", "eavesdroppers.smart"):
-        (line,) = mistakes({f"{receiver}.link": link})
+        (line,) = mistakes_in_good({f"{receiver}.link": link})
         assert line.startswith(f"{receiver}.{said}")
 
 
 def test_all_mistakes_of_links_are_named_at_once() -> None:
     """What is missing, unknown and wrong, in one loss model and in several."""
-    found = mistakes(
+    found = mistakes_in_good(
         {
             "legitimate.link": {"loss": {"model": "gilbert-elliott", "p": 2.0, "q": 0.1}},
             "eavesdroppers.smart.link": {

@@ -17,7 +17,7 @@ from evedrop.scenario.expected.estimates import warnings_of
 from evedrop.scenario.loading import load, parse, shipped, value_of
 from evedrop.scenario.tables import Scenario
 from evedrop.scenarios import write_new
-from tests.scenario.good import GOOD, mistakes
+from tests.builders import GOOD, mistakes_in_good
 
 
 @pytest.mark.parametrize(
@@ -86,7 +86,7 @@ from tests.scenario.good import GOOD, mistakes
 )  # fmt: skip
 def test_a_mistake_is_named_with_path_found_and_expected(key: str, value: Any, said: str) -> None:
     """One wrong entry gives one line: its path, what was found, what was expected, an example or a hint."""
-    found = mistakes({key: value})
+    found = mistakes_in_good({key: value})
     assert [line for line in found if said in line], found
     assert "\n" not in "".join(found)
 
@@ -94,12 +94,12 @@ def test_a_mistake_is_named_with_path_found_and_expected(key: str, value: Any, s
 @pytest.mark.parametrize("entry", ["title", "slots", "process", "process.Q", "encoding.scheme", "legitimate.link"])
 def test_a_missing_entry_is_named(entry: str) -> None:
     """A missing entry is named by its path."""
-    assert any(line.startswith(f"{entry}: is missing; expected ") for line in mistakes({}, entry))
+    assert any(line.startswith(f"{entry}: is missing; expected ") for line in mistakes_in_good({}, entry))
 
 
 def test_an_uncontrollable_pair_is_named() -> None:
     """A process with noise that never reaches a direction of the state is refused."""
-    found = mistakes({"process.A": [[1.0, 0.0], [0.0, 1.0]], "process.Q": [[1.0, 0.0], [0.0, 0.0]]})
+    found = mistakes_in_good({"process.A": [[1.0, 0.0], [0.0, 1.0]], "process.Q": [[1.0, 0.0], [0.0, 0.0]]})
     assert any("not controllable: the noise reaches 1 of 2 directions" in line for line in found)
 
 
@@ -117,7 +117,7 @@ def test_all_mistakes_are_named_at_once() -> None:
         "expect": [{"figure": "nobody.used_fraction"}, {"below": 1.0}],
         "record_trials": 9,
     }
-    found = mistakes(changes, "process.initial_covariance")
+    found = mistakes_in_good(changes, "process.initial_covariance")
     for path in (
         "slots: ",
         "titel: ",
@@ -143,21 +143,21 @@ def test_an_expectation_on_what_theory_does_not_know_is_refused() -> None:
     expect = [
         {"figure": f"smart.{figure}", "below": 1.0} for figure in ("received_fraction", "expected_trace_covariance")
     ]
-    (line,) = mistakes({**queue, "expect": expect})
+    (line,) = mistakes_in_good({**queue, "expect": expect})
     assert line.startswith('expect.1.figure: is "smart.expected_trace_covariance", but no theory covers')
-    (line,) = mistakes({"eavesdroppers.smart.strategy": "bayesian", "expect": expect})
+    (line,) = mistakes_in_good({"eavesdroppers.smart.strategy": "bayesian", "expect": expect})
     assert line.endswith("but no closed form is known for the strategy bayesian of smart; expected another figure")
 
 
 def test_more_slots_than_the_horizon_are_refused() -> None:
     """The bound and three ways out are named, and the bound is exact."""
-    (said,) = mistakes({"process.A": [[1.4, 0.3], [0.5, 1.0]], "slots": 4000})
+    (said,) = mistakes_in_good({"process.A": [[1.4, 0.3], [0.5, 1.0]], "slots": 4000})
     assert "slots: is 4000; this process (spectral radius" in said
     assert said.count(";") >= 3
     bound = int(said.split("slots = ")[1].split()[0])
     inside = {"process.A": [[1.4, 0.3], [0.5, 1.0]], "slots": bound}
     assert parse(tomli_w.dumps(GOOD), "scenario", inside).slots == bound
-    assert mistakes({**inside, "slots": bound + 1})
+    assert mistakes_in_good({**inside, "slots": bound + 1})
 
 
 @pytest.mark.parametrize(("key", "value"), [("legitimate.link.quality", 0.2), ("encoding.state_probability", 0.1)])

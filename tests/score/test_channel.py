@@ -10,6 +10,7 @@ import pytest
 from evedrop.model.slot.account import Accountant
 from evedrop.model.slot.link import Link
 from evedrop.model.streams import Batch
+from evedrop.scenario.loading import checked
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.scenario.tables import Scenario
 from evedrop.score.channel import RATE_CONFIDENCE, interval, link_summary_of
@@ -39,9 +40,9 @@ LINKS: dict[str, dict[str, Any]] = {
 }
 
 
-def scenario(seed: int, events: list[dict[str, Any]] | None = None) -> Scenario:
-    """One with all these links, which the legitimate estimator's is not among."""
-    return Scenario.model_validate(
+def linked(seed: int, events: list[dict[str, Any]] | None = None) -> Scenario:
+    """A scenario with an eavesdropper behind each of these links."""
+    return checked(
         scalar_tables(
             1.0,
             0.1,
@@ -51,7 +52,8 @@ def scenario(seed: int, events: list[dict[str, Any]] | None = None) -> Scenario:
             encoding={"scheme": "plain"},
             eavesdroppers={name: {"strategy": "naive", "link": link, "window": 4} for name, link in LINKS.items()},
             event=events or [],
-        )
+        ),
+        "scenario",
     )
 
 
@@ -71,7 +73,7 @@ def test_right_links_are_within_their_intervals() -> None:
     """Every link that runs by its model, over 12 seeds: of 96 intervals of 99.9 % none is missed, or one."""
     outside = 0
     for seed in range(12):
-        one = scenario(
+        one = linked(
             seed,
             [
                 {"from": 100, "to": 150, "link": "coins", "set": {"quality": 0.3}},
@@ -86,14 +88,14 @@ def test_right_links_are_within_their_intervals() -> None:
 @pytest.mark.parametrize("name", ["coins", "bursts", "pattern", "far", "slow"])
 def test_a_link_with_another_model_is_flagged(name: str) -> None:
     """The counts of one link are outside the interval of a model with other losses."""
-    one = scenario(3)
-    changed = scenario(3, [{"at": 1, "link": name, "set": {"quality": 0.45}}])
+    one = linked(3)
+    changed = linked(3, [{"at": 1, "link": name, "set": {"quality": 0.45}}])
     assert link_summary_of(changed, name, tally_of(one, name)).within_interval is False
 
 
 def test_every_loss_has_a_reason_in_a_run_cut_short() -> None:
     """Late packets that the receiver has not taken when the run ends are under way."""
-    lossy = scenario(3)
+    lossy = linked(3)
     tally = tally_of(lossy, "slow")
     assert tally.late_sent > tally.late == 0
     account = link_summary_of(lossy, "slow", tally)
@@ -115,13 +117,13 @@ def test_the_interval_is_clopper_and_pearsons() -> None:
 
 def test_bursts_and_delays_stand_beside_their_models() -> None:
     """Mean burst length 1/r of a Gilbert link, within what 12 runs scatter; delay fractions within 5 standard errors."""
-    found = [link_summary_of(one := scenario(seed), "bursts", tally_of(one, "bursts")) for seed in range(12)]
+    found = [link_summary_of(one := linked(seed), "bursts", tally_of(one, "bursts")) for seed in range(12)]
     lengths = np.array([one.mean_burst for one in found])
     assert found[0].expected_mean_burst == pytest.approx(1 / 0.3)
     assert (
         abs(lengths.mean() - 1 / 0.3) < 5 * lengths.std(ddof=1) / np.sqrt(12) + 0.3
     )  # long bursts at the end are not seen
-    one = scenario(5)
+    one = linked(5)
     slow = link_summary_of(one, "slow", tally_of(one, "slow"))
     total = 0.8 * one.slots * one.trials
     assert slow.delays is not None
@@ -133,6 +135,6 @@ def test_bursts_and_delays_stand_beside_their_models() -> None:
 
 def test_nothing_is_said_of_what_was_not_measured() -> None:
     """Of a run that did not begin."""
-    one = scenario(1)
+    one = linked(1)
     found = link_summary_of(one, "coins", Tally(one.slots, one.trials))
     assert (found.rate, found.interval, found.within_interval, found.mean_burst) == (None, None, None, None)

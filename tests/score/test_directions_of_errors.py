@@ -19,7 +19,7 @@ from evedrop.score.summary import Summary
 from evedrop.score.sums import DirectionErrors
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
-from tests.scenario.good import mistakes
+from tests.builders import mistakes_in_good
 
 SOME: dict[str, Any] = {"slots": 150, "trials": 40, "record_trials": 40}
 
@@ -178,5 +178,5 @@ def test_trials_and_slots_in_parts_have_the_same_bits() -> None:
 )
 def test_directions_that_mean_nothing(changes: dict[str, Any], said: str) -> None:
     """Are refused, and named."""
-    found = mistakes(changes)
+    found = mistakes_in_good(changes)
     assert any(line.startswith(said) for line in found), found

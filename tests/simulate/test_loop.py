@@ -19,10 +19,9 @@ from evedrop.results.diff import difference
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import checked, load
 from evedrop.scenario.news import silent
-from evedrop.scenario.tables import Scenario
 from evedrop.simulate.montecarlo import Plan, simulate
 from evedrop.simulate.simulation import Mode
-from tests.builders import digests_of
+from tests.builders import changed, digests_of
 from tests.conftest import Evedrop
 
 TITLE = "A tank that is steered over a lossy network"
@@ -39,63 +38,45 @@ CALM = dict.fromkeys((f"plant__{name}" for name in DRAUGHT), None)
 """No draught, for as many slots as one likes."""
 
 
-def tables(**changes: Any) -> dict[str, Any]:
-    """A marginal plant with a disturbance, a regulator and two eavesdroppers.
-
-    changes: by dotted key, `__` for the dot; None leaves the entry out.
-    """
-    made: dict[str, Any] = {
-        "title": TITLE,
-        "slots": 300,
-        "seed": 5,
-        "trials": 6,
-        "record_trials": 2,
-        "process": {
-            "A": [[1.0, 0.0], [0.05, 1.0]],
-            "Q": [[1e-4, 0.0], [0.0, 1e-4]],
-            "initial_covariance": [[0.01, 0.0], [0.0, 0.01]],
-            "reference": [55.0, 50.0],
-        },
-        "plant": {
-            "inputs": ["heater"],
-            "input_matrix": [[0.1], [0.0]],
-            "input_lower": [-2.0],
-            "input_upper": [2.0],
-            **DRAUGHT,
-            "noise": [[1e-6, 0.0], [0.0, 0.0]],
-            "start": [54.0, 50.5],
-        },
-        "controller": {
-            "strategy": "lqr",
-            "state_weights": [1.0, 1.0],
-            "input_weights": [0.1],
-        },
-        "encoding": {"scheme": "innovation", "state_probability": 0.3},
-        "legitimate": {"link": {"quality": 0.6}},
-        "eavesdroppers": {
-            "smart": {"strategy": "smart", "link": {"quality": 0.6}},
-            "naive": {"strategy": "naive", "link": {"quality": 0.6}},
-        },
-    }
-    for key, value in changes.items():
-        *path, last = key.split("__")
-        inner = made
-        for name in path:
-            inner = inner[name]
-        inner[last] = value
-        if value is None:
-            del inner[last]
-    return made
-
-
-def scenario_of(**changes: Any) -> Scenario:
-    """The scenario so changed."""
-    return checked(tables(**changes), "file")
+TANK: dict[str, Any] = {
+    "title": TITLE,
+    "slots": 300,
+    "seed": 5,
+    "trials": 6,
+    "record_trials": 2,
+    "process": {
+        "A": [[1.0, 0.0], [0.05, 1.0]],
+        "Q": [[1e-4, 0.0], [0.0, 1e-4]],
+        "initial_covariance": [[0.01, 0.0], [0.0, 0.01]],
+        "reference": [55.0, 50.0],
+    },
+    "plant": {
+        "inputs": ["heater"],
+        "input_matrix": [[0.1], [0.0]],
+        "input_lower": [-2.0],
+        "input_upper": [2.0],
+        **DRAUGHT,
+        "noise": [[1e-6, 0.0], [0.0, 0.0]],
+        "start": [54.0, 50.5],
+    },
+    "controller": {
+        "strategy": "lqr",
+        "state_weights": [1.0, 1.0],
+        "input_weights": [0.1],
+    },
+    "encoding": {"scheme": "innovation", "state_probability": 0.3},
+    "legitimate": {"link": {"quality": 0.6}},
+    "eavesdroppers": {
+        "smart": {"strategy": "smart", "link": {"quality": 0.6}},
+        "naive": {"strategy": "naive", "link": {"quality": 0.6}},
+    },
+}
+"""A marginal plant with a disturbance, a regulator and two eavesdroppers."""
 
 
 def in_memory(folder: Path, plan: Plan | None = None, **changes: Any) -> Results:
     """Its results."""
-    simulate(scenario_of(**changes), folder, silent, plan or Plan(workers=1))
+    simulate(checked(changed(TANK, **changes), "file"), folder, silent, plan or Plan(workers=1))
     return Results.read(folder)
 
 
@@ -119,7 +100,7 @@ def test_the_loop_is_closed_over_the_estimate(tmp_path: Path) -> None:
     assert results.inputs is not None
     assert results.inputs.schema.names == ["slot", "trial", "u", "d", "failed", "clipped"]
     u, d = (column(results.inputs, name, trial=1) for name in ("u", "d"))
-    plant = scenario_of().plant
+    plant = checked(changed(TANK), "file").plant
     assert plant is not None
     assert plant.disturbance_values is not None
     assert np.array_equal(d, plant.disturbance_values)
@@ -199,7 +180,7 @@ def test_errors_against_the_true_state_have_standard_errors(tmp_path: Path) -> N
 def test_a_singular_noise_runs_and_is_warned_of(evedrop: Evedrop) -> None:
     """One measurement of two states: Q has rank one, and the warning says what that gives away."""
     one = {"plant__output_matrix": [[0.0, 1.0]], "plant__measurement_noise": [[0.01]]}
-    (evedrop.folder / "loop.toml").write_text(tomli_w.dumps(tables(**{**MEASURED, **one})))
+    (evedrop.folder / "loop.toml").write_text(tomli_w.dumps(changed(TANK, **{**MEASURED, **one})))
     done = evedrop("montecarlo", "loop.toml", "--trials", "5", "--out", "run")
     assert done.status == 0
     assert (
@@ -217,7 +198,7 @@ OFTEN = ("twenty trials", "filtered and betrayed")
 )
 def test_a_live_loop_is_the_one_in_memory(case: str, tmp_path: Path) -> None:
     """Digests of all, the controller's too, and every recorded input: whatever the links and events are."""
-    live = run(scenario_of(**LIVE[case]), out=tmp_path / "live")
+    live = run(checked(changed(TANK, **LIVE[case]), "file"), out=tmp_path / "live")
     memory = in_memory(tmp_path / "memory", **LIVE[case])
     assert live.summary["ended"] == "complete"
     assert None not in digests(live).values()
@@ -242,7 +223,7 @@ def test_a_live_loop_is_the_one_in_memory(case: str, tmp_path: Path) -> None:
 
 def test_a_killed_controller_is_named(evedrop: Evedrop) -> None:
     """The run fails, says who is at fault, and keeps what was measured."""
-    (evedrop.folder / "loop.toml").write_text(tomli_w.dumps(tables(slots=200_000, **CALM)))
+    (evedrop.folder / "loop.toml").write_text(tomli_w.dumps(changed(TANK, slots=200_000, **CALM)))
     live = evedrop.live("loop.toml", "--trials", "1", "--record-trials", "1")
     live.running()
     live.kill("controller")
@@ -259,7 +240,7 @@ def test_a_killed_controller_is_named(evedrop: Evedrop) -> None:
 
 def test_a_loop_can_be_paused_and_steered(evedrop: Evedrop) -> None:
     """The operator holds the run between two slots, changes a link, and lets it go on: as in any run."""
-    (evedrop.folder / "loop.toml").write_text(tomli_w.dumps(tables(slots=200, **CALM)))
+    (evedrop.folder / "loop.toml").write_text(tomli_w.dumps(changed(TANK, slots=200, **CALM)))
     live = evedrop.live("loop.toml", "--paused")
     live.held()
     for words in (("step", "50"), ("pause",), ("link", "legitimate", "cut"), ("step", "20"), ("resume",)):
@@ -283,7 +264,7 @@ def test_what_the_controller_did_differently_is_found(tmp_path: Path) -> None:
 
 def test_the_closing_report_has_a_line_on_the_loop(evedrop: Evedrop) -> None:
     """Both errors, and what was clipped."""
-    (evedrop.folder / "loop.toml").write_text(tomli_w.dumps(tables()))
+    (evedrop.folder / "loop.toml").write_text(tomli_w.dumps(changed(TANK)))
     done = evedrop("montecarlo", "loop.toml", "--trials", "5", "--out", "run")
     assert done.status == 0
     line = next(line for line in done.out.splitlines() if line.startswith("controller "))
@@ -356,7 +337,7 @@ _NAMES = {False: "ignoring_input", True: "knowing_input"}
 def test_a_plant_without_inputs_needs_no_controller(tmp_path: Path) -> None:
     """Disturbances alone move it; nothing is said of a controller."""
     plant = {"disturbances": ["rain"], "disturbance_matrix": [[1.0], [0.0]], "disturbance_values": [[0.01]] * 300}
-    made = tables(plant=plant)
+    made = changed(TANK, plant=plant)
     del made["controller"]
     simulate(checked(made, "file"), tmp_path / "run", silent, Plan(workers=1))
     results = Results.read(tmp_path / "run")
@@ -371,7 +352,7 @@ def test_other_modes_say_what_they_make_of_a_loop(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="error-coordinates follows errors, not states"):
         in_memory(tmp_path / "errors", Plan(Mode.ERROR_COORDINATES, 1))
     with_loop = in_memory(tmp_path / "loop", Plan(Mode.COVARIANCE_ONLY, 1))
-    made = tables()
+    made = changed(TANK)
     del made["plant"], made["controller"]
     simulate(checked(made, "file"), tmp_path / "none", silent, Plan(Mode.COVARIANCE_ONLY, 1))
     assert with_loop.summary["peers"] == Results.read(tmp_path / "none").summary["peers"]
@@ -389,7 +370,7 @@ def test_workers_change_nothing(tmp_path: Path) -> None:
 
 def test_a_results_folder_runs_again_to_the_same_digests(tmp_path: Path) -> None:
     """With the disturbances that lie in it."""
-    (tmp_path / "loop.toml").write_text(tomli_w.dumps(tables()))
+    (tmp_path / "loop.toml").write_text(tomli_w.dumps(changed(TANK)))
     first = in_memory(tmp_path / "run")
     from evedrop.scenario.loading import load
 

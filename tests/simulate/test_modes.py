@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from evedrop.cli.api import montecarlo
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.model import streams
+from evedrop.model.process import Process
 from evedrop.model.theory.covariances import Outcomes, expected_traces
 from evedrop.results.reading import Results
 from evedrop.scenario.link_table import LinkTable
@@ -25,7 +26,7 @@ from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.scenario.tables import Scenario
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode, Simulation
-from tests.builders import MICROGRID, process_table
+from tests.builders import MICROGRID, process_table, scenario_of
 from tests.conftest import Evedrop
 
 SURE = 4.5
@@ -34,21 +35,18 @@ MARGINAL = [[1.0, 0.05], [0.0, 1.0]]
 UNSTABLE = [[1.0, 0.3], [0.5, 1.001]]
 
 
-def scenario(A: list[list[float]], slots: int, mu_d: float = 0.6, **eavesdroppers: dict[str, Any]) -> Scenario:
+def studied(A: list[list[float]], slots: int, mu_d: float = 0.6, **eavesdroppers: dict[str, Any]) -> Scenario:
     """A process with these receivers and a legitimate link of quality 0.9, allowed beyond the horizon."""
-    n = len(A)
-    identity = [[1e-3 * (i == j) for j in range(n)] for i in range(n)]
-    tables = {
-        "title": "test",
-        "slots": slots,
-        "seed": 5,
-        "trials": 1_000_000,
-        "process": {"A": A, "Q": identity, "initial_covariance": identity},
-        "encoding": {"scheme": "innovation", "state_probability": mu_d},
-        "legitimate": {"link": {"quality": 0.9}},
-        "eavesdroppers": eavesdroppers,
-    }
-    return checked(tables, "test", beyond_horizon=True)
+    identity = 1e-3 * np.eye(len(A))
+    return scenario_of(
+        Process(np.array(A), identity, identity),
+        beyond_horizon=True,
+        slots=slots,
+        seed=5,
+        trials=1_000_000,
+        encoding={"scheme": "innovation", "state_probability": mu_d},
+        eavesdroppers=eavesdroppers,
+    )
 
 
 SMART = {"strategy": "smart", "link": {"quality": 0.85}}
@@ -100,7 +98,7 @@ def agrees(samples: np.ndarray[Any, Any], expected: np.ndarray[Any, Any]) -> Non
 def test_error_coordinates_are_the_ordinary_errors(A: list[list[float]]) -> None:
     """Same trials where both can run: same actions and beliefs, errors equal to rounding of the states they come from."""
     slots = 150 if A is MARGINAL else 26
-    of = scenario(A, slots, **ALL)
+    of = studied(A, slots, **ALL)
     exact, errors = played(of, Mode.EXACT, 60), played(of, Mode.ERROR_COORDINATES, 60)
     unread = Outcomes(predicted=1.0, state=0.0, misled=0.0, decoded=0.0, initial=1.0)
     state = np.sqrt(expected_traces(of.process.process, unread, slots))[:, None]
@@ -114,7 +112,7 @@ def test_error_coordinates_are_the_ordinary_errors(A: list[list[float]]) -> None
 
 def test_covariances_alone_see_the_same_events() -> None:
     """Actions and believed covariances of the covariance-only mode are those of the ordinary one, to the bit."""
-    of = scenario(MARGINAL, 120, **ALL)
+    of = studied(MARGINAL, 120, **ALL)
     exact, alone = played(of, Mode.EXACT, 40, 3), played(of, Mode.COVARIANCE_ONLY, 40, 3)
     for name in of.receivers:
         assert np.array_equal(exact[name]["action"], alone[name]["action"])
@@ -137,7 +135,7 @@ def test_which_streams_are_drawn(mode: Mode, monkeypatch: pytest.MonkeyPatch) ->
 
     monkeypatch.setattr(streams, "Stream", Watched)
     for receivers, misled in (({"smart": SMART}, False), (ALL, True)):
-        of = scenario(MARGINAL, 40, **receivers)
+        of = studied(MARGINAL, 40, **receivers)
         drawn.clear()
         played(of, mode, 10)
         keys = StreamKeys.from_scenario(of)
@@ -151,7 +149,7 @@ def test_which_streams_are_drawn(mode: Mode, monkeypatch: pytest.MonkeyPatch) ->
 @pytest.mark.parametrize("mode", [Mode.COVARIANCE_ONLY, Mode.ERROR_COORDINATES])
 def test_means_agree_with_theory(mode: Mode) -> None:
     """Every receiver's error and belief, at every tenth slot of a marginally stable process, over 4000 trials."""
-    of = scenario(MARGINAL, 111, mu_d=0.4, **ALL)
+    of = studied(MARGINAL, 111, mu_d=0.4, **ALL)
     found = played(of, mode, 4000)
     for name, outcomes in outcomes_of(of).items():
         for what, theory in (("error", outcomes), ("trace", outcomes.believed)):
@@ -161,7 +159,7 @@ def test_means_agree_with_theory(mode: Mode) -> None:
 
 def test_error_coordinates_go_where_states_cannot_be_followed() -> None:
     """An unstable process, 400 slots (state of 10⁵⁵), μ_d with finite variances: means at every twentieth slot."""
-    of = scenario([[1.2]], 400, mu_d=0.97, smart={"strategy": "smart", "link": {"quality": 0.9}})
+    of = studied([[1.2]], 400, mu_d=0.97, smart={"strategy": "smart", "link": {"quality": 0.9}})
     found = played(of, Mode.ERROR_COORDINATES, 4000)
     for name, outcomes in outcomes_of(of).items():
         agrees(found[name]["error"][::20], expected_traces(of.process.process, outcomes, of.slots)[::20])
@@ -173,7 +171,7 @@ def test_heavy_tails_agree_by_quantiles() -> None:
     The reference is independent: one long list of geometric times since the last state packet, each with its own
     covariance and a normal error. 6000 samples each, compared by the two-sample binomial bound at 4.5 σ.
     """
-    of = scenario(UNSTABLE, 301, mu_d=0.6)
+    of = studied(UNSTABLE, 301, mu_d=0.6)
     found = played(of, Mode.ERROR_COORDINATES, 6000)["legitimate"]["error"][300]
     random = np.random.default_rng(3)
     A, Q, samples = np.array(UNSTABLE), 1e-3 * np.eye(2), []
@@ -260,7 +258,7 @@ def test_who_reads_packets_is_refused(plan: Plan, strategy: str, tmp_path: Path)
         "replay-informed": {"link": {"quality": 0.5}, "reads_as": "smart", "learns_at": 3},
     }
     more = entries.get(strategy, {"link": {"quality": 0.5}})
-    of = scenario(MARGINAL, 20, eve={"strategy": strategy, **more}, smart=SMART)
+    of = studied(MARGINAL, 20, eve={"strategy": strategy, **more}, smart=SMART)
     option = f"--{plan.mode.value}"
     said = rf"{option} follows .* the actions of eve \(strategy {strategy}\).*; leave {option} out, or remove eve"
     with pytest.raises(UsageError, match=said):
@@ -302,7 +300,7 @@ def test_a_refused_study_runs_as_advised(name: str, option: str, evedrop: Evedro
 def test_a_constant_one_and_a_pool_are_followed_in_every_mode() -> None:
     """Their actions follow from what was lost: the three modes agree on actions and beliefs, to the bit."""
     pool = {"strategy": "colluding", "links": [{"quality": 0.5}, {"quality": 0.6}], "reads_as": "smart"}
-    of = scenario(MARGINAL, 80, pool=pool, deaf={"strategy": "constant", "link": {"quality": 0.9}})
+    of = studied(MARGINAL, 80, pool=pool, deaf={"strategy": "constant", "link": {"quality": 0.9}})
     exact, *others = (played(of, mode, 30) for mode in Mode)
     for name in of.receivers:
         for other in others:

@@ -22,7 +22,7 @@ from evedrop.score.acknowledging import Detection, chart_of
 from evedrop.score.summary import DetectionSummary
 from evedrop.simulate.montecarlo import check_mode
 from evedrop.simulate.simulation import Mode, Simulation
-from tests.builders import digests_of, part_of
+from tests.builders import digests_of, mistakes_of, part_of
 from tests.examples import mostly_long
 
 STABLE = [[0.9, 0.3], [0.0, 0.8]]
@@ -86,22 +86,15 @@ def tables_of(scheme: str, **more: Any) -> dict[str, Any]:
     return {**tables, **more}
 
 
-def scenario_of(scheme: str, **more: Any) -> Scenario:
+def running(scheme: str, **more: Any) -> Scenario:
     """The same, checked."""
     return checked(tables_of(scheme, **more), scheme)
-
-
-def mistakes(scheme: str, **more: Any) -> list[str]:
-    """What is wrong with it."""
-    with pytest.raises(ScenarioError) as caught:
-        scenario_of(scheme, **more)
-    return str(caught.value).splitlines()
 
 
 @pytest.mark.parametrize("scheme", mostly_long(RUNS, USUAL))
 def test_live_and_memory_are_the_same_bits(scheme: str, tmp_path: Path) -> None:
     """Equal digests and accounts of every receiver, the same alarms, and no packet unaccounted for."""
-    scenario = scenario_of(scheme)
+    scenario = running(scheme)
     live = run(scenario, out=tmp_path / "live")
     memory = montecarlo(scenario, trials=5, out=tmp_path / "memory")
     assert all(digests_of(live).values())
@@ -124,8 +117,8 @@ def test_live_and_memory_are_the_same_bits(scheme: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("scheme", RUNS)
 def test_who_is_given_what(scheme: str) -> None:
     """Only the sensor's brief has what only it needs, and the leaks' states; only the router's has the acknowledgements' link."""
-    briefs = briefs_of(scenario_of(scheme), "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False))
-    scenario = scenario_of(scheme)
+    briefs = briefs_of(running(scheme), "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False))
+    scenario = running(scheme)
     kind = scheme_of(scenario.process.process, scenario.encoding.spec)
     assert set(briefs["sensor"].keys) == {"process", *kind.secret_streams}
     assert set(briefs["legitimate"].keys) == set(kind.estimator_streams)
@@ -141,7 +134,7 @@ def test_who_is_given_what(scheme: str) -> None:
 def test_studies_of_events_refuse_what_they_cannot_follow(scheme: str, mode: Mode) -> None:
     """Packets that are read, acknowledged or not sent, and receivers that take a masked or shifted packet for the state."""
     alone = {"naive": {"strategy": "naive", "link": {"quality": 0.7}}}
-    scenario = scenario_of(scheme, eavesdroppers=alone, event=[], **_unattacked(scheme))
+    scenario = running(scheme, eavesdroppers=alone, event=[], **_unattacked(scheme))
     with pytest.raises(UsageError, match="follows events, not packets"):
         check_mode(scenario, mode)
 
@@ -157,35 +150,41 @@ def test_a_scheme_and_its_acknowledgements_go_together() -> None:
     with pytest.raises(ScenarioError, match=r"acknowledgements: is missing; the scheme acknowledged acts on"):
         checked(tables, "it")
     link = {"link": {"quality": 0.9}}
-    assert "the scheme cipher needs none; remove the table" in str(mistakes("cipher", acknowledgements=link))
-    attacked = {**link, "attack": "critical"}
-    assert "acknowledgements.jammer: is missing" in str(mistakes("scheduled", acknowledgements=attacked))
-    nobody = {**attacked, "jammer": "nobody"}
-    assert "expected an eavesdropper: naive, ref, sel or spy" in str(mistakes("scheduled", acknowledgements=nobody))
-    assert "does not depend on what it hears" in str(
-        mistakes("scheduled", acknowledgements={**link, "attack": "all", "jammer": "ref"})
+    assert "the scheme cipher needs none; remove the table" in str(
+        mistakes_of(running, "cipher", acknowledgements=link)
     )
-    assert "expected none, all, critical or forge" not in str(mistakes("scheduled", acknowledgements=nobody))
-    assert "event.0.jam: no attack is described" in str(mistakes("scheduled", acknowledgements=link))
-    assert "has no acknowledgements that could be jammed" in str(mistakes("cipher", event=[JAM]))
+    attacked = {**link, "attack": "critical"}
+    assert "acknowledgements.jammer: is missing" in str(mistakes_of(running, "scheduled", acknowledgements=attacked))
+    nobody = {**attacked, "jammer": "nobody"}
+    assert "expected an eavesdropper: naive, ref, sel or spy" in str(
+        mistakes_of(running, "scheduled", acknowledgements=nobody)
+    )
+    assert "does not depend on what it hears" in str(
+        mistakes_of(running, "scheduled", acknowledgements={**link, "attack": "all", "jammer": "ref"})
+    )
+    assert "expected none, all, critical or forge" not in str(
+        mistakes_of(running, "scheduled", acknowledgements=nobody)
+    )
+    assert "event.0.jam: no attack is described" in str(mistakes_of(running, "scheduled", acknowledgements=link))
+    assert "has no acknowledgements that could be jammed" in str(mistakes_of(running, "cipher", event=[JAM]))
     twice = [{"at": 3, "jam": "acknowledgements"}, JAM]
-    assert "begins in slot 10, while another one lasts" in str(mistakes("scheduled", event=twice))
+    assert "begins in slot 10, while another one lasts" in str(mistakes_of(running, "scheduled", event=twice))
 
 
 def test_a_queue_and_silence_do_not_go_together() -> None:
     """A link of limited rate counts on a packet in every slot of every trial."""
     slow = {"link": {"quality": 0.8, "rate": 0.5}}
     assert "legitimate.link.rate: is given, but the scheme withholding may stay silent" in str(
-        mistakes("withholding", legitimate=slow)
+        mistakes_of(running, "withholding", legitimate=slow)
     )
 
 
 def test_an_attack_is_on_in_its_slots_alone() -> None:
     """Without events always; with them from slot to slot, or to the end."""
-    assert scenario_of("scheduled", event=[]).timeline.jams is None
-    assert scenario_of("scheduled").timeline.jams == [[10, 20]]
+    assert running("scheduled", event=[]).timeline.jams is None
+    assert running("scheduled").timeline.jams == [[10, 20]]
     later = [dict(JAM), {"at": 25, "jam": "acknowledgements"}]
-    spans = scenario_of("scheduled", event=later).timeline.jams
+    spans = running("scheduled", event=later).timeline.jams
     assert spans is not None
     assert spans[0] == [10, 20]
     assert spans[1][0] == 25
@@ -195,7 +194,7 @@ def test_an_attack_is_on_in_its_slots_alone() -> None:
 def test_the_sensor_notices_what_it_cannot_miss() -> None:
     """Where every packet should be acknowledged, one that is not settles it; the delay counts from the attack's start."""
     perfect = {"link": {"quality": 1.0}, "attack": "all"}
-    scenario = scenario_of("acknowledged", acknowledgements=perfect, legitimate={"link": {"quality": 1.0}}, event=[JAM])
+    scenario = running("acknowledged", acknowledgements=perfect, legitimate={"link": {"quality": 1.0}}, event=[JAM])
     assert chart_of(scenario) == Chart(acknowledged=0, missing=1, threshold=1)
     detection = Detection(5)
     for chunk in Simulation(scenario, range(5)).chunks():
@@ -236,7 +235,7 @@ def test_errors_in_runs_agree_with_the_closed_forms(scheme: str, receiver: str, 
     table = {"acknowledgements": {"link": {"quality": 0.9}, **jam}} if scheme in NEEDS else {}
     eavesdroppers = tables_of(scheme)["eavesdroppers"]
     eavesdroppers["sel"] = {"strategy": "selective", "link": {"quality": 0.8}}
-    scenario = scenario_of(scheme, event=[], eavesdroppers=eavesdroppers, slots=24, trials=3000, **table)
+    scenario = running(scheme, event=[], eavesdroppers=eavesdroppers, slots=24, trials=3000, **table)
     expected = expectations_of(scenario)[receiver]
     assert expected.known
     assert np.isfinite(expected.limit)
@@ -248,7 +247,7 @@ def test_errors_in_runs_agree_with_the_closed_forms(scheme: str, receiver: str, 
 def test_whose_reference_is_kept_and_whose_is_lost() -> None:
     """Blocking the critical acknowledgements is expected to be as good as being the legitimate estimator; listening is not."""
     eavesdroppers = {name: {"strategy": "reference", "link": {"quality": 0.8}} for name in ("ref", "listener")}
-    scenario = scenario_of("acknowledged", event=[], eavesdroppers=eavesdroppers)
+    scenario = running("acknowledged", event=[], eavesdroppers=eavesdroppers)
     found = expectations_of(scenario)
     assert np.allclose(found["ref"].traces(30), found["legitimate"].traces(30), rtol=1e-9)
     assert not found["listener"].known
@@ -257,7 +256,7 @@ def test_whose_reference_is_kept_and_whose_is_lost() -> None:
     assert floor.traces(30)[-1] > 100.0
     assert (floor.limit, found["listener"].infinite_variance) == (np.inf, False)  # it grows alike in all trials
     assert np.isfinite(found["ref"].limit)
-    jammed_later = scenario_of("acknowledged", eavesdroppers=eavesdroppers)
+    jammed_later = running("acknowledged", eavesdroppers=eavesdroppers)
     assert not expectations_of(jammed_later)["listener"].known
     assert expectations_of(jammed_later)["legitimate"].known
 
@@ -271,7 +270,7 @@ def test_a_betrayed_state_opens_twin_tracks(tmp_path: Path) -> None:
     link = {"link": {"quality": 0.9}}
     tracker = {"strategy": "tracker", **link}
     spy = {"strategy": "replay-informed", "reads_as": "tracker", "learns_at": 20, **link}
-    scenario = scenario_of("twin-track", slots=40, trials=30, eavesdroppers={"tracker": tracker, "spy": spy})
+    scenario = running("twin-track", slots=40, trials=30, eavesdroppers={"tracker": tracker, "spy": spy})
     live = run(scenario, out=tmp_path / "live")
     memory = montecarlo(scenario, trials=30, out=tmp_path / "memory")
     assert all(digests_of(live).values())

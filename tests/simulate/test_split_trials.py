@@ -16,17 +16,18 @@ import pytest
 from evedrop.cli.api import montecarlo
 from evedrop.cli.report import print_summary
 from evedrop.errors import Interrupted
+from evedrop.model.process import Process
 from evedrop.model.streams import OWN, Lineage
 from evedrop.results.reading import Results
 from evedrop.scenario.expected.expectations import expectations_of
-from evedrop.scenario.loading import checked, load
+from evedrop.scenario.loading import load
 from evedrop.scenario.tables import Scenario
 from evedrop.score.summary import Summary
 from evedrop.simulate import montecarlo as studies
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode, Simulation
 from evedrop.simulate.splitting import POPULATIONS, SplitMeans, Splitter, rare_estimates
-from tests.builders import UNSTABLE, process_table
+from tests.builders import UNSTABLE, listener, process_table, scenario_of
 from tests.conftest import Evedrop
 
 SURE = 4.5
@@ -36,22 +37,19 @@ MIXED = {"A": [[1.2, 0.1], [0.0, 0.5]], "Q": [[0.6, 0.2], [0.2, 0.5]], "initial_
 FLIPPED = {"link": {"quality": 0.9}, "attack": "flip", "flip": 0.1}
 
 
-def scenario_of(**more: Any) -> Scenario:
+def heavy(**more: Any) -> Scenario:
     """The paper's example, whose errors have infinite variance, with a good link, a link with bursts, and a misled receiver."""
     tables = {
-        "title": "Heavy tails",
         "slots": 30,
         "seed": 3,
-        "process": SETTLED,
         "encoding": {"scheme": "innovation", "state_probability": 0.56},
-        "legitimate": {"link": {"quality": 0.9}},
         "eavesdroppers": {
-            "better": {"strategy": "smart", "link": {"quality": 0.95}},
+            "better": listener("smart", 0.95),
             "bursts": {"strategy": "smart", "link": dict(BURSTS)},
-            "naive": {"strategy": "naive", "link": {"quality": 0.8}},
+            "naive": listener("naive", 0.8),
         },
     }
-    return checked({**tables, **more}, "it", beyond_horizon=True)
+    return scenario_of(Process(UNSTABLE.A, UNSTABLE.Q, 1e-3 * np.eye(2)), beyond_horizon=True, **{**tables, **more})
 
 
 ACKNOWLEDGED = {
@@ -80,7 +78,7 @@ def errors_of(scenario: Scenario, mode: Mode, lineage: Lineage = OWN, trials: in
 @pytest.mark.parametrize(("mode", "more"), [("exact", ACKNOWLEDGED), ("exact", LATE), ("covariance-only", {})])
 def test_a_copy_is_its_ancestor_up_to_the_split(mode: str, more: dict[str, Any]) -> None:
     """To the bit, with bursts, late packets, acknowledgements and coins; afterwards copies of one trial differ."""
-    scenario, ancestors = scenario_of(**more), np.array([2, 2, 2, 0, 5, 5])
+    scenario, ancestors = heavy(**more), np.array([2, 2, 2, 0, 5, 5])
     own = errors_of(scenario, Mode(mode))
     copied = errors_of(scenario, Mode(mode), OWN.split(17, ancestors))
     for name, errors in copied.items():
@@ -90,7 +88,7 @@ def test_a_copy_is_its_ancestor_up_to_the_split(mode: str, more: dict[str, Any])
 
 def test_left_out_eavesdroppers_change_nothing() -> None:
     """The others have the same errors."""
-    scenario = scenario_of()
+    scenario = heavy()
     left = Simulation(scenario, range(6), Mode.EXACT, leaving_out={"bursts", "naive"})
     chunks = list(left.chunks())
     assert set(chunks[0].receivers) == {"legitimate", "better"}
@@ -101,7 +99,7 @@ def test_left_out_eavesdroppers_change_nothing() -> None:
 
 def test_heavy_tails_agree_with_closed_forms() -> None:
     """For user, eavesdropper, bursts and a misled receiver, in the mean and slot by slot; plain means do not."""
-    scenario = scenario_of(slots=30)
+    scenario = heavy(slots=30)
     expected = expectations_of(scenario)
     plain = errors_of(scenario, Mode.COVARIANCE_ONLY, trials=POPULATIONS * 100)
     for name in scenario.receivers:
@@ -132,7 +130,7 @@ def test_an_initial_covariance_that_is_never_lost(tmp_path: Path) -> None:
 def test_the_exact_mode_estimates_the_same() -> None:
     """Squared errors, with packets and estimates, agree with theory too; so do those of a receiver that reads packets."""
     wise = {"wise": {"strategy": "genie", "link": {"quality": 0.9}}}
-    scenario = scenario_of(slots=20, eavesdroppers=wise)
+    scenario = heavy(slots=20, eavesdroppers=wise)
     for name, expected in expectations_of(scenario).items():
         found = Splitter(scenario, Mode.EXACT, name).estimated().estimate(100, expected)
         assert found.z is not None
@@ -142,7 +140,7 @@ def test_the_exact_mode_estimates_the_same() -> None:
 @pytest.mark.long
 def test_flipped_acknowledgements_agree_with_many_trials() -> None:
     """Where packets depend on acknowledgements, in a run that is short enough for plain trials to contain what matters."""
-    scenario = scenario_of(**ACKNOWLEDGED, slots=7)
+    scenario = heavy(**ACKNOWLEDGED, slots=7)
     many = errors_of(scenario, Mode.EXACT, trials=4000)
     for receiver in scenario.receivers:
         found, plain = Splitter(scenario, Mode.EXACT, receiver).estimated().of_populations, many[receiver].mean(axis=0)
@@ -154,7 +152,7 @@ def test_flipped_acknowledgements_agree_with_many_trials() -> None:
 @pytest.mark.long
 def test_results_depend_on_the_seed_alone(tmp_path: Path) -> None:
     """The same estimates for any number of workers and any trials of the study; others for another seed."""
-    scenario = scenario_of(slots=10)
+    scenario = heavy(slots=10)
 
     def entry(folder: str, plan: Plan, **more: Any) -> Any:
         found = montecarlo(scenario, trials=1001, plan=plan, out=tmp_path / folder, **more).summary
@@ -171,9 +169,7 @@ def test_results_depend_on_the_seed_alone(tmp_path: Path) -> None:
 def test_more_trials_make_it_more_exact() -> None:
     """The populations together have at least the trials of the study."""
     made = {
-        trials: rare_estimates(
-            scenario_of(slots=12, trials=trials), Mode.COVARIANCE_ONLY, lambda: False, lambda _: None
-        )
+        trials: rare_estimates(heavy(slots=12, trials=trials), Mode.COVARIANCE_ONLY, lambda: False, lambda _: None)
         for trials in (40, 40 * 800)
     }
     few, many = (made[trials]["legitimate"] for trials in (40, 40 * 800))
@@ -185,7 +181,7 @@ def test_more_trials_make_it_more_exact() -> None:
 
 def test_what_is_too_skewed_is_refused() -> None:
     """With the reason and the remedy: a large standard error, or errors beyond double precision."""
-    expected = expectations_of(scenario_of())["legitimate"]
+    expected = expectations_of(heavy())["legitimate"]
 
     def doubt(populations: list[float]) -> str | None:
         errors = np.repeat(np.array(populations)[:, None], 3, axis=1)
@@ -211,7 +207,7 @@ def test_an_interrupted_study_has_no_estimates(tmp_path: Path, monkeypatch: pyte
 
     monkeypatch.setattr(studies, "rare_estimates", stopped_early)
     with pytest.raises(Interrupted):
-        montecarlo(scenario_of(), trials=20, plan=Plan(workers=1, rare=True), out=tmp_path / "it")
+        montecarlo(heavy(), trials=20, plan=Plan(workers=1, rare=True), out=tmp_path / "it")
     found = Results.read(tmp_path / "it").summary
     assert found["trials"] == 20
     assert "rare_estimate" not in found["peers"]["legitimate"]

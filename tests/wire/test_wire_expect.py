@@ -6,17 +6,16 @@ from typing import Any
 
 import pytest
 
-from evedrop.errors import ScenarioError
 from evedrop.wire.expect import WireExpectTable, expectation_mistakes
 from evedrop.wire.file import wire_of
+from evedrop.wire.plan import WirePlan
+from tests.builders import mistakes_of
 
 
-def mistakes(**table: Any) -> list[str]:
-    """Those of a wire with one link, scan, and this expectation."""
+def expecting(**table: Any) -> WirePlan:
+    """A wire with one link, scan, and this expectation."""
     link = {"name": "scan", "from": "robot", "to": "base"}
-    with pytest.raises(ScenarioError) as caught:
-        wire_of({"side": {"robot": {}, "base": {}}, "link": [link], "expect": [table]})
-    return caught.value.mistakes
+    return wire_of({"side": {"robot": {}, "base": {}}, "link": [link], "expect": [table]})
 
 
 @pytest.mark.parametrize(
@@ -48,14 +47,14 @@ def test_both_bounds_hold_together() -> None:
 @pytest.mark.parametrize("bound", [-0.5, float("inf"), float("nan"), True, "1"])
 def test_a_bound_is_a_number_that_a_figure_can_reach(bound: Any) -> None:
     """Not below 0, not infinite, and a text only with a unit of time."""
-    assert [mistake.partition(":")[0] for mistake in mistakes(figure="scan.delivery", below=bound)] == [
+    assert [mistake.partition(":")[0] for mistake in mistakes_of(expecting, figure="scan.delivery", below=bound)] == [
         "expect.0.below"
     ]
 
 
 def test_a_link_stands_alone() -> None:
     """Each other entry is named, and no others; None is as good as an entry that is not there."""
-    sentences = mistakes(link="scan", figure="scan.heard", quantile=0.5, above=1)
+    sentences = mistakes_of(expecting, link="scan", figure="scan.heard", quantile=0.5, above=1)
     assert sorted(mistake.partition(":")[0] for mistake in sentences) == [
         "expect.0.above",
         "expect.0.figure",
@@ -66,13 +65,15 @@ def test_a_link_stands_alone() -> None:
 
 def test_a_figure_is_that_of_a_link() -> None:
     """Without a link it is refused, as is one of an unknown link; the message names what there is."""
-    assert mistakes(figure="delivery", below=1)[0].startswith('expect.0.figure: is "delivery"; expected LINK.heard, ')
-    (unknown,) = mistakes(figure="scam.heard", below=1)
+    assert mistakes_of(expecting, figure="delivery", below=1)[0].startswith(
+        'expect.0.figure: is "delivery"; expected LINK.heard, '
+    )
+    (unknown,) = mistakes_of(expecting, figure="scam.heard", below=1)
     assert unknown == (
         'expect.0.figure: is "scam.heard", but there is no link scam; expected a figure or the name of scan; '
         "did you mean scan?"
     )
-    (unknown,) = mistakes(link="sc.an")
+    (unknown,) = mistakes_of(expecting, link="sc.an")
     assert unknown.startswith('expect.0.link: is "sc.an", but there is no link sc.an; ')
 
 

@@ -14,6 +14,7 @@ from evedrop.wire.endpoints import place_of
 from evedrop.wire.file import load_wire, resolved_wire, wire_of
 from evedrop.wire.plan import Side, SideTls, WireEvent
 from evedrop.wire.units import in_seconds
+from tests.builders import mistakes_of
 
 EXAMPLE = Path(str(resources.files("evedrop.wire"))) / "examples" / "robot.toml"
 BASE = """
@@ -30,14 +31,6 @@ to = "base"
 def of(text: str, folder: Path = Path()) -> Any:
     """The wire in a text."""
     return wire_of(tomllib.loads(text), "wire.toml", folder=folder)
-
-
-def mistakes(text: str, folder: Path = Path()) -> list[str]:
-    """What is said of a wire file that is refused."""
-    with pytest.raises(ScenarioError) as caught:
-        of(text, folder)
-    assert caught.value.exit_status == 2
-    return caught.value.mistakes
 
 
 def test_the_example() -> None:
@@ -219,7 +212,9 @@ def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
 
 def test_all_mistakes_at_once() -> None:
     """Those of single tables and those across tables are in one message."""
-    found = mistakes("""
+    found = mistakes_of(
+        of,
+        """
     lossles = []
     largest = "64 Mb"
     [side.robot]
@@ -234,7 +229,8 @@ def test_all_mistakes_at_once() -> None:
     [[event]]
     at = "12"
     partition = ["robot", "bsae"]
-    """)
+    """,
+    )
     assert found == [
         'side.base.listen.1: is "tcp/127.0.0.1"; expected PROTOCOL/HOST:PORT with the protocol tcp, tls, quic, ws or '
         "unixsock-stream, such as tcp/127.0.0.1:7448",
@@ -341,14 +337,16 @@ def test_all_mistakes_at_once() -> None:
 )  # fmt: skip
 def test_one_mistake(text: str, expected: str | None) -> None:
     """It is the only one that is reported, in words that say what to do. None: only that there is one."""
-    found = mistakes(text)
+    found = mistakes_of(of, text)
     assert len(found) == 1 or expected is None
     assert expected is None or found == [expected]
 
 
 def test_a_correlated_link_keeps_its_model() -> None:
     """Its uniform numbers are the other link's, and each model uses them in its own way."""
-    found = mistakes(f"""{BASE}correlation = {{ with = "x", strength = 0.5 }}
+    found = mistakes_of(
+        of,
+        f"""{BASE}correlation = {{ with = "x", strength = 0.5 }}
     [[link]]
     name = "x"
     from = "base"
@@ -357,7 +355,8 @@ def test_a_correlated_link_keeps_its_model() -> None:
     at = 1
     link = "robot-base"
     set = {{ loss = {{ model = "pattern", outcomes = "10" }} }}
-    """)
+    """,
+    )
     assert found == [
         "event.0.set.loss.model: differs from the first one, but the link's losses are tied to another link's; expected the same "
         "model"

@@ -26,7 +26,7 @@ from evedrop.wire.file import wire_of
 from evedrop.wire.network import over_wire
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.timeline import moments
-from tests.builders import MARGINAL, process_table
+from tests.builders import MARGINAL, listener, process_table, scenario_of
 from tests.conftest import wait_until
 from tests.wire.wire_at_work import at_work
 
@@ -37,20 +37,17 @@ BURSTS = {"model": "gilbert-elliott", "p": 0.1, "r": 0.4}
 SECONDS = 0.05
 
 
-def scenario_of(slots: int = 300, **more: Any) -> Scenario:
+def over_the_air(slots: int = 300, **more: Any) -> Scenario:
     """A scenario with one eavesdropper, whose links are replaced."""
-    link = {"link": {"quality": 1.0}}
     tables = {
-        "title": "Over a wire",
         "slots": slots,
         "slot_seconds": SECONDS,
-        "process": process_table(MARGINAL),
         "encoding": {"scheme": "innovation", "state_probability": 0.4},
-        "legitimate": {"window": 3, **link},
-        "eavesdroppers": {"eve": {"strategy": "smart", **link}},
+        "legitimate": {"window": 3, "link": {"quality": 1.0}},
+        "eavesdroppers": {"eve": listener("smart", 1.0)},
         **more,
     }
-    return checked({name: value for name, value in tables.items() if value is not None}, "file")
+    return scenario_of(MARGINAL, **{name: value for name, value in tables.items() if value is not None})
 
 
 def wire(**more: Any) -> WirePlan:
@@ -63,9 +60,9 @@ def wire(**more: Any) -> WirePlan:
     )
 
 
-def changed(plan: WirePlan, scenario: Scenario | None = None) -> Scenario:
+def replaced(plan: WirePlan, scenario: Scenario | None = None) -> Scenario:
     """The scenario over the wire."""
-    before = scenario_of() if scenario is None else scenario
+    before = over_the_air() if scenario is None else scenario
     return checked(before.model_dump(mode="json", exclude_none=True), "wire", over_wire(before, plan, KEY, SIDES))
 
 
@@ -106,7 +103,7 @@ def test_packets_have_the_fates_of_messages(tmp_path: Path) -> None:
         tap={"correlation": {"with": "radio", "strength": 0.5}},
         event=EVENTS,
     )
-    scenario = changed(plan)
+    scenario = replaced(plan)
     memory = montecarlo(scenario, trials=1, out=tmp_path / "memory", plan=Plan(workers=1))
     for receiver, name in (("legitimate", "radio"), ("eve", "tap")):
         found = delivered(memory, receiver)
@@ -144,7 +141,7 @@ def test_a_program_on_the_wire_loses_what_the_run_loses(tmp_path: Path) -> None:
         fates = work.when_heard(400)
         expected = sum(one == 0 for one in fates)
         wait_until(lambda: sum(map(len, heard.values())) == expected, "all messages arrive")
-    found = montecarlo(changed(plan, scenario_of(200)), trials=1, out=tmp_path / "run", plan=Plan(workers=1))
+    found = montecarlo(replaced(plan, over_the_air(200)), trials=1, out=tmp_path / "run", plan=Plan(workers=1))
     for receiver, side in (("legitimate", "base"), ("eve", "listener")):
         assert {k for k, one in enumerate(delivered(found, receiver)) if one} == heard[side]
 
@@ -164,7 +161,7 @@ def test_states_may_cross_a_wire(tmp_path: Path) -> None:
         }
         with subprocess.Popen(command, stdout=subprocess.DEVNULL) as player:
             try:
-                assert run(scenario_of(40, process=process), out=tmp_path / "run").summary["ended"] == "complete"
+                assert run(over_the_air(40, process=process), out=tmp_path / "run").summary["ended"] == "complete"
             finally:
                 player.kill()
     lines = (tmp_path / "run" / "states.csv").read_text().splitlines()[1:]
@@ -176,7 +173,7 @@ def test_states_may_cross_a_wire(tmp_path: Path) -> None:
 
 def test_a_key_that_is_never_lost(tmp_path: Path) -> None:
     """Neither losses nor events of the wire concern it."""
-    scenario = changed(wire(lossless=["robot/pose"], event=EVENTS))
+    scenario = replaced(wire(lossless=["robot/pose"], event=EVENTS))
     assert scenario.wire is None
     assert not scenario.event
     assert {scenario.link(name).model.quality for name in scenario.receivers} == {1.0}
@@ -192,26 +189,26 @@ def refusal(plan: WirePlan, scenario: Scenario, key: str | None = KEY, **sides: 
 
 def test_what_a_run_cannot_have_is_refused() -> None:
     """Each with the receiver and the link."""
-    assert "the key of the packets is not known" in refusal(wire(), scenario_of(), None)
-    assert "robot/* is not a key without wildcards" in refusal(wire(), scenario_of(), "robot/*")
-    assert "/robot is not a key without wildcards" in refusal(wire(), scenario_of(), "/robot")
+    assert "the key of the packets is not known" in refusal(wire(), over_the_air(), None)
+    assert "robot/* is not a key without wildcards" in refusal(wire(), over_the_air(), "robot/*")
+    assert "/robot is not a key without wildcards" in refusal(wire(), over_the_air(), "/robot")
     assert "eve is on no side of the wire, whose sides are robot, base or listener" in refusal(
-        wire(), scenario_of(), eve="x"
+        wire(), over_the_air(), eve="x"
     )
-    assert "mallory is not sensor, legitimate or eve" in refusal(wire(), scenario_of(), mallory="base")
+    assert "mallory is not sensor, legitimate or eve" in refusal(wire(), over_the_air(), mallory="base")
     assert "no link of the wire takes robot/pose from robot to robot, where eve is" in refusal(
-        wire(), scenario_of(), eve="robot"
+        wire(), over_the_air(), eve="robot"
     )
-    rate = refusal(wire(radio={"rate": "1 kB/s"}), scenario_of())
+    rate = refusal(wire(radio={"rate": "1 kB/s"}), over_the_air())
     assert "radio, the link of legitimate, has a rate in bytes per second" in rate
     ordered = wire(radio={"ordered": True, "delay": {"model": "constant", "value": 0.1}})
-    assert "radio, the link of legitimate, has ordered = true, and the delays" in refusal(ordered, scenario_of())
+    assert "radio, the link of legitimate, has ordered = true, and the delays" in refusal(ordered, over_the_air())
     apart = [{"at": "1 s", "partition": ["robot", "base"]}]
-    assert "the scenario has no slot_seconds" in refusal(wire(event=apart), scenario_of(slot_seconds=None))
-    both = refusal(tied_to_a_third(), scenario_of())
+    assert "the scenario has no slot_seconds" in refusal(wire(event=apart), over_the_air(slot_seconds=None))
+    both = refusal(tied_to_a_third(), over_the_air())
     assert "tap, the link of eve, is tied to third, which is not the link of another receiver" in both
     several = {"eve": {"strategy": "colluding", "reads_as": "smart", "links": [{"quality": 0.5}, {"quality": 0.5}]}}
-    assert "eve has several links" in refusal(wire(), scenario_of(eavesdroppers=several))
+    assert "eve has several links" in refusal(wire(), over_the_air(eavesdroppers=several))
 
 
 def tied_to_a_third() -> WirePlan:
@@ -226,7 +223,7 @@ def tied_to_a_third() -> WirePlan:
 def test_the_key_of_the_program_is_the_default() -> None:
     """A run whose states come from a program knows the key already."""
     program = {"source": "zenoh", "zenoh": {"key": "robot/scan", "connect": "tcp/127.0.0.1:1"}, "states": ["x", "v"]}
-    scenario = scenario_of(process={**process_table(MARGINAL), **program})
+    scenario = over_the_air(process={**process_table(MARGINAL), **program})
     assert over_wire(scenario, wire(), None, SIDES)["wire"]["key"] == "robot/scan"
 
 
@@ -235,7 +232,7 @@ def test_wires_in_scenarios_are_checked() -> None:
     several = {"eve": {"strategy": "colluding", "reads_as": "smart", "links": [{"quality": 0.5}, {"quality": 0.5}]}}
     links = {"mallory": "tap", "eve": "tap"}
     with pytest.raises(ScenarioError) as caught:
-        scenario_of(eavesdroppers=several, wire={"seed": 1, "key": KEY, "links": links})
+        over_the_air(eavesdroppers=several, wire={"seed": 1, "key": KEY, "links": links})
     assert caught.value.mistakes == [
         "wire.links.mallory: is not a receiver; expected legitimate or eve",
         "wire.links.eve: is a receiver with several links; expected one with a single link",

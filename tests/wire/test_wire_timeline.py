@@ -5,12 +5,10 @@ from __future__ import annotations
 import tomllib
 from typing import Any
 
-import pytest
-
-from evedrop.errors import ScenarioError
 from evedrop.wire.file import resolved_wire, wire_of
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.timeline import moment_at, moments, with_change, with_cut_ended, with_partition_ended
+from tests.builders import mistakes_of
 
 SIDES: dict[str, Any] = {"robot": {}, "base": {}, "listener": {}}
 LINKS = [
@@ -106,39 +104,32 @@ def test_an_operator_ends_partitions() -> None:
     assert moment_at(healed, 4.0).cut == {"scan"}
 
 
-def refused(*arguments: Any) -> list[str]:
-    """The message for an operator's change that is refused: a function and its arguments."""
-    with pytest.raises(ScenarioError) as caught:
-        arguments[0](*arguments[1:])
-    return caught.value.mistakes
-
-
 def test_what_an_operator_cannot_do() -> None:
     """The messages are those of a file, all at once, and say what to do."""
     plan = plan_of({"at": 1, "partition": ["robot", "base"]})
-    assert refused(with_change, plan, {"link": "scan", "set": {"qualty": 1, "corrupt": 2}}, 2.0) == [
+    assert mistakes_of(with_change, plan, {"link": "scan", "set": {"qualty": 1, "corrupt": 2}}, 2.0) == [
         "set.qualty: is not a link setting that can be changed; expected quality, loss, delay, reorder, duplicate, corrupt, rate "
         "or queue; did you mean quality?",
         "set.corrupt: is 2; expected a number from 0 to 1, such as 0.01",
     ]
-    assert refused(with_change, plan, {"cut": "scna", "partition": ["robot", "bas"]}, 2.0) == [
+    assert mistakes_of(with_change, plan, {"cut": "scna", "partition": ["robot", "bas"]}, 2.0) == [
         'event: has partition or cut at once; expected one of partition, cut, set or note, such as partition = ["robot", "base"]',
         'partition.1: is "bas"; expected robot, base or listener; did you mean base?',
         'cut: is "scna"; expected scan, robot-base, base-robot or robot-listener; did you mean scan?',
     ]
-    assert refused(with_cut_ended, plan, "scan", 2.0) == [
+    assert mistakes_of(with_cut_ended, plan, "scan", 2.0) == [
         "heal: scan is not cut by itself; end the partition of its sides with `evedrop heal`"
     ]
-    assert refused(with_cut_ended, plan, "scan", 0.5) == [
+    assert mistakes_of(with_cut_ended, plan, "scan", 0.5) == [
         "heal: scan is not cut by itself; expected a link that is cut"
     ]
-    assert refused(with_cut_ended, plan, "scn", 2.0) == [
+    assert mistakes_of(with_cut_ended, plan, "scn", 2.0) == [
         'heal: is "scn"; expected scan, robot-base, base-robot or robot-listener; did you mean scan?'
     ]
-    assert refused(with_partition_ended, plan, "robot", "listener", 2.0) == [
+    assert mistakes_of(with_partition_ended, plan, "robot", "listener", 2.0) == [
         "heal: robot and listener are not partitioned; expected two sides that are"
     ]
-    assert refused(with_partition_ended, plan, "robot", "bse", 2.0) == [
+    assert mistakes_of(with_partition_ended, plan, "robot", "bse", 2.0) == [
         'heal: is "bse"; expected robot, base or listener; did you mean base?'
     ]
 
@@ -148,6 +139,6 @@ def test_the_loss_model_of_correlated_links_cannot_change() -> None:
     tied = {"name": "back", "from": "base", "to": "robot", "correlation": {"with": "scan", "strength": 0.5}}
     plan = wire_of({"side": SIDES, "link": [*LINKS[:2], tied]})
     other = {"loss": {"model": "pattern", "outcomes": "10"}}
-    assert len(refused(with_change, plan, {"link": "back", "set": other}, 2.0)) == 1
+    assert len(mistakes_of(with_change, plan, {"link": "back", "set": other}, 2.0)) == 1
     assert with_change(plan, {"link": "robot-base", "set": other}, 2.0)[1].startswith("link robot-base: loss = ")
     assert with_change(plan, {"link": "back", "set": {"quality": 0.4}}, 2.0)[1].startswith("link back: loss = ")

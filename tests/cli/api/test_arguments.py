@@ -13,7 +13,7 @@ from evedrop.cli.api import RunResults, design_budget, design_policy, design_sch
 from evedrop.errors import UnknownName, UsageError
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
-from tests.scenario.good import GOOD
+from tests.builders import GOOD
 
 SMALL = Scenario(GOOD).replace(slots=12)
 A_SCENARIO = "expected a built-in name, a file, or a Scenario"

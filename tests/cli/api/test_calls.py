@@ -36,9 +36,8 @@ from evedrop.show.report import closing
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
 from evedrop.studies.sweep import grid_of
-from tests.builders import digests_of
+from tests.builders import GOOD, digests_of
 from tests.pages import checked
-from tests.scenario.good import GOOD
 
 SMALL = Scenario(GOOD).replace(slots=12)
 

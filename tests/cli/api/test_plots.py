@@ -20,9 +20,9 @@ from evedrop.show.report.writing import REPORT
 from evedrop.show.view.palette import DROPPED, colour, hexadecimal
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
+from tests.builders import GOOD
 from tests.pages import Checked, checked
 from tests.scenario.conformance.own_classes import BLOCK, PAGE
-from tests.scenario.good import GOOD
 
 SCENARIO = Scenario(GOOD).replace(slots=30, trials=2, record_trials=2)
 

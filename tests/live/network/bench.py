@@ -6,8 +6,7 @@ import json
 import os
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -25,19 +24,10 @@ from evedrop.live.protocol.envelope import enclosed, payload_of
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.scenario.tables import Scenario
 from evedrop.system.ports import free_port
-from tests.builders import MARGINAL, process_table
-from tests.conftest import LIMIT
+from tests.builders import MARGINAL, listener, scenario_of
+from tests.conftest import LIMIT, wait_until
 
 Message = tuple[str, bytes]
-
-
-def until(condition: Callable[[], Any], what: str, seconds: float = LIMIT) -> Any:
-    """The first true value of a condition; fails, saying what was waited for, if it stays false."""
-    deadline = time.monotonic() + seconds
-    while not (value := condition()):
-        assert time.monotonic() < deadline, f"waited {seconds:.0f} s in vain: {what}"
-        time.sleep(0.005)
-    return value
 
 
 def is_matched(end: zenoh.Publisher | zenoh.Querier) -> bool:
@@ -45,24 +35,21 @@ def is_matched(end: zenoh.Publisher | zenoh.Querier) -> bool:
     return bool(end.matching_status.matching)  # type: ignore[attr-defined]  # the stub says bool
 
 
-def scenario_of(**changes: Any) -> Scenario:
+def small_network(**changes: Any) -> Scenario:
     """A small scenario: legitimate estimator, a smart, a suspicious and a naive eavesdropper."""
-    tables: dict[str, Any] = {
-        "title": "Network test",
+    tables = {
         "slots": 64,
         "trials": 5,
         "seed": 91,
-        "process": process_table(MARGINAL),
         "encoding": {"scheme": "innovation", "state_probability": 0.4},
         "legitimate": {"link": {"quality": 0.8}},
         "eavesdroppers": {
-            "eve": {"strategy": "smart", "link": {"quality": 0.7}},
-            "mallory": {"strategy": "suspicious", "use_state": 0.8, "use_innovation": 0.2, "link": {"quality": 0.6}},
-            "nadia": {"strategy": "naive", "link": {"quality": 0.9}},
+            "eve": listener("smart", 0.7),
+            "mallory": listener("suspicious", 0.6, use_state=0.8, use_innovation=0.2),
+            "nadia": listener("naive", 0.9),
         },
-        **changes,
     }
-    return Scenario.model_validate(tables)
+    return scenario_of(MARGINAL, **{**tables, **changes})
 
 
 @dataclass
@@ -163,7 +150,7 @@ class Bench:
         """Publish with a process's credentials on a key it may write, in the order of all its other puts."""
         if (process, key) not in self._publishers:
             publisher = self.sessions[process].declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
-            until(lambda: is_matched(publisher), f"a reader of {key}")
+            wait_until(lambda: is_matched(publisher), f"a reader of {key}")
             self._publishers[process, key] = publisher
         self._publishers[process, key].put(enclosed(key, payload))
 
@@ -188,5 +175,7 @@ def bench_of(scenario: Scenario, folder: Path, protocol: str = "tcp") -> Iterato
 
 def brief_of_eve(**part: Any) -> AnyBrief:
     """The brief of the smart eavesdropper of that scenario, as it is read; part: entries of its part that differ."""
-    brief = briefs_of(scenario_of(), loopback_endpoints(None, None, False), ObserverTask(Path("nowhere"), False))["eve"]
+    brief = briefs_of(small_network(), loopback_endpoints(None, None, False), ObserverTask(Path("nowhere"), False))[
+        "eve"
+    ]
     return brief_from(json.loads(replace(brief, part=replace(brief.part, **part)).text))

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from tests.live.network.bench import Bench, bench_of, scenario_of
+from tests.live.network.bench import Bench, bench_of, small_network
 
 
 @pytest.fixture
@@ -20,6 +20,6 @@ def bench(tmp_path: Path) -> Iterator[Callable[..., Bench]]:
         def make(**changes: Any) -> Bench:
             folder = tmp_path / str(len(list(tmp_path.iterdir())))
             folder.mkdir()
-            return stack.enter_context(bench_of(scenario_of(**changes), folder))
+            return stack.enter_context(bench_of(small_network(**changes), folder))
 
         yield make

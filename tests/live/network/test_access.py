@@ -23,8 +23,8 @@ from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
 from evedrop.live.protocol.commands import End, Unknown
 from evedrop.live.protocol.envelope import enclosed
-from tests.conftest import LIMIT
-from tests.live.network.bench import Bench, Ear, bench_of, connect, scenario_of, until
+from tests.conftest import LIMIT, wait_until
+from tests.live.network.bench import Bench, Ear, bench_of, connect, small_network
 
 EVE = "eve"
 PROCESSES = ("sensor", "legitimate", "eve", "mallory", "nadia")
@@ -36,7 +36,7 @@ LINKS = 10  # attempts at a link between routers
 @pytest.fixture(scope="module")
 def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     """One router for all tests of this file: none of them may leave a trace in it."""
-    with bench_of(scenario_of(slots=100_000), tmp_path_factory.mktemp("access")) as one:
+    with bench_of(small_network(slots=100_000), tmp_path_factory.mktemp("access")) as one:
         yield one
 
 
@@ -109,7 +109,7 @@ def test_eavesdropper_hears_only_its_own_downlink(mode: str, stage: Bench) -> No
             flow(stage)
             return not ears_of_own.messages.empty()
 
-        until(delivered, "a delivery to the attacker")
+        wait_until(delivered, "a delivery to the attacker")
         first = stage.due
         talk(stage)
         slots = range(first, stage.due)
@@ -134,7 +134,7 @@ def attacking(stage: Bench, mode: str) -> Iterator[zenoh.Session]:
         for _ in range(LINKS):
             attacker = stack.enter_context(connect(stage.briefs[EVE], **MODES[mode]))
             with suppress(AssertionError):
-                until(lambda: knock(attacker), "the attacker's own telemetry", 2.0)  # noqa: B023 - used at once
+                wait_until(lambda: knock(attacker), "the attacker's own telemetry", 2.0)  # noqa: B023 - used at once
                 break
             stack.close()
         assert_heard(stage, attacker)
@@ -286,7 +286,7 @@ def test_no_session_without_credentials(who: str, mode: str, stage: Bench) -> No
 
 
 LOOP: dict[str, dict[str, Any]] = {
-    "plant": {"inputs": ["u"], "input_matrix": [[1.0], [0.0]]},
+    "plant": {"inputs": ["u"], "input_matrix": [[0.0], [1.0]]},
     "controller": {"strategy": "lqr", "state_weights": [1.0, 0.0], "input_weights": [1.0]},
 }
 
@@ -296,7 +296,7 @@ def test_eavesdropper_has_no_part_in_the_loop(acts_on: str, tmp_path: Path) -> N
     """It can read neither estimate nor state nor input, nor write any: what the others tell each other stays theirs."""
     tables = {**LOOP, "controller": {**LOOP["controller"], "acts_on": acts_on}}
     link = {"link": {"quality": 0.8}, "knows_input": acts_on == "estimate"}
-    with bench_of(scenario_of(**tables, legitimate=link), tmp_path) as bench, connect(bench.briefs[EVE]) as attacker:
+    with bench_of(small_network(**tables, legitimate=link), tmp_path) as bench, connect(bench.briefs[EVE]) as attacker:
         bench.sessions["controller"] = stack = connect(bench.briefs["controller"])
         keys, loop = bench.keys, (bench.keys.estimate, bench.keys.state, bench.keys.input)
         ears = {key: Ear() for key in (*loop, *wildcards(bench))}

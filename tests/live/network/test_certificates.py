@@ -31,7 +31,8 @@ from evedrop.live.protocol import packets
 from evedrop.live.protocol.brief import AnyBrief, read_brief
 from evedrop.live.protocol.brief_parts import Identity, ObserverPart
 from evedrop.system.ports import free_port
-from tests.live.network.bench import Bench, Ear, bench_of, connect, scenario_of, until
+from tests.conftest import wait_until
+from tests.live.network.bench import Bench, Ear, bench_of, connect, small_network
 
 EVE, MALLORY = "eve", "mallory"
 NOW = datetime.datetime(2026, 5, 4, 12, tzinfo=datetime.UTC)
@@ -41,7 +42,7 @@ ONCE = {"timeout_ms": 0, "exit_on_failure": True}
 @pytest.fixture(scope="module")
 def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     """One router for all tests of this file."""
-    with bench_of(scenario_of(slots=100_000), tmp_path_factory.mktemp("tls"), "tls") as one:
+    with bench_of(small_network(slots=100_000), tmp_path_factory.mktemp("tls"), "tls") as one:
         yield one
 
 
@@ -131,7 +132,7 @@ def test_a_certificate_opens_nothing_under_another_user(user: str, shown: str, s
             stage.settle("sensor")
             return not own.messages.empty()
 
-        until(heard, "what is rightfully heard")
+        wait_until(heard, "what is rightfully heard")
         for _ in range(3):
             flow(stage)
             stage.settle("sensor")
@@ -152,7 +153,7 @@ def test_with_the_own_certificate_an_eavesdropper_hears_its_own_alone(stage: Ben
             flow(stage)
             return not ears[stage.keys.downlink(EVE)].messages.empty()
 
-        until(heard, "its own delivery")
+        wait_until(heard, "its own delivery")
         flow(stage)
         assert {key for ear in ears.values() for key, _ in ear.all()} == {stage.keys.downlink(EVE)}
 
@@ -214,7 +215,7 @@ def test_the_operator_has_a_certificate_too(stage: Bench, tmp_path: Path) -> Non
 def test_private_keys_are_in_the_own_brief_alone(tmp_path: Path) -> None:
     """Every process has a key of its own, the operator's is with the observer, and the authority's is nowhere."""
     made = briefs_of(
-        scenario_of(), endpoints_at("tls/0.0.0.0:7447", "tls/router.lan:7447"), ObserverTask(tmp_path, False)
+        small_network(), endpoints_at("tls/0.0.0.0:7447", "tls/router.lan:7447"), ObserverTask(tmp_path, False)
     )
     texts = {name: brief.write(tmp_path).read_text() for name, brief in made.items()}
     keys = {name: json.loads(text)["identity"]["key"] for name, text in texts.items()}
@@ -238,7 +239,7 @@ def certificate_of(brief: AnyBrief) -> x509.Certificate:
 def test_certificates_say_what_they_are_for(tmp_path: Path) -> None:
     """The router's names its hosts and is for a server; all are for a client, and the others' name no host."""
     made = briefs_of(
-        scenario_of(), endpoints_at("tls/10.0.0.7:7447", "tls/router.lan:7447"), ObserverTask(tmp_path, False)
+        small_network(), endpoints_at("tls/10.0.0.7:7447", "tls/router.lan:7447"), ObserverTask(tmp_path, False)
     )
     names = certificate_of(made["router"]).extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     assert names.get_values_for_type(x509.DNSName) == ["router.lan"]

@@ -10,7 +10,7 @@ import pytest
 
 from evedrop.cli import main as cli
 from evedrop.live.network.health import is_there
-from tests.live.network.bench import Bench, bench_of, scenario_of
+from tests.live.network.bench import Bench, bench_of, small_network
 
 EVE = "eve"
 
@@ -44,7 +44,7 @@ def test_the_router_is_asked_for_itself(bench: Callable[..., Bench]) -> None:
 
 def test_behind_certificates_it_is_no_different(tmp_path: Path) -> None:
     """A router that listens everywhere is asked where it is found from its own machine, and has no name there."""
-    with bench_of(scenario_of(), tmp_path, protocol="tls") as stage:
+    with bench_of(small_network(), tmp_path, protocol="tls") as stage:
         assert is_there(replace(stage.briefs["router"], router=f"tls/0.0.0.0:{stage.briefs['router'].router[-5:]}"))
         assert not is_there(stage.briefs[EVE])
 

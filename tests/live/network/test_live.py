@@ -31,8 +31,8 @@ from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.scenario.tables import Scenario
-from tests.conftest import LIMIT
-from tests.live.network.bench import Ear, connect, until
+from tests.conftest import LIMIT, wait_until
+from tests.live.network.bench import Ear, connect
 from tests.processes import descendants, parent_of, words_of
 
 SCENARIO = """
@@ -182,7 +182,7 @@ def attack(folder: Path) -> Evidence:
             )
         )
         stack.callback(run.kill)
-        found = until(
+        found = wait_until(
             lambda: (here := processes_of(run.pid)).keys() == {*EVERYBODY, *SERVERS} and here, "all processes"
         )
         servers = [found.pop(server) for server in SERVERS]
@@ -194,7 +194,7 @@ def attack(folder: Path) -> Evidence:
         counts = {key: Ear() for key in meant}
         for key, name in meant.items():
             stack.enter_context(connect(briefs[name])).declare_subscriber(key, counts[key])
-        until(lambda: all(not ear.messages.empty() for ear in counts.values()), "the run to flow")
+        wait_until(lambda: all(not ear.messages.empty() for ear in counts.values()), "the run to flow")
         refused = []
         for name, user, password in (("none", "", ""), ("wrong password", "eve", "guess"), ("no user", "trudy", "x")):
             auth = {"auth": {"usrpwd": {"user": user, "password": password}}} if user else {}
@@ -207,7 +207,7 @@ def attack(folder: Path) -> Evidence:
         overheard = ask(eve, keys)
         disturb(eve, keys)
         sizes = {key: ear.messages.qsize() for key, ear in counts.items()}
-        until(
+        wait_until(
             lambda: all(ear.messages.qsize() >= sizes[key] + ENOUGH for key, ear in counts.items()), "the run to go on"
         )
         heard = {key: ear.messages.qsize() for key, ear in counts.items()}

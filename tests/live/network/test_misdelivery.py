@@ -27,8 +27,8 @@ from evedrop.live.protocol.envelope import enclosed, head_of, named_in
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.requests import StatusRequest
 from evedrop.system.ports import free_port
-from tests.conftest import LIMIT
-from tests.live.network.bench import is_matched, scenario_of, until
+from tests.conftest import LIMIT, wait_until
+from tests.live.network.bench import is_matched, small_network
 from tests.proxy import Cable, cable
 
 GOOD = progress(7)
@@ -47,7 +47,7 @@ class Stage:
         port = free_port()
         self.cable: Cable = stack.enter_context(cable(port))
         observation = ObserverTask(folder / "results", False)
-        self.briefs = briefs_of(scenario_of(), self.cable.endpoint, observation, ends_with_stdin=False)
+        self.briefs = briefs_of(small_network(), self.cable.endpoint, observation, ends_with_stdin=False)
         with users_file({"operator": "password", **{one.user: one.password for one in self.briefs.values()}}) as users:
             config = {
                 "mode": "router",
@@ -66,7 +66,7 @@ class Stage:
     def reads(self, key: str) -> None:
         """Wait until somebody reads a key."""
         publisher = self.router.declare_publisher(key)
-        until(lambda: is_matched(publisher), f"a reader of {key}")
+        wait_until(lambda: is_matched(publisher), f"a reader of {key}")
         publisher.undeclare()
 
     def put(self, key: str, messages: list[bytes]) -> None:
@@ -128,7 +128,7 @@ def test_a_question_that_names_another_key_is_not_answered(stage: Stage) -> None
     with Session(stage.briefs["observer"]) as session:
         session.asked(key, asked.put)
         querier = stage.router.declare_querier(key)
-        until(lambda: is_matched(querier), "somebody to be asked")
+        wait_until(lambda: is_matched(querier), "somebody to be asked")
         for message in foreign(stage.keys, key):
             assert list(stage.router.get(key, payload=message, timeout=2.0)) == []
         assert asked.empty()
@@ -193,13 +193,13 @@ def test_a_lost_connection_is_replaced(stage: Stage) -> None:
             assert [tokens.get(timeout=LIMIT) for _ in range(2)] == [False, True]
             assert [watched.get(timeout=LIMIT) for _ in range(2)] == [False, True]
             # One flap may cost two sessions; the news of the second then come early at the next flap.
-            until(lambda: str(session.connection.session.zid()) not in ids, "another session")
+            wait_until(lambda: str(session.connection.session.zid()) not in ids, "another session")
             ids.add(str(session.connection.session.zid()))
         stage.put(keys.downlink("eve"), [enclosed(keys.downlink("eve"), progress(2))])
         stage.put(keys.telemetry("eve"), [enclosed(keys.telemetry("eve"), progress(3))])
         assert [subscription.recv(), subscription.recv()] == [progress(1), progress(2)]
         assert handed_on.get(timeout=LIMIT) == progress(3)
-        until(lambda: session.reaches(keys.progress("eve")), "the reader of its progress")
+        wait_until(lambda: session.reaches(keys.progress("eve")), "the reader of its progress")
         put(GOOD)
         assert heard.get(timeout=LIMIT) == enclosed(keys.progress("eve"), GOOD)
     assert tokens.get(timeout=LIMIT) is False
@@ -218,7 +218,7 @@ def test_a_connection_that_takes_one_key_for_another_is_replaced(stage: Stage) -
 
         reads = threading.Thread(target=lambda: list(subscription))
         reads.start()
-        until(renewed, "another session")
+        wait_until(renewed, "another session")
     reads.join(LIMIT)
     assert not reads.is_alive()
 
@@ -251,7 +251,7 @@ def test_zenoh_reconnects_no_session(stage: Stage) -> None:
 
     with Session(stage.eve, opened=opened) as session:
         stage.cable.flap()
-        until(lambda: session.connection.openings > 1, "another session")
+        wait_until(lambda: session.connection.openings > 1, "another session")
     assert len(seen) > 1
     day = 24 * 3600 * 1000
     assert all(one["period_init_ms"] >= day and one["period_max_ms"] >= day for one in seen), seen

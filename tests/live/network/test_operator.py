@@ -21,7 +21,8 @@ from evedrop.live.protocol.envelope import enclosed, payload_of
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.requests import PauseRequest, StatusRequest, StepRequest
 from tests.builders import part_of
-from tests.live.network.bench import Bench, Ear, bench_of, connect, scenario_of, until
+from tests.conftest import wait_until
+from tests.live.network.bench import Bench, Ear, bench_of, connect, small_network
 
 OTHERS = ("sensor", "legitimate", "eve", "mallory", "nadia")
 PATIENCE = 5.0
@@ -30,7 +31,7 @@ PATIENCE = 5.0
 @pytest.fixture(scope="module")
 def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     """One router for all tests of this file, and an observer that answers."""
-    with bench_of(scenario_of(), tmp_path_factory.mktemp("operator")) as one:
+    with bench_of(small_network(), tmp_path_factory.mktemp("operator")) as one:
         yield one
 
 
@@ -60,7 +61,7 @@ def answering(stage: Bench) -> Iterator[list[bytes]]:
         query.drop()
 
     queryable = stage.sessions["observer"].declare_queryable(key, answer)
-    until(lambda: ask(control(stage), StatusRequest(), PATIENCE), "an observer that answers")
+    wait_until(lambda: ask(control(stage), StatusRequest(), PATIENCE), "an observer that answers")
     asked.clear()
     yield asked
     queryable.undeclare()

@@ -29,7 +29,7 @@ from evedrop.live.protocol.keys import RunKeys
 from evedrop.model.process import Floats
 from tests.conftest import LIMIT
 from tests.live.in_memory import Stage
-from tests.live.network.bench import Bench, scenario_of
+from tests.live.network.bench import Bench, small_network
 
 
 def uniforms_of(key: bytes, slots: int, trials: range) -> np.ndarray:
@@ -62,7 +62,7 @@ class MemoryBench:
     """The work of a router in a thread of its own, on a session in memory, with everybody else played by the test."""
 
     def __init__(self, **changes: Any) -> None:
-        self.scenario = scenario_of(**changes)
+        self.scenario = small_network(**changes)
         self.briefs = briefs_of(self.scenario, "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False))
         brief = self.briefs["router"]
         assert isinstance(brief.part, RouterPart)

@@ -26,7 +26,8 @@ from evedrop.live.protocol.envelope import enclosed
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.names import RELAY
 from tests.builders import part_of
-from tests.live.network.bench import Bench, Ear, bench_of, connect, scenario_of, until
+from tests.conftest import wait_until
+from tests.live.network.bench import Bench, Ear, bench_of, connect, small_network
 
 EVE = "eve"
 RECEIVERS = ("legitimate", "eve", "mallory", "nadia")
@@ -36,7 +37,7 @@ ONCE = {"timeout_ms": 0, "exit_on_failure": True}
 @pytest.fixture(scope="module", params=["tcp", "tls"])
 def stage(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     """A router and a relay for all tests of this file, in clear and with certificates."""
-    scenario = scenario_of(slots=100_000, network={"routers": 2})
+    scenario = small_network(slots=100_000, network={"routers": 2})
     with bench_of(scenario, tmp_path_factory.mktemp("linked"), request.param) as one:
         yield one
 
@@ -80,7 +81,7 @@ def test_an_eavesdropper_at_the_relay_hears_its_own_alone(stage: Bench) -> None:
             flow(stage)
             return not ears[keys.downlink(EVE)].messages.empty()
 
-        until(heard, "its own delivery")
+        wait_until(heard, "its own delivery")
         for _ in range(4):
             flow(stage)
             stage.settle("sensor")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from evedrop.live.protocol.brief_parts import EavesdropperPart
 from evedrop.live.protocol.brief_use import expect_usable
 from evedrop.scenario.loading import load
 from evedrop.scenario.tables import Scenario
+from tests.builders import listener, scenario_of
 
 BRIEF = Brief(
     run="r01",
@@ -34,26 +34,19 @@ BRIEF = Brief(
 )
 
 
-def scenario_of(seed: int = 3, **changes: Any) -> Scenario:
+def briefed(seed: int = 3, **changes: Any) -> Scenario:
     """A scenario with one eavesdropper of each strategy."""
-    link = {"link": {"quality": 0.8}}
-    suspicious = {"strategy": "suspicious", "use_state": 0.9, "use_innovation": 0.1, **link}
-    table: dict[str, Any] = {
-        "title": "Briefs",
+    tables: dict[str, Any] = {
         "slots": 50,
         "seed": seed,
-        "process": asdict(BRIEF.model),
-        "encoding": {"scheme": "innovation", "state_probability": 0.5},
-        "legitimate": link,
+        "legitimate": {"link": {"quality": 0.8}},
         "eavesdroppers": {
-            "naive": {"strategy": "naive", **link},
-            "smart": {"strategy": "smart", **link},
-            "doubtful": suspicious,
+            "naive": listener("naive", 0.8),
+            "smart": listener("smart", 0.8),
+            "doubtful": listener("suspicious", 0.8, use_state=0.9, use_innovation=0.1),
         },
     }
-    for entry in ("state_probability", "state_probabilities", "header"):
-        del table["process"][entry]
-    return Scenario.model_validate({**table, **changes})
+    return scenario_of(BRIEF.model.process, **{**tables, **changes})
 
 
 def made(scenario: Scenario) -> dict[str, AnyBrief]:

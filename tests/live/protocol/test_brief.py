@@ -20,7 +20,7 @@ from evedrop.live.protocol.brief_parts import EavesdropperPart, ObserverPart, Ro
 from evedrop.scenario.stream_keys import StreamKeys
 from tests.conftest import Evedrop
 from tests.examples import mostly_long
-from tests.live.protocol.made_briefs import BRIEF, BRIEFS, made, refusal, scenario_of
+from tests.live.protocol.made_briefs import BRIEF, BRIEFS, briefed, made, refusal
 
 PLAIN: dict[str, Any] = json.loads(BRIEF.text)
 
@@ -117,7 +117,7 @@ def test_refuses_what_is_not_there(tmp_path: Path) -> None:
 
 def test_who_is_given_which_keys() -> None:
     """Each process has the keys of the streams it owns by definition, and no others."""
-    found = {name: set(brief.keys) for name, brief in made(scenario_of()).items()}
+    found = {name: set(brief.keys) for name, brief in made(briefed()).items()}
     assert found == {
         "router": {
             f"{what}/{name}"
@@ -135,14 +135,14 @@ def test_who_is_given_which_keys() -> None:
 
 def test_without_secret_nobody_has_its_keys() -> None:
     """The plain scheme has no secret: sensor and estimator are given none."""
-    briefs = made(scenario_of(encoding={"scheme": "plain"}, eavesdroppers={}))
+    briefs = made(briefed(encoding={"scheme": "plain"}, eavesdroppers={}))
     assert set(briefs["sensor"].keys) == {"process"}
     assert set(briefs["legitimate"].keys) == set()
 
 
 def test_keys_agree_between_those_who_share_them() -> None:
     """All processes with a stream have the same key; different streams have different keys."""
-    briefs = made(scenario_of())
+    briefs = made(briefed())
     for stream in ("schedule", "noise"):
         assert len({brief.keys[stream] for brief in briefs.values() if stream in brief.keys}) == 1
     everything = {(name, key) for brief in briefs.values() for name, key in brief.keys.items()}
@@ -153,17 +153,17 @@ def test_a_secret_file_replaces_the_seed_where_it_must(tmp_path: Path) -> None:
     """With a secret of its own a scenario has other schedule and noise keys, and everything else as before."""
     secret = tmp_path / "secret"
     secret.write_bytes(bytes(range(40)))
-    plain, own = made(scenario_of()), made(scenario_of(secret_file=str(secret)))
+    plain, own = made(briefed()), made(briefed(secret_file=str(secret)))
     for name, brief in plain.items():
         for stream, key in brief.keys.items():
             assert (own[name].keys[stream] == key) == (stream not in {"schedule", "noise"})
-    keys = [StreamKeys.from_scenario(one) for one in (scenario_of(secret_file=str(secret)), scenario_of())]
+    keys = [StreamKeys.from_scenario(one) for one in (briefed(secret_file=str(secret)), briefed())]
     assert keys[0].seed_root == keys[1].seed_root
 
 
 def test_passwords_and_run_are_made_afresh() -> None:
     """Two runs of one scenario share no password, each process has its own, and the router alone knows all."""
-    first, second = made(scenario_of()), made(scenario_of())
+    first, second = made(briefed()), made(briefed())
     passwords = [brief.password for briefs in (first, second) for brief in briefs.values()]
     assert len(set(passwords)) == len(passwords) == 14
     assert min(map(len, passwords)) >= 32
@@ -178,8 +178,8 @@ def test_passwords_and_run_are_made_afresh() -> None:
 
 def test_an_added_eavesdropper_changes_nobody_elses_keys() -> None:
     """Keys of streams depend on their own names only."""
-    fewer = scenario_of()
-    more = scenario_of(
+    fewer = briefed()
+    more = briefed(
         eavesdroppers={**fewer.model_dump()["eavesdroppers"], "extra": fewer.model_dump()["eavesdroppers"]["smart"]}
     )
     before, after = made(fewer), made(more)
@@ -189,7 +189,7 @@ def test_an_added_eavesdropper_changes_nobody_elses_keys() -> None:
 
 def test_model_is_the_only_thing_all_share() -> None:
     """Every brief holds the public model; no eavesdropper's brief holds anything of the scenario beyond its own part."""
-    briefs = made(scenario_of())
+    briefs = made(briefed())
     assert len({json.dumps(asdict(brief.model)) for brief in briefs.values()}) == 1
     assert json.loads(briefs["doubtful"].text)["part"] == {
         "strategy": "suspicious",
@@ -202,7 +202,7 @@ def test_model_is_the_only_thing_all_share() -> None:
 def test_no_secret_is_in_what_python_shows_of_a_brief() -> None:
     """Neither keys, passwords, private keys nor the seed: they would be in a traceback, and so in a log."""
     made_for = endpoints_at("tls/0.0.0.0:7447", "tls/router.lan:7447")
-    for brief in briefs_of(scenario_of(seed=987_654_321), made_for, ObserverTask(Path("nowhere"), False)).values():
+    for brief in briefs_of(briefed(seed=987_654_321), made_for, ObserverTask(Path("nowhere"), False)).values():
         shown, found = repr(brief), json.loads(brief.text)
         secrets = [brief.password, *brief.keys.values(), *found["part"].get("users", {}).values()]
         secrets += [found["part"].get("operator"), found["identity"]["key"], "PRIVATE KEY", "987654321"]
@@ -221,7 +221,7 @@ def test_no_secret_is_in_what_python_shows_of_a_brief() -> None:
 )
 def test_a_malformed_outage_is_refused(role: str, outage: list[Any], said: str, tmp_path: Path) -> None:
     """It is refused before the receiver joins the run."""
-    found = json.loads(made(scenario_of())[role].text)
+    found = json.loads(made(briefed())[role].text)
     found["part"]["outages"] = [outage]
     assert said in str(refusal(found, tmp_path))
 
@@ -229,7 +229,7 @@ def test_a_malformed_outage_is_refused(role: str, outage: list[Any], said: str, 
 @pytest.mark.parametrize("wrong", [[0.5] * 3, [1.5], [-0.1]])
 def test_probabilities_that_are_not_one_for_each_slot_are_refused(wrong: list[float], tmp_path: Path) -> None:
     """A list of μ_d(k) has one number from 0 to 1 for each slot."""
-    found = json.loads(made(scenario_of())["smart"].text)
+    found = json.loads(made(briefed())["smart"].text)
     found["model"]["state_probabilities"] = wrong if len(wrong) > 1 else wrong * found["slots"]
     assert "model.state_probabilities are not" in str(refusal(found, tmp_path))
     found["model"]["state_probabilities"] = [0.5] * found["slots"]
@@ -239,7 +239,7 @@ def test_probabilities_that_are_not_one_for_each_slot_are_refused(wrong: list[fl
 @pytest.mark.parametrize("role", ["router", "sensor", "legitimate", "smart", "observer"])
 def test_unknown_entries_of_a_part_are_refused(role: str, tmp_path: Path) -> None:
     """As those of the brief itself."""
-    found = json.loads(made(scenario_of())[role].text)
+    found = json.loads(made(briefed())[role].text)
     found["part"]["seed"] = 3
     assert "(part.seed is an unknown entry)" in str(refusal(found, tmp_path))
 
@@ -331,7 +331,7 @@ def test_a_brief_without_its_key_is_refused(name: str, tmp_path: Path) -> None:
 def test_a_process_without_its_key_ends_with_status_2(evedrop: Evedrop) -> None:
     """Typed as a user does it: one line, before it waits for anybody."""
     for process, stream in (("sensor", "process"), ("smart", "schedule"), ("router", "link/legitimate")):
-        brief = made(scenario_of())[process]
+        brief = made(briefed())[process]
         path = replace(brief, keys={name: key for name, key in brief.keys.items() if name != stream}).write(
             evedrop.folder
         )

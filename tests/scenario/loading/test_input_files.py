@@ -19,8 +19,8 @@ from evedrop.model.links.pattern import Pattern
 from evedrop.scenario.input_files import read_recordings
 from evedrop.scenario.loading import load, parse
 from evedrop.system.files import Limit, Unreadable, contents, lines_of
+from tests.builders import BASE, mistakes_of
 from tests.conftest import Evedrop
-from tests.scenario.loading.refused import BASE, mistakes
 
 PLANT = """
 [plant]
@@ -75,7 +75,7 @@ def test_what_is_no_file_is_read_nowhere(kind: str, tmp_path: Path) -> None:
     trace = f'{{ model = "trace", file = "{path}" }}'
     trace = f"[legitimate]\nlink = {{ loss = {trace}, delay = {trace} }}"
     text = f'secret_file = "{path}"\n' + BASE.replace("[legitimate]\nlink = { quality = 0.9 }", trace)
-    found = mistakes(text + PLANT.format(file=path))
+    found = mistakes_of(parse, text + PLANT.format(file=path), "scenario.toml")
     for entry in ("secret_file", "legitimate.link.loss.file", "legitimate.link.delay.file", "plant.disturbance_file"):
         assert any(one.startswith(f"{entry}: ") and f"cannot be read ({SPECIAL[kind]})" in one for one in found), entry
     if kind not in ("folder", "nothing", "long"):
@@ -85,7 +85,7 @@ def test_what_is_no_file_is_read_nowhere(kind: str, tmp_path: Path) -> None:
 
 def test_a_path_with_a_zero_byte_is_refused() -> None:
     """TOML can write one; no file has it."""
-    (mistake,) = mistakes('secret_file = "a\\u0000b"\n' + BASE)
+    (mistake,) = mistakes_of(parse, 'secret_file = "a\\u0000b"\n' + BASE, "scenario.toml")
     assert (
         mistake
         == 'secret_file: is "a\\u0000b" with the character U+0000 in it; expected text without control characters'
@@ -159,7 +159,12 @@ def test_a_damaged_gz_file_is_refused(tmp_path: Path) -> None:
     whole = gzip.compress(b"P_load\n" + b"0.5\n" * 100_000)
     for damaged in (whole[:-20], whole[:200], whole[:30] + b"\xff" * 60 + whole[90:], b"\x1f\x8b\x08"):
         (tmp_path / "day.csv.gz").write_bytes(damaged)
-        found = mistakes(BASE.replace("slots = 50", "slots = 100000") + PLANT.format(file="day.csv.gz"), tmp_path)
+        found = mistakes_of(
+            parse,
+            BASE.replace("slots = 50", "slots = 100000") + PLANT.format(file="day.csv.gz"),
+            "scenario.toml",
+            folder=tmp_path,
+        )
         assert any("day.csv.gz cannot be read (" in one for one in found)
 
 

@@ -16,8 +16,8 @@ from evedrop.model.theory.horizon import horizon
 from evedrop.results.folder import claimed, default_folder
 from evedrop.scenario.loading import load, parse
 from evedrop.system.files import Unreadable
+from tests.builders import BASE, mistakes_of
 from tests.conftest import Evedrop
-from tests.scenario.loading.refused import BASE, mistakes
 from tests.scenario.loading.test_input_files import measured
 
 POOLED = """
@@ -45,7 +45,7 @@ def test_all_mistyped_models_of_events_are_told_at_once() -> None:
             event('{ loss = { model = "mine:Own" } }'),
         ]
     )
-    found = "\n".join(mistakes(text))
+    found = "\n".join(mistakes_of(parse, text, "scenario.toml"))
     for said in (
         'event.0.set.loss.model: is "bernouli"; expected bernoulli, distance, gilbert-elliott, markov, pattern or trace; did you',
         'event.1.set.delay.model: is "konstant"; expected constant, normal, pareto or trace; did you mean constant?',
@@ -71,7 +71,7 @@ def test_a_change_replaces_the_other_form_of_a_links_losses() -> None:
 def test_an_event_on_pooled_links_is_looked_at_too() -> None:
     """It puts one link in place of them all, which needs a quality or a loss model; both are checked."""
     text = BASE + POOLED + event("{ corrupt = 0.1 }", "pool") + event('{ loss = { model = "nope" } }', "pool", 5)
-    found = mistakes(text)
+    found = mistakes_of(parse, text, "scenario.toml")
     assert (
         found[0].partition(" (line")[0]
         == "event.0.set: pool has several links; expected a quality or a loss, for the one link that replaces them"
@@ -169,7 +169,7 @@ def test_the_horizon_is_the_same_slot_by_slot_and_in_halves(n: int, radius: floa
 )  # fmt: skip
 def test_what_no_entry_can_be_is_refused(text: str, said: str) -> None:
     """Numbers, names, texts and tables beyond all bounds; each in a line of some length."""
-    found = mistakes(text)
+    found = mistakes_of(parse, text, "scenario.toml")
     assert any(said in one for one in found), found
     assert all(len(one) < 1000 for one in found)
     assert len(found) < 200

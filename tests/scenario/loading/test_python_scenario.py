@@ -24,9 +24,8 @@ from evedrop.scenario.loading.file import with_event
 from evedrop.simulate.montecarlo import Plan
 from evedrop.wire.file import example_wire, wire_of
 from evedrop.wire.timeline import with_change
-from tests.builders import digests_of
+from tests.builders import GOOD, digests_of, mistakes_in_good
 from tests.scenario.conformance.own_classes import BLOCK, PAGE
-from tests.scenario.good import GOOD, mistakes
 
 
 def vehicle(**others: Any) -> Scenario:
@@ -108,7 +107,7 @@ def test_a_mistake_is_told_as_for_a_file(changes: dict[str, Any]) -> None:
     """All mistakes at once, each with its key; also those that show only when tables are compared."""
     with pytest.raises(ScenarioError) as caught:
         vehicle().replace(changes)
-    assert caught.value.mistakes == mistakes(changes)
+    assert caught.value.mistakes == mistakes_in_good(changes)
 
 
 def test_all_mistakes_of_a_new_scenario_are_told_at_once() -> None:

@@ -11,6 +11,7 @@ import pytest
 from evedrop.errors import DisturbanceError
 from evedrop.scenario.recordings import disturbance_file as plant_data
 from evedrop.scenario.recordings.disturbance_file import read_disturbances, table_text
+from tests.builders import mistakes_of
 
 NAMES = ("P_solar", "P_load")
 UNITS = ("kW", "kW")
@@ -24,12 +25,9 @@ def write(folder: Path, text: str, name: str = "day.csv") -> Path:
     return path
 
 
-def mistakes(path: Path, slots: int = 3, slot_seconds: float = 1.0) -> list[str]:
-    """What is said of a file."""
-    with pytest.raises(DisturbanceError) as caught:
-        read_disturbances(path, NAMES, UNITS, slots, slot_seconds)
-    assert caught.value.exit_status == 2
-    return caught.value.mistakes
+def read(path: Path, slots: int = 3, slot_seconds: float = 1.0) -> object:
+    """What is read of a file."""
+    return read_disturbances(path, NAMES, UNITS, slots, slot_seconds)
 
 
 @pytest.mark.parametrize(
@@ -53,7 +51,7 @@ def test_slots_may_last_longer(tmp_path: Path) -> None:
     rows = "".join(f"{0.1 * k:.1f},1,2\n" for k in range(1000))
     path = write(tmp_path, f"time [s],P_solar [kW],P_load [kW]\n{rows}")
     assert len(read_disturbances(path, NAMES, UNITS, 1000, 0.1)) == 1000
-    assert "expected 60 s, for slots of 60 s" in mistakes(path, 10, 60.0)[0]
+    assert "expected 60 s, for slots of 60 s" in mistakes_of(read, path, 10, 60.0)[0]
 
 
 @pytest.mark.parametrize(
@@ -79,20 +77,20 @@ def test_slots_may_last_longer(tmp_path: Path) -> None:
 )  # fmt: skip
 def test_what_is_wrong_with_a_day_is_said(tmp_path: Path, text: str, said: str) -> None:
     """With the line, what was found there, and what was expected."""
-    found = mistakes(write(tmp_path, text))
+    found = mistakes_of(read, write(tmp_path, text))
     assert any(line.startswith(said) for line in found), found
 
 
 def test_all_that_is_wrong_is_said_at_once(tmp_path: Path) -> None:
     """Every column that is wrong, and the first lines that are with the number of them all."""
-    header = mistakes(write(tmp_path, "time [h],P_solar [A],P_load\n0,1,2\n"))
+    header = mistakes_of(read, write(tmp_path, "time [h],P_solar [A],P_load\n0,1,2\n"))
     assert [line.split(";")[0] for line in header] == [
         'line 1: the column "time" is in [h]',
         'line 1: the column "P_solar" is in [A]',
         'line 1: the column "P_load" has no unit',
     ]
     rows = "".join(f"{k},x,{'y' if k == 1 else 1}\n" for k in range(20))
-    found = mistakes(write(tmp_path, f"time [s],P_solar [kW],P_load [kW]\n{rows}"), 20)
+    found = mistakes_of(read, write(tmp_path, f"time [s],P_solar [kW],P_load [kW]\n{rows}"), 20)
     assert found[1:3] == [
         'line 3: P_solar is "x"; expected a finite number',
         'line 3: P_load is "y"; expected a finite number',
@@ -108,7 +106,7 @@ def test_what_is_no_file_is_said(tmp_path: Path, name: str, content: bytes | Non
     """It is not there, not compressed as its name says, or no text."""
     if content is not None:
         (tmp_path / name).write_bytes(content)
-    (line,) = mistakes(tmp_path / name)
+    (line,) = mistakes_of(read, tmp_path / name)
     assert line.startswith(("cannot be read (", "is empty"))
     assert "expected a" in line
 

@@ -15,12 +15,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evedrop.cli.api import montecarlo
-from evedrop.errors import ScenarioError, TraceError
+from evedrop.errors import TraceError
 from evedrop.model.checks import as_toml
 from evedrop.scenario.loading import load
 from evedrop.scenario.recordings import link_recording as traces
 from evedrop.scenario.recordings.link_recording import LinkRecording
-from tests.builders import scalar_tables
+from evedrop.scenario.tables import Scenario
+from tests.builders import mistakes_of, scalar_tables
 from tests.conftest import Evedrop
 
 GOOD = scalar_tables(1.0, 0.01, slots=6, legitimate={"link": {"loss": {"model": "trace", "file": "walk.csv"}}})
@@ -120,7 +121,7 @@ def test_what_is_no_recording_is_said(
     assert (caught.value.entry, caught.value.exit_status) == (entry, 2)
     assert said in caught.value.what
     loss = {"model": "trace", "file": name, **({} if column is None else {"column": column})}
-    (line,) = mistakes(tmp_path, loss)
+    (line,) = mistakes_of(with_trace, tmp_path, loss)
     assert line.startswith(f"legitimate.link.loss.{entry}: ")
     assert said in line
 
@@ -152,12 +153,10 @@ def test_a_delay_that_is_none_is_said(tmp_path: Path, delay: str) -> None:
         LinkRecording(path).delays("delay")
 
 
-def mistakes(folder: Path, loss: dict[str, Any], **more: Any) -> list[str]:
-    """What is said of the scenario with this trace."""
+def with_trace(folder: Path, loss: dict[str, Any], **more: Any) -> Scenario:
+    """The scenario with this trace."""
     tables = {**GOOD, **more, "legitimate": {"link": {"loss": loss}}}
-    with pytest.raises(ScenarioError) as caught:
-        load(write(folder, "mine.toml", tomli_w.dumps(tables)))
-    return caught.value.mistakes
+    return load(write(folder, "mine.toml", tomli_w.dumps(tables)))
 
 
 @pytest.mark.parametrize(
@@ -179,7 +178,7 @@ def mistakes(folder: Path, loss: dict[str, Any], **more: Any) -> list[str]:
 def test_a_mistake_of_a_scenarios_trace_is_named(tmp_path: Path, loss: dict[str, Any], said: str) -> None:
     """One line each, with its path."""
     write(tmp_path, "walk.csv", "1\n0\n1\n1\n")
-    (line,) = mistakes(tmp_path, {"model": "trace", **loss})
+    (line,) = mistakes_of(with_trace, tmp_path, {"model": "trace", **loss})
     assert line.startswith("legitimate.link.loss.")
     assert said in line
 
@@ -187,7 +186,9 @@ def test_a_mistake_of_a_scenarios_trace_is_named(tmp_path: Path, loss: dict[str,
 def test_mistakes_of_recordings_hide_no_others(tmp_path: Path) -> None:
     """Two files that are not recordings and a wrong entry: three lines."""
     eve = {"strategy": "smart", "link": {"loss": {"model": "trace", "file": "other.csv", "once": True}}}
-    found = mistakes(tmp_path, {"model": "trace", "file": "walk.csv"}, eavesdroppers={"eve": eve}, slots=0)
+    found = mistakes_of(
+        with_trace, tmp_path, {"model": "trace", "file": "walk.csv"}, eavesdroppers={"eve": eve}, slots=0
+    )
     assert sorted(line.partition(":")[0] for line in found) == [
         "eavesdroppers.eve.link.loss.file", "legitimate.link.loss.file", "slots",
     ]  # fmt: skip

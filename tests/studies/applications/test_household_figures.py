@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import sys
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from evedrop.scenario.loading import checked
 from evedrop.score.energy import Meter, energy
 from evedrop.simulate.montecarlo import Plan
 from evedrop.studies.applications.microgrid import privacy
+from tests.builders import changed, listener
 from tests.conftest import Evedrop
 from tests.scenario.test_plant_tables import LOOP
 from tests.studies.applications.test_microgrid import part_of_day
@@ -26,21 +26,12 @@ from tests.studies.applications.test_microgrid import part_of_day
 SLOTS = 1200
 
 
-def tables(**changes: Any) -> dict[str, Any]:
-    """The scenario of the plant's tests with a house; changes by dotted key, `__` for the dot; None takes one out."""
-    made = copy.deepcopy(LOOP)
-    made["household"] = {"grid": "P_grid", "load": "P_load", "sun": "P_solar", "battery": "SOC"}
-    made["eavesdroppers"] = {"eve": {"strategy": "smart", "link": {"quality": 0.6}}}
-    for key, value in changes.items():
-        *path, last = key.split("__")
-        inner = made
-        for name in path:
-            inner = inner[name]
-        if value is None:
-            del inner[last]
-        else:
-            inner[last] = value
-    return made
+HOUSE: dict[str, Any] = {
+    **LOOP,
+    "household": {"grid": "P_grid", "load": "P_load", "sun": "P_solar", "battery": "SOC"},
+    "eavesdroppers": {"eve": listener("smart", 0.6)},
+}
+"""The scenario of the plant's tests with a house."""
 
 
 @pytest.mark.parametrize(
@@ -62,7 +53,7 @@ def tables(**changes: Any) -> dict[str, Any]:
 def test_a_mistake_about_the_house_is_named(changes: dict[str, Any], said: str) -> None:
     """With its path, what was found and what there is."""
     with pytest.raises(ScenarioError) as caught:
-        checked(tables(**changes), "file")
+        checked(changed(HOUSE, **changes), "file")
     assert [line for line in caught.value.mistakes if line.startswith(said)], caught.value.mistakes
 
 
@@ -117,7 +108,7 @@ def test_a_broken_solver_is_told_in_one_line(
 def test_a_house_needs_a_plant() -> None:
     """And a controller."""
     with pytest.raises(ScenarioError) as caught:
-        checked(tables(plant=None, controller=None, legitimate__knows_input=False), "file")
+        checked(changed(HOUSE, plant=None, controller=None, legitimate__knows_input=False), "file")
     assert "household: is given without a [plant] and a [controller]" in caught.value.mistakes[0]
 
 
