@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from evedrop.model import update
-from evedrop.model.block_methods import outdated
+from evedrop.model.block_methods import complete, needed, outdated
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Belief, Beliefs, Codes, Flags, Receiver, Reception
+
+
+def _use_one(uses_block: Callable[..., Flags | None]) -> Callable[..., Flags | None]:
+    def uses(self: PacketUser, k: int) -> Flags | None:
+        found = uses_block(self, range(k, k + 1))
+        return None if found is None else found[0]
+
+    return uses
 
 
 class PacketUser(Receiver):
@@ -20,19 +28,19 @@ class PacketUser(Receiver):
     """
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Take `uses_block` from this class again in a subclass that changes `uses` alone.
+        """Complete `uses_block` and `uses`.
 
-        It also takes `follow` from `Receiver` again, where it inherits one that may not ask `uses_block`.
+        A subclass that changes `uses` takes `follow` from `Receiver` again, where it inherits one that may not ask `uses_block`.
         """
         super().__init_subclass__(**options)
-        if outdated(cls, "uses_block", "uses"):
-            setattr(cls, "uses_block", PacketUser.uses_block)  # noqa: B010 - mypy refuses the assignment
+        complete(cls, PacketUser, "uses_block", "uses", _use_one)
         if outdated(cls, "follow", "uses") and cls.follow is not PacketUser.follow:
-            setattr(cls, "follow", Receiver.follow)  # noqa: B010 - the same
+            setattr(cls, "follow", Receiver.follow)  # noqa: B010 - mypy refuses the assignment
 
-    @abstractmethod
+    @needed
     def uses(self, k: int) -> Flags | None:
         """b_k (R,): whether a packet received in slot k is used as the state; None means always."""
+        raise NotImplementedError
 
     def act(self, k: int, gamma: Flags) -> Codes:
         """Lost, used as the state, or discarded."""

@@ -103,12 +103,8 @@ class ProcessNoise:
         self._factor = process.noise_factor if covariance is None else semidefinite_factor(covariance)
         self._noise = Ahead(self._reader.ahead, self._drawn)
 
-    def at(self, k: int) -> Floats:
-        """The noise that slot k adds to A x_{k−1}, (n, R)."""
-        return self._noise.at(k)
-
     def block(self, slots: range) -> Floats:
-        """The noise of consecutive slots, (c, n, R)."""
+        """The noise that each of consecutive slots k adds to A x_{k−1}, (c, n, R)."""
         return self._noise.of(slots)
 
     def _drawn(self, slots: range) -> Floats:
@@ -145,15 +141,9 @@ class Trajectory:
 
     def advance(self, pushed: Floats | None = None) -> Floats:
         """The next slot's state, (n, R); pushed: the effect of inputs and disturbances on it, (n, R) or (n, 1)."""
-        noise = self._noise.at(self._next)
-        if self._next == 0:
-            self.x = noise
-        else:
-            predicted, x = kernels.advance(self._process.A, noise[None], self.x)
-            self.predicted, self.x = predicted[0], x[0]
+        self.advance_block(1)
         if pushed is not None:
             self.x = self.x + pushed
-        self._next += 1
         return self.x
 
     def advance_block(self, count: int) -> tuple[Floats, Floats]:

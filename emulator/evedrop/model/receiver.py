@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.model.block_methods import outdated
+from evedrop.model.block_methods import complete, needed
 from evedrop.model.kernels.current import kernels
 from evedrop.model.process import Floats, Process
 
@@ -145,14 +145,20 @@ def prior(process: Process, trials: int, first: int = 0) -> Belief:
     return Belief(np.zeros((process.n, trials)), np.repeat(sigma, trials, axis=2), np.zeros(trials, np.uint8))
 
 
+def _step_one(follow: Callable[..., tuple[Beliefs, Belief]]) -> Callable[..., Belief]:
+    return lambda self, k, belief, heard: follow(self, range(k, k + 1), belief, heard.gamma[None], heard.z[None])[1]
+
+
 class Receiver(ABC):
-    """Turns deliveries into beliefs, slot by slot. It keeps no state except what its secret streams read ahead."""
+    """Turns deliveries into beliefs. It keeps no state except what its secret streams read ahead.
+
+    A subclass writes `follow`, or `step` if it reads headers or betrayed states, or takes one slot at a time.
+    """
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Take `follow` from this class again in a subclass that changes a slot and not a block of slots."""
+        """Complete the pair of methods."""
         super().__init_subclass__(**options)
-        if outdated(cls, "follow", "step", "act"):
-            setattr(cls, "follow", Receiver.follow)  # noqa: B010 - mypy refuses the assignment
+        complete(cls, Receiver, "follow", "step", _step_one, "act")
 
     def __init__(self, process: Process, trials: int) -> None:
         self.process = process
@@ -166,9 +172,10 @@ class Receiver(ABC):
     def act(self, k: int, gamma: Flags) -> Codes:
         """`Action` of slot k in every trial, (R,), from γ (R,) alone: no scheme of this kind looks at the packet first."""
 
-    @abstractmethod
+    @needed
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """Belief after slot k, from the belief before it and the reception in it. Any slot may be asked for again."""
+        raise NotImplementedError
 
     def follow(self, slots: range, belief: Belief, gamma: Flags, z: Floats) -> tuple[Beliefs, Belief]:
         """The beliefs after consecutive slots, and the last of them, from γ (c, R) and packets z (c, n, R) without headers.

@@ -172,7 +172,7 @@ class Simulation:
             measured = self._blank(chunk, links)
             delivered = {name: link.in_time for name, link in links.items()}
             for row, k in enumerate(chunk):
-                nu, w = self._nu(k), noise.at(k)
+                nu, w = self._nu(k), noise.block(range(k, k + 1))[0]
                 if trajectory is not None:
                     trajectory.advance()
                 for name, action, one in self._acts(k, row, measured, delivered):

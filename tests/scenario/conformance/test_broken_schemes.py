@@ -91,9 +91,9 @@ class Discards(PlainEstimator):
 class AllInnovations(SharedSecret):  # type: ignore[misc]  # final: nobody should do this
     """Slot 0 as any other."""
 
-    def nu(self, k: int) -> Flags:
+    def nu_block(self, slots: range) -> Flags:
         """Always."""
-        return np.ones_like(super().nu(k))
+        return np.ones_like(super().nu_block(slots))
 
 
 class NoFirst(Innovation):

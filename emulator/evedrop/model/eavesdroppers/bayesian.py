@@ -17,7 +17,7 @@ from evedrop.model.kernels.elementary import cholesky
 from evedrop.model.kernels.factored import Factor, Factors
 from evedrop.model.kernels.mixtures import Mixture
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Belief, Beliefs, Flags, Reception
+from evedrop.model.receiver import Belief, Beliefs, Flags
 from evedrop.model.schedule import equal_slots, in_slot
 from evedrop.model.streams import Batch
 from evedrop.model.theory.leak import Leaks
@@ -60,12 +60,8 @@ class Bayesian(PacketReader):
         nothing = np.zeros((n * (n - 1) // 2, 1, trials)), np.zeros((n, 1, trials))
         return belief._replace(memory=Mixture(np.ones((1, trials)), self._stairs.inward(x)[:, None, :], *nothing))
 
-    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
-        """Predict every component, weight it by the packet and add the packet's own; returns their common mean and covariance."""
-        return self.follow(range(k, k + 1), belief, heard.gamma[None], heard.z[None])[1]
-
     def follow(self, slots: range, belief: Belief, gamma: Flags, z: Floats) -> tuple[Beliefs, Belief]:
-        """The same in many slots at once."""
+        """Predict every component, weight it by the packet and add the packet's own; returns common means and covariances."""
         mixture, parts, stairs = belief.memory, [], self._stairs
         z = stairs.inward(z)
         for some in equal_slots(self._mu_d, slots):

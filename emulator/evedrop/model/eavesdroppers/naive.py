@@ -20,10 +20,6 @@ class Naive(PacketTaker):
         """Certain for both types."""
         return 1.0, 1.0
 
-    def uses(self, k: int) -> Flags | None:  # noqa: ARG002 - every slot alike
-        """Always."""
-        return None
-
     def uses_block(self, slots: range) -> Flags | None:  # noqa: ARG002 - every slot alike
         """Always."""
         return None

@@ -31,10 +31,6 @@ class Smart(PacketTaker):
         """Every state, no innovation."""
         return 1.0, 0.0
 
-    def uses(self, k: int) -> Flags | None:
-        """Where the packet is the state."""
-        return ~self._schedule.at(k)
-
     def uses_block(self, slots: range) -> Flags | None:
-        """The same for consecutive slots."""
+        """Where the packet is the state."""
         return ~self._schedule.block(slots)

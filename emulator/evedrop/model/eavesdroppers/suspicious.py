@@ -39,12 +39,8 @@ class Suspicious(PacketTaker):
         """μ_b and μ̄_b."""
         return parameters["use_state"], parameters["use_innovation"]
 
-    def uses(self, k: int) -> Flags | None:
-        """True where this slot's coin falls below the probability for the packet's type."""
-        return self._used.at(k)
-
     def uses_block(self, slots: range) -> Flags:
-        """The same for consecutive slots."""
+        """True where a slot's coin falls below the probability for the packet's type."""
         return self._used.of(slots)
 
     def _tossed(self, slots: range) -> Flags:

@@ -13,15 +13,13 @@ from evedrop.model import update
 from evedrop.model.checks import probabilities_mistakes
 from evedrop.model.kernels.current import kernels
 from evedrop.model.process import Floats, Process, StateFactors, product
-from evedrop.model.receiver import Action, Belief, Beliefs, Codes, Flags, Receiver, Reception, select
+from evedrop.model.receiver import Belief, Beliefs, Codes, Flags, Receiver
 from evedrop.model.schedule import Schedule, StateProbability
-from evedrop.model.schemes.scheme import Encoder, Packet, PacketBlock, Scheme, Shared
+from evedrop.model.schemes.scheme import Encoder, PacketBlock, Scheme, Shared
 from evedrop.model.staircase import is_regular
 from evedrop.model.streams import Ahead, Batch, BlockReader
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.model.theory.leaked_bits import LeakedBits, RevealedBits
-
-_INNOVATION = int(Action.INNOVATION)  # numpy compares with an int ten times as fast
 
 
 @final
@@ -81,11 +79,6 @@ class InnovationEncoder(Encoder):
     def __init__(self, secret: SharedSecret) -> None:
         self._secret = secret
 
-    def encode(self, k: int, x: Floats, predicted: Floats) -> Packet:
-        """The packet of slot k."""
-        nu = self._secret.nu(k)
-        return Packet(select(nu, lambda: (x - predicted) + self._secret.chi(k), lambda: x), nu)
-
     def encode_block(self, slots: range, x: Floats, predicted: Floats) -> PacketBlock:
         """The packets of consecutive slots."""
         nu = self._secret.nu_block(slots)
@@ -107,14 +100,8 @@ class InnovationEstimator(Receiver):
         # The codes 0, 1, 2 of `Action` are these sums: LOST, STATE where γ, INNOVATION where γ and ν.
         return gamma.view(np.uint8) + (gamma & self._secret.nu(k)).view(np.uint8)
 
-    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
-        """(A x̂, A P Aᵀ + Q) if lost, (z, 0) for the state, (A x̂ + z − χ, A P Aᵀ) for an innovation."""
-        action = self.act(k, heard.gamma)
-        chi = self._secret.chi(k) if (action == _INNOVATION).any() else None
-        return update.belief(self.process, k, belief, action, heard.z, chi)
-
     def follow(self, slots: range, belief: Belief, gamma: Flags, z: Floats) -> tuple[Beliefs, Belief]:
-        """The same for consecutive slots."""
+        """(A x̂, A P Aᵀ + Q) if lost, (z, 0) for the state, (A x̂ + z − χ, A P Aᵀ) for an innovation."""
         action = gamma.view(np.uint8) + (gamma & self._secret.nu_block(slots)).view(np.uint8)
         found = update.beliefs(self.process, slots.start, belief, action, z, self._secret.chi_block(slots))
         return found, found.last

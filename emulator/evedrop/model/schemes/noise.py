@@ -14,9 +14,9 @@ from evedrop.model.kernels.elementary import cholesky
 from evedrop.model.noise_law import PACKETS, NoiseLaw
 from evedrop.model.packet_user import PacketUser
 from evedrop.model.process import Floats, Process, product
-from evedrop.model.receiver import Flags, Receiver, select
+from evedrop.model.receiver import Flags, Receiver
 from evedrop.model.schedule import Schedule
-from evedrop.model.schemes.scheme import Encoder, Packet, PacketBlock, Scheme, Shared
+from evedrop.model.schemes.scheme import Encoder, PacketBlock, Scheme, Shared
 from evedrop.model.streams import Ahead, Batch, BlockReader
 from evedrop.model.theory.closed_form import ReceiverConditions
 from evedrop.model.theory.covariances import Outcomes
@@ -33,12 +33,7 @@ class NoiseEncoder(Encoder):
         factors, reader = law.factors(process), BlockReader(key, batch, process.n)
         self._noise = Ahead(reader.ahead, lambda slots: product(factors.block(slots), reader.normals(slots)))
 
-    def encode(self, k: int, x: Floats, predicted: Floats) -> Packet:  # noqa: ARG002 - no innovation is sent
-        """The packet of slot k."""
-        nu = self._schedule.at(k)
-        return Packet(select(nu, lambda: self._noise.at(k), lambda: x), nu)
-
-    def encode_block(self, slots: range, x: Floats, predicted: Floats) -> PacketBlock:  # noqa: ARG002 - the same
+    def encode_block(self, slots: range, x: Floats, predicted: Floats) -> PacketBlock:  # noqa: ARG002 - no innovation
         """The packets of consecutive slots."""
         nu = self._schedule.block(slots)
         return PacketBlock(np.where(nu[:, None, :], self._noise.of(slots), x), nu)
@@ -52,12 +47,8 @@ class NoiseEstimator(PacketUser):
         super().__init__(process, trials)
         self._schedule = schedule
 
-    def uses(self, k: int) -> Flags | None:
-        """Where the packet is the state."""
-        return ~self._schedule.at(k)
-
     def uses_block(self, slots: range) -> Flags | None:
-        """The same for consecutive slots."""
+        """Where the packet is the state."""
         return ~self._schedule.block(slots)
 
 

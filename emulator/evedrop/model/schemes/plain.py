@@ -27,7 +27,7 @@ class PlainEncoder(Encoder):
 class PlainEstimator(PacketUser):
     """Uses every packet it receives: E P → (1−μ) S(μ)."""
 
-    def uses(self, k: int) -> Flags | None:  # noqa: ARG002 - every slot alike
+    def uses_block(self, slots: range) -> Flags | None:  # noqa: ARG002 - every slot alike
         """Always."""
         return None
 

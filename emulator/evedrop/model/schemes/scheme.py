@@ -11,7 +11,7 @@ from typing import Any, ClassVar, NamedTuple, final
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.model.block_methods import outdated
+from evedrop.model.block_methods import complete, needed
 from evedrop.model.noise_law import NoiseLaw
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Flags, Receiver
@@ -84,18 +84,22 @@ class PacketBlock(NamedTuple):
         return Packet(*(None if column is None else column[row] for column in self))  # type: ignore[arg-type]
 
 
-class Encoder(ABC):
-    """Makes packets from states, slot by slot."""
+def _encode_one(encode_block: Callable[..., PacketBlock]) -> Callable[..., Packet]:
+    return lambda self, k, x, predicted: encode_block(self, range(k, k + 1), x[None], predicted[None]).at(0)
+
+
+class Encoder(ABC):  # noqa: B024 - `encode` is abstract
+    """Makes packets from states. A subclass writes `encode_block`, or `encode`."""
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Take `encode_block` from this class again in a subclass that changes a slot and not a block of slots."""
+        """Complete the pair of methods."""
         super().__init_subclass__(**options)
-        if outdated(cls, "encode_block", "encode"):
-            setattr(cls, "encode_block", Encoder.encode_block)  # noqa: B010 - mypy refuses the assignment
+        complete(cls, Encoder, "encode_block", "encode", _encode_one)
 
-    @abstractmethod
+    @needed
     def encode(self, k: int, x: Floats, predicted: Floats) -> Packet:
         """The packet of slot k, from x_k and A x_{k−1}, both (n, R)."""
+        raise NotImplementedError
 
     def encode_block(self, slots: range, x: Floats, predicted: Floats) -> PacketBlock:
         """The packets of consecutive slots, from x and A x of the slots before, both (c, n, R).
