@@ -13,7 +13,7 @@ from evedrop.live.protocol.brief_closed_loop import decoded
 from evedrop.live.protocol.brief_parts import ControllerPart
 from evedrop.live.protocol.closed_loop import decided, read_known
 from evedrop.live.protocol.codec import Reader
-from evedrop.live.protocol.commands import End
+from evedrop.live.protocol.commands import EndRun
 from evedrop.model.slot.controller import ControllerCore
 from evedrop.names import CONTROLLER
 from evedrop.peers.closed_loop import kept_decisive
@@ -43,4 +43,4 @@ def steer(brief: Brief[ControllerPart], connect: Callable[[AnyBrief], ProcessSes
             made = controller.decide(k, x)
             put(k, decided(k, made.u, made.failed))
             reporter.add_decision(k, *made)
-        session.wait_for(End)
+        session.wait_for(EndRun)

@@ -18,7 +18,7 @@ from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import AnyBrief, Brief
 from evedrop.live.protocol.brief_parts import ReceiverPart
 from evedrop.live.protocol.codec import Reader
-from evedrop.live.protocol.commands import End
+from evedrop.live.protocol.commands import EndRun
 from evedrop.live.protocol.packet_blocks import read_deliveries
 from evedrop.live.protocol.packets import acknowledgement, is_barrier, read_acknowledgement
 from evedrop.live.protocol.telemetry import leaving
@@ -46,7 +46,7 @@ def follow(
         session.ready()
         loop.carry_on()
         replies.acknowledge_after_end(loop.deliveries)
-        session.wait_for(End)
+        session.wait_for(EndRun)
 
 
 @final

@@ -21,7 +21,7 @@ from evedrop.live.protocol.brief import AnyBrief, Brief
 from evedrop.live.protocol.brief_closed_loop import decoded
 from evedrop.live.protocol.brief_parts import ProgramEntry, SensorPart
 from evedrop.live.protocol.codec import Reader, read_progress
-from evedrop.live.protocol.commands import End, Go, Hold, Start
+from evedrop.live.protocol.commands import EndRun, Go, Hold, Start
 from evedrop.live.protocol.packets import barrier, read_acknowledgement, resend, uplink
 from evedrop.live.protocol.telemetry import held
 from evedrop.model.given_states import GivenStates, recorded
@@ -329,4 +329,4 @@ def sense(
         session.ready()
         session.wait_for(Start)
         loop.carry_on()
-        session.wait_for(End)
+        session.wait_for(EndRun)

@@ -52,9 +52,7 @@ def test_no_two_public_classes_have_one_name() -> None:
 
 GERUNDS = {
     "Colluding": "a strategy of scenario files",
-    "Ending": "a noun: how a run ended",
     "Finding": "a noun",
-    "Finishing": "news of the end of a run, as RunOver",
     "Greeting": "a noun",
     "Jamming": "an attack by the field's name",
     "Nothing": "no gerund",

@@ -15,7 +15,7 @@ import pytest
 
 from evedrop.errors import Interrupted, MalformedMessage, MissingProcesses
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
-from evedrop.live.launch.children import Children, Exit
+from evedrop.live.launch.children import Children, ProcessExit
 from evedrop.live.launch.process_set import follow_to_end
 from evedrop.live.protocol.brief import read_brief
 from evedrop.live.protocol.last_word import Cause, LastWord, last_word_file, protocol_breaker, read_last_word
@@ -96,7 +96,7 @@ class Bench:
 
         def ended() -> bool:
             match self.children.news(0.1):
-                case Exit("observer"):
+                case ProcessExit("observer"):
                     return True
                 case News() as news:
                     found.append(news)
@@ -146,12 +146,12 @@ def test_why_zenoh_panicked_is_shown_without_its_stack(bench: Bench) -> None:
     bench.starter.status = -6
     bench.children.start(bench.briefs["eve"])
     (bench.results / "logs" / "eve.log").write_text(PANIC)
-    report = bench.children.failure_report(Exit("eve", -6), None)
+    report = bench.children.failure_report(ProcessExit("eve", -6), None)
     assert report.splitlines()[-1] == "    OS can't spawn worker thread: Resource temporarily unavailable (os error 11)"
 
 
-@pytest.mark.parametrize("first", [Exit("eve", 3), Exit("observer", 3)])
-def test_who_ends_for_lack_of_an_observer_is_not_at_fault(bench: Bench, first: Exit) -> None:
+@pytest.mark.parametrize("first", [ProcessExit("eve", 3), ProcessExit("observer", 3)])
+def test_who_ends_for_lack_of_an_observer_is_not_at_fault(bench: Bench, first: ProcessExit) -> None:
     """Cut off from the router, the observer and all others give up after the same time; it is named, and why."""
     for name in ("eve", "observer"):
         bench.starter.status = 3
@@ -180,7 +180,7 @@ def test_the_sender_of_a_malformed_message_is_named(bench: Bench, key: str, send
     error = MalformedMessage(f"evedrop/r1/{key}", "3", "4", b"")
     bench.leaves("naive", LastWord.about(error))
     said = f"{sender} broke the protocol: malformed message on evedrop/r1/{key}"
-    assert bench.children.failure_report(Exit("naive", 3), RunEnded(3, "naive left")).startswith(said)
+    assert bench.children.failure_report(ProcessExit("naive", 3), RunEnded(3, "naive left")).startswith(said)
     ending = RunEnded(3, str(error), broken_by=protocol_breaker(error))
     assert bench.children.failure_report(None, ending).startswith(said)
 
@@ -191,10 +191,12 @@ def test_a_router_that_all_have_lost_is_at_fault(bench: Bench) -> None:
     for name in bench.briefs:
         bench.children.start(bench.briefs[name])
     bench.leaves("eve", CUT_OFF)
-    assert bench.children.failure_report(Exit("eve", 3), RunEnded(3, "", suspects=["eve"])).startswith("eve ended with")
+    assert bench.children.failure_report(ProcessExit("eve", 3), RunEnded(3, "", suspects=["eve"])).startswith(
+        "eve ended with"
+    )
     for name in bench.briefs.keys() - {"router", "observer"}:
         bench.leaves(name, CUT_OFF)
-    assert bench.children.failure_report(Exit("eve", 3), None).startswith("router ended with")
+    assert bench.children.failure_report(ProcessExit("eve", 3), None).startswith("router ended with")
 
 
 def test_a_process_that_is_started_again_has_not_said_why_it_ends(bench: Bench) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from evedrop.live.observer.conductor import Conductor, Stop
 from evedrop.live.protocol.codec import end_report
-from evedrop.live.protocol.commands import End
+from evedrop.live.protocol.commands import EndRun
 from evedrop.live.protocol.keys import RunKeys
 from tests.clock import TestClock
 
@@ -48,7 +48,7 @@ class Network:
         name = key.rpartition("/")[2]
 
         def put(payload: bytes) -> None:
-            assert payload == End().pack()
+            assert payload == EndRun().pack()
             self.told[name] += 1
             if name in self.does:
                 self.does[name](self.told[name])

@@ -16,7 +16,7 @@ import zenoh
 
 from evedrop.live.network.session import client_config
 from evedrop.live.protocol.brief import read_brief
-from evedrop.live.protocol.commands import End
+from evedrop.live.protocol.commands import EndRun
 from evedrop.live.protocol.envelope import enclosed
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.scenario.loading import load
@@ -151,8 +151,8 @@ def test_a_message_of_another_key_is_dropped_counted_and_sent_again(evedrop: Eve
             for name in ("other", "sensor"):
                 publisher = session.declare_publisher(keys.control(name))
                 wait_until(partial(is_matched, publisher), f"{name} to read")
-                publisher.put(enclosed(keys.downlink("legitimate"), End().pack()))
-            publisher.put(enclosed(RunKeys("another").control("sensor"), End().pack()))
+                publisher.put(enclosed(keys.downlink("legitimate"), EndRun().pack()))
+            publisher.put(enclosed(RunKeys("another").control("sensor"), EndRun().pack()))
         assert evedrop("resume", str(run.results)).status == 0
         assert set(run.statuses().values()) == {0}
         as_if_undisturbed(run.summary, scenario, tmp_path / "memory")

@@ -21,7 +21,7 @@ from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
 from evedrop.live.protocol.brief import AnyBrief, Flow
 from evedrop.live.protocol.brief_parts import LegitimatePart, SensorPart
-from evedrop.live.protocol.commands import End, Start
+from evedrop.live.protocol.commands import EndRun, Start
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.model.digest import Blocks, Digests
 from evedrop.model.flag_bits import packed_flags
@@ -63,7 +63,7 @@ def stage() -> Iterator[Stage]:
     """A stage in the place of the network."""
     one = Stage()
     yield one
-    one.commands.put(End().pack())
+    one.commands.put(EndRun().pack())
 
 
 def deliveries(count: int = SLOTS) -> list[bytes]:
@@ -89,7 +89,7 @@ def test_receiver_reports_every_slot_once(name: str, stage: Stage) -> None:
     brief = briefs()[name]
     keys = RunKeys(brief.run)
     stage.fill(keys.downlink(name), deliveries())
-    stage.commands.put(End().pack())
+    stage.commands.put(EndRun().pack())
     RECEIVERS[name](brief, stage.session)
     put = []
     while not stage.put.empty():
@@ -118,7 +118,7 @@ def test_reports_do_not_depend_on_the_batch(name: str, batch: int, stage: Stage)
     for flow in (Flow(1024, 7), Flow(1024, batch)):
         brief = replace(briefs(slots=600)[name], flow=flow, run="r")
         stage.fill(RunKeys("r").downlink(name), deliveries(600))
-        stage.commands.put(End().pack())
+        stage.commands.put(EndRun().pack())
         RECEIVERS[name](brief, stage.session)
         end, x_hat, P = 0, [], []
         blocks: dict[int, bytes] = {}
@@ -174,7 +174,7 @@ def test_receiver_takes_each_slot_once(name: str, stage: Stage) -> None:
         [*good[:20], *good[23:30], packets.barrier(25), *good[5:40], packets.barrier(7), good[0], *good[30:]],
     ):
         stage.fill(RunKeys("r").downlink(name), messages)
-        stage.commands.put(End().pack())
+        stage.commands.put(EndRun().pack())
         RECEIVERS[name](brief, stage.session)
         found.append(stage.all(RunKeys("r").telemetry(name)))
     assert found[0] == found[1]
@@ -203,7 +203,7 @@ def test_what_was_acknowledged_is_acknowledged_once_more(stage: Stage) -> None:
 
     slots = [0, 1, 2, 0, 1, 2, *range(3, SLOTS)]
     stage.fill(RunKeys("r").downlink("legitimate"), [delivered(k) for k in slots])
-    stage.commands.put(End().pack())
+    stage.commands.put(EndRun().pack())
     part_of(brief, LegitimatePart)
     RECEIVERS["legitimate"](brief, stage.session)
     expected = [packets.acknowledgement(k, np.arange(3) != k % 3) for k in slots]
@@ -215,7 +215,7 @@ def test_a_report_is_kept_for_a_window(name: str, stage: Stage) -> None:
     """Reports that the observer may not have joined yet can be sent again, and no older ones; the last progress too."""
     brief = replace(briefs()[name], run="r")
     stage.fill(RunKeys("r").downlink(name), deliveries())
-    stage.commands.put(End().pack())
+    stage.commands.put(EndRun().pack())
     RECEIVERS[name](brief, stage.session)
     stage.all("")
     stage.kept[RunKeys("r").telemetry(name)].again(1, 0)
@@ -280,7 +280,7 @@ def test_sensor_sends_as_its_followers_let_it(stage: Stage) -> None:
             sensor.progress(name, sent)
         sensor.progress("observer", done)
         sensor.packets(sent, sent := min(SLOTS, done + WINDOW))
-    stage.commands.put(End().pack())
+    stage.commands.put(EndRun().pack())
     sensor.thread.join(LIMIT)
     assert stage.put.get(timeout=LIMIT) == ("closed", b"")
     assert stage.put.empty()

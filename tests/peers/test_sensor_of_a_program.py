@@ -12,7 +12,7 @@ import pytest
 
 from evedrop.live.launch.briefs import ObserverTask, briefs_of
 from evedrop.live.protocol.brief import Flow
-from evedrop.live.protocol.commands import End, Start
+from evedrop.live.protocol.commands import EndRun, Start
 from evedrop.model.process import Floats
 from evedrop.peers.sensor import sense
 from evedrop.scenario.loading import checked
@@ -70,7 +70,7 @@ def test_slots_after_a_late_state_are_due_that_much_later() -> None:
     thread.start()
     stage.commands.put(Start().pack())
     wait_until(lambda: len(program.taken) == 8, "all slots have a state")
-    stage.commands.put(End().pack())
+    stage.commands.put(EndRun().pack())
     thread.join(LIMIT)
     late = [0.0 if k <= 3 else 7.0 for k in range(8)]
     assert program.taken == pytest.approx([1000.0 + 0.5 * k + more for k, more in enumerate(late)])

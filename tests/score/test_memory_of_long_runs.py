@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from evedrop.scenario.loading import load
-from evedrop.score.scorekeeper import Ending, Scorekeeper, summary_of
+from evedrop.score.scorekeeper import RunOutcome, Scorekeeper, summary_of
 
 SCENARIO: dict[str, Any] = {"process.directions": {"position": [1.0, 0.0]}, "expect": []}
 MEGABYTES = 4.0
@@ -44,7 +44,7 @@ def test_a_summary_does_not_take_more_memory_the_longer_the_run() -> None:
             tally.done = tally.offered = done
             for direction in tally.directions.values():
                 direction.done = done
-        summary_of(scenario, totals, digests, Ending(1.0, f"slot {done}"))
+        summary_of(scenario, totals, digests, RunOutcome(1.0, f"slot {done}"))
 
     summarise(100)  # which imports what a summary needs
     assert peak_of(lambda: summarise(SLOTS)) < MEGABYTES

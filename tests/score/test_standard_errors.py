@@ -28,7 +28,7 @@ from evedrop.results.reading import Results
 from evedrop.scenario.expected.expectations import expectations_of
 from evedrop.scenario.loading import load
 from evedrop.scenario.tables import Scenario
-from evedrop.score.scorekeeper import Ending
+from evedrop.score.scorekeeper import RunOutcome
 from evedrop.score.summary import RARE_SHARE, Summary
 from evedrop.score.sums import Tally
 from evedrop.simulate.montecarlo import Merger, Plan
@@ -401,7 +401,7 @@ def merged(scenario: Scenario, workers: int = 1, mode: Mode = Mode.EXACT) -> Mer
 
 def summary_of_study(scenario: Scenario, workers: int = 1, mode: Mode = Mode.EXACT) -> Summary:
     """The summary of a study, in memory."""
-    return merged(scenario, workers, mode).summary(Ending(1.0))
+    return merged(scenario, workers, mode).summary(RunOutcome(1.0))
 
 
 STUDY_TRIALS = 200

@@ -16,7 +16,7 @@ from evedrop.results.reading import Results
 from evedrop.results.summary_file import summary_text, write_summary
 from evedrop.scenario.loading import load
 from evedrop.scenario.news import ConnectionOutage
-from evedrop.score.scorekeeper import Ending, summary_of
+from evedrop.score.scorekeeper import RunOutcome, summary_of
 from evedrop.score.summary import Summary
 from evedrop.score.totals import Totals
 from evedrop.simulate.montecarlo import Merger, Plan
@@ -117,9 +117,9 @@ def test_theory_promises_the_same_however_soon_a_run_is_interrupted(name: str) -
     whole = Merger(scenario, Mode.EXACT)
     for result in in_this_process(tasks_of(scenario, Mode.EXACT, 1), lambda _: None, lambda: False):
         whole.add_batch(result)
-    ending = Ending(0.0, "interrupted")
+    ending = RunOutcome(0.0, "interrupted")
     nothing = summary_of(scenario, Totals.nothing(scenario, 2), dict.fromkeys(scenario.digested), ending)
-    for eavesdropper, verdict in whole.summary(Ending(1.0)).secrecy.items():
+    for eavesdropper, verdict in whole.summary(RunOutcome(1.0)).secrecy.items():
         early = nothing.secrecy[eavesdropper]
         assert early.sentence.endswith(verdict.sentence.rpartition("; ")[2])
         assert early.relative_from == verdict.relative_from

@@ -15,7 +15,7 @@ from evedrop.results.growing_tables import UNFINISHED, finish, is_unfinished, la
 from evedrop.results.reading import Results, age_of_figures
 from evedrop.results.writer import ResultsWriter, write_summary
 from evedrop.scenario.tables import Scenario
-from evedrop.score.scorekeeper import Ending, summary_of
+from evedrop.score.scorekeeper import RunOutcome, summary_of
 from evedrop.score.summary import Summary
 from evedrop.score.totals import Totals
 
@@ -34,7 +34,7 @@ def note_end(folder: Path, scenario: Scenario, how: str) -> Summary:
         summary = replace(Results.read(folder).typed_summary, ended=how)
     except UsageError:  # there are no figures
         totals = Totals.nothing(scenario, scenario.trials)
-        summary = summary_of(scenario, totals, dict.fromkeys(scenario.digested), Ending(0.0, how))
+        summary = summary_of(scenario, totals, dict.fromkeys(scenario.digested), RunOutcome(0.0, how))
         summary = replace(summary, slots=rows.slots)
         if not rows.at:
             left_behind = False

@@ -288,7 +288,7 @@ def _no_figures(folder: Path) -> dict[str, Any]:
     """The summary of a run that was killed before it wrote one. Raises UsageError if its scenario cannot be read."""
     # Only this case needs theory and the scenario to read results.
     from evedrop.scenario.loading.recorded import recorded  # noqa: PLC0415
-    from evedrop.score.scorekeeper import Ending, summary_of  # noqa: PLC0415
+    from evedrop.score.scorekeeper import RunOutcome, summary_of  # noqa: PLC0415
     from evedrop.score.totals import Totals  # noqa: PLC0415
 
     found = recorded(folder)
@@ -300,6 +300,6 @@ def _no_figures(folder: Path) -> dict[str, Any]:
     scenario = found.scenario
     nothing = Totals.nothing(scenario, scenario.trials)
     summary: dict[str, Any] = plain(
-        summary_of(scenario, nothing, dict.fromkeys(scenario.digested), Ending(0.0, "slot 0")).as_dict()
+        summary_of(scenario, nothing, dict.fromkeys(scenario.digested), RunOutcome(0.0, "slot 0")).as_dict()
     )
     return summary

@@ -116,8 +116,8 @@ class Scorekeeper:
 
 
 @dataclass(frozen=True)
-class Ending:
-    """How a run ended."""
+class RunOutcome:
+    """How a run went and ended, apart from its numbers."""
 
     wall_seconds: float
     """From the start command to the last row on disk."""
@@ -142,7 +142,7 @@ def verdicts(scenario: Scenario, tallies: Mapping[str, Tally]) -> list[Secrecy]:
     return [secrecy(user, (name, tallies[name], expected[name])) for name in scenario.eavesdroppers]
 
 
-def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | None], ending: Ending) -> Summary:
+def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | None], ending: RunOutcome) -> Summary:
     """The summary of a run; digests: process → its digest, None if it has none or the run was cut short.
 
     An accused process has no digest either, because its reports were contradicted. A run to the end in which a package's
@@ -159,7 +159,7 @@ def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | N
     directions = directions_of(tallies, expected)
     expectations = Evidence(scenario, peers, links, tallies, secret, applications, directions).judged(ending.replay)
     # Known only now that every figure has been computed.
-    failures = totals.failures if ending.how == Ending.how else []
+    failures = totals.failures if ending.how == RunOutcome.how else []
     return Summary(
         scenario=scenario.title,
         mode=ending.mode,

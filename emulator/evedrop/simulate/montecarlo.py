@@ -30,7 +30,7 @@ from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import listed
 from evedrop.score.expectations_held import replay_of
 from evedrop.score.histogram import SlotHistograms
-from evedrop.score.scorekeeper import Ending, events_of, summary_of
+from evedrop.score.scorekeeper import RunOutcome, events_of, summary_of
 from evedrop.score.slots import concatenated
 from evedrop.score.summary import Summary
 from evedrop.score.sums import SlotSums, squared_errors
@@ -110,8 +110,8 @@ def simulate(scenario: Scenario, folder: Path, tell: Tell, plan: Plan = Plan(), 
     failure: RunError | None = None
     merger = Merger(scenario, plan.mode)
 
-    def ending(how: str) -> Ending:
-        return Ending(kept.seconds, how, replay_of(folder, scenario, plan.mode.value))
+    def ending(how: str) -> RunOutcome:
+        return RunOutcome(kept.seconds, how, replay_of(folder, scenario, plan.mode.value))
 
     with stop_on_signals() as stop, plan.crew([scenario]) as crew, kept_tasks(folder, study, resume) as kept:
         tasks, told = tasks_of(scenario, plan.mode, crew.workers, kept), teller(tell, scenario.trials * scenario.slots)
@@ -323,7 +323,7 @@ class Merger:
         return PacketCounts.merged(self._packets)
 
     @np.errstate(over="ignore", invalid="ignore")
-    def summary(self, ending: Ending) -> Summary:
+    def summary(self, ending: RunOutcome) -> Summary:
         """The summary of all added batches; fills in mode and events."""
         totals = self.totals
         whole = self._whole and self.complete

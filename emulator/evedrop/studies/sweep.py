@@ -23,7 +23,7 @@ from evedrop.scenario.application import APPLICATIONS
 from evedrop.scenario.loading import prepared, value_of
 from evedrop.scenario.news import Tell
 from evedrop.scenario.tables import Scenario
-from evedrop.score.scorekeeper import Ending
+from evedrop.score.scorekeeper import RunOutcome
 from evedrop.score.summary import Summary
 from evedrop.simulate.kept_tasks import kept_tasks, study_of
 from evedrop.simulate.montecarlo import Merger, Plan, check_mode, teller
@@ -169,7 +169,7 @@ def _summary(scenario: Scenario, plan: Plan, results: Iterator[BatchResult]) -> 
         merger.add_batch(result)
     if not merger.complete:
         return None
-    ending = Ending(time.monotonic() - started)
+    ending = RunOutcome(time.monotonic() - started)
     summary = merger.summary(ending)
     if summary.ended != ending.how:  # a figure failed
         raise RunError(summary.ended)

@@ -266,7 +266,7 @@ def control_of(value: dict[str, Any]) -> commands.ControlCommand:
         case {"do": "start"}:
             return commands.Start()
         case {"do": "end"}:
-            return commands.End()
+            return commands.EndRun()
         case {"do": "abandon", "why": why}:
             return commands.Abandon(why)
         case {"do": "go", "k": k, "absent": absent, "until": until}:

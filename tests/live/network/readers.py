@@ -94,7 +94,7 @@ EXAMPLES: Mapping[str, bytes] = {
     "state": loop_wire.known("x", K, _z),
     "input": loop_wire.decided(K, _z[:1], _flags),
     "progress": wire.progress(K),
-    "control": commands.End().pack(),
+    "control": commands.EndRun().pack(),
     "go": commands.Go(K, ("eve",), 9).pack(),
     "change": commands.LinkChange("eve", (Change(4, cut=True), Change(9, {"loss": {}}))).pack(),
     "again": commands.Again(1, K, {"eve": (Change(4, cut=True),)}).pack(),

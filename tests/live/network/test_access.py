@@ -21,7 +21,7 @@ import zenoh
 from evedrop.live.network.access import Grant, access_control, grants
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
-from evedrop.live.protocol.commands import End, Unknown
+from evedrop.live.protocol.commands import EndRun, Unknown
 from evedrop.live.protocol.envelope import enclosed
 from tests.conftest import LIMIT, wait_until
 from tests.live.network.bench import Bench, Ear, bench_of, connect, small_network
@@ -219,7 +219,7 @@ def test_eavesdropper_can_write_only_its_telemetry_and_progress(mode: str, stage
     """Its messages on any other key, and all its deletions, reach no process; the run goes on undisturbed."""
     keys = all_keys(stage)
     own = {keys[f"telemetry/{EVE}"], keys[f"progress/{EVE}"]}
-    payloads = (packets.uplink(stage.due, np.zeros(SHAPE)), End().pack(), wire.progress(10**9), b"\xc1")
+    payloads = (packets.uplink(stage.due, np.zeros(SHAPE)), EndRun().pack(), wire.progress(10**9), b"\xc1")
     block = zenoh.CongestionControl.BLOCK
     with attacking(stage, mode) as attacker:
         for key in [*keys.values(), f"evedrop/{stage.keys.run}/**", "**"]:

@@ -22,7 +22,7 @@ from evedrop.live.network.router_users import users_file
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.codec import Reader, progress
-from evedrop.live.protocol.commands import End, Start
+from evedrop.live.protocol.commands import EndRun, Start
 from evedrop.live.protocol.envelope import enclosed, head_of, named_in
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.requests import StatusRequest
@@ -117,7 +117,7 @@ def test_commands_that_name_another_process_are_dropped(stage: Stage) -> None:
     """A command on a process's own control key is obeyed only if it is meant for it."""
     key, other = stage.keys.control("eve"), stage.keys.control("mallory")
     with Session(stage.eve) as session:
-        stage.put(key, [enclosed(other, End().pack()), enclosed(key, Start().pack())])
+        stage.put(key, [enclosed(other, EndRun().pack()), enclosed(key, Start().pack())])
         assert session.command() == Start()
         assert session.dropped == 1
 

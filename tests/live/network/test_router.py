@@ -24,7 +24,7 @@ from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
 from evedrop.live.protocol.brief import Brief, Flow
 from evedrop.live.protocol.brief_parts import RouterPart
-from evedrop.live.protocol.commands import End
+from evedrop.live.protocol.commands import EndRun
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.model.process import Floats
 from tests.conftest import LIMIT
@@ -88,7 +88,7 @@ class MemoryBench:
 
     def end(self) -> None:
         """The run is over: the router returns."""
-        self.stage.commands.put(End().pack())
+        self.stage.commands.put(EndRun().pack())
         self._thread.join(LIMIT)
         assert not self._thread.is_alive()
 
@@ -133,7 +133,7 @@ def test_every_packet_is_accounted_for(bench: Callable[..., Bench]) -> None:
         key = stage.briefs["router"].stream_keys[f"link/{name}"]
         quality = stage.scenario.quality[name]
         assert np.array_equal(gamma, uniforms_of(key, 61, range(1000, 1005)) < quality)
-    stage.put("observer", stage.keys.control("router"), End().pack())
+    stage.put("observer", stage.keys.control("router"), EndRun().pack())
     assert stage.router.wait(LIMIT) == 0
     assert stage.log.read_text() == ""
 
@@ -177,7 +177,7 @@ def test_bad_packet_is_refused(name: str) -> None:
     bench.stage.fill(bench.keys.uplink, messages)
     with pytest.raises(RunError, match=line) as found:
         loop.carry_on()
-    bench.stage.commands.put(End().pack())  # ends the thread that reads commands
+    bench.stage.commands.put(EndRun().pack())  # ends the thread that reads commands
     assert found.value.exit_status == 3
 
 

@@ -21,7 +21,7 @@ from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.brief_parts import RelayPart, RouterPart
-from evedrop.live.protocol.commands import End, Unknown
+from evedrop.live.protocol.commands import EndRun, Unknown
 from evedrop.live.protocol.envelope import enclosed
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.names import RELAY
@@ -105,7 +105,7 @@ def test_an_eavesdropper_at_the_relay_cannot_write_for_others(stage: Bench) -> N
             *(keys.control(name) for name in ("sensor", "router", "relay", "legitimate")),
             *(keys.telemetry(name) for name in ("sensor", "legitimate")),
         ):
-            attacker.put(key, enclosed(key, End().pack()), congestion_control=zenoh.CongestionControl.BLOCK)
+            attacker.put(key, enclosed(key, EndRun().pack()), congestion_control=zenoh.CongestionControl.BLOCK)
         mine = enclosed(keys.telemetry(EVE), b"mine")
         attacker.put(keys.telemetry(EVE), mine, congestion_control=zenoh.CongestionControl.BLOCK)
         assert stage.telemetry[EVE].hear() == (keys.telemetry(EVE), b"mine")

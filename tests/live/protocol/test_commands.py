@@ -14,7 +14,7 @@ from evedrop.live.protocol.commands import (
     Again,
     Bounds,
     ControlCommand,
-    End,
+    EndRun,
     Go,
     Hold,
     LinkChange,
@@ -38,7 +38,7 @@ def read(process: str, payload: bytes) -> ControlCommand:
     ("process", "command"),
     [
         ("sensor", Start()),
-        ("eve", End()),
+        ("eve", EndRun()),
         ("eve", ReportStatus()),
         ("sensor", Hold()),
         ("relay", Abandon("interrupted")),

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from evedrop.live.protocol.news import Alive, Finishing, ProcessRequest, RunOver, read_news
+from evedrop.live.protocol.news import Alive, ProcessRequest, SaveStarted, SlotsDone, read_news
 from evedrop.names import ProcessAction
 from evedrop.scenario.news import (
     ConnectionOutage,
@@ -32,8 +32,8 @@ KINDS: list[News] = [
     ConnectionOutage("eve", 3, None, 0.5, 1),
     RunProgress(40, 12.5, "slots/s", {"eve": math.inf}),
     RunProgress(40, 12.5, "trial-slots/s", {}, 80),
-    RunOver(),
-    Finishing(),
+    SlotsDone(),
+    SaveStarted(),
     RunEnded(3, "a crash", ["eve"], ["router"], "no screen"),
     RunEnded(0, "complete", [], []),
     ViewOpened("http://127.0.0.1:1/", None),

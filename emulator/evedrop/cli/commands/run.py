@@ -18,7 +18,7 @@ from evedrop.errors import Interrupted, RunError, UsageError
 if TYPE_CHECKING:
     from evedrop.cli.progress_line import ProgressLine
     from evedrop.live.launch.hosts_file import HostsPlan
-    from evedrop.live.launch.process_set import Ended
+    from evedrop.live.launch.process_set import FinishedRun
     from evedrop.scenario.news import Tell
     from evedrop.scenario.tables import Scenario
     from evedrop.show.view.viewer import Viewer
@@ -41,7 +41,7 @@ def run(options: argparse.Namespace) -> int:
     return ended.status
 
 
-def _run(options: argparse.Namespace) -> Ended:
+def _run(options: argparse.Namespace) -> FinishedRun:
     from evedrop.cli.progress_line import ProgressLine
     from evedrop.live.launch.launcher import launch
     from evedrop.results.folder import results_folder

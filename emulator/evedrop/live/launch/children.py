@@ -26,7 +26,7 @@ from evedrop.live.launch.starter import (
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.brief_parts import ReceiverPart, RoutingPart
 from evedrop.live.protocol.last_word import Cause, LastWord, last_word_file, read_last_word
-from evedrop.live.protocol.news import Alive, Finishing, ProcessRequest, RouterListens, RunOver, read_news
+from evedrop.live.protocol.news import Alive, ProcessRequest, RouterListens, SaveStarted, SlotsDone, read_news
 from evedrop.names import OBSERVER, RELAY, ROUTER, SENSOR, ProcessAction
 from evedrop.results.folder import HeldFolder, private_opener
 from evedrop.scenario.news import News, RunEnded, Started, Tell
@@ -49,7 +49,7 @@ _ZENOH_CLOSES = "Received Data for unknown expr_id"
 
 
 @dataclass(frozen=True)
-class Exit:
+class ProcessExit:
     """The end of a child process."""
 
     process: str
@@ -81,7 +81,7 @@ class Children:
         self._lock_step = lock_step
         self._private = private
         self._processes: dict[str, StartedProcess] = {}
-        self._news: SimpleQueue[News | Exit] = SimpleQueue()
+        self._news: SimpleQueue[News | ProcessExit] = SimpleQueue()
         self.silent_seconds = 0.0
         """How many seconds the observer has been silent for."""
         self.started = False
@@ -156,7 +156,7 @@ class Children:
                         self._refuse(name, error)
         status = process.wait()  # without a limit: nobody waits for this thread
         if process.pid not in self._killed:
-            self._news.put(Exit(name, status))
+            self._news.put(ProcessExit(name, status))
 
     def _refuse(self, name: str, error: ValueError) -> None:
         """Write into a process's log that the launcher cannot read its news."""
@@ -171,7 +171,7 @@ class Children:
         process = self._processes.get(router)
         return process is None or process.stdout is None or router in self._listening
 
-    def restart_router(self, ended: Exit) -> bool:
+    def restart_router(self, ended: ProcessExit) -> bool:
         """Restart a router or relay if a signal ended it, a few times per run; returns whether it was restarted."""
         signalled = ended.status < 0 or ended.status == INTERRUPTED
         if ended.process not in {ROUTER, RELAY} or not signalled or self._restarts == ROUTER_RESTARTS:
@@ -213,7 +213,7 @@ class Children:
                 observer.write(b"%d\n" % request.number)
                 observer.flush()
 
-    def news(self, seconds: float) -> News | Exit | None:
+    def news(self, seconds: float) -> News | ProcessExit | None:
         """The next news or exit that concerns the caller, or None; waits for `seconds` at most.
 
         A process that is to be started again waits, as the others did, until its router listens.
@@ -223,7 +223,7 @@ class Children:
         except Empty:
             self.silent_seconds += seconds
             return None
-        if isinstance(news, Exit):
+        if isinstance(news, ProcessExit):
             return news
         self.silent_seconds = 0.0
         match news:
@@ -236,11 +236,11 @@ class Children:
                 time.sleep(_AGAIN_SECONDS)
             case ProcessRequest():
                 self.act(news)
-            case RunOver():
+            case SlotsDone():
                 self.over = True
-            case Finishing():
+            case SaveStarted():
                 self._finishing = True
-        return None if isinstance(news, Alive | RouterListens | ProcessRequest | RunOver | Finishing) else news
+        return None if isinstance(news, Alive | RouterListens | ProcessRequest | SlotsDone | SaveStarted) else news
 
     def conclude(self, tell: Tell, patience: float = 0.0) -> RunEnded | None:
         """End the observer, at once or after `patience` seconds; returns its `RunEnded`, or None if it sent none.
@@ -254,7 +254,7 @@ class Children:
             time.monotonic() - begun < (_FINISH_SECONDS if self._finishing else _BEGIN_SECONDS)
         ):
             news = self.news(0.05)
-            if isinstance(news, Exit):
+            if isinstance(news, ProcessExit):
                 if news.process == OBSERVER:
                     break
             elif news is not None:
@@ -276,7 +276,7 @@ class Children:
         """Wait for all processes to leave by themselves, for `GRACE_SECONDS` at most."""
         wait_for(self._processes.values(), GRACE_SECONDS)
 
-    def failure_report(self, first: Exit | None, ending: RunEnded | None) -> str:
+    def failure_report(self, first: ProcessExit | None, ending: RunEnded | None) -> str:
         """The failure in words: the process at fault, and the last lines of its log and of the log that accuses it.
 
         first: the first process that ended too early, if any; ending: the end as the observer reported it, if it did.
@@ -315,7 +315,7 @@ class Children:
             head = f"{broken_by} broke the protocol: {why}"
         return "\n".join([head, *(line for name in named for line in self._log_lines(name))])
 
-    def _first_failure(self, suspects: list[str]) -> Exit | None:
+    def _first_failure(self, suspects: list[str]) -> ProcessExit | None:
         """A child that failed or left too early, other than the observer. Waits a moment for missing processes to end."""
         deadline = time.monotonic() + (_GONE_SECONDS if suspects else 0.0)
         while True:
@@ -329,9 +329,9 @@ class Children:
                     {ROUTER, RELAY} & set(suspects) and self._lost_router(name)
                 )
                 if status and not for_others:
-                    return Exit(name, status)
+                    return ProcessExit(name, status)
             if suspects and all(ended.get(name) == 0 for name in suspects):
-                return Exit(suspects[0], 0)
+                return ProcessExit(suspects[0], 0)
             if time.monotonic() > deadline:
                 return None
             time.sleep(0.01)

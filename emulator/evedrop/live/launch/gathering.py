@@ -37,7 +37,7 @@ from evedrop.results.writer import DIGESTS, ResultsWriter, write_summary
 from evedrop.scenario.news import ConnectionOutage, RunEvent
 from evedrop.scenario.tables import Scenario
 from evedrop.score.expectations_held import replay_of
-from evedrop.score.scorekeeper import Ending, summary_of
+from evedrop.score.scorekeeper import RunOutcome, summary_of
 from evedrop.score.summary import Summary
 from evedrop.score.totals import Totals
 
@@ -47,7 +47,7 @@ _RECORDING = "recording.rrd"
 def gather(scenario: Scenario, folder: Path, shards: Sequence[Shard], started: float | None, how: str) -> Summary:
     """Fill a run's folder from those of its shards, which are then removed; returns the run's summary.
 
-    started: when the first shard began, by the monotonic clock, if one did; how: as in `Ending`. Raises OSError if the folder
+    started: when the first shard began, by the monotonic clock, if one did; how: as in `RunOutcome`. Raises OSError if the folder
     cannot be written; the shards' folders are then unchanged.
     """
     write_resolved(folder, scenario)
@@ -60,7 +60,7 @@ def gather(scenario: Scenario, folder: Path, shards: Sequence[Shard], started: f
     totals = Totals.merged(scores)
     replay = replay_of(folder, scenario)
     parts = _summaries(shards)
-    ending = Ending(
+    ending = RunOutcome(
         wall,
         noted(how, _age_of_figures(shards, scores, parts)),
         replay,

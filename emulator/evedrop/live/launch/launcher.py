@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from evedrop.errors import UsageError
 from evedrop.live.launch.ports import loopback_endpoints, warn_if_exposed
 from evedrop.live.launch.preloading import process_starter
-from evedrop.live.launch.process_set import Ended, launch_one
+from evedrop.live.launch.process_set import FinishedRun, launch_one
 from evedrop.scenario.news import Tell
 from evedrop.scenario.tables import Scenario
 from evedrop.show.view.viewer import choose
@@ -37,7 +37,7 @@ def launch(
     *,
     paused: bool = False,
     hosts: HostsPlan | None = None,
-) -> Ended:
+) -> FinishedRun:
     """Run a scenario live into a results folder; `tell` gets the observer's news as they come.
 
     view: auto, native, web or off; listen, relay: the endpoints of router and relay, if there is one; by default no
@@ -85,7 +85,7 @@ def _on_hosts(
     here: Starter,
     hosts: HostsPlan,
     paused: bool,
-) -> Ended:
+) -> FinishedRun:
     """Run a scenario as `launch` does, with processes on other hosts."""
     from evedrop.live.launch.ssh_starter import ssh_starter  # noqa: PLC0415 - not needed on one machine
 

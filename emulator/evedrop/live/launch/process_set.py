@@ -16,7 +16,7 @@ from pathlib import Path
 
 from evedrop.errors import EvedropError, Interrupted, RunError, UsageError
 from evedrop.live.launch.briefs import LAUNCHED_PATIENCE, ObserverTask, briefs_of
-from evedrop.live.launch.children import SILENCE_SECONDS, Children, Exit
+from evedrop.live.launch.children import SILENCE_SECONDS, Children, ProcessExit
 from evedrop.live.launch.ports import RouterEndpoints, socket_endpoints
 from evedrop.live.launch.private_folder import private_folder, socket_folder
 from evedrop.live.launch.starter import Starter
@@ -34,8 +34,8 @@ _EARLY_SECONDS = 1.0
 
 
 @dataclass(frozen=True)
-class Ended:
-    """The end of a run."""
+class FinishedRun:
+    """A run that has come to its end."""
 
     status: int
     """Its exit status."""
@@ -57,7 +57,7 @@ def launch_one(
     shard: bool = False,
     paused: bool = False,
     patience: int = LAUNCHED_PATIENCE,
-) -> Ended:
+) -> FinishedRun:
     """Run a scenario as `launch` does, in one set of processes, until `stop` is set.
 
     endpoints: None for a socket in a private folder, which other users cannot enter.
@@ -111,7 +111,7 @@ def launch_one(
             remove_control(now)
             if now != held.first:
                 tell(FolderMoved(str(now)))
-    return Ended(status, viewer, now)
+    return FinishedRun(status, viewer, now)
 
 
 @contextlib.contextmanager
@@ -134,7 +134,7 @@ def _wait_until_listening(children: Children, router: str, stop: threading.Event
         if stop.is_set():
             raise Interrupted
         news = children.news(_POLL_SECONDS)
-        if isinstance(news, Exit) and not _meant_us_too(news, stop) and not children.restart_router(news):
+        if isinstance(news, ProcessExit) and not _meant_us_too(news, stop) and not children.restart_router(news):
             raise RunError(children.failure_report(news, None))
         if time.monotonic() > deadline:
             raise RunError(
@@ -159,7 +159,7 @@ def _forget(folder: Path) -> None:
 
 def follow_to_end(children: Children, stop: threading.Event, tell: Tell) -> int:
     """Follow the run to its end; returns the exit status that the observer gives it."""
-    early: tuple[Exit, float] | None = None
+    early: tuple[ProcessExit, float] | None = None
     ending: RunEnded | None
     while True:
         if early is not None and not children.over and time.monotonic() - early[1] > _EARLY_SECONDS:
@@ -171,7 +171,7 @@ def follow_to_end(children: Children, stop: threading.Event, tell: Tell) -> int:
             raise RunError(children.failure_report(None, RunEnded(RunError.exit_status, "", [OBSERVER])))
         news = children.news(_POLL_SECONDS)
         ending = None
-        if isinstance(news, Exit):
+        if isinstance(news, ProcessExit):
             if _meant_us_too(news, stop) or (
                 news.process != OBSERVER and (news.status == 0 or children.restart_router(news))
             ):
@@ -204,6 +204,6 @@ def _stopped(children: Children, tell: Tell) -> RunEnded:
     return ending
 
 
-def _meant_us_too(ended: Exit, stop: threading.Event) -> bool:
+def _meant_us_too(ended: ProcessExit, stop: threading.Event) -> bool:
     """Whether the signal that ended a child soon reaches the launcher, too, as when a closing terminal hangs up on all."""
     return ended.status == INTERRUPTED and stop.wait(AFTERTHOUGHT_SECONDS)

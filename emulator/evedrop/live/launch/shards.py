@@ -19,7 +19,7 @@ from typing import final
 
 from evedrop.errors import Interrupted, RunError, UsageError
 from evedrop.live.launch.ports import RouterEndpoints, loopback_endpoints
-from evedrop.live.launch.process_set import Ended, launch_one
+from evedrop.live.launch.process_set import FinishedRun, launch_one
 from evedrop.live.launch.shard import SHARDS_FOLDER, Shard, shards_of
 from evedrop.live.launch.starter import Starter
 from evedrop.model.kernels.elementary import sum_in_order
@@ -130,7 +130,7 @@ def launch_shards(
     tell: Tell,
     stop: threading.Event,
     starter: Starter,
-) -> Ended:
+) -> FinishedRun:
     """Run a scenario in its shards, all at the same time, into one results folder; raises as `launch` does.
 
     The view shows the first shard, which has the recorded trials.
@@ -156,7 +156,7 @@ def launch_shards(
         if now != folder:
             tell(FolderMoved(str(now)))
             shards = [replace(shard, folder=now / SHARDS_FOLDER / str(shard.number)) for shard in shards]
-        return Ended(_made_one(scenario, now, shards, state, progress.started), state.viewer, now)
+        return FinishedRun(_made_one(scenario, now, shards, state, progress.started), state.viewer, now)
     except BaseException as error:
         if state.viewer is not None:
             state.viewer.stop()

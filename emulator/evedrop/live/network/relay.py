@@ -11,7 +11,7 @@ from evedrop.live.network.router_users import until_all_left, users_file
 from evedrop.live.network.session import ATTEMPT, Session, client_config, router_address_of, router_config
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.brief_parts import RelayPart
-from evedrop.live.protocol.commands import End
+from evedrop.live.protocol.commands import EndRun
 from evedrop.live.protocol.keys import ZenohConfig
 
 
@@ -29,7 +29,7 @@ def relay(brief: Brief[RelayPart]) -> None:
         present = session.presence(grant.process for grant in table if grant.token is not None and grant.zid is None)
         session.wait_for_link()
         session.ready()
-        session.wait_for(End)
+        session.wait_for(EndRun)
         until_all_left(present)
 
 

@@ -12,7 +12,7 @@ from typing import final
 
 from evedrop.errors import EvedropError
 from evedrop.live.network.process_session import ProcessSession
-from evedrop.live.protocol.commands import Again, ControlCommand, End
+from evedrop.live.protocol.commands import Again, ControlCommand, EndRun
 from evedrop.names import ROUTER
 
 
@@ -68,7 +68,7 @@ class Commands:
                     self._asked = command
                     self._news.notify()
                 self._wake()
-            case End():
+            case EndRun():
                 self._ended = True
             case _:
                 self._orders.put((self._asked.round, command))

@@ -40,7 +40,7 @@ from evedrop.live.network.zenoh_log import LOGGED
 from evedrop.live.protocol.brief import AnyBrief, Brief
 from evedrop.live.protocol.brief_parts import Identity, RouterPart, RoutingPart
 from evedrop.live.protocol.codec import Reader, end_report, refusal
-from evedrop.live.protocol.commands import Abandon, Again, Bounds, ControlCommand, End, ReportStatus, read_command
+from evedrop.live.protocol.commands import Abandon, Again, Bounds, ControlCommand, EndRun, ReportStatus, read_command
 from evedrop.live.protocol.envelope import Dropped
 from evedrop.live.protocol.keys import RunKeys, ZenohConfig, reader_of
 from evedrop.live.protocol.message_limits import low_pass
@@ -373,11 +373,11 @@ class Session:
         return read_command(Reader(self._control, payload), Bounds(self._slots, receivers))
 
     def wait_for(self, kind: type[ControlCommand]) -> None:
-        """Wait for one command of the conductor: `Start` or `End`."""
+        """Wait for one command of the conductor: `Start` or `EndRun`."""
         with self.status.waiting(self._control):
             while not isinstance(self.command(), kind):
                 pass
-        if kind is End:
+        if kind is EndRun:
             self.conclude()
 
     def command(self, receivers: Collection[str] | None = None) -> ControlCommand:

@@ -14,7 +14,7 @@ from evedrop.live.network.declared import Question
 from evedrop.live.network.mailbox import Mailbox
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.codec import Reader, is_over, progress, read_over
-from evedrop.live.protocol.commands import Abandon, ControlCommand, End, Start
+from evedrop.live.protocol.commands import Abandon, ControlCommand, EndRun, Start
 from evedrop.names import OBSERVER, RELAY, ROUTER, SENSOR
 from evedrop.system.signals import AFTERTHOUGHT_SECONDS
 
@@ -176,7 +176,7 @@ class Conductor:
                 said = self._clock.monotonic()
                 for name in left:
                     if self._present[name]:
-                        self.send_to(name, End())
+                        self.send_to(name, EndRun())
                         told.add(name)
             self._hear_out(self._next())
         # The relay after the router: the router's messages pass through it.
@@ -200,7 +200,7 @@ class Conductor:
                 return
             if self._clock.monotonic() - said > _END_SECONDS:
                 said = self._clock.monotonic()
-                self.send_to(name, End())
+                self.send_to(name, EndRun())
             self._hear_out(self._next())
 
     def _hear_out(self, news: tuple[str, bytes | bool] | None) -> None:

@@ -31,7 +31,7 @@ from evedrop.live.protocol.brief_parts import ObserverPart
 from evedrop.live.protocol.codec import Reader, is_refusal, read_refusal
 from evedrop.live.protocol.commands import ReportStatus
 from evedrop.live.protocol.last_word import protocol_breaker
-from evedrop.live.protocol.news import RunOver
+from evedrop.live.protocol.news import SlotsDone
 from evedrop.live.protocol.process_status import is_process_status, read_process_status
 from evedrop.live.protocol.requests import StatusRequest
 from evedrop.live.protocol.status import RunStatus
@@ -48,7 +48,7 @@ from evedrop.results.writer import ResultsWriter, write_summary
 from evedrop.scenario.news import ConnectionOutage, RunEnded, RunEvent, RunProgress, Started, ViewOpened
 from evedrop.scenario.tables import Scenario
 from evedrop.score.expectations_held import replay_of
-from evedrop.score.scorekeeper import Ending, Scored, Scorekeeper, digest_of, summary_of
+from evedrop.score.scorekeeper import RunOutcome, Scored, Scorekeeper, digest_of, summary_of
 from evedrop.score.summary import Summary
 from evedrop.show.view.scored_slots import loop_values_of, open_recording, shown
 from evedrop.show.view.viewer import Viewer, WebAddress
@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from evedrop.show.view.plant_slots import LoopValues
     from evedrop.show.view.recording import ViewRecording
 
-Report = Callable[[Path, int, str], None]
+EndPrinter = Callable[[Path, int, str], None]
 """Prints the end of a run, from its results folder, its exit status, and the reason for a failure."""
 _PROGRESS_SECONDS = 0.25
 
@@ -168,7 +168,7 @@ class ObservedRun:
                 self._recovery.give_up(self._joiner.done, complete=self._joiner.done == self._scenario.slots)
                 self._outages = self._recovery.outages
                 self._ended = time.monotonic()
-            tell(RunOver())
+            tell(SlotsDone())
             try:
                 conductor.end(patience)
             finally:
@@ -352,7 +352,7 @@ class ObservedRun:
                 self._keeper.totals.tallies[name].know_traces(sums)
         digests = {name: digest_of(self._scenario, name, blocks) for name, blocks in self._joiner.digests.items()}
         replay, wall = replay_of(self.folder, self._scenario), self._ended - self._started
-        ending = Ending(
+        ending = RunOutcome(
             wall,
             how,
             replay,
@@ -376,7 +376,7 @@ class ObservedRun:
         if self._scenario.process.source == "zenoh" and self._joiner.done == self._scenario.slots:
             write_resolved(self.folder, self._scenario, taken=True)
 
-    def finish(self, status: int, how: str, report: Report, saved: bool = True) -> int:
+    def finish(self, status: int, how: str, report: EndPrinter, saved: bool = True) -> int:
         """Close the view, write the summary, and tell the launcher; returns the exit status of the run.
 
         report: prints how the run ended, if it was started by hand. saved: whether all rows are on disk; otherwise the summary

@@ -20,10 +20,10 @@ from evedrop.live.network.launcher_news import set_news_apart, tell
 from evedrop.live.network.launcher_watchdog import launcher_is_gone, when_launcher_is_gone
 from evedrop.live.network.session import Session
 from evedrop.live.observer.conductor import Stop
-from evedrop.live.observer.observation import ObservedRun, Report
+from evedrop.live.observer.observation import EndPrinter, ObservedRun
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.brief_parts import ObserverPart
-from evedrop.live.protocol.news import Finishing
+from evedrop.live.protocol.news import SaveStarted
 from evedrop.model.eavesdroppers import REMOTE_CALLS
 from evedrop.results.folder import new_folder
 from evedrop.results.resolved_scenario import write_resolved
@@ -36,7 +36,7 @@ from evedrop.system.signals import heeded
 _ORPHAN_SECONDS = 30.0  # to write the results once the launcher is gone
 
 
-def observe(brief: Brief[ObserverPart], report: Report, serve: str | None = None) -> int:
+def observe(brief: Brief[ObserverPart], report: EndPrinter, serve: str | None = None) -> int:
     """Run the observer of a brief; returns the exit status of the run.
 
     report: prints the end of a run that was started by hand. serve: HOST:PORT where browsers may see the run, if anywhere.
@@ -71,7 +71,7 @@ def observe(brief: Brief[ObserverPart], report: Report, serve: str | None = None
             except EvedropError as error:
                 status, how = error.exit_status, "interrupted" if isinstance(error, Interrupted) else str(error)
             finally:
-                tell(Finishing())
+                tell(SaveStarted())
             observation.settle(how)
     except OSError as error:
         saved = False

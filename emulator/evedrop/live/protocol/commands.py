@@ -49,7 +49,7 @@ class Start(ControlCommand):
 
 
 @dataclass(frozen=True)
-class End(ControlCommand):
+class EndRun(ControlCommand):
     """To all: the run is over; confirm it and leave."""
 
     do = "end"
@@ -199,7 +199,7 @@ def _changes(found: Reader, name: str, slots: int) -> tuple[Change, ...]:
 
 
 _KINDS: Mapping[str, type[ControlCommand]] = {
-    kind.do: kind for kind in (Start, End, ReportStatus, Hold, Abandon, Go, LinkChange, Again)
+    kind.do: kind for kind in (Start, EndRun, ReportStatus, Hold, Abandon, Go, LinkChange, Again)
 }
 
 

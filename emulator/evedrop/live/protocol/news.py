@@ -43,14 +43,14 @@ class ProcessRequest(News):
 
 
 @dataclass(frozen=True)
-class RunOver(News):
+class SlotsDone(News):
     """All slots are done, and the processes will be told to leave."""
 
     event = "over"
 
 
 @dataclass(frozen=True)
-class Finishing(News):
+class SaveStarted(News):
     """The observer begins to write the results."""
 
     event = "finishing"
@@ -66,8 +66,8 @@ _KINDS: Mapping[str, type[News]] = {
         ProcessRequest,
         ConnectionOutage,
         RunProgress,
-        RunOver,
-        Finishing,
+        SlotsDone,
+        SaveStarted,
         RunEnded,
         ViewOpened,
     )
