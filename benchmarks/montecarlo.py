@@ -88,7 +88,7 @@ def elapsed(work: Callable[[], object]) -> float:
 
 
 def silent(_: object) -> None:
-    """Take no news."""
+    """Ignore an event."""
 
 
 def study(slots: int) -> float:

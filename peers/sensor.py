@@ -64,9 +64,9 @@ class Window:
         self._absent: Collection[str] = ()
         self._limit = window
         self._keys = {name: session.keys.progress(name) for name in followers}
-        self._news = Mailbox(self._keys, _PROGRESS_BYTES, clock)
+        self._mailbox = Mailbox(self._keys, _PROGRESS_BYTES, clock)
         for name, key in self._keys.items():
-            session.subscribe_with(key, partial(self._news.put, name))
+            session.subscribe_with(key, partial(self._mailbox.put, name))
 
     @property
     def followers(self) -> tuple[str, ...]:
@@ -79,7 +79,7 @@ class Window:
             with self._status.waiting(
                 *(self._keys[name] for name in self._followed if self._done[name] + self._window <= k)
             ):
-                name, payload = self._news.get()
+                name, payload = self._mailbox.get()
             self._take(name, payload, k)
 
     def settle(self, k: int, seconds: float) -> None:
@@ -87,7 +87,7 @@ class Window:
         deadline = self._clock.monotonic() + seconds
         with contextlib.suppress(Empty):
             while min(self._done[name] for name in self._followed) < k:
-                self._take(*self._news.get(max(0.0, deadline - self._clock.monotonic())), k)
+                self._take(*self._mailbox.get(max(0.0, deadline - self._clock.monotonic())), k)
 
     def _take(self, name: str, payload: bytes | bool, k: int) -> None:
         """Take a progress message; all slots of it are below k or k itself."""

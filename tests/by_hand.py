@@ -107,9 +107,9 @@ class ByHand:
         assert lines is not None
         with lines:
             for line in lines:
-                news = json.loads(line)
-                self._done.append(news.get("done", 0))
-                if news["event"] == "ended":
+                event = json.loads(line)
+                self._done.append(event.get("done", 0))
+                if event["event"] == "ended":
                     break
             lines.read()  # the table, for people
 

@@ -29,11 +29,11 @@ _ROOT = Path(__file__).parents[1]
 _UNTIL_THE_END = ExitStack()
 atexit.register(_UNTIL_THE_END.close)
 NEWS = "EVEDROP_TEST_NEWS"
-"""The environment variable that names the file for a command's news."""
+"""The environment variable that names the file for a command's events."""
 LARGEST_FILE = "EVEDROP_TEST_LARGEST_FILE"
-"""The environment variable that limits the size of the files of a command that writes its news, in bytes; 0: no limit."""
+"""The environment variable that limits the size of the files of a command that writes its events, in bytes; 0: no limit."""
 TELLING = Path(__file__).with_name("telling.py")
-"""Runs a command that writes its news."""
+"""Runs a command that writes its events."""
 
 
 class CommandProcess(Protocol):

@@ -1,6 +1,6 @@
 """The command as it is, which also writes what its progress line shows: run as a script, or imported by a fork server.
 
-The environment variable EVEDROP_TEST_NEWS names the file for the news, if it is set, and EVEDROP_TEST_LARGEST_FILE limits the
+The environment variable EVEDROP_TEST_NEWS names the file for the events, if it is set, and EVEDROP_TEST_LARGEST_FILE limits the
 size of the command's files in bytes (0: no limit). A fork finds the modules of its own PYTHONPATH, as a new interpreter would.
 """
 
@@ -24,21 +24,21 @@ from evedrop import __main__ as command
 from evedrop.cli.progress_line import ProgressLine
 from evedrop.fork_server import serve
 from evedrop.live.launch import preloading
-from evedrop.scenario.news import Held
+from evedrop.scenario.progress_events import Held
 
 if TYPE_CHECKING:
-    from evedrop.scenario.news import News
+    from evedrop.scenario.progress_events import ProgressEvent
 
-show = ProgressLine.tell
+show = ProgressLine.on_event
 
 
-def tell(self: ProgressLine, news: News) -> None:
-    """In the place of `ProgressLine.tell`."""
+def on_event(self: ProgressLine, event: ProgressEvent) -> None:
+    """In the place of `ProgressLine.on_event`."""
     if (path := os.environ.get("EVEDROP_TEST_NEWS")) is not None:
         with open(path, "a") as file:
-            done = news.before if isinstance(news, Held) else getattr(news, "done", 0)
-            file.write(f"{done} {news.event}\n")
-    show(self, news)
+            done = event.before if isinstance(event, Held) else getattr(event, "done", 0)
+            file.write(f"{done} {event.kind}\n")
+    show(self, event)
 
 
 class Forked:
@@ -104,7 +104,7 @@ def program_with_path() -> NoReturn:
     limited_program()
 
 
-ProgressLine.tell = tell  # type: ignore[method-assign]
+ProgressLine.on_event = on_event  # type: ignore[method-assign]
 program = command.program
 
 if __name__ == "__main__":

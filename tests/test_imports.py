@@ -84,7 +84,9 @@ def test_peers_and_network_stay_light(loaded: dict[str, set[str]]) -> None:
             f"evedrop.{name}" for name in ("live", "model", "peers", "scenario", "system", "names", "errors")
         }
         of_scenarios = {".".join(name.split(".")[:3]) for name in names if name.startswith("evedrop.scenario.")}
-        assert of_scenarios <= {f"evedrop.scenario.{name}" for name in ("conformance", "plugins", "news")}, module
+        assert of_scenarios <= {f"evedrop.scenario.{name}" for name in ("conformance", "plugins", "progress_events")}, (
+            module
+        )
 
 
 def test_a_solver_is_loaded_only_when_a_controller_is_made(loaded: dict[str, set[str]]) -> None:

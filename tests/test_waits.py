@@ -24,7 +24,7 @@ EXCEPTIONS = {
     "emulator/evedrop/live/network/declared.py _received self._subscribers.get": PROCESS,
     "emulator/evedrop/live/network/declared.py _received self._subscriber.recv": PROCESS,
     "emulator/evedrop/live/network/declared.py __iter__ self.recv": PROCESS,
-    "emulator/evedrop/live/network/delayed_sender.py _go_round self._news.wait": WORK,
+    "emulator/evedrop/live/network/delayed_sender.py _go_round self._changed.wait": WORK,
     "emulator/evedrop/live/network/router.py _acknowledged self.sent.get": PROCESS,
     "emulator/evedrop/live/network/router_commands.py next self._orders.get": PROCESS,
     "emulator/evedrop/live/network/session.py _send_again self._rounds.get": WORK,
@@ -42,7 +42,7 @@ EXCEPTIONS = {
     "emulator/evedrop/wire/queries.py _run self._heard.get": WORK,
     "peers/closed_loop.py of self._subscription.recv": PROCESS,
     "peers/controller.py steer subscription.recv": PROCESS,
-    "peers/sensor.py wait self._news.get": PROCESS,
+    "peers/sensor.py wait self._mailbox.get": PROCESS,
     "peers/sensor.py wait self._subscription.recv": PROCESS,
 }
 """File, function and call → why it needs no limit."""

@@ -16,7 +16,7 @@ import pytest
 
 from evedrop.simulate import montecarlo, workers
 from evedrop.simulate.montecarlo import Plan
-from evedrop.simulate.tasks import Result, Stopped, Task, Tell
+from evedrop.simulate.tasks import OnProgress, Result, Stopped, Task
 from evedrop.system.lacks import lack_of, preload_within_limit, refuse_scipy_without_room
 from tests.conftest import Evedrop
 from tests.examples import mostly_long
@@ -98,9 +98,9 @@ def test_a_run_without_threads_ends_with_a_sentence(evedrop: Evedrop, monkeypatc
 class Hungry(Task[Result]):
     """A task for which there is not enough memory."""
 
-    def carry_out(self, tell: Tell, stopped: Stopped) -> Result:
+    def carry_out(self, on_progress: OnProgress, stopped: Stopped) -> Result:
         """Raises MemoryError."""
-        del tell, stopped
+        del on_progress, stopped
         raise MemoryError
 
     def example(self) -> Result:

@@ -10,7 +10,7 @@ from rich.cells import cell_len
 from rich.text import Text
 
 from evedrop.cli.progress_line import ProgressLine
-from evedrop.scenario.news import Held, RunProgress, Started
+from evedrop.scenario.progress_events import Held, RunProgress, Started
 
 
 class Terminal(io.StringIO):
@@ -27,7 +27,7 @@ def test_a_held_run_shows_how_far_it_is(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setenv("TERM", "xterm")
     with ProgressLine(50, "slots") as line:
-        line.tell(Held(20))
+        line.on_event(Held(20))
     assert "held before slot 20" in terminal.getvalue()
     assert "20/50" in terminal.getvalue()
 
@@ -38,9 +38,9 @@ def test_a_study_shows_no_total_before_it_is_known(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setenv("TERM", "xterm")
     with ProgressLine(None, "trial-slots") as line:
-        line.tell(Started())
+        line.on_event(Started())
         before = terminal.getvalue()
-        line.tell(RunProgress(5, 1.0, "trial-slots/s", {}, 20))
+        line.on_event(RunProgress(5, 1.0, "trial-slots/s", {}, 20))
     assert "0/0" not in terminal.getvalue()
     assert ("0/?" in before, "left" in before) == (True, False)
     assert "5/20" in terminal.getvalue().removeprefix(before)
@@ -54,8 +54,8 @@ def test_a_narrow_terminal_shows_what_is_done_and_the_time_left(monkeypatch: pyt
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "40")
     with ProgressLine(2_000_000, "trial-slots") as line:
-        line.tell(Started())
-        line.tell(RunProgress(500_000, 123_456.0, "trial-slots/s", {"legitimate": 0.5, "smart": 2.0}))
+        line.on_event(Started())
+        line.on_event(RunProgress(500_000, 123_456.0, "trial-slots/s", {"legitimate": 0.5, "smart": 2.0}))
     last = terminal.getvalue().split("500000/2000000")[-1]
     assert "trial-slots" in last
     assert "left" in last
@@ -86,9 +86,9 @@ def test_the_errors_never_hide_how_far_a_run_is(
     monkeypatch.setenv("COLUMNS", str(columns))
     monkeypatch.setenv("NO_COLOR", "1")
     with ProgressLine(3000, "slots") as line:
-        line.tell(Started())
-        line.tell(RunProgress(10, 43.0, "slots/s", ERRORS))
-        line.tell(RunProgress(2999, 43.0, "slots/s", ERRORS))
+        line.on_event(Started())
+        line.on_event(RunProgress(10, 43.0, "slots/s", ERRORS))
+        line.on_event(RunProgress(2999, 43.0, "slots/s", ERRORS))
     written = Text.from_ansi(terminal.getvalue()).plain.splitlines()
     assert all(cell_len(one) <= columns for one in written)
     assert not any(one.strip() in {"left", "slots"} for one in written), "nothing goes on in a second line"
@@ -106,8 +106,8 @@ def test_a_held_run_on_a_narrow_terminal_says_that_it_is_held(monkeypatch: pytes
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "40")
     with ProgressLine(400, "slots") as line:
-        line.tell(RunProgress(100, 43.0, "slots/s", ERRORS))
-        line.tell(Held(120))
+        line.on_event(RunProgress(100, 43.0, "slots/s", ERRORS))
+        line.on_event(Held(120))
     last = [one for one in Text.from_ansi(terminal.getvalue()).plain.splitlines() if "held before" in one][-1]
     assert "held before slot 120 120/400 slots" in last
     assert "left" not in last

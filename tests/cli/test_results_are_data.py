@@ -21,7 +21,7 @@ from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.writer import ResultsWriter
 from evedrop.scenario.loading import load
 from evedrop.scenario.loading.recorded import recorded
-from evedrop.scenario.news import silent
+from evedrop.scenario.progress_events import silent
 from evedrop.score.sums import SlotSums
 from evedrop.show.view.replay import replay
 from evedrop.simulate.montecarlo import simulate

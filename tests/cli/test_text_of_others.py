@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from evedrop.cli.console import StyledConsole
 from evedrop.errors import ScenarioError
 from evedrop.scenario.loading import load
-from evedrop.scenario.news import silent
+from evedrop.scenario.progress_events import silent
 from evedrop.simulate.montecarlo import simulate
 from evedrop.system.output import Output, escaped, print_json
 from tests.conftest import Evedrop

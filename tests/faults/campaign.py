@@ -179,7 +179,7 @@ def _usual(variant: Variant, folder: Path, reference: Reference, server: Sshd | 
                 f"an undisturbed run of {variant.name} did not end within {_UNDISTURBED_SECONDS:.0f} s"
             ) from None
         ended = time.monotonic()
-        run.over.wait(0.1)  # for the last news to be read
+        run.over.wait(0.1)  # for the last events to be read
         if run.launcher.returncode:
             ours.end_all(ours.none_left(before, 5.0))
             raise Refused(f"an undisturbed run of {variant.name} fails: {run.text('stderr')}")

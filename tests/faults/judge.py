@@ -103,7 +103,7 @@ class Run(Protocol):
 
     @property
     def told(self) -> Sequence[Mapping[str, Any]]:
-        """Its news, each with the time `at` which it came."""
+        """Its events, each with the time `at` which it came."""
 
     def text(self, name: str) -> str:
         """What it wrote to stdout or stderr."""
@@ -179,12 +179,12 @@ def _of_refusal(run: Run, fatal: Sequence[Fault]) -> Iterator[str]:
 def _of_ignored_signals(run: Run, fatal: Sequence[Fault], hits: Mapping[Fault, float], slots: int) -> Iterator[str]:
     """A launcher that is told to end while slots are to come ends the run, rather than complete it.
 
-    It hears the news of the run in the loop in which it heeds signals, so that it is late for both on a busy machine.
+    It hears the events of the run in the loop in which it heeds signals, so that it is late for both on a busy machine.
     """
     for fault in fatal:
         late = hits[fault] + _HEEDED_SECONDS
-        progress = [news for news in run.told if news["event"] == "progress" and news["at"] > late]
-        if fault.kind in SIGNALS and fault.target == "launcher" and any(news["done"] < slots for news in progress):
+        progress = [event for event in run.told if event["event"] == "progress" and event["at"] > late]
+        if fault.kind in SIGNALS and fault.target == "launcher" and any(event["done"] < slots for event in progress):
             yield f"the run went on to its end, {_HEEDED_SECONDS:.0f} s and more after {fault}"
 
 

@@ -14,7 +14,7 @@ from tests.faults.kinds import CONFUSED, EVERYBODY, Fault
 _ROUTERS = ("router", "relay")
 _CUTTING = ("flap", "cut", "silence", "stop", CONFUSED)
 _LAG_SECONDS = 0.3
-"""By which news of the run may be late: later news of slots to come prove that the run was not over when a fault struck."""
+"""By which events of the run may be late: later events of slots to come prove that the run was not over when a fault struck."""
 
 
 def wrong_outages(
@@ -26,12 +26,12 @@ def wrong_outages(
 ) -> Iterator[str]:
     """What is wrong with a summary's `outages`.
 
-    told: the run's news, each with the time `at` which it came; struck: when each fault hit something; slots: of the whole run.
+    told: the run's events, each with the time `at` which it came; struck: when each fault hit something; slots: of the whole run.
     """
     entries = {(entry["process"], entry["slot"]) for entry in listed}
-    for news in told:
-        if news["event"] == "reconnected" and (news["process"], news["slot"]) not in entries:
-            yield f"the run told of an outage of {news['process']} at slot {news['slot']}, and the summary lists none"
+    for event in told:
+        if event["event"] == "reconnected" and (event["process"], event["slot"]) not in entries:
+            yield f"the run told of an outage of {event['process']} at slot {event['slot']}, and the summary lists none"
     for entry in listed:
         if not _explained(str(entry["process"]), struck, complete):
             yield f"an outage of {entry['process']} at slot {entry['slot']}, and no fault caused one"
@@ -66,8 +66,8 @@ def _explained(process: str, struck: Mapping[Fault, float], complete: bool) -> b
 
 def _went_on(told: Sequence[Mapping[str, Any]], struck: float, slots: int) -> bool:
     """Whether the run had begun when a fault struck, and slots were still to come well after it."""
-    begun = any(news["event"] in ("started", "progress") and news["at"] < struck for news in told)
+    begun = any(event["event"] in ("started", "progress") and event["at"] < struck for event in told)
     return begun and any(
-        news["event"] == "progress" and news["at"] > struck + _LAG_SECONDS and 0 < news["done"] < slots - 1
-        for news in told
+        event["event"] == "progress" and event["at"] > struck + _LAG_SECONDS and 0 < event["done"] < slots - 1
+        for event in told
     )

@@ -45,11 +45,11 @@ def ended_late(
 ) -> Iterator[str]:
     """Whether a run whose host hangs ended within half a minute of its last slot, or of a signal to its launcher.
 
-    told: its news, each with the time `at` which it came; ended: when its launcher ended; slots: of the whole run.
+    told: its events, each with the time `at` which it came; ended: when its launcher ended; slots: of the whole run.
     """
     if not any(fault.is_ignored for fault in hits):
         return
-    last = [news["at"] for news in told if news["event"] == "progress" and news["done"] >= slots]
+    last = [event["at"] for event in told if event["event"] == "progress" and event["done"] >= slots]
     signalled = [at for fault, at in hits.items() if fault.kind in SIGNALS and fault.target == "launcher"]
     begun = min([*last[:1], *signalled], default=ended)
     if ended - max(begun, *hits.values()) > _HALF_A_MINUTE + _BUSY_SECONDS:

@@ -190,7 +190,7 @@ def test_another_account_of_a_run_that_ended_early_is_seen(early: Ended, referen
 
 
 def progress(done: int, at: float) -> dict[str, Any]:
-    """News of the progress of a run."""
+    """Events of the progress of a run."""
     return {"event": "progress", "done": done, "at": at}
 
 
@@ -232,7 +232,7 @@ def test_the_judge_sees_what_is_left_and_what_cannot_be_read(ended: Ended, refer
 
 
 def test_a_launcher_that_heeds_no_signal_is_seen(ended: Ended, reference: Reference) -> None:
-    """Slots are done a second after the signal, and all of them at the end; news of the end alone say nothing."""
+    """Slots are done a second after the signal, and all of them at the end; events of the end alone say nothing."""
     ended.told = [progress(399, 2.5), progress(400, 2.6)]
     assert [line for line in ended.misses(reference, INTERRUPT) if "the run went on to its end" in line]
     ended.told = [progress(399, 1.5), progress(400, 2.6)]

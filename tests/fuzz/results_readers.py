@@ -22,8 +22,8 @@ from evedrop.results.reading import Results
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.writer import ResultsWriter
 from evedrop.scenario.loading import load
-from evedrop.scenario.news import silent
 from evedrop.scenario.plugins import named_in
+from evedrop.scenario.progress_events import silent
 from evedrop.score.sums import SlotSums
 from evedrop.show.report.wire import wire_failures
 from evedrop.show.view.replay import replay

@@ -41,12 +41,12 @@ def begun(evedrop: Evedrop, name: str, path: str, *options: str, folder: Path | 
 
 
 def closing(done: Done) -> list[str]:
-    """What an observer printed after its news, but for the folder's name and how fast it was."""
-    news = [line for line in done.out.splitlines() if line.startswith("{")]
+    """What an observer printed after its events, but for the folder's name and how fast it was."""
+    events = [line for line in done.out.splitlines() if line.startswith("{")]
     lines = done.out.splitlines()
-    assert lines[: len(news)] == news
-    assert json.loads(news[-1])["event"] == "ended"
-    return comparable(lines[len(news) :])
+    assert lines[: len(events)] == events
+    assert json.loads(events[-1])["event"] == "ended"
+    return comparable(lines[len(events) :])
 
 
 def comparable(lines: list[str]) -> list[str]:

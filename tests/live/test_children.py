@@ -1,4 +1,4 @@
-"""The launcher's view of its children: their briefs on disk, the observer's news, and how a run ended; no process is started."""
+"""The launcher's view of its children: their briefs, the observer's events, and how a run ended; no process is started."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from evedrop.live.launch.children import Children, ProcessExit
 from evedrop.live.launch.process_set import follow_to_end
 from evedrop.live.protocol.brief import read_brief
 from evedrop.live.protocol.last_word import Cause, LastWord, last_word_file, protocol_breaker, read_last_word
-from evedrop.live.protocol.news import ProcessRequest, RouterListens, read_news
+from evedrop.live.protocol.launcher_events import ProcessRequest, RouterListens, read_event
 from evedrop.names import ProcessAction
 from evedrop.results.folder import HeldFolder, new_folder
-from evedrop.scenario.news import ConnectionOutage, News, RunEnded, RunProgress, Started, silent
+from evedrop.scenario.progress_events import ConnectionOutage, ProgressEvent, RunEnded, RunProgress, Started, silent
 from tests.conftest import wait_until
 from tests.live.network.bench import small_network
 
@@ -88,18 +88,18 @@ class Bench:
         """A process leaves its last word."""
         word.leave(last_word_file(self.private, name))
 
-    def tells(self, *lines: bytes) -> list[News]:
+    def tells(self, *lines: bytes) -> list[ProgressEvent]:
         """The observer writes these lines and ends: what the launcher shows of them."""
         self.starter.lines = b"".join(lines)
         self.children.start(self.briefs["observer"])
-        found: list[News] = []
+        found: list[ProgressEvent] = []
 
         def ended() -> bool:
-            match self.children.news(0.1):
+            match self.children.next_event(0.1):
                 case ProcessExit("observer"):
                     return True
-                case News() as news:
-                    found.append(news)
+                case ProgressEvent() as event:
+                    found.append(event)
             return False
 
         wait_until(ended, "the observer's end")
@@ -216,13 +216,13 @@ def test_a_process_starts_again_only_when_its_router_listens(bench: Bench) -> No
     bench.children.start(bench.briefs["observer"])
     begun = len(bench.starter.begun)
     for _ in range(10):
-        bench.children.news(0.01)
+        bench.children.next_event(0.01)
     assert bench.starter.begun[begun:] == []
     bench.starter.pipes = {"router": BytesIO(RouterListens("router").line)}
     bench.children.start(bench.briefs["router"], again=True)
 
     def started_again() -> bool:
-        bench.children.news(0.01)
+        bench.children.next_event(0.01)
         return "eve" in bench.starter.begun[begun:]
 
     wait_until(started_again, "the process to start again")
@@ -234,7 +234,7 @@ OUTAGE = ConnectionOutage("router", 3, 5, 0.5)
 
 
 def test_no_news_deletes_the_brief_of_a_process_that_may_not_have_read_it(bench: Bench) -> None:
-    """News of another process, or of an earlier start of this one, say nothing about who is starting just now."""
+    """Events of another process, or of an earlier start of this one, say nothing about who is starting just now."""
     router = bench.private / "router.json"
     bench.children.start(bench.briefs["router"])
     bench.tells(Started().line)
@@ -244,12 +244,12 @@ def test_no_news_deletes_the_brief_of_a_process_that_may_not_have_read_it(bench:
 
 
 @pytest.mark.parametrize(
-    "news", [PROGRESS, OUTAGE, RunEnded(3, "é", ["eve"], ["eve"], "why", "eve"), RunEnded(0, "complete")]
+    "event", [PROGRESS, OUTAGE, RunEnded(3, "é", ["eve"], ["eve"], "why", "eve"), RunEnded(0, "complete")]
 )
-def test_news_are_read_as_they_were_written(news: News) -> None:
+def test_news_are_read_as_they_were_written(event: ProgressEvent) -> None:
     """Whatever their entries."""
-    found = read_news(news.line)
-    assert (type(found), found.line) == (type(news), news.line)
+    found = read_event(event.line)
+    assert (type(found), found.line) == (type(event), event.line)
 
 
 MALFORMED = {
@@ -273,5 +273,5 @@ def test_malformed_news_are_refused(line: bytes, bench: Bench) -> None:
     """The launcher goes on with the next line, and the observer's log says what was wrong."""
     assert bench.tells(line + b"\n", PROGRESS.line) == [PROGRESS]
     log = (bench.results / "logs" / "observer.log").read_text()
-    assert log.startswith("evedrop: the launcher refused malformed news: ")
+    assert log.startswith("evedrop: the launcher refused a malformed event: ")
     assert MALFORMED[line] in log

@@ -116,10 +116,10 @@ def test_processes_that_come_and_go_are_noted() -> None:
     conductor.assemble()
     network.clock.now += 5.0
     network.watches["smart"](False)
-    assert conductor.news() is None
+    assert conductor.next_message() is None
     network.clock.now += 2.0
     network.watches["smart"](False)
-    assert conductor.news() is None
+    assert conductor.next_message() is None
     assert conductor.lost == {"smart": 1005.0}
     assert conductor.missing == ["smart"]
     assert conductor.processes == {"router": True, "sensor": True, "legitimate": True, "smart": False}
@@ -128,11 +128,11 @@ def test_processes_that_come_and_go_are_noted() -> None:
     network.watches["smart"](True)
     report = end_report(0)
     network.reads[network.keys.telemetry("sensor")](report)
-    assert conductor.news() is None
+    assert conductor.next_message() is None
     assert conductor.lost == {}
-    assert conductor.news() == ("sensor", report)
+    assert conductor.next_message() == ("sensor", report)
     assert conductor.misdelivered == {}
-    assert conductor.news() is None
+    assert conductor.next_message() is None
 
 
 def test_the_routers_are_told_last_that_a_run_is_given_up() -> None:
@@ -157,7 +157,7 @@ def test_a_command_to_all_reaches_who_reports_and_is_there() -> None:
     conductor = conducted(network, relayed=True)
     conductor.assemble()
     network.watches["smart"](False)
-    assert conductor.news() is None
+    assert conductor.next_message() is None
     conductor.send_to_all(Start())
     assert [name for name, *_ in network.said] == ["router", "sensor", "legitimate"]
 

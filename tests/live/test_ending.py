@@ -137,7 +137,7 @@ def test_a_process_that_was_never_told_is_waited_for(network: Network) -> None:
     one.assemble()
     network.watches["smart"](False)
     network.does["sensor"] = gone
-    assert one.news() is None
+    assert one.next_message() is None
     one.end(30.0)
     assert network.told["smart"] == 1
     assert "smart" in one.misdelivered

@@ -9,7 +9,7 @@ from evedrop.cli.api import run
 from evedrop.results.diff import difference
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import checked, shipped
-from evedrop.scenario.news import silent
+from evedrop.scenario.progress_events import silent
 from evedrop.simulate.montecarlo import Plan, simulate
 from tests.builders import digests_of
 

@@ -13,7 +13,15 @@ from evedrop.errors import UsageError
 from evedrop.live.launch.metrics import MetricsAddress, RunMetrics, metrics_served
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
-from evedrop.scenario.news import ConnectionOutage, FolderMoved, Held, News, RunProgress, Started, silent
+from evedrop.scenario.progress_events import (
+    ConnectionOutage,
+    FolderMoved,
+    Held,
+    ProgressEvent,
+    RunProgress,
+    Started,
+    silent,
+)
 from tests.conftest import LIMIT, Evedrop, wait_until
 
 pytest.importorskip("prometheus_client")
@@ -39,14 +47,14 @@ def test_a_scrape_has_the_figures_of_the_run(tmp_path: Path) -> None:
     scenario = load("restart")
     seen: list[Samples] = []
 
-    def tell(news: News) -> None:
-        metrics.tell(news)
-        if isinstance(news, RunProgress):
+    def on_event(event: ProgressEvent) -> None:
+        metrics.on_event(event)
+        if isinstance(event, RunProgress):
             seen.append(scraped(page))
 
     metrics = RunMetrics(scenario, tmp_path / "run", silent)
     with metrics_served(ANY_PORT, metrics) as page:
-        run(scenario, out=tmp_path / "run", view="off", tell=tell)
+        run(scenario, out=tmp_path / "run", view="off", on_event=on_event)
         last = scraped(page)
     slots = [one["evedrop_slots_total",] for one in seen]
     assert slots == sorted(slots)
@@ -70,17 +78,17 @@ def test_a_scrape_has_the_figures_of_the_run(tmp_path: Path) -> None:
 
 
 def test_a_lost_connection_is_counted(tmp_path: Path) -> None:
-    """By process; the news goes on to the terminal, and without figures on disk the rest is served."""
-    told: list[News] = []
+    """By process; the events go on to the terminal, and without figures on disk the rest is served."""
+    told: list[ProgressEvent] = []
     metrics = RunMetrics(load("vehicle"), tmp_path, told.append)
-    news = [Started(), *[ConnectionOutage("smart", slot, slot + 1, 0.5) for slot in (3, 9)]]
+    events = [Started(), *[ConnectionOutage("smart", slot, slot + 1, 0.5) for slot in (3, 9)]]
     with metrics_served(ANY_PORT, metrics) as page:
         assert scraped(page)["evedrop_running",] == 0
-        for one in news:
-            metrics.tell(one)
+        for one in events:
+            metrics.on_event(one)
         found = scraped(page)
     assert (found["evedrop_running",], found["evedrop_lost_connections_total", "smart"]) == (1, 2)
-    assert told == news
+    assert told == events
 
 
 @contextlib.contextmanager
@@ -119,8 +127,8 @@ def test_a_run_that_is_paused_is_held(tmp_path: Path) -> None:
     metrics = RunMetrics(load("vehicle"), tmp_path, silent)
     held = []
     with metrics_served(ANY_PORT, metrics) as page:
-        for news in (Started(), Held(20), RunProgress(21, 5.0, "slots/s", {"smart": 0.5})):
-            metrics.tell(news)
+        for event in (Started(), Held(20), RunProgress(21, 5.0, "slots/s", {"smart": 0.5})):
+            metrics.on_event(event)
             held.append(scraped(page)["evedrop_held",])
         assert scraped(page)["evedrop_recent_squared_error", "smart"] == 0.5
     assert held == [0, 1, 0]
@@ -132,7 +140,7 @@ def test_figures_are_those_of_the_folder_and_alarms_of_the_watermark(tmp_path: P
     metrics = RunMetrics(load("replay-attack"), tmp_path / "before", silent)
     with metrics_served(ANY_PORT, metrics) as page:
         assert ("evedrop_mean_squared_error", "legitimate") not in scraped(page)
-        metrics.tell(FolderMoved(str(tmp_path / "after")))
+        metrics.on_event(FolderMoved(str(tmp_path / "after")))
         found = scraped(page)
     summary = Results.read(tmp_path / "after").summary
     assert found["evedrop_mean_squared_error", "legitimate"] == summary["peers"]["legitimate"]["mean_squared_error"]

@@ -25,8 +25,8 @@ from evedrop.live.launch.private_folder import private_folder, socket_folder
 from evedrop.live.launch.process_set import launch_one
 from evedrop.live.launch.starter import StartedProcess, Starter
 from evedrop.live.network.endpoint import Endpoint, SocketEndpoint, endpoint_in
-from evedrop.live.protocol.news import RouterListens
-from evedrop.scenario.news import silent
+from evedrop.live.protocol.launcher_events import RouterListens
+from evedrop.scenario.progress_events import silent
 from evedrop.scenario.tables import Scenario
 from evedrop.system.ports import free_port
 from tests.conftest import LIMIT, Evedrop, Live, with_mark

@@ -19,14 +19,14 @@ import time
 import evedrop.live.launch.children as children
 import evedrop.live.launch.process_set as process_set
 import evedrop.live.launch.starter as starter
-import evedrop.live.network.launcher_news as heartbeat
+import evedrop.live.network.launcher_pipe as heartbeat
 import evedrop.results.writer as results
 
 def finish(folder, honest=results.finish):
     time.sleep({finish})
     honest(folder)
 
-def news(self, seconds, honest=children.Children.news):
+def next_event(self, seconds, honest=children.Children.next_event):
     if self.started:
         children.SILENCE_SECONDS = process_set.SILENCE_SECONDS = {silence}
     return honest(self, seconds)
@@ -34,7 +34,7 @@ def news(self, seconds, honest=children.Children.news):
 results.finish = finish
 children.GRACE_SECONDS = children._GONE_SECONDS = starter.GRACE_SECONDS = {grace}
 heartbeat.Heartbeat.__init__.__defaults__ = (0.1,)
-children.Children.news = news
+children.Children.next_event = next_event
 """
 """How long an observer takes to make Parquet files, after how long a silence in a run its launcher gives it up, and how long
 processes that are told to end may take."""

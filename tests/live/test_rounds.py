@@ -12,7 +12,7 @@ from evedrop.live.observer.recovery import Recovery
 from evedrop.live.observer.stall import patience_of
 from evedrop.live.protocol.brief import Flow
 from evedrop.live.protocol.commands import Again, ControlCommand
-from evedrop.scenario.news import News
+from evedrop.scenario.progress_events import ProgressEvent
 from tests.clock import TestClock
 from tests.live.test_ending import Network
 
@@ -66,7 +66,7 @@ class Conducted:
 
 def test_losses_that_overlap_are_one_outage() -> None:
     """One entry for each process that was cut off, from its first loss to when slots are joined again; then another."""
-    conducted, said = Conducted(), list[News]()
+    conducted, said = Conducted(), list[ProgressEvent]()
     recovery = Recovery(
         conducted,  # type: ignore[arg-type]
         conducted,  # type: ignore[arg-type]
@@ -196,7 +196,7 @@ def test_a_process_is_reached_when_its_commands_have_a_reader() -> None:
     conductor.assemble()
     assert conductor.unreached == ["sensor", "smart"]
     network.watches["sensor"](False)
-    assert conductor.news() is None
+    assert conductor.next_message() is None
     assert conductor.unreached == ["smart"]
     network.unread.clear()
     assert conductor.unreached == []

@@ -21,7 +21,7 @@ from evedrop.live.launch.shards import OneProgress
 from evedrop.results.growing_tables import last_round
 from evedrop.results.reading import Results, age_of_figures
 from evedrop.scenario.loading import load
-from evedrop.scenario.news import News, RunEnded, RunProgress, Started, silent
+from evedrop.scenario.progress_events import ProgressEvent, RunEnded, RunProgress, Started, silent
 from tests.builders import digests_of
 from tests.conftest import Evedrop, Live, wait_until, with_mark
 from tests.examples import mostly_long
@@ -169,7 +169,7 @@ def test_shards_are_contiguous_and_as_equal_as_can_be() -> None:
 
 def test_progress_is_that_of_the_slowest() -> None:
     """Nothing is told before all have begun, and never more than all have done."""
-    told: list[News] = []
+    told: list[ProgressEvent] = []
     shards = shards_of(load("eavesdroppers", {"trials": 3, "shards": 2, "slots": 90}), Path("run"))
     one = OneProgress(shards, told.append)
     first, second = (one.of(shard) for shard in shards)
@@ -186,13 +186,13 @@ def test_progress_is_that_of_the_slowest() -> None:
 
 def test_a_shard_that_was_ended_early_has_done_no_more_than_it_said() -> None:
     """Its end adds the last slots to what it has told only if the run was complete."""
-    told: list[News] = []
+    told: list[ProgressEvent] = []
     shards = shards_of(load("eavesdroppers", {"trials": 3, "shards": 2, "slots": 90}), Path("run"))
     one = OneProgress(shards, told.append)
     first, second = (one.of(shard) for shard in shards)
-    for tell in (first, second):
-        tell(Started())
-        tell(RunProgress(20, 4.0, "slots/s", {"smart": 4.0}))
+    for on_event in (first, second):
+        on_event(Started())
+        on_event(RunProgress(20, 4.0, "slots/s", {"smart": 4.0}))
     second(RunEnded(130, "interrupted"))
     first(RunProgress(70, 9.0, "slots/s", {"smart": 1.0}))
     assert told[-1] == RunProgress(20, 4.0, "slots/s", {"smart": 3.0})

@@ -13,7 +13,7 @@ from evedrop.live.protocol.commands import ControlCommand, Go, Hold, LinkChange
 from evedrop.live.protocol.requests import REQUESTS
 from evedrop.model.slot.link import Change
 from evedrop.scenario.loading import checked
-from evedrop.scenario.news import Held, News
+from evedrop.scenario.progress_events import Held, ProgressEvent
 from evedrop.scenario.tables import Scenario
 from tests.builders import scalar_tables
 
@@ -65,12 +65,12 @@ class Run:
     def __init__(self, *events: dict[str, Any], paused: bool = False) -> None:
         self.conductor = RecordingConductor()
         self.kept: list[Scenario] = []
-        self.news: list[News] = []
+        self.progress: list[ProgressEvent] = []
         scenario = checked({**TABLES, "event": list(events)}, "test")
         self.steering = Steering(
             scenario,
             self.conductor,  # type: ignore[arg-type]
-            self.news.append,
+            self.progress.append,
             self.kept.append,
             paused=paused,
         )
@@ -172,7 +172,7 @@ def test_an_order_during_a_hold_of_the_scenario_waits_for_it() -> None:
     assert run.events == []
     run.steering.left("smart", 30)
     run.steering.carry_on(30)
-    assert [news.event for news in run.news] == ["act"]
+    assert [event.kind for event in run.progress] == ["act"]
     asked = run.asks("link", event=SET)
     run.steering.carry_on(30)
     assert run.conductor.told() == []
@@ -211,7 +211,7 @@ def test_a_pause_lasts_until_it_is_ended() -> None:
     assert run.conductor.told() == go(12)
     assert resumed.answers == [Answer(12, "the run goes on with slot 12")]
     assert [event[1] for event in run.events] == ["pause the run", "link legitimate: quality = 0.2", "resume the run"]
-    assert Held(12) in run.news
+    assert Held(12) in run.progress
 
 
 def test_a_run_may_begin_paused() -> None:
@@ -219,7 +219,7 @@ def test_a_run_may_begin_paused() -> None:
     run = Run({"at": 0, "cut": "smart"}, paused=True)
     assert run.holds(0) == []
     assert (run.steering.paused, run.events) == (True, [(0, "pause the run", "operator"), (0, "cut smart", "scenario")])
-    assert Held(0) in run.news
+    assert Held(0) in run.progress
     stepped = run.asks("step", slots=3)
     run.steering.carry_on(0)
     assert run.conductor.told() == go(0, until=3)
@@ -372,7 +372,7 @@ def test_a_router_that_missed_a_go_hears_it_while_the_sensor_holds_again() -> No
 
 
 def test_a_hold_that_is_told_once_more_is_one_hold() -> None:
-    """The sensor may say twice that it holds; when the run has gone on since, that is not news."""
+    """The sensor may say twice that it holds; when the run has gone on since, that is nothing new."""
     run = Run()
     run.asks("pause")
     run.holds(12)

@@ -112,7 +112,7 @@ def test_a_late_packet_counts_as_if_it_had_been_in_time(name: str, window: int) 
 
 
 def test_duplicates_change_nothing() -> None:
-    """A second copy, of this slot or an earlier one, is not news."""
+    """A second copy, of this slot or an earlier one, is not fresh."""
     one, z = receivers()["legitimate"], packets()
     everybody = np.ones(BATCH.trials, bool)
     plain, twice = OneByOne(one, 3), OneByOne(one, 3)
@@ -124,16 +124,16 @@ def test_duplicates_change_nothing() -> None:
 
 
 def test_what_is_older_than_the_window_changes_nothing() -> None:
-    """One slot within the window is news, one slot beyond it is not."""
+    """One slot within the window is fresh, one slot beyond it is not."""
     one, z = receivers()["legitimate"], packets()
     nobody, everybody = np.zeros(BATCH.trials, bool), np.ones(BATCH.trials, bool)
-    for age, news in ((3, True), (4, False)):
+    for age, fresh in ((3, True), (4, False)):
         plain, given_ = OneByOne(one, 3), OneByOne(one, 3)
         for k in range(8):
             late = (Late(k - age, Reception(everybody, z[k - age])),) if k == 7 else ()
             before = plain.take(k, Arrival(Reception(nobody, z[k])))
             after = given_.take(k, Arrival(Reception(nobody, z[k]), late))
-        assert same(before, after) is not news
+        assert same(before, after) is not fresh
 
 
 def test_an_absence_is_a_receiver_that_hears_nothing() -> None:
@@ -195,7 +195,7 @@ def test_every_packet_is_accounted_for(window: int) -> None:
 
 
 def test_slots_that_a_receiver_was_away_are_lost_and_end_its_window() -> None:
-    """It predicts through them, and a packet from before them is not news any more."""
+    """It predicts through them, and a packet from before them is not fresh any more."""
     one, z = receivers()["legitimate"], packets()
     everybody = np.ones(BATCH.trials, bool)
     follower, expected = OneByOne(one, 3), one.prior()
@@ -212,7 +212,7 @@ def test_slots_that_a_receiver_was_away_are_lost_and_end_its_window() -> None:
 
 @pytest.mark.parametrize("with_header", [True, False])
 def test_a_late_packet_has_its_own_header(with_header: bool) -> None:
-    """In the trials in which it is news, whether or not the slot had one before."""
+    """In the trials in which it is fresh, whether or not the slot had one before."""
     process, slots = Process(np.eye(2), np.eye(2), np.eye(2)), 3
     keys = stream_keys(2, ("mask",))
     scheme = EncryptedSchedule(process, 1)

@@ -309,7 +309,7 @@ def test_sensor_sends_once_more_what_is_not_done(stage: Stage) -> None:
 
 
 class WouldWaitError(Exception):
-    """The sensor would have to wait for news."""
+    """The sensor would have to wait for a message."""
 
 
 class Impatient(TestClock):

@@ -190,8 +190,8 @@ def test_a_figure_that_fails_costs_no_other(evedrop: Evedrop, case: str, how: st
     assert summary["expectations"][0]["held"] is None
 
 
-def test_what_a_figure_prints_does_not_mix_with_the_news(evedrop: Evedrop) -> None:
-    """It goes to the observer's log, and the launcher reads every line of news."""
+def test_what_a_figure_prints_does_not_mix_with_the_events(evedrop: Evedrop) -> None:
+    """It goes to the observer's log, and the launcher reads every event."""
     prints = f"        print('hello', end='')\n        import os; os.write(1, b'again')\n{ADD}"
     environment = installed(evedrop, of_the_docs().replace(ADD, prints))
     done = evedrop.process("run", "eavesdroppers", "--slots", "60", "--view", "off", "--out", "run", env=environment)

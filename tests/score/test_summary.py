@@ -15,7 +15,7 @@ from evedrop.model.figures import FIGURES, figure
 from evedrop.results.reading import Results
 from evedrop.results.summary_file import summary_text, write_summary
 from evedrop.scenario.loading import load
-from evedrop.scenario.news import ConnectionOutage
+from evedrop.scenario.progress_events import ConnectionOutage
 from evedrop.score.scorekeeper import RunOutcome, summary_of
 from evedrop.score.summary import Summary
 from evedrop.score.totals import Totals

@@ -18,7 +18,7 @@ from evedrop.model.figures.standard_error import z_of
 from evedrop.results.diff import difference
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import checked, load
-from evedrop.scenario.news import silent
+from evedrop.scenario.progress_events import silent
 from evedrop.simulate.montecarlo import Plan, simulate
 from evedrop.simulate.simulation import Mode
 from tests.builders import changed, digests_of

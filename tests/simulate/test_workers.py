@@ -22,7 +22,7 @@ from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
-from evedrop.simulate.tasks import Result, Stopped, Task, Tell
+from evedrop.simulate.tasks import OnProgress, Result, Stopped, Task
 from evedrop.simulate.trials import BLOCK_TRIALS, tasks_of
 from evedrop.simulate.workers import in_processes, usable_cores
 from evedrop.system.processes import is_suspended
@@ -150,7 +150,7 @@ def own_crew() -> list[int]:
     return [pid for pid, command in commands.items() if b"simulate.workers import work" in command.read_bytes()]
 
 
-def outcome(of: Sequence[Task[Any]], tell: Tell = lambda _: None, until_first: bool = False) -> Any:
+def outcome(of: Sequence[Task[Any]], on_progress: OnProgress = lambda _: None, until_first: bool = False) -> Any:
     """What two processes make of tasks: their results, or the error that ended them. Fails the test if they do not end.
 
     until_first: whether they are told to stop when the first result has come.
@@ -160,7 +160,7 @@ def outcome(of: Sequence[Task[Any]], tell: Tell = lambda _: None, until_first: b
 
     def carry_out() -> None:
         try:
-            results.extend(in_processes(of, 2, tell, lambda: until_first and bool(results)))
+            results.extend(in_processes(of, 2, on_progress, lambda: until_first and bool(results)))
             came.append(results)
         except Exception as error:
             came.append(error)
@@ -185,7 +185,7 @@ def test_a_worker_that_stays_suspended_is_named(monkeypatch: pytest.MonkeyPatch)
             suspended.append(own_crew()[-1])
             os.kill(suspended[0], signal.SIGSTOP)
 
-    error = outcome(tasks, tell=suspend_last)
+    error = outcome(tasks, on_progress=suspend_last)
     assert isinstance(error, RunError)
     assert str(error).startswith(f"worker process {suspended[0]}, which computes trials ")
     assert "has been suspended for " in str(error)
@@ -205,7 +205,7 @@ def test_a_worker_that_is_continued_is_not_named(monkeypatch: pytest.MonkeyPatch
             wait_until(lambda: is_suspended(suspended[0]), "a suspended worker")
             os.kill(suspended[0], signal.SIGCONT)
 
-    results = outcome(tasks, tell=pause)
+    results = outcome(tasks, on_progress=pause)
     assert sorted(number for number, _ in results) == [0, 1]
     assert all(result.complete for _, result in results)
 
@@ -223,7 +223,7 @@ class Hangs(Task[Result]):
         """What it is read by."""
         return exec, (self.HALF,)
 
-    def carry_out(self, tell: Tell, stopped: Stopped) -> Result:
+    def carry_out(self, on_progress: OnProgress, stopped: Stopped) -> Result:
         """Never called."""
         raise NotImplementedError
 
@@ -271,7 +271,7 @@ def test_a_worker_is_given_no_tokens(monkeypatch: pytest.MonkeyPatch) -> None:
         if not given:
             given.extend(Path(f"/proc/{pid}/environ").read_bytes() for pid in own_crew())
 
-    assert isinstance(outcome(tasks, tell=look), list)
+    assert isinstance(outcome(tasks, on_progress=look), list)
     assert given
     assert not [one for one in given if b"ACCESS_TOKEN" in one]
     assert all(b"PATH=" in one for one in given)

@@ -88,7 +88,7 @@ class Node:
     def __post_init__(self) -> None:
         """Declare the node's token, and follow the graph."""
         self.graph: dict[str, bool] = {}
-        self.news = threading.Event()
+        self.changed = threading.Event()
         """Set whenever the graph changes."""
         self._id = next(self._ids)
         self._held.append(self.session.liveliness().declare_token(self._token(self._id, "NN")))
@@ -99,7 +99,7 @@ class Node:
 
         def changed(sample: zenoh.Sample) -> None:
             self.graph[str(sample.key_expr)] = sample.kind == zenoh.SampleKind.PUT
-            self.news.set()
+            self.changed.set()
 
         self._held.append(self.session.liveliness().declare_subscriber(everything, changed, history=True))
 

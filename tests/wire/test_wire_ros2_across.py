@@ -97,8 +97,8 @@ def test_a_service_answers_as_soon_as_it_is_seen(field: Field) -> None:
         send, responses = caller.client(name)
         server.service(name)
         while not caller.sees("SS", name):  # at once: a pause would hide that the service cannot be asked yet
-            assert caller.news.wait(LIMIT), "the graph shows the service"
-            caller.news.clear()
+            assert caller.changed.wait(LIMIT), "the graph shows the service"
+            caller.changed.clear()
         sequence = send(n, 40)
         wait_until(responses.__len__, "the response")
         assert [(one.sequence, one.text) for one in responses] == [(sequence, n + 40)]

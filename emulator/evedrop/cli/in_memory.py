@@ -81,7 +81,7 @@ def studied(
     Returns the scenario and what the study found.
     """
     from evedrop.cli.progress_line import ProgressLine
-    from evedrop.simulate.montecarlo import teller
+    from evedrop.simulate.montecarlo import progress_counter
     from evedrop.studies.parts import StudyPlace
 
     check_resuming(options)
@@ -91,7 +91,7 @@ def studied(
     total = scenario.trials * scenario.slots
     with ProgressLine(total, "trial-slots", options.json) as line:
         place = None if options.out is None else StudyPlace(options.out, options.resume)
-        return scenario, study(scenario, teller(line.tell, total), plan, place)
+        return scenario, study(scenario, progress_counter(line.on_event, total), plan, place)
 
 
 MEMORY = (entries, output, memory, resuming)

@@ -24,7 +24,16 @@ from rich.text import Text
 
 from evedrop.cli.console import StyledConsole
 from evedrop.model.kernels.choice import fallback_warning
-from evedrop.scenario.news import ConnectionOutage, FolderMoved, Held, News, RunEnded, RunProgress, Started, ViewOpened
+from evedrop.scenario.progress_events import (
+    ConnectionOutage,
+    FolderMoved,
+    Held,
+    ProgressEvent,
+    RunEnded,
+    RunProgress,
+    Started,
+    ViewOpened,
+)
 
 _BAR_FROM = 120  # the least width of a terminal, in columns, that has room for a bar
 _BAR_WIDTH = 24
@@ -71,9 +80,9 @@ _MORE = "  …"
 
 @final
 class ProgressLine:
-    """Shows the news of a run on standard error; a context manager.
+    """Shows the events of a run on standard error; a context manager.
 
-    total: progress at the end, counted in `unit`s; None if the news will tell it.
+    total: progress at the end, counted in `unit`s; None if an event will tell it.
     """
 
     def __init__(self, total: int | None, unit: str, quiet: bool = False) -> None:
@@ -105,36 +114,36 @@ class ProgressLine:
     ) -> None:
         self._progress.stop()
 
-    def tell(self, news: News) -> None:
-        """Show one item of news."""
-        match news:
+    def on_event(self, event: ProgressEvent) -> None:
+        """Show one event."""
+        match event:
             case Started():
                 self._progress.update(self._task, description="running")
             case Held():
                 self._progress.update(
-                    self._task, description=f"held before slot {news.before}", completed=news.before, rate=""
+                    self._task, description=f"held before slot {event.before}", completed=event.before, rate=""
                 )
             case RunProgress():
                 self._progress.update(
                     self._task,
                     description="running",
-                    total=self._total if news.total is None else news.total,
-                    completed=news.done,
-                    rate=f"{news.rate:,.0f} {news.rate_unit}",
-                    errors=news.squared_errors,
+                    total=self._total if event.total is None else event.total,
+                    completed=event.done,
+                    rate=f"{event.rate:,.0f} {event.rate_unit}",
+                    errors=event.squared_errors,
                 )
             case ViewOpened() if not self._quiet:
-                if news.address:
-                    self._print(f"live view, open to anybody who has this address: {news.address}")
-                if news.warning:
-                    self._print(f"warning: {news.warning}")
+                if event.address:
+                    self._print(f"live view, open to anybody who has this address: {event.address}")
+                if event.warning:
+                    self._print(f"warning: {event.warning}")
             case ConnectionOutage() if not self._quiet:
-                self._print(outage_line(news))
+                self._print(outage_line(event))
             case FolderMoved():
-                self.moved = Path(news.folder)
+                self.moved = Path(event.folder)
                 self._print(f"the results folder was renamed while the run went on; it is {self.moved}")
-            case RunEnded() if news.view:
-                self._print(f"the view stopped early: {news.view}")
+            case RunEnded() if event.view:
+                self._print(f"the view stopped early: {event.view}")
 
     def _print(self, line: str) -> None:
         self.console.print(line, soft_wrap=True)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from evedrop.model.kernels.choice import KERNELS
 from evedrop.results.reading import Results
-from evedrop.scenario.news import silent
+from evedrop.scenario.progress_events import silent
 from evedrop.scenario.tables import Scenario
 from evedrop.simulate.montecarlo import simulate
 

@@ -1,4 +1,4 @@
-"""The entries of briefs, news and a run's status: each field of their dataclasses says how it is checked, read and written.
+"""The entries of briefs, progress events and a run's status: each field says how it is checked, read and written.
 
 The type and range of each value are checked before an object is made of it.
 

@@ -23,7 +23,7 @@ from evedrop.results.growing_tables import batches_of, figures_path, goes_on, is
 from evedrop.results.summary_file import plain
 from evedrop.results.tables import DIGESTS, JOURNAL, NULLABLE, SLOTS, inputs_schema_in, trials_schema
 from evedrop.scenario.arguments import path_argument
-from evedrop.scenario.news import RunEvent
+from evedrop.scenario.progress_events import RunEvent
 from evedrop.score.summary import Summary
 from evedrop.system.files import Unreadable, opened, text_of
 

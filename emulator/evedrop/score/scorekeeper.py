@@ -18,7 +18,7 @@ from evedrop.model.figures.figure import COVARIANCE_ONLY, ScoredSlots
 from evedrop.model.process import Floats
 from evedrop.names import CONTROLLER, LEGITIMATE
 from evedrop.scenario.expected.expectations import Expectation, ExpectedTraceStream, expectations_of
-from evedrop.scenario.news import ConnectionOutage, RunEvent
+from evedrop.scenario.progress_events import ConnectionOutage, RunEvent
 from evedrop.scenario.tables import Scenario
 from evedrop.score.channel import link_summary_of
 from evedrop.score.closed_loop_tally import Acted

@@ -19,7 +19,7 @@ from evedrop.model.figures import FIGURES
 from evedrop.model.figures.links import LinkAccount
 from evedrop.model.figures.text import estimate
 from evedrop.scenario import application
-from evedrop.scenario.news import ConnectionOutage, RunEvent
+from evedrop.scenario.progress_events import ConnectionOutage, RunEvent
 from evedrop.score.built_in_figures import BuiltInFigures
 
 if TYPE_CHECKING:

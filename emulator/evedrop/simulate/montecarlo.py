@@ -25,7 +25,7 @@ from evedrop.results.writer import ResultsWriter, write_summary
 from evedrop.scenario.arguments import number_argument, refuse_unless
 from evedrop.scenario.expected.expectations import expected_traces_of
 from evedrop.scenario.input_files import states_of
-from evedrop.scenario.news import FolderMoved, RunProgress, Tell
+from evedrop.scenario.progress_events import FolderMoved, OnEvent, RunProgress
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import listed
 from evedrop.score.expectations_held import replay_of
@@ -97,8 +97,8 @@ class Plan:
             yield crew
 
 
-def simulate(scenario: Scenario, folder: Path, tell: Tell, plan: Plan = Plan(), *, resume: bool = False) -> int:
-    """Run all trials of a scenario into a results folder; returns the exit status. `tell` gets progress as it is made.
+def simulate(scenario: Scenario, folder: Path, on_event: OnEvent, plan: Plan = Plan(), *, resume: bool = False) -> int:
+    """Run all trials of a scenario into a results folder; returns the exit status. `on_event` gets progress as it is made.
 
     resume: go on with the study in the folder, which was interrupted.
 
@@ -114,12 +114,13 @@ def simulate(scenario: Scenario, folder: Path, tell: Tell, plan: Plan = Plan(), 
         return RunOutcome(kept.seconds, how, replay_of(folder, scenario, plan.mode.value))
 
     with stop_on_signals() as stop, plan.crew([scenario]) as crew, kept_tasks(folder, study, resume) as kept:
-        tasks, told = tasks_of(scenario, plan.mode, crew.workers, kept), teller(tell, scenario.trials * scenario.slots)
+        tasks = tasks_of(scenario, plan.mode, crew.workers, kept)
+        on_progress = progress_counter(on_event, scenario.trials * scenario.slots)
         with contextlib.closing(HeldFolder(folder)) as held, disk_errors(folder):
             write_resolved(folder, scenario)
             with (
                 ResultsWriter.of(folder, scenario) as writer,
-                contextlib.closing(crew.results(tasks, told, stop.is_set, kept)) as results,
+                contextlib.closing(crew.results(tasks, on_progress, stop.is_set, kept)) as results,
             ):
                 try:
                     for result in results:
@@ -132,8 +133,8 @@ def simulate(scenario: Scenario, folder: Path, tell: Tell, plan: Plan = Plan(), 
                     merger.write(writer)
                     summary = merger.summary(ending(how))
                     if plan.rare and how == "complete":
-                        told = teller(tell, work_of(scenario))
-                        estimates = rare_estimates(scenario, _split_mode(scenario), stop.is_set, told)
+                        on_progress = progress_counter(on_event, work_of(scenario))
+                        estimates = rare_estimates(scenario, _split_mode(scenario), stop.is_set, on_progress)
                         summary = summary.with_rare_estimates(estimates)
                     writer.settle(merger.at, summary)
             if not merger.trials:
@@ -142,7 +143,7 @@ def simulate(scenario: Scenario, folder: Path, tell: Tell, plan: Plan = Plan(), 
             place = held.now
             write_summary(place, summary)
             if place != folder:
-                tell(FolderMoved(str(place)))
+                on_event(FolderMoved(str(place)))
         if failure is not None:
             raise failure
         if not merger.complete or (plan.rare and stop.is_set()):
@@ -223,7 +224,7 @@ def _check_scheme(scenario: Scenario, mode: Mode) -> None:
             )
 
 
-def teller(tell: Tell, total: int) -> Callable[[int], None]:
+def progress_counter(on_event: OnEvent, total: int) -> Callable[[int], None]:
     """A function that takes counts of trial-slots and reports progress and rate a few times a second."""
     started = told = time.monotonic()
     done = 0
@@ -234,7 +235,7 @@ def teller(tell: Tell, total: int) -> Callable[[int], None]:
         now = time.monotonic()
         if now - told > _TELL_SECONDS:
             told = now
-            tell(RunProgress(done, done / (now - started), "trial-slots/s", {}, total))
+            on_event(RunProgress(done, done / (now - started), "trial-slots/s", {}, total))
 
     return take
 

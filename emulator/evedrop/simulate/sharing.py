@@ -9,7 +9,7 @@ from typing import final
 
 from evedrop.simulate.cluster import REACH_SECONDS, Cluster, connected
 from evedrop.simulate.kept_tasks import KeptTasks
-from evedrop.simulate.tasks import R, Stopped, Task, Tell
+from evedrop.simulate.tasks import OnProgress, R, Stopped, Task
 from evedrop.simulate.workers import in_processes, in_this_process
 
 
@@ -23,12 +23,12 @@ class Crew:
     cluster: Cluster | None = None
 
     def results(
-        self, tasks: Sequence[Task[R]], tell: Tell, stopped: Stopped, kept: KeptTasks | None = None
+        self, tasks: Sequence[Task[R]], on_progress: OnProgress, stopped: Stopped, kept: KeptTasks | None = None
     ) -> Generator[R]:
         """Carry out tasks; yields their results in task order.
 
-        tell: gets the trial-slots done since its last call; kept: where complete results are kept as they come, and from where
-        those that it has are read. After a stop, the last results may be incomplete.
+        on_progress: gets the trial-slots done since its last call; kept: where complete results are kept as they come, and from
+        where those that it has are read. After a stop, the last results may be incomplete.
 
         Raises RunError if a worker fails, OSError if a result cannot be kept.
         """
@@ -36,14 +36,14 @@ class Crew:
         left = [number for number in range(len(tasks)) if number not in read]
         held: dict[int, R] = {}
         due = 0
-        with contextlib.closing(self._as_they_come([tasks[number] for number in left], tell, stopped)) as new:
+        with contextlib.closing(self._as_they_come([tasks[number] for number in left], on_progress, stopped)) as new:
             while True:
                 while due in read or due in held:
                     if due in held:
                         yield held.pop(due)
                     elif kept is not None and not stopped():
                         yield kept.load(tasks[due])
-                        tell(tasks[due].work)
+                        on_progress(tasks[due].work)
                     else:
                         return
                     due += 1
@@ -54,18 +54,20 @@ class Crew:
                 if kept is not None and result.complete and len(tasks) > 1:  # a study of one task is complete with it
                     kept.keep(tasks[number], result)
 
-    def _as_they_come(self, tasks: Sequence[Task[R]], tell: Tell, stopped: Stopped) -> Generator[tuple[int, R]]:
+    def _as_they_come(
+        self, tasks: Sequence[Task[R]], on_progress: OnProgress, stopped: Stopped
+    ) -> Generator[tuple[int, R]]:
         """The results, with the numbers of their tasks."""
         if not tasks:
             return
         if self.cluster is not None:
             for number, result in self.cluster.results(tasks, stopped):
-                tell(tasks[number].work)
+                on_progress(tasks[number].work)
                 yield number, result
         elif self.workers == 1 or len(tasks) == 1:
-            yield from enumerate(in_this_process(tasks, tell, stopped))
+            yield from enumerate(in_this_process(tasks, on_progress, stopped))
         else:
-            yield from in_processes(tasks, min(self.workers, len(tasks)), tell, stopped)
+            yield from in_processes(tasks, min(self.workers, len(tasks)), on_progress, stopped)
 
 
 @contextlib.contextmanager

@@ -86,7 +86,8 @@ class SplitMeans:
 class Splitter:
     """Splits trials of a scenario by the error of one receiver.
 
-    trials: of each population; stopped: asked between slots, ends the work; tell: gets the trial-slots done since its last call.
+    trials: of each population; stopped: asked between slots, ends the work; on_progress: gets the trial-slots done since its
+    last call.
     """
 
     def __init__(
@@ -96,10 +97,10 @@ class Splitter:
         receiver: str,
         trials: int = LEAST_TRIALS,
         stopped: Callable[[], bool] = lambda: False,
-        tell: Callable[[int], None] = lambda _: None,
+        on_progress: Callable[[int], None] = lambda _: None,
     ) -> None:
         self._scenario, self._mode, self._receiver, self._trials = scenario, mode, receiver, trials
-        self._stopped, self._tell = stopped, tell
+        self._stopped, self._on_progress = stopped, on_progress
         self._key = stream_key(root_of_seed(scenario.seed), f"splitting/{receiver}")
         jammer = None if scenario.acknowledgements is None else scenario.acknowledgements.jammer
         self._others = scenario.eavesdroppers.keys() - {receiver, jammer}
@@ -131,7 +132,7 @@ class Splitter:
                 errors[:, k] = populations.means(error.reshape(count, size))
                 share = populations.weigh((important + self._floor[k]).reshape(count, size)).mean()
                 counting[k], start = share, k + 1
-                self._tell(count * size)
+                self._on_progress(count * size)
                 if self._stopped():
                     break
                 if k + 1 < slots and (share < _SPLIT_BELOW if splits is None else k in splits):
@@ -154,13 +155,13 @@ class Splitter:
 
 
 def rare_estimates(
-    scenario: Scenario, mode: Mode, stopped: Callable[[], bool], tell: Callable[[int], None]
+    scenario: Scenario, mode: Mode, stopped: Callable[[], bool], on_progress: Callable[[int], None]
 ) -> dict[str, RareEstimate]:
     """Receiver → its estimate, by populations that together have at least the scenario's trials; empty once `stopped`."""
     found: dict[str, RareEstimate] = {}
     trials, expected = trials_of(scenario), expectations_of(scenario)
     for name in scenario.receivers:
-        means = Splitter(scenario, mode, name, trials, stopped, tell).estimated()
+        means = Splitter(scenario, mode, name, trials, stopped, on_progress).estimated()
         if stopped():
             return {}
         found[name] = means.estimate(trials, expected[name])

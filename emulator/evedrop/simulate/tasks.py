@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
-Tell = Callable[[int], None]
+OnProgress = Callable[[int], None]
 """Takes the number of trial-slots done since the last call."""
 Stopped = Callable[[], bool]
 """Whether the study was told to stop."""
@@ -39,7 +39,7 @@ class Task(ABC, Generic[R]):
         return (self.stop - self.start) * int(self.scenario["slots"])
 
     @abstractmethod
-    def carry_out(self, tell: Tell, stopped: Stopped) -> R:
+    def carry_out(self, on_progress: OnProgress, stopped: Stopped) -> R:
         """Simulate the trials. The simulation ends early once `stopped`; the result is then not complete."""
 
     @abstractmethod

@@ -28,7 +28,7 @@ from evedrop.simulate.chunk import Chunk
 from evedrop.simulate.kept_tasks import KeptTasks
 from evedrop.simulate.packet_counts import PacketCounts
 from evedrop.simulate.simulation import Mode, Simulation
-from evedrop.simulate.tasks import Stopped, Task, Tell
+from evedrop.simulate.tasks import OnProgress, Stopped, Task
 
 BLOCK_TRIALS = 500
 _SIDE_BY_SIDE = 4  # blocks: spreads the overhead of numpy calls over more trials, and the state still fits the cache
@@ -75,9 +75,9 @@ class TrialsTask(Task[BatchResult]):
 
     mode: Mode
 
-    def carry_out(self, tell: Tell, stopped: Stopped) -> BatchResult:
+    def carry_out(self, on_progress: OnProgress, stopped: Stopped) -> BatchResult:
         """Simulate the trials."""
-        return carry_out(self, tell, stopped)
+        return carry_out(self, on_progress, stopped)
 
     def example(self) -> BatchResult:
         """A result of one trial without slots, with recorded ones."""
@@ -115,8 +115,8 @@ def _split(first: int, end: int, workers: int, side_by_side: int) -> Iterator[tu
         yield from pairwise(min(first - BLOCK_TRIALS * (-blocks * i // count), end) for i in range(count + 1))
 
 
-def carry_out(task: TrialsTask, tell: Tell, stopped: Stopped) -> BatchResult:
-    """Simulate a task. `tell` gets the trial-slots done since its last call; the simulation ends early once `stopped`."""
+def carry_out(task: TrialsTask, on_progress: OnProgress, stopped: Stopped) -> BatchResult:
+    """Simulate a task. `on_progress` gets the trial-slots done since its last call; the simulation ends early once `stopped`."""
     scenario = Scenario.read(task.scenario)
     names, slots = scenario.receivers, scenario.slots
     trials = range(task.start, task.stop)
@@ -149,7 +149,7 @@ def carry_out(task: TrialsTask, tell: Tell, stopped: Stopped) -> BatchResult:
             result.traces[name].add_values(chunk.first, one.trace)
         if chunk.slots is not None and recorded:
             result.recorded.append(chunk.slots.part(slice(0, recorded)).copied())
-        tell(len(trials) * count)
+        on_progress(len(trials) * count)
         if stopped():
             break
     # All trials of the task were simulated side by side, so each decision was for all of them.

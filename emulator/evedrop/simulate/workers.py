@@ -21,7 +21,7 @@ from typing import Any, final
 from evedrop.errors import EvedropError, RunError
 from evedrop.model.registry import place_of
 from evedrop.scenario.dry_run import foreign
-from evedrop.simulate.tasks import R, Result, Stopped, Task, Tell
+from evedrop.simulate.tasks import OnProgress, R, Result, Stopped, Task
 from evedrop.system.environment import SINGLE_THREADED, own_environment
 from evedrop.system.lacks import lack_of
 from evedrop.system.processes import KILLED_SECONDS, SUSPENDED_SECONDS, SuspensionWatch, continue_when_parent_dies, kill
@@ -38,13 +38,13 @@ def usable_cores() -> int:
     return os.cpu_count() or 1
 
 
-def in_this_process(tasks: Sequence[Task[R]], tell: Tell, stopped: Stopped) -> Iterator[R]:
+def in_this_process(tasks: Sequence[Task[R]], on_progress: OnProgress, stopped: Stopped) -> Iterator[R]:
     """Carry out the tasks in this process, one after the other."""
     for task in tasks:
         if stopped():
             return
         try:
-            result = task.carry_out(tell, stopped)
+            result = task.carry_out(on_progress, stopped)
         except EvedropError:
             raise
         except Exception as error:
@@ -58,7 +58,9 @@ def in_this_process(tasks: Sequence[Task[R]], tell: Tell, stopped: Stopped) -> I
         yield result
 
 
-def in_processes(tasks: Sequence[Task[R]], workers: int, tell: Tell, stopped: Stopped) -> Iterator[tuple[int, R]]:
+def in_processes(
+    tasks: Sequence[Task[R]], workers: int, on_progress: OnProgress, stopped: Stopped
+) -> Iterator[tuple[int, R]]:
     """Carry out the tasks in worker processes; yields the number of a task and its result as they come.
 
     After a stop, the partial results of the current tasks come last, as far as they come within `_LAST_SECONDS`. Raises RunError
@@ -69,7 +71,7 @@ def in_processes(tasks: Sequence[Task[R]], workers: int, tell: Tell, stopped: St
     try:
         for _ in range(workers):
             crew.append(_Worker(inbox))
-        yield from _results(tasks, crew, inbox, tell, stopped)
+        yield from _results(tasks, crew, inbox, on_progress, stopped)
     finally:
         kill(*(worker.process for worker in crew))
         for worker in crew:
@@ -125,9 +127,9 @@ class _Worker:
             with self.pipe:
                 while (task := self._tasks.get()) is not None:
                     self.pipe.send(task)
-                    while isinstance(news := self.pipe.recv(), int):
-                        self._inbox.put((self, news))
-                    self._inbox.put((self, news))
+                    while isinstance(message := self.pipe.recv(), int):
+                        self._inbox.put((self, message))
+                    self._inbox.put((self, message))
         except Exception as error:
             self._inbox.put((self, error))
 
@@ -155,7 +157,7 @@ _Inbox = SimpleQueue[tuple[_Worker, Any]]
 
 
 def _results(
-    tasks: Sequence[Task[R]], crew: list[_Worker], inbox: _Inbox, tell: Tell, stopped: Stopped
+    tasks: Sequence[Task[R]], crew: list[_Worker], inbox: _Inbox, on_progress: OnProgress, stopped: Stopped
 ) -> Iterator[tuple[int, R]]:
     waiting = iter(enumerate(tasks))
     for worker, (number, task) in zip(crew, waiting, strict=False):
@@ -172,29 +174,29 @@ def _results(
         if (pid := watch.suspended_for_good(busy)) is not None:
             raise _suspended(busy[pid])
         try:
-            worker, news = inbox.get(timeout=_POLL_SECONDS)
+            worker, message = inbox.get(timeout=_POLL_SECONDS)
         except Empty:
             continue
-        news = _unfailed(worker, news)
-        if isinstance(news, int):
-            tell(news)
+        message = _unfailed(worker, message)
+        if isinstance(message, int):
+            on_progress(message)
             continue
         if worker.number is not None:
-            yield worker.number, news
+            yield worker.number, message
         worker.number = None
         if deadline is None and (following := next(waiting, None)) is not None:
             worker.send_task(*following)
 
 
-def _unfailed(worker: _Worker, news: Any) -> Any:
+def _unfailed(worker: _Worker, message: Any) -> Any:
     """What a worker says: a count or a result. Raises RunError if it failed or ended."""
-    if isinstance(news, str):
-        raise RunError(f"a worker failed: {news}")
-    if isinstance(news, EOFError | OSError):
-        raise worker.lost from news
-    if isinstance(news, Exception):
-        raise news
-    return news
+    if isinstance(message, str):
+        raise RunError(f"a worker failed: {message}")
+    if isinstance(message, EOFError | OSError):
+        raise worker.lost from message
+    if isinstance(message, Exception):
+        raise message
+    return message
 
 
 def _suspended(worker: _Worker) -> RunError:
@@ -223,9 +225,9 @@ def work(descriptor: int) -> None:
             pipe.send(_outcome(pipe.recv(), pipe.send, stop.is_set))
 
 
-def _outcome(task: Task[Result], tell: Tell, stopped: Stopped) -> Result | str:
+def _outcome(task: Task[Result], on_progress: OnProgress, stopped: Stopped) -> Result | str:
     try:
-        return task.carry_out(tell, stopped)
+        return task.carry_out(on_progress, stopped)
     except OSError:
         raise
     except EvedropError as error:

@@ -32,7 +32,7 @@ from evedrop.results.folder import (
 )
 from evedrop.results.resolved_scenario import input_texts, resolved
 from evedrop.scenario.expected.expectations import Expectation, expectations_of
-from evedrop.scenario.news import Tell
+from evedrop.scenario.progress_events import OnEvent
 from evedrop.scenario.tables import Scenario
 from evedrop.score.histogram import LEVELS
 from evedrop.score.leak import revealed_by_packets
@@ -40,7 +40,7 @@ from evedrop.score.rare_events import rare_events_of, z_of_error
 from evedrop.score.scorekeeper import verdicts
 from evedrop.score.sums import Tally, trial_means
 from evedrop.simulate.kept_tasks import kept_tasks, study_of
-from evedrop.simulate.montecarlo import Merger, Plan, teller
+from evedrop.simulate.montecarlo import Merger, Plan, progress_counter
 from evedrop.simulate.packet_counts import PacketCounts
 from evedrop.simulate.simulation import Mode
 from evedrop.simulate.trials import BatchResult, tasks_of
@@ -53,7 +53,7 @@ _WRITE_SECONDS, _WRITE_SHARE = (
 )  # from one compare.json to the next, and as a multiple of the time to write one
 
 
-def compare_all(matchups: Matchups, folder: Path, tell: Tell, plan: Plan, *, resume: bool = False) -> Comparison:
+def compare_all(matchups: Matchups, folder: Path, on_event: OnEvent, plan: Plan, *, resume: bool = False) -> Comparison:
     """Simulate all matches into a results folder: compare.json, compare.png and .pdf, and the simulated scenarios.
 
     resume: go on with the comparison in the folder, which was interrupted.
@@ -68,7 +68,7 @@ def compare_all(matchups: Matchups, folder: Path, tell: Tell, plan: Plan, *, res
     groups = matchups.groups
     wanted = {"schemes": [*matchups.schemes], "adversaries": [*matchups.adversaries]}
     study = study_of("compare", wanted, [group.scenario for group in groups])
-    told = teller(tell, sum(group.scenario.trials * group.scenario.slots for group in groups))
+    on_progress = progress_counter(on_event, sum(group.scenario.trials * group.scenario.slots for group in groups))
     played: list[tuple[Group, Merger]] = []
     failure: RunError | None = None
     with (
@@ -80,7 +80,7 @@ def compare_all(matchups: Matchups, folder: Path, tell: Tell, plan: Plan, *, res
         everything = list(itertools.chain(*tasks))
         with (
             disk_errors(folder),
-            contextlib.closing(crew.results(everything, told, stop.is_set, kept)) as results,
+            contextlib.closing(crew.results(everything, on_progress, stop.is_set, kept)) as results,
         ):
             written, took = time.monotonic(), 0.0
             try:

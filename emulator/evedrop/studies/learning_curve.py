@@ -21,7 +21,7 @@ from evedrop.names import LEGITIMATE
 from evedrop.scenario.tables import Scenario
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Simulation
-from evedrop.simulate.tasks import Stopped, Task, Tell
+from evedrop.simulate.tasks import OnProgress, Stopped, Task
 from evedrop.studies.parts import StudyPlace, all_results, parts_of, write_found
 
 _SIDE_BY_SIDE = 100  # trials
@@ -67,7 +67,7 @@ class LearningRow:
 
 def learning_curve(
     scenario: Scenario,
-    tell: Tell,
+    on_progress: OnProgress,
     plan: Plan | None = None,
     place: StudyPlace | None = None,
     side_by_side: int = _SIDE_BY_SIDE,
@@ -85,7 +85,7 @@ def learning_curve(
     if not first.learned():
         raise UsageError(f"{scenario.title}: no eavesdropper learns; try the scenario learning")
     tasks = parts_of(_LearningTask, scenario, side_by_side)
-    with all_results(tasks, plan or Plan(), tell, "learned", place) as parts:
+    with all_results(tasks, plan or Plan(), on_progress, "learned", place) as parts:
         rows = [_row(window, [part.windows[i] for part in parts]) for i, window in enumerate(windows)]
         write_found(place, "learned.json", [asdict(row) for row in rows])
     return rows
@@ -123,11 +123,11 @@ class _Part:
 class _LearningTask(Task[_Part]):
     """Some trials that are simulated at once."""
 
-    def carry_out(self, tell: Tell, stopped: Stopped) -> _Part:
+    def carry_out(self, on_progress: OnProgress, stopped: Stopped) -> _Part:
         """Simulate the trials. Raises UsageError if no eavesdropper learns."""
         scenario = Scenario.read(self.scenario)
         windows = _windows(scenario)
-        found = _measured(scenario, range(self.start, self.stop), windows, tell, stopped)
+        found = _measured(scenario, range(self.start, self.stop), windows, on_progress, stopped)
         return _Part(found, len(found) == len(windows))
 
     def example(self) -> _Part:
@@ -136,7 +136,7 @@ class _LearningTask(Task[_Part]):
 
 
 def _measured(
-    scenario: Scenario, trials: range, windows: list[tuple[int, int]], tell: Tell, stopped: Stopped
+    scenario: Scenario, trials: range, windows: list[tuple[int, int]], on_progress: OnProgress, stopped: Stopped
 ) -> list[_Measured]:
     """The windows of these trials, fewer after a stop."""
     simulation = Simulation(scenario, trials, stops=[stop for _, stop in windows])
@@ -157,7 +157,7 @@ def _measured(
             }
             found.append(_Measured(off, {name: total / (stop - first) for name, total in sums.items()}))
             sums = {}
-        tell(count * len(trials))
+        on_progress(count * len(trials))
         if stopped():
             break
     return found

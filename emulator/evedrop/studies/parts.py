@@ -15,7 +15,7 @@ from evedrop.results.folder import disk_errors, replace_private
 from evedrop.scenario.tables import Scenario
 from evedrop.simulate.kept_tasks import KeptTasks, kept_tasks, study_of
 from evedrop.simulate.montecarlo import Plan
-from evedrop.simulate.tasks import R, Task, Tell
+from evedrop.simulate.tasks import OnProgress, R, Task
 from evedrop.system.signals import stop_on_signals
 
 T = TypeVar("T", bound=Task[Any])
@@ -41,12 +41,12 @@ class StudyPlace:
 
 @contextmanager
 def all_results(
-    tasks: Sequence[Task[R]], plan: Plan, tell: Tell, kind: str, place: StudyPlace | None = None
+    tasks: Sequence[Task[R]], plan: Plan, on_progress: OnProgress, kind: str, place: StudyPlace | None = None
 ) -> Iterator[list[R]]:
     """The results of all tasks, in order, for a block that combines them and writes what it finds.
 
-    tell: gets the trial-slots done since its last call; kind: the command; place: where finished tasks are kept until the block
-    has ended, if there is a results folder.
+    on_progress: gets the trial-slots done since its last call; kind: the command; place: where finished tasks are kept until
+    the block has ended, if there is a results folder.
 
     Raises UsageError if a scheduler does not answer or the folder cannot be used, RunError if a worker fails, Interrupted on
     Ctrl-C.
@@ -59,7 +59,7 @@ def all_results(
         if place is not None:
             kept = stack.enter_context(kept_tasks(place.folder, study_of(kind, {}, [scenario]), place.resume))
             stack.enter_context(disk_errors(place.folder))
-        with closing(crew.results(tasks, tell, stop.is_set, kept)) as results:
+        with closing(crew.results(tasks, on_progress, stop.is_set, kept)) as results:
             found = [result for result in results if result.complete]
         if len(found) < len(tasks):
             if kept is None:

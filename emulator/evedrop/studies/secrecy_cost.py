@@ -24,7 +24,7 @@ from evedrop.scenario.tables import Scenario
 from evedrop.score.energy import Meter, energy
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Simulation
-from evedrop.simulate.tasks import Stopped, Task, Tell
+from evedrop.simulate.tasks import OnProgress, Stopped, Task
 from evedrop.studies.parts import StudyPlace, all_results, parts_of, write_found
 
 _SIDE_BY_SIDE = 50  # trials
@@ -66,7 +66,7 @@ class SecrecyCost:
 
 def secrecy_cost(
     scenario: Scenario,
-    tell: Tell,
+    on_progress: OnProgress,
     plan: Plan | None = None,
     place: StudyPlace | None = None,
     side_by_side: int = _SIDE_BY_SIDE,
@@ -85,7 +85,7 @@ def secrecy_cost(
     if scenario.trials < 2:
         raise UsageError(f"--trials {scenario.trials}: expected 2 or more, so that there is a standard error")
     tasks = parts_of(_CostTask, scenario, side_by_side)
-    with all_results(tasks, plan or Plan(), tell, "cost", place) as parts:
+    with all_results(tasks, plan or Plan(), on_progress, "cost", place) as parts:
         found = _combined(scenario, loop, parts)
         write_found(place, "cost.json", asdict(found))
     return found
@@ -126,16 +126,16 @@ class _Part:
 class _CostTask(Task[_Part]):
     """Some trials that are simulated at once, each with both schemes."""
 
-    def carry_out(self, tell: Tell, stopped: Stopped) -> _Part:
+    def carry_out(self, on_progress: OnProgress, stopped: Stopped) -> _Part:
         """Simulate the trials."""
-        return _part_of(Scenario.read(self.scenario), range(self.start, self.stop), tell, stopped)
+        return _part_of(Scenario.read(self.scenario), range(self.start, self.stop), on_progress, stopped)
 
     def example(self) -> _Part:
         """A part of one trial without slots."""
         return _Part((Meter.zero(1), Meter.zero(1), Meter.zero(1)), complete=True)
 
 
-def _part_of(scenario: Scenario, trials: range, tell: Tell, stopped: Stopped) -> _Part:
+def _part_of(scenario: Scenario, trials: range, on_progress: OnProgress, stopped: Stopped) -> _Part:
     found = [Meter.zero(len(trials)) for _ in range(3)]
     tables: dict[str, Any] = scenario.model_dump(mode="json", exclude_none=True)
     alone = {**tables, "eavesdroppers": {}, "expect": []}  # eavesdroppers change nothing
@@ -145,7 +145,7 @@ def _part_of(scenario: Scenario, trials: range, tell: Tell, stopped: Stopped) ->
     for (power, truth), (other, other_truth) in zip(ours, plain, strict=True):
         pairs = ((power, other), (power, truth), (other, other_truth))
         found = [meter.then(*pair) for meter, pair in zip(found, pairs, strict=True)]
-        tell(power.size)
+        on_progress(power.size)
         if stopped():
             return _Part((found[0], found[1], found[2]), complete=False)
     return _Part((found[0], found[1], found[2]), complete=True)

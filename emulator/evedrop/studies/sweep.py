@@ -21,12 +21,12 @@ from evedrop.model.figures import all_figures, error_column, estimated_figures, 
 from evedrop.results.folder import disk_errors, private_pictures, private_replacement, write_private
 from evedrop.scenario.application import APPLICATIONS
 from evedrop.scenario.loading import prepared, value_of
-from evedrop.scenario.news import Tell
+from evedrop.scenario.progress_events import OnEvent
 from evedrop.scenario.tables import Scenario
 from evedrop.score.scorekeeper import RunOutcome
 from evedrop.score.summary import Summary
 from evedrop.simulate.kept_tasks import kept_tasks, study_of
-from evedrop.simulate.montecarlo import Merger, Plan, check_mode, teller
+from evedrop.simulate.montecarlo import Merger, Plan, check_mode, progress_counter
 from evedrop.simulate.trials import BatchResult, tasks_of
 from evedrop.system.signals import stop_on_signals
 
@@ -84,7 +84,7 @@ def sweep_over(
     changes: Mapping[str, Any],
     grid: Grid,
     folder: Path,
-    tell: Tell,
+    on_event: OnEvent,
     plan: Plan,
     *,
     resume: bool = False,
@@ -111,13 +111,13 @@ def sweep_over(
     ):
         each = crew.workers if len(scenarios) < 4 * crew.workers else 1  # if there are many points, do not split them
         tasks = [tasks_of(scenario, plan.mode, each, kept) for _, scenario in scenarios]
-        told = teller(tell, total)
+        on_progress = progress_counter(on_event, total)
         everything = list(itertools.chain(*tasks))
         with disk_errors(folder):
             write_private(folder / "sweep.json", text + "\n")
             if isinstance(source, Scenario):  # there is no other file from which the sweep could be repeated
                 write_private(folder / "scenario.toml", source.to_toml())
-            with contextlib.closing(crew.results(everything, told, stop.is_set, kept)) as results:
+            with contextlib.closing(crew.results(everything, on_progress, stop.is_set, kept)) as results:
                 written = time.monotonic()
                 try:
                     for (point, scenario), its_tasks in zip(scenarios, tasks, strict=True):

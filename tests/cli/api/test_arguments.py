@@ -48,7 +48,7 @@ def results() -> RunResults:
         (montecarlo, [SMALL], {"workers": True}, "workers=True: expected a whole number"),
         (montecarlo, [SMALL], {"plan": "exact"}, "plan='exact': expected a Plan"),
         (montecarlo, [SMALL], {"plan": {}}, r"plan=\{\}: expected a Plan"),
-        (montecarlo, [SMALL], {"tell": 3}, "tell=3: expected a function"),
+        (montecarlo, [SMALL], {"on_event": 3}, "on_event=3: expected a function"),
         (Plan, [], {"mode": "fast"}, "mode='fast': expected exact, error-coordinates or covariance-only"),
         (run, [SMALL], {"listen": 7447}, "listen=7447: expected an endpoint"),
         (load_results, [3], {}, "folder=3: expected the results folder"),

@@ -29,7 +29,7 @@ from evedrop.errors import RunError, ScenarioError, UsageError
 from evedrop.model.figures import all_figures
 from evedrop.results.by_name import ByName
 from evedrop.scenario.loading import load
-from evedrop.scenario.news import News, RunProgress
+from evedrop.scenario.progress_events import ProgressEvent, RunProgress
 from evedrop.score.built_in_figures import BuiltInFigures
 from evedrop.score.summary import PeerSummary
 from evedrop.show.report import closing
@@ -257,7 +257,7 @@ def test_a_comparison_takes_a_scenario_of_python() -> None:
 
 
 def test_a_notebook_shows_progress_and_takes_it_away(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Only the kernel of a notebook shows a bar, and only if no function takes the news; the kernel is a stand-in."""
+    """Only the kernel of a notebook shows a bar, and only if no function takes the events; the kernel is a stand-in."""
     shown: list[str] = []
     handle = SimpleNamespace(update=shown.append)
 
@@ -268,15 +268,15 @@ def test_a_notebook_shows_progress_and_takes_it_away(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setitem(sys.modules, "IPython", _module(get_ipython=lambda: SimpleNamespace(kernel=None)))
     monkeypatch.setitem(sys.modules, "IPython.display", _module(HTML=str, display=display))
-    news: list[News] = []
-    montecarlo(SMALL, trials=1, tell=news.append)
+    event: list[ProgressEvent] = []
+    montecarlo(SMALL, trials=1, on_event=event.append)
     assert shown == []
     montecarlo(SMALL, trials=1)
     assert (shown[0], shown[-1]) == ('<progress max="1" value="0.0000"></progress> 0% · starting', "")
     from evedrop.cli.api.notebook import progress
 
-    with progress(None, 50) as tell:
-        tell(RunProgress(25, 1000.0, "slots/s", {}))
+    with progress(None, 50) as on_event:
+        on_event(RunProgress(25, 1000.0, "slots/s", {}))
     assert shown[-2] == '<progress max="1" value="0.5000"></progress> 50% · 1,000 slots/s'
 
 

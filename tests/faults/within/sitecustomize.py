@@ -28,14 +28,14 @@ if LAUNCHES or (CONFUSED and "evedrop.fork_server" in sys.orig_argv):
         import json
         import time
 
-        show = module.ProgressLine.tell
+        show = module.ProgressLine.on_event
 
-        def tell(line: Any, news: Any) -> None:
+        def on_event(line: Any, event: Any) -> None:
             with open(f"{FOLDER}/news", "a") as file:
-                file.write(json.dumps({**news.plain, "at": time.monotonic()}) + "\n")
-            show(line, news)
+                file.write(json.dumps({**event.plain, "at": time.monotonic()}) + "\n")
+            show(line, event)
 
-        module.ProgressLine.tell = tell
+        module.ProgressLine.on_event = on_event
 
     def _wired(module: ModuleType) -> None:
         import dataclasses

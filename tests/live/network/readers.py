@@ -21,7 +21,7 @@ from evedrop.model.receiver import Belief, Reception
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
 from evedrop.model.slot.link import Change
 from evedrop.model.slot.transit import Late
-from evedrop.scenario.news import RunEvent
+from evedrop.scenario.progress_events import RunEvent
 
 SLOTS, N, TRIALS, RECORDED, WINDOW, INPUTS, PERIOD = 40, 2, 3, 1, 2, 1, 4
 SHAPE = (N, TRIALS)

@@ -192,7 +192,7 @@ def test_a_lost_connection_is_replaced(stage: Stage) -> None:
             stage.cable.flap()
             assert [tokens.get(timeout=LIMIT) for _ in range(2)] == [False, True]
             assert [watched.get(timeout=LIMIT) for _ in range(2)] == [False, True]
-            # One flap may cost two sessions; the news of the second then come early at the next flap.
+            # One flap may cost two sessions; the events of the second then come early at the next flap.
             wait_until(lambda: str(session.connection.session.zid()) not in ids, "another session")
             ids.add(str(session.connection.session.zid()))
         stage.put(keys.downlink("eve"), [enclosed(keys.downlink("eve"), progress(2))])

@@ -12,7 +12,7 @@ from evedrop.live.network.operator import Answer, read_answer
 from evedrop.live.protocol.codec import pack
 from evedrop.live.protocol.status import LinkStatus, RunStatus, status_of_shards
 from evedrop.live.protocol.wire_status import WireLinkStatus, WireStatus
-from evedrop.scenario.news import RunEvent
+from evedrop.scenario.progress_events import RunEvent
 
 KEY = "evedrop/r1/control/observer"
 STATUS = RunStatus(

@@ -12,7 +12,7 @@ import pytest
 
 from evedrop.live.launch.metrics import MetricsAddress, RunMetrics, metrics_served
 from evedrop.scenario.loading import load
-from evedrop.scenario.news import silent
+from evedrop.scenario.progress_events import silent
 from evedrop.show.view.bounded_http import own_host
 from evedrop.show.view.viewer import Viewer
 from tests.conftest import LIMIT

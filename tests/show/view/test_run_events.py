@@ -9,7 +9,7 @@ import pytest
 
 from evedrop import load_results, montecarlo
 from evedrop.cli.main import main
-from evedrop.scenario.news import RunEvent
+from evedrop.scenario.progress_events import RunEvent
 from evedrop.show.view.replay import replay
 from tests.show.view.read_back import rows
 

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from importlib import import_module
 
 from evedrop.scenario.arguments import refuse_unless
-from evedrop.scenario.news import News, RunProgress, Tell, silent
+from evedrop.scenario.progress_events import OnEvent, ProgressEvent, RunProgress, silent
 from evedrop.show.report.text_table import TextTable
 
 _TELL_SECONDS = 0.2
@@ -22,25 +22,25 @@ def in_notebook() -> bool:
 
 
 @contextlib.contextmanager
-def progress(tell: Tell | None, total: int) -> Iterator[Tell]:
-    """The function that takes the news of a call: `tell` if one is given, else a progress bar in a notebook.
+def progress(on_event: OnEvent | None, total: int) -> Iterator[OnEvent]:
+    """The function that takes the events of a call: `on_event` if one is given, else a progress bar in a notebook.
 
-    total: the progress at the end, unless the news gives it. The bar vanishes at the end.
+    total: the progress at the end, unless an event gives it. The bar vanishes at the end.
     """
-    refuse_unless(tell is None or callable(tell), "tell", tell, "a function that takes an item of news")
-    if tell is not None or not in_notebook():
-        yield tell or silent
+    refuse_unless(on_event is None or callable(on_event), "on_event", on_event, "a function that takes an event")
+    if on_event is not None or not in_notebook():
+        yield on_event or silent
         return
     shown = import_module("IPython.display")
     handle = shown.display(shown.HTML(bar_text(0, total, "starting")), display_id=True)
     due = time.monotonic()
 
-    def take(news: News) -> None:
+    def take(event: ProgressEvent) -> None:
         nonlocal due
-        if isinstance(news, RunProgress) and time.monotonic() >= due:
+        if isinstance(event, RunProgress) and time.monotonic() >= due:
             due = time.monotonic() + _TELL_SECONDS
-            rate = f"{news.rate:,.0f} {news.rate_unit}"
-            handle.update(shown.HTML(bar_text(news.done, news.total or total, rate)))
+            rate = f"{event.rate:,.0f} {event.rate_unit}"
+            handle.update(shown.HTML(bar_text(event.done, event.total or total, rate)))
 
     try:
         yield take

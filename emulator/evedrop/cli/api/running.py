@@ -13,7 +13,7 @@ from evedrop.cli.api.results import ComparisonResults, RunResults, SweepResults
 from evedrop.errors import UsageError
 from evedrop.scenario.arguments import refuse_unless, table_argument
 from evedrop.scenario.loading.python_values import plain_tables
-from evedrop.scenario.news import Tell
+from evedrop.scenario.progress_events import OnEvent
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import dotted
 from evedrop.simulate.montecarlo import Plan
@@ -31,14 +31,14 @@ def run(
     overwrite: bool = False,
     view: str = "off",
     listen: str | None = None,
-    tell: Tell | None = None,
+    on_event: OnEvent | None = None,
     **changes: Any,
 ) -> RunResults:
     """Run a scenario live, with sensor, router, estimators and observer in separate processes.
 
     scenario: a built-in name, a file, or a `Scenario`; out: the results folder, new or empty, by default a temporary one that is
     removed with the results; overwrite: replace the results in `out`; view: auto, native, web or off; listen: the router's
-    loopback endpoint, tls/127.0.0.1:PORT, by default a socket; tell: called with each item of news, by default a progress bar
+    loopback endpoint, tls/127.0.0.1:PORT, by default a socket; on_event: called with each event, by default a progress bar
     in a notebook; changes: entries of the scenario by dotted key, with `__` for the dot, such as `slots=500` or
     `legitimate__link__quality=0.5`.
 
@@ -55,8 +55,8 @@ def run(
     refuse_unless(
         listen is None or isinstance(listen, str), "listen", listen, "an endpoint such as tls/127.0.0.1:17460"
     )
-    with place_for(out, overwrite) as place, progress(tell, made.slots) as told:
-        ended = launch(made, place.folder, view, listen, told)
+    with place_for(out, overwrite) as place, progress(on_event, made.slots) as emit:
+        ended = launch(made, place.folder, view, listen, emit)
         if ended.viewer is not None:
             ended.viewer.stop()
         results = RunResults.read(ended.folder)
@@ -74,7 +74,7 @@ def montecarlo(
     workers: int | None = None,
     scheduler: str | None = None,
     plan: Plan | None = None,
-    tell: Tell | None = None,
+    on_event: OnEvent | None = None,
     **changes: Any,
 ) -> RunResults:
     """Run the trials of a scenario in memory; in the exact mode, the default, to the same bits as a live run.
@@ -88,8 +88,8 @@ def montecarlo(
 
     plan = plan_of(plan, workers, scheduler)
     made = scenario_of(scenario, {**changes, "trials": trials}, plan.mode is not Mode.EXACT)
-    with place_for(out, overwrite, resume) as place, progress(tell, made.trials * made.slots) as told:
-        simulate(made, place.folder, told, plan, resume=resume)
+    with place_for(out, overwrite, resume) as place, progress(on_event, made.trials * made.slots) as emit:
+        simulate(made, place.folder, emit, plan, resume=resume)
         results = RunResults.read(place.folder)
         place.keep_for(results)
         return results
@@ -106,7 +106,7 @@ def sweep(
     workers: int | None = None,
     scheduler: str | None = None,
     plan: Plan | None = None,
-    tell: Tell | None = None,
+    on_event: OnEvent | None = None,
     **changes: Any,
 ) -> SweepResults:
     """Run the trials of a scenario in memory for every combination of values of some entries.
@@ -128,9 +128,9 @@ def sweep(
             raise UsageError(f"over: {key} is {found!r}; expected a list of values, such as [0.2, 0.4]")
     if not values or math.prod(map(len, values.values())) > MOST_POINTS:
         raise UsageError(f"over: expected 1 to {MOST_POINTS} points, such as {{'slots': [100, 200]}}")
-    with place_for(out, overwrite, resume) as place, progress(tell, 0) as told:
+    with place_for(out, overwrite, resume) as place, progress(on_event, 0) as emit:
         table = sweep_over(
-            scenario, given, values, place.folder, told, plan_of(plan, workers, scheduler), resume=resume
+            scenario, given, values, place.folder, emit, plan_of(plan, workers, scheduler), resume=resume
         )
         results = SweepResults(place.folder, table, tuple(values))
         place.keep_for(results)
@@ -150,7 +150,7 @@ def compare(
     workers: int | None = None,
     scheduler: str | None = None,
     plan: Plan | None = None,
-    tell: Tell | None = None,
+    on_event: OnEvent | None = None,
     **changes: Any,
 ) -> ComparisonResults:
     """Compare schemes against adversaries, on a scenario's process and links.
@@ -176,8 +176,8 @@ def compare(
     chosen = _named({"schemes": schemes, "adversaries": adversaries}, "compare", scenario, given)
     made = scenario_of(scenario, given)
     matchups = matchups_of(made, chosen.get("schemes"), chosen.get("adversaries"), parameters)
-    with place_for(out, overwrite, resume) as place, progress(tell, 0) as told:
-        found = compare_all(matchups, place.folder, told, plan_of(plan, workers, scheduler), resume=resume)
+    with place_for(out, overwrite, resume) as place, progress(on_event, 0) as emit:
+        found = compare_all(matchups, place.folder, emit, plan_of(plan, workers, scheduler), resume=resume)
         results = ComparisonResults.of(found, place.folder)
         place.keep_for(results)
         return results
@@ -191,7 +191,7 @@ def cost(
     resume: bool = False,
     workers: int | None = None,
     scheduler: str | None = None,
-    tell: Tell | None = None,
+    on_event: OnEvent | None = None,
     **changes: Any,
 ) -> SecrecyCost:
     """The energy that secrecy costs an application: the scenario's scheme against `plain`, trial by trial.
@@ -202,12 +202,12 @@ def cost(
     Raises ScenarioError with every mistake of the scenario, UsageError without an application that has a power, RunError if a
     worker fails, Interrupted on Ctrl-C.
     """
-    from evedrop.simulate.montecarlo import teller  # a live run does not need it
+    from evedrop.simulate.montecarlo import progress_counter  # a live run does not need it
     from evedrop.studies.secrecy_cost import secrecy_cost  # no other call needs it
 
     made = scenario_of(scenario, {**changes, "trials": trials})
-    with place_in(out, resume) as place, progress(tell, total := made.trials * made.slots) as told:
-        return secrecy_cost(made, teller(told, total), plan_of(None, workers, scheduler), place)
+    with place_in(out, resume) as place, progress(on_event, total := made.trials * made.slots) as emit:
+        return secrecy_cost(made, progress_counter(emit, total), plan_of(None, workers, scheduler), place)
 
 
 def learned(
@@ -218,7 +218,7 @@ def learned(
     resume: bool = False,
     workers: int | None = None,
     scheduler: str | None = None,
-    tell: Tell | None = None,
+    on_event: OnEvent | None = None,
     **changes: Any,
 ) -> list[LearningRow]:
     """What eavesdroppers that learn know of the process after 8, 16, 32, … slots, and how that affects their error.
@@ -229,12 +229,12 @@ def learned(
     Raises ScenarioError with every mistake of the scenario, UsageError if no eavesdropper learns, RunError if a worker fails,
     Interrupted on Ctrl-C.
     """
-    from evedrop.simulate.montecarlo import teller  # a live run does not need it
+    from evedrop.simulate.montecarlo import progress_counter  # a live run does not need it
     from evedrop.studies.learning_curve import learning_curve  # no other call needs it
 
     made = scenario_of(scenario, {**changes, "trials": trials})
-    with place_in(out, resume) as place, progress(tell, total := made.trials * made.slots) as told:
-        return learning_curve(made, teller(told, total), plan_of(None, workers, scheduler), place)
+    with place_in(out, resume) as place, progress(on_event, total := made.trials * made.slots) as emit:
+        return learning_curve(made, progress_counter(emit, total), plan_of(None, workers, scheduler), place)
 
 
 def _named(

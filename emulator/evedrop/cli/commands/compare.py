@@ -45,7 +45,7 @@ def compare(options: argparse.Namespace) -> int:
             out=folder,
             resume=options.resume,
             plan=plan_of(options),
-            tell=line.tell,
+            on_event=line.on_event,
             **{"trials": 200, **changes},
         )
     if options.json:

@@ -24,7 +24,7 @@ def montecarlo(options: argparse.Namespace) -> int:
     with results_folder(options.out, options.scenario) as folder:
         with ProgressLine(scenario.trials * scenario.slots, "trial-slots", options.json) as line:
             try:
-                status = simulate(scenario, folder, line.tell, plan, resume=options.resume)
+                status = simulate(scenario, folder, line.on_event, plan, resume=options.resume)
             except Interrupted:
                 print_so_far(line.moved or folder, options.json)
                 raise

@@ -90,9 +90,9 @@ def process(options: argparse.Namespace) -> int:
         options.brief.unlink(missing_ok=True)  # its keys should not stay on disk
         continue_when_parent_dies()
         if isinstance(brief.part, RoutingPart):
-            from evedrop.live.network.launcher_news import set_news_apart
+            from evedrop.live.network.launcher_pipe import keep_events_apart
 
-            set_news_apart(launched=True)  # before the modules of link classes print anything
+            keep_events_apart(launched=True)  # before the modules of link classes print anything
     if isinstance(brief.part, ObserverPart) and getattr(options, "out", None) is not None:
         brief = replace(brief, part=replace(brief.part, results=str(options.out)))
     if isinstance(brief.part, ImportingPart) and brief.part.modules is not None:
@@ -119,7 +119,7 @@ def _play(brief: AnyBrief, serve: str | None) -> int:
 
         check_identity(brief.identity, brief.process)
     if has_part(brief, ObserverPart):
-        from evedrop.live.network.launcher_news import Heartbeat
+        from evedrop.live.network.launcher_pipe import Heartbeat
 
         with Heartbeat() if brief.ends_with_stdin else contextlib.nullcontext():
             return _observe(brief, serve)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from evedrop.cli.progress_line import ProgressLine
     from evedrop.live.launch.hosts_file import HostsPlan
     from evedrop.live.launch.process_set import FinishedRun
-    from evedrop.scenario.news import Tell
+    from evedrop.scenario.progress_events import OnEvent
     from evedrop.scenario.tables import Scenario
     from evedrop.show.view.viewer import Viewer
 
@@ -51,7 +51,7 @@ def _run(options: argparse.Namespace) -> FinishedRun:
     with results_folder(options.out, options.scenario) as folder:
         with (
             ProgressLine(scenario.slots, "slots", options.json) as line,
-            _metrics(options, scenario, folder, line) as tell,
+            _metrics(options, scenario, folder, line) as on_event,
         ):
             try:
                 ended = launch(
@@ -59,7 +59,7 @@ def _run(options: argparse.Namespace) -> FinishedRun:
                     folder,
                     options.view,
                     options.listen,
-                    tell,
+                    on_event,
                     options.relay,
                     paused=options.paused,
                     hosts=hosts,
@@ -72,22 +72,22 @@ def _run(options: argparse.Namespace) -> FinishedRun:
 
 
 @contextlib.contextmanager
-def _metrics(options: argparse.Namespace, scenario: Scenario, folder: Path, line: ProgressLine) -> Iterator[Tell]:
-    """Serve the metrics of `--metrics` during the block; gives what takes the news."""
+def _metrics(options: argparse.Namespace, scenario: Scenario, folder: Path, line: ProgressLine) -> Iterator[OnEvent]:
+    """Serve the metrics of `--metrics` during the block; gives what takes the events."""
     if options.metrics is None:
-        yield line.tell
+        yield line.on_event
         return
     from evedrop.live.launch.metrics import MetricsAddress, RunMetrics, metrics_served
     from evedrop.system.output import warn
 
     address = MetricsAddress.of(options.metrics)
-    metrics = RunMetrics(scenario, folder, line.tell)
+    metrics = RunMetrics(scenario, folder, line.on_event)
     with metrics_served(address, metrics) as page:
         if not options.json:
             line.console.print(f"metrics are served at {page}", soft_wrap=True)
         if address.warning is not None:
             warn(address.warning)
-        yield metrics.tell
+        yield metrics.on_event
 
 
 def _hosts_of(options: argparse.Namespace, scenario: Scenario) -> HostsPlan | None:

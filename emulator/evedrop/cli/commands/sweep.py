@@ -28,7 +28,9 @@ def sweep(options: argparse.Namespace) -> int:
         results_folder(options.out, f"{Path(options.scenario).stem}-sweep") as folder,
         ProgressLine(None, "trial-slots", options.json) as line,
     ):
-        table = sweep_over(options.scenario, changes_of(options), grid, folder, line.tell, plan, resume=options.resume)
+        table = sweep_over(
+            options.scenario, changes_of(options), grid, folder, line.on_event, plan, resume=options.resume
+        )
     if options.json:
         print_json(table.to_pylist())
     else:

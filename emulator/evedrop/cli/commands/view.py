@@ -125,17 +125,17 @@ def _times_of(options: argparse.Namespace) -> Sequence[float]:
 def _film(recording: Path, options: argparse.Namespace, moments: Sequence[float]) -> int:
     """Draw some moments as a video."""
     from evedrop.cli.progress_line import ProgressLine
-    from evedrop.scenario.news import RunProgress
+    from evedrop.scenario.progress_events import RunProgress
     from evedrop.show.view.video import FRAME_RATE, VIDEO_SIZE, video_apart
 
     start = time.monotonic()
     with ProgressLine(len(moments), "frames") as line:
 
-        def tell(done: int) -> None:
-            line.tell(RunProgress(done, done / (time.monotonic() - start), "frames/s", {}))
+        def on_event(done: int) -> None:
+            line.on_event(RunProgress(done, done / (time.monotonic() - start), "frames/s", {}))
 
         size, rate = options.size or VIDEO_SIZE, options.fps or FRAME_RATE
-        complaints = video_apart(recording, options.video, moments, size, rate, tell)
+        complaints = video_apart(recording, options.video, moments, size, rate, on_event)
     frames = f"{len(moments)} frames are" if len(moments) > 1 else "1 frame is"
     print("\n".join([*complaints, f"{frames} in {options.video}"]))
     return 0

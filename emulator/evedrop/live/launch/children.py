@@ -26,10 +26,17 @@ from evedrop.live.launch.starter import (
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.brief_parts import ReceiverPart, RoutingPart
 from evedrop.live.protocol.last_word import Cause, LastWord, last_word_file, read_last_word
-from evedrop.live.protocol.news import Alive, ProcessRequest, RouterListens, SaveStarted, SlotsDone, read_news
+from evedrop.live.protocol.launcher_events import (
+    Alive,
+    ProcessRequest,
+    RouterListens,
+    SaveStarted,
+    SlotsDone,
+    read_event,
+)
 from evedrop.names import OBSERVER, RELAY, ROUTER, SENSOR, ProcessAction
 from evedrop.results.folder import HeldFolder, private_opener
-from evedrop.scenario.news import News, RunEnded, Started, Tell
+from evedrop.scenario.progress_events import OnEvent, ProgressEvent, RunEnded, Started
 from evedrop.system.environment import SINGLE_THREADED, check_zenoh_runtime, lock_step_environment, own_environment
 from evedrop.system.processes import wait_for
 from evedrop.system.signals import INTERRUPTED
@@ -81,7 +88,7 @@ class Children:
         self._lock_step = lock_step
         self._private = private
         self._processes: dict[str, StartedProcess] = {}
-        self._news: SimpleQueue[News | ProcessExit] = SimpleQueue()
+        self._events: SimpleQueue[ProgressEvent | ProcessExit] = SimpleQueue()
         self.silent_seconds = 0.0
         """How many seconds the observer has been silent for."""
         self.started = False
@@ -105,7 +112,7 @@ class Children:
     def start(self, brief: AnyBrief, again: bool = False) -> None:
         """Start the process of a brief, or restart it (`again`).
 
-        Its output goes to its log, the news of an observer or a router to the launcher. Raises
+        Its output goes to its log, the events of an observer or a router to the launcher. Raises
         RunError if the system cannot start it, and UsageError if it could not open a session with this environment.
         """
         check_zenoh_runtime()
@@ -148,23 +155,23 @@ class Children:
             with process.stdout as lines:
                 for line in lines:
                     try:
-                        news = read_news(line)
-                        if name != OBSERVER and news != RouterListens(name):
-                            raise ValueError("only the observer sends such news")
-                        self._news.put(news)
+                        event = read_event(line)
+                        if name != OBSERVER and event != RouterListens(name):
+                            raise ValueError("only the observer sends such events")
+                        self._events.put(event)
                     except ValueError as error:
                         self._refuse(name, error)
         status = process.wait()  # without a limit: nobody waits for this thread
         if process.pid not in self._killed:
-            self._news.put(ProcessExit(name, status))
+            self._events.put(ProcessExit(name, status))
 
     def _refuse(self, name: str, error: ValueError) -> None:
-        """Write into a process's log that the launcher cannot read its news."""
+        """Write into a process's log that the launcher cannot read its events."""
         with (
             contextlib.suppress(OSError),
             (self._folder.now / "logs" / f"{name}.log").open("a", encoding="utf-8") as log,
         ):
-            log.write(f"evedrop: the launcher refused malformed news: {error}\n")
+            log.write(f"evedrop: the launcher refused a malformed event: {error}\n")
 
     def listens(self, router: str) -> bool:
         """Whether a router or relay has said that it listens; true for one that cannot say so, or is not there."""
@@ -213,36 +220,36 @@ class Children:
                 observer.write(b"%d\n" % request.number)
                 observer.flush()
 
-    def news(self, seconds: float) -> News | ProcessExit | None:
-        """The next news or exit that concerns the caller, or None; waits for `seconds` at most.
+    def next_event(self, seconds: float) -> ProgressEvent | ProcessExit | None:
+        """The next event or exit that concerns the caller, or None; waits for `seconds` at most.
 
         A process that is to be started again waits, as the others did, until its router listens.
         """
         try:
-            news = self._news.get(timeout=seconds)
+            event = self._events.get(timeout=seconds)
         except Empty:
             self.silent_seconds += seconds
             return None
-        if isinstance(news, ProcessExit):
-            return news
+        if isinstance(event, ProcessExit):
+            return event
         self.silent_seconds = 0.0
-        match news:
+        match event:
             case Started():
                 self.started = True
             case RouterListens(process):
                 self._listening.add(process)
             case ProcessRequest(ProcessAction.START) if not all(self.listens(name) for name in (ROUTER, RELAY)):
-                self._news.put(news)
+                self._events.put(event)
                 time.sleep(_AGAIN_SECONDS)
             case ProcessRequest():
-                self.act(news)
+                self.act(event)
             case SlotsDone():
                 self.over = True
             case SaveStarted():
                 self._finishing = True
-        return None if isinstance(news, Alive | RouterListens | ProcessRequest | SlotsDone | SaveStarted) else news
+        return None if isinstance(event, Alive | RouterListens | ProcessRequest | SlotsDone | SaveStarted) else event
 
-    def conclude(self, tell: Tell, patience: float = 0.0) -> RunEnded | None:
+    def conclude(self, on_event: OnEvent, patience: float = 0.0) -> RunEnded | None:
         """End the observer, at once or after `patience` seconds; returns its `RunEnded`, or None if it sent none.
 
         Once it has begun to write the results, it may take `_FINISH_SECONDS`, as long as it sends heartbeats.
@@ -253,13 +260,13 @@ class Children:
         while self.silent_seconds < SILENCE_SECONDS and (
             time.monotonic() - begun < (_FINISH_SECONDS if self._finishing else _BEGIN_SECONDS)
         ):
-            news = self.news(0.05)
-            if isinstance(news, ProcessExit):
-                if news.process == OBSERVER:
+            event = self.next_event(0.05)
+            if isinstance(event, ProcessExit):
+                if event.process == OBSERVER:
                     break
-            elif news is not None:
-                tell(news)
-                ending = news if isinstance(news, RunEnded) else ending
+            elif event is not None:
+                on_event(event)
+                ending = event if isinstance(event, RunEnded) else ending
         return ending
 
     def terminate(self, name: str, after: float = 0.0) -> None:

@@ -34,7 +34,7 @@ from evedrop.results.reading import Results, as_of
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.results.shard_score import load_score
 from evedrop.results.writer import DIGESTS, ResultsWriter, write_summary
-from evedrop.scenario.news import ConnectionOutage, RunEvent
+from evedrop.scenario.progress_events import ConnectionOutage, RunEvent
 from evedrop.scenario.tables import Scenario
 from evedrop.score.expectations_held import replay_of
 from evedrop.score.scorekeeper import RunOutcome, summary_of

@@ -146,9 +146,9 @@ class HostProcesses:
             gone = error.errno in (errno.ESRCH, errno.ETIMEDOUT)  # its fork server, whose host is to blame
             self.answer(ProcessEnded(number, FORK_SERVER_LOST if gone else 1))
             return
-        news = self._processes[number].stdout
-        if news is not None:
-            news.close()  # the launcher waits for no router on another host
+        events = self._processes[number].stdout
+        if events is not None:
+            events.close()  # the launcher waits for no router on another host
         threading.Thread(target=self._follow, args=(number, brief.process, read), daemon=True).start()
 
     def _kept_here(self, brief: AnyBrief) -> AnyBrief:

@@ -14,7 +14,7 @@ from evedrop.errors import UsageError
 from evedrop.live.launch.ports import loopback_endpoints, warn_if_exposed
 from evedrop.live.launch.preloading import process_starter
 from evedrop.live.launch.process_set import FinishedRun, launch_one
-from evedrop.scenario.news import Tell
+from evedrop.scenario.progress_events import OnEvent
 from evedrop.scenario.tables import Scenario
 from evedrop.show.view.viewer import choose
 from evedrop.system.output import say
@@ -32,13 +32,13 @@ def launch(
     folder: Path,
     view: str,
     listen: str | None,
-    tell: Tell,
+    on_event: OnEvent,
     relay: str | None = None,
     *,
     paused: bool = False,
     hosts: HostsPlan | None = None,
 ) -> FinishedRun:
-    """Run a scenario live into a results folder; `tell` gets the observer's news as they come.
+    """Run a scenario live into a results folder; `on_event` gets the observer's events as they come.
 
     view: auto, native, web or off; listen, relay: the endpoints of router and relay, if there is one; by default no
     port, or free ports for two routers; paused: whether the run is held before slot 0, until the operator lets it continue;
@@ -55,13 +55,13 @@ def launch(
 
     with stop_on_signals() as stop, told_when_suspended(suspended), process_starter(stop) as start:
         if hosts is not None:
-            return _on_hosts(scenario, folder, view, tell, stop, start, hosts, paused)
+            return _on_hosts(scenario, folder, view, on_event, stop, start, hosts, paused)
         if scenario.shards == 1:
             endpoints = None
             if listen is not None or relay is not None or scenario.relayed:
                 endpoints = loopback_endpoints(listen, relay, scenario.relayed)
                 warn_if_exposed(endpoints)
-            return launch_one(scenario, folder, view, endpoints, tell, stop, start, paused=paused)
+            return launch_one(scenario, folder, view, endpoints, on_event, stop, start, paused=paused)
         from evedrop.live.launch.shards import launch_shards  # noqa: PLC0415 - not needed for one set of processes
 
         given = {"listen": listen, "relay": relay}
@@ -73,14 +73,14 @@ def launch(
                 )
         if paused:
             raise UsageError(f"--paused: a run in {scenario.shards} shards cannot be steered; give --set shards=1")
-        return launch_shards(scenario, folder, view, tell, stop, start)
+        return launch_shards(scenario, folder, view, on_event, stop, start)
 
 
 def _on_hosts(
     scenario: Scenario,
     folder: Path,
     view: str,
-    tell: Tell,
+    on_event: OnEvent,
     stop: threading.Event,
     here: Starter,
     hosts: HostsPlan,
@@ -95,5 +95,5 @@ def _on_hosts(
         )
     with ssh_starter(hosts, here, stop, scenario.longest_outage) as start:
         return launch_one(
-            scenario, folder, view, hosts.endpoints, tell, stop, start, paused=paused, patience=_HOSTS_PATIENCE
+            scenario, folder, view, hosts.endpoints, on_event, stop, start, paused=paused, patience=_HOSTS_PATIENCE
         )

@@ -1,6 +1,6 @@
 """Metrics of a live run for Prometheus, by HTTP.
 
-They are made from the news of the observer and, at each scrape, from the figures that the run has on disk; the run itself does
+They are made from the events of the observer and, at each scrape, from the figures that the run has on disk; the run itself does
 nothing for them. prometheus_client is imported only here: a run without metrics needs neither it nor a web server.
 
 Source: docs/results.md, metrics of a live run.
@@ -23,7 +23,15 @@ from evedrop.errors import UsageError
 from evedrop.model.figures import estimated_figures
 from evedrop.results.reading import Results
 from evedrop.scenario.application import APPLICATIONS
-from evedrop.scenario.news import ConnectionOutage, FolderMoved, Held, News, RunProgress, Started, Tell
+from evedrop.scenario.progress_events import (
+    ConnectionOutage,
+    FolderMoved,
+    Held,
+    OnEvent,
+    ProgressEvent,
+    RunProgress,
+    Started,
+)
 from evedrop.scenario.tables import Scenario
 from evedrop.show.view.bounded_http import BoundedServer, QuietHandler
 
@@ -76,29 +84,29 @@ class MetricsAddress:
 class RunMetrics:
     """The metrics of a run: a collector of prometheus_client."""
 
-    def __init__(self, scenario: Scenario, folder: Path, tell: Tell) -> None:
-        """folder: of the results; tell: gets all news after this object."""
-        self._scenario, self._folder, self._tell = scenario, folder, tell
+    def __init__(self, scenario: Scenario, folder: Path, on_event: OnEvent) -> None:
+        """folder: of the results; on_event: gets all events after this object."""
+        self._scenario, self._folder, self._on_event = scenario, folder, on_event
         self._lock = threading.Lock()
         self._progress: RunProgress | None = None
         self._running = self._held = False
         self._losses: Counter[str] = Counter()
 
-    def tell(self, news: News) -> None:
-        """Note an item of news, and pass it on."""
+    def on_event(self, event: ProgressEvent) -> None:
+        """Note an event, and pass it on."""
         with self._lock:
-            match news:
+            match event:
                 case Started():
                     self._running = True
                 case Held():
                     self._held = True
                 case RunProgress():
-                    self._progress, self._held = news, False
+                    self._progress, self._held = event, False
                 case ConnectionOutage():
-                    self._losses[news.process] += 1
+                    self._losses[event.process] += 1
                 case FolderMoved():
-                    self._folder = Path(news.folder)
-        self._tell(news)
+                    self._folder = Path(event.folder)
+        self._on_event(event)
 
     def describe(self) -> list[Any]:
         """Nothing: the metrics are made at each scrape."""
@@ -118,7 +126,7 @@ class RunMetrics:
             (0, 0.0, {}) if progress is None else (progress.done, progress.rate, progress.squared_errors)
         )
         summary = _summary(folder)
-        done = max(done, int(summary.get("slots", 0)))  # the last slots are in no news
+        done = max(done, int(summary.get("slots", 0)))  # the last slots are in no events
         yield CounterMetricFamily("evedrop_slots", "Slots that are complete.", done)
         yield GaugeMetricFamily("evedrop_slots_per_second", "The rate of slots at present.", rate)
         errors = GaugeMetricFamily(

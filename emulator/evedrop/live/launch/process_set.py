@@ -24,7 +24,7 @@ from evedrop.live.network.control_file import remove_control
 from evedrop.names import OBSERVER, RELAY, ROUTER
 from evedrop.results.folder import HeldFolder, make_private, new_folder
 from evedrop.results.resolved_scenario import write_resolved
-from evedrop.scenario.news import FolderMoved, RunEnded, Tell, ViewOpened
+from evedrop.scenario.progress_events import FolderMoved, OnEvent, RunEnded, ViewOpened
 from evedrop.scenario.tables import Scenario
 from evedrop.show.view.viewer import Viewer
 from evedrop.system.signals import AFTERTHOUGHT_SECONDS, INTERRUPTED
@@ -50,7 +50,7 @@ def launch_one(
     folder: Path,
     view: str,
     endpoints: RouterEndpoints | None,
-    tell: Tell,
+    on_event: OnEvent,
     stop: threading.Event,
     starter: Starter,
     *,
@@ -87,9 +87,9 @@ def launch_one(
                 # The other processes start up at the same time as the viewer.
                 viewer = Viewer.start(view, folder / "logs", folder.absolute() / "recording.rrd")
                 if viewer is not None:
-                    tell(ViewOpened(viewer.address, viewer.warning))
+                    on_event(ViewOpened(viewer.address, viewer.warning))
                 children.start(observer)
-                status = follow_to_end(children, stop, tell)
+                status = follow_to_end(children, stop, on_event)
                 if viewer is not None:
                     viewer.complete()
         except BaseException as error:
@@ -110,7 +110,7 @@ def launch_one(
             now = _now(held)
             remove_control(now)
             if now != held.first:
-                tell(FolderMoved(str(now)))
+                on_event(FolderMoved(str(now)))
     return FinishedRun(status, viewer, now)
 
 
@@ -133,9 +133,9 @@ def _wait_until_listening(children: Children, router: str, stop: threading.Event
     while not children.listens(router):
         if stop.is_set():
             raise Interrupted
-        news = children.news(_POLL_SECONDS)
-        if isinstance(news, ProcessExit) and not _meant_us_too(news, stop) and not children.restart_router(news):
-            raise RunError(children.failure_report(news, None))
+        event = children.next_event(_POLL_SECONDS)
+        if isinstance(event, ProcessExit) and not _meant_us_too(event, stop) and not children.restart_router(event):
+            raise RunError(children.failure_report(event, None))
         if time.monotonic() > deadline:
             raise RunError(
                 f"{router} did not listen within {patience:.0f} s of its start, so no other process was started; run again, and "
@@ -157,35 +157,35 @@ def _forget(folder: Path) -> None:
         shutil.rmtree(folder)
 
 
-def follow_to_end(children: Children, stop: threading.Event, tell: Tell) -> int:
+def follow_to_end(children: Children, stop: threading.Event, on_event: OnEvent) -> int:
     """Follow the run to its end; returns the exit status that the observer gives it."""
     early: tuple[ProcessExit, float] | None = None
     ending: RunEnded | None
     while True:
         if early is not None and not children.over and time.monotonic() - early[1] > _EARLY_SECONDS:
-            raise RunError(children.failure_report(early[0], children.conclude(tell)))
+            raise RunError(children.failure_report(early[0], children.conclude(on_event)))
         if stop.is_set():
-            ending = _stopped(children, tell)
+            ending = _stopped(children, on_event)
             break
         if children.silent_seconds > SILENCE_SECONDS:
             raise RunError(children.failure_report(None, RunEnded(RunError.exit_status, "", [OBSERVER])))
-        news = children.news(_POLL_SECONDS)
+        event = children.next_event(_POLL_SECONDS)
         ending = None
-        if isinstance(news, ProcessExit):
-            if _meant_us_too(news, stop) or (
-                news.process != OBSERVER and (news.status == 0 or children.restart_router(news))
+        if isinstance(event, ProcessExit):
+            if _meant_us_too(event, stop) or (
+                event.process != OBSERVER and (event.status == 0 or children.restart_router(event))
             ):
-                # A process that leaves at the end may be faster than the news that the run is over.
-                early = early or ((news, time.monotonic()) if news.status == 0 else None)
+                # A process that leaves at the end may be faster than the event that the run is over.
+                early = early or ((event, time.monotonic()) if event.status == 0 else None)
                 continue
-            if news.process != OBSERVER:
+            if event.process != OBSERVER:
                 # An observer that has just ended may still report so; a running one would wait for the lost process in vain.
-                ending = children.conclude(tell)
+                ending = children.conclude(on_event)
             if ending is None or not ending.well:
-                raise RunError(children.failure_report(news, ending))
-        elif news is not None:
-            tell(news)
-            ending = news if isinstance(news, RunEnded) else None
+                raise RunError(children.failure_report(event, ending))
+        elif event is not None:
+            on_event(event)
+            ending = event if isinstance(event, RunEnded) else None
         if ending is not None:
             break
     if ending.status == Interrupted.exit_status:
@@ -196,9 +196,9 @@ def follow_to_end(children: Children, stop: threading.Event, tell: Tell) -> int:
     return ending.status
 
 
-def _stopped(children: Children, tell: Tell) -> RunEnded:
+def _stopped(children: Children, on_event: OnEvent) -> RunEnded:
     """End the run after a signal; returns its end if it was complete before. Raises Interrupted otherwise."""
-    ending = children.conclude(tell)
+    ending = children.conclude(on_event)
     if ending is None or not ending.well:
         raise Interrupted
     return ending

@@ -25,7 +25,15 @@ from evedrop.live.launch.starter import Starter
 from evedrop.model.kernels.elementary import sum_in_order
 from evedrop.results.folder import HeldFolder, new_folder
 from evedrop.results.resolved_scenario import write_resolved
-from evedrop.scenario.news import ConnectionOutage, FolderMoved, News, RunEnded, RunProgress, Started, Tell
+from evedrop.scenario.progress_events import (
+    ConnectionOutage,
+    FolderMoved,
+    OnEvent,
+    ProgressEvent,
+    RunEnded,
+    RunProgress,
+    Started,
+)
 from evedrop.scenario.tables import Scenario
 from evedrop.show.view.viewer import Viewer
 from evedrop.system.threads import wait_for_thread
@@ -35,47 +43,47 @@ _POLL_SECONDS = 0.25
 
 @final
 class OneProgress:
-    """Merges the news of all shards into those of one run, whose progress is the slowest shard's; thread-safe."""
+    """Merges the events of all shards into those of one run, whose progress is the slowest shard's; thread-safe."""
 
-    def __init__(self, shards: Sequence[Shard], tell: Tell) -> None:
+    def __init__(self, shards: Sequence[Shard], on_event: OnEvent) -> None:
         self._trials = {shard.number: shard.scenario.trials for shard in shards}
         self._slots = shards[0].scenario.slots
-        self._tell = tell
+        self._on_event = on_event
         self._lock = threading.Lock()
         self._latest: dict[int, RunProgress] = {}
         self._waited_for = set(self._trials)
         self.started: float | None = None
         """When the first shard began, by the monotonic clock."""
 
-    def of(self, shard: Shard) -> Tell:
-        """A function that takes the news of one shard."""
+    def of(self, shard: Shard) -> OnEvent:
+        """A function that takes the events of one shard."""
 
-        def tell(news: News) -> None:
+        def on_event(event: ProgressEvent) -> None:
             with self._lock:
-                self._take(shard.number, news)
+                self._take(shard.number, event)
 
-        return tell
+        return on_event
 
-    def _take(self, number: int, news: News) -> None:
-        match news:
+    def _take(self, number: int, event: ProgressEvent) -> None:
+        match event:
             case Started():
                 self.started = time.monotonic() if self.started is None else self.started
                 self._waited_for.discard(number)
                 if not self._waited_for:
-                    self._tell(news)
+                    self._on_event(event)
             case RunProgress():
-                self._latest[number] = news
+                self._latest[number] = event
                 if len(self._latest) == len(self._trials):
-                    self._tell(self._all())
+                    self._on_event(self._all())
             case FolderMoved():
                 pass  # a shard's folder moves with the run's, which is reported separately
             case ConnectionOutage():
-                self._tell(replace(news, shard=number))
+                self._on_event(replace(event, shard=number))
             case _:
-                if isinstance(news, RunEnded) and news.well and number in self._latest:
+                if isinstance(event, RunEnded) and event.well and number in self._latest:
                     # Its last slots were too few for a progress report.
                     self._latest[number] = replace(self._latest[number], done=self._slots)
-                self._tell(news)
+                self._on_event(event)
 
     def _all(self) -> RunProgress:
         """The slowest shard's progress and rate, with the errors over all trials."""
@@ -102,14 +110,14 @@ class _ShardsState:
         self,
         shard: Shard,
         at: RouterEndpoints | None,
-        tell: Tell,
+        on_event: OnEvent,
         view: str,
         stop: threading.Event,
         starter: Starter,
     ) -> None:
         """Run one shard to its end, its routers at these endpoints, or at a socket; if it ends early, all shards end."""
         try:
-            ended = launch_one(shard.scenario, shard.folder, view, at, tell, stop, starter, shard=True)
+            ended = launch_one(shard.scenario, shard.folder, view, at, on_event, stop, starter, shard=True)
         except BaseException as error:
             self.failures.append((shard, error))
             stop.set()
@@ -127,7 +135,7 @@ def launch_shards(
     scenario: Scenario,
     folder: Path,
     view: str,
-    tell: Tell,
+    on_event: OnEvent,
     stop: threading.Event,
     starter: Starter,
 ) -> FinishedRun:
@@ -140,7 +148,7 @@ def launch_shards(
     with contextlib.suppress(OSError):  # it is written again when the shards are merged, and an error reported then
         write_resolved(folder, scenario)
     shards = shards_of(scenario, folder)
-    progress, state = OneProgress(shards, tell), _ShardsState()
+    progress, state = OneProgress(shards, on_event), _ShardsState()
     first, *others = [(shard, at, progress.of(shard)) for shard, at in zip(shards, endpoints, strict=True)]
     threads = [threading.Thread(target=state.launched, args=(*one, "off", stop, starter)) for one in others]
     for thread in threads:
@@ -154,7 +162,7 @@ def launch_shards(
             wait_for_thread(thread)
         now = held.now
         if now != folder:
-            tell(FolderMoved(str(now)))
+            on_event(FolderMoved(str(now)))
             shards = [replace(shard, folder=now / SHARDS_FOLDER / str(shard.number)) for shard in shards]
         return FinishedRun(_made_one(scenario, now, shards, state, progress.started), state.viewer, now)
     except BaseException as error:

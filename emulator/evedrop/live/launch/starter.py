@@ -17,7 +17,7 @@ from evedrop.system.processes import kill, wait_for
 from evedrop.system.signals import SHOW_STACKS, held_back
 
 TELLING = frozenset({OBSERVER, ROUTER, RELAY})
-"""The roles whose processes send the launcher news on their standard output."""
+"""The roles whose processes send the launcher events on their standard output."""
 GRACE_SECONDS = 3.0  # for all processes to leave
 CONNECTION_LOST = 1000
 """The status of a process on another host if the connection with the host, or its fork server, ended; no process ends with it."""
@@ -39,7 +39,7 @@ class StartedProcess(Protocol):
 
     @property
     def stdout(self) -> IO[bytes] | None:
-        """The news of an observer or a router; None for others, and for a process on another host."""
+        """The events of an observer or a router; None for others, and for a process on another host."""
 
     def poll(self) -> int | None:
         """Its exit status; None while it runs."""
@@ -105,7 +105,7 @@ class ReportedProcess(ABC):
 
 
 class Starter(Protocol):
-    """Starts the process of a role with the file of its brief; the news of `TELLING` roles come on `stdout`."""
+    """Starts the process of a role with the file of its brief; the events of `TELLING` roles come on `stdout`."""
 
     def __call__(self, role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:
         """Start it. Raises OSError if the system cannot."""

@@ -22,7 +22,7 @@ class DelayedSender:
     def __init__(self) -> None:
         self._due: list[tuple[float, int, Put, bytes]] = []
         self._numbers = itertools.count()
-        self._news = threading.Condition()
+        self._changed = threading.Condition()
         threading.Thread(target=self._go_round, name="delayed-sender", daemon=True).start()
 
     def round(self, put: Put) -> Callable[[bytes, float], None]:
@@ -32,16 +32,16 @@ class DelayedSender:
         def send(payload: bytes, seconds: float) -> None:
             nonlocal last
             last = max(last, time.monotonic() + seconds)
-            with self._news:
+            with self._changed:
                 heapq.heappush(self._due, (last, next(self._numbers), put, payload))
-                self._news.notify()
+                self._changed.notify()
 
         return send
 
     def _go_round(self) -> None:
         while True:
-            with self._news:
+            with self._changed:
                 while not self._due or (wait := self._due[0][0] - time.monotonic()) > 0.0:
-                    self._news.wait(wait if self._due else None)
+                    self._changed.wait(wait if self._due else None)
                 _, _, put, payload = heapq.heappop(self._due)
             put(payload)

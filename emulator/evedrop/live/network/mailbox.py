@@ -32,16 +32,16 @@ class Mailbox:
         self._lock = threading.Lock()
         self._flooded: tuple[str, bytes] | None = None
 
-    def put(self, sender: str, news: bytes | bool) -> None:
+    def put(self, sender: str, item: bytes | bool) -> None:
         """Put a message, or whether the sender is present. If a sender sends too much, its further messages are dropped."""
-        if isinstance(news, bytes):
+        if isinstance(item, bytes):
             with self._lock:
-                waiting = self._waiting[sender] + len(news) + _OVERHEAD_BYTES
+                waiting = self._waiting[sender] + len(item) + _OVERHEAD_BYTES
                 if waiting > self._most:
-                    self._flooded = self._flooded or (sender, news)
+                    self._flooded = self._flooded or (sender, item)
                     return
                 self._waiting[sender] = waiting
-        self._queue.put((sender, news))
+        self._queue.put((sender, item))
 
     def __len__(self) -> int:
         """How many messages wait."""
@@ -59,8 +59,8 @@ class Mailbox:
                 last,
                 writer_of(key),
             )
-        sender, news = self._clock.next(self._queue, timeout)
-        if isinstance(news, bytes):
+        sender, item = self._clock.next(self._queue, timeout)
+        if isinstance(item, bytes):
             with self._lock:
-                self._waiting[sender] -= len(news) + _OVERHEAD_BYTES
-        return sender, news
+                self._waiting[sender] -= len(item) + _OVERHEAD_BYTES
+        return sender, item

@@ -56,7 +56,7 @@ class ProgramStates:
         self._patience = max(patience, LEAST_SECONDS)
         self._clock = clock
         self._heard: deque[bytes] = deque(maxlen=1 if newest else _MOST_WAITING + 1)
-        self._news = threading.Condition()
+        self._changed = threading.Condition()
         self._waited = 0.0
         where = entry.listen or entry.connect
         try:
@@ -84,9 +84,9 @@ class ProgramStates:
             return
         large = len(sample.payload) > MOST_BYTES
         payload = bytes(MOST_BYTES + 1) if large else sample.payload.to_bytes()
-        with self._news:
+        with self._changed:
             self._heard.append(payload)
-            self._news.notify()
+            self._changed.notify()
 
     @property
     def waited(self) -> float:
@@ -99,8 +99,8 @@ class ProgramStates:
         Raises RunError if the program is silent for too long, sends what is not a state, or sends faster than slots go by.
         """
         k, began = slots.start, self._clock.monotonic()
-        with self._news:
-            there = self._news.wait_for(lambda: self._heard, self._patience)
+        with self._changed:
+            there = self._changed.wait_for(lambda: self._heard, self._patience)
             self._waited = self._clock.monotonic() - began
             if len(self._heard) > _MOST_WAITING:
                 raise RunError(

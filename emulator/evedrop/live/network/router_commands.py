@@ -43,7 +43,7 @@ class Commands:
         self._session, self._receivers, self._knock, self._waiting = session, receivers, knock, tuple(waiting)
         self._patience = patience
         self._orders: SimpleQueue[tuple[int, ControlCommand] | None] = SimpleQueue()
-        self._news = threading.Condition()
+        self._changed = threading.Condition()
         self._asked = Again(0, 0)
         self._heeded = 0
         self._ended = False
@@ -56,17 +56,17 @@ class Commands:
                 self._sort(self._session.command(self._receivers))
         except EvedropError as error:  # the working thread raises it
             self._failure = error
-        with self._news:
-            self._news.notify()
+        with self._changed:
+            self._changed.notify()
         self._wake()
         self._knock()
 
     def _sort(self, command: ControlCommand) -> None:
         match command:
             case Again():
-                with self._news:
+                with self._changed:
                     self._asked = command
-                    self._news.notify()
+                    self._changed.notify()
                 self._wake()
             case EndRun():
                 self._ended = True
@@ -103,9 +103,9 @@ class Commands:
 
         Also None if it has ended the run meanwhile, or if no such command arrives within the patience.
         """
-        with self._news:
+        with self._changed:
             # Sensor and router are told at the same time: if the command does not arrive, the round does not exist.
-            if not self._news.wait_for(lambda: self.over() or self._asked.round >= number, self._patience):
+            if not self._changed.wait_for(lambda: self.over() or self._asked.round >= number, self._patience):
                 return None
             if self._ended or self._asked.round > number:
                 return None

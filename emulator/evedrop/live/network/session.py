@@ -30,7 +30,7 @@ from evedrop.live.network.connection import Connection
 from evedrop.live.network.connection_watchdog import ConnectionWatchdog
 from evedrop.live.network.container_heartbeat import HeartbeatFile
 from evedrop.live.network.declared import CallbackSubscription, Publisher, Question, Questions, Subscription, Watch
-from evedrop.live.network.launcher_news import tell
+from evedrop.live.network.launcher_pipe import emit
 from evedrop.live.network.launcher_watchdog import when_launcher_is_gone
 from evedrop.live.network.listening import listening
 from evedrop.live.network.mailbox import allowance
@@ -43,8 +43,8 @@ from evedrop.live.protocol.codec import Reader, end_report, refusal
 from evedrop.live.protocol.commands import Abandon, Again, Bounds, ControlCommand, EndRun, ReportStatus, read_command
 from evedrop.live.protocol.envelope import Dropped
 from evedrop.live.protocol.keys import RunKeys, ZenohConfig, reader_of
+from evedrop.live.protocol.launcher_events import RouterListens
 from evedrop.live.protocol.message_limits import low_pass
-from evedrop.live.protocol.news import RouterListens
 from evedrop.live.protocol.process_status import StatusReporter
 from evedrop.names import OBSERVER, ROUTER
 
@@ -182,7 +182,7 @@ class Session:
         else:
             self.connection = Connection(listening(listen, brief.identity, config), None)
             if brief.ends_with_stdin:
-                tell(RouterListens(brief.process))
+                emit(RouterListens(brief.process))
         self._publishers: dict[str, Publisher] = {}
         self._replays: list[ReplayBuffer] = []
         self._commands: SimpleQueue[bytes] = SimpleQueue()

@@ -67,11 +67,11 @@ class Conductor:
         keys = session.keys
         self.keys = {ROUTER: keys.journal, SENSOR: keys.telemetry(SENSOR)}
         self.keys.update({name: keys.telemetry(name) for name in reporters})
-        self._news = Mailbox(self.keys, session.allowance, clock)
+        self._mailbox = Mailbox(self.keys, session.allowance, clock)
         for source, key in self.keys.items():
-            session.subscribe_with(key, partial(self._news.put, source))
+            session.subscribe_with(key, partial(self._mailbox.put, source))
         for name in self._present:
-            session.watch(name, partial(self._news.put, name))
+            session.watch(name, partial(self._mailbox.put, name))
         self.misdelivered: dict[str, int] = {}
         """Process that has confirmed its end → how many messages it dropped because they name another key."""
         self.absent: set[str] = set()
@@ -128,17 +128,17 @@ class Conductor:
         """Tell the sensor to begin."""
         self.send_to(SENSOR, Start())
 
-    def news(self) -> tuple[str, bytes] | None:
+    def next_message(self) -> tuple[str, bytes] | None:
         """The next message with its sender, or None if there was none for a moment.
 
         Raises Interrupted if the run was told to end.
         """
         self._stop.check()
-        news = self._next()
-        if news is None or not isinstance(news[1], bytes):
-            self._note(news)
+        item = self._next()
+        if item is None or not isinstance(item[1], bytes):
+            self._note(item)
             return None
-        return news[0], news[1]
+        return item[0], item[1]
 
     def fail_cut_off(self, names: Collection[str], patience: float) -> NoReturn:
         """Raise RunError: these processes have been missing for `patience` seconds. Raises Interrupted if told to end now."""
@@ -203,13 +203,13 @@ class Conductor:
                 self.send_to(name, EndRun())
             self._hear_out(self._next())
 
-    def _hear_out(self, news: tuple[str, bytes | bool] | None) -> None:
+    def _hear_out(self, item: tuple[str, bytes | bool] | None) -> None:
         """Note which processes are present, and which confirm that the run is over; ignore all other messages."""
-        if news is not None and isinstance(news[1], bytes):
-            message = Reader(self.keys[news[0]], news[1])
+        if item is not None and isinstance(item[1], bytes):
+            message = Reader(self.keys[item[0]], item[1])
             if is_over(message):
-                self.misdelivered[news[0]] = read_over(message)
-        self._note(news)
+                self.misdelivered[item[0]] = read_over(message)
+        self._note(item)
 
     def abandon(self, why: str) -> None:
         """Tell all processes that the run has been given up."""
@@ -229,14 +229,14 @@ class Conductor:
 
     def _next(self) -> tuple[str, bytes | bool] | None:
         try:
-            return self._news.get(timeout=_POLL_SECONDS)
+            return self._mailbox.get(timeout=_POLL_SECONDS)
         except Empty:
             return None
 
-    def _note(self, news: tuple[str, bytes | bool] | None) -> None:
-        if news is None or not isinstance(news[1], bool):
+    def _note(self, item: tuple[str, bytes | bool] | None) -> None:
+        if item is None or not isinstance(item[1], bool):
             return
-        name, there = news[0], news[1]
+        name, there = item[0], item[1]
         self._present[name] = there
         if there:
             self.lost.pop(name, None)

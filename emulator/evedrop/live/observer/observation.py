@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, final
 from evedrop.errors import EvedropError, Interrupted, NoAnswer, RunError
 from evedrop.live.network.control_file import Control, remove_control
 from evedrop.live.network.declared import Question
-from evedrop.live.network.launcher_news import tell
+from evedrop.live.network.launcher_pipe import emit
 from evedrop.live.network.operator import Answer, Order
 from evedrop.live.network.resending import GapDetector
 from evedrop.live.network.session import Session
@@ -31,7 +31,7 @@ from evedrop.live.protocol.brief_parts import ObserverPart
 from evedrop.live.protocol.codec import Reader, is_refusal, read_refusal
 from evedrop.live.protocol.commands import ReportStatus
 from evedrop.live.protocol.last_word import protocol_breaker
-from evedrop.live.protocol.news import SlotsDone
+from evedrop.live.protocol.launcher_events import SlotsDone
 from evedrop.live.protocol.process_status import is_process_status, read_process_status
 from evedrop.live.protocol.requests import StatusRequest
 from evedrop.live.protocol.status import RunStatus
@@ -45,7 +45,7 @@ from evedrop.results.rows import DigestRows, write_rows
 from evedrop.results.shard_score import dump_score
 from evedrop.results.summary_file import unwritten
 from evedrop.results.writer import ResultsWriter, write_summary
-from evedrop.scenario.news import ConnectionOutage, RunEnded, RunEvent, RunProgress, Started, ViewOpened
+from evedrop.scenario.progress_events import ConnectionOutage, RunEnded, RunEvent, RunProgress, Started, ViewOpened
 from evedrop.scenario.tables import Scenario
 from evedrop.score.expectations_held import replay_of
 from evedrop.score.scorekeeper import RunOutcome, Scored, Scorekeeper, digest_of, summary_of
@@ -117,7 +117,7 @@ class ObservedRun:
     def show(self, web_address: WebAddress) -> Viewer:
         """Start a viewer for browsers at this address, which follows the recording of the run."""
         viewer = Viewer.serve(web_address, self.folder / "recording.rrd")
-        tell(ViewOpened(viewer.address))
+        emit(ViewOpened(viewer.address))
         return viewer
 
     def writer(self) -> ResultsWriter:
@@ -133,12 +133,12 @@ class ObservedRun:
                 self._loop_values = loop_values_of(self._scenario)
                 path = self.folder / "recording.rrd"
                 self._recording = open_recording(
-                    self._scenario, self._brief.run, path, lambda text: tell(ViewOpened(None, text))
+                    self._scenario, self._brief.run, path, lambda text: emit(ViewOpened(None, text))
                 )
-            self._steering = Steering(self._scenario, conductor, tell, self._keep, paused=self._brief.part.paused)
+            self._steering = Steering(self._scenario, conductor, emit, self._keep, paused=self._brief.part.paused)
             patience = self._brief.flow.longest_outage
             self._due = {source: GapDetector(key, patience) for source, key in conductor.keys.items()}
-            self._recovery = Recovery(conductor, self._steering, self._brief.flow, self._scenario.pace, tell)
+            self._recovery = Recovery(conductor, self._steering, self._brief.flow, self._scenario.pace, emit)
             program = self._scenario.process.source == "zenoh"
             limit = patience_of(patience, self._scenario.pace, self._brief.flow.batch, program)
             self._stall = Stall(limit, self._brief.flow.batch, lambda: conductor.send_to_all(ReportStatus()))
@@ -148,11 +148,11 @@ class ObservedRun:
                 self._recent = (self._started, 0)
                 self._control.write(self.folder)
                 conductor.start()
-                tell(Started())
+                emit(Started())
                 while not self._joiner.complete(self._scenario.slots):
-                    news = conductor.news()
-                    if news is not None:
-                        self._take(conductor, *news)
+                    item = conductor.next_message()
+                    if item is not None:
+                        self._take(conductor, *item)
                     self._steer(conductor)
                     self._recovery.poll(self._joiner.done)
                     self._save()
@@ -168,7 +168,7 @@ class ObservedRun:
                 self._recovery.give_up(self._joiner.done, complete=self._joiner.done == self._scenario.slots)
                 self._outages = self._recovery.outages
                 self._ended = time.monotonic()
-            tell(SlotsDone())
+            emit(SlotsDone())
             try:
                 conductor.end(patience)
             finally:
@@ -246,7 +246,7 @@ class ObservedRun:
         if is_process_status(message):
             self._stall.add_answer(source, read_process_status(message, self._scenario.slots))
             return
-        if not self._news(source, message):
+        if not self._is_due(source, message):
             return
         if source == ROUTER:
             for name, account in self._joiner.add_journal(message).items():
@@ -282,7 +282,7 @@ class ObservedRun:
             if reporter.over:
                 del self._absent[name]
 
-    def _news(self, source: str, message: Reader) -> bool:
+    def _is_due(self, source: str, message: Reader) -> bool:
         """Whether a message is the next one from its source; after losses, earlier and later ones arrive, too."""
         found = message.integer("k")
         if source not in (ROUTER, SENSOR) and is_leaving(message):  # comes before the reports of the slots before it
@@ -319,7 +319,7 @@ class ObservedRun:
         rate = (self._joiner.done - done) / (now - before)
         self._told, self._recent = now, (now, self._joiner.done)
         errors = {name: float(one.squared_error.mean()) for name, one in scored.items()}
-        tell(RunProgress(self._joiner.done, rate, "slots/s", errors))
+        emit(RunProgress(self._joiner.done, rate, "slots/s", errors))
 
     @property
     def _at(self) -> str:
@@ -399,7 +399,7 @@ class ObservedRun:
         except OSError as error:
             status, how = RunError.exit_status, unwritten(error)
         view = self._recording.failure if self._recording is not None else None
-        tell(RunEnded(status, how, self._suspects, self._accused, view, self._broken_by))
+        emit(RunEnded(status, how, self._suspects, self._accused, view, self._broken_by))
         if self._by_hand:
             with suppress(FileNotFoundError):
                 report(self.folder, status, how)

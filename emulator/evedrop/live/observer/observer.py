@@ -1,6 +1,6 @@
 """The observer: the only process that sees truth and every estimate. It conducts, scores, records and feeds the view.
 
-Its news goes to standard output, one JSON object per line: every second `{"event": "alive"}`; `{"event": "started"}`, then four
+Its events go to standard output, one JSON object per line: every second `{"event": "alive"}`; `{"event": "started"}`, then four
 times a second `{"event": "progress", …}`, then `{"event": "over"}` if all slots are done, `{"event": "finishing"}`
 and `{"event": "ended", "status": …}`. However the run ends, the results folder is complete. An observer started by hand
 then prints the same table and verdict as `evedrop run`.
@@ -16,14 +16,14 @@ from dataclasses import replace
 from queue import SimpleQueue
 
 from evedrop.errors import EvedropError, Interrupted, NoAnswer, RunError
-from evedrop.live.network.launcher_news import set_news_apart, tell
+from evedrop.live.network.launcher_pipe import emit, keep_events_apart
 from evedrop.live.network.launcher_watchdog import launcher_is_gone, when_launcher_is_gone
 from evedrop.live.network.session import Session
 from evedrop.live.observer.conductor import Stop
 from evedrop.live.observer.observation import EndPrinter, ObservedRun
 from evedrop.live.protocol.brief import Brief
 from evedrop.live.protocol.brief_parts import ObserverPart
-from evedrop.live.protocol.news import SaveStarted
+from evedrop.live.protocol.launcher_events import SaveStarted
 from evedrop.model.eavesdroppers import REMOTE_CALLS
 from evedrop.results.folder import new_folder
 from evedrop.results.resolved_scenario import write_resolved
@@ -48,7 +48,7 @@ def observe(brief: Brief[ObserverPart], report: EndPrinter, serve: str | None = 
         signal.signal(number, lambda *_: setattr(stop, "wanted", True))
     preload_within_limit()
     by_hand = not brief.ends_with_stdin
-    set_news_apart(launched=not by_hand)
+    keep_events_apart(launched=not by_hand)
     if not by_hand:
         when_launcher_is_gone(_end_orphaned, confirmations.put)
         brief = replace(brief, ends_with_stdin=False)
@@ -71,7 +71,7 @@ def observe(brief: Brief[ObserverPart], report: EndPrinter, serve: str | None = 
             except EvedropError as error:
                 status, how = error.exit_status, "interrupted" if isinstance(error, Interrupted) else str(error)
             finally:
-                tell(SaveStarted())
+                emit(SaveStarted())
             observation.settle(how)
     except OSError as error:
         saved = False

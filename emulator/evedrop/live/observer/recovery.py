@@ -18,7 +18,7 @@ from evedrop.live.observer.steering import Steering
 from evedrop.live.protocol.brief import Flow
 from evedrop.live.protocol.commands import Again
 from evedrop.names import OBSERVER, RELAY, ROUTER
-from evedrop.scenario.news import ConnectionOutage, Tell
+from evedrop.scenario.progress_events import ConnectionOutage, OnEvent
 
 _SOON_SECONDS = 0.5  # after which a round without effect is repeated; the wait doubles each time
 _IDLE_SECONDS = 10.0  # for which a run may stand still without a known reason before a round is tried
@@ -28,7 +28,7 @@ _REACH_SECONDS = 2.0  # for which a round waits for processes that are back to s
 
 @final
 class Recovery:
-    """Notices lost connections and begins rounds of resending. say: sends news to the launcher."""
+    """Notices lost connections and begins rounds of resending. say: sends events to the launcher."""
 
     def __init__(
         self,
@@ -36,7 +36,7 @@ class Recovery:
         steering: Steering,
         flow: Flow,
         pace: float,
-        say: Tell,
+        say: OnEvent,
         clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         self._clock = clock

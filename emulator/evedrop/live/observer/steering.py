@@ -19,13 +19,13 @@ from evedrop.live.network.operator import Order
 from evedrop.live.network.session import READY_SECONDS
 from evedrop.live.observer.conductor import Conductor
 from evedrop.live.protocol.commands import Go, Hold, LinkChange
-from evedrop.live.protocol.news import ProcessRequest
+from evedrop.live.protocol.launcher_events import ProcessRequest
 from evedrop.live.protocol.requests import LinkRequest, PauseRequest, ResumeRequest, StepRequest
 from evedrop.model.slot.link import Change
 from evedrop.names import ROUTER, SENSOR, ProcessAction
 from evedrop.scenario.events.event import Act
 from evedrop.scenario.loading.file import with_event
-from evedrop.scenario.news import Held, RunEvent, Tell
+from evedrop.scenario.progress_events import Held, OnEvent, RunEvent
 from evedrop.scenario.tables import Scenario
 
 
@@ -49,7 +49,7 @@ class OperatorStep:
 class Steering:
     """Carries out the events of the scenario and the requests of the operator while the run is held.
 
-    tell: sends news to the launcher, such as an act on a process, which the launcher confirms; see `done`.
+    on_event: sends events to the launcher, such as an act on a process, which the launcher confirms; see `done`.
     keep: called with the amended scenario each time the operator has changed it.
     paused: whether the run begins paused; the sensor's brief then has a hold before slot 0.
     """
@@ -58,12 +58,12 @@ class Steering:
         self,
         scenario: Scenario,
         conductor: Conductor,
-        tell: Tell,
+        on_event: OnEvent,
         keep: Callable[[Scenario], None],
         *,
         paused: bool = False,
     ) -> None:
-        self._scenario, self._conductor, self._tell, self._keep = scenario, conductor, tell, keep
+        self._scenario, self._conductor, self._on_event, self._keep = scenario, conductor, on_event, keep
         self._due = scenario.timeline.holds
         self.at: int | None = None
         """The slot before which the sensor holds; None while it does not."""
@@ -95,7 +95,7 @@ class Steering:
             self._pause(k, "pause the run")
 
     def left(self, name: str, k: int) -> None:
-        """Take the news that a receiver has left before slot k, the first slot of its absence."""
+        """Note that a receiver has left before slot k, the first slot of its absence."""
         self._left[name] = k
 
     def has_left(self, name: str, k: int) -> bool:
@@ -192,7 +192,7 @@ class Steering:
         action = act.effect.action
         if action is not None:
             self._waiting, self._confirmed, self._since = (act, action), False, time.monotonic()
-            self._tell(ProcessRequest(action, act.names[0], k, len(self.events)))
+            self._on_event(ProcessRequest(action, act.names[0], k, len(self.events)))
 
     def _obey(self, k: int, order: Order) -> None:
         """Carry out a request of the operator before slot k."""
@@ -238,7 +238,7 @@ class Steering:
 
     def _pause(self, k: int, said: str | None = None) -> None:
         self.paused = True
-        self._tell(Held(k))
+        self._on_event(Held(k))
         if said is not None:
             self._note(k, said, "operator")
 

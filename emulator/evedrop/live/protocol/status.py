@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 from evedrop.model.entries import SLOT, entry, flag, listed, maybe, named, not_negative, read, table_of, text
-from evedrop.scenario.news import RunEvent
+from evedrop.scenario.progress_events import RunEvent
 
 
 @dataclass(frozen=True)

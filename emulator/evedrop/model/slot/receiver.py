@@ -29,7 +29,7 @@ class _Slot:
     k: int
     heard: Reception
     before: Belief
-    news: Flags
+    fresh: Flags
     """Trials whose packet has just arrived."""
 
 
@@ -110,7 +110,7 @@ class ReceiverCore:
         if late.heard.header is not None:
             header = late.heard.header if header is None else np.where(new, late.heard.header, header)
         slot.heard = Reception(slot.heard.gamma | new, z, header, slot.heard.truth)
-        slot.news = slot.news | new
+        slot.fresh = slot.fresh | new
         return True
 
     def _again(self, first: int) -> None:
@@ -120,8 +120,8 @@ class ReceiverCore:
         for slot in slots:
             slot.before = belief
             belief = self._receiver.step(slot.k, belief, slot.heard)
-            self._late[1] += slot.news & (belief.action != Action.DISCARDED)
-            slot.news = np.zeros_like(slot.news)
+            self._late[1] += slot.fresh & (belief.action != Action.DISCARDED)
+            slot.fresh = np.zeros_like(slot.fresh)
         self.belief = belief
 
 

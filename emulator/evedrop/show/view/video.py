@@ -188,12 +188,12 @@ def video_apart(
     moments: Sequence[float],
     size: tuple[int, int],
     rate: float,
-    tell: Callable[[int], None],
+    on_progress: Callable[[int], None],
     files: Mapping[str, Callable[[Path, float], VideoFile]] = VIDEO_FILES,
 ) -> list[str]:
     """Draw some moments of a recording as a video; returns the panels' complaints. The file appears when it is complete.
 
-    rate: frames per second. tell: is called with the number of frames so far. files: the end of a name → what writes the
+    rate: frames per second. on_progress: is called with the number of frames so far. files: the end of a name → what writes the
     video.
 
     Raises UsageError as `picture_apart` does, and if such a video cannot be made here.
@@ -206,7 +206,7 @@ def video_apart(
         next(pictures)
         for done, picture in enumerate(pictures, 1):
             file.add(picture)
-            tell(done)
+            on_progress(done)
     return complaints
 
 

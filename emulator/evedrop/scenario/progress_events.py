@@ -1,4 +1,4 @@
-"""The news of a run in progress: a class for each kind.
+"""The events of progress of a run or study: a class for each kind.
 
 The observer sends it to its launcher as lines of JSON: `event`, and the entries of that kind.
 """
@@ -23,43 +23,43 @@ _TEXTS: Check = listed(text)
 
 
 @dataclass(frozen=True)
-class News:
-    """One item of news."""
+class ProgressEvent:
+    """Something that a command or function reports while it works."""
 
-    event: ClassVar[str]
+    kind: ClassVar[str]
 
     @property
     def plain(self) -> dict[str, object]:
-        """The news as a JSON object."""
-        return {"event": self.event, **plain(self)}
+        """The event as a JSON object."""
+        return {"event": self.kind, **plain(self)}
 
     @property
     def line(self) -> bytes:
-        """The news as a line for the launcher."""
+        """The event as a line for the launcher."""
         return json.dumps(self.plain, ensure_ascii=False).encode() + b"\n"
 
 
 @dataclass(frozen=True)
-class Started(News):
+class Started(ProgressEvent):
     """All processes are present, and the sensor begins."""
 
-    event = "started"
+    kind = "started"
 
 
 @dataclass(frozen=True)
-class Held(News):
+class Held(ProgressEvent):
     """The operator holds the run."""
 
-    event = "held"
+    kind = "held"
     before: int = field(metadata=entry(SLOT))
     """The slot before which the run is held."""
 
 
 @dataclass(frozen=True)
-class ConnectionOutage(News):
+class ConnectionOutage(ProgressEvent):
     """A process was cut off, and the run has gone on or ended since."""
 
-    event = "reconnected"
+    kind = "reconnected"
     process: str = field(metadata=entry(text))
     """The process whose connection was lost; the router if it was restarted, because every connection goes through it."""
     slot: int = field(metadata=entry(SLOT))
@@ -73,10 +73,10 @@ class ConnectionOutage(News):
 
 
 @dataclass(frozen=True)
-class RunProgress(News):
+class RunProgress(ProgressEvent):
     """How far a run has come."""
 
-    event = "progress"
+    kind = "progress"
     done: int = field(metadata=entry(SLOT))
     """Slots in a live run; slots times trials in memory."""
     rate: float = field(metadata=entry(_real))
@@ -90,10 +90,10 @@ class RunProgress(News):
 
 
 @dataclass(frozen=True)
-class RunEnded(News):
+class RunEnded(ProgressEvent):
     """The end of a run, as the observer sees it."""
 
-    event = "ended"
+    kind = "ended"
     status: int = field(metadata=entry(whole(0, 255)))
     """Its exit status."""
     how: str = field(metadata=entry(text))
@@ -114,20 +114,20 @@ class RunEnded(News):
 
 
 @dataclass(frozen=True)
-class ViewOpened(News):
+class ViewOpened(ProgressEvent):
     """A live view is open, or there is a warning about it."""
 
-    event = "view"
+    kind = "view"
     address: str | None = field(metadata=entry(maybe(text)))
     """The address to open in a browser; None for a window."""
     warning: str | None = field(default=None, metadata=entry(maybe(text)))
 
 
 @dataclass(frozen=True)
-class FolderMoved(News):
+class FolderMoved(ProgressEvent):
     """The results folder was renamed while the run went on."""
 
-    event = "moved"
+    kind = "moved"
     folder: str = field(metadata=entry(text))
 
 
@@ -146,10 +146,10 @@ class RunEvent:
         return self.event if self.by == "scenario" else f"{self.event} (by the {self.by})"
 
 
-Tell = Callable[[News], None]
-"""Takes each item of news."""
+OnEvent = Callable[[ProgressEvent], None]
+"""Takes each event."""
 
 
-def silent(news: News) -> None:
-    """Ignore the news."""
-    del news
+def silent(event: ProgressEvent) -> None:
+    """Ignore an event."""
+    del event

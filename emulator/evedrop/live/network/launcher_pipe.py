@@ -1,4 +1,4 @@
-"""Sends news to the launcher: that a router listens, and the observer's news, including its heartbeat.
+"""Sends events to the launcher: that a router listens, and the observer's events, including its heartbeat.
 
 The launcher gives up on an observer that is silent for half a minute. So the heartbeat has its own thread: it continues
 while the observer imports, computes or writes, however long that takes on a busy machine.
@@ -13,8 +13,8 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Self, TextIO, cast, final
 
-from evedrop.live.protocol.news import Alive
-from evedrop.scenario.news import News
+from evedrop.live.protocol.launcher_events import Alive
+from evedrop.scenario.progress_events import ProgressEvent
 from evedrop.system.output import Output
 
 _BEAT_SECONDS = 1.0
@@ -22,13 +22,13 @@ _LINE = threading.Lock()  # one line at a time
 
 
 _TO: list[TextIO] = []
-"""The stream for a launched process's news; empty before `set_news_apart`, and in a process that was started by hand."""
+"""The stream for a launched process's events; empty before `keep_events_apart`, and in a process that was started by hand."""
 
 
-def set_news_apart(launched: bool) -> None:
-    """Redirect file descriptor 1 to standard error: Zenoh logs to it, and would mix its lines into the news.
+def keep_events_apart(launched: bool) -> None:
+    """Redirect file descriptor 1 to standard error: Zenoh logs to it, and would mix its lines into the events.
 
-    launched: whether a launcher reads the news, from the former standard output; `print` then writes to the log.
+    launched: whether a launcher reads the events, from the former standard output; `print` then writes to the log.
     """
     sys.stdout.flush()
     apart = os.fdopen(os.dup(1), "w", encoding="utf-8")
@@ -39,9 +39,9 @@ def set_news_apart(launched: bool) -> None:
         sys.stdout = cast(TextIO, Output(apart))
 
 
-def tell(news: News) -> None:
-    """Send an item of news to the launcher, or to standard output if there is none; harmless if nobody reads it."""
-    left = memoryview(news.line)
+def emit(event: ProgressEvent) -> None:
+    """Send an event to the launcher, or to standard output if there is none; harmless if nobody reads it."""
+    left = memoryview(event.line)
     with _LINE, suppress(OSError, ValueError, AttributeError):  # the launcher is gone, or there is no standard output
         to = _TO[0] if _TO else sys.stdout
         while left:
@@ -69,4 +69,4 @@ class Heartbeat:
 
     def _beat(self) -> None:
         while not self._over.wait(self._seconds):
-            tell(Alive())
+            emit(Alive())

@@ -1,6 +1,7 @@
-"""The lines that observer and routers write for their launcher: JSON objects with `event` and the entries of that kind of news.
+"""The lines that observer and routers write for their launcher: JSON objects with `event`, its kind, and its entries.
 
-Kinds that only the launcher needs are defined here; it passes the others, which are in `evedrop.scenario.news`, on to be shown.
+Kinds that only the launcher needs are defined here; it passes the others, which are in `evedrop.scenario.progress_events`, on
+to be shown.
 """
 
 from __future__ import annotations
@@ -11,29 +12,37 @@ from dataclasses import dataclass, field
 
 from evedrop.model.entries import SLOT, choice, entry, expect, read, table_of, text
 from evedrop.names import ProcessAction
-from evedrop.scenario.news import ConnectionOutage, Held, News, RunEnded, RunProgress, Started, ViewOpened
+from evedrop.scenario.progress_events import (
+    ConnectionOutage,
+    Held,
+    ProgressEvent,
+    RunEnded,
+    RunProgress,
+    Started,
+    ViewOpened,
+)
 
 
 @dataclass(frozen=True)
-class Alive(News):
+class Alive(ProgressEvent):
     """The observer's heartbeat."""
 
-    event = "alive"
+    kind = "alive"
 
 
 @dataclass(frozen=True)
-class RouterListens(News):
-    """From a router or relay, its only news: it listens, so the processes that connect to it may be started."""
+class RouterListens(ProgressEvent):
+    """From a router or relay, its only event: it listens, so the processes that connect to it may be started."""
 
-    event = "listening"
+    kind = "listening"
     process: str = field(metadata=entry(text))
 
 
 @dataclass(frozen=True)
-class ProcessRequest(News):
+class ProcessRequest(ProgressEvent):
     """The observer asks the launcher to act on a process, and to confirm it."""
 
-    event = "act"
+    kind = "act"
     do: ProcessAction = field(metadata=entry(choice(ProcessAction), ProcessAction))
     process: str = field(metadata=entry(text))
     first: int = field(metadata=entry(SLOT))
@@ -43,22 +52,22 @@ class ProcessRequest(News):
 
 
 @dataclass(frozen=True)
-class SlotsDone(News):
+class SlotsDone(ProgressEvent):
     """All slots are done, and the processes will be told to leave."""
 
-    event = "over"
+    kind = "over"
 
 
 @dataclass(frozen=True)
-class SaveStarted(News):
+class SaveStarted(ProgressEvent):
     """The observer begins to write the results."""
 
-    event = "finishing"
+    kind = "finishing"
 
 
-_KINDS: Mapping[str, type[News]] = {
-    kind.event: kind
-    for kind in (
+_KINDS: Mapping[str, type[ProgressEvent]] = {
+    one.kind: one
+    for one in (
         Alive,
         RouterListens,
         Started,
@@ -74,7 +83,7 @@ _KINDS: Mapping[str, type[News]] = {
 }
 
 
-def read_news(line: bytes) -> News:
+def read_event(line: bytes) -> ProgressEvent:
     """Read a line of the observer or a router. Raises ValueError if it is malformed."""
     try:
         found = json.loads(line)

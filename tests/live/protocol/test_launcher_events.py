@@ -1,4 +1,4 @@
-"""News of a run: each kind is read as it was written, and a malformed line is refused."""
+"""Events of a run: each kind is read as it was written, and a malformed line is refused."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from evedrop.live.protocol.news import Alive, ProcessRequest, SaveStarted, SlotsDone, read_news
+from evedrop.live.protocol.launcher_events import Alive, ProcessRequest, SaveStarted, SlotsDone, read_event
 from evedrop.names import ProcessAction
-from evedrop.scenario.news import (
+from evedrop.scenario.progress_events import (
     ConnectionOutage,
     FolderMoved,
     Held,
-    News,
+    ProgressEvent,
     RunEnded,
     RunEvent,
     RunProgress,
@@ -23,7 +23,7 @@ from evedrop.scenario.news import (
     silent,
 )
 
-KINDS: list[News] = [
+KINDS: list[ProgressEvent] = [
     Alive(),
     Started(),
     Held(7),
@@ -41,13 +41,13 @@ KINDS: list[News] = [
 ]
 
 
-@pytest.mark.parametrize("news", KINDS, ids=lambda news: news.event)
-def test_news_is_read_as_it_was_written(news: News) -> None:
+@pytest.mark.parametrize("event", KINDS, ids=lambda event: event.kind)
+def test_news_is_read_as_it_was_written(event: ProgressEvent) -> None:
     """One line of JSON, which names its kind."""
-    assert news.line.endswith(b"\n")
-    assert news.line.count(b"\n") == 1
-    assert json.loads(news.line)["event"] == news.event
-    assert read_news(news.line) == news
+    assert event.line.endswith(b"\n")
+    assert event.line.count(b"\n") == 1
+    assert json.loads(event.line)["event"] == event.kind
+    assert read_event(event.line) == event
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_news_is_read_as_it_was_written(news: News) -> None:
 def test_a_malformed_line_is_refused(line: bytes, said: str) -> None:
     """With a ValueError that says what is wrong with it."""
     with pytest.raises(ValueError) as refused:  # noqa: PT011 - the words are compared below
-        read_news(line)
+        read_event(line)
     assert said in str(refused.value)
 
 
@@ -91,9 +91,9 @@ def test_the_view_shows_who_caused_an_event(by: str, line: str) -> None:
 
 
 def test_only_the_launcher_tells_that_the_folder_moved(capsys: pytest.CaptureFixture[str]) -> None:
-    """The launcher refuses an observer that writes it; a caller that ignores news prints nothing."""
+    """The launcher refuses an observer that writes it; a caller that ignores events prints nothing."""
     moved: Any = FolderMoved("there")
     with pytest.raises(ValueError, match="it is not an object with an event of"):
-        read_news(moved.line)
+        read_event(moved.line)
     silent(moved)
     assert capsys.readouterr() == ("", "")
