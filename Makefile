@@ -32,7 +32,7 @@ COVERING := $(addprefix tests/,model live/protocol live/network/test_protocol.py
 coverage: $(READY)
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not long and not hypothesis and not thorough" --cov --cov-report=term-missing:skip-covered $(COVERING)
 
-# Every figure of speed as a Markdown table (docs/performance.md). QUICK=--quick: small sizes, to see only that everything runs.
+# Every performance metric as a Markdown table (docs/performance.md). QUICK=--quick: small sizes, to see only that everything runs.
 QUICK ?=
 bench: $(READY)
 	$(BIN)/python benchmarks/bench.py $(QUICK)

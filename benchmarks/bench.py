@@ -1,10 +1,10 @@
-"""Every figure that the speed of Evedrop is judged by, in one run, as a Markdown table.
+"""Every performance metric of Evedrop, in one run, as a Markdown table.
 
     make bench                     # python benchmarks/bench.py; about twenty minutes
     make bench QUICK=--quick       # small sizes, about a minute: shows only that everything runs
 
-The rows come from one program for each family of figures, which can also be run alone. A program that fails or does not end is
-reported as failed, and the others are run all the same; the exit status is then 1. Otherwise it is 0, whether or not the figures
+The rows come from one program for each family of metrics, which can also be run alone. A program that fails or does not end is
+reported as failed, and the others are run all the same; the exit status is then 1. Otherwise it is 0, whether or not the metrics
 reach what they must.
 """
 
@@ -26,7 +26,7 @@ _SAID_LINES = 15
 
 @dataclass(frozen=True)
 class Family:
-    """A family of figures: the program that measures them, and how long it may take."""
+    """A family of metrics: the program that measures them, and how long it may take."""
 
     program: Path
     seconds: float

@@ -17,7 +17,7 @@ import tomli_w
 from evedrop.scenario.loading import shipped
 
 _COMMAND = (sys.executable, "-m", "evedrop", "run")
-_MEASURED = (0, 1)  # 1: the scenario did not meet an expectation of its own, but its figures of speed are right
+_MEASURED = (0, 1)  # 1: the scenario did not meet an expectation of its own, but its performance metrics are right
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""The table of `make bench`: its rows, its heading, and how a family of figures is run alone."""
+"""The table of `make bench`: its rows, its heading, and how a family of metrics is run alone."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _ROOT = Path(__file__).parents[1]
 
 @dataclass(frozen=True)
 class Row:
-    """One figure: what it is, what was measured now, and with what to compare it."""
+    """One metric: what it is, what was measured now, and with what to compare it."""
 
     what: str
     measured: str
@@ -38,7 +38,7 @@ class Row:
 
 
 def judged(at_least: bool, aim: bool) -> str:
-    """The last column: whether a figure reaches what it must reach, and whether it reaches the aim."""
+    """The last column: whether a metric reaches what it must reach, and whether it reaches the aim."""
     return "yes, and the aim" if at_least and aim else "yes" if at_least else "no"
 
 

@@ -293,7 +293,7 @@ def _looked_at(process: subprocess.Popen[str], out: Path, heard: int = 0) -> tup
 
 
 def rows(quick: bool) -> Iterator[Row]:
-    """All figures."""
+    """All metrics."""
     yield from rates(1 if quick else 5, 5_000 if quick else 300_000)
     yield from latencies(1 if quick else 3, 300 if quick else 5_000)
     yield from large(1 if quick else 3, 10 if quick else 400, 2**22)

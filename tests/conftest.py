@@ -116,8 +116,8 @@ class Done:
 
 
 def cause_of(ended: str) -> str:
-    """Why a run ended, by its summary, without the moment of its figures, which a killed observer's summary may add."""
-    return re.sub(r" \(the figures are as of [^)]*\)", "", ended)
+    """Why a run ended, by its summary, without the moment of its metrics, which a killed observer's summary may add."""
+    return re.sub(r" \(the metrics are as of [^)]*\)", "", ended)
 
 
 class Live:

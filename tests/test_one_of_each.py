@@ -33,7 +33,7 @@ ENTRIES = {
     "evedrop.links": {"shifts": "shifts:Shifts"},
     "evedrop.delays": {"steady": "steady:Steady"},
     "evedrop.events": {"dim": "dimming:Dim"},
-    "evedrop.figures": {"largest_error": "largest:LargestError"},
+    "evedrop.metrics": {"largest_error": "largest:LargestError"},
     "evedrop.panels": {"ratio": "ratio:ErrorRatio"},
     "evedrop.commands": {"greet": "greeting"},
 }
@@ -45,7 +45,7 @@ process = { A = [[1.0, 0.1], [0.0, 1.0]], Q = [[1e-3, 0.0], [0.0, 1e-3]], initia
 encoding = { scheme = "flipped" }
 legitimate = { window = 3, link = { quality = 0.9, delay = { model = "steady", value = 1 } } }
 event = [{ at = 20, dim = "legitimate" }]
-expect = [{ figure = "smart.largest_error", above = 0.0 }]
+expect = [{ metric = "smart.largest_error", above = 0.0 }]
 
 [eavesdroppers.smart]
 strategy = "chaser"

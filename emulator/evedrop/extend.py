@@ -1,4 +1,4 @@
-"""The names that authors of schemes, eavesdroppers, links, events, figures, panels, applications and commands import.
+"""The names that authors of schemes, eavesdroppers, links, events, metrics, panels, applications and commands import.
 
 A plug-in needs nothing else of Evedrop. Every name here keeps its meaning within a major version.
 
@@ -17,10 +17,10 @@ from evedrop.model.delays.constant import ConstantDelay
 from evedrop.model.delays.delay import DelayModel
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge, PacketReader, PacketTaker
 from evedrop.model.eavesdroppers.naive import Naive
-from evedrop.model.figures.figure import Figure, FigureColumn, FigureTally, MeanFigure, ScoredSlots
 from evedrop.model.kernels import elementary
 from evedrop.model.links.bernoulli import Bernoulli
 from evedrop.model.links.link import Chain, Fate, LossModel, fates_of
+from evedrop.model.metrics.metric import MeanMetric, Metric, MetricColumn, MetricTally, ScoredSlots
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Action, Belief, Beliefs, Codes, Flags, Receiver, Reception, prior, trace_of
 from evedrop.model.schemes.innovation import Innovation
@@ -83,9 +83,6 @@ __all__ = [
     "EvedropError",
     "EventKind",
     "Fate",
-    "Figure",
-    "FigureColumn",
-    "FigureTally",
     "Flags",
     "Floats",
     "Innovation",
@@ -96,7 +93,10 @@ __all__ = [
     "LinkHealed",
     "LinkSettings",
     "LossModel",
-    "MeanFigure",
+    "MeanMetric",
+    "Metric",
+    "MetricColumn",
+    "MetricTally",
     "Naive",
     "NoInnovations",
     "Nothing",

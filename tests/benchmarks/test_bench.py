@@ -1,4 +1,4 @@
-"""`make bench`: a table of all figures, whatever fails."""
+"""`make bench`: a table of all metrics, whatever fails."""
 
 from __future__ import annotations
 
@@ -74,8 +74,8 @@ def test_without_a_failure_the_exit_status_is_0(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_every_figure_is_measured() -> None:
-    """With small sizes, all programs run to their end and print each figure with its yardstick and its targets."""
+def test_every_metric_is_measured() -> None:
+    """With small sizes, all programs run to their end and print each metric with its yardstick and its targets."""
     command = [sys.executable, str(BENCHMARKS / "bench.py"), "--quick"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=900)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -127,7 +127,7 @@ def test_wherever_the_modules_are(evedrop: Evedrop, mark: Path, where: str) -> N
 
 
 def test_a_run_in_progress_is_only_looked_at(evedrop: Evedrop) -> None:
-    """Without figures its theory would need the classes; a sentence says so. Its tables are shown."""
+    """Without metrics its theory would need the classes; a sentence says so. Its tables are shown."""
     run, mark = evedrop.folder / "run", evedrop.folder / "mark"
     run.mkdir(mode=0o700)
     scenario = load("eavesdroppers", {"slots": 12, "trials": 3, "record_trials": 2, "expect": []})

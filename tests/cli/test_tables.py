@@ -18,7 +18,7 @@ import evedrop.cli
 from evedrop.cli.api import montecarlo, sweep
 from evedrop.cli.commands import MODULES, ROLES
 from evedrop.cli.tables import tables
-from evedrop.model.figures.text import estimate, figure_text, finite_text
+from evedrop.model.metrics.text import estimate, finite_text, number_text
 from evedrop.show.report.table_files import csv_text, latex_escaped, latex_text
 from evedrop.show.report.text_table import TextTable
 from tests.conftest import Evedrop
@@ -130,8 +130,8 @@ def test_numbers_are_at_full_precision(evedrop: Evedrop) -> None:
 def by_hand() -> TextTable:
     """A table with everything that may be in one."""
     table = TextTable.headed(["receiver"], ["mean |x − x̂|²", "μ_d", "z"], ["digest"], "The title")
-    table.add("a_b & c", estimate(0.0123456789, 0.0004) + "*", finite_text(float("inf")), figure_text(None), "–")
-    table.add("", estimate(2.5e-7, None), figure_text(0.1), figure_text(-1.25, "+.2f"), "50 % {x}")
+    table.add("a_b & c", estimate(0.0123456789, 0.0004) + "*", finite_text(float("inf")), number_text(None), "–")
+    table.add("", estimate(2.5e-7, None), number_text(0.1), number_text(-1.25, "+.2f"), "50 % {x}")
     return table
 
 

@@ -54,7 +54,7 @@ def test_up_alone_runs_the_demo(project: Make) -> None:
 
 def test_the_recipe_for_a_script_gives_table_and_status(project: Make) -> None:
     """Word by word as docs/containers.md has it: all that the observer says, the table too, and the status of the run."""
-    tested = project(EVEDROP_OPTIONS=f"{SHORT} --set expect=[{{figure='smart.mean_squared_error',below=0}}]")
+    tested = project(EVEDROP_OPTIONS=f"{SHORT} --set expect=[{{metric='smart.mean_squared_error',below=0}}]")
     tested.compose("up", "--detach")
     said = tested.compose("logs", "--follow", "observer").stdout
     identity = tested.compose("ps", "--all", "--quiet", "observer").stdout.strip()

@@ -24,7 +24,7 @@ def sections(page: Path) -> list[str]:
 
 
 def _names(cited: str, titles: list[str]) -> bool:
-    """Whether words name a section; `figure` and `figures` are the same."""
+    """Whether words name a section; `metric` and `metrics` are the same."""
     return any(words(cited).removesuffix("s") in title for title in titles)
 
 

@@ -32,7 +32,7 @@ state_probability = 0.4
 link = { quality = 0.9 }
 
 [[expect]]
-figure = "legitimate.mean_squared_error"
+metric = "legitimate.mean_squared_error"
 below = 100.0
 """
 
@@ -49,7 +49,7 @@ to = "b"
 quality = 0.5
 
 [[expect]]
-figure = "radio.delivery"
+metric = "radio.delivery"
 above = 0.4
 """
 
@@ -59,7 +59,7 @@ def page(name: str) -> str:
     return re.sub(r"\s+", " ", (DOCS / name).read_text(encoding="utf-8"))
 
 
-def test_a_study_without_the_figure_fails(
+def test_a_study_without_the_metric_fails(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A covariance-only study has no squared errors: it says so, with status 1."""
@@ -78,16 +78,16 @@ def test_a_test_lists_what_it_cannot_decide() -> None:
     assert "FAILED" in undecided.sentence
 
 
-@pytest.mark.parametrize(("figure", "status"), [("delivery", 1), ("heard", 0)])
+@pytest.mark.parametrize(("metric", "status"), [("delivery", 1), ("heard", 0)])
 def test_a_wire_that_heard_nothing_fails_unless_it_must_be_silent(
-    figure: str, status: int, evedrop: Evedrop, tmp_path: Path
+    metric: str, status: int, evedrop: Evedrop, tmp_path: Path
 ) -> None:
     """Whatever is expected of a link that is silent, such as no loss at all, except that it is silent."""
-    text = WIRE.replace("radio.delivery", f"radio.{figure}").replace("above = 0.4", "below = 1")
+    text = WIRE.replace("radio.delivery", f"radio.{metric}").replace("above = 0.4", "below = 1")
     (tmp_path / "wire.toml").write_text(text, encoding="utf-8")
     done = evedrop("wire", str(tmp_path / "wire.toml"), "--for", "1 s", "--out", str(tmp_path / "out"))
     assert done.status == status, done.err
-    told = f"expected radio.{figure} below 1: {'FAILED, the link heard nothing' if status else 'held, found 0'}"
+    told = f"expected radio.{metric} below 1: {'FAILED, the link heard nothing' if status else 'held, found 0'}"
     assert told in done.out + done.err
     assert "a test whose robot never started does not pass" in page("wire.md")
     assert "A link that must stay silent has the expectation `heard` below 1." in page("wire.md")

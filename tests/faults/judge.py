@@ -13,10 +13,10 @@ from evedrop.errors import UsageError
 from evedrop.results.reading import Results
 from tests.faults import ours
 from tests.faults.disturbed import CLEANER, CONFUSED_FILE, FORK_SERVERS
-from tests.faults.figures import unlike_digests, unlike_rows
 from tests.faults.hosts import HOST_CLEANER, PROGRAM, host_of, target_on
 from tests.faults.kinds import KILLING, LIMITS, RESULTS, SIGNALS, Fault
 from tests.faults.looks import failed_looks
+from tests.faults.metrics import unlike_digests, unlike_rows
 from tests.faults.outages import wrong_outages
 from tests.faults.over_ssh import ended_late, unlike_first_line, unlike_refusal
 from tests.faults.reference import Reference, tables_of, unlike

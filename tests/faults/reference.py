@@ -15,7 +15,7 @@ from evedrop.model.digest import block_starts
 from evedrop.results.reading import Results
 from evedrop.scenario.tables import Scenario
 from tests.faults.fates import journal_rows
-from tests.faults.figures import unlike_memory
+from tests.faults.metrics import unlike_memory
 
 KEYS: Mapping[str, tuple[str, ...]] = {
     "slots": ("slot", "peer"),
@@ -26,7 +26,7 @@ KEYS: Mapping[str, tuple[str, ...]] = {
 }
 """Table → what names a row of it."""
 _COUNTS = {"slots": "trials", "journal": "offered"}  # of how many trials a row is
-_ROUNDED = 1e-9  # of figures that a live run adds up in another order
+_ROUNDED = 1e-9  # of metrics that a live run adds up in another order
 _SHOWN = 3  # rows that are wrong, of a table
 
 Row = Mapping[str, Any]
@@ -132,7 +132,7 @@ def _difference(name: str, row: Row, wanted: Row, fewer: bool) -> str | None:
 
 
 def _near(value: Any, expected: Any) -> bool:
-    """Whether two figures are the same but for rounding; where there is nothing it is None or NaN."""
+    """Whether two numbers are the same but for rounding; where there is nothing it is None or NaN."""
     if _nothing(value) or _nothing(expected):
         return _nothing(value) and _nothing(expected)
     if isinstance(value, float) and isinstance(expected, float):

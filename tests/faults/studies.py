@@ -22,8 +22,8 @@ from evedrop import montecarlo
 from evedrop.errors import UsageError
 from evedrop.results.reading import Results
 from tests.faults import ours
-from tests.faults.figures import unlike_memory
 from tests.faults.looks import failed_looks
+from tests.faults.metrics import unlike_memory
 
 TRIALS, SLOTS, WORKERS = 4500, 200, 2
 _SCENARIO = "eavesdroppers"
@@ -217,7 +217,7 @@ def _partial(out: Path, complete: bool) -> Iterator[str]:
     except UsageError as error:
         if (
             "has nothing yet" not in str(error)
-            and "has no figures" not in str(error)
+            and "has no metrics" not in str(error)
             and "is not a results folder" not in str(error)
         ):
             yield f"the unfinished study cannot be read: {error}"

@@ -46,7 +46,7 @@ WORDS = {
         {FULL: "", FULL_EARLY: "", EARLY: "failed by name", LITTLE: ""},  # whichever end: their results are looked at
         {WIRE: "as if undisturbed", STUDY: "as if undisturbed"},
     ],
-    ids=["failed", "endured and interrupted", "full disks, before the first figures, little memory", "wire and study"],
+    ids=["failed", "endured and interrupted", "full disks, before the first metrics, little memory", "wire and study"],
 )
 def test_cases_of_the_campaign_keep_what_is_promised(ends: dict[str, str]) -> None:
     """One of each end, as `make test-faults` runs them. `tests/live` does the same to runs in every `make test`."""

@@ -24,8 +24,8 @@ from tests.examples import mostly_long
 from tests.faults import ours
 from tests.faults.disturbed import CONFUSED_FILE
 from tests.faults.ended import Ended
-from tests.faults.figures import unlike_digests, unlike_rows
 from tests.faults.kinds import CONFUSED, EVERYBODY, Fault
+from tests.faults.metrics import unlike_digests, unlike_rows
 from tests.faults.moments import Moment
 from tests.faults.outages import wrong_outages
 from tests.faults.reference import Reference, tables_of, unlike
@@ -157,27 +157,27 @@ def test_missing_digests_are_seen(ended: Ended, reference: Reference) -> None:
 
 
 @pytest.mark.parametrize(
-    ("when", "figure"),
+    ("when", "metric"),
     mostly_long(
         [
-            (when, figure)
+            (when, metric)
             for when in ("ended", "early")
-            for figure in ("mean_squared_error", "mean_trace_covariance", "received_fraction")
+            for metric in ("mean_squared_error", "mean_trace_covariance", "received_fraction")
         ],
         [("ended", "mean_trace_covariance"), ("early", "mean_squared_error")],
     ),
 )
-def test_swapped_figures_are_seen(when: str, figure: str, request: pytest.FixtureRequest, reference: Reference) -> None:
-    """Figures of two receivers exchanged in the summary, of a complete run and of one that ended early."""
+def test_swapped_metrics_are_seen(when: str, metric: str, request: pytest.FixtureRequest, reference: Reference) -> None:
+    """Metrics of two receivers exchanged in the summary, of a complete run and of one that ended early."""
     run: Ended = request.getfixturevalue(when)
 
     def swap(summary: dict[str, Any]) -> None:
         a, b = summary["peers"]["smart"], summary["peers"]["naive"]
-        a[figure], b[figure] = b[figure], a[figure] + 1e-3
+        a[metric], b[metric] = b[metric], a[metric] + 1e-3
 
     run.edit(swap)
     misses = run.misses(reference, *([KILL] if when == "early" else []))
-    assert [line for line in misses if line.startswith(f"{figure} of smart is")], misses
+    assert [line for line in misses if line.startswith(f"{metric} of smart is")], misses
 
 
 def test_another_account_of_a_run_that_ended_early_is_seen(early: Ended, reference: Reference) -> None:
@@ -206,7 +206,7 @@ def test_an_outage_that_is_not_listed_is_seen(ended: Ended, reference: Reference
     assert [line for line in ended.misses(reference, ROUTER) if "told of an outage of router at slot 7" in line]
 
 
-def test_figures_without_rows_are_seen(ended: Ended, reference: Reference) -> None:
+def test_metrics_without_rows_are_seen(ended: Ended, reference: Reference) -> None:
     """Of a receiver that is in the summary and in no row of the journal."""
     table = pq.read_table(ended.out / "journal.parquet")
     pq.write_table(table.filter(pc.field("link") != "smart"), ended.out / "journal.parquet")
@@ -326,7 +326,7 @@ def test_a_panic_in_zenohs_code_must_cost_nothing(ended: Ended, reference: Refer
     assert complaints("src/kernels.rs", 0)
 
 
-def test_figures_of_shards_cover_all_rows(ended: Ended, reference: Reference) -> None:
+def test_metrics_of_shards_cover_all_rows(ended: Ended, reference: Reference) -> None:
     """However far each shard came; unless the run says that some are of an earlier slot."""
     results = Results.read(ended.out)
     tables = dict(tables_of(results))
@@ -335,7 +335,7 @@ def test_figures_of_shards_cover_all_rows(ended: Ended, reference: Reference) ->
     assert list(unlike_rows(summary, tables, shards=2)) == []
     summary["peers"]["legitimate"]["mean_squared_error"] *= 2.0
     assert list(unlike_rows(summary, tables, shards=2))
-    summary["ended"] = "killed (the figures are as of slot 10 in shard 2; the tables have more)"
+    summary["ended"] = "killed (the metrics are as of slot 10 in shard 2; the tables have more)"
     assert list(unlike_rows(summary, tables, shards=2)) == []
 
 

@@ -305,7 +305,7 @@ def true_to_receivers(number: int, start: Start, rows: list[dict[str, Any]]) -> 
 
 
 def _summary(out: Path, rows: list[dict[str, Any]], start: int) -> Iterator[str]:
-    """The figures of the last start, which ended by itself, are those of its rows."""
+    """The metrics of the last start, which ended by itself, are those of its rows."""
     path = out / "summary.json"
     if not path.exists():
         yield "there is no summary"

@@ -106,7 +106,7 @@ def test_started_by_hand_it_is_the_same_run(options: tuple[str, ...], backwards:
 )
 def test_by_hand_the_observer_prints_and_ends_as_run_does(below: float, evedrop: Evedrop) -> None:
     """The table and the verdict of `evedrop run`, and its exit status, be it that an expectation failed."""
-    expect = f"expect=[{{figure='legitimate.mean_squared_error', below={below}}}]"
+    expect = f"expect=[{{metric='legitimate.mean_squared_error', below={below}}}]"
     launched = evedrop("run", "eavesdroppers", "--slots", "200", "--view", "off", "--set", expect, "--out", "launched")
     assert launched.status == (0 if below else 1)
     briefs = written(evedrop, "--listen", f"tcp/127.0.0.1:{free_port()}", "--set", expect)
@@ -122,7 +122,7 @@ def test_by_hand_the_observer_prints_and_ends_as_run_does(below: float, evedrop:
 @pytest.mark.long
 def test_a_reader_that_leaves_early_changes_no_exit_status(evedrop: Evedrop) -> None:
     """An observer whose output is no longer read still exits with the status of the run."""
-    expect = "expect=[{figure='smart.mean_squared_error', below=0}]"
+    expect = "expect=[{metric='smart.mean_squared_error', below=0}]"
     briefs = written(evedrop, "--listen", f"tcp/127.0.0.1:{free_port()}", "--set", expect)
     observer_brief = briefs.pop("observer")
     running = {name: begun(evedrop, name, path) for name, path in briefs.items()}

@@ -137,7 +137,7 @@ def test_connections_that_are_reset_change_nothing(seed: int, evedrop: Evedrop) 
 
 @pytest.mark.long
 def test_a_message_of_another_key_is_dropped_counted_and_sent_again(evedrop: Evedrop, tmp_path: Path) -> None:
-    """A delivery that arrives on another receiver's key changes no figure: the summary says who dropped how many."""
+    """A delivery that arrives on another receiver's key changes no metric: the summary says who dropped how many."""
     scenario = flapping(tmp_path, PLAIN)
     with by_hand(scenario, tmp_path, f"tcp/127.0.0.1:{free_port()}", paused=True) as run:
         run.write()

@@ -240,7 +240,7 @@ def test_the_same_faults_live_and_in_memory(tmp_path: Path) -> None:
         montecarlo("nemesis", trials=3, out=tmp_path / "memory", **changes),
         montecarlo(tmp_path / "live", trials=3, out=tmp_path / "again"),
     ):
-        for name, figures in live.summary["peers"].items():
-            assert figures["digest"] == again.summary["peers"][name]["digest"]
+        for name, metrics in live.summary["peers"].items():
+            assert metrics["digest"] == again.summary["peers"][name]["digest"]
             assert live.summary["links"][name]["lost_by"] == again.summary["links"][name]["lost_by"]
     assert {link["unexplained"] for link in live.summary["links"].values()} == {0}

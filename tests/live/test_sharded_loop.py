@@ -24,7 +24,7 @@ from tests.live.test_shards import child, close, in_order
 from tests.studies.applications.test_microgrid import part_of_day
 
 TIMED = {"decisions", "mean_solve_seconds", "longest_solve_seconds"}
-"""The controller's figures that depend on its own process."""
+"""The controller's metrics that depend on its own process."""
 TRIALS, SLOTS, RECORDED = 5, 300, 4
 HOUSE: dict[str, Any] = {
     "trials": TRIALS,
@@ -47,7 +47,7 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> Ran:
     """The run in this number of shards; in memory for 0."""
     folder = tmp_path_factory.mktemp("loops")
     noon = part_of_day("microgrid", 43_200, SLOTS, **HOUSE)
-    expect = [{"figure": "household.summed_difference", "above": 0.0}]
+    expect = [{"metric": "household.summed_difference", "above": 0.0}]
 
     @cache
     def once(shards: int) -> Results:
@@ -123,7 +123,7 @@ def test_a_loop_with_a_solver_is_made_one(tmp_path: Path) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["controller", "observer"])
 def test_a_loop_that_is_cut_short_is_made_one(evedrop: Evedrop, name: str) -> None:
-    """Inputs, and the figures of controller and house, as far as each shard came, or as its observer had written them."""
+    """Inputs, and the metrics of controller and house, as far as each shard came, or as its observer had written them."""
     words = ("--trials", "5", "--set", "shards=2", "--set", "expect=[]", "--set", f"record_trials={RECORDED}")
     live = evedrop.live("microgrid", *words)
     wait_until(lambda: all(last_round(live.folder / "shards" / one).slots > 100 for one in "12"), "slots on disk")

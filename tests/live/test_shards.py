@@ -19,7 +19,7 @@ from evedrop.errors import RunError, UsageError
 from evedrop.live.launch.shard import shards_of
 from evedrop.live.launch.shards import OneProgress
 from evedrop.results.growing_tables import last_round
-from evedrop.results.reading import Results, age_of_figures
+from evedrop.results.reading import Results, age_of_metrics
 from evedrop.scenario.loading import load
 from evedrop.scenario.progress_events import ProgressEvent, RunEnded, RunProgress, Started, silent
 from tests.builders import digests_of
@@ -42,8 +42,8 @@ EVENTFUL: dict[str, Any] = {
         {"at": 200, "link": "naive", "set": {"quality": 0.4}},
     ],
     "expect": [
-        {"figure": "naive.mean_squared_error", "slots": [100, 200], "quantile": 0.5, "above": 0.0},
-        {"figure": "legitimate.mean_squared_error", "below": 1e-9},
+        {"metric": "naive.mean_squared_error", "slots": [100, 200], "quantile": 0.5, "above": 0.0},
+        {"metric": "legitimate.mean_squared_error", "below": 1e-9},
         {"in_step": "smart", "by": 290},
         {"link": "naive"},
     ],
@@ -106,7 +106,7 @@ def test_the_statistics_of_every_slot_agree(ran: Ran, shards: int) -> None:
 
 @two_or_three
 def test_the_summary_is_that_of_all_trials(ran: Ran, shards: int) -> None:
-    """Figures, accounts, quantiles, events, verdicts and expectations are those of the whole run."""
+    """Metrics, accounts, quantiles, events, verdicts and expectations are those of the whole run."""
     close(dict(ran(shards).summary), dict(ran(1).summary), "summary")
     recorded = {2: 4, 3: 5}[shards]  # each shard records its first trial at least
     assert {one["recomputed_trials"] for one in ran(shards).summary["verification"].values()} == {recorded}
@@ -203,7 +203,7 @@ def test_a_real_time_run_keeps_its_pace_and_an_expectation_that_fails_is_its_sta
     done = evedrop(
         *("run", "eavesdroppers", "--view", "off", "--json", "--out", "run", "--slots", "60", "--pace", "0.02"),
         *("--trials", "2", "--set", "shards=2"),
-        *("--set", "expect=[{ figure = 'legitimate.mean_squared_error', below = 1e-9 }]"),
+        *("--set", "expect=[{ metric = 'legitimate.mean_squared_error', below = 1e-9 }]"),
     )
     assert done.status == 1, done.err
     assert done.summary["wall_seconds"] >= 59 * 0.02
@@ -261,12 +261,12 @@ def test_a_killed_process_of_a_shard_ends_all(evedrop: Evedrop, name: str) -> No
 def test_a_killed_observer_costs_no_slot_that_is_on_disk(evedrop: Evedrop) -> None:
     """The slots of both shards are in the folder, up to those that the observer had written when it was killed.
 
-    The summary says that its last figures were of an earlier slot.
+    The summary says that its last metrics were of an earlier slot.
     """
     live = evedrop.live("eavesdroppers", *ENDLESS)
     second = live.folder / "shards" / "2"
     wait_until(lambda: last_round(second).slots > 0, "slots of the second shard on disk")
-    wait_until(lambda: "the tables have more" in age_of_figures(second), "rows that are later than the figures")
+    wait_until(lambda: "the tables have more" in age_of_metrics(second), "rows that are later than the metrics")
     os.kill(child(live, 2, "observer"), signal.SIGKILL)
     done = live.end()
     assert done.status == 3
@@ -276,7 +276,7 @@ def test_a_killed_observer_costs_no_slot_that_is_on_disk(evedrop: Evedrop) -> No
     assert results.slots.num_rows == results.journal.num_rows
     assert {3, 5} & set(results.slots["trials"].to_pylist())
     reason = results.summary["ended"].splitlines()[0]
-    assert re.search(r"\(the figures are as of slot \d+ in shard 2; the tables have more\)$", reason)
+    assert re.search(r"\(the metrics are as of slot \d+ in shard 2; the tables have more\)$", reason)
 
 
 def test_an_interrupted_run_leaves_one_folder_and_no_process(evedrop: Evedrop) -> None:

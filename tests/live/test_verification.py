@@ -250,7 +250,7 @@ def test_a_report_that_no_run_has_is_refused(what: str) -> None:
 
 
 def test_digests_that_are_due_are_missed() -> None:
-    """A report without the digests of a block that ends in it is refused, or its figures could never be verified."""
+    """A report without the digests of a block that ends in it is refused, or its metrics could never be verified."""
     raw = replace(reports(100)[2], digests={}).pack()
     with pytest.raises(
         MalformedMessage, match=r"digests of blocks \[\]; expected those of \[0\], which end in these slots"

@@ -121,7 +121,7 @@ def test_it_believes_the_truth() -> None:
     ("mu_d", "genie", "smart"), [(0.9, 4.462e-4, 5.077e-4), (0.7, 1.545e-3, 1.760e-3)], ids=["0.9", "0.7"]
 )
 def test_it_becomes_the_genie_in_the_numerical_example(mu_d: float, genie: float, smart: float) -> None:
-    """Slot 60: exact genie plus the mean of (Bayes − genie) over the same trials is the genie's figure to 0.2 % and 4.5 σ.
+    """Slot 60: exact genie plus the mean of (Bayes − genie) over the same trials is the genie's error to 0.2 % and 4.5 σ.
 
     In every slot Bayes is not better, at 4.5 standard errors, and by slot 10 it has been worse than smart.
     """

@@ -1,4 +1,4 @@
-"""Flipped acknowledgements: the channel, the policies that live with it, the optimal reader, and the published figures."""
+"""Flipped acknowledgements: the channel, the policies that live with it, the optimal reader, and the published numbers."""
 
 from __future__ import annotations
 
@@ -242,8 +242,8 @@ def traces_of(
 
 
 @pytest.mark.parametrize(("mu_e", "policy", "user", "eve"), mostly_long([PUBLISHED[1], PUBLISHED[4]], [PUBLISHED[1]]))
-def test_the_published_figures(mu_e: float, policy: dict[str, float], user: float, eve: float, tmp_path: Path) -> None:
-    """40,000 slots, within 4.5 standard errors, and 1 % for the standard error of the published figures."""
+def test_the_published_numbers(mu_e: float, policy: dict[str, float], user: float, eve: float, tmp_path: Path) -> None:
+    """40,000 slots, within 4.5 standard errors, and 1 % for the standard error of the published numbers."""
     found, error = traces_of(mu_e, policy, 550, 80, tmp_path)
     assert (error < 0.03 * found).all()
     assert (np.abs(found - [user, eve]) < 4.5 * error + 0.01 * found).all()
@@ -251,10 +251,10 @@ def test_the_published_figures(mu_e: float, policy: dict[str, float], user: floa
 
 @pytest.mark.long
 @pytest.mark.parametrize(("mu_e", "policy", "user", "eve"), PUBLISHED)
-def test_all_published_figures(mu_e: float, policy: dict[str, float], user: float, eve: float, tmp_path: Path) -> None:
+def test_all_published_numbers(mu_e: float, policy: dict[str, float], user: float, eve: float, tmp_path: Path) -> None:
     """200,000 slots: within 2 %, or 4.5 standard errors of the difference of two such runs, whichever is more.
 
-    A published figure is the mean of one run of 200,000 slots, whose standard error is up to 2 % itself.
+    A published number is the mean of one run of 200,000 slots, whose standard error is up to 2 % itself.
     """
     found, error = traces_of(mu_e, policy, 2050, 100, tmp_path)
     assert (error < 0.02 * found).all()

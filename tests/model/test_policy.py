@@ -1,4 +1,4 @@
-"""The best policy of sending, if both holding times were known, and the figures of policies."""
+"""The best policy of sending, if both holding times were known, and the metrics of policies."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from evedrop.model.process import Process
 from evedrop.model.theory.policy import best_policy, held_traces, least_weight
 from evedrop.model.theory.policy_front import (
-    PolicyFigures,
+    PolicyMetrics,
     ScheduledLinks,
     front,
-    policy_figures,
-    scheduled_figures,
+    policy_metrics,
+    scheduled_metrics,
 )
 from tests.builders import DRIFTING, MICROGRID, UNSTABLE
 from tests.examples import examples
@@ -101,11 +101,11 @@ def test_the_best_of_all_rules() -> None:
 @pytest.mark.parametrize("process", [STABLE, DRIFTING, UNSTABLE, MICROGRID])
 @pytest.mark.parametrize("threshold", [1, 2, 4])
 def test_a_rule_that_ignores_the_eavesdropper_is_scheduled(process: Process, threshold: int) -> None:
-    """The figures by both holding times are those of the chain of `scheduled`, unbounded errors as well."""
+    """The metrics by both holding times are those of the chain of `scheduled`, unbounded errors as well."""
     for mu, mu_e in ((0.8, 0.6), (0.95, 0.2), (1.0, 0.5), (0.9, 1.0), (0.7, 0.0)):
         send = np.broadcast_to(np.arange(1, 6)[:, None] >= threshold, (5, 5))
-        found = policy_figures(process, send, mu, mu_e)
-        expected = scheduled_figures(process, links_of(mu, mu_e), threshold)
+        found = policy_metrics(process, send, mu, mu_e)
+        expected = scheduled_metrics(process, links_of(mu, mu_e), threshold)
         assert found.user == pytest.approx(expected.user, rel=1e-9, abs=1e-13)
         assert found.eavesdropper == pytest.approx(expected.eavesdropper, rel=1e-9, abs=1e-13)
         assert found.transmissions == pytest.approx(expected.transmissions, rel=1e-9)
@@ -119,12 +119,12 @@ def test_held_traces_are_the_errors_after_a_state() -> None:
 
 
 @pytest.mark.parametrize("weight", [0.5, 0.55, 0.7])
-def test_the_figures_of_a_policy_are_those_of_following_it(weight: float) -> None:
+def test_the_metrics_of_a_policy_are_those_of_following_it(weight: float) -> None:
     """Both holding times played for many trials, with the errors that go with them: within 4.5 standard errors."""
     states, trials, slots = 6, 4000, 400
     policy = best_policy(MICROGRID, MU, MU_E, weight, states)
     assert len(set(policy.thresholds)) > 1
-    figures = policy_figures(MICROGRID, policy.send, MU, MU_E)
+    metrics = policy_metrics(MICROGRID, policy.send, MU, MU_E)
     traces = held_traces(MICROGRID, slots + states)
     rng = np.random.default_rng(3)
     i = j = np.full(trials, states)
@@ -136,7 +136,7 @@ def test_the_figures_of_a_policy_are_those_of_following_it(weight: float) -> Non
         if k >= 100:
             sums += np.stack([traces[i - 1], traces[j - 1], sent])
     means = sums / (slots - 100)
-    for mean, expected in zip(means, (figures.user, figures.eavesdropper, figures.transmissions), strict=True):
+    for mean, expected in zip(means, (metrics.user, metrics.eavesdropper, metrics.transmissions), strict=True):
         assert abs(mean.mean() - expected) <= SIGMAS * mean.std(ddof=1) / math.sqrt(trials)
 
 
@@ -145,7 +145,7 @@ def test_a_point_of_the_front_is_what_the_scheme_does() -> None:
     found = front(STABLE, ScheduledLinks(0.7, 0.5, (0.56, 0.0), (0.28, 0.28)), (0.45, 0.5), (0.0,), 4)
     threshold = found.points[-1].scheduled
     assert threshold > 1
-    figures = found.thresholds[threshold - 1]
+    metrics = found.thresholds[threshold - 1]
     slots, trials, first = 160, 3000, 60
     events = (coins(0.7, slots, trials, 1), coins(0.5, slots, trials, 2), coins(0.8, slots, trials, 3))
     played = played_over("scheduled", STABLE, threshold, events)
@@ -157,9 +157,9 @@ def test_a_point_of_the_front_is_what_the_scheme_does() -> None:
         for name in ("legitimate", "eve")
     }
     for series, expected in (
-        (errors["legitimate"], figures.user),
-        (errors["eve"], figures.eavesdropper),
-        (sent, figures.transmissions),
+        (errors["legitimate"], metrics.user),
+        (errors["eve"], metrics.eavesdropper),
+        (sent, metrics.transmissions),
     ):
         means = series.mean(axis=0)
         assert abs(means.mean() - expected) <= SIGMAS * means.std(ddof=1) / math.sqrt(trials)
@@ -172,15 +172,15 @@ def test_the_front_is_a_front() -> None:
     for price in (0.0, 1e-6):
         ours = [point for point in found.points if point.price == price]
         assert [point.weights for point in ours] == sorted(point.weights for point in ours)
-        users = [point.figures.user for point in ours]
-        eavesdroppers = [point.figures.eavesdropper for point in ours]
+        users = [point.metrics.user for point in ours]
+        eavesdroppers = [point.metrics.eavesdropper for point in ours]
         assert users == sorted(users, reverse=True)
         assert eavesdroppers == sorted(eavesdroppers, reverse=True)
         asked = {weight for weight, one in found.never if one == price}
         asked |= {w for point in ours for w in weights if point.weights[0] <= w <= point.weights[1]}
         assert found.dominated or asked == set(weights)
     for one, other in itertools.permutations(found.points, 2):
-        assert not one.figures.dominates(other.figures)
+        assert not one.metrics.dominates(other.metrics)
     assert len(found.thresholds) == 6
     assert found.points[-1].weights[1] == 1.0
 
@@ -189,7 +189,7 @@ def test_a_dominated_policy_is_left_out() -> None:
     """Against an eavesdropper whose error is unbounded, the policy with the least error of the user dominates others."""
     found = front(UNSTABLE, links_of(0.9, 0.5), [i / 20 for i in range(21)], (0.0, 1e-3), 4)
     assert found.dominated == 1
-    assert all(math.isinf(point.figures.eavesdropper) for point in found.points if point.weights[1] < 0.8)
+    assert all(math.isinf(point.metrics.eavesdropper) for point in found.points if point.weights[1] < 0.8)
     assert found.as_dict()["dominated"] == 1
 
 
@@ -201,7 +201,7 @@ def test_knowing_the_eavesdropper_helps() -> None:
         (point,) = found.points
         best = found.thresholds[point.scheduled - 1].cost(weight, 0.0)
         assert best == min(one.cost(weight, 0.0) for one in found.thresholds)
-        gains.append(best - point.figures.cost(weight, 0.0))
+        gains.append(best - point.metrics.cost(weight, 0.0))
     assert min(gains) >= -1e-9
     assert max(gains) > 1e-4
 
@@ -228,8 +228,8 @@ def test_there_may_be_no_weight_at_which_it_sends() -> None:
 
 def test_costs_of_unbounded_errors() -> None:
     """An unbounded error of the user costs infinitely much, one of the eavesdropper alone is worth infinitely much."""
-    plain, good = PolicyFigures(1.0, 3.0, 0.5), PolicyFigures(1.0, math.inf, 0.5)
-    bad = PolicyFigures(math.inf, math.inf, 0.1)
+    plain, good = PolicyMetrics(1.0, 3.0, 0.5), PolicyMetrics(1.0, math.inf, 0.5)
+    bad = PolicyMetrics(math.inf, math.inf, 0.1)
     assert plain.cost(0.25, 2.0) == pytest.approx(0.25 - 2.25 + 1.0)
     assert (good.cost(0.5, 0.0), good.cost(1.0, 0.0)) == (-math.inf, 1.0)
     assert (bad.cost(0.5, 0.0), bad.cost(0.0, 0.0)) == (math.inf, -math.inf)

@@ -1,4 +1,4 @@
-"""No figure depends on the version of Python: `sum` compensates their rounding since 3.12."""
+"""No metric depends on the version of Python: `sum` compensates their rounding since 3.12."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_numbers_are_added_in_order() -> None:
 @pytest.mark.parametrize(
     "name", mostly_long(sorted(shipped()), ["eavesdroppers", "heated-room", "microgrid", "nemesis"])
 )
-def test_no_figure_of_a_study_is_a_compensated_sum(name: str, tmp_path: Path) -> None:
+def test_no_metric_of_a_study_is_a_compensated_sum(name: str, tmp_path: Path) -> None:
     """Warnings, trials, theory and summary of every built-in scenario, cut to a few slots."""
     scenario = load(name)
     timed = scenario.event or scenario.nemesis is not None
@@ -65,7 +65,7 @@ def test_no_figure_of_a_study_is_a_compensated_sum(name: str, tmp_path: Path) ->
 
 @pytest.mark.usefixtures("sums")
 @pytest.mark.parametrize("loss", [{"model": "gilbert-elliott", "p": 0.1, "r": 0.3}, {"model": "distance", **SHADOWED}])
-def test_no_figure_of_a_wire_is_a_compensated_sum(loss: dict[str, Any]) -> None:
+def test_no_metric_of_a_wire_is_a_compensated_sum(loss: dict[str, Any]) -> None:
     """The expected deliveries of a link that counted many pieces."""
     ranges = [range(start, start + 40) for start in range(0, 4000, 100)]
     mean, variance = expected({"loss": loss, "corrupt": 0.1}, (), ranges)

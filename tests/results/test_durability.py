@@ -122,7 +122,7 @@ MOMENTS: dict[str, Callable[[Live], object]] = {
     "a folder": lambda live: live.folder.exists(),
     "streams": lambda live: (live.folder / UNFINISHED).exists(),
     "first slots": lambda live: last_round(live.folder).slots > 0,
-    "figures": lambda live: (live.folder / UNFINISHED / "summary.json").exists(),
+    "metrics": lambda live: (live.folder / UNFINISHED / "summary.json").exists(),
     "parquet": lambda live: (
         (live.folder / UNFINISHED / "slots.parquet").exists() or (live.folder / "slots.parquet").exists()
     ),
@@ -133,7 +133,7 @@ MOMENTS: dict[str, Callable[[Live], object]] = {
 @pytest.mark.parametrize("what", mostly_long(MOMENTS, ["parquet"]))
 def test_a_run_may_be_killed_at_any_moment(evedrop: Evedrop, what: str) -> None:
     """From its first file to its last: the folder opens with whole tables, or says in a line why there is nothing."""
-    slots = 20000 if what == "figures" else 3000
+    slots = 20000 if what == "metrics" else 3000
     live = evedrop.live("eavesdroppers", "--slots", str(slots))
     wait_until(lambda: MOMENTS[what](live), what)
     kill_all(live)
@@ -232,7 +232,7 @@ def test_a_full_disk_ends_the_run_and_what_fitted_can_be_read(evedrop: Evedrop, 
 def test_a_killed_study_can_be_read(evedrop: Evedrop) -> None:
     """Kill -9 of Monte Carlo: the trials that were done, with statistics, digests and the recorded one."""
     live = evedrop.started("montecarlo", "eavesdroppers", "--trials", "100000", "--slots", "400", "--workers", "1")
-    wait_until((live.folder / UNFINISHED / "summary.json").exists, "figures on disk")
+    wait_until((live.folder / UNFINISHED / "summary.json").exists, "metrics on disk")
     kill_all(live)
     results = live.results
     trials = results.summary["trials"]
@@ -303,18 +303,18 @@ def test_a_writer_may_stop_at_any_byte(rounds: list[int], data: st.DataObject) -
 
 @cache
 def microgrid() -> Scenario:
-    """A part of a day in a house: a scenario whose figures are those of an application."""
+    """A part of a day in a house: a scenario whose metrics are those of an application."""
     return load("microgrid", {"slots": 200, "expect": []})
 
 
-def test_no_rows_are_on_disk_before_the_first_figures(tmp_path: Path) -> None:
-    """Or a run that is killed just then could not be looked at: only its own classes could make figures of nothing."""
+def test_no_rows_are_on_disk_before_the_first_metrics(tmp_path: Path) -> None:
+    """Or a run that is killed just then could not be looked at: only its own classes could make metrics of nothing."""
     scenario = microgrid()
     nothing = summary_of(
         scenario, Totals.nothing(scenario, 1), dict.fromkeys(scenario.digested), RunOutcome(0.0, "slot 10")
     )
 
-    def figures() -> Summary:
+    def metrics() -> Summary:
         assert not last_round(tmp_path).slots
         return nothing
 
@@ -324,7 +324,7 @@ def test_no_rows_are_on_disk_before_the_first_figures(tmp_path: Path) -> None:
             writer.slot_rows(0, receiver, sums(10), np.zeros(10))
 
         def on_disk() -> bool:
-            writer.checkpoint("slot 10", figures)
+            writer.checkpoint("slot 10", metrics)
             return last_round(tmp_path).slots == 10
 
         wait_until(on_disk, "rows on disk")
@@ -333,15 +333,15 @@ def test_no_rows_are_on_disk_before_the_first_figures(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_a_score_is_saved_only_with_rows(tmp_path: Path) -> None:
-    """What a shard saves together with its figures: if it is killed before, it has neither score nor rows."""
+    """What a shard saves together with its metrics: if it is killed before, it has neither score nor rows."""
     scenario = microgrid()
     nothing = summary_of(
         scenario, Totals.nothing(scenario, 1), dict.fromkeys(scenario.digested), RunOutcome(0.0, "slot 10")
     )
     events: list[str] = []
 
-    def figures() -> Summary:
-        events.append("figures")
+    def metrics() -> Summary:
+        events.append("metrics")
         return nothing
 
     def save() -> None:
@@ -355,14 +355,14 @@ def test_a_score_is_saved_only_with_rows(tmp_path: Path) -> None:
             writer.slot_rows(0, receiver, sums(10), np.zeros(10))
 
         def saved() -> bool:
-            writer.checkpoint("slot 10", figures)
+            writer.checkpoint("slot 10", metrics)
             return bool(events)
 
         wait_until(saved, "a checkpoint")
-    assert events == ["figures", "save"]
+    assert events == ["metrics", "save"]
 
 
-def test_the_end_of_a_run_without_figures_keeps_its_rows(tmp_path: Path) -> None:
+def test_the_end_of_a_run_without_metrics_keeps_its_rows(tmp_path: Path) -> None:
     """The launcher notes why the run ended, and takes nothing from what was measured."""
     scenario = microgrid()
     write_resolved(tmp_path, scenario)
@@ -372,12 +372,12 @@ def test_the_end_of_a_run_without_figures_keeps_its_rows(tmp_path: Path) -> None
     writer.write_rows("slot 10")
     note_end(tmp_path, scenario, "observer was ended by signal 9")
     results = Results.read(tmp_path)
-    why = "observer was ended by signal 9 (the figures are as of slot 0; the tables have more)"
+    why = "observer was ended by signal 9 (the metrics are as of slot 0; the tables have more)"
     assert (results.summary["ended"], results.summary["slots"]) == (why, 10)
     assert results.slots.num_rows == 10 * len(scenario.receivers)
 
 
-def test_the_end_of_a_killed_run_says_which_slot_its_figures_are_of(tmp_path: Path) -> None:
+def test_the_end_of_a_killed_run_says_which_slot_its_metrics_are_of(tmp_path: Path) -> None:
     """They were written when fewer slots were done; an excerpt of a log follows in lines of its own."""
     scenario = microgrid()
     write_resolved(tmp_path, scenario)
@@ -394,7 +394,7 @@ def test_the_end_of_a_killed_run_says_which_slot_its_figures_are_of(tmp_path: Pa
     summary = Results.read(tmp_path).summary
     assert summary["slots"] == 30
     assert summary["ended"].splitlines() == [
-        "observer was ended by signal 9 (the figures are as of slot 10; the tables have more)",
+        "observer was ended by signal 9 (the metrics are as of slot 10; the tables have more)",
         "its log:",
         "    nothing",
     ]

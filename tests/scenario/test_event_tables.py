@@ -247,12 +247,12 @@ def test_events_survive_being_written_and_read() -> None:
 def test_an_expectation_that_events_leave_without_theory_is_refused(
     event: dict[str, Any], receiver: str, more: dict[str, Any]
 ) -> None:
-    """Figures that would be null are refused, even where link and strategy by themselves have a theory."""
-    figure = f"{receiver}.expected_trace_covariance"
-    expect = [{"figure": figure, "below": 1.0}]
+    """Metrics that would be null are refused, even where link and strategy by themselves have a theory."""
+    metric = f"{receiver}.expected_trace_covariance"
+    expect = [{"metric": metric, "below": 1.0}]
     (line,) = mistakes_of(right, event, expect=expect, **more)
     why = f"no theory covers {receiver} with these links, attacks and events together"
-    assert line == f'expect.0.figure: is "{figure}", but {why}; expected another figure'
+    assert line == f'expect.0.metric: is "{metric}", but {why}; expected another metric'
     assert right(expect=expect, **more)
 
 

@@ -31,39 +31,39 @@ def expecting(*expectations: dict[str, Any], **changes: Any) -> Scenario:
 @pytest.mark.parametrize(
     ("expectation", "said"),
     [
-        ({}, 'figure: is missing; expected figure = "legitimate.mean_squared_error", or one of link, secrecy, in_step'),
+        ({}, 'metric: is missing; expected metric = "legitimate.mean_squared_error", or one of link, secrecy, in_step'),
         ({"by": 3}, 'in_step: is missing; expected in_step = "legitimate"'),
         ({"against": "smart"}, 'secrecy: is missing; expected secrecy = "relative"'),
-        ({"figure": ERROR, "below": 1.0, "link": "smart"}, "link: is given together with figure; expected one of figure, link"),
-        ({"secrecy": "relative", "figure": ERROR}, "secrecy: is given together with figure; expected one of figure, link, sec"),
+        ({"metric": ERROR, "below": 1.0, "link": "smart"}, "link: is given together with metric; expected one of metric, link"),
+        ({"secrecy": "relative", "metric": ERROR}, "secrecy: is given together with metric; expected one of metric, link, sec"),
         ({"link": "smart", "below": 1.0}, "below: is set, but link has no such entry; remove the line"),
         ({"in_step": "smart", "by": 9, "slots": [0, 9]}, "slots: is set, but in_step has no such entry"),
-        ({"figure": ERROR}, "below: is missing, and so is above; add below, above or near"),
-        ({"figure": ERROR, "within": 1.0}, "within: is set without near; expected near = 0.01 as well"),
-        ({"figure": ERROR, "within_relative": 0.1, "below": 1.0}, "within_relative: is set without near"),
-        ({"figure": ERROR, "near": 1.0}, "within: is missing; expected within = 0.002, or within_relative = 0.1"),
-        ({"figure": ERROR, "near": 1, "within": 1, "within_relative": 1}, "within_relative: is given together with within"),
-        ({"figure": ERROR, "near": 0, "within_relative": 0.1}, "within_relative: is set, but any fraction of near = 0"),
-        ({"figure": ERROR, "near": 1, "within": -1}, "within: is -1; expected a number at least 0"),
-        ({"figure": ERROR, "near": 1, "within": "a bit"}, 'within: is "a bit"; expected a number, such as 0.002'),
-        ({"figure": ERROR, "above": 2.0, "below": 1.0}, "above: is 2.0, and below is 1.0; expected above < below"),
-        ({"figure": ERROR, "below": 1, "slots": 9}, "slots: is 9; expected a list, such as [100, 200]"),
-        ({"figure": ERROR, "below": 1, "slots": [1, "x"]}, 'slots.1: is "x"; expected a whole number'),
-        ({"figure": ERROR, "below": 1, "slots": [9]}, "slots: is [9]; expected two slots [from, to], 0 ≤ from < to"),
-        ({"figure": ERROR, "below": 1, "slots": [9, 9]}, "slots: is [9, 9]; expected two slots [from, to], 0 ≤ from"),
-        ({"figure": ERROR, "below": 1, "slots": [-1, 9]}, "slots: is [-1, 9]; expected two slots"),
-        ({"figure": ERROR, "below": 1, "slots": [9, 51]}, "slots: is [9, 51]; expected from < to ≤ slots, which is 50"),
-        ({"figure": ERROR, "below": 1, "quantile": 1.0}, "quantile: is 1.0; expected a number between 0 and 1"),
-        ({"figure": ERROR, "below": 1, "quantile": 0}, "quantile: is 0; expected a number between 0 and 1"),
-        ({"figure": ERROR, "below": 1, "quantile": 0.99}, "quantile: is 0.99 of 12 trials; expected trials = 100 or mo"),
-        ({"figure": "smart.mean_trace_covariance", "below": 1, "quantile": 0.5}, "quantile: is set, but smart.mean_trac"),
-        ({"figure": "links.smart.lost", "below": 1, "quantile": 0.5}, "quantile: is set, but a link's account is of the"),
-        ({"figure": "links.smart.lost", "below": 1, "slots": [0, 9]}, "slots: is set, but a link's account is of the wh"),
-        ({"figure": "links.smart.lots", "below": 1}, "did you mean links.smart.lost?"),
-        ({"figure": "links.nobody.lost", "below": 1}, 'figure: is "links.nobody.lost"; expected RECEIVER (legitimate, s'),
-        ({"figure": "links.smart.lost_by.2", "below": 1}, 'figure: is "links.smart.lost_by.2"; expected RECEIVER'),
-        ({"figure": "smart", "below": 1}, 'figure: is "smart"; expected RECEIVER (legitimate, smart).FIGURE (mean_sq'),
-        ({"figure": 3, "below": 1}, "figure: is 3; expected a string"),
+        ({"metric": ERROR}, "below: is missing, and so is above; add below, above or near"),
+        ({"metric": ERROR, "within": 1.0}, "within: is set without near; expected near = 0.01 as well"),
+        ({"metric": ERROR, "within_relative": 0.1, "below": 1.0}, "within_relative: is set without near"),
+        ({"metric": ERROR, "near": 1.0}, "within: is missing; expected within = 0.002, or within_relative = 0.1"),
+        ({"metric": ERROR, "near": 1, "within": 1, "within_relative": 1}, "within_relative: is given together with within"),
+        ({"metric": ERROR, "near": 0, "within_relative": 0.1}, "within_relative: is set, but any fraction of near = 0"),
+        ({"metric": ERROR, "near": 1, "within": -1}, "within: is -1; expected a number at least 0"),
+        ({"metric": ERROR, "near": 1, "within": "a bit"}, 'within: is "a bit"; expected a number, such as 0.002'),
+        ({"metric": ERROR, "above": 2.0, "below": 1.0}, "above: is 2.0, and below is 1.0; expected above < below"),
+        ({"metric": ERROR, "below": 1, "slots": 9}, "slots: is 9; expected a list, such as [100, 200]"),
+        ({"metric": ERROR, "below": 1, "slots": [1, "x"]}, 'slots.1: is "x"; expected a whole number'),
+        ({"metric": ERROR, "below": 1, "slots": [9]}, "slots: is [9]; expected two slots [from, to], 0 ≤ from < to"),
+        ({"metric": ERROR, "below": 1, "slots": [9, 9]}, "slots: is [9, 9]; expected two slots [from, to], 0 ≤ from"),
+        ({"metric": ERROR, "below": 1, "slots": [-1, 9]}, "slots: is [-1, 9]; expected two slots"),
+        ({"metric": ERROR, "below": 1, "slots": [9, 51]}, "slots: is [9, 51]; expected from < to ≤ slots, which is 50"),
+        ({"metric": ERROR, "below": 1, "quantile": 1.0}, "quantile: is 1.0; expected a number between 0 and 1"),
+        ({"metric": ERROR, "below": 1, "quantile": 0}, "quantile: is 0; expected a number between 0 and 1"),
+        ({"metric": ERROR, "below": 1, "quantile": 0.99}, "quantile: is 0.99 of 12 trials; expected trials = 100 or mo"),
+        ({"metric": "smart.mean_trace_covariance", "below": 1, "quantile": 0.5}, "quantile: is set, but smart.mean_trac"),
+        ({"metric": "links.smart.lost", "below": 1, "quantile": 0.5}, "quantile: is set, but a link's account is of the"),
+        ({"metric": "links.smart.lost", "below": 1, "slots": [0, 9]}, "slots: is set, but a link's account is of the wh"),
+        ({"metric": "links.smart.lots", "below": 1}, "did you mean links.smart.lost?"),
+        ({"metric": "links.nobody.lost", "below": 1}, 'metric: is "links.nobody.lost"; expected RECEIVER (legitimate, s'),
+        ({"metric": "links.smart.lost_by.2", "below": 1}, 'metric: is "links.smart.lost_by.2"; expected RECEIVER'),
+        ({"metric": "smart", "below": 1}, 'metric: is "smart"; expected RECEIVER (legitimate, smart).METRIC (mean_sq'),
+        ({"metric": 3, "below": 1}, "metric: is 3; expected a string"),
         ({"link": "smrt"}, 'link: is "smrt"; expected legitimate or smart; did you mean smart?'),
         ({"secrecy": "total", "against": "smart"}, 'secrecy: is "total"; expected perfect or relative'),
         ({"secrecy": "relative"}, "against: is missing; expected the name of an eavesdropper"),
@@ -72,7 +72,7 @@ def expecting(*expectations: dict[str, Any], **changes: Any) -> Scenario:
         ({"in_step": "smart", "by": 50}, "by: is 50; expected a slot of the run, 0 to 49"),
         ({"in_step": "smart", "by": 9, "since": 10}, "by: is 9, before since, which is 10; expected since ≤ by"),
         ({"in_step": "smart", "by": -1}, "by: is -1; expected a number at least 0"),
-        ({"figure": ERROR, "blow": 1.0}, "blow: is not an entry of this table; did you mean below?"),
+        ({"metric": ERROR, "blow": 1.0}, "blow: is not an entry of this table; did you mean below?"),
     ],
 )  # fmt: skip
 def test_a_mistake_of_an_expectation_is_named(expectation: dict[str, Any], said: str) -> None:
@@ -85,13 +85,13 @@ def test_all_mistakes_of_expectations_are_named_at_once() -> None:
     """Mistakes of several tables, and of one table with wrong entries and wrong combinations, are reported together."""
     found = mistakes_of(
         expecting,
-        {"figure": "smart.mean_eror", "near": 1, "slots": [3, 99], "quantile": 2.0},
+        {"metric": "smart.mean_eror", "near": 1, "slots": [3, 99], "quantile": 2.0},
         {"secrecy": "relative", "against": "nobody", "by": 3},
         {"link": "nobody"},
         {"in_step": "nobody", "by": 99, "since": 100},
     )
     for path in (
-        "0.figure", "0.within", "0.slots", "0.quantile", "1.by", "1.against", "2.link", "3.in_step", "3.by", "3.since",
+        "0.metric", "0.within", "0.slots", "0.quantile", "1.by", "1.against", "2.link", "3.in_step", "3.by", "3.since",
     ):  # fmt: skip
         assert [line for line in found if line.startswith(f"expect.{path}: ")], path
     assert len(found) == 11  # by of the last is both beyond the run and before since
@@ -110,7 +110,7 @@ def test_without_eavesdroppers_there_is_nobody_to_be_secret_from() -> None:
 )
 def test_a_quantile_needs_a_trial_beyond_it(quantile: float, least: int) -> None:
     """The least number of trials is 1 over the share of trials beyond the quantile."""
-    expectation = {"figure": ERROR, "below": 1.0, "quantile": quantile}
+    expectation = {"metric": ERROR, "below": 1.0, "quantile": quantile}
     assert expecting(expectation, trials=least).trials == least
     (said,) = mistakes_of(expecting, expectation, trials=least - 1)
     assert said.partition(" (line")[0].endswith(f"expected trials = {least} or more")
@@ -119,26 +119,26 @@ def test_a_quantile_needs_a_trial_beyond_it(quantile: float, least: int) -> None
 @pytest.mark.parametrize(
     ("expectation", "text", "holds", "fails"),
     [
-        ({"figure": ERROR, "above": 1, "below": 2.5}, f"{ERROR} below 2.5 and above 1", (1.1, 2.4), (1, 2.5)),
-        ({"figure": ERROR, "near": 2, "within": 0.5}, f"{ERROR} near 2 within 0.5", (1.5, 2.5), (1.49, 2.51)),
+        ({"metric": ERROR, "above": 1, "below": 2.5}, f"{ERROR} below 2.5 and above 1", (1.1, 2.4), (1, 2.5)),
+        ({"metric": ERROR, "near": 2, "within": 0.5}, f"{ERROR} near 2 within 0.5", (1.5, 2.5), (1.49, 2.51)),
         (
-            {"figure": ERROR, "near": -2, "within_relative": 0.25, "slots": [10, 20], "quantile": 0.9},
+            {"metric": ERROR, "near": -2, "within_relative": 0.25, "slots": [10, 20], "quantile": 0.9},
             f"0.9 quantile of {ERROR} over slots 10 to 19 near -2 within 0.25 of it",
             (-2.5, -1.5),
             (-2.51, -1.49),
         ),
         (
-            {"figure": "links.smart.lost_by.late", "below": 3},
+            {"metric": "links.smart.lost_by.late", "below": 3},
             "links.smart.lost_by.late below 3",
             (2,),
             (3, float("nan")),
         ),
     ],
 )
-def test_what_is_wanted_of_a_figure(
+def test_what_is_wanted_of_a_metric(
     expectation: dict[str, Any], text: str, holds: tuple[float, ...], fails: tuple[float, ...]
 ) -> None:
-    """The sentence, and the figures that are as wanted: bounds are not, distances are."""
+    """The sentence, and the metrics that are as wanted: bounds are not, distances are."""
     (made,) = expecting(expectation).expect
     assert made.text == text
     assert text.endswith(made.wanted)

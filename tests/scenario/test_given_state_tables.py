@@ -79,7 +79,7 @@ ROWS = [[0.1, 2.0], [0.2, 2.5], [0.7, -1.0]]
         ),
         (
             {"source": "file", "state_values": ROWS},
-            {"expect": [{"figure": "eve.expected_trace_covariance", "below": 1.0}]},
+            {"expect": [{"metric": "eve.expected_trace_covariance", "below": 1.0}]},
             "A and Q need not describe states that come from a file; theory = true says that they do",
         ),
     ],

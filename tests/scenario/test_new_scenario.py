@@ -17,9 +17,9 @@ from evedrop.model.acknowledgements import ATTACKS
 from evedrop.model.controllers import CONTROLLERS
 from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.eavesdroppers import STRATEGIES
-from evedrop.model.figures import FIGURES
 from evedrop.model.integrity import POLICIES, SENSOR_ATTACKS
 from evedrop.model.links import LOSS_MODELS
+from evedrop.model.metrics import METRICS
 from evedrop.model.schemes import SCHEMES
 from evedrop.scenario.application import APPLICATIONS
 from evedrop.scenario.events import EVENTS
@@ -90,9 +90,9 @@ def test_everything_built_in_is_in_a_new_one(names: Iterable[str]) -> None:
     assert [name for name in names if f'"{name}"' not in NEW] == []
 
 
-def test_every_figure_is_in_a_new_one() -> None:
+def test_every_metric_is_in_a_new_one() -> None:
     """Those that every run has."""
-    assert [name for name in FIGURES if name not in NEW] == []
+    assert [name for name in METRICS if name not in NEW] == []
 
 
 def test_an_entry_that_is_missing_is_noticed() -> None:

@@ -77,9 +77,9 @@ from tests.builders import GOOD, mistakes_in_good
             {f"e{i}": GOOD["eavesdroppers"]["smart"] for i in range(65)},
             "eavesdroppers: has 65 entries; expected at most 64",
         ),
-        ("expect", [{"figure": "smart.mean_eror", "below": 1.0}], "expect.0.figure: is \"smart.mean_eror\"; expected REC"),
-        ("expect", [{"figure": "smart.used_fraction"}], "expect.0.below: is missing, and so is above"),
-        ("expect", [{"figure": "smart.used_fraction", "below": float("nan")}], "expect.0.below: is nan; expected a fin"),
+        ("expect", [{"metric": "smart.mean_eror", "below": 1.0}], "expect.0.metric: is \"smart.mean_eror\"; expected REC"),
+        ("expect", [{"metric": "smart.used_fraction"}], "expect.0.below: is missing, and so is above"),
+        ("expect", [{"metric": "smart.used_fraction", "below": float("nan")}], "expect.0.below: is nan; expected a fin"),
         ("secret_file", "no-such-file", "secret_file: no-such-file cannot be read (No such file or directory)"),
         ("secret_file", "/dev/null", "secret_file: /dev/null cannot be read (it is a pipe or a device, not a file)"),
     ],
@@ -114,7 +114,7 @@ def test_all_mistakes_are_named_at_once() -> None:
         "legitimate.link.quality": 2.0,
         "eavesdroppers.smart.use_state": 0.5,
         "eavesdroppers.smart.link": 3,
-        "expect": [{"figure": "nobody.used_fraction"}, {"below": 1.0}],
+        "expect": [{"metric": "nobody.used_fraction"}, {"below": 1.0}],
         "record_trials": 9,
     }
     found = mistakes_in_good(changes, "process.initial_covariance")
@@ -129,8 +129,8 @@ def test_all_mistakes_are_named_at_once() -> None:
         "eavesdroppers.smart.link: ",
         "eavesdroppers.smart.use_state: ",
         "expect.0.below: ",
-        "expect.0.figure: ",
-        "expect.1.figure: ",
+        "expect.0.metric: ",
+        "expect.1.metric: ",
         "record_trials: ",
     ):
         assert len([line for line in found if line.startswith(path)]) == 1, path
@@ -138,15 +138,15 @@ def test_all_mistakes_are_named_at_once() -> None:
 
 
 def test_an_expectation_on_what_theory_does_not_know_is_refused() -> None:
-    """Behind a queue the expected trace is unknown, so expectations of it are refused; those of other figures are not."""
+    """Behind a queue the expected trace is unknown, so expectations of it are refused; those of other metrics are not."""
     queue = {"eavesdroppers.smart.link": {"quality": 0.9, "rate": 0.5}}
     expect = [
-        {"figure": f"smart.{figure}", "below": 1.0} for figure in ("received_fraction", "expected_trace_covariance")
+        {"metric": f"smart.{metric}", "below": 1.0} for metric in ("received_fraction", "expected_trace_covariance")
     ]
     (line,) = mistakes_in_good({**queue, "expect": expect})
-    assert line.startswith('expect.1.figure: is "smart.expected_trace_covariance", but no theory covers')
+    assert line.startswith('expect.1.metric: is "smart.expected_trace_covariance", but no theory covers')
     (line,) = mistakes_in_good({"eavesdroppers.smart.strategy": "bayesian", "expect": expect})
-    assert line.endswith("but no closed form is known for the strategy bayesian of smart; expected another figure")
+    assert line.endswith("but no closed form is known for the strategy bayesian of smart; expected another metric")
 
 
 def test_more_slots_than_the_horizon_are_refused() -> None:
@@ -200,9 +200,9 @@ def test_any_entry_can_be_set() -> None:
         "eavesdroppers.extra.use_state": 0.5,
         "eavesdroppers.extra.use_innovation": 0.25,
         "eavesdroppers.extra.link.quality": 0.5,
-        "expect.0.figure": "extra.used_fraction",
+        "expect.0.metric": "extra.used_fraction",
         "expect.0.below": 0.5,
-        "expect.1.figure": "legitimate.received_fraction",
+        "expect.1.metric": "legitimate.received_fraction",
         "expect.1.above": 0.25,
     }
     scenario = parse(tomli_w.dumps(GOOD), "scenario", changes)

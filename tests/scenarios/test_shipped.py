@@ -75,23 +75,23 @@ def test_live_and_memory_are_the_same_bits(name: str, batch: str, twins: Callabl
     assert digests_of(live) == digests_of(memory)
     assert all(digests_of(live).values())
     assert blocks(live) == blocks(memory)
-    for receiver, figures in live.summary["peers"].items():
+    for receiver, metrics in live.summary["peers"].items():
         same = memory.summary["peers"][receiver]
-        assert figures.keys() == same.keys()
-        for figure, found in figures.items():
+        assert metrics.keys() == same.keys()
+        for metric, found in metrics.items():
             # Differences of trials cancel more digits than their sums do.
-            apart = 1e-9 if figure in {"standard_errors", "z"} else 1e-12
+            apart = 1e-9 if metric in {"standard_errors", "z"} else 1e-12
             if isinstance(found, dict):
-                alike = dict(same[figure])
-                if figure == "standard_errors" and found["mean_trace_covariance"] is None:
+                alike = dict(same[metric])
+                if metric == "standard_errors" and found["mean_trace_covariance"] is None:
                     alike["mean_trace_covariance"] = None  # only memory knows tr P of trials that are not recorded
                 assert found.keys() == alike.keys()
                 for part, value in found.items():
                     assert value == (alike[part] if alike[part] is None else pytest.approx(alike[part], rel=apart)), (
                         part
                     )
-            elif figure != "digest":
-                assert found == (same[figure] if same[figure] is None else pytest.approx(same[figure], rel=apart))
+            elif metric != "digest":
+                assert found == (same[metric] if same[metric] is None else pytest.approx(same[metric], rel=apart))
     for eavesdropper, verdict in live.summary["secrecy"].items():
         ratios = {
             key: pytest.approx(verdict[key], rel=1e-9) for key in ("ratio", "ratio_standard_error") if verdict[key]
@@ -160,10 +160,10 @@ def test_simulated_errors_agree_with_theory(tmp_path: Path) -> None:
             assert abs(deviation) < 4.5 * table["standard_error"][i] + 1e-15, (slot, table["peer"][i])
             judged += 1
     assert judged == 12 * len(receivers)
-    for name, figures in receivers.items():
+    for name, metrics in receivers.items():
         quality = load("eavesdroppers").quality[name]
         spread = np.sqrt(quality * (1 - quality) / (600 * 221))
-        assert abs(figures["received_fraction"] - quality) < 4.5 * spread
+        assert abs(metrics["received_fraction"] - quality) < 4.5 * spread
     for name in ("legitimate", "smart"):  # they know how well they do
         believed = receivers[name]["mean_trace_covariance"]
         assert believed == pytest.approx(receivers[name]["expected_trace_covariance"], rel=0.05)

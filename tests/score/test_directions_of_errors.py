@@ -93,13 +93,13 @@ def test_the_report_has_a_table(found: Results, capsys: pytest.CaptureFixture[st
 
 
 def test_expectations_hold_in_directions(tmp_path: Path) -> None:
-    """Perfect secrecy needs theory's promise, relative secrecy what the run shows; a figure is the mean squared error."""
+    """Perfect secrecy needs theory's promise, relative secrecy what the run shows; a metric is the mean squared error."""
     expect = [
         {"secrecy": "perfect", "against": "antenna", "direction": "position"},
         {"secrecy": "perfect", "against": "antenna", "direction": "speed"},
         {"secrecy": "perfect", "against": "naive", "direction": "position"},
         {"secrecy": "relative", "against": "naive", "direction": "position"},
-        {"figure": "directions.antenna.goal", "above": 0.02},
+        {"metric": "directions.antenna.goal", "above": 0.02},
     ]
     some = {**SOME, "trials": 60, "record_trials": 1}
     results = montecarlo("partial-encryption", out=tmp_path / "run", plan=Plan(workers=1), expect=expect, **some)
@@ -114,7 +114,7 @@ def test_modes_without_estimates_have_no_directions(tmp_path: Path) -> None:
     """Nothing is said, and expectations are left open."""
     expect = [
         {"secrecy": "relative", "against": "smart", "direction": "sum"},
-        {"figure": "directions.smart.sum", "below": 1.0},
+        {"metric": "directions.smart.sum", "below": 1.0},
     ]
     results = montecarlo(
         "eavesdroppers",
@@ -159,19 +159,19 @@ def test_trials_and_slots_in_parts_have_the_same_bits() -> None:
             'expect.0.direction: is "up"; there are no directions; expected process.directions = { up = [1.0, 0.0] }',
         ),
         (
-            {"process.directions": {"up": [1.0, 0.0]}, "expect": [{"figure": "directions.smart.upp", "below": 1.0}]},
-            'expect.0.figure: is "directions.smart.upp"; expected up; did you mean up?',
+            {"process.directions": {"up": [1.0, 0.0]}, "expect": [{"metric": "directions.smart.upp", "below": 1.0}]},
+            'expect.0.metric: is "directions.smart.upp"; expected up; did you mean up?',
         ),
-        ({"expect": [{"figure": "directions.nobody.up", "below": 1.0}]}, "expect.0.figure: is"),
+        ({"expect": [{"metric": "directions.nobody.up", "below": 1.0}]}, "expect.0.metric: is"),
         (
             {
                 "process.directions": {"up": [1.0, 0.0]},
-                "expect": [{"figure": "directions.smart.up", "below": 1.0, "slots": [0, 3]}],
+                "expect": [{"metric": "directions.smart.up", "below": 1.0, "slots": [0, 3]}],
             },
             "expect.0.slots: is set, but the error in a direction is the mean of the whole run; remove the line",
         ),
         (
-            {"expect": [{"figure": "smart.used_fraction", "below": 1.0, "direction": "up"}]},
+            {"expect": [{"metric": "smart.used_fraction", "below": 1.0, "direction": "up"}]},
             "expect.0.direction: is set",
         ),
     ],

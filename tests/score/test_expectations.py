@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evedrop.cli.api import montecarlo, run
-from evedrop.model.figures.figure import ScoredSlots
+from evedrop.model.metrics.metric import ScoredSlots
 from evedrop.model.receiver import Action
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
@@ -29,17 +29,17 @@ from evedrop.simulate.montecarlo import Plan
 from tests.conftest import Evedrop
 
 SLOTS, TRIALS, FIRST = 90, 12, 30
-FIGURES = ("mean_squared_error", "received_fraction", "used_fraction")
+METRICS = ("mean_squared_error", "received_fraction", "used_fraction")
 ON_SUSPICIOUS: list[dict[str, Any]] = [
-    {"figure": f"suspicious.{figure}", **what, "above": 0.0}
-    for figure in FIGURES
+    {"metric": f"suspicious.{metric}", **what, "above": 0.0}
+    for metric in METRICS
     for what in ({}, {"slots": [FIRST, 70]}, {"quantile": 0.9}, {"slots": [FIRST, 70], "quantile": 0.9})
 ]
 OTHERS: list[dict[str, Any]] = [
-    {"figure": "naive.mean_trace_covariance", "slots": [FIRST, 70], "above": 0.0},
-    {"figure": "naive.expected_trace_covariance", "slots": [FIRST, 70], "above": 0.0},
-    {"figure": "links.naive.lost", "above": 0},
-    {"figure": "links.naive.lost_by.nothing", "above": 0},
+    {"metric": "naive.mean_trace_covariance", "slots": [FIRST, 70], "above": 0.0},
+    {"metric": "naive.expected_trace_covariance", "slots": [FIRST, 70], "above": 0.0},
+    {"metric": "links.naive.lost", "above": 0},
+    {"metric": "links.naive.lost_by.nothing", "above": 0},
     {"link": "naive"},
     {"secrecy": "relative", "against": "naive"},
     {"secrecy": "perfect", "against": "smart"},
@@ -85,7 +85,7 @@ def test_live_and_memory_agree_on_every_expectation(made: Runs) -> None:
         assert ("replay" in one) == ("replay" in other) == (one["held"] is False)
 
 
-def test_figures_of_ranges_and_quantiles_are_those_of_the_table(made: Runs) -> None:
+def test_metrics_of_ranges_and_quantiles_are_those_of_the_table(made: Runs) -> None:
     """Mean over slots and trials, and quantile over trials of a trial's mean, by numpy from every recorded trial."""
     table = of_trials(made("memory"), "suspicious")
     received = table["action"] != "dropped"
@@ -95,7 +95,7 @@ def test_figures_of_ranges_and_quantiles_are_those_of_the_table(made: Runs) -> N
         "used_fraction": received & (table["action"] != "discarded"),
     }
     for expect, found in zip(ON_SUSPICIOUS, made("memory").summary["expectations"], strict=False):
-        means = columns[expect["figure"].split(".")[1]][slice(*expect.get("slots", (0, SLOTS)))].mean(axis=0)
+        means = columns[expect["metric"].split(".")[1]][slice(*expect.get("slots", (0, SLOTS)))].mean(axis=0)
         known = np.quantile(means, expect["quantile"]) if "quantile" in expect else means.mean()
         assert found["found"] == pytest.approx(known, rel=1e-12), found["text"]
         assert found["held"] is True
@@ -106,9 +106,9 @@ def test_other_expectations_are_those_of_tables_and_summary(made: Runs) -> None:
     results = made("live")
     found = {one["text"]: one for one in results.summary["expectations"]}
     rows = [row for row in results.slots.to_pylist() if row["peer"] == "naive" and FIRST <= row["slot"] < 70]
-    for figure in ("mean_trace_covariance", "expected_trace_covariance"):
-        known = np.mean([row[figure] for row in rows])
-        assert found[f"naive.{figure} over slots {FIRST} to 69 above 0"]["found"] == pytest.approx(known, rel=1e-12)
+    for metric in ("mean_trace_covariance", "expected_trace_covariance"):
+        known = np.mean([row[metric] for row in rows])
+        assert found[f"naive.{metric} over slots {FIRST} to 69 above 0"]["found"] == pytest.approx(known, rel=1e-12)
     assert found["links.naive.lost above 0"]["found"] == results.summary["links"]["naive"]["lost"]
     unknown = found["links.naive.lost_by.nothing above 0"]
     assert (unknown["found"], unknown["held"]) == (None, None)
@@ -145,7 +145,7 @@ def test_what_is_watched_does_not_depend_on_how_it_is_cut(cuts: set[int], blocks
     """Slots in chunks and trials in blocks: the bits are those of one piece."""
     draw = np.random.default_rng(1)
     error, action = draw.lognormal(size=(40, 7)), draw.integers(0, 4, (40, 7)).astype(np.uint8)
-    watches = [WatchedSlots(figure, *span) for figure in FIGURES for span in ((0, 40), (7, 21))]
+    watches = [WatchedSlots(metric, *span) for metric in METRICS for span in ((0, 40), (7, 21))]
     steps = [WatchedSlots(IN_STEP, 0, 40), WatchedSlots(IN_STEP, 11, 40)]
 
     def watched(trials: slice, ends: list[int]) -> Watched:
@@ -178,7 +178,7 @@ def test_a_trial_that_never_is_in_step_is_found_as_nothing(tmp_path: Path) -> No
     (one,) = results.summary["expectations"]
     assert (one["held"], one["found"], one["wanted"]) == (False, None, "by slot 3")
     assert Judged(**one).sentence == "expected legitimate in step by slot 3: FAILED, found none"
-    ranged = {"figure": "smart.used_fraction", "slots": [3, 9], "below": 1}
+    ranged = {"metric": "smart.used_fraction", "slots": [3, 9], "below": 1}
     secret = {"secrecy": "relative", "against": "smart"}
     scenario = load("eavesdroppers", {"slots": 9, "expect": [*expect, ranged, secret]})
     short = {name: Tally(9, 1) for name in scenario.receivers}
@@ -236,7 +236,7 @@ def test_the_printed_command_shows_the_failure_again(evedrop: Evedrop, command: 
     view = ("--view", "off") if command == "run" else ()
     done = evedrop(
         command, "eavesdroppers", "--slots", "40", "--trials", "10", "--seed", "3", "--first-trial", "5", *view,
-        "--set", "expect.0={figure = 'smart.mean_squared_error', slots = [9, 40], quantile = 0.9, above = 9.0}",
+        "--set", "expect.0={metric = 'smart.mean_squared_error', slots = [9, 40], quantile = 0.9, above = 9.0}",
         "--set", "expect.1={in_step = 'suspicious', by = 0}", "--out", "a run",
     )  # fmt: skip
     assert (done.status, done.err) == (1, "")
@@ -256,7 +256,7 @@ def test_the_printed_command_shows_the_failure_again(evedrop: Evedrop, command: 
 
 def test_one_trial_of_a_study_can_be_watched_whatever_was_expected(evedrop: Evedrop) -> None:
     """The most surprising trial's command leaves out expectations that one trial cannot meet."""
-    expect = "expect.0={figure = 'smart.mean_squared_error', quantile = 0.9, above = 0.0}"
+    expect = "expect.0={metric = 'smart.mean_squared_error', quantile = 0.9, above = 0.0}"
     done = evedrop("montecarlo", "eavesdroppers", "--slots", "40", "--trials", "30", "--set", expect, "--out", "study")
     assert (done.status, done.err) == (0, "")
     line = next(line for line in done.out.splitlines() if "watch it live: " in line)

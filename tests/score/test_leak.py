@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from evedrop.cli.api import compare, montecarlo
-from evedrop.model.figures.standard_error import z_of
+from evedrop.model.metrics.standard_error import z_of
 from evedrop.model.receiver import Action
 from evedrop.model.theory.leaked_bits import LeakedBits
 from evedrop.scenario.loading import load
@@ -69,7 +69,7 @@ def test_a_schedule_of_probabilities_leaks_slot_by_slot() -> None:
 
 
 def test_trials_in_parts_have_the_same_bits() -> None:
-    """However slots and trials are divided; trials that were cut short at different slots have no figure."""
+    """However slots and trials are divided; trials that were cut short at different slots have no metric."""
     random = np.random.default_rng(5)
     action = random.choice([Action.LOST, Action.STATE, Action.DISCARDED], (30, 8)).astype(np.uint8)
     nu = random.random((30, 8)) < 0.5

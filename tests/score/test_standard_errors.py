@@ -1,4 +1,4 @@
-"""Standard errors, z and rare events: of every figure, against the recorded trials, and calibrated over many studies."""
+"""Standard errors, z and rare events: of every metric, against the recorded trials, and calibrated over many studies."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from scipy.stats import t as student
 
 from evedrop.cli.api import montecarlo, run
 from evedrop.cli.report import closing_table, print_summary
-from evedrop.model.figures.figure import MeanFigure, ScoredSlots, TotalsFigure
-from evedrop.model.figures.packets import UsedFraction
-from evedrop.model.figures.standard_error import ratio_error, standard_error, z_of
-from evedrop.model.figures.text import estimate
+from evedrop.model.metrics.metric import MeanMetric, ScoredSlots, TotalsMetric
+from evedrop.model.metrics.packets import UsedFraction
+from evedrop.model.metrics.standard_error import ratio_error, standard_error, z_of
+from evedrop.model.metrics.text import estimate
 from evedrop.model.process import Floats
 from evedrop.results.reading import Results
 from evedrop.scenario.expected.expectations import expectations_of
@@ -72,7 +72,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Results:
 
 @pytest.mark.parametrize("receiver", ["legitimate", "naive", "suspicious", "smart"])
 def test_standard_errors_are_those_of_the_trials_means(recorded: Results, receiver: str) -> None:
-    """Of every figure that is estimated, from the rows of the recorded trials; z is the distance from theory in them."""
+    """Of every metric that is estimated, from the rows of the recorded trials; z is the distance from theory in them."""
     peer = recorded.summary["peers"][receiver]
     values: dict[str, Callable[[dict[str, Any]], float]] = {
         "mean_squared_error": lambda row: float(row["squared_error"]),
@@ -94,14 +94,14 @@ def test_standard_errors_are_those_of_the_trials_means(recorded: Results, receiv
 
 
 def test_late_packets_count_in_the_trials_too() -> None:
-    """A packet that comes late is received in its trial: the mean of the trials is the figure."""
+    """A packet that comes late is received in its trial: the mean of the trials is the metric."""
     scenario = load("late", {"slots": 200, "trials": 6, "expect": []})
     totals = merged(scenario).totals
     for name, tally in totals.tallies.items():
-        for figure in ("received_fraction", "used_fraction"):
-            means = tally.of_trials(figure)
+        for metric in ("received_fraction", "used_fraction"):
+            means = tally.of_trials(metric)
             assert means is not None
-            assert means.mean() == pytest.approx(tally.figure(figure), rel=1e-12), (name, figure)
+            assert means.mean() == pytest.approx(tally.metric(metric), rel=1e-12), (name, metric)
     assert any(tally.late for tally in totals.tallies.values())
 
 
@@ -115,8 +115,8 @@ def test_a_live_run_has_the_standard_errors_of_memory(recorded: Results, tmp_pat
         same, unrecorded = (one.summary["peers"][name] for one in (live, others))
         assert same["standard_errors"] == pytest.approx(peer["standard_errors"], rel=1e-9)
         assert same["z"].keys() == peer["z"].keys()
-        for figure, z in peer["z"].items():
-            assert same["z"][figure] == (None if z is None else pytest.approx(z, rel=1e-6))
+        for metric, z in peer["z"].items():
+            assert same["z"][metric] == (None if z is None else pytest.approx(z, rel=1e-6))
         assert same["rare_events"] == peer["rare_events"]
         assert unrecorded["standard_errors"] == pytest.approx(peer["standard_errors"], rel=1e-9)
         for one in (same, unrecorded):
@@ -144,7 +144,7 @@ def test_rounding_has_no_z() -> None:
     changes = {"legitimate.link.quality": 1.0, "slots": 100, "trials": 50, "expect": []}
     summary = summary_of_study(load("eavesdroppers", changes))
     user = summary.peers["legitimate"]
-    assert 0.0 < user.figures["mean_squared_error"] < 1e-25  # type: ignore[operator]
+    assert 0.0 < user.metrics["mean_squared_error"] < 1e-25  # type: ignore[operator]
     assert user.z == {"mean_squared_error": None}
     assert summary.secrecy["naive"].ratio is None
     assert summary.secrecy["naive"].sentence.startswith("naive: ∞ × the legitimate error in slots 51 to 99;")
@@ -161,12 +161,12 @@ def test_infinite_variance_leaves_only_counts_a_standard_error() -> None:
     assert peer.z == {"mean_squared_error": None}
 
 
-def test_a_covariance_only_study_has_the_z_of_its_own_figure() -> None:
+def test_a_covariance_only_study_has_the_z_of_its_own_metric() -> None:
     """The mean actual trace is compared with theory; there is no squared error."""
     scenario = load("eavesdroppers", {"slots": 50, "trials": 20, "expect": []})
     peer = summary_of_study(scenario, mode=Mode.COVARIANCE_ONLY).peers["naive"]
     error, z = peer.standard_errors["mean_actual_trace_covariance"], peer.z["mean_actual_trace_covariance"]
-    found, expected = peer.figure("mean_actual_trace_covariance"), peer.figure("expected_trace_covariance")
+    found, expected = peer.metric("mean_actual_trace_covariance"), peer.metric("expected_trace_covariance")
     assert None not in (error, z, found, expected)
     assert z * (found - expected) > 0.0  # type: ignore[operator]
     assert peer.standard_errors["mean_squared_error"] is peer.z["mean_squared_error"] is None
@@ -186,10 +186,10 @@ def test_trials_that_were_cut_short_have_no_standard_errors() -> None:
     assert tally.standard_error("mean_squared_error") is None
 
 
-def test_a_figure_that_is_not_known_trial_by_trial_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_metric_that_is_not_known_trial_by_trial_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
     """A mean that is kept for all trials together, and totals that say nothing about trials."""
 
-    class KeptFraction(MeanFigure):
+    class KeptFraction(MeanMetric):
         by_trial = False
 
         @staticmethod
@@ -197,11 +197,11 @@ def test_a_figure_that_is_not_known_trial_by_trial_has_none(monkeypatch: pytest.
             return slots.error
 
     tally = Tally(9, 3, done=4, offered=12)
-    monkeypatch.setattr("evedrop.score.sums.figure", lambda _: KeptFraction)
+    monkeypatch.setattr("evedrop.score.sums.metric", lambda _: KeptFraction)
     assert tally.of_trials("kept") is None
-    monkeypatch.setattr("evedrop.score.sums.figure", lambda _: UsedFraction)
+    monkeypatch.setattr("evedrop.score.sums.metric", lambda _: UsedFraction)
     assert tally.of_trials("used") is not None
-    monkeypatch.setattr(UsedFraction, "sums_of_trials", TotalsFigure.sums_of_trials)
+    monkeypatch.setattr(UsedFraction, "sums_of_trials", TotalsMetric.sums_of_trials)
     assert tally.of_trials("used") is None
 
 
@@ -213,7 +213,7 @@ def test_a_summary_of_an_older_version_can_be_read(recorded: Results) -> None:
             del peer[name]
     peer = Summary.read(text).peers["smart"]
     assert (peer.standard_errors, peer.z, peer.rare_events) == ({}, {}, None)
-    assert peer.figures == recorded.typed_summary.peers["smart"].figures
+    assert peer.metrics == recorded.typed_summary.peers["smart"].metrics
     assert closing_table(Summary.read(text), 100).row_count == 4
 
 
@@ -248,7 +248,7 @@ def test_an_estimate_has_the_digits_of_its_error(value: float | None, error: flo
     st.booleans(),
 )
 def test_an_estimate_is_never_wide(value: float, error: float, relative: bool) -> None:
-    """However small or large its error is, a table keeps its shape, and the figure has its significant digits."""
+    """However small or large its error is, a table keeps its shape, and the metric has its significant digits."""
     error = error * abs(value) if relative else error
     text = estimate(value, error)
     shown, _, after = text.partition(" ± ")
@@ -378,7 +378,7 @@ def test_rare_events_are_those_of_theory(recorded: Results) -> None:
 
 
 def test_the_closing_table_fits_80_columns(recorded: Results) -> None:
-    """With the standard error and z of the error; in a wide terminal every figure has its standard error."""
+    """With the standard error and z of the error; in a wide terminal every metric has its standard error."""
     shown = {}
     for width in (80, 140):
         console = Console(width=width, file=StringIO())

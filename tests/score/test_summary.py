@@ -11,7 +11,7 @@ import pytest
 
 from evedrop.cli.api import montecarlo
 from evedrop.errors import UsageError
-from evedrop.model.figures import FIGURES, figure
+from evedrop.model.metrics import METRICS, metric
 from evedrop.results.reading import Results
 from evedrop.results.summary_file import summary_text, write_summary
 from evedrop.scenario.loading import load
@@ -40,7 +40,7 @@ from tests.examples import mostly_long
     ),
 )
 def test_a_summary_that_was_read_is_written_to_the_byte(tmp_path: Path, scenario: str, mode: Mode) -> None:
-    """With filter, controller, applications, events, detection, delays, and the figure of one mode."""
+    """With filter, controller, applications, events, detection, delays, and the metric of one mode."""
     changes: dict[str, Any] = (
         {"event": [{"at": 3, "link": "legitimate", "set": {"quality": 0.5}}]} if scenario == "late" else {}
     )
@@ -49,9 +49,9 @@ def test_a_summary_that_was_read_is_written_to_the_byte(tmp_path: Path, scenario
     text = (tmp_path / "run" / "summary.json").read_text(encoding="utf-8")
     summary = results.typed_summary
     assert summary_text(summary) == text
-    figures = [name for name in FIGURES if figure(name).only_in_mode in {None, mode.value}]
+    metrics = [name for name in METRICS if metric(name).only_in_mode in {None, mode.value}]
     others = ["error_quantiles", "standard_errors", "z", "infinite_variance", "rare_events", "digest"]
-    order = [*figures[:5], *others, *figures[5:]]
+    order = [*metrics[:5], *others, *metrics[5:]]
     assert [list(peer) for peer in results.summary["peers"].values()] == [order] * len(summary.peers)
     outages = [ConnectionOutage("smart", 3, None, 0.5), ConnectionOutage("router", 4, 9, 1.0, shard=2)]
     write_summary(tmp_path / "run", replace(summary, outages=outages))
@@ -64,7 +64,7 @@ def test_a_summary_that_was_read_is_written_to_the_byte(tmp_path: Path, scenario
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
     """A small run."""
-    expect = [{"figure": "smart.mean_squared_error", "below": 0.0}]
+    expect = [{"metric": "smart.mean_squared_error", "below": 0.0}]
     return montecarlo("eavesdroppers", slots=9, trials=2, out=tmp_path_factory.mktemp("run"), expect=expect)
 
 
@@ -107,7 +107,7 @@ def test_infinite_numbers_are_numbers(results: Results) -> None:
     """In the file they are strings, because JSON lacks them."""
     changed: Any = copy.deepcopy(dict(results.summary))
     changed["peers"]["smart"]["mean_squared_error"] = "inf"
-    assert Summary.read(changed).peers["smart"].figure("mean_squared_error") == float("inf")
+    assert Summary.read(changed).peers["smart"].metric("mean_squared_error") == float("inf")
 
 
 @pytest.mark.parametrize("name", ["bursts", "late"])

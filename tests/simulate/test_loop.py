@@ -14,7 +14,7 @@ import tomli_w
 
 from evedrop.cli.api import run
 from evedrop.errors import UsageError
-from evedrop.model.figures.standard_error import z_of
+from evedrop.model.metrics.standard_error import z_of
 from evedrop.results.diff import difference
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import checked, load

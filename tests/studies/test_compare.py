@@ -145,7 +145,7 @@ def test_every_adversary_is_played_somewhere(everything: Everything) -> None:
 
 
 def test_a_cell_is_a_study_of_its_own(everything: Everything, tmp_path: Path) -> None:
-    """The scenario that the folder has of a scheme gives the figures of its cells, by `montecarlo`, to the bit."""
+    """The scenario that the folder has of a scheme gives the metrics of its cells, by `montecarlo`, to the bit."""
     found, folder = everything
     for file, scheme in (("innovation", "innovation"), ("acknowledged-blocks-critical", "acknowledged")):
         alone = montecarlo(folder / "scenarios" / f"{file}.toml", trials=found.trials, out=tmp_path / file).summary

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from evedrop.errors import ScenarioError, UsageError
-from evedrop.model.figures.text import share_text
+from evedrop.model.metrics.text import share_text
 from evedrop.model.schemes import SCHEMES
 from evedrop.scenario.loading import load
 from evedrop.studies.matchups import adversaries_of, matchups_of
@@ -70,7 +70,7 @@ def test_shipped_scenarios_can_be_compared(name: str) -> None:
 
 
 def test_what_a_measuring_sensor_cannot_use_is_left_out() -> None:
-    """A scheme that decides the first state; strategies that invert its singular Q have a reason instead of figures."""
+    """A scheme that decides the first state; strategies that invert its singular Q have a reason instead of numbers."""
     matchups = matchups_of(load("measured"))
     assert set(matchups.schemes) == set(SCHEMES) - {"twin-track"}
     assert set(matchups.left_out) == {"twin-track"}

@@ -26,9 +26,9 @@ def test_errors_are_those_of_a_study_of_the_same_trials(tmp_path: Path) -> None:
     assert [(row.first, row.stop) for row in rows] == [(0, 8), (8, 16), (16, 24)]
     options: dict[str, Any] = {"expect": [], "slots": SLOTS, "trials": TRIALS, "eavesdroppers__learning__keeps": 16}
     study = montecarlo("learning", out=tmp_path / "study", plan=Plan(workers=1), **options)
-    for name, figures in study.summary["peers"].items():
+    for name, metrics in study.summary["peers"].items():
         mean = sum(row.errors[name] * (row.stop - row.first) for row in rows) / SLOTS
-        assert mean == pytest.approx(figures["mean_squared_error"], rel=1e-12)
+        assert mean == pytest.approx(metrics["mean_squared_error"], rel=1e-12)
     (one,) = learning_curve(load("learning", {**SMALL, "slots": 8}), lambda _: None)
     assert one == rows[0]
     last = rows[-1]

@@ -33,7 +33,7 @@ def grid_powers(folder: Path, **changes: Any) -> Floats:
     return found
 
 
-def test_figures_are_those_of_pairs_of_studies(tmp_path: Path) -> None:
+def test_metrics_are_those_of_pairs_of_studies(tmp_path: Path) -> None:
     """From three studies of the same trials: with the scheme, with plain, and with a controller that sees the truth."""
     ours = grid_powers(tmp_path / "ours")
     plain = grid_powers(tmp_path / "plain", encoding={"scheme": "plain"})
@@ -50,9 +50,9 @@ def test_figures_are_those_of_pairs_of_studies(tmp_path: Path) -> None:
         ("plain_from_truth", plain, truth),
     ):
         summed = np.abs(one - other).sum(axis=0) / np.abs(other).sum(axis=0)
-        figure = found.differences[name]["summed"]
-        assert figure.mean == pytest.approx(summed.mean(), rel=1e-9)
-        assert figure.standard_error == pytest.approx(summed.std(ddof=1) / 2.0, rel=1e-6)
+        metric = found.differences[name]["summed"]
+        assert metric.mean == pytest.approx(summed.mean(), rel=1e-9)
+        assert metric.standard_error == pytest.approx(summed.std(ddof=1) / 2.0, rel=1e-6)
         totals = np.abs(one).sum(axis=0), np.abs(other).sum(axis=0)
         total = np.abs(totals[0] - totals[1]) / totals[1]
         assert found.differences[name]["total"].mean == pytest.approx(total.mean(), rel=1e-6)
@@ -89,7 +89,7 @@ def test_a_days_cost_is_that_of_the_document() -> None:
 
 
 def test_the_command_prints_the_table_and_json(evedrop: Evedrop) -> None:
-    """The same figures in both, and one line for a scenario or a number of trials that cannot be used."""
+    """The same metrics in both, and one line for a scenario or a number of trials that cannot be used."""
     command = ("cost", "microgrid", "--trials", "2", "--slots", "200")
     shown, entry = evedrop(*command), evedrop(*command, "--json")
     assert (shown.status, entry.status) == (0, 0)

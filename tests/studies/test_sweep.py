@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from evedrop.cli.api import montecarlo
 from evedrop.errors import UsageError
-from evedrop.model.figures import expectable_figures
+from evedrop.model.metrics import expectable_metrics
 from evedrop.scenario.loading import load
 from evedrop.show.report.sweep import sweep_table
 from evedrop.show.report.writing import write_report
@@ -117,7 +117,7 @@ def test_every_combination_has_a_row_for_every_peer(swept: tuple[pa.Table, Path]
 
 
 @pytest.mark.long
-def test_a_sweep_without_a_house_has_none_of_its_figures(swept: tuple[pa.Table, Path]) -> None:
+def test_a_sweep_without_a_house_has_none_of_its_metrics(swept: tuple[pa.Table, Path]) -> None:
     """Neither columns nor a plot."""
     table, folder = swept
     assert "sold_energy" not in table.column_names
@@ -125,7 +125,7 @@ def test_a_sweep_without_a_house_has_none_of_its_figures(swept: tuple[pa.Table, 
 
 
 def test_a_point_is_a_study_of_its_own(swept: tuple[pa.Table, Path], tmp_path: Path) -> None:
-    """Figures, verdicts and digests of each point are those of `montecarlo` with the same entries, to the bit."""
+    """Metrics, verdicts and digests of each point are those of `montecarlo` with the same entries, to the bit."""
     rows = {(*(row[key] for key in GRID), row["peer"]): row for row in swept[0].to_pylist()}
     for i, point in enumerate(itertools.product(*GRID.values())):
         changes: dict[str, Any] = {key.replace(".", "__"): value for key, value in zip(GRID, point, strict=True)}
@@ -136,10 +136,10 @@ def test_a_point_is_a_study_of_its_own(swept: tuple[pa.Table, Path], tmp_path: P
             row = rows[(*point, name)]
             assert row["digest"] == peer["digest"]
             assert row["infinite_variance"] == peer["infinite_variance"]
-            for figure in expectable_figures():
-                assert row[figure] == peer[figure]
-            for figure, error in peer["standard_errors"].items():
-                assert row[f"{figure}_standard_error"] == error
+            for metric in expectable_metrics():
+                assert row[metric] == peer[metric]
+            for metric, error in peer["standard_errors"].items():
+                assert row[f"{metric}_standard_error"] == error
             assert row["mean_squared_error_z"] == peer["z"]["mean_squared_error"]
             assert {"share": row["rare_share"], "trials": row["rare_trials"]} == peer["rare_events"]
             for level, value in peer["error_quantiles"].items():

@@ -31,9 +31,9 @@ SCENARIO = (
     .partition("[[expect]]")[0]
     .replace("slots = ", "slots = 60 #")
 )
-HOLDS = SCENARIO + '[[expect]]\nfigure = "legitimate.mean_squared_error"\nbelow = 0.1\n'
+HOLDS = SCENARIO + '[[expect]]\nmetric = "legitimate.mean_squared_error"\nbelow = 0.1\n'
 ENDLESS = HOLDS.replace("slots = 60", "slots = 1000000").replace("pace = 0.0", "pace = 0.01")
-FAILS = HOLDS + '[[expect]]\nfigure = "smart.received_fraction"\nslots = [10, 60]\nabove = 2\n'
+FAILS = HOLDS + '[[expect]]\nmetric = "smart.received_fraction"\nslots = [10, 60]\nabove = 2\n'
 WRONG = SCENARIO.replace("slots = ", "sluts = ").replace("seed = ", "seed = -")
 
 
@@ -120,8 +120,8 @@ def test_a_live_test_that_fails_says_how_to_see_it_again(evedrop: Evedrop) -> No
 
 
 def test_shipped_names_and_expectations_that_nobody_can_tell(evedrop: Evedrop) -> None:
-    """A shipped scenario by its name; a figure that the run does not have has failed. A reason that did not occur counts 0."""
-    expected = [f'[[expect]]\nfigure = "links.smart.lost_by.{reason}"\nbelow = 1\n' for reason in ("gremlins", "down")]
+    """A shipped scenario by its name; a metric that the run does not have has failed. A reason that did not occur counts 0."""
+    expected = [f'[[expect]]\nmetric = "links.smart.lost_by.{reason}"\nbelow = 1\n' for reason in ("gremlins", "down")]
     written(evedrop.folder, unknown=SCENARIO + "".join(expected))
     done = evedrop("test", "stable-mode", "unknown.toml", "--in-memory", "--trials", "2")
     assert "lost_by.down" not in done.out  # it held

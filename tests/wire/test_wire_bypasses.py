@@ -111,7 +111,7 @@ def test_programs_that_connect_again_and_again_do_not_fill_the_journal() -> None
 
 def test_a_wire_past_which_programs_could_speak_has_no_verdict(tmp_path: Path) -> None:
     """An expectation that would hold fails; status, summary, page and the `with` statement say why."""
-    expectation: dict[str, Any] = {"figure": "scan.heard", "below": 1}
+    expectation: dict[str, Any] = {"metric": "scan.heard", "below": 1}
     running = wire(side=["robot", "base"], link=[LINK], expect=[expectation], out=tmp_path / "wire")
 
     def use() -> None:

@@ -22,14 +22,14 @@ def expecting(**table: Any) -> WirePlan:
     ("table", "subject", "text"),
     [
         ({"link": "scan"}, "scan", "link scan within the 99 % bounds of its model"),
-        ({"figure": "scan.delivery", "below": 0.9}, "scan", "scan.delivery below 0.9"),
-        ({"figure": "a.heard", "above": 0, "below": 5}, "a", "a.heard below 5 and above 0"),
+        ({"metric": "scan.delivery", "below": 0.9}, "scan", "scan.delivery below 0.9"),
+        ({"metric": "a.heard", "above": 0, "below": 5}, "a", "a.heard below 5 and above 0"),
         (
-            {"figure": "scan.latency", "quantile": 0.99, "below": "20 ms"},
+            {"metric": "scan.latency", "quantile": 0.99, "below": "20 ms"},
             "scan",
             "0.99 quantile of scan.latency below 0.02",
         ),
-        ({"figure": "scan.latency", "quantile": 0.5, "above": 0.5}, "scan", "0.5 quantile of scan.latency above 0.5"),
+        ({"metric": "scan.latency", "quantile": 0.5, "above": 0.5}, "scan", "0.5 quantile of scan.latency above 0.5"),
     ],
 )
 def test_an_expectation_in_words(table: dict[str, Any], subject: str, text: str) -> None:
@@ -40,37 +40,37 @@ def test_an_expectation_in_words(table: dict[str, Any], subject: str, text: str)
 
 def test_both_bounds_hold_together() -> None:
     """Nothing outside of them does."""
-    table = WireExpectTable.model_validate({"figure": "scan.gap_seconds", "above": "1 s", "below": "2 s"})
+    table = WireExpectTable.model_validate({"metric": "scan.gap_seconds", "above": "1 s", "below": "2 s"})
     assert [table.holds(value) for value in (0.5, 1.0, 1.5, 2.0, 2.5)] == [False, False, True, False, False]
 
 
 @pytest.mark.parametrize("bound", [-0.5, float("inf"), float("nan"), True, "1"])
-def test_a_bound_is_a_number_that_a_figure_can_reach(bound: Any) -> None:
+def test_a_bound_is_a_number_that_a_metric_can_reach(bound: Any) -> None:
     """Not below 0, not infinite, and a text only with a unit of time."""
-    assert [mistake.partition(":")[0] for mistake in mistakes_of(expecting, figure="scan.delivery", below=bound)] == [
+    assert [mistake.partition(":")[0] for mistake in mistakes_of(expecting, metric="scan.delivery", below=bound)] == [
         "expect.0.below"
     ]
 
 
 def test_a_link_stands_alone() -> None:
     """Each other entry is named, and no others; None is as good as an entry that is not there."""
-    sentences = mistakes_of(expecting, link="scan", figure="scan.heard", quantile=0.5, above=1)
+    sentences = mistakes_of(expecting, link="scan", metric="scan.heard", quantile=0.5, above=1)
     assert sorted(mistake.partition(":")[0] for mistake in sentences) == [
         "expect.0.above",
-        "expect.0.figure",
+        "expect.0.metric",
         "expect.0.quantile",
     ]
-    assert WireExpectTable.model_validate({"link": "scan", "figure": None, "below": None}).link == "scan"
+    assert WireExpectTable.model_validate({"link": "scan", "metric": None, "below": None}).link == "scan"
 
 
-def test_a_figure_is_that_of_a_link() -> None:
+def test_a_metric_is_that_of_a_link() -> None:
     """Without a link it is refused, as is one of an unknown link; the message names what there is."""
-    assert mistakes_of(expecting, figure="delivery", below=1)[0].startswith(
-        'expect.0.figure: is "delivery"; expected LINK.heard, '
+    assert mistakes_of(expecting, metric="delivery", below=1)[0].startswith(
+        'expect.0.metric: is "delivery"; expected LINK.heard, '
     )
-    (unknown,) = mistakes_of(expecting, figure="scam.heard", below=1)
+    (unknown,) = mistakes_of(expecting, metric="scam.heard", below=1)
     assert unknown == (
-        'expect.0.figure: is "scam.heard", but there is no link scam; expected a figure or the name of scan; '
+        'expect.0.metric: is "scam.heard", but there is no link scam; expected a metric or the name of scan; '
         "did you mean scan?"
     )
     (unknown,) = mistakes_of(expecting, link="sc.an")
@@ -79,4 +79,4 @@ def test_a_figure_is_that_of_a_link() -> None:
 
 def test_malformed_names_of_links_are_the_tables_matter() -> None:
     """Here they are passed over: the table itself refuses them."""
-    assert list(expectation_mistakes([{"figure": 3, "link": 4}, {"figure": ".heard"}, {"link": ""}], ["scan"])) == []
+    assert list(expectation_mistakes([{"metric": 3, "link": 4}, {"metric": ".heard"}, {"link": ""}], ["scan"])) == []

@@ -16,8 +16,8 @@ def test_a_failed_expectation_is_told_apart_from_the_rest(tmp_path: Path) -> Non
             "side": {"robot": {}, "base": {}},
             "link": [{"from": "robot", "to": "base"}, {"from": "base", "to": "robot"}],
             "expect": [
-                {"figure": "robot-base.delivery", "below": 0.5},
-                {"figure": "robot-base.delivery", "above": 0.5},
+                {"metric": "robot-base.delivery", "below": 0.5},
+                {"metric": "robot-base.delivery", "above": 0.5},
             ],
         }
     )

@@ -30,7 +30,7 @@ FAILING = """
 import pytest, time, zenoh
 
 WIRE = {"side": ["robot", "base"], "link": [{"name": "scan", "from": "robot", "to": "base", "quality": 0.0}],
-        "expect": [{"figure": "scan.delivery", "above": 0.9}]}
+        "expect": [{"metric": "scan.delivery", "above": 0.9}]}
 
 
 def hear(radio):
@@ -69,7 +69,7 @@ def heard(running: RunningWire) -> int:
 
 def test_a_wire_is_opened_steered_read_and_judged(tmp_path: Path) -> None:
     """All in one, because a process takes a second to begin: what programs get is what the journal and the summary say."""
-    expectation = {"figure": "scan.delivery", "above": 0.9}
+    expectation = {"metric": "scan.delivery", "above": 0.9}
     got: list[int] = []
     running = wire(side=["robot", "base"], link=[LINK], expect=[expectation], seed=7, out=tmp_path / "wire")
     with pytest.raises(ExpectationFailed, match=r"expected scan\.delivery above 0\.9: FAILED"), running:
@@ -169,7 +169,7 @@ def test_the_fixture_ends_the_wires_of_a_test_that_fails(tmp_path: Path) -> None
 @pytest.mark.long
 def test_the_error_of_the_with_block_comes_first(tmp_path: Path) -> None:
     """An expectation that failed as well does not hide it."""
-    expectation = {"figure": "scan.delivery", "above": 0.9}
+    expectation = {"metric": "scan.delivery", "above": 0.9}
     entries: dict[str, Any] = {"side": ["robot", "base"], "link": [{**LINK, "quality": 0.0}], "expect": [expectation]}
     running = wire(**entries, out=tmp_path / "wire")
 
@@ -222,7 +222,7 @@ def test_an_entry_of_a_file_is_changed_by_its_dotted_key(tmp_path: Path) -> None
     assert changed.plan.links[0].settings["loss"]["quality"] == 0.9
 
 
-def test_figures_from_the_disk_are_those_of_the_wire(tmp_path: Path) -> None:
+def test_metrics_from_the_disk_are_those_of_the_wire(tmp_path: Path) -> None:
     """Of every kind of message, fate and link, with changed settings, second copies, and fates that were changed later."""
     plan = wire_plan(
         scan={"loss": {"model": "bernoulli", "quality": 0.6}}, rest={"loss": {"model": "bernoulli", "quality": 1.0}}

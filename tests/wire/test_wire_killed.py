@@ -67,7 +67,7 @@ def test_a_wire_without_a_summary_is_summed_up_from_its_journal(
     assert (link.delivered, link.lost_by, link.dropped_by) == (delivered, {"loss": LOST}, dropped)
     assert 0.0 < found.seconds < 100.0
     assert main(["view", str(folder), "--table"]) == 0
-    sentence = f"{says}: these are the figures that its journal gives so far"
+    sentence = f"{says}: these are the metrics that its journal gives so far"
     printed = capfd.readouterr().out
     assert sentence in printed
     assert "robot-base lost 3 by loss" in printed

@@ -20,10 +20,10 @@ from evedrop.show.report.writing import write_report
 from evedrop.wire.closing import closing_lines
 from evedrop.wire.expect import WireExpectTable
 from evedrop.wire.fates import KeyFates
-from evedrop.wire.figures import WIRE_FIGURES
 from evedrop.wire.file import resolved_wire, wire_of
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.journal_on_disk import scorekeeper_on_disk
+from evedrop.wire.metrics import WIRE_METRICS
 from evedrop.wire.plan import Side, WirePlan
 from evedrop.wire.record import AGAIN, UNLINKED, Kind, WireFate
 from evedrop.wire.scorekeeper import WireScorekeeper
@@ -236,22 +236,22 @@ def expecting(text: str) -> WirePlan:
 
 
 def test_expectations(tmp_path: Path) -> None:
-    """Each figure holds or fails by its bounds, with a line, and the exit status is 1 if one fails."""
+    """Each metric holds or fails by its bounds, with a line, and the exit status is 1 if one fails."""
     plan = expecting(
         """
 [[expect]]
-figure = "scan.delivery"
+metric = "scan.delivery"
 above = 0.55
 below = 0.65
 [[expect]]
-figure = "scan.latency"
+metric = "scan.latency"
 quantile = 0.9
 below = "25 ms"
 [[expect]]
-figure = "scan.gap_messages"
+metric = "scan.gap_messages"
 below = 3
 [[expect]]
-figure = "scan.gap_seconds"
+metric = "scan.gap_seconds"
 above = "1 min"
 [[expect]]
 link = "scan"
@@ -294,11 +294,11 @@ link = "scan"
 @pytest.mark.parametrize(
     ("fate", "text", "why"),
     [
-        (WireFate.LOST, '[[expect]]\nfigure = "scan.latency"\nquantile = 0.5\nbelow = 1', "no message was delivered"),
+        (WireFate.LOST, '[[expect]]\nmetric = "scan.latency"\nquantile = 0.5\nbelow = 1', "no message was delivered"),
         (WireFate.CUT, '[[expect]]\nlink = "scan"', "the link's models decided on no message"),
     ],
 )
-def test_a_figure_without_a_value_has_failed(fate: WireFate, text: str, why: str, tmp_path: Path) -> None:
+def test_a_metric_without_a_value_has_failed(fate: WireFate, text: str, why: str, tmp_path: Path) -> None:
     """With the reason, on a link that heard something."""
     plan = expecting(text)
     with WireJournal(tmp_path, plan) as journal:
@@ -379,16 +379,16 @@ def test_mistakes_in_expectations() -> None:
         expecting(
             """
 [[expect]]
-figure = "scam.delivery"
+metric = "scam.delivery"
 [[expect]]
-figure = "scan.latencies"
+metric = "scan.latencies"
 below = "3 apples"
 [[expect]]
-figure = "scan.gap_seconds"
+metric = "scan.gap_seconds"
 quantile = 0.5
 below = 1
 [[expect]]
-figure = "scan.latency"
+metric = "scan.latency"
 below = 1
 [[expect]]
 link = "scan"
@@ -400,13 +400,13 @@ below = 0.5
     said = "\n".join(caught.value.mistakes)
     for line in (
         "expect.0.below: is missing, and so is above; add one of them, or both",
-        'expect.0.figure: is "scam.delivery", but there is no link scam; expected a figure or the name of scan',
-        'expect.1.figure: is "scan.latencies"; expected LINK.heard, LINK.delivery, LINK.latency, LINK.gap_messages or LINK.ga',
+        'expect.0.metric: is "scam.delivery", but there is no link scam; expected a metric or the name of scan',
+        'expect.1.metric: is "scan.latencies"; expected LINK.heard, LINK.delivery, LINK.latency, LINK.gap_messages or LINK.ga',
         'expect.1.below: is "3 apples"; expected a number, or a length of time such as "20 ms"',
         "expect.2.quantile: is set, but only a latency has quantiles",
         "expect.3.quantile: is missing; a latency needs one",
         "expect.4.below: is set, but a table with link has no other entries",
-        "expect.5.figure: is missing",
+        "expect.5.metric: is missing",
     ):
         assert line in said, said
 
@@ -416,13 +416,13 @@ below = 0.5
     ("above", 0.4, False), ("above", 0.5, False), ("above", 0.6, True),
 ])  # fmt: skip
 def test_a_bound_itself_is_neither_below_nor_above(bound: str, found: float, holds: bool) -> None:
-    """A figure must be on its side of the bound."""
-    assert WireExpectTable.model_validate({"figure": "scan.delivery", bound: 0.5}).holds(found) is holds
+    """A metric must be on its side of the bound."""
+    assert WireExpectTable.model_validate({"metric": "scan.delivery", bound: 0.5}).holds(found) is holds
 
 
 def test_a_latency_is_that_of_its_quantile(tmp_path: Path) -> None:
     """Of 100 different delays, the 90th."""
-    plan = expecting('[[expect]]\nfigure = "scan.latency"\nquantile = 0.9\nbelow = 1\n')
+    plan = expecting('[[expect]]\nmetric = "scan.latency"\nquantile = 0.9\nbelow = 1\n')
     with WireJournal(tmp_path, plan) as journal:
         keeper = WireScorekeeper(plan, journal)
         for n in range(100):
@@ -449,8 +449,8 @@ def test_the_exit_status_tells_of_an_incomplete_journal_and_of_unaccounted_messa
     assert "unaccounted for: 1 message; this is a fault of Evedrop" in wire_failures(keeper.summary())
 
 
-def test_a_figure_of_a_link_is_one_line_of_the_registry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A wire file may expect something of a figure that is only in the registry, and its own method gives the value."""
+def test_a_metric_of_a_link_is_one_line_of_the_registry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A wire file may expect something of a metric that is only in the registry, and its own method gives the value."""
 
     class Bytes:
         name = "bytes"
@@ -460,17 +460,17 @@ def test_a_figure_of_a_link_is_one_line_of_the_registry(tmp_path: Path, monkeypa
             assert (tally.heard, quantile) == (link.heard, None)
             return link.bytes
 
-    monkeypatch.setitem(WIRE_FIGURES, "bytes", Bytes())
-    found, _ = run(tmp_path, expecting('[[expect]]\nfigure = "scan.bytes"\nabove = 0.5\n'), messages=30)
+    monkeypatch.setitem(WIRE_METRICS, "bytes", Bytes())
+    found, _ = run(tmp_path, expecting('[[expect]]\nmetric = "scan.bytes"\nabove = 0.5\n'), messages=30)
     (judged,) = found["expectations"]
     assert (judged["held"], judged["found"]) == (True, found["links"]["scan"]["bytes"])
 
 
-def test_the_page_lists_every_figure_of_a_link() -> None:
+def test_the_page_lists_every_metric_of_a_link() -> None:
     """In the section about expectations."""
     page = (Path(__file__).parents[2] / "docs" / "wire.md").read_text(encoding="utf-8")
     section = page.partition("## Expectations")[2].partition("\n## ")[0]
-    assert [name for name in WIRE_FIGURES if name not in section] == []
+    assert [name for name in WIRE_METRICS if name not in section] == []
 
 
 def test_the_report_names_the_reasons_on_which_no_model_decided() -> None:

@@ -25,7 +25,7 @@ _HEAD = """# Gallery
 
 Every built-in scenario, with errors, packets and estimates of a study in memory of at most 5000 slots.
 `evedrop show NAME` prints a scenario, with comments that say what to look for; `evedrop run NAME` runs it live.
-[Results](results.md) and [the view](view.md) explain the figures and colours.
+[Results](results.md) and [the view](view.md) explain the metrics and colours.
 """
 
 

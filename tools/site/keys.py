@@ -8,9 +8,9 @@ from typing import Any
 from evedrop.model.controllers import CONTROLLERS
 from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.eavesdroppers import STRATEGIES
-from evedrop.model.figures import FIGURES
 from evedrop.model.integrity import POLICIES, SENSOR_ATTACKS
 from evedrop.model.links import LOSS_MODELS
+from evedrop.model.metrics import METRICS
 from evedrop.model.schemes import SCHEMES
 from evedrop.scenario.events import EVENTS
 from evedrop.scenario.tables import Scenario
@@ -41,7 +41,7 @@ _REGISTRIES = (
     ("attacks on measurements", "model", SENSOR_ATTACKS),
     ("watermark policies", "policy", POLICIES),
     ("events", "event", EVENTS),
-    ("figures", "figure", FIGURES),
+    ("metrics", "metric", METRICS),
 )
 
 

@@ -8,7 +8,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from evedrop.cli.report import left_out_line, terminal
-from evedrop.model.figures.text import figure_text, finite_text
+from evedrop.model.metrics.text import finite_text, number_text
 
 if TYPE_CHECKING:
     from evedrop.scenario.expected.energy_budget import BudgetDesign
@@ -27,13 +27,13 @@ def print_budget(design: BudgetDesign) -> None:
         shown.add_column(head, justify="right", no_wrap=True)
     shown.add_column("")
     for one in sorted({round(each.threshold, 9): each for each in (*design.others, design.best)}.items()):
-        figures = one[1]
+        metrics = one[1]
         shown.add_row(
-            figure_text(figures.threshold, ".6g"),
-            figure_text(figures.encrypted_fraction, ".4f"),
-            figure_text(figures.energy, ".6g"),
-            *(finite_text(figures.eavesdroppers[name]) for name in names),
-            "the budget's" if figures is design.best else "",
+            number_text(metrics.threshold, ".6g"),
+            number_text(metrics.encrypted_fraction, ".4f"),
+            number_text(metrics.energy, ".6g"),
+            *(finite_text(metrics.eavesdroppers[name]) for name in names),
+            "the budget's" if metrics is design.best else "",
         )
     console.print(shown)
     if design.left_out:

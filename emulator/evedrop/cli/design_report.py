@@ -10,7 +10,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from evedrop.cli.report import terminal
-from evedrop.model.figures.text import figure_text, finite_text
+from evedrop.model.metrics.text import finite_text, number_text
 
 if TYPE_CHECKING:
     from evedrop.model.theory.design import Design
@@ -59,7 +59,7 @@ def print_design(design: Design) -> None:
             "none"
             if not against.relative
             else " ∪ ".join(f"({low:.5f}, {high:.5f})" for low, high in against.relative),
-            figure_text(against.best_difference, ".5f"),
+            number_text(against.best_difference, ".5f"),
             "–" if against.largest is None else _largest(against.largest),
             finite_text(against.trace, ".6g"),
             "–" if math.isnan(against.ratio) else finite_text(against.ratio),

@@ -9,15 +9,15 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from evedrop.cli.report import left_out_line, terminal
-from evedrop.model.figures.text import figure_text, finite_text
+from evedrop.model.metrics.text import finite_text, number_text
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from evedrop.model.theory.policy_front import Front, PolicyFigures
+    from evedrop.model.theory.policy_front import Front, PolicyMetrics
     from evedrop.scenario.expected.policies import PolicyDesign
 
-_FIGURES = ("user's error", "its error", "sent")
+_METRICS = ("user's error", "its error", "sent")
 
 
 def print_policies(design: PolicyDesign) -> None:
@@ -46,24 +46,24 @@ def print_policies(design: PolicyDesign) -> None:
 
 def _thresholds(front: Front) -> Table:
     shown = Table(box=SIMPLE_HEAD)
-    for head in ("threshold θ", *_FIGURES):
+    for head in ("threshold θ", *_METRICS):
         shown.add_column(head, justify="right", no_wrap=True)
-    for i, figures in enumerate(front.thresholds):
-        shown.add_row(str(i + 1), *_figures(figures))
+    for i, metrics in enumerate(front.thresholds):
+        shown.add_row(str(i + 1), *_metrics(metrics))
     return shown
 
 
 def _policies(front: Front, states: int) -> Table:
     shown = Table(box=SIMPLE_HEAD)
-    for head in ("weight", "λ", *_FIGURES, "best θ"):
+    for head in ("weight", "λ", *_METRICS, "best θ"):
         shown.add_column(head, justify="right", no_wrap=True)
     shown.add_column("send from h ≥, by its holding time 1, 2 …")
     for point in front.points:
         low, high = point.weights
         shown.add_row(
             f"{low:g}" if low == high else f"{low:g} … {high:g}",
-            figure_text(point.price, "g"),
-            *_figures(point.figures),
+            number_text(point.price, "g"),
+            *_metrics(point.metrics),
             str(point.scheduled),
             _by_holding_time(point.thresholds, states),
         )
@@ -78,5 +78,5 @@ def _by_holding_time(thresholds: Sequence[int], states: int) -> str:
     )
 
 
-def _figures(figures: PolicyFigures) -> tuple[str, ...]:
-    return (*map(finite_text, (figures.user, figures.eavesdropper)), figure_text(figures.transmissions, ".4f"))
+def _metrics(metrics: PolicyMetrics) -> tuple[str, ...]:
+    return (*map(finite_text, (metrics.user, metrics.eavesdropper)), number_text(metrics.transmissions, ".4f"))

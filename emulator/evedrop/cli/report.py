@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 _DIGEST_WIDTH = 100
-"""The least width of a terminal, in columns, to show digests, and the standard error of every figure."""
+"""The least width of a terminal, in columns, to show digests, and the standard error of every metric."""
 
 
 def rich_table(table: TextTable, *, tight: bool = True, short_heads: bool = False) -> Table:
@@ -43,7 +43,7 @@ def rich_table(table: TextTable, *, tight: bool = True, short_heads: bool = Fals
 
 
 def closing_table(summary: Summary, width: int) -> Table:
-    """The table of the receivers: their figures and, if there is room, their digests; width: of the terminal, in columns."""
+    """The table of the receivers: their metrics and, if there is room, their digests; width: of the terminal, in columns."""
     wide = width >= _DIGEST_WIDTH
     return rich_table(closing.receivers_table(summary, wide), tight=not wide, short_heads=not wide)
 

@@ -9,7 +9,7 @@ from rich.table import Table
 
 from evedrop.cli.report import left_out_line, terminal
 from evedrop.model.checks import toml_of
-from evedrop.model.figures.text import figure_text
+from evedrop.model.metrics.text import number_text
 
 if TYPE_CHECKING:
     from evedrop.model.theory.schedules import MeanSchedule, ScheduleDesign
@@ -47,5 +47,5 @@ def _slots(schedule: MeanSchedule) -> Table:
         shown.add_column(head, justify="right", no_wrap=True)
     for k, row in enumerate(zip(schedule.mu_d, schedule.user, schedule.eavesdropper, strict=True)):
         mu_d, ours, theirs = row
-        shown.add_row(str(k), figure_text(mu_d, ".6g"), figure_text(ours), figure_text(theirs))
+        shown.add_row(str(k), number_text(mu_d, ".6g"), number_text(ours), number_text(theirs))
     return shown

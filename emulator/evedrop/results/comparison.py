@@ -86,7 +86,7 @@ class SimulatedError:
 
     @property
     def typical(self) -> float:
-        """The figure to compare by: the mean over trials, or the median if the variance is infinite."""
+        """The metric to compare by: the mean over trials, or the median if the variance is infinite."""
         return self.quantiles["0.5"] if self.infinite_variance else self.mean
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from evedrop.errors import UsageError
 from evedrop.results.growing_tables import UNFINISHED, finish, is_unfinished, last_round
-from evedrop.results.reading import Results, age_of_figures
+from evedrop.results.reading import Results, age_of_metrics
 from evedrop.results.writer import ResultsWriter, write_summary
 from evedrop.scenario.tables import Scenario
 from evedrop.score.scorekeeper import RunOutcome, summary_of
@@ -23,16 +23,16 @@ from evedrop.score.totals import Totals
 def note_end(folder: Path, scenario: Scenario, how: str) -> Summary:
     """Write the reason for the run's end into its summary, and finish the tables that could not be finished before.
 
-    The figures are the last that were written; if they are of an earlier slot than the rows, the first line of `ended` says so.
+    The metrics are the last that were written; if they are of an earlier slot than the rows, the first line of `ended` says so.
 
     Raises OSError if the folder cannot be written.
     """
     left_behind = is_unfinished(folder)
     rows = last_round(folder)
-    how = noted(how, age_of_figures(folder))
+    how = noted(how, age_of_metrics(folder))
     try:
         summary = replace(Results.read(folder).typed_summary, ended=how)
-    except UsageError:  # there are no figures
+    except UsageError:  # there are no metrics
         totals = Totals.nothing(scenario, scenario.trials)
         summary = summary_of(scenario, totals, dict.fromkeys(scenario.digested), RunOutcome(0.0, how))
         summary = replace(summary, slots=rows.slots)

@@ -204,13 +204,13 @@ def last_round(folder: Path) -> TableRound:
     return TableRound()
 
 
-def write_figures(folder: Path, text: str) -> None:
+def write_metrics(folder: Path, text: str) -> None:
     """Write the summary of the run so far; the file is complete at any moment."""
     replace_private(folder / UNFINISHED / _SUMMARY, text)
 
 
-def figures_path(folder: Path) -> Path:
-    """The path to which `write_figures` writes."""
+def metrics_path(folder: Path) -> Path:
+    """The path to which `write_metrics` writes."""
     return folder / UNFINISHED / _SUMMARY
 
 

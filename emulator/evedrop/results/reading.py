@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 from evedrop.errors import UsageError
 from evedrop.model.digest import DIGEST_BYTES
 from evedrop.model.streams import MOST_SLOTS
-from evedrop.results.growing_tables import batches_of, figures_path, goes_on, is_unfinished, last_round, schema_of
+from evedrop.results.growing_tables import batches_of, goes_on, is_unfinished, last_round, metrics_path, schema_of
 from evedrop.results.summary_file import plain
 from evedrop.results.tables import DIGESTS, JOURNAL, NULLABLE, SLOTS, inputs_schema_in, trials_schema
 from evedrop.scenario.arguments import path_argument
@@ -249,7 +249,7 @@ def _is_event(found: Any) -> bool:
 
 
 def _cut_short(folder: Path) -> dict[str, Any]:
-    """The last figures that were written, as the summary of a results folder that has no summary yet."""
+    """The last metrics that were written, as the summary of a results folder that has no summary yet."""
     found = last_round(folder)
     at = found.at
     if not at:
@@ -257,34 +257,34 @@ def _cut_short(folder: Path) -> dict[str, Any]:
             f"{folder} has nothing yet: its run has just begun, or was killed then; run the scenario again"
         )
     try:
-        summary = _read_summary(figures_path(folder))
+        summary = _read_summary(metrics_path(folder))
     except UsageError:
-        summary = _no_figures(folder)
+        summary = _no_metrics(folder)
     ended = (
         f"the run goes on, at {at}"
         if goes_on(folder)
         else f"cut short at {at}, because its run was killed or its disk was full"
     )
-    return {**summary, "slots": found.slots, "ended": ended + age_of_figures(folder)}
+    return {**summary, "slots": found.slots, "ended": ended + age_of_metrics(folder)}
 
 
-def age_of_figures(folder: Path) -> str:
-    """What `ended` of an unfinished results folder adds if its figures are of an earlier moment than its rows."""
+def age_of_metrics(folder: Path) -> str:
+    """What `ended` of an unfinished results folder adds if its metrics are of an earlier moment than its rows."""
     rows = last_round(folder)
     try:
-        figures = _read_summary(figures_path(folder))
-        at, slots = figures["ended"], figures["slots"]
-    except UsageError:  # no figures have been written
+        metrics = _read_summary(metrics_path(folder))
+        at, slots = metrics["ended"], metrics["slots"]
+    except UsageError:  # no metrics have been written
         at, slots = "slot 0", 0
     return as_of(at, slots < rows.slots) if rows.at and at != rows.at else ""
 
 
 def as_of(moment: str, more: bool = True) -> str:
-    """What `ended` adds if figures are of an earlier moment. more: whether the tables have slots that the figures lack."""
-    return f" (the figures are as of {moment}{'; the tables have more' if more else ''})"
+    """What `ended` adds if metrics are of an earlier moment. more: whether the tables have slots that the metrics lack."""
+    return f" (the metrics are as of {moment}{'; the tables have more' if more else ''})"
 
 
-def _no_figures(folder: Path) -> dict[str, Any]:
+def _no_metrics(folder: Path) -> dict[str, Any]:
     """The summary of a run that was killed before it wrote one. Raises UsageError if its scenario cannot be read."""
     # Only this case needs theory and the scenario to read results.
     from evedrop.scenario.loading.recorded import recorded  # noqa: PLC0415
@@ -294,8 +294,8 @@ def _no_figures(folder: Path) -> dict[str, Any]:
     found = recorded(folder)
     if not found.complete:
         raise UsageError(
-            f"{folder} has no figures yet, and theory needs its classes, which are not built in; looking at results imports "
-            "none: look again when the run has figures, or run the scenario again"
+            f"{folder} has no metrics yet, and theory needs its classes, which are not built in; looking at results imports "
+            "none: look again when the run has metrics, or run the scenario again"
         )
     scenario = found.scenario
     nothing = Totals.nothing(scenario, scenario.trials)

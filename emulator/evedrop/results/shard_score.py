@@ -20,7 +20,7 @@ _NAME = "score"
 def dump_score(totals: Totals, folder: Path, scenario: Scenario) -> None:
     """Write the totals to a results folder; the file is complete at any moment, and private to this user.
 
-    scenario: that of the shard. The figure of a package whose tally is not data fails, which the totals then say.
+    scenario: that of the shard. The metric of a package whose tally is not data fails, which the totals then say.
 
     Raises OSError.
     """

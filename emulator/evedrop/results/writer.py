@@ -26,7 +26,7 @@ from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Codes, Flags
 from evedrop.names import CONTROLLER
 from evedrop.results.folder import HeldFolder
-from evedrop.results.growing_tables import BATCH_BYTES, UNFINISHED, TableStream, Unfinished, finish, write_figures
+from evedrop.results.growing_tables import BATCH_BYTES, UNFINISHED, TableStream, Unfinished, finish, write_metrics
 from evedrop.results.summary_file import plain, summary_text, write_summary
 from evedrop.results.tables import (
     DIGESTS,
@@ -50,7 +50,7 @@ from evedrop.score.sums import SlotSums
 _ROUND_SECONDS = 3.0  # the longest time between rounds, which a killed writer loses
 _ROUND_BYTES = (32 * 2**10, 4 * 2**20)  # the most that is held back, at the start of a run and later
 _ROUND_SHARE = 8  # at most this fraction (one in 8) of the bytes on disk is held back
-_FIGURES_SHARE = 50  # after figures took some time, none are computed for 50 times as long
+_METRICS_SHARE = 50  # after metrics took some time, none are computed for 50 times as long
 
 __all__ = [
     "DIGESTS", "JOURNAL", "NULLABLE", "SLOTS", "ResultsWriter", "plain", "seen_actions", "write_summary",
@@ -102,9 +102,9 @@ class ResultsWriter:
         self._outdated: list[TableStream] = []
         self._restarts = self._bytes = self._on_disk = self._slots = 0
         self._at = "slot 0"
-        self._broken = self._figures_before = False
-        self._round_due = self._figures_due = time.monotonic() + _ROUND_SECONDS
-        self._with_figures: Callable[[], None] = lambda: None
+        self._broken = self._metrics_before = False
+        self._round_due = self._metrics_due = time.monotonic() + _ROUND_SECONDS
+        self._with_metrics: Callable[[], None] = lambda: None
         self._round()
 
     def _stream(self, name: str, number: int) -> TableStream:
@@ -112,10 +112,10 @@ class ResultsWriter:
         return TableStream(self._held.now / UNFINISHED / f"{name}-{number}.arrows", schema, names)
 
     @classmethod
-    def of(cls, folder: Path, scenario: Scenario, with_figures: Callable[[], None] = lambda: None) -> Self:
+    def of(cls, folder: Path, scenario: Scenario, with_metrics: Callable[[], None] = lambda: None) -> Self:
         """A writer for the results of a scenario.
 
-        with_figures: called before figures are written; their rows are on disk by then.
+        with_metrics: called before metrics are written; their rows are on disk by then.
         """
         loop = (
             None
@@ -125,7 +125,7 @@ class ResultsWriter:
         states, around = len(scenario.process.A), scenario.process.around
         program = scenario.process if scenario.process.source == "zenoh" else None
         writer = cls(folder, scenario.receivers, states, around, loop, monitor_of(scenario) is not None, program)
-        writer._with_figures = with_figures
+        writer._with_metrics = with_metrics
         return writer
 
     def __enter__(self) -> Self:
@@ -153,50 +153,50 @@ class ResultsWriter:
         if failure is not None and error is None:
             raise failure
 
-    def checkpoint(self, at: str, figures: Callable[[], Summary], before: Callable[[], None] = lambda: None) -> None:
+    def checkpoint(self, at: str, metrics: Callable[[], Summary], before: Callable[[], None] = lambda: None) -> None:
         """Write rows to disk if some seconds have passed since the last round, or if many are held back.
 
-        at: how far the run came, in words; figures: returns the summary so far, called more rarely if it takes long;
-        before: called before figures. Raises OSError if the disk is full or the folder is gone.
+        at: how far the run came, in words; metrics: returns the summary so far, called more rarely if it takes long;
+        before: called before metrics. Raises OSError if the disk is full or the folder is gone.
         """
         self._at = at
         began = time.monotonic()
         least, most = _ROUND_BYTES
         if began < self._round_due and self._bytes < min(most, max(least, self._on_disk // _ROUND_SHARE)):
             return
-        first = not self._figures_before
-        due = first or began >= self._figures_due
+        first = not self._metrics_before
+        due = first or began >= self._metrics_due
         if due:
             before()
-        if first:  # rows without figures could not be looked at, if the run were killed now
-            earliest = figures()
-            self._round(lambda: self.write_figures(earliest))
-            self._figures_before = True
+        if first:  # rows without metrics could not be looked at, if the run were killed now
+            earliest = metrics()
+            self._round(lambda: self.write_metrics(earliest))
+            self._metrics_before = True
         else:
             self._round()
         self._round_due = time.monotonic() + _ROUND_SECONDS
         if due:
-            self._figures_due = self._round_due
-        if due and not first:  # the first figures import the theory, so their time says nothing about the next
-            self.write_figures(figures())
+            self._metrics_due = self._round_due
+        if due and not first:  # the first metrics import the theory, so their time says nothing about the next
+            self.write_metrics(metrics())
             now = time.monotonic()
-            self._figures_due = now + max(_ROUND_SECONDS, _FIGURES_SHARE * (now - began))
+            self._metrics_due = now + max(_ROUND_SECONDS, _METRICS_SHARE * (now - began))
 
     def write_rows(self, at: str) -> None:
         """Write all rows to disk now. Raises OSError as `checkpoint` does."""
         self._at = at
         self._round()
 
-    def settle(self, at: str, figures: Summary) -> None:
-        """Write everything to disk, with the last figures; no rows may follow. Raises OSError as `checkpoint` does."""
+    def settle(self, at: str, metrics: Summary) -> None:
+        """Write everything to disk, with the last metrics; no rows may follow. Raises OSError as `checkpoint` does."""
         self._at = at
         self._round()
-        self.write_figures(figures)
+        self.write_metrics(metrics)
 
-    def write_figures(self, figures: Summary) -> None:
+    def write_metrics(self, metrics: Summary) -> None:
         """Write the summary so far, of a run that has not ended."""
-        self._with_figures()
-        write_figures(self._held.now, summary_text(replace(figures, ended=self._at)))
+        self._with_metrics()
+        write_metrics(self._held.now, summary_text(replace(metrics, ended=self._at)))
 
     def restart_slots(self) -> None:
         """Discard the rows of all slots; other rows will replace them."""

@@ -123,7 +123,7 @@ def application_mistakes(tables: ValidTables) -> Iterator[str]:
         elif name in tables.application_tables:
             yield from _named_mistakes(name, application, tables.application_tables[name], tables)
         if name in tables.receivers[1:]:
-            yield f"eavesdroppers.{name}: is a name that the {name}'s figures use; expected another"
+            yield f"eavesdroppers.{name}: is a name that the {name}'s metrics use; expected another"
 
 
 def _named_mistakes(name: str, application: type[Application], table: Table, tables: ValidTables) -> Iterator[str]:

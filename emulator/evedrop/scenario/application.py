@@ -1,6 +1,6 @@
 """The hook for applications: uses of a closed loop's plant.
 
-An application has a table of its own in a scenario, figures in the summary and in expectations, lines in the closing report,
+An application has a table of its own in a scenario, metrics in the summary and in expectations, lines in the closing report,
 panels in the view and a picture of a sweep. Nothing else names an application: it asks those whose tables a scenario contains.
 
 Source: docs/your-own.md, applications.
@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 from evedrop.errors import NotRegistered
 from evedrop.model.controllers import Assignment, Controller
-from evedrop.model.figures import error_column
-from evedrop.model.figures.standard_error import standard_error
-from evedrop.model.figures.text import estimate
 from evedrop.model.integrity.monitor import MonitoredSlots, MonitorPlan
+from evedrop.model.metrics import error_column
+from evedrop.model.metrics.standard_error import standard_error
+from evedrop.model.metrics.text import estimate
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process
 from evedrop.model.registry import Registry
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 Summary = Mapping[str, Any]
-"""An application's entry of the summary: its figures by name, and under `receivers` those of each receiver."""
+"""An application's entry of the summary: its metrics by name, and under `receivers` those of each receiver."""
 Kind = Literal["inputs", "disturbances", "states"]
 """A kind of quantity that has names."""
 RECEIVERS, STANDARD_ERRORS = "receivers", "standard_errors"
@@ -116,18 +116,18 @@ class ApplicationTally(ABC):
 
     @abstractmethod
     def summary(self) -> Summary:
-        """The summary's entry: every figure, a number or None; under `receivers`, each receiver's figures by its name."""
+        """The summary's entry: every metric, a number or None; under `receivers`, each receiver's metrics by its name."""
 
     @property
     def of_trials(self) -> Mapping[tuple[str, ...], Floats]:
-        """The place of a figure in the summary's entry → what it is the mean of, for every trial, (R,); by default none.
+        """The place of a metric in the summary's entry → what it is the mean of, for every trial, (R,); by default none.
 
-        These figures have standard errors, at the same places of `standard_errors` in the entry.
+        These metrics have standard errors, at the same places of `standard_errors` in the entry.
         """
         return {}
 
     def entry(self) -> Summary:
-        """The summary's entry, with the standard errors of its figures if there are any."""
+        """The summary's entry, with the standard errors of its metrics if there are any."""
         errors: dict[str, Any] = {}
         for (*outer, name), values in self.of_trials.items():
             inner = errors
@@ -200,12 +200,12 @@ class Application(ABC):
     """The entries of its table."""
     names: ClassVar[Mapping[str, Kind]]
     """The entries of its table that name an input or a disturbance of the plant, or a state of the process."""
-    figures: ClassVar[tuple[str, ...]]
-    """Its figures in the summary that expectations and sweeps can use."""
-    receiver_figures: ClassVar[tuple[str, ...]] = ()
-    """Its figures for each receiver, likewise."""
-    metrics: ClassVar[tuple[str, ...]] = ()
-    """Those of `figures` that `evedrop run --metrics` serves."""
+    metrics: ClassVar[tuple[str, ...]]
+    """Its metrics in the summary that expectations and sweeps can use."""
+    receiver_metrics: ClassVar[tuple[str, ...]] = ()
+    """Its metrics for each receiver, likewise."""
+    served_metrics: ClassVar[tuple[str, ...]] = ()
+    """Those of `metrics` that `evedrop run --metrics` serves."""
     has_monitor: ClassVar[bool] = False
     """Whether it can have a monitor."""
     has_power: ClassVar[bool] = False
@@ -256,12 +256,12 @@ class Application(ABC):
 
     @classmethod
     def draw_sweep(cls, path: Path, table: pa.Table, key: str) -> None:
-        """Draw its figures in a sweep over the entry `key`, as `path`.png and `path`.pdf; by default nothing."""
+        """Draw its metrics in a sweep over the entry `key`, as `path`.png and `path`.pdf; by default nothing."""
         del path, table, key
 
     @classmethod
-    def figure(cls, summary: Summary, path: Sequence[str]) -> float | None:
-        """A figure by its path, as in an expectation but without the application's name: FIGURE, or RECEIVER and FIGURE."""
+    def metric(cls, summary: Summary, path: Sequence[str]) -> float | None:
+        """A metric by its path, as in an expectation but without the application's name: METRIC, or RECEIVER and METRIC."""
         inner: Any = summary
         for part in _place(path):
             inner = inner[part]
@@ -269,7 +269,7 @@ class Application(ABC):
 
     @classmethod
     def standard_error(cls, summary: Summary, path: Sequence[str]) -> float | None:
-        """The standard error of a figure by its path, as above; None if it has none."""
+        """The standard error of a metric by its path, as above; None if it has none."""
         inner: Any = summary.get(STANDARD_ERRORS, {})
         for part in _place(path):
             inner = {} if inner is None else inner.get(part)
@@ -277,19 +277,19 @@ class Application(ABC):
 
     @classmethod
     def text(cls, summary: Summary, path: Sequence[str], how: str = ".4g") -> str:
-        """A figure by its path, as above, with its standard error: 0.0123 ± 0.0004; how: its format without one."""
-        return estimate(cls.figure(summary, path), cls.standard_error(summary, path), how)
+        """A metric by its path, as above, with its standard error: 0.0123 ± 0.0004; how: its format without one."""
+        return estimate(cls.metric(summary, path), cls.standard_error(summary, path), how)
 
     @classmethod
     def sweep_columns(cls, summary: Summary, receiver: str) -> dict[str, float | None]:
         """Its columns in a receiver's row of a sweep's table: column → value."""
-        paths = {name: [name] for name in cls.figures} | {name: [receiver, name] for name in cls.receiver_figures}
-        found = {name: cls.figure(summary, path) for name, path in paths.items()}
+        paths = {name: [name] for name in cls.metrics} | {name: [receiver, name] for name in cls.receiver_metrics}
+        found = {name: cls.metric(summary, path) for name, path in paths.items()}
         return found | {error_column(name): cls.standard_error(summary, path) for name, path in paths.items()}
 
 
 def _place(path: Sequence[str]) -> Sequence[str]:
-    """The place of a figure in its application's entry of the summary."""
+    """The place of a metric in its application's entry of the summary."""
     return (RECEIVERS, *path) if len(path) > 1 else path
 
 

@@ -1,4 +1,4 @@
-"""`[[expect]]`: a condition that a run must meet: on a figure, on a link, on secrecy, or on when a receiver is in step.
+"""`[[expect]]`: a condition that a run must meet: on a metric, on a link, on secrecy, or on when a receiver is in step.
 
 Source: docs/scenario.md, expect.
 """
@@ -14,8 +14,8 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field
 
 from evedrop.model.checks import is_number
-from evedrop.model.figures import expectable_figures, figures_of, unloadable_figures
-from evedrop.model.figures.links import LINK_FIGURES
+from evedrop.model.metrics import expectable_metrics, metrics_of, unloadable_metrics
+from evedrop.model.metrics.links import LINK_METRICS
 from evedrop.scenario.application import APPLICATIONS, Application
 from evedrop.scenario.table import Found, Number, Table, expected, one_of
 from evedrop.scenario.words import as_toml, listed
@@ -27,14 +27,14 @@ LINKS, DIRECTIONS = "links", "directions"
 _LOST_BY = re.compile(r"lost_by\.[a-z][a-z0-9_-]*")
 _COMPARISONS = ("below", "above", "near", "within", "within_relative")
 _ENTRIES: Mapping[str, tuple[str, ...]] = {
-    "figure": (*_COMPARISONS, "slots", "quantile"),
+    "metric": (*_COMPARISONS, "slots", "quantile"),
     "link": (),
     "secrecy": ("against", "direction"),
     "in_step": ("by", "since"),
 }
 """The subjects an expectation may have → the entries that go with each."""
 _EXAMPLES: Mapping[str, str] = {
-    "figure": 'figure = "legitimate.mean_squared_error"',
+    "metric": 'metric = "legitimate.mean_squared_error"',
     "link": 'link = "legitimate"',
     "secrecy": 'secrecy = "relative"',
     "in_step": 'in_step = "legitimate"',
@@ -61,9 +61,9 @@ Slot = Annotated[int, Field(strict=True, ge=0)]
 
 
 class ExpectTable(Table):
-    """`[[expect]]`: one of `figure`, `link`, `secrecy` and `in_step`, with the entries that go with it."""
+    """`[[expect]]`: one of `metric`, `link`, `secrecy` and `in_step`, with the entries that go with it."""
 
-    figure: Annotated[str | None, Field(examples=["legitimate.mean_squared_error"])] = None
+    metric: Annotated[str | None, Field(examples=["legitimate.mean_squared_error"])] = None
     below: Annotated[Number | None, Field(examples=[0.01])] = None
     above: Annotated[Number | None, Field(examples=[0.01])] = None
     near: Annotated[Number | None, Field(examples=[0.01])] = None
@@ -86,7 +86,7 @@ class ExpectTable(Table):
         kinds = [kind for kind in _ENTRIES if kind in given]
         if not kinds:
             meant = [kind for kind, entries in _ENTRIES.items() if any(name in given for name in entries)]
-            kind = meant[0] if meant else "figure"
+            kind = meant[0] if meant else "metric"
             others = ", or one of " + ", ".join(name for name in _ENTRIES if name != kind) if not meant else ""
             return [(kind, f"is missing; expected {_EXAMPLES[kind]}{others}")]
         if len(kinds) > 1:
@@ -99,12 +99,12 @@ class ExpectTable(Table):
             for name in entries
             if other != kind and name in given
         ]
-        check = {"figure": _figure_mistakes, "link": _nothing, "secrecy": _secrecy_mistakes, "in_step": _step_mistakes}
+        check = {"metric": _metric_mistakes, "link": _nothing, "secrecy": _secrecy_mistakes, "in_step": _step_mistakes}
         return found + check[kind](table)
 
     @property
     def kind(self) -> str:
-        """Its subject: `figure`, `link`, `secrecy` or `in_step`."""
+        """Its subject: `metric`, `link`, `secrecy` or `in_step`."""
         return next(kind for kind in _ENTRIES if getattr(self, kind) is not None)
 
     @property
@@ -129,7 +129,7 @@ class ExpectTable(Table):
         """The expectation as a sentence."""
         of_direction = "" if self.direction is None else f" of {self.direction}"
         subject = {
-            "figure": self.figure,
+            "metric": self.metric,
             "link": f"link {self.link}",
             "secrecy": f"{self.secrecy} secrecy{of_direction} against {self.against}",
             "in_step": f"{self.in_step} in step",
@@ -141,7 +141,7 @@ class ExpectTable(Table):
         return f"{subject} {self.wanted}"
 
     def holds(self, found: float) -> bool:
-        """Whether a figure meets the expectation."""
+        """Whether a metric meets the expectation."""
         if (self.below is not None and not found < self.below) or (self.above is not None and not found > self.above):
             return False
         if self.near is None:
@@ -150,15 +150,15 @@ class ExpectTable(Table):
         return abs(found - self.near) <= (self.within if self.within is not None else relative * abs(self.near))
 
 
-def link_figure(figure: str) -> tuple[str, tuple[str, ...]] | None:
-    """The receiver of a link's figure, and the figure's path in the account of the link; None for a receiver's own figure."""
-    parts = figure.split(".")
+def link_metric(metric: str) -> tuple[str, tuple[str, ...]] | None:
+    """The receiver of a link's metric, and the metric's path in the account of the link; None for a receiver's own metric."""
+    parts = metric.split(".")
     return (parts[1], tuple(parts[2:])) if parts[0] == LINKS and len(parts) > 2 else None
 
 
-def direction_figure(figure: str) -> tuple[str, str] | None:
-    """The receiver and the direction of a direction's figure; None for any other."""
-    parts = figure.split(".")
+def direction_metric(metric: str) -> tuple[str, str] | None:
+    """The receiver and the direction of a direction's metric; None for any other."""
+    parts = metric.split(".")
     return (parts[1], parts[2]) if parts[0] == DIRECTIONS and len(parts) == 3 else None
 
 
@@ -167,8 +167,8 @@ def _nothing(table: Mapping[str, Any]) -> list[Found]:
     return []
 
 
-def _figure_mistakes(table: Mapping[str, Any]) -> list[Found]:
-    """Mistakes unless there is a bound to compare with, and slots or a quantile only for a figure that allows them."""
+def _metric_mistakes(table: Mapping[str, Any]) -> list[Found]:
+    """Mistakes unless there is a bound to compare with, and slots or a quantile only for a metric that allows them."""
     below, above, middle = (table.get(name) for name in ("below", "above", "near"))
     distances = [name for name in ("within", "within_relative") if table.get(name) is not None]
     found: list[Found] = []
@@ -185,23 +185,23 @@ def _figure_mistakes(table: Mapping[str, Any]) -> list[Found]:
         found.append(("within_relative", "is set, but any fraction of near = 0 is 0; expected within"))
     if below is not None and above is not None and is_number(below) and is_number(above) and not above < below:
         found.append(("above", f"is {as_toml(above)}, and below is {as_toml(below)}; expected above < below"))
-    figure = table["figure"]
-    if not isinstance(figure, str):
+    metric = table["metric"]
+    if not isinstance(metric, str):
         return found
-    link = link_figure(figure)
+    link = link_metric(metric)
     for name in ("slots", "quantile"):
-        if direction_figure(figure) is not None and table.get(name) is not None:
+        if direction_metric(metric) is not None and table.get(name) is not None:
             found.append((name, "is set, but the error in a direction is the mean of the whole run; remove the line"))
         if link is not None and table.get(name) is not None:
-            instead = f"expected none, or the figure {link[0]}.received_fraction"
+            instead = f"expected none, or the metric {link[0]}.received_fraction"
             found.append((name, f"is set, but a link's account is of the whole run; {instead}"))
-    known = expectable_figures()
-    of_receiver = known.get(figure.rpartition(".")[2])
+    known = expectable_metrics()
+    of_receiver = known.get(metric.rpartition(".")[2])
     if link is None and table.get("quantile") is not None and of_receiver is not None and not of_receiver.by_trial:
         instead = (
-            f"expected a figure that every trial has: {listed([name for name, one in known.items() if one.by_trial])}"
+            f"expected a metric that every trial has: {listed([name for name, one in known.items() if one.by_trial])}"
         )
-        found.append(("quantile", f"is set, but {figure} is not known trial by trial; {instead}"))
+        found.append(("quantile", f"is set, but {metric} is not known trial by trial; {instead}"))
     return found
 
 
@@ -238,15 +238,15 @@ class Around:
     """Names of the process's directions; None if its table has a mistake."""
 
     def mistakes(self, expectation: ExpectTable) -> list[Found]:
-        """Unknown receivers and figures, slots beyond the run, and quantiles of too few trials."""
+        """Unknown receivers and metrics, slots beyond the run, and quantiles of too few trials."""
         found: list[Found] = []
-        direction = None if expectation.figure is None else direction_figure(expectation.figure)
-        if expectation.figure is not None and (direction is None or direction[0] not in self.receivers):
-            found += self._figure_mistakes(expectation.figure)
-            application = expectation.figure.partition(".")[0]
+        direction = None if expectation.metric is None else direction_metric(expectation.metric)
+        if expectation.metric is not None and (direction is None or direction[0] not in self.receivers):
+            found += self._metric_mistakes(expectation.metric)
+            application = expectation.metric.partition(".")[0]
             if application in self.applications:
                 mean = (
-                    f"is set, but the {application}'s figures are means over trials of the whole run; remove the line"
+                    f"is set, but the {application}'s metrics are means over trials of the whole run; remove the line"
                 )
                 found += [(name, mean) for name in ("slots", "quantile") if getattr(expectation, name) is not None]
         names = {"link": self.receivers, "in_step": self.receivers, "against": self.receivers[1:]}
@@ -267,53 +267,53 @@ class Around:
         return f"expected {listed(self.directions)}{near(name, self.directions)}"
 
     def _direction_mistakes(self, expectation: ExpectTable) -> list[Found]:
-        """Directions that the process does not have, as the entry `direction` or in a figure."""
+        """Directions that the process does not have, as the entry `direction` or in a metric."""
         named = [("direction", expectation.direction, "")]
-        figure = None if expectation.figure is None else direction_figure(expectation.figure)
-        if figure is not None and figure[0] in self.receivers:
-            named.append(("figure", figure[1], f"{DIRECTIONS}.{figure[0]}."))
+        metric = None if expectation.metric is None else direction_metric(expectation.metric)
+        if metric is not None and metric[0] in self.receivers:
+            named.append(("metric", metric[1], f"{DIRECTIONS}.{metric[0]}."))
         return [
             (entry, f"is {as_toml(before + name)}; {what}")
             for entry, name, before in named
             if name is not None and (what := self._unknown_direction(name)) is not None
         ]
 
-    def _figure_mistakes(self, figure: str) -> list[Found]:
-        link = link_figure(figure)
+    def _metric_mistakes(self, metric: str) -> list[Found]:
+        link = link_metric(metric)
         if link is not None and link[0] in self.receivers and _LOST_BY.fullmatch(".".join(link[1])):
             return []
-        known = expectable_figures()
-        own = [f"{receiver}.{name}" for receiver in self.receivers for name in figures_of(receiver) if name in known]
-        links = [f"{LINKS}.{receiver}.{name}" for receiver in self.receivers for name in LINK_FIGURES]
-        first = figure.partition(".")[0]
+        known = expectable_metrics()
+        own = [f"{receiver}.{name}" for receiver in self.receivers for name in metrics_of(receiver) if name in known]
+        links = [f"{LINKS}.{receiver}.{name}" for receiver in self.receivers for name in LINK_METRICS]
+        first = metric.partition(".")[0]
         if first not in self.receivers and first in APPLICATIONS:
-            return self._application_mistakes(figure, first, APPLICATIONS[first])
-        name = figure.rpartition(".")[2]
-        if figure not in [*own, *links]:
-            broken = unloadable_figures().get(name)
+            return self._application_mistakes(metric, first, APPLICATIONS[first])
+        name = metric.rpartition(".")[2]
+        if metric not in [*own, *links]:
+            broken = unloadable_metrics().get(name)
             if broken is not None:
-                return [("figure", f"is {as_toml(figure)}{broken}")]
-            names = f"RECEIVER ({', '.join(self.receivers)}).FIGURE ({', '.join(known)})"
-            of_links = f"{LINKS}.RECEIVER.FIGURE ({', '.join(LINK_FIGURES)}, lost_by.REASON)"
-            hint = near(figure, [*own, *links])
-            return [("figure", f"is {as_toml(figure)}; expected {names} or {of_links}{hint}")]
+                return [("metric", f"is {as_toml(metric)}{broken}")]
+            names = f"RECEIVER ({', '.join(self.receivers)}).METRIC ({', '.join(known)})"
+            of_links = f"{LINKS}.RECEIVER.METRIC ({', '.join(LINK_METRICS)}, lost_by.REASON)"
+            hint = near(metric, [*own, *links])
+            return [("metric", f"is {as_toml(metric)}; expected {names} or {of_links}{hint}")]
         why = self.no_theory(first) if link is None and known[name].needs_theory else None
         if why is not None:
-            return [("figure", f"is {as_toml(figure)}, but {why}; expected another figure")]
+            return [("metric", f"is {as_toml(metric)}, but {why}; expected another metric")]
         return []
 
-    def _application_mistakes(self, figure: str, name: str, application: type[Application]) -> list[Found]:
-        own, of_receivers = application.figures, application.receiver_figures
+    def _application_mistakes(self, metric: str, name: str, application: type[Application]) -> list[Found]:
+        own, of_receivers = application.metrics, application.receiver_metrics
         if name not in self.applications:
-            wanted = f"expected a table [{name}], or another figure"
-            return [("figure", f"is {as_toml(figure)}, but there is no {name}; {wanted}")]
+            wanted = f"expected a table [{name}], or another metric"
+            return [("metric", f"is {as_toml(metric)}, but there is no {name}; {wanted}")]
         known = [f"{name}.{one}" for one in own]
         known += [f"{name}.{receiver}.{one}" for receiver in self.receivers for one in of_receivers]
-        if figure in known:
+        if metric in known:
             return []
-        choice = [f"{name}.FIGURE ({', '.join(own)})"] if own else []
-        choice += [f"{name}.RECEIVER.FIGURE ({', '.join(of_receivers)})"] if of_receivers else []
-        return [("figure", f"is {as_toml(figure)}; expected {' or '.join(choice)}{near(figure, known)}")]
+        choice = [f"{name}.METRIC ({', '.join(own)})"] if own else []
+        choice += [f"{name}.RECEIVER.METRIC ({', '.join(of_receivers)})"] if of_receivers else []
+        return [("metric", f"is {as_toml(metric)}; expected {' or '.join(choice)}{near(metric, known)}")]
 
     def _slot_mistakes(self, expectation: ExpectTable) -> list[Found]:
         if self.slots is None:

@@ -135,7 +135,7 @@ class Scenario(Table):
         NemesisTable | None, Field(examples=[{"faults": ["kill", "cut"], "every": 200, "lasting": 50}])
     ] = None
     expect: Annotated[
-        list[ExpectTable], Field(examples=[[{"figure": "legitimate.mean_squared_error", "below": 0.01}]])
+        list[ExpectTable], Field(examples=[[{"metric": "legitimate.mean_squared_error", "below": 0.01}]])
     ] = Field(default_factory=list)
     made_with: Annotated[dict[str, str], Field(exclude=True)] = Field(default_factory=dict)
     _applications: dict[str, Table] = PrivateAttr(default_factory=dict)

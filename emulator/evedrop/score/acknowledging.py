@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.model.acknowledgements import AckChannelSpec, rates_of
-from evedrop.model.figures.standard_error import standard_error
+from evedrop.model.metrics.standard_error import standard_error
 from evedrop.model.numeric.detection import Chart, chart_for
 from evedrop.model.receiver import Flags
 from evedrop.names import LEGITIMATE

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from evedrop.model.delays import delay_of
-from evedrop.model.figures.links import LinkAccount
 from evedrop.model.kernels.elementary import sum_in_order
 from evedrop.model.links import loss_of
 from evedrop.model.links.link import Chain, LossModel
+from evedrop.model.metrics.links import LinkAccount
 from evedrop.model.parts_of_runs import parts_of
 from evedrop.model.slot.link import LinkSchedule
 from evedrop.model.slot.link_law import stretches

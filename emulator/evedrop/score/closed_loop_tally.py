@@ -12,8 +12,8 @@ from typing import final
 
 import numpy as np
 
-from evedrop.model.figures.standard_error import standard_error
 from evedrop.model.input_aware import Offset
+from evedrop.model.metrics.standard_error import standard_error
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Codes
@@ -159,7 +159,7 @@ class LoopTally:
         assert scenario.controller is not None  # noqa: S101 - else there is no tally
         knows = scenario.legitimate.knows_input
         errors = [
-            user.figure("mean_squared_error"),
+            user.metric("mean_squared_error"),
             self.other_error / self.trial_slots if self._offset and self.trial_slots else None,
         ]
         return ControllerSummary(
@@ -173,13 +173,13 @@ class LoopTally:
             failed_fraction=self.failed / self.trial_slots if self.trial_slots else None,
             clipped_fraction=self.clipped / self.trial_slots if self.trial_slots else None,
             mean_squared_errors=dict(zip(ESTIMATORS, errors[::-1] if knows else errors, strict=True)),
-            mean_trace_covariance=user.figure("mean_trace_covariance"),
+            mean_trace_covariance=user.metric("mean_trace_covariance"),
             digest=digest,
             standard_errors=self._standard_errors(user, knows),
         )
 
     def _standard_errors(self, user: PeerSummary, knows: bool) -> StandardErrors:
-        """The standard errors of the figures; user: the summary's entry on the legitimate estimator."""
+        """The standard errors of the metrics; user: the summary's entry on the legitimate estimator."""
         slots, *totals = self.of_trials
         alike = bool(slots.all()) and bool((slots == slots[0]).all())
         failed, clipped, other = (standard_error(total / slots) if alike else None for total in totals)

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from evedrop.model.figures.standard_error import standard_error
+from evedrop.model.metrics.standard_error import standard_error
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.expected.expectations import Expectation
 from evedrop.score.rare_events import rare_events_of, z_of_error

@@ -15,7 +15,7 @@ import numpy as np
 
 from evedrop.model.links.link import REASONS
 from evedrop.scenario.application import APPLICATIONS, Summary
-from evedrop.scenario.expect import ExpectTable, direction_figure, link_figure
+from evedrop.scenario.expect import ExpectTable, direction_metric, link_metric
 from evedrop.scenario.tables import Scenario
 from evedrop.score.summary import MODES, DirectionSummary, Found, Judged, LinkSummary, PeerSummary
 from evedrop.score.sums import Tally
@@ -58,38 +58,38 @@ class Evidence:
         return [self._judged(expect, replay) for expect in self.scenario.expect]
 
     def _judged(self, expect: ExpectTable, replay: str | None) -> Judged:
-        judge = {"figure": self._figure, "link": self._link, "secrecy": self._secrecy, "in_step": self._in_step}
+        judge = {"metric": self._metric, "link": self._link, "secrecy": self._secrecy, "in_step": self._in_step}
         found, held = judge[expect.kind](expect)
         return Judged(expect.text, held, found, expect.wanted, replay if held is False else None)
 
-    def _figure(self, expect: ExpectTable) -> tuple[float | None, bool | None]:
-        name = str(expect.figure)
-        link = link_figure(name)
+    def _metric(self, expect: ExpectTable) -> tuple[float | None, bool | None]:
+        name = str(expect.metric)
+        link = link_metric(name)
         application, *path = name.split(".")
-        direction = direction_figure(name)
+        direction = direction_metric(name)
         if direction is not None:
             entry = self.directions.get(direction[0], {}).get(direction[1])
             found = None if entry is None else entry.mean_squared_error
         elif application in self.scenario.applications:
             summary = self.applications.get(application)
-            found = None if summary is None else APPLICATIONS[application].figure(summary, path)
+            found = None if summary is None else APPLICATIONS[application].metric(summary, path)
         else:
             found = self._of_link(*link) if link is not None else self._of_receiver(expect, *name.split("."))
         return found, None if found is None else expect.holds(found)
 
     def _of_link(self, receiver: str, path: tuple[str, ...]) -> float | None:
-        """A figure of a link's account, or of its losses by reason: 0 for a reason that did not occur."""
+        """A metric of a link's account, or of its losses by reason: 0 for a reason that did not occur."""
         entries: Mapping[str, object] = vars(self.links[receiver])
-        *place, figure = path
+        *place, metric = path
         for part in place:
             inner = entries.get(part)
             entries = inner if isinstance(inner, Mapping) else {}
-        value = entries.get(figure, 0 if place == ["lost_by"] and figure in REASONS else None)
+        value = entries.get(metric, 0 if place == ["lost_by"] and metric in REASONS else None)
         return value if isinstance(value, (int, float)) else None
 
-    def _of_receiver(self, expect: ExpectTable, receiver: str, figure: str) -> float | None:
-        """A figure of the whole run or of some slots, or a quantile of it over trials."""
-        whole = self.peers[receiver].figure(figure)
+    def _of_receiver(self, expect: ExpectTable, receiver: str, metric: str) -> float | None:
+        """A metric of the whole run or of some slots, or a quantile of it over trials."""
+        whole = self.peers[receiver].metric(metric)
         wanted = watch_of(self.scenario, expect)
         if whole is None or wanted is None:
             return whole

@@ -11,9 +11,9 @@ from typing import final
 
 import numpy as np
 
-from evedrop.model.figures.standard_error import standard_error, z_of
 from evedrop.model.kernels.elementary import sum_in_order
 from evedrop.model.local_filter import LocalFilter, Steps
+from evedrop.model.metrics.standard_error import standard_error, z_of
 from evedrop.model.process import Floats
 from evedrop.model.streams import Batch
 from evedrop.names import SENSOR

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from evedrop.model.figures.standard_error import mean_skewness, z_of
+from evedrop.model.metrics.standard_error import mean_skewness, z_of
 from evedrop.model.process import Floats
 from evedrop.scenario.expected.expectations import Expectation
 from evedrop.score.summary import RARE_SHARE, RareEvents

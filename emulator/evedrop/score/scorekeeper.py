@@ -13,8 +13,8 @@ from typing import NamedTuple, final
 import numpy as np
 
 from evedrop.model.digest import Digests, RunDigest, block_starts
-from evedrop.model.figures import figures_of
-from evedrop.model.figures.figure import COVARIANCE_ONLY, ScoredSlots
+from evedrop.model.metrics import metrics_of
+from evedrop.model.metrics.metric import COVARIANCE_ONLY, ScoredSlots
 from evedrop.model.process import Floats
 from evedrop.names import CONTROLLER, LEGITIMATE
 from evedrop.scenario.expected.expectations import Expectation, ExpectedTraceStream, expectations_of
@@ -146,7 +146,7 @@ def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | N
     """The summary of a run; digests: process → its digest, None if it has none or the run was cut short.
 
     An accused process has no digest either, because its reports were contradicted. A run to the end in which a package's
-    figure failed is not `complete`: it ended with that failure.
+    metric failed is not `complete`: it ended with that failure.
     """
     tallies, detection, loop = totals.tallies, totals.detection, totals.loop
     digests = {name: None if name in ending.accused else one for name, one in digests.items()}
@@ -158,7 +158,7 @@ def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | N
     secret = {one.eavesdropper: one for one in verdicts(scenario, tallies)}
     directions = directions_of(tallies, expected)
     expectations = Evidence(scenario, peers, links, tallies, secret, applications, directions).judged(ending.replay)
-    # Known only now that every figure has been computed.
+    # Known only now that every metric has been computed.
     failures = totals.failures if ending.how == RunOutcome.how else []
     return Summary(
         scenario=scenario.title,
@@ -192,27 +192,27 @@ def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | N
 def _peer(name: str, tally: Tally, expected: Expectation, digest: str | None, mode: str) -> PeerSummary:
     """A receiver's entry of the summary."""
     infinite_variance = expected.infinite_variance
-    figures: dict[str, float | None] = {}
+    metrics: dict[str, float | None] = {}
     of_mode: dict[str, float | None] = {}
     errors: dict[str, float | None] = {}
-    for figure, one in figures_of(name).items():
+    for metric, one in metrics_of(name).items():
         if one.only_in_mode not in {None, mode}:
             continue
-        found = None if one.not_in_mode == mode else tally.figure(figure)
-        (figures if one.only_in_mode is None else of_mode)[figure] = found
+        found = None if one.not_in_mode == mode else tally.metric(metric)
+        (metrics if one.only_in_mode is None else of_mode)[metric] = found
         if one.rests_on != "theory":
             meaningless = found is None or (one.of_error and infinite_variance)
-            errors[figure] = None if meaningless else tally.standard_error(figure)
-    known, comparable = {**figures, **of_mode}, not expected.of_model or mode == COVARIANCE_ONLY
+            errors[metric] = None if meaningless else tally.standard_error(metric)
+    known, comparable = {**metrics, **of_mode}, not expected.of_model or mode == COVARIANCE_ONLY
     rare = rare_events_of(expected, tally) if comparable else None
     z = {
-        figure: z_of_error(tally.of_trials(figure), known[one.expected], expected, tally.done, rare)
-        if comparable and known[figure] is not None
+        metric: z_of_error(tally.of_trials(metric), known[one.expected], expected, tally.done, rare)
+        if comparable and known[metric] is not None
         else None
-        for figure, one in figures_of(name).items()
-        if one.expected is not None and figure in errors
+        for metric, one in metrics_of(name).items()
+        if one.expected is not None and metric in errors
     }
-    return PeerSummary(figures, _quantiles(tally), infinite_variance, digest, of_mode, errors, z, rare)
+    return PeerSummary(metrics, _quantiles(tally), infinite_variance, digest, of_mode, errors, z, rare)
 
 
 def _quantiles(tally: Tally) -> dict[str, float] | None:
@@ -257,25 +257,25 @@ def events_of(scenario: Scenario, done: int) -> list[RunEvent]:
 
 
 def verification_of(scenario: Scenario, accused: Collection[str] = ()) -> dict[str, Verification]:
-    """The entry `verification` of a live run's summary: receiver → the verified figures, and those that rest on its word.
+    """The entry `verification` of a live run's summary: receiver → the verified metrics, and those that rest on its word.
 
     accused: processes whose misbehaviour ended the run.
     """
     recorded = _recorded_of(scenario)
     found = {}
     for name in scenario.receivers:
-        figures = {who: _resting_on(who, name) for who in ("observer", "receiver", "recorded trials")}
-        checked, of_recorded = figures["observer"], [*figures["recorded trials"], "digest"]
+        metrics = {who: _resting_on(who, name) for who in ("observer", "receiver", "recorded trials")}
+        checked, of_recorded = metrics["observer"], [*metrics["recorded trials"], "digest"]
         verified = [] if name in accused else checked + (of_recorded if recorded == scenario.trials else [])
-        own_word = [one for one in (*checked, *figures["receiver"], *of_recorded) if one not in verified]
+        own_word = [one for one in (*checked, *metrics["receiver"], *of_recorded) if one not in verified]
         found[name] = Verification(0 if name in accused else recorded, verified, own_word)
     return found
 
 
 def _resting_on(who: str, receiver: str) -> list[str]:
-    """The figures of a receiver of a live run with this value of `rests_on`."""
-    figures = figures_of(receiver).items()
-    return [name for name, one in figures if one.rests_on == who and one.only_in_mode is None]
+    """The metrics of a receiver of a live run with this value of `rests_on`."""
+    metrics = metrics_of(receiver).items()
+    return [name for name, one in metrics if one.rests_on == who and one.only_in_mode is None]
 
 
 def _recorded_of(scenario: Scenario) -> int:

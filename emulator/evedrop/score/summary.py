@@ -1,6 +1,6 @@
 """The contents of summary.json as typed classes: `Summary`, and a class for each kind of entry in it.
 
-The fields of a class are the entry's keys, in their order. Entries of applications and figures of receivers are open:
+The fields of a class are the entry's keys, in their order. Entries of applications and metrics of receivers are open:
 packages add to them.
 
 Source: docs/results.md, summary.json.
@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 
 from evedrop.errors import UnknownName
 from evedrop.model.entries import plain
-from evedrop.model.figures import FIGURES
-from evedrop.model.figures.links import LinkAccount
-from evedrop.model.figures.text import estimate
+from evedrop.model.metrics import METRICS
+from evedrop.model.metrics.links import LinkAccount
+from evedrop.model.metrics.text import estimate
 from evedrop.scenario import application
 from evedrop.scenario.progress_events import ConnectionOutage, RunEvent
-from evedrop.score.built_in_figures import BuiltInFigures
+from evedrop.score.built_in_metrics import BuiltInMetrics
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
@@ -30,7 +30,7 @@ Found = float | int | str | None
 
 
 StandardErrors = Mapping[str, float | Mapping[str, float | None] | None]
-"""Figure → its standard error, None if it has none; for figures by name, such as those of receivers, a further mapping."""
+"""Metric → its standard error, None if it has none; for metrics by name, such as those of receivers, a further mapping."""
 MODES: Mapping[str, str] = {
     "live": "",
     "exact": "",
@@ -74,41 +74,41 @@ class RareEstimate:
 
 
 @dataclass(frozen=True)
-class PeerSummary(BuiltInFigures):
-    """The entry of a receiver; its built-in figures are attributes."""
+class PeerSummary(BuiltInMetrics):
+    """The entry of a receiver; its built-in metrics are attributes."""
 
-    figures: Mapping[str, float | None]
-    """Name of the figure → its value; None if it has none."""
+    metrics: Mapping[str, float | None]
+    """Name of the metric → its value; None if it has none."""
     error_quantiles: Mapping[str, float] | None
     infinite_variance: bool
     digest: str | None
-    mode_figures: Mapping[str, float | None] = field(default_factory=dict)
-    """The figures that only the run's mode has."""
+    mode_metrics: Mapping[str, float | None] = field(default_factory=dict)
+    """The metrics that only the run's mode has."""
     standard_errors: Mapping[str, float | None] = field(default_factory=dict)
-    """Name of a figure → its standard error, for figures that are estimated; None if it has none."""
+    """Name of a metric → its standard error, for metrics that are estimated; None if it has none."""
     z: Mapping[str, float | None] = field(default_factory=dict)
-    """Name of a figure that theory expects → its z-score; None if that is unknown, or rare events carry too much of it."""
+    """Name of a metric that theory expects → its z-score; None if that is unknown, or rare events carry too much of it."""
     rare_events: RareEvents | None = None
     """None: unknown."""
     rare_estimate: RareEstimate | None = None
     """None, and left out of the entry: not asked for."""
 
     @property
-    def all_figures(self) -> dict[str, float | None]:
-        """The figures, and those of the mode."""
-        return {**self.figures, **self.mode_figures}
+    def all_metrics(self) -> dict[str, float | None]:
+        """The metrics, and those of the mode."""
+        return {**self.metrics, **self.mode_metrics}
 
-    def figure(self, name: str) -> float | None:
-        """A figure by its name; None if this receiver has no value of it. Raises UnknownName if there is no such figure."""
-        if name not in self.all_figures and name not in FIGURES.names:
-            raise UnknownName("figure", name, self.all_figures)
-        return self.all_figures.get(name)
+    def metric(self, name: str) -> float | None:
+        """A metric by its name; None if this receiver has no value of it. Raises UnknownName if there is no such metric."""
+        if name not in self.all_metrics and name not in METRICS.names:
+            raise UnknownName("metric", name, self.all_metrics)
+        return self.all_metrics.get(name)
 
     def as_dict(self) -> dict[str, Any]:
         """The entry of summary.json."""
         left_out = {"rare_estimate"} if self.rare_estimate is None else set[str]()
         own = {name: _entry(getattr(self, name)) for name in _PEER if name not in left_out}
-        return {**self.figures, **own, **self.mode_figures}
+        return {**self.metrics, **own, **self.mode_metrics}
 
 
 _PEER = ("error_quantiles", "standard_errors", "z", "infinite_variance", "rare_events", "rare_estimate", "digest")
@@ -138,7 +138,7 @@ class LinkSummary(LinkAccount):
 
 @dataclass(frozen=True)
 class Verification:
-    """Which figures of a receiver were verified, and which rest on its own word."""
+    """Which metrics of a receiver were verified, and which rest on its own word."""
 
     recomputed_trials: int
     verified: Sequence[str]
@@ -399,13 +399,13 @@ def _entry(value: Any) -> Any:
 
 
 def _peer_fields(peer: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of `PeerSummary` in a receiver's entry: figures come before its other entries, those of a mode after them."""
+    """The fields of `PeerSummary` in a receiver's entry: metrics come before its other entries, those of a mode after them."""
     names = list(peer)
     start, stop = names.index(_PEER[0]), names.index(_PEER[-1])
     return {
-        "figures": {name: peer[name] for name in names[:start]},
+        "metrics": {name: peer[name] for name in names[:start]},
         **{name: peer[name] for name in _PEER if name in peer},  # those of an older version have fewer
-        "mode_figures": {name: peer[name] for name in names[stop + 1 :]},
+        "mode_metrics": {name: peer[name] for name in names[stop + 1 :]},
     }
 
 

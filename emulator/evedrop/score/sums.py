@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.model.block_sums import BlockSums, added_in_order
-from evedrop.model.figures import figure
-from evedrop.model.figures.figure import ReceiverTotals, TotalsFigure, TrialTotals
-from evedrop.model.figures.standard_error import standard_error
 from evedrop.model.kernels.current import kernels
+from evedrop.model.metrics import metric
+from evedrop.model.metrics.metric import ReceiverTotals, TotalsMetric, TrialTotals
+from evedrop.model.metrics.standard_error import standard_error
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Codes, Flags
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
@@ -144,7 +144,7 @@ class Tally(ReceiverTotals):
     """The number of slots of the whole run."""
     trials: int
     watched: Watched = field(default_factory=lambda: Watched((), 0))
-    """Further totals that its figures and expectations need."""
+    """Further totals that its metrics and expectations need."""
     done: int = 0
     """Slots that all trials have reached."""
     conditional: ConditionalError | None = None
@@ -245,10 +245,10 @@ class Tally(ReceiverTotals):
             self.delays = np.zeros(account.delays.size, np.int64)
         self.delays += account.delays
 
-    def figure(self, name: str) -> float | None:
-        """A figure of the run by its name; None if it has no value."""
-        found = figure(name)
-        if not issubclass(found, TotalsFigure):
+    def metric(self, name: str) -> float | None:
+        """A metric of the run by its name; None if it has no value."""
+        found = metric(name)
+        if not issubclass(found, TotalsMetric):
             return self.watched.tally(WatchedSlots(name, 0, self.slots)).value
         value = found.of_totals(self) if self.offered else math.nan
         return None if math.isnan(value) else value
@@ -259,21 +259,21 @@ class Tally(ReceiverTotals):
         return self.done > 0 and self.offered == self.done * self.trials
 
     def of_trials(self, name: str) -> Floats | None:
-        """What a figure is the mean of, for every trial, (R,).
+        """What a metric is the mean of, for every trial, (R,).
 
-        None if the figure is not such a mean, if that is not known, or if trials were cut short at different slots.
+        None if the metric is not such a mean, if that is not known, or if trials were cut short at different slots.
         """
-        found = figure(name)
+        found = metric(name)
         if not (found.averages_trials and self.alike):
             return None
-        if issubclass(found, TotalsFigure):
+        if issubclass(found, TotalsMetric):
             error: Floats = self.window_errors.sum(axis=0)
             sums = found.sums_of_trials(TrialTotals(error, self.traces, self.packets[0], self.packets[1]))
             return None if sums is None else sums / self.done
         return self.watched.tally(WatchedSlots(name, 0, self.slots)).of_trials if found.by_trial else None
 
     def standard_error(self, name: str) -> float | None:
-        """The standard error of a figure of the run; None if it has none."""
+        """The standard error of a metric of the run; None if it has none."""
         return standard_error(self.of_trials(name))
 
 

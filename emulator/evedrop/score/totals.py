@@ -52,13 +52,13 @@ class Totals:
         )
 
     def begin(self) -> None:
-        """Make the tallies of packages' figures now, not with the first slot: an example of all that totals consist of."""
+        """Make the tallies of packages' metrics now, not with the first slot: an example of all that totals consist of."""
         for tally in self.tallies.values():
             tally.watched.begin()
 
     @property
     def failures(self) -> list[str]:
-        """Why figures of packages failed, in words."""
+        """Why metrics of packages failed, in words."""
         return [failure for tally in self.tallies.values() for failure in tally.watched.failures]
 
     @classmethod

@@ -12,8 +12,8 @@ from enum import StrEnum
 
 import numpy as np
 
-from evedrop.model.figures.standard_error import ratio_error, skewed_test, student_test
-from evedrop.model.figures.text import count_text, estimate
+from evedrop.model.metrics.standard_error import ratio_error, skewed_test, student_test
+from evedrop.model.metrics.text import count_text, estimate
 from evedrop.model.parts_of_runs import parts_of
 from evedrop.model.process import Floats
 from evedrop.model.theory.covariances import NOBODY, ExpectedCovariance

@@ -1,4 +1,4 @@
-"""Quantities of a receiver that its totals do not have: figures over some slots, packages' figures, when it was in step.
+"""Quantities of a receiver that its totals do not have: metrics over some slots, packages' metrics, when it was in step.
 
 They take a number for each trial and expectation. A trial's numbers are added slot by slot, so they have the same bits
 however its slots and the other trials were divided, live and in memory.
@@ -13,8 +13,8 @@ from typing import NamedTuple, TypeVar, final
 import numpy as np
 
 from evedrop.errors import NoAnswer
-from evedrop.model.figures import FIGURES, figure, figures_of
-from evedrop.model.figures.figure import FigureTally, ScoredSlots, TotalsFigure
+from evedrop.model.metrics import METRICS, metric, metrics_of
+from evedrop.model.metrics.metric import MetricTally, ScoredSlots, TotalsMetric
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action
 from evedrop.model.registry import place_of
@@ -25,15 +25,15 @@ T = TypeVar("T")
 
 
 @final
-class GuardedTally(FigureTally):
-    """The tally of a package's figure, which never raises an error."""
+class GuardedTally(MetricTally):
+    """The tally of a package's metric, which never raises an error."""
 
     def __init__(self, name: str, trials: int) -> None:
-        """name: the figure's name."""
+        """name: the metric's name."""
         self._name, self._trials = name, trials
         self.failure = ""
-        """Why the figure is None, if it failed."""
-        self._tally: FigureTally | None = None
+        """Why the metric is None, if it failed."""
+        self._tally: MetricTally | None = None
 
     def begin(self) -> None:
         """Make the package's tally now, not with the first slot."""
@@ -54,27 +54,27 @@ class GuardedTally(FigureTally):
 
     @property
     def value(self) -> float | None:
-        """The figure over the slots so far; None if it has no value, or if it is not a number."""
+        """The metric over the slots so far; None if it has no value, or if it is not a number."""
         found = self._asked(lambda: _number(self._begun.value))
         return None if found is None or math.isnan(found) else found
 
     @property
     def of_trials(self) -> Floats | None:
-        """The figure of every trial, (R,); None if it failed."""
+        """The metric of every trial, (R,); None if it failed."""
         return self._asked(lambda: _numbers(self._begun.of_trials, self._trials))
 
     @property
-    def _begun(self) -> FigureTally:
+    def _begun(self) -> MetricTally:
         if self._tally is None:
-            found: object = figure(self._name).tally(self._trials)
-            if not isinstance(found, FigureTally):
-                raise NoAnswer(f"tally() gave {found!r:.40}; expected a FigureTally")
+            found: object = metric(self._name).tally(self._trials)
+            if not isinstance(found, MetricTally):
+                raise NoAnswer(f"tally() gave {found!r:.40}; expected a MetricTally")
             self._tally = found
         return self._tally
 
     def fail(self, why: str) -> None:
-        """From now on the figure is None; why: in words."""
-        self.failure, self._tally = f"the figure {self._name} of an installed package failed: {why}", None
+        """From now on the metric is None; why: in words."""
+        self.failure, self._tally = f"the metric {self._name} of an installed package failed: {why}", None
 
     def _asked(self, ask: Callable[[], T]) -> T | None:
         if not self.failure:
@@ -105,18 +105,18 @@ class WatchedSlots(NamedTuple):
     """A quantity to keep, over the slots from `first` to before `end`."""
 
     what: str
-    """A figure's name, or `in_step`."""
+    """A metric's name, or `in_step`."""
     first: int
     end: int
 
 
 def watch_of(scenario: Scenario, expect: ExpectTable) -> tuple[str, WatchedSlots] | None:
-    """The receiver and the quantity that an expectation needs; None if the summary's figures are enough."""
+    """The receiver and the quantity that an expectation needs; None if the summary's metrics are enough."""
     if expect.in_step is not None:
         return expect.in_step, WatchedSlots(IN_STEP, _since(scenario, expect), scenario.slots)
-    if expect.figure is None or (expect.slots is None and expect.quantile is None):
+    if expect.metric is None or (expect.slots is None and expect.quantile is None):
         return None
-    receiver, _, name = expect.figure.partition(".")
+    receiver, _, name = expect.metric.partition(".")
     return receiver, WatchedSlots(name, *(expect.slots or (0, scenario.slots)))
 
 
@@ -130,21 +130,21 @@ def _since(scenario: Scenario, expect: ExpectTable) -> int:
 
 
 def watches_of(scenario: Scenario) -> dict[str, tuple[WatchedSlots, ...]]:
-    """Receiver → all quantities that its figures and the scenario's expectations need."""
+    """Receiver → all quantities that its metrics and the scenario's expectations need."""
     wanted = [watch for expect in scenario.expect if (watch := watch_of(scenario, expect)) is not None]
     found = {}
     for receiver in scenario.receivers:
         own = [
             WatchedSlots(name, 0, scenario.slots)
-            for name, one in figures_of(receiver).items()
-            if not issubclass(one, TotalsFigure)
+            for name, one in metrics_of(receiver).items()
+            if not issubclass(one, TotalsMetric)
         ]
         found[receiver] = tuple(dict.fromkeys([*own, *(watch for name, watch in wanted if name == receiver)]))
     return found
 
 
 @final
-class FirstState(FigureTally):
+class FirstState(MetricTally):
     """The first slot of each trial in which a packet was used as the state."""
 
     def __init__(self, trials: int) -> None:
@@ -169,11 +169,11 @@ class FirstState(FigureTally):
         return None if (self._first == _NEVER).any() else int(self._first.max())
 
 
-def _tally(what: str, trials: int) -> FigureTally:
+def _tally(what: str, trials: int) -> MetricTally:
     """A tally of a quantity, of no slots yet."""
     if what == IN_STEP:
         return FirstState(trials)
-    return GuardedTally(what, trials) if FIGURES.foreign(what) else figure(what).tally(trials)
+    return GuardedTally(what, trials) if METRICS.foreign(what) else metric(what).tally(trials)
 
 
 @final
@@ -187,26 +187,26 @@ class Watched:
         """Add the next slots."""
         for watch, kept in self._kept.items():
             start, stop = max(watch.first - slots.first, 0), min(watch.end - slots.first, len(slots.error))
-            stateless = slots.x is None and watch.what != IN_STEP and figure(watch.what).needs_states
+            stateless = slots.x is None and watch.what != IN_STEP and metric(watch.what).needs_states
             if start < stop and not stateless:
                 kept.add(slots if (start, stop) == (0, len(slots.error)) else slots.part(start, stop))
 
     def begin(self) -> None:
-        """Make the tallies of packages' figures now, not with the first slot."""
+        """Make the tallies of packages' metrics now, not with the first slot."""
         for tally in self.of_packages.values():
             tally.begin()
 
     @property
     def of_packages(self) -> dict[WatchedSlots, GuardedTally]:
-        """The tallies of packages' figures."""
+        """The tallies of packages' metrics."""
         return {watch: tally for watch, tally in self._kept.items() if isinstance(tally, GuardedTally)}
 
     @property
     def failures(self) -> list[str]:
-        """Why figures of packages failed, in words."""
+        """Why metrics of packages failed, in words."""
         return [tally.failure for tally in self.of_packages.values() if tally.failure]
 
-    def tally(self, watch: WatchedSlots) -> FigureTally:
+    def tally(self, watch: WatchedSlots) -> MetricTally:
         """The tally of a quantity over its slots."""
         return self._kept[watch]
 

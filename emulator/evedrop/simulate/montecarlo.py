@@ -149,7 +149,7 @@ def simulate(scenario: Scenario, folder: Path, on_event: OnEvent, plan: Plan = P
         if not merger.complete or (plan.rare and stop.is_set()):
             raise Interrupted.with_results(place)
         kept.forget()
-    if summary.ended != how:  # a figure failed
+    if summary.ended != how:  # a metric failed
         raise RunError(summary.ended)
     return 1 if summary.failed_expectations else 0
 

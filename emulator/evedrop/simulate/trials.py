@@ -14,7 +14,7 @@ from typing import final
 import numpy as np
 
 from evedrop.model.digest import Digests
-from evedrop.model.figures.figure import ScoredSlots
+from evedrop.model.metrics.metric import ScoredSlots
 from evedrop.model.process import Floats
 from evedrop.model.slot.account import Account, Accountant
 from evedrop.scenario.expected.expectations import KnownTraces, expected_traces_of
@@ -71,7 +71,7 @@ class BatchResult:
 @final
 @dataclass(frozen=True)
 class TrialsTask(Task[BatchResult]):
-    """Some consecutive blocks of trials, of which all figures are kept."""
+    """Some consecutive blocks of trials, of which all metrics are kept."""
 
     mode: Mode
 

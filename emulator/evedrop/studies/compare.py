@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from evedrop.errors import Interrupted, RunError, UsageError
-from evedrop.model.figures.errors import MeanSquaredError
-from evedrop.model.figures.standard_error import standard_error
+from evedrop.model.metrics.errors import MeanSquaredError
+from evedrop.model.metrics.standard_error import standard_error
 from evedrop.model.schemes import scheme_of
 from evedrop.names import LEGITIMATE
 from evedrop.results.comparison import Cell, Comparison, Needs, PacketLeak, SchemeResult, SimulatedError, Theory

@@ -15,7 +15,7 @@ from typing import final
 import numpy as np
 
 from evedrop.errors import UsageError
-from evedrop.model.figures.standard_error import ratio_error, standard_error
+from evedrop.model.metrics.standard_error import ratio_error, standard_error
 from evedrop.model.process import Floats
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.tables import Scenario

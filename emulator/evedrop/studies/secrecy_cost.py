@@ -1,7 +1,7 @@
 """The energy that secrecy costs: a scenario's scheme against `plain`, over the same link, in the same trials.
 
 A trial is run with the scenario's scheme and with `plain`, with the same noise of the plant and the same losses, and each
-time also with a controller that sees the truth. Every figure is made from differences within a trial, so its standard error
+time also with a controller that sees the truth. Every metric is made from differences within a trial, so its standard error
 is that of the mean of the trials' differences.
 
 Source: docs/microgrid.md, what does secrecy cost in energy.
@@ -34,7 +34,7 @@ MEASURES = ("net", "total", "summed")
 
 @dataclass(frozen=True)
 class MeanEstimate:
-    """The mean over trials of a figure."""
+    """The mean over trials of a metric."""
 
     mean: float
     standard_error: float
@@ -44,7 +44,7 @@ class MeanEstimate:
 
     @classmethod
     def of_trials(cls, trials: Floats) -> MeanEstimate:
-        """From the figure of each trial, (R,), R ≥ 2."""
+        """From the metric of each trial, (R,), R ≥ 2."""
         from scipy.special import stdtrit  # noqa: PLC0415 - 0.2 s that only this needs
 
         mean, error = float(np.mean(trials)), float(np.std(trials, ddof=1)) / len(trials) ** 0.5

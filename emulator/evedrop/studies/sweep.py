@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from evedrop.errors import Interrupted, RunError, ScenarioError, UsageError
-from evedrop.model.figures import all_figures, error_column, estimated_figures, z_column
+from evedrop.model.metrics import all_metrics, error_column, estimated_metrics, z_column
 from evedrop.results.folder import disk_errors, private_pictures, private_replacement, write_private
 from evedrop.scenario.application import APPLICATIONS
 from evedrop.scenario.loading import prepared, value_of
@@ -171,7 +171,7 @@ def _summary(scenario: Scenario, plan: Plan, results: Iterator[BatchResult]) -> 
         return None
     ending = RunOutcome(time.monotonic() - started)
     summary = merger.summary(ending)
-    if summary.ended != ending.how:  # a figure failed
+    if summary.ended != ending.how:  # a metric failed
         raise RunError(summary.ended)
     return summary
 
@@ -201,7 +201,7 @@ def _title(source: str | Path | Scenario) -> str:
 
 
 def _rows(point: Point, scenario: Scenario, summary: Summary) -> Iterator[dict[str, Any]]:
-    """A row for each peer: the point, the figures, the verdict."""
+    """A row for each peer: the point, the metrics, the verdict."""
     for name, peer in summary.peers.items():
         verdict = summary.secrecy.get(name)
         yield {
@@ -209,9 +209,9 @@ def _rows(point: Point, scenario: Scenario, summary: Summary) -> Iterator[dict[s
             "peer": name,
             "slots": scenario.slots,
             "trials": summary.trials,
-            **{figure: peer.figure(figure) for figure in all_figures()},
-            **{error_column(name): peer.standard_errors.get(name) for name in estimated_figures()},
-            **{z_column(name): peer.z.get(name) for name, one in all_figures().items() if one.expected is not None},
+            **{metric: peer.metric(metric) for metric in all_metrics()},
+            **{error_column(name): peer.standard_errors.get(name) for name in estimated_metrics()},
+            **{z_column(name): peer.z.get(name) for name, one in all_metrics().items() if one.expected is not None},
             **{f"error_quantile_{level}": value for level, value in (peer.error_quantiles or {}).items()},
             "infinite_variance": peer.infinite_variance,
             "rare_share": None if peer.rare_events is None else peer.rare_events.share,

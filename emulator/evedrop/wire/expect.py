@@ -14,7 +14,7 @@ from evedrop.model.checks import as_toml
 from evedrop.scenario.table import Found, Table, expected
 from evedrop.scenario.words import listed
 from evedrop.system.hints import near
-from evedrop.wire.figures import WIRE_FIGURES
+from evedrop.wire.metrics import WIRE_METRICS
 from evedrop.wire.units import in_seconds
 
 _BOUNDS = ("below", "above")
@@ -27,11 +27,11 @@ def _bound(value: Any) -> Any:
     return value if seconds is None else seconds
 
 
-def _figure(text: str) -> str:
-    _, dot, figure = text.rpartition(".")
-    if not dot or figure not in WIRE_FIGURES:
-        names = [f"LINK.{one}" for one in WIRE_FIGURES]
-        raise expected(listed(names), near(figure, WIRE_FIGURES))
+def _metric(text: str) -> str:
+    _, dot, metric = text.rpartition(".")
+    if not dot or metric not in WIRE_METRICS:
+        names = [f"LINK.{one}" for one in WIRE_METRICS]
+        raise expected(listed(names), near(metric, WIRE_METRICS))
     return text
 
 
@@ -39,10 +39,10 @@ Bound = Annotated[float, Field(strict=True, ge=0.0, allow_inf_nan=False), Before
 
 
 class WireExpectTable(Table):
-    """`[[expect]]` of a wire file: a figure of a link with its bounds, or a link whose losses must agree with its model."""
+    """`[[expect]]` of a wire file: a metric of a link with its bounds, or a link whose losses must agree with its model."""
 
-    figure: Annotated[
-        str | None, AfterValidator(lambda text: text and _figure(text)), Field(examples=["scan.delivery"])
+    metric: Annotated[
+        str | None, AfterValidator(lambda text: text and _metric(text)), Field(examples=["scan.delivery"])
     ] = None
     below: Annotated[Bound | None, Field(examples=[0.9])] = None
     above: Annotated[Bound | None, Field(examples=[0.5])] = None
@@ -51,22 +51,22 @@ class WireExpectTable(Table):
 
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
-        """Mistakes unless there is a figure with a bound, or a link alone."""
+        """Mistakes unless there is a metric with a bound, or a link alone."""
         given = [name for name, value in table.items() if value is not None]
         if "link" in given:
-            others = [name for name in given if name in {"figure", "quantile", *_BOUNDS}]
+            others = [name for name in given if name in {"metric", "quantile", *_BOUNDS}]
             return [
                 (name, 'is set, but a table with link has no other entries; expected link = "scan" alone')
                 for name in others
             ]
-        if "figure" not in given:
-            return [("figure", 'is missing; expected figure = "scan.delivery" with below or above, or link = "scan"')]
+        if "metric" not in given:
+            return [("metric", 'is missing; expected metric = "scan.delivery" with below or above, or link = "scan"')]
         found = []
         if not set(given) & set(_BOUNDS):
             found.append(("below", "is missing, and so is above; add one of them, or both"))
-        figure = WIRE_FIGURES.get(str(table["figure"]).rpartition(".")[2])
-        if (figure is not None and figure.has_quantile) == ("quantile" not in given):
-            names = [one.name for one in WIRE_FIGURES.values() if one.has_quantile]
+        metric = WIRE_METRICS.get(str(table["metric"]).rpartition(".")[2])
+        if (metric is not None and metric.has_quantile) == ("quantile" not in given):
+            names = [one.name for one in WIRE_METRICS.values() if one.has_quantile]
             said = (
                 f"is missing; a {listed(names)} needs one"
                 if "quantile" not in given
@@ -80,7 +80,7 @@ class WireExpectTable(Table):
     @property
     def subject(self) -> str:
         """The name of the link."""
-        return self.link if self.link is not None else str(self.figure).rpartition(".")[0]
+        return self.link if self.link is not None else str(self.metric).rpartition(".")[0]
 
     @property
     def wanted(self) -> str:
@@ -96,19 +96,19 @@ class WireExpectTable(Table):
         if self.link is not None:
             return f"link {self.link} {self.wanted}"
         quantile = "" if self.quantile is None else f"{self.quantile:.10g} quantile of "
-        return f"{quantile}{self.figure} {self.wanted}"
+        return f"{quantile}{self.metric} {self.wanted}"
 
     def holds(self, found: float) -> bool:
-        """Whether a figure meets the expectation."""
+        """Whether a metric meets the expectation."""
         return (self.below is None or found < self.below) and (self.above is None or found > self.above)
 
 
 def expectation_mistakes(expectations: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Iterator[str]:
     """Mistakes in the names of links, of tables that may be malformed."""
     for i, table in enumerate(expectations):
-        for entry in ("figure", "link"):
+        for entry in ("metric", "link"):
             text = table.get(entry)
-            link = text.rpartition(".")[0] if isinstance(text, str) and entry == "figure" else text
+            link = text.rpartition(".")[0] if isinstance(text, str) and entry == "metric" else text
             if isinstance(link, str) and link and link not in names:
-                choice = f"expected a figure or the name of {listed(names)}" if names else "the file has no link"
+                choice = f"expected a metric or the name of {listed(names)}" if names else "the file has no link"
                 yield f"expect.{i}.{entry}: is {as_toml(text)}, but there is no link {link}; {choice}{near(link, names)}"

@@ -1,4 +1,4 @@
-"""The journal of a wire that runs in another process, or was killed, read from the disk: for its figures so far.
+"""The journal of a wire that runs in another process, or was killed, read from the disk: for its metrics so far.
 
 Source: docs/wire.md, from Python.
 """
@@ -38,7 +38,7 @@ def summary_of_wire(folder: Path) -> WireSummary:
 
 
 def scorekeeper_on_disk(folder: Path, plan: WirePlan) -> WireScorekeeper:
-    """The figures of a wire so far, from its results folder. Raises UsageError if there is no journal."""
+    """The metrics of a wire so far, from its results folder. Raises UsageError if there is no journal."""
     journal = JournalOnDisk(folder, plan)
     scorekeeper = WireScorekeeper(plan, journal)
     journal.read()

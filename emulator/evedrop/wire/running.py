@@ -194,12 +194,12 @@ class RunningWire:
             return WireSummary.read(path)
         return scorekeeper_on_disk(self.folder, self.plan).summary()
 
-    def expect(self, figure: str | None = None, **bounds: Any) -> None:
+    def expect(self, metric: str | None = None, **bounds: Any) -> None:
         """Raise ExpectationFailed if an expectation fails so far.
 
         The arguments are the entries of an `[[expect]]` of a wire file, such as `"scan.delivery", above=0.5`, or `link="scan"`.
         """
-        table = {"figure": figure, **bounds} if figure is not None else bounds
+        table = {"metric": metric, **bounds} if metric is not None else bounds
         plan = wire_of({**tomllib.loads(resolved_wire(self.plan)), "expect": [table]})
         summary = scorekeeper_on_disk(self.folder, plan).summary()
         if failures := failed(summary.expectations):

@@ -33,11 +33,11 @@ from evedrop.results.wire_summary import (
 from evedrop.score.summary import Judged
 from evedrop.system.output import warn
 from evedrop.wire.expect import WireExpectTable
-from evedrop.wire.figures import WIRE_FIGURES
 from evedrop.wire.history import NotedEvent
 from evedrop.wire.journal import AmendmentListener, Listener
 from evedrop.wire.journal_part import REASONS, Records
 from evedrop.wire.law import bounds, expected
+from evedrop.wire.metrics import WIRE_METRICS
 from evedrop.wire.plan import WireLink, WirePlan
 from evedrop.wire.record import UNLINKED, Kind, WireFate
 from evedrop.wire.tallies import LinkTally, StreamTally
@@ -206,8 +206,8 @@ class WireScorekeeper:
         if table.link is not None:
             held, value, lacking = link.within_bounds, link.rate, "the link's models decided on no message"
         else:
-            figure = WIRE_FIGURES[str(table.figure).rpartition(".")[2]]
-            value = figure.value(link, self._links[self._plan.named(table.subject).number], table.quantile)
+            metric = WIRE_METRICS[str(table.metric).rpartition(".")[2]]
+            value = metric.value(link, self._links[self._plan.named(table.subject).number], table.quantile)
             held, lacking = None if value is None else table.holds(value), "no message was delivered"
         if held is not None:
             return Judged(table.text, held, value, table.wanted)

@@ -93,12 +93,12 @@ def test_a_picture_is_of_a_range_of_slots(results: RunResults) -> None:
             results.plot(slots=slots)  # type: ignore[arg-type]
 
 
-def test_a_figure_that_there_is_not_is_an_error(results: RunResults) -> None:
-    """It used to be None, which is what a figure without a value is."""
+def test_a_metric_that_there_is_not_is_an_error(results: RunResults) -> None:
+    """It used to be None, which is what a metric without a value is."""
     peer = results.peers["smart"]
-    assert peer.figure("mean_squared_error") == peer.mean_squared_error
-    with pytest.raises(UnknownName, match="there is no figure 'mse'; expected one of mean_squared_error"):
-        peer.figure("mse")
+    assert peer.metric("mean_squared_error") == peer.mean_squared_error
+    with pytest.raises(UnknownName, match="there is no metric 'mse'; expected one of mean_squared_error"):
+        peer.metric("mse")
 
 
 def test_a_mode_may_be_given_by_its_name() -> None:

@@ -26,11 +26,11 @@ from evedrop.cli.api.given import place_for
 from evedrop.cli.main import parser_of
 from evedrop.cli.options import changes_of
 from evedrop.errors import RunError, ScenarioError, UsageError
-from evedrop.model.figures import all_figures
+from evedrop.model.metrics import all_metrics
 from evedrop.results.by_name import ByName
 from evedrop.scenario.loading import load
 from evedrop.scenario.progress_events import ProgressEvent, RunProgress
-from evedrop.score.built_in_figures import BuiltInFigures
+from evedrop.score.built_in_metrics import BuiltInMetrics
 from evedrop.score.summary import PeerSummary
 from evedrop.show.report import closing
 from evedrop.simulate.montecarlo import Plan
@@ -137,17 +137,17 @@ def test_results_so_far_of_a_failed_call_stay_until_the_program_ends(at_exit: li
         assert (folder.exists(), said) == (False, [])
 
 
-def test_figures_are_attributes_with_types(results: RunResults) -> None:
-    """Every built-in figure, with the number of the summary; an editor knows their names."""
+def test_metrics_are_attributes_with_types(results: RunResults) -> None:
+    """Every built-in metric, with the number of the summary; an editor knows their names."""
     assert list(results.peers) == ["legitimate", "smart"]
     for name, entry in results.summary["peers"].items():
         peer = results.peers[name]
         assert isinstance(peer, PeerSummary)
         assert peer.mean_squared_error == entry["mean_squared_error"] > 0.0
-        for figure in all_figures():
-            assert getattr(peer, figure) == peer.figure(figure)
-    written = {name for name, one in vars(BuiltInFigures).items() if isinstance(one, property)}
-    assert written == set(all_figures())
+        for metric in all_metrics():
+            assert getattr(peer, metric) == peer.metric(metric)
+    written = {name for name, one in vars(BuiltInMetrics).items() if isinstance(one, property)}
+    assert written == set(all_metrics())
     assert results.links["smart"].offered == 48
     assert results.secrecy["smart"].sentence
     assert results.expectations == []

@@ -236,7 +236,7 @@ def said_by(lies: dict[str, Any]) -> Any:
 
 @pytest.mark.parametrize("lie", LIES)
 def test_an_answer_that_is_none_is_refused(lie: str) -> None:
-    """Each answer has a form and a range; one of another is an error that quotes it, not a figure."""
+    """Each answer has a form and a range; one of another is an error that quotes it, not a number."""
     answer, asked = LIES[lie]
     asked(said_by({}))
     with pytest.raises(NoAnswer, match="; expected "):

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("imports_forgotten")
 
 
 def test_the_tutorial_has_short_classes_and_a_scenario() -> None:
-    """Each is complete in less than 40 lines; a figure with its tally, and an application, in less than 50."""
+    """Each is complete in less than 40 lines; a metric with its tally, and an application, in less than 50."""
     blocks = dict(BLOCK.findall(PAGE.read_text(encoding="utf-8")))
     modules = {
         "flipped.py",

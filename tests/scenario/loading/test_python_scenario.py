@@ -100,7 +100,7 @@ def test_a_scenario_from_python_has_the_digests_of_its_file(tmp_path: Path) -> N
         {"encoding.scheme": "inovation"},
         {"eavesdroppers.smart.link.quality": 2.0},
         {"event": [{"at": 900, "cut": "legitimate"}]},
-        {"expect": [{"figure": "nobody.mean_squared_error", "below": 1.0}]},
+        {"expect": [{"metric": "nobody.mean_squared_error", "below": 1.0}]},
     ],
 )
 def test_a_mistake_is_told_as_for_a_file(changes: dict[str, Any]) -> None:

@@ -58,8 +58,8 @@ QUICK: dict[str, Any] = {"slots": 60, "plan": Plan(workers=1)}
 def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A study with a hostile title, in which one expectation fails."""
     expect = [
-        {"figure": "legitimate.received_fraction", "above": 0.5},
-        {"figure": "smart.received_fraction", "above": 2},
+        {"metric": "legitimate.received_fraction", "above": 0.5},
+        {"metric": "smart.received_fraction", "above": 2},
     ]
     folder = tmp_path_factory.mktemp("report") / "study"
     montecarlo("eavesdroppers", trials=20, out=folder, title=HOSTILE, expect=expect, **QUICK)
@@ -73,7 +73,7 @@ def test_a_page_says_what_the_terminal_says_and_does_nothing_else(study: Path) -
     said = "".join(page.texts)
     assert page.headings == [
         HOSTILE,
-        "Verdicts", "Expectations", "Figures", "Errors", "Lost track", "Links", "Repeat it",
+        "Verdicts", "Expectations", "Metrics", "Errors", "Lost track", "Links", "Repeat it",
     ]  # fmt: skip
     assert "1 of 2 expectations FAILED" in page.texts
     cells = [cell for row in closing.receivers_table(summary).rows for cell in row]
@@ -231,7 +231,7 @@ def test_every_mode_has_its_page(tmp_path: Path, mode: Mode) -> None:
     folder = tmp_path / "study"
     montecarlo("vehicle", trials=3, out=folder, slots=30, plan=Plan(mode, workers=1))
     write_report(folder)
-    assert {"Verdicts", "Figures", "Errors"} <= set(checked(folder).headings)
+    assert {"Verdicts", "Metrics", "Errors"} <= set(checked(folder).headings)
 
 
 def slot_by_slot(errors: list[float], traces: list[float], noise: float) -> Iterator[str]:

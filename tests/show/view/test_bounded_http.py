@@ -10,7 +10,7 @@ from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
-from evedrop.live.launch.metrics import MetricsAddress, RunMetrics, metrics_served
+from evedrop.live.launch.metrics_server import MetricsAddress, RunMetrics, metrics_served
 from evedrop.scenario.loading import load
 from evedrop.scenario.progress_events import silent
 from evedrop.show.view.bounded_http import own_host

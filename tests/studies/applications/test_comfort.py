@@ -1,4 +1,4 @@
-"""The heated room: its figures against sums written here, its table, its panels, and shards of it."""
+"""The heated room: its metrics against sums written here, its table, its panels, and shards of it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.packages import install
 SHORT = {"slots": 300, "expect": []}
 
 
-def test_its_figures_are_sums_over_slots(tmp_path: Path) -> None:
+def test_its_metrics_are_sums_over_slots(tmp_path: Path) -> None:
     """From the inputs and states that the run recorded, added up here slot by slot."""
     results = montecarlo(load("heated-room", SHORT), trials=1, out=tmp_path / "run")
     scenario = load("heated-room", SHORT)
@@ -94,9 +94,9 @@ def test_the_view_is_given_every_curve_of_its_panels() -> None:
         ({"comfort.window": 3}, "comfort.window: "),
         ({"comfort": 3}, "comfort: is 3; expected a table"),
         ({"comfrt": {}}, "comfrt: is not an entry of this table; did you mean comfort?"),
-        ({"expect": [{"figure": "comfort.cold", "below": 1.0}]}, 'expect.0.figure: is "comfort.cold"; expected comfort.FIGURE ('),
-        ({"expect": [{"figure": "comfort.bob.known_fraction", "below": 1.0}]}, "expect.0.figure: is "),
-        ({"expect": [{"figure": "comfort.discomfort", "below": 1.0, "quantile": 0.5}]}, "expect.0.quantile: is set, but the com"),
+        ({"expect": [{"metric": "comfort.cold", "below": 1.0}]}, 'expect.0.metric: is "comfort.cold"; expected comfort.METRIC ('),
+        ({"expect": [{"metric": "comfort.bob.known_fraction", "below": 1.0}]}, "expect.0.metric: is "),
+        ({"expect": [{"metric": "comfort.discomfort", "below": 1.0, "quantile": 0.5}]}, "expect.0.quantile: is set, but the com"),
     ],
 )  # fmt: skip
 def test_mistakes_are_named(changes: dict[str, Any], said: str) -> None:
@@ -125,7 +125,7 @@ controller = { strategy = "lqr", state_weights = [1.0], input_weights = [1.0] }
 platoon = { gap = "gap" }
 encoding = { scheme = "innovation", state_probability = 0.5 }
 legitimate = { link = { quality = 0.8 } }
-expect = [{ figure = "platoon.smallest_gap", below = 0.0 }]
+expect = [{ metric = "platoon.smallest_gap", below = 0.0 }]
 """
 PLATOON = {"evedrop.applications": {"platoon": "platooning:Platoon"}}
 

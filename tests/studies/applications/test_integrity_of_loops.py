@@ -1,4 +1,4 @@
-"""Integrity in scenarios: its table and mistakes, its figures against sums written here, its panels, live and in memory."""
+"""Integrity in scenarios: its table and mistakes, its metrics against sums written here, its panels, live and in memory."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PARSIMONIOUS = {"policy": "parsimonious", "watch_from": 0.05, "alarm_from": 0.99
 ATTACK = {"model": "replace", "matrix": [[0.8]]}
 
 
-def test_its_figures_are_those_of_the_recorded_trials(tmp_path: Path) -> None:
+def test_its_metrics_are_those_of_the_recorded_trials(tmp_path: Path) -> None:
     """Alarms, delays, and the watermark's cost, from the tables of forty trials, slot by slot."""
     results = montecarlo("replay-attack", trials=40, record_trials=40, out=tmp_path / "run", **SHORT)
     found, table = results.summary["integrity"], results.inputs

@@ -43,7 +43,7 @@ def leaves(found: Mapping[str, Any], place: tuple[str, ...] = ()) -> dict[tuple[
 
 
 def check(together: Mapping[str, Any], alone: list[Mapping[str, Any]], ignored: tuple[str, ...] = ()) -> None:
-    """Each standard error is that of the values of the single trials; every figure that differs has one."""
+    """Each standard error is that of the values of the single trials; every metric that differs has one."""
     errors = leaves(together[STANDARD_ERRORS])
     singles = [leaves({name: value for name, value in one.items() if name != STANDARD_ERRORS}) for one in alone]
     differ = {place for place in singles[0] if len({one[place] for one in singles}) > 1 and place[0] not in ignored}
@@ -102,7 +102,7 @@ def test_a_sweep_has_the_standard_errors_of_an_application(tmp_path: Path) -> No
 
 
 def test_an_application_without_trials_has_no_standard_errors() -> None:
-    """Its entry is its summary; its figures have no error in the report."""
+    """Its entry is its summary; its metrics have no error in the report."""
 
     class Plain(ApplicationTally):
         def add(self, x: Any, u: Any, estimates: Any) -> None:

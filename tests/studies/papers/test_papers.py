@@ -95,7 +95,7 @@ def test_a_number_agrees_within_the_largest_of_its_tolerances() -> None:
     assert verdict(1.0, 1.05, standard_error=0.01, errors=3.0) is differs
     assert verdict(1.0, 1.05, standard_error=0.03, errors=3.0) is agrees
     assert verdict(1.0, 1.05, standard_error=0.01, errors=3.0, their_error=0.03) is agrees
-    assert verdict(1.0, 2.0, errors=3.0, erratum="the figures are interchanged") is erratum
+    assert verdict(1.0, 2.0, errors=3.0, erratum="the values are interchanged") is erratum
     assert verdict(1.0, float("nan"), relative=0.5) is differs
     with pytest.raises(ValueError, match="no tolerance"):
         verdict(1.0, 1.0)

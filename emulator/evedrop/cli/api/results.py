@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Literal, Protocol, Self
 import pyarrow as pa
 
 from evedrop.cli.api.notebook import table_text
-from evedrop.model.figures import shown_figure
-from evedrop.model.figures.text import figure_text
+from evedrop.model.metrics import shown_metric
+from evedrop.model.metrics.text import number_text
 from evedrop.results.by_name import ByName
 from evedrop.results.comparison import Comparison
 from evedrop.results.reading import Results
@@ -73,7 +73,7 @@ class ReportedResults:
 
 @dataclass(frozen=True, repr=False)
 class RunResults(Results, ReportedResults):
-    """The results of a run or of trials in memory: typed figures, and tables as Arrow.
+    """The results of a run or of trials in memory: typed metrics, and tables as Arrow.
 
     Results in a temporary folder are removed with this object, or when the program ends.
     """
@@ -84,7 +84,7 @@ class RunResults(Results, ReportedResults):
 
     @cached_property
     def peers(self) -> Mapping[str, PeerSummary]:
-        """Receiver → its figures, the legitimate estimator first."""
+        """Receiver → its metrics, the legitimate estimator first."""
         return ByName("receiver", self._typed.peers)
 
     @cached_property
@@ -131,7 +131,7 @@ class RunResults(Results, ReportedResults):
     def __repr__(self) -> str:
         error = ("mean_squared_error", "mean_actual_trace_covariance")
         errors = [
-            f"{name} {figure_text(shown_figure(one.all_figures, error), '.3g')}" for name, one in self.peers.items()
+            f"{name} {number_text(shown_metric(one.all_metrics, error), '.3g')}" for name, one in self.peers.items()
         ]
         remark = "" if self.remark is None else "; incomplete"
         return f"<RunResults of {self._typed.scenario!r}: {self._facts}; mean error: {', '.join(errors)}{remark}>"
@@ -150,7 +150,7 @@ class RunResults(Results, ReportedResults):
 
 @dataclass(frozen=True, repr=False)
 class SweepResults(ReportedResults):
-    """The results of a sweep: `table` has a row for each point and receiver, with every figure and its standard error."""
+    """The results of a sweep: `table` has a row for each point and receiver, with every metric and its standard error."""
 
     folder: Path
     table: pa.Table
@@ -220,7 +220,7 @@ class ComparisonResults(Comparison, ReportedResults):
         for one in self.schemes.values():
             price, kept = (None if math.isnan(error) else error for error in (one.price, one.kept))
             beaten = "–" if kept is None else "no" if one.name in self.dominant else "yes"
-            table.add(one.name, figure_text(price, ".3g"), figure_text(kept, ".3g"), beaten)
+            table.add(one.name, number_text(price, ".3g"), number_text(kept, ".3g"), beaten)
         return table_text(f"{self.title} · {self._facts}", table)
 
 

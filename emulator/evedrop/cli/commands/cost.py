@@ -10,8 +10,8 @@ from evedrop.cli.command import Command
 from evedrop.cli.in_memory import crew, keeping, studied
 from evedrop.cli.options import as_json, entries, scenario
 from evedrop.cli.tables import tables
-from evedrop.model.figures.shown_number import ShownNumber
-from evedrop.model.figures.text import figure_text
+from evedrop.model.metrics.shown_number import ShownNumber
+from evedrop.model.metrics.text import number_text
 from evedrop.system.output import print_json
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def _print(found: SecrecyCost) -> None:
 
 
 def _cells(one: MeanEstimate, scale: float, unit: str) -> tuple[str, str, str]:
-    mean, low, high = (figure_text(scale * value, ".3g") for value in (one.mean, one.low, one.high))
+    mean, low, high = (number_text(scale * value, ".3g") for value in (one.mean, one.low, one.high))
     error = ShownNumber(f"{float(f'{scale * one.standard_error:.3g}'):.2g}", scale * one.standard_error)
     return mean + unit, error, f"{low} to {high}{unit}"
 

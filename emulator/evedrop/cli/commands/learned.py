@@ -10,8 +10,8 @@ from evedrop.cli.command import Command
 from evedrop.cli.in_memory import crew, keeping, studied
 from evedrop.cli.options import as_json, entries, scenario
 from evedrop.cli.tables import tables
-from evedrop.model.figures.shown_number import ShownNumber
-from evedrop.model.figures.text import figure_text
+from evedrop.model.metrics.shown_number import ShownNumber
+from evedrop.model.metrics.text import number_text
 from evedrop.system.output import print_json
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def _print(rows: list[LearningRow], trials: int) -> None:
     for row in rows:
         for learner, values in row.parameters.items():
             cells = (
-                figure_text(one.median, ".3g") + f" ({_with_error(one.mean, one.standard_error)})"
+                number_text(one.median, ".3g") + f" ({_with_error(one.mean, one.standard_error)})"
                 for one in values.values()
             )
             table.add_row(str(row.stop), learner, *cells)
@@ -76,7 +76,7 @@ def _print(rows: list[LearningRow], trials: int) -> None:
 
 def _with_error(value: float, error: float | None) -> ShownNumber:
     if error is None:
-        return figure_text(value, ".3g")
+        return number_text(value, ".3g")
     return ShownNumber(f"{value:.3g} ± {error if error > _ROUNDING * abs(value) else 0.0:.1g}", value, error)
 
 

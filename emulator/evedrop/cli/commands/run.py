@@ -77,7 +77,7 @@ def _metrics(options: argparse.Namespace, scenario: Scenario, folder: Path, line
     if options.metrics is None:
         yield line.on_event
         return
-    from evedrop.live.launch.metrics import MetricsAddress, RunMetrics, metrics_served
+    from evedrop.live.launch.metrics_server import MetricsAddress, RunMetrics, metrics_served
     from evedrop.system.output import warn
 
     address = MetricsAddress.of(options.metrics)

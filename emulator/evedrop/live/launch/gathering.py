@@ -62,7 +62,7 @@ def gather(scenario: Scenario, folder: Path, shards: Sequence[Shard], started: f
     parts = _summaries(shards)
     ending = RunOutcome(
         wall,
-        noted(how, _age_of_figures(shards, scores, parts)),
+        noted(how, _age_of_metrics(shards, scores, parts)),
         replay,
         events=_events(parts),
         outages=_outages(parts),
@@ -113,8 +113,8 @@ def _blocks(shard: Shard, name: str) -> dict[int, Digests]:
     return {int(start): digests[starts == start] for start in np.unique(starts)}
 
 
-def _age_of_figures(shards: Sequence[Shard], scores: Sequence[Totals], summaries: Mapping[int, Summary]) -> str:
-    """What `ended` adds about shards whose observers were killed after their last figures."""
+def _age_of_metrics(shards: Sequence[Shard], scores: Sequence[Totals], summaries: Mapping[int, Summary]) -> str:
+    """What `ended` adds about shards whose observers were killed after their last metrics."""
     earlier = [
         f"slot {score.tallies[LEGITIMATE].done} in shard {shard.number}"
         for shard, score in zip(shards, scores, strict=True)

@@ -380,7 +380,7 @@ class ObservedRun:
         """Close the view, write the summary, and tell the launcher; returns the exit status of the run.
 
         report: prints how the run ended, if it was started by hand. saved: whether all rows are on disk; otherwise the summary
-        has the last figures whose rows are.
+        has the last metrics whose rows are.
         """
         safe = self._recording.close() if self._recording is not None else True
         try:
@@ -388,7 +388,7 @@ class ObservedRun:
             if status == 0 and any(link.unexplained for link in summary.links.values()):
                 status = RunError.exit_status
                 how = "packets are unaccounted for: see links.*.unexplained, and look at the router's log"
-            if status == 0 and summary.ended != how:  # a figure failed
+            if status == 0 and summary.ended != how:  # a metric failed
                 status, how = RunError.exit_status, summary.ended
             if status == 0 and summary.failed_expectations:
                 status = 1

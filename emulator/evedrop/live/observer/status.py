@@ -8,7 +8,7 @@ from __future__ import annotations
 from evedrop.live.observer.conductor import Conductor
 from evedrop.live.observer.steering import Steering
 from evedrop.live.protocol.status import LinkStatus, RunStatus
-from evedrop.model.figures.links import LinkAccount
+from evedrop.model.metrics.links import LinkAccount
 from evedrop.scenario.tables import Scenario
 from evedrop.score.totals import Totals
 

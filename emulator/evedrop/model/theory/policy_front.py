@@ -1,4 +1,4 @@
-"""The performance of transmission policies: figures of user, eavesdropper and sensor in the limit, and the Pareto front.
+"""The performance of transmission policies: metrics of user, eavesdropper and sensor in the limit, and the Pareto front.
 
 Source: docs/mathematics.md, the best policy.
 """
@@ -50,8 +50,8 @@ def policy_chains(send: NDArray[np.bool_], mu: float, mu_e: float) -> tuple[Sens
 
 
 @dataclass(frozen=True)
-class PolicyFigures:
-    """The figures of one policy in the limit: exact, by the stationary law of its chain."""
+class PolicyMetrics:
+    """The metrics of one policy in the limit: exact, by the stationary law of its chain."""
 
     user: float
     """Trace of the user's expected error covariance; inf if it is unbounded."""
@@ -60,16 +60,16 @@ class PolicyFigures:
     transmissions: float
     """The fraction of slots in which the sensor sends."""
 
-    def dominates(self, other: PolicyFigures) -> bool:
-        """Whether one of the three figures is better and none is worse: user and transmissions low, eavesdropper high."""
+    def dominates(self, other: PolicyMetrics) -> bool:
+        """Whether one of the three metrics is better and none is worse: user and transmissions low, eavesdropper high."""
         ours, theirs = self.to_lower, other.to_lower
         return all(a <= b for a, b in zip(ours, theirs, strict=True)) and ours != theirs
 
     @property
     def to_lower(self) -> tuple[float, float, float]:
         """What a good policy has low, to ten digits: the rest is rounding."""
-        figures = (self.user, -self.eavesdropper, self.transmissions)
-        user, eavesdropper, transmissions = (float(f"{one:.10g}") for one in figures)
+        metrics = (self.user, -self.eavesdropper, self.transmissions)
+        user, eavesdropper, transmissions = (float(f"{one:.10g}") for one in metrics)
         return user, eavesdropper, transmissions
 
     def cost(self, weight: float, price: float) -> float:
@@ -97,7 +97,7 @@ class FrontPoint:
     """λ, the cost of a transmission."""
     thresholds: tuple[int, ...]
     """By the eavesdropper's holding time 1 … S: the least holding time of the user at which to send; S + 1: never."""
-    figures: PolicyFigures
+    metrics: PolicyMetrics
     scheduled: int
     """The threshold of `scheduled` that costs least at the larger weight, of those in `Front.thresholds`."""
 
@@ -106,7 +106,7 @@ class FrontPoint:
 class Front:
     """The performance of `scheduled` against one eavesdropper, and that of a sensor that knew both holding times."""
 
-    thresholds: tuple[PolicyFigures, ...]
+    thresholds: tuple[PolicyMetrics, ...]
     """`scheduled` with the thresholds 1, 2 … S."""
     points: tuple[FrontPoint, ...]
     """The best policies, those that another one dominates left out."""
@@ -124,7 +124,7 @@ class Front:
                     "weights": list(point.weights),
                     "price": point.price,
                     "thresholds": list(point.thresholds),
-                    **point.figures.as_dict(),
+                    **point.metrics.as_dict(),
                     "scheduled": point.scheduled,
                 }
                 for point in self.points
@@ -146,30 +146,30 @@ class ScheduledLinks:
     """The same for the eavesdropper."""
 
 
-def policy_figures(process: Process, send: NDArray[np.bool_], mu: float, mu_e: float) -> PolicyFigures:
-    """The figures of a rule by the holding times of both receivers, (S, S); holding times beyond S decide like S.
+def policy_metrics(process: Process, send: NDArray[np.bool_], mu: float, mu_e: float) -> PolicyMetrics:
+    """The metrics of a rule by the holding times of both receivers, (S, S); holding times beyond S decide like S.
 
     The errors are exact: only the decisions are cut off, not the covariances.
 
     Source: docs/mathematics.md, the best policy.
     """
     user, eve, sends = policy_chains(send, mu, mu_e)
-    return _figures(process, user, eve, sends)
+    return _metrics(process, user, eve, sends)
 
 
-def scheduled_figures(process: Process, links: ScheduledLinks, threshold: int) -> PolicyFigures:
-    """The figures of the scheme `scheduled`.
+def scheduled_metrics(process: Process, links: ScheduledLinks, threshold: int) -> PolicyMetrics:
+    """The metrics of the scheme `scheduled`.
 
     Source: docs/mathematics.md, schedules by holding time.
     """
     user = scheduled(threshold, links.mu, links.user)
     eve = scheduled(threshold, links.mu_e, links.eavesdropper)
-    return _figures(process, user, eve, np.arange(threshold) == threshold - 1)
+    return _metrics(process, user, eve, np.arange(threshold) == threshold - 1)
 
 
-def _figures(process: Process, user: SensorChain, eve: SensorChain, sends: Floats | NDArray[np.bool_]) -> PolicyFigures:
+def _metrics(process: Process, user: SensorChain, eve: SensorChain, sends: Floats | NDArray[np.bool_]) -> PolicyMetrics:
     ours, theirs = (float(np.trace(chain.limit(process))) for chain in (user, eve))
-    return PolicyFigures(ours, theirs, float(user.law @ sends))
+    return PolicyMetrics(ours, theirs, float(user.law @ sends))
 
 
 def front(
@@ -181,7 +181,7 @@ def front(
 
     Source: docs/mathematics.md, the best policy.
     """
-    alone = tuple(scheduled_figures(process, links, threshold) for threshold in range(1, states + 1))
+    alone = tuple(scheduled_metrics(process, links, threshold) for threshold in range(1, states + 1))
     points: list[FrontPoint] = []
     never = []
     for price, weight in product(sorted(set(prices)), sorted(set(weights))):
@@ -189,16 +189,16 @@ def front(
         if not policy.ever_sends:
             never.append((weight, price))
             continue
-        found = policy_figures(process, policy.send, links.mu, links.mu_e)
+        found = policy_metrics(process, policy.send, links.mu, links.mu_e)
         cheapest = _cheapest(alone, weight, price)
-        if points and points[-1].price == price and points[-1].figures.to_lower == found.to_lower:
+        if points and points[-1].price == price and points[-1].metrics.to_lower == found.to_lower:
             points[-1] = replace(points[-1], weights=(points[-1].weights[0], weight), scheduled=cheapest)
         else:
             points.append(FrontPoint((weight, weight), price, policy.thresholds, found, cheapest))
-    kept = [one for one in points if not any(other.figures.dominates(one.figures) for other in points)]
+    kept = [one for one in points if not any(other.metrics.dominates(one.metrics) for other in points)]
     return Front(alone, tuple(kept), tuple(never), len(points) - len(kept))
 
 
-def _cheapest(figures: Sequence[PolicyFigures], weight: float, price: float) -> int:
+def _cheapest(metrics: Sequence[PolicyMetrics], weight: float, price: float) -> int:
     """The threshold, from 1 on, of the least cost; of equal ones the one with the least error of the user."""
-    return min(range(len(figures)), key=lambda i: (figures[i].cost(weight, price), figures[i].user)) + 1
+    return min(range(len(metrics)), key=lambda i: (metrics[i].cost(weight, price), metrics[i].user)) + 1

@@ -85,7 +85,7 @@ class LossChecks:
         return self._fates(model, 0, self._uniforms(model, problem))
 
     def shapes(self, problem: Problem) -> None:
-        """Fates, and the figures that the model states, have the right shapes and types."""
+        """Fates, and the numbers that the model states, have the right shapes and types."""
         self._whole(problem)
         model, slots = self._made(), range(problem.slots)
         with calling("quality, quality_at(), rate_variance()", self._kind):

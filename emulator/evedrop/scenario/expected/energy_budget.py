@@ -25,7 +25,7 @@ def _finite(value: float) -> float | None:
 
 
 @dataclass(frozen=True)
-class ThresholdFigures:
+class ThresholdMetrics:
     """What one threshold costs and achieves in the long run."""
 
     threshold: float
@@ -52,9 +52,9 @@ class BudgetDesign:
     """Energy of an encrypted packet."""
     user: float
     """The trace of the user's expected error covariance in the limit, whatever the threshold is."""
-    best: ThresholdFigures
+    best: ThresholdMetrics
     """The least threshold that meets the budget."""
-    others: tuple[ThresholdFigures, ...]
+    others: tuple[ThresholdMetrics, ...]
     """The whole thresholds 1, 2, …"""
     left_out: dict[str, str]
     """Eavesdropper → strategy, for those whose error has no closed form."""
@@ -111,17 +111,17 @@ def budget_of(scenario: Scenario, budget: float) -> BudgetDesign:
             + ("" if arrives else f"; no acknowledgement arrives, so nothing less than {encrypted:g} is enough")
         )
 
-    def figures(one: float) -> ThresholdFigures:
+    def metrics(one: float) -> ThresholdMetrics:
         fraction = encrypted_fraction(one, arrives)
         errors = {}
         for eavesdropper in forms:
             form = stated_form(_with(scenario, one), eavesdropper)
             if form is not None:
                 errors[eavesdropper] = form.limit
-        return ThresholdFigures(one, fraction, model.spent(scheme, 1.0, fraction), errors)
+        return ThresholdMetrics(one, fraction, model.spent(scheme, 1.0, fraction), errors)
 
-    others = tuple(figures(float(whole)) for whole in range(1, _SHOWN + 1))
-    return BudgetDesign(budget, in_clear, encrypted, user.limit, figures(threshold), others, left_out)
+    others = tuple(metrics(float(whole)) for whole in range(1, _SHOWN + 1))
+    return BudgetDesign(budget, in_clear, encrypted, user.limit, metrics(threshold), others, left_out)
 
 
 def _with(scenario: Scenario, threshold: float) -> Scenario:

@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
-from evedrop.model.figures import columns, shown_figure, unloadable_figures
-from evedrop.model.figures.text import count_text, estimate, figure_text, share_text
+from evedrop.model.metrics import columns, shown_metric, unloadable_metrics
+from evedrop.model.metrics.text import count_text, estimate, number_text, share_text
 from evedrop.model.theory.rare_events import RARE
 from evedrop.scenario.application import applications_in
 from evedrop.score.summary import (
@@ -60,9 +60,9 @@ def expectations_outcome(expectations: Sequence[Judged], of: str) -> tuple[str, 
 
 
 def receivers_table(summary: Summary, wide: bool = True) -> TextTable:
-    """The table of the receivers: their figures; if `wide`, with all standard errors, and the digests."""
+    """The table of the receivers: their metrics; if `wide`, with all standard errors, and the digests."""
     shown = columns("column", summary.mode)
-    compared = {figure: z for peer in summary.peers.values() for figure, z in peer.z.items() if z is not None}
+    compared = {metric: z for peer in summary.peers.values() for metric, z in peer.z.items() if z is not None}
     table = TextTable.headed(
         ["receiver"],
         [*(column.heading for column in shown), *(["z"] if compared else [])],
@@ -70,43 +70,43 @@ def receivers_table(summary: Summary, wide: bool = True) -> TextTable:
         heading(summary),
     )
     for name, peer in summary.peers.items():
-        figures, errors, z, marked = _with_rare_estimate(peer)
+        metrics, errors, z, marked = _with_rare_estimate(peer)
         table.add(
             name,
             *(
                 estimate(
-                    shown_figure(figures, names),
-                    shown_figure(errors, names) if wide or not compared.keys().isdisjoint(names) else None,
+                    shown_metric(metrics, names),
+                    shown_metric(errors, names) if wide or not compared.keys().isdisjoint(names) else None,
                     column.format,
                 )
                 + (_MARK if marked and not set(_SPLIT).isdisjoint(names) else "")
                 for column, names in shown.items()
             ),
-            *([_z_text(shown_figure(z, list(compared)), marked)] if compared else []),
+            *([_z_text(shown_metric(z, list(compared)), marked)] if compared else []),
             *([(peer.digest or "–")[:12]] if wide else []),
         )
     return table
 
 
-_Figures = Mapping[str, float | None]
+_Metrics = Mapping[str, float | None]
 _MARK = "*"
 _SPLIT = ("mean_squared_error", "mean_actual_trace_covariance")
-"""The figures that splitting estimates; a run has one of them."""
+"""The metrics that splitting estimates; a run has one of them."""
 
 
-def _with_rare_estimate(peer: PeerSummary) -> tuple[_Figures, _Figures, _Figures, bool]:
-    """The figures of a receiver, their standard errors and z, and whether its mean error is that of splitting."""
+def _with_rare_estimate(peer: PeerSummary) -> tuple[_Metrics, _Metrics, _Metrics, bool]:
+    """The metrics of a receiver, their standard errors and z, and whether its mean error is that of splitting."""
     rare = peer.rare_estimate
-    given = peer.all_figures, peer.standard_errors, peer.z
+    given = peer.all_metrics, peer.standard_errors, peer.z
     if rare is None or rare.mean_error is None:
         return *given, False
     values = (rare.mean_error, rare.standard_error, rare.z)
-    figures, errors, z = ({**old, **dict.fromkeys(_SPLIT, new)} for old, new in zip(given, values, strict=True))
-    return figures, errors, z, True
+    metrics, errors, z = ({**old, **dict.fromkeys(_SPLIT, new)} for old, new in zip(given, values, strict=True))
+    return metrics, errors, z, True
 
 
 def _z_text(z: float | None, marked: bool) -> str:
-    return figure_text(z, "+.1f") + (_MARK if marked and z is not None else "")
+    return number_text(z, "+.1f") + (_MARK if marked and z is not None else "")
 
 
 def _split_lines(summary: Summary) -> Iterator[str]:
@@ -118,7 +118,7 @@ def _split_lines(summary: Summary) -> Iterator[str]:
         if rare.mean_error is None:
             yield f"{name}: splitting gives no estimate that can be trusted: {rare.doubt}"
             continue
-        plain = estimate(shown_figure(peer.all_figures, _SPLIT), shown_figure(peer.standard_errors, _SPLIT))
+        plain = estimate(shown_metric(peer.all_metrics, _SPLIT), shown_metric(peer.standard_errors, _SPLIT))
         yield (
             f"{_MARK} {name}: by splitting, {rare.populations} populations of {rare.trials:,} trials, copied after "
             f"{rare.splits} slot{'' if rare.splits == 1 else 's'}; the mean over the {summary.trials:,} trials is {plain}"
@@ -126,10 +126,10 @@ def _split_lines(summary: Summary) -> Iterator[str]:
 
 
 def remarks(summary: Summary) -> Iterator[str]:
-    """Notes to the table: figures by splitting, figures that are left out, and links unlike their models."""
+    """Notes to the table: metrics by splitting, metrics that are left out, and links unlike their models."""
     yield from _split_lines(summary)
-    for name, why in unloadable_figures().items():
-        yield f"the figure {name} is left out{why}"
+    for name, why in unloadable_metrics().items():
+        yield f"the metric {name} is left out{why}"
     yield from _link_lines(summary.links)
     if summary.controller is not None:
         yield _loop_line(summary.controller)
@@ -180,8 +180,8 @@ def directions_table(directions: Mapping[str, Mapping[str, DirectionSummary]]) -
                 receiver,
                 direction,
                 estimate(one.mean_squared_error, one.standard_error),
-                figure_text(one.expected),
-                figure_text(one.z, "+.1f"),
+                number_text(one.expected),
+                number_text(one.z, "+.1f"),
                 {True: "unbounded", False: "bounded", None: "–"}[one.unbounded],
                 one.relative or "–",
                 one.perfect or "–",

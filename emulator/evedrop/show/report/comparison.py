@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from itertools import groupby
 from typing import TYPE_CHECKING
 
-from evedrop.model.figures.shown_number import ShownNumber
-from evedrop.model.figures.text import estimate, figure_text, share_text
+from evedrop.model.metrics.shown_number import ShownNumber
+from evedrop.model.metrics.text import estimate, number_text, share_text
 from evedrop.score.summary import RARE_SHARE
 from evedrop.score.verdict import MARKS, SecrecyKept
 from evedrop.show.report.closing import rare_events_words
@@ -53,14 +53,14 @@ def schemes_table(found: Comparison) -> TextTable:
             simulated(one.legitimate),
             theory(one.legitimate),
             "yes" if needs.acknowledgements else "–",
-            figure_text(needs.sent_fraction, ".3g"),
-            figure_text(needs.bits_per_slot),
+            number_text(needs.sent_fraction, ".3g"),
+            number_text(needs.bits_per_slot),
             estimate(needs.energy_per_slot, needs.standard_errors["energy_per_slot"] or None, ".3g"),
             f"{needs.secret_bits_per_slot}{once}" if needs.secret_bits_per_slot else "–",
             *(
                 ("–", "–")
                 if one.leak is None
-                else (figure_text(one.leak.clear_fraction, ".3g"), figure_text(one.leak.bits, ".3g"))
+                else (number_text(one.leak.clear_fraction, ".3g"), number_text(one.leak.bits, ".3g"))
             ),
             *(("–", "–") if cell is None else (cell.match.adversary, verdict(cell))),
         )
@@ -81,7 +81,7 @@ def pairs_table(found: Comparison) -> TextTable:
                 adversary if cell.match.attack == "none" else f"{adversary} ({cell.match.strategy})",
                 simulated(cell.eavesdropper),
                 theory(cell.eavesdropper),
-                figure_text(cell.eavesdropper.z, "+.1f"),
+                number_text(cell.eavesdropper.z, "+.1f"),
                 simulated(cell.legitimate),
                 theory(cell.legitimate),
                 estimate(cell.ratio, cell.ratio_error, ".3g"),
@@ -94,16 +94,16 @@ def pairs_table(found: Comparison) -> TextTable:
 def simulated(of: SimulatedError) -> str:
     """The mean over trials with its standard error, or the median if the variance is infinite."""
     if of.infinite_variance:
-        return figure_text(of.typical, ".3g") + " med"
+        return number_text(of.typical, ".3g") + " med"
     return estimate(of.mean, of.standard_error, ".3g")
 
 
 def theory(of: SimulatedError) -> str:
     """The mean that theory expects over the same slots; with ≥ if it is only a bound."""
     if of.theory is None:
-        return figure_text(None)
+        return number_text(None)
     mean = of.theory.mean
-    return ShownNumber(f"≥ {mean:.3g}", mean, after="at least") if of.theory.bound else figure_text(mean, ".3g")
+    return ShownNumber(f"≥ {mean:.3g}", mean, after="at least") if of.theory.bound else number_text(mean, ".3g")
 
 
 def verdict(cell: Cell) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from evedrop.model.figures.text import estimate
+from evedrop.model.metrics.text import estimate
 from evedrop.results.comparison import Cell, Comparison, read_comparison
 from evedrop.score.verdict import SecrecyKept
 from evedrop.show.report.comparison import comparison_lines, pairs_table, schemes_table, verdict

@@ -9,7 +9,7 @@ from io import BytesIO
 
 from markupsafe import Markup
 
-from evedrop.model.figures.text import figure_text
+from evedrop.model.metrics.text import number_text
 from evedrop.model.receiver import Codes
 from evedrop.score.expectations_held import repeating
 from evedrop.score.track import FACTOR, LostSpan, Track
@@ -36,8 +36,8 @@ def _expectations(of: RunSource) -> Iterator[Markup]:
     yield made("expectations", of.summary.expectations)
 
 
-def _figures(of: RunSource) -> Iterator[Markup]:
-    """The figures with their standard errors, theory, and z."""
+def _metrics(of: RunSource) -> Iterator[Markup]:
+    """The metrics with their standard errors, theory, and z."""
     yield made(
         "table",
         closing.receivers_table(of.summary),
@@ -195,7 +195,7 @@ def _repeat(of: RunSource) -> Iterator[Markup]:
 RUN_SECTIONS: Mapping[str, Callable[[RunSource], Iterator[Markup]]] = {
     "Verdicts": _verdicts,
     "Expectations": _expectations,
-    "Figures": _figures,
+    "Metrics": _metrics,
     "Errors": _errors,
     "Lost track": _lost_track,
     "Links": _links,

@@ -17,7 +17,7 @@ from markupsafe import Markup
 
 from evedrop.errors import UsageError
 from evedrop.model.checks import toml_of
-from evedrop.model.figures import all_figures, error_column, shown_figure
+from evedrop.model.metrics import all_metrics, error_column, shown_metric
 from evedrop.model.process import Floats
 from evedrop.scenario.loading import value_of
 from evedrop.show.report.chart import Curve, LogChart
@@ -104,7 +104,7 @@ def _errors(of: SweepSource) -> Iterator[Markup]:
 def _curve(name: str, i: int, rows: Sequence[Mapping[str, Any]], key: str, words: Sequence[str] | None) -> Curve:
     """The curve of the i-th receiver; words: the names of the places of the axis, if it has names."""
     marks, lines = (
-        [one for one, kind in all_figures().items() if kind.sweep_picture == way] for way in ("marks", "lines")
+        [one for one, kind in all_metrics().items() if kind.sweep_picture == way] for way in ("marks", "lines")
     )
     x = [float(row[key]) if words is None else float(words.index(str(row[key]))) for row in rows]
     y, theory = (_values(rows, names) for names in (marks, lines))
@@ -115,12 +115,12 @@ def _curve(name: str, i: int, rows: Sequence[Mapping[str, Any]], key: str, words
 
 
 def _values(rows: Sequence[Mapping[str, Any]], names: list[str]) -> Floats:
-    found = [shown_figure(row, names) for row in rows]
+    found = [shown_metric(row, names) for row in rows]
     return np.array([math.nan if one is None else one for one in found], np.float64)
 
 
-def _figures(of: SweepSource) -> Iterator[Markup]:
-    """The figures of all points, with their standard errors, theory, and z."""
+def _metrics(of: SweepSource) -> Iterator[Markup]:
+    """The metrics of all points, with their standard errors, theory, and z."""
     caption = (
         "A row for each point and receiver: means ± standard errors; z: the z-score of the error against theory; "
         "ratio: an eavesdropper's error over the legitimate one, in the second half of the run"
@@ -158,7 +158,7 @@ def _is_plain(value: Any) -> bool:
 SWEEP_SECTIONS: Mapping[str, Callable[[SweepSource], Iterator[Markup]]] = {
     "Verdicts": _verdicts,
     "Errors": _errors,
-    "Figures": _figures,
+    "Metrics": _metrics,
     "Repeat it": _repeat,
 }
 """Title → the function that makes the contents, in the order of the page."""

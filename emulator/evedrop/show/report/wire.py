@@ -99,7 +99,7 @@ def wire_failures(summary: WireSummary) -> Iterator[str]:
 def wire_faults(summary: WireSummary) -> Iterator[str]:
     """A wire that has not ended, ways past it, links outside their bounds, unaccounted messages, and an incomplete journal."""
     if _unfinished(summary):
-        yield f"{_unfinished(summary)}: these are the figures that its journal gives so far"
+        yield f"{_unfinished(summary)}: these are the metrics that its journal gives so far"
     yield from (f"no verdict: {bypass.event}" for bypass in summary.bypasses)
     for name, link in summary.links.items():
         if link.within_bounds is False and link.bounds is not None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 
-from evedrop.model.figures import all_figures, error_column, shown_figure
+from evedrop.model.metrics import all_metrics, error_column, shown_metric
 from evedrop.show.view.figure_style import drawing, panels
 from evedrop.show.view.palette import RECEIVERS, hexadecimal
 
@@ -55,7 +55,7 @@ def _others(rows: list[dict[str, Any]], keys: Sequence[str]) -> list[tuple[Any, 
 
 def _draw_on(axes: list[Axes], rows: list[dict[str, Any]], keys: Sequence[str]) -> None:
     marks, lines = (
-        [name for name, one in all_figures().items() if one.sweep_picture == way] for way in ("marks", "lines")
+        [name for name, one in all_metrics().items() if one.sweep_picture == way] for way in ("marks", "lines")
     )
     peers = list(dict.fromkeys(row["peer"] for row in rows))
     for one, values in zip(axes, _others(rows, keys), strict=True):
@@ -89,8 +89,8 @@ def _draw_on(axes: list[Axes], rows: list[dict[str, Any]], keys: Sequence[str]) 
     axes[0].legend()
 
 
-def _height(row: dict[str, Any], figures: list[str]) -> float:
-    found = shown_figure(row, figures)
+def _height(row: dict[str, Any], metrics: list[str]) -> float:
+    found = shown_metric(row, metrics)
     return math.nan if found is None else found
 
 

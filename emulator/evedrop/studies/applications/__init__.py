@@ -1,1 +1,1 @@
-"""Applications of the emulator, each with its own data, figures and panels."""
+"""Applications of the emulator, each with its own data, metrics and panels."""

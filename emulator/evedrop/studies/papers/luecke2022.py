@@ -78,7 +78,7 @@ class _Published:
     """The quality of its link → its mean trace."""
 
 
-STABLE_FIGURES = (
+STABLE_NUMBERS = (
     _Published(TransmissionPolicy(alpha=0.1), (0.8697,), {0.8: 2.3167}),
     _Published(TransmissionPolicy(alpha=0.3), (0.3676, 0.3601), {0.8: 0.8527, 0.6: 1.7086}),
     _Published(TransmissionPolicy(alpha=0.5), (0.2795,), {0.8: 0.4864}),
@@ -86,7 +86,7 @@ STABLE_FIGURES = (
     _Published(TransmissionPolicy(theta=0.1), (0.3082, 0.3039), {0.8: 0.7555, 0.6: 1.6844}),
     _Published(TransmissionPolicy(theta=0.2), (0.4664,), {0.8: 1.6717}),
 )
-UNSTABLE_FIGURES = (
+UNSTABLE_NUMBERS = (
     _Published(TransmissionPolicy(alpha=0.305), (1.97,), {0.8: 15.0}),
     _Published(TransmissionPolicy(theta=0.188), (1.96,), {0.8: 1154.0}),
 )
@@ -123,12 +123,12 @@ class Luecke2022(Paper):
         size = QUICK if quick else FULL
         L = float(ReferenceCode(STABLE).at(1)[0, 0])
         yield PublishedNumber.compared("tutorial", "L for A = 0.9, Q = 1", 1.11111111, L, absolute=5e-9)
-        for one in STABLE_FIGURES:
+        for one in STABLE_NUMBERS:
             progress(f"A = 0.9, {one.policy}")
             trials, slots = size.stable
             means = mean_traces(STABLE, one.policy, (MU, *one.eavesdropper), trials, slots)
             yield from _estimated(one, means, trials * slots)
-        for one in UNSTABLE_FIGURES:
+        for one in UNSTABLE_NUMBERS:
             progress(f"unstable A, {one.policy}")
             slots = _RUN_SLOTS // size.run_trials
             means = mean_traces(UNSTABLE, one.policy, (MU, *one.eavesdropper), size.runs * size.run_trials, slots, True)

@@ -12,10 +12,10 @@ from typing import final
 import numpy as np
 
 from evedrop.model.controllers.controller import Assignment
-from evedrop.model.figures.standard_error import standard_error
 from evedrop.model.integrity import SENSOR_ATTACKS
 from evedrop.model.integrity.monitor import MonitorPlan
 from evedrop.model.integrity.theory import WatermarkTheory, loop_of
+from evedrop.model.metrics.standard_error import standard_error
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process
 from evedrop.model.slot.monitored_loop import LoopRun, simulate

@@ -14,7 +14,7 @@ from evedrop.model.theory.design import Against
 from evedrop.studies.papers import numerical
 from evedrop.studies.papers.reproduction import NumberVerdict, PublishedNumber
 
-_INTERCHANGED = "the paper gives the other eavesdropper's value: the figures for 0.95 and 0.99 are interchanged"
+_INTERCHANGED = "the paper gives the other eavesdropper's value: the values for 0.95 and 0.99 are interchanged"
 _LOWER_END = "0.5342 is the legitimate stability bound; just above it J → ∞ while J_e stays finite, so J_r < 0"
 
 

@@ -99,7 +99,7 @@ class ComfortTally(ApplicationTally):
 
     @property
     def of_trials(self) -> Mapping[tuple[str, ...], Floats]:
-        """Every figure of every trial, (R,); none where trials were cut short at different slots."""
+        """Every metric of every trial, (R,); none where trials were cut short at different slots."""
         slots = int(self._slots[0])
         if not slots or (self._slots != slots).any():
             return {}
@@ -154,8 +154,8 @@ class Comfort(Application):
 
     table = ComfortTable
     names: ClassVar[Mapping[str, Kind]] = {"temperature": "states", "heater": "inputs"}
-    figures = ("discomfort", "heating_energy")
-    receiver_figures = ("known_fraction",)
+    metrics = ("discomfort", "heating_energy")
+    receiver_metrics = ("known_fraction",)
 
     @classmethod
     def tally(cls, loop: ControlledPlant, table: Table, trials: int) -> ComfortTally:

@@ -44,7 +44,7 @@ class IntegrityFeed(PanelFeed):
         self._alarmed = False
 
     def take(self, first: int, u: Floats, estimates: Mapping[str, Floats]) -> Mapping[str, Floats]:
-        """Do nothing: all figures come from the monitor."""
+        """Do nothing: all metrics come from the monitor."""
         del first, u, estimates
         return {}
 
@@ -68,7 +68,7 @@ class Integrity(Application):
 
     table = IntegrityTable
     names = {}  # noqa: RUF012 - declared so by the base class
-    figures = (
+    metrics = (
         "false_alarm_fraction",
         "false_alarm_bound",
         "detected_fraction",
@@ -80,7 +80,7 @@ class Integrity(Application):
         "expected_watermark_cost",
         "watermark_cost_z",
     )
-    metrics = ("false_alarm_fraction", "detected_fraction")
+    served_metrics = ("false_alarm_fraction", "detected_fraction")
     has_monitor = True
 
     @classmethod

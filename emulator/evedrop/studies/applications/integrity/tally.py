@@ -1,4 +1,4 @@
-"""Figures of integrity: false alarms, detections and their delay, and the cost of the watermark, each with its theory.
+"""Metrics of integrity: false alarms, detections and their delay, and the cost of the watermark, each with its theory.
 
 Source: docs/results.md, integrity; docs/mathematics.md, integrity.
 """
@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.model.digest import Digests, InputLog, RunDigest
-from evedrop.model.figures.standard_error import z_of
 from evedrop.model.integrity.loop import WatermarkedLoop
 from evedrop.model.integrity.monitor import MonitoredSlots
 from evedrop.model.integrity.policy import WatermarkPolicy
 from evedrop.model.integrity.theory import WatermarkTheory
+from evedrop.model.metrics.standard_error import z_of
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, product
 from evedrop.scenario.application import ApplicationTally
@@ -26,7 +26,7 @@ from evedrop.scenario.application import ApplicationTally
 
 @dataclass(frozen=True)
 class IntegrityCase:
-    """What the figures are compared with."""
+    """What the metrics are compared with."""
 
     plant: Plant
     loop: WatermarkedLoop
@@ -67,7 +67,7 @@ class IntegrityTally(ApplicationTally):
         self._digests: dict[int, Digests] = {}
 
     def add(self, x: Floats, u: Floats, estimates: Mapping[str, Floats]) -> None:
-        """Do nothing: all figures come from the monitor."""
+        """Do nothing: all metrics come from the monitor."""
 
     def add_monitored(self, x: Floats, u: Floats, monitored: MonitoredSlots) -> None:
         """Add the next slots, one by one, so that the sums have the same bits however the slots are divided."""
@@ -117,7 +117,7 @@ class IntegrityTally(ApplicationTally):
 
     @property
     def of_trials(self) -> Mapping[tuple[str, ...], Floats]:
-        """The values of every figure that is a mean, by trial; none where trials were cut short at different slots."""
+        """The values of every metric that is a mean, by trial; none where trials were cut short at different slots."""
         if not self._alike:
             return {}
         case, slots = self._case, int(self._slots[0])

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar, final
 
 import numpy as np
 
-from evedrop.model.figures.text import estimate
+from evedrop.model.metrics.text import estimate
 from evedrop.model.process import Floats
 from evedrop.scenario.application import (
     STANDARD_ERRORS,
@@ -52,8 +52,8 @@ class Household(Application):
         "sun": "disturbances",
         "battery": "states",
     }
-    figures = ("bought_energy", "sold_energy", "net_difference", "total_difference", "summed_difference")
-    receiver_figures = ("activity_area", "detection_rate")
+    metrics = ("bought_energy", "sold_energy", "net_difference", "total_difference", "summed_difference")
+    receiver_metrics = ("activity_area", "detection_rate")
     has_power = True
     example = "microgrid"
 

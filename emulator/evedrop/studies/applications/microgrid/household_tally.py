@@ -115,7 +115,7 @@ class HouseholdTally(ApplicationTally):
 
     @property
     def of_trials(self) -> Mapping[tuple[str, ...], Floats]:
-        """Every figure of every trial, (R,); NaN or infinite where it does not exist."""
+        """Every metric of every trial, (R,); NaN or infinite where it does not exist."""
         meter, seconds = self.meter, self._slot_seconds
         apart = meter.difference
         detected = self._detected(self._active)
@@ -132,7 +132,7 @@ class HouseholdTally(ApplicationTally):
         }
 
     def summary(self) -> dict[str, Any]:
-        """The summary's entry: means over trials; None for figures that do not exist."""
+        """The summary's entry: means over trials; None for metrics that do not exist."""
         meter, seconds = self.meter, self._slot_seconds
         apart = meter.difference
         return {

@@ -7,7 +7,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from evedrop.model.figures import error_column
+from evedrop.model.metrics import error_column
 from evedrop.show.view.figure_style import BLUE, GREEN, GREY, ORANGE, RED, panels
 
 _COLOURS = (BLUE, RED, ORANGE, GREEN, GREY)

@@ -4,24 +4,24 @@ from __future__ import annotations
 
 from typing import final
 
-from evedrop.model.figures.figure import (
+from evedrop.model.metrics.metric import (
     COVARIANCE_ONLY,
-    FigureColumn,
-    MeanFigure,
+    MeanMetric,
+    MetricColumn,
     ReceiverTotals,
     ScoredSlots,
-    TotalsFigure,
+    TotalsMetric,
     TrialTotals,
 )
 from evedrop.model.process import Floats
 
 
-class MeanError(MeanFigure, TotalsFigure):
+class MeanError(MeanMetric, TotalsMetric):
     """The mean of the mode's error: |x − x̂|², or in a covariance-only study the trace of the actual covariance."""
 
     of_error = True
     expected = "expected_trace_covariance"
-    sweep_column = FigureColumn("mean error", 0)
+    sweep_column = MetricColumn("mean error", 0)
     sweep_picture = "marks"
 
     @classmethod
@@ -47,7 +47,7 @@ class MeanSquaredError(MeanError):
     meaning = "of |x − x̂|²; null in a covariance-only study"
     not_in_mode = COVARIANCE_ONLY
     rests_on = "observer"
-    column = FigureColumn("mean |x−x̂|²", 2)
+    column = MetricColumn("mean |x−x̂|²", 2)
 
 
 @final
@@ -56,4 +56,4 @@ class MeanActualTraceCovariance(MeanError):
 
     meaning = "in a covariance-only study, of the trace of the actual error covariance given the events"
     only_in_mode = COVARIANCE_ONLY
-    column = FigureColumn("actual tr P", 2)
+    column = MetricColumn("actual tr P", 2)

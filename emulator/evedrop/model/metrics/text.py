@@ -1,10 +1,10 @@
-"""Figures as text: with their standard errors, and only the digits that these leave significant."""
+"""Metrics as text: with their standard errors, and only the digits that these leave significant."""
 
 from __future__ import annotations
 
 import math
 
-from evedrop.model.figures.shown_number import ShownNumber
+from evedrop.model.metrics.shown_number import ShownNumber
 
 _SMALL_NUMBER, _LARGE_NUMBER, _LEAST_PLACE, _LAST_PLACE = 0.01, 1e5, -4, -6  # beyond them estimates have exponents
 _ROUNDING = 1e-12  # a standard error below this part of the estimate comes from the rounding of equal trials
@@ -12,8 +12,8 @@ _MOST_DIGITS = 8  # significant digits of an estimate
 _LARGE_COUNT, _NEARLY_ALL = 1e7, 0.99
 
 
-def figure_text(value: float | None, how: str = ".4g") -> ShownNumber:
-    """A figure of the summary as text; a dash for None."""
+def number_text(value: float | None, how: str = ".4g") -> ShownNumber:
+    """A metric of the summary as text; a dash for None."""
     return ShownNumber("–" if value is None else format(value, how), value)
 
 
@@ -42,9 +42,9 @@ def estimate(value: float | None, error: float | None, how: str = ".4g") -> Show
 
 def _estimate(value: float | None, error: float | None, how: str) -> str:
     if value is None or not error or not math.isfinite(value) or math.isnan(error) or error <= _ROUNDING * abs(value):
-        return figure_text(value, how)
+        return number_text(value, how)
     if math.isinf(error):
-        return f"{figure_text(value, how)} ± ∞"
+        return f"{number_text(value, how)} ± ∞"
     place = int(f"{error:.0e}".partition("e")[2])
     if value and math.floor(math.log10(abs(value))) - place >= _MOST_DIGITS:
         return f"{value:.{_MOST_DIGITS}g} ± {_scientific(error, 0)}"

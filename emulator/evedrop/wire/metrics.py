@@ -1,4 +1,4 @@
-"""The figures of a link that a wire file can expect something of: a class for each, and `WIRE_FIGURES`, which lists them.
+"""The metrics of a link that a wire file can expect something of: a class for each, and `WIRE_METRICS`, which lists them.
 
 Source: docs/wire.md, expectations.
 """
@@ -12,16 +12,16 @@ from evedrop.results.wire_summary import WireLinkSummary
 from evedrop.wire.tallies import LinkTally
 
 
-class WireFigure(Protocol):
-    """A figure of a link."""
+class WireMetric(Protocol):
+    """A metric of a link."""
 
     name: ClassVar[str]
-    """As in `figure = "LINK.name"`."""
+    """As in `metric = "LINK.name"`."""
     has_quantile: ClassVar[bool]
     """Whether its table has `quantile`."""
 
     def value(self, link: WireLinkSummary, tally: LinkTally, quantile: float | None) -> float | None:
-        """The figure so far; None if no message gives one: its expectation failed. quantile: that of the table, if it has one."""
+        """The metric so far; None if no message gives one: its expectation failed. quantile: that of the table, if it has one."""
 
 
 @final
@@ -84,6 +84,6 @@ class GapSeconds:
         return link.gap_seconds if link.heard else None
 
 
-_ALL: tuple[WireFigure, ...] = (Heard(), Delivery(), Latency(), GapMessages(), GapSeconds())
-WIRE_FIGURES: Mapping[str, WireFigure] = {figure.name: figure for figure in _ALL}
-"""Name → the figure, in the order of docs/wire.md."""
+_ALL: tuple[WireMetric, ...] = (Heard(), Delivery(), Latency(), GapMessages(), GapSeconds())
+WIRE_METRICS: Mapping[str, WireMetric] = {metric.name: metric for metric in _ALL}
+"""Name → the metric, in the order of docs/wire.md."""

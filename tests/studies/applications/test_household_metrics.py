@@ -1,4 +1,4 @@
-"""The house of a run: table, figures in the summary, expectations, and that workers and blocks change nothing."""
+"""The house of a run: table, metrics in the summary, expectations, and that workers and blocks change nothing."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ HOUSE: dict[str, Any] = {
         ({"household__grid": None}, "household.grid: is missing; expected"),
         ({"household__window_seconds": 0.0}, "household.window_seconds: is 0.0; expected"),
         ({"household__stove": "x"}, "household.stove: "),
-        ({"expect": [{"figure": "household.bought", "below": 1.0}]}, 'expect.0.figure: is "household.bought"; expected hous'),
-        ({"expect": [{"figure": "household.adam.activity_area", "below": 1.0}]}, "expect.0.figure: is "),
-        ({"expect": [{"figure": "household.sold_energy", "below": 1.0, "slots": [0, 2]}]}, "expect.0.slots: is set, but the"),
-        ({"household": None, "expect": [{"figure": "household.sold_energy", "below": 1.0}]}, "expect.0.figure: is "),
+        ({"expect": [{"metric": "household.bought", "below": 1.0}]}, 'expect.0.metric: is "household.bought"; expected hous'),
+        ({"expect": [{"metric": "household.adam.activity_area", "below": 1.0}]}, "expect.0.metric: is "),
+        ({"expect": [{"metric": "household.sold_energy", "below": 1.0, "slots": [0, 2]}]}, "expect.0.slots: is set, but the"),
+        ({"household": None, "expect": [{"metric": "household.sold_energy", "below": 1.0}]}, "expect.0.metric: is "),
     ],
 )  # fmt: skip
 def test_a_mistake_about_the_house_is_named(changes: dict[str, Any], said: str) -> None:
@@ -112,7 +112,7 @@ def test_a_house_needs_a_plant() -> None:
     assert "household: is given without a [plant] and a [controller]" in caught.value.mistakes[0]
 
 
-def test_the_figures_are_those_of_the_tables(tmp_path: Path) -> None:
+def test_the_metrics_are_those_of_the_tables(tmp_path: Path) -> None:
     """Energies from the recorded inputs of every trial; a run that acts on the truth differs from that by nothing."""
     made = {}
     for acts_on in ("estimate", "truth"):
@@ -152,7 +152,7 @@ def test_active_windows_are_the_days(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_blocks_and_workers_change_nothing(tmp_path: Path) -> None:
-    """The same figures from one process and from two."""
+    """The same metrics from one process and from two."""
     options: dict[str, Any] = {"trials": 501, "slots": 130, "eavesdroppers__bayesian__strategy": "smart"}
     one = montecarlo("microgrid", out=tmp_path / "one", plan=Plan(workers=1), **options)
     two = montecarlo("microgrid", out=tmp_path / "two", plan=Plan(workers=2), **options)
@@ -175,16 +175,16 @@ def test_blocks_and_workers_change_nothing(tmp_path: Path) -> None:
 def test_expectations_of_a_house_are_judged(tmp_path: Path) -> None:
     """One that holds, one that fails, and one that the run does not tell: no window has been active yet."""
     expect = [
-        {"figure": "household.sold_energy", "below": 100.0},
-        {"figure": "household.summed_difference", "above": 3.0},
-        {"figure": "household.naive.activity_area", "below": 0.9},
+        {"metric": "household.sold_energy", "below": 100.0},
+        {"metric": "household.summed_difference", "above": 3.0},
+        {"metric": "household.naive.activity_area", "below": 0.9},
     ]
     results = montecarlo("microgrid", trials=1, slots=200, out=tmp_path / "x", expect=expect)
     assert [one["held"] for one in results.summary["expectations"]] == [True, False, None]
 
 
 @pytest.mark.long
-def test_a_sweep_over_a_house_has_its_figures(evedrop: Evedrop) -> None:
+def test_a_sweep_over_a_house_has_its_metrics(evedrop: Evedrop) -> None:
     """In every row, and in a plot of their own."""
     options = ["--slots", "130", "--trials", "2", "--set=eavesdroppers.bayesian.strategy=smart"]
     done = evedrop("sweep", "microgrid", "--over", "encoding.state_probability=0.1,0.9", *options, "--out", "house")

@@ -1,11 +1,11 @@
-"""The account of a link's packets, whose entries are the link figures that expectations can name."""
+"""The account of a link's packets, whose entries are the link metrics that expectations can name."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from typing import Self
 
-from evedrop.model.figures.figure import ReceiverTotals
+from evedrop.model.metrics.metric import ReceiverTotals
 
 
 @dataclass(frozen=True)
@@ -33,5 +33,5 @@ class LinkAccount:
         return cls(offered, delivered, totals.late, lost, max(missing, totals.unexplained))
 
 
-LINK_FIGURES = (*(one.name for one in fields(LinkAccount)), "rate")
-"""The figures of a link; `rate` is the fraction of packets that its loss model let through."""
+LINK_METRICS = (*(one.name for one in fields(LinkAccount)), "rate")
+"""The metrics of a link; `rate` is the fraction of packets that its loss model let through."""

@@ -7,28 +7,28 @@ from typing import final
 
 import numpy as np
 
-from evedrop.model.figures.figure import (
-    FigureColumn,
-    FigureTally,
-    MeanFigure,
+from evedrop.model.metrics.metric import (
+    MeanMetric,
+    MetricColumn,
+    MetricTally,
     ReceiverTotals,
     ScoredSlots,
-    TotalsFigure,
+    TotalsMetric,
     TrialTotals,
 )
 from evedrop.model.process import Floats
 
 
 @final
-class MeanTraceCovariance(MeanFigure, TotalsFigure):
+class MeanTraceCovariance(MeanMetric, TotalsMetric):
     """The mean of tr P, where P is the covariance that the receiver believes."""
 
     meaning = "of tr P, the error covariance that the receiver believes"
     by_trial = False
     of_error = True
     rests_on = "recorded trials"
-    column = FigureColumn("believed tr P", 3)
-    sweep_column = FigureColumn("believed tr P", 2)
+    column = MetricColumn("believed tr P", 3)
+    sweep_column = MetricColumn("believed tr P", 2)
 
     @classmethod
     def of_totals(cls, totals: ReceiverTotals) -> float:
@@ -47,7 +47,7 @@ class MeanTraceCovariance(MeanFigure, TotalsFigure):
 
 
 @final
-class ExpectedTraceCovariance(TotalsFigure):
+class ExpectedTraceCovariance(TotalsMetric):
     """The mean trace of the actual error covariance that theory expects."""
 
     meaning = (
@@ -56,8 +56,8 @@ class ExpectedTraceCovariance(TotalsFigure):
     )
     needs_theory = True
     rests_on = "theory"
-    column = FigureColumn("expected tr P", 4)
-    sweep_column = FigureColumn("expected tr P", 1)
+    column = MetricColumn("expected tr P", 4)
+    sweep_column = MetricColumn("expected tr P", 1)
     sweep_picture = "lines"
 
     @classmethod
@@ -66,14 +66,14 @@ class ExpectedTraceCovariance(TotalsFigure):
         return totals.expected_trace / max(1, totals.offered)
 
     @classmethod
-    def tally(cls, trials: int) -> FigureTally:
+    def tally(cls, trials: int) -> MetricTally:
         """A tally of no slots yet."""
         del trials
         return ExpectedTraces()
 
 
 @final
-class ExpectedTraces(FigureTally):
+class ExpectedTraces(MetricTally):
     """The expected traces of some slots, which are the same for all trials."""
 
     def __init__(self) -> None:

@@ -1,6 +1,6 @@
 """Metrics of a live run for Prometheus, by HTTP.
 
-They are made from the events of the observer and, at each scrape, from the figures that the run has on disk; the run itself does
+They are made from the events of the observer and, at each scrape, from the metrics that the run has on disk; the run itself does
 nothing for them. prometheus_client is imported only here: a run without metrics needs neither it nor a web server.
 
 Source: docs/results.md, metrics of a live run.
@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, final
 
 from evedrop.errors import UsageError
-from evedrop.model.figures import estimated_figures
+from evedrop.model.metrics import estimated_metrics
 from evedrop.results.reading import Results
 from evedrop.scenario.application import APPLICATIONS
 from evedrop.scenario.progress_events import (
@@ -139,10 +139,10 @@ class RunMetrics:
         for name, count in losses.items():
             lost.add_metric([name], count)
         yield lost
-        yield from self._figures(summary, CounterMetricFamily, GaugeMetricFamily)
+        yield from self._metrics(summary, CounterMetricFamily, GaugeMetricFamily)
 
-    def _figures(self, summary: Mapping[str, Any], counter: Any, gauge: Any) -> Iterator[Any]:
-        """The metrics from the figures on disk."""
+    def _metrics(self, summary: Mapping[str, Any], counter: Any, gauge: Any) -> Iterator[Any]:
+        """Those that are made from the metrics on disk."""
         packets = counter("evedrop_packets", "Packets by receiver and fate.", labels=["receiver", "fate"])
         for name, link in summary.get("links", {}).items():
             packets.add_metric([name, "delivered"], link["delivered"])
@@ -151,23 +151,23 @@ class RunMetrics:
                 if reason != "underway" or summary["slots"] == self._scenario.slots:
                     packets.add_metric([name, reason], count)
         yield packets
-        for figure, kind in estimated_figures().items():
+        for metric, kind in estimated_metrics().items():
             if kind.only_in_mode is not None:
                 continue
-            family = gauge(f"evedrop_{figure}", f"{figure} so far, as in the summary.", labels=["receiver"])
-            for name, figures in summary.get("peers", {}).items():
-                if isinstance(value := figures.get(figure), (int, float)):
+            family = gauge(f"evedrop_{metric}", f"{metric} so far, as in the summary.", labels=["receiver"])
+            for name, metrics in summary.get("peers", {}).items():
+                if isinstance(value := metrics.get(metric), (int, float)):
                     family.add_metric([name], value)
             yield family
         for name in self._scenario.applications:
-            figures = summary.get(name) or {}
-            for figure in APPLICATIONS[name].metrics:
-                if isinstance(value := figures.get(figure), (int, float)):
-                    yield gauge(f"evedrop_{figure}", f"{figure} of {name} so far.", value)
+            metrics = summary.get(name) or {}
+            for metric in APPLICATIONS[name].served_metrics:
+                if isinstance(value := metrics.get(metric), (int, float)):
+                    yield gauge(f"evedrop_{metric}", f"{metric} of {name} so far.", value)
 
 
 def _summary(folder: Path) -> Mapping[str, Any]:
-    """The figures that a run has on disk; empty if there are none yet."""
+    """The metrics that a run has on disk; empty if there are none yet."""
     try:
         return Results.read(folder).summary
     except UsageError:

@@ -1,4 +1,4 @@
-"""Figures of installed packages: the one in docs/your-own.md in every kind of run, and figures that fail."""
+"""Metrics of installed packages: the one in docs/your-own.md in every kind of run, and metrics that fail."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from evedrop.model.figures import FIGURES, figure, figures_of
-from evedrop.model.figures.figure import ScoredSlots
+from evedrop.model.metrics import METRICS, metric, metrics_of
+from evedrop.model.metrics.metric import ScoredSlots
 from evedrop.results.reading import Results
 from tests.conftest import Evedrop
 from tests.packages import install
@@ -19,15 +19,15 @@ from tests.packages import install
 DOCS = Path(__file__).parents[2] / "docs"
 RUN = ("--slots", "20", "--trials", "510")
 EXPECT = (
-    "--set", "expect.0={figure = 'smart.largest_error', above = 0.0}",
-    "--set", "expect.1={figure = 'smart.largest_error', below = 0.0, slots = [5, 15]}",
-    "--set", "expect.2={figure = 'smart.largest_error', above = 0.0, quantile = 0.5}",
+    "--set", "expect.0={metric = 'smart.largest_error', above = 0.0}",
+    "--set", "expect.1={metric = 'smart.largest_error', below = 0.0, slots = [5, 15]}",
+    "--set", "expect.2={metric = 'smart.largest_error', above = 0.0, quantile = 0.5}",
 )  # fmt: skip
 
 
 def installed(evedrop: Evedrop, module: str, name: str = "largest_error") -> dict[str, str]:
-    """The environment in which a package that has this module adds a figure by its metadata."""
-    install(evedrop.folder, {"largest.py": module}, {"evedrop.figures": {name: "largest:LargestError"}})
+    """The environment in which a package that has this module adds a metric by its metadata."""
+    install(evedrop.folder, {"largest.py": module}, {"evedrop.metrics": {name: "largest:LargestError"}})
     return {**evedrop.environment, "PYTHONPATH": str(evedrop.folder)}
 
 
@@ -37,7 +37,7 @@ def of_the_docs() -> str:
 
 
 @pytest.mark.long
-def test_a_figure_of_a_package_needs_nothing_here(evedrop: Evedrop) -> None:
+def test_a_metric_of_a_package_needs_nothing_here(evedrop: Evedrop) -> None:
     """One file and one line of metadata: the same number live, in memory with two workers, and in shards; judged and shown."""
     environment = installed(evedrop, of_the_docs())
     runs = {
@@ -70,12 +70,12 @@ def test_a_figure_of_a_package_needs_nothing_here(evedrop: Evedrop) -> None:
     assert "largest error" in done.out
     table = pq.read_table(evedrop.folder / "swept" / "sweep.parquet").to_pylist()
     assert {row["peer"]: row["largest_error"] for row in table if row["slots"] == 20} == found["memory"]
-    assert "largest_error" not in FIGURES.names
+    assert "largest_error" not in METRICS.names
 
 
 @pytest.mark.long
 def test_a_tally_that_is_not_data_fails_alone_in_shards(evedrop: Evedrop) -> None:
-    """An instance where a new tally has none could be of any class; the run and its other figures are not concerned."""
+    """An instance where a new tally has none could be of any class; the run and its other metrics are not concerned."""
     becomes = "    def add(self, slots):\n        self.last = type('Last', (), {})()\n        self.last.k = 1\n"
     module = of_the_docs().replace("    def add(self, slots):\n", becomes)
     module = module.replace(
@@ -90,7 +90,7 @@ def test_a_tally_that_is_not_data_fails_alone_in_shards(evedrop: Evedrop) -> Non
     assert smart["mean_squared_error"] > 0
 
 
-def test_a_figure_that_needs_states_is_null_without_them(evedrop: Evedrop) -> None:
+def test_a_metric_that_needs_states_is_null_without_them(evedrop: Evedrop) -> None:
     """And one of eavesdroppers is not the legitimate estimator's."""
     facts = "    needs_states = True\n    of = 'eavesdropper'\n    by_trial = True\n"
     environment = installed(evedrop, of_the_docs().replace("    by_trial = True\n", facts))
@@ -100,7 +100,7 @@ def test_a_figure_that_needs_states_is_null_without_them(evedrop: Evedrop) -> No
     peers = json.loads(done.out)["peers"]
     assert peers["smart"]["largest_error"] is None
     assert "largest_error" not in peers["legitimate"]
-    expect = "expect.0={figure = 'legitimate.largest_error', below = 1.0}"
+    expect = "expect.0={metric = 'legitimate.largest_error', below = 1.0}"
     done = evedrop.process("check", "eavesdroppers", "--set", expect, env=environment)
     assert (done.status, "did you mean" in done.err) == (2, True)
 
@@ -112,42 +112,42 @@ def test_a_figure_that_needs_states_is_null_without_them(evedrop: Evedrop) -> No
         ("digest", of_the_docs(), "; expected a name of letters, digits and _"),
     ],
 )
-def test_a_figure_that_cannot_be_loaded_is_left_out(evedrop: Evedrop, name: str, module: str, said: str) -> None:
+def test_a_metric_that_cannot_be_loaded_is_left_out(evedrop: Evedrop, name: str, module: str, said: str) -> None:
     """The closing report says why; an expectation that names it is a mistake, with the reason."""
     environment = installed(evedrop, module, name)
     run = ("montecarlo", "eavesdroppers", "--slots", "9", "--trials", "2")
     done = evedrop.process(*run, env=environment)
     assert done.status == 0, done.err
-    assert f"the figure {name} is left out" in done.out
+    assert f"the metric {name} is left out" in done.out
     assert said in done.out
-    done = evedrop.process(*run, "--set", f"expect.0={{figure = 'smart.{name}', below = 1.0}}", env=environment)
+    done = evedrop.process(*run, "--set", f"expect.0={{metric = 'smart.{name}', below = 1.0}}", env=environment)
     assert done.status == 2
     assert said in done.err
 
 
-def test_docs_say_of_every_figure_what_it_says_itself() -> None:
+def test_docs_say_of_every_metric_what_it_says_itself() -> None:
     """In the table of docs/results.md, and in the entry of docs/scenario.md those that an expectation can name."""
     results, scenario = ((DOCS / page).read_text(encoding="utf-8") for page in ("results.md", "scenario.md"))
-    for name in FIGURES:
-        meaning = figure(name).meaning.replace("|", "\\|")
+    for name in METRICS:
+        meaning = metric(name).meaning.replace("|", "\\|")
         assert f"\n| `{name}` | {meaning} |\n" in results
-        assert (f"`{name}`" in scenario) == (figure(name).only_in_mode is None)
+        assert (f"`{name}`" in scenario) == (metric(name).only_in_mode is None)
 
 
-@pytest.mark.parametrize("name", [name for name, one in figures_of("smart").items() if one.only_in_mode is None])
-def test_a_figure_over_all_slots_is_that_of_the_totals(name: str) -> None:
+@pytest.mark.parametrize("name", [name for name, one in metrics_of("smart").items() if one.only_in_mode is None])
+def test_a_metric_over_all_slots_is_that_of_the_totals(name: str) -> None:
     """Kept by its tally, or computed from what is counted of every receiver."""
     from evedrop.score.sums import Tally, slot_sums
 
     draw = np.random.default_rng(2)
     error, action = draw.lognormal(size=(30, 4)), draw.integers(0, 4, (30, 4)).astype(np.uint8)
     trace, expected = draw.lognormal(size=(30, 2)), draw.lognormal(size=30)
-    tally, kept = Tally(30, 4), figure(name).tally(4)
+    tally, kept = Tally(30, 4), metric(name).tally(4)
     tally.add_slots(0, error, slot_sums(error, action, trace), expected)
     for first in (0, 11):
         rows = slice(first, 11 if first == 0 else 30)
         kept.add(ScoredSlots(first, error[rows], action[rows], trace[rows, 0], expected[rows]))
-    value: Any = tally.figure(name)
+    value: Any = tally.metric(name)
     assert kept.value == pytest.approx(value, rel=1e-12)
 
 
@@ -162,25 +162,25 @@ FAILING = {
     "an error at the end": (VALUE, "raise ValueError('no')", "ValueError: no, largest.py line {}"),
     "no number": (VALUE, "return 'abc'", "value gave 'abc'; expected a number, or None"),
     "no trials": (TRIALS, "def of_each_trial(self)", "of_trials gave None; expected an array of 4 numbers"),
-    "no tally": (TALLY, "return None", "tally() gave None; expected a FigureTally"),
+    "no tally": (TALLY, "return None", "tally() gave None; expected a MetricTally"),
 }
 """What fails → the line of the module, its replacement, and the expected message."""
 
 
 @pytest.mark.parametrize("case", FAILING)
 @pytest.mark.parametrize("how", ["in memory", pytest.param("live", marks=pytest.mark.long)])
-def test_a_figure_that_fails_costs_no_other(evedrop: Evedrop, case: str, how: str) -> None:
-    """It is null; all else is measured and saved; then the run fails with status 3, and names figure, error and line."""
+def test_a_metric_that_fails_costs_no_other(evedrop: Evedrop, case: str, how: str) -> None:
+    """It is null; all else is measured and saved; then the run fails with status 3, and names metric, error and line."""
     line, instead, said = FAILING[case]
     module = of_the_docs().replace(line, instead)
     said = said.format(module[: module.find(instead.splitlines()[0])].count("\n") + 1)
     environment = installed(evedrop, module)
     command = ("run", "--view", "off") if how == "live" else ("montecarlo", "--workers", "1")
-    expect = "expect.0={figure = 'smart.largest_error', above = 0.0, quantile = 0.5}"
+    expect = "expect.0={metric = 'smart.largest_error', above = 0.0, quantile = 0.5}"
     changes = ("--slots", "30", "--trials", "4", "--set", expect, "--out", "run")
     done = evedrop.process(command[0], "eavesdroppers", *command[1:], *changes, env=environment)
     assert done.status == 3, done.err
-    assert f"the figure largest_error of an installed package failed: {said}" in done.err
+    assert f"the metric largest_error of an installed package failed: {said}" in done.err
     assert "Traceback" not in done.err
     summary = Results.read(evedrop.folder / "run").summary
     assert summary["ended"] in done.err
@@ -190,7 +190,7 @@ def test_a_figure_that_fails_costs_no_other(evedrop: Evedrop, case: str, how: st
     assert summary["expectations"][0]["held"] is None
 
 
-def test_what_a_figure_prints_does_not_mix_with_the_events(evedrop: Evedrop) -> None:
+def test_what_a_metric_prints_does_not_mix_with_the_events(evedrop: Evedrop) -> None:
     """It goes to the observer's log, and the launcher reads every event."""
     prints = f"        print('hello', end='')\n        import os; os.write(1, b'again')\n{ADD}"
     environment = installed(evedrop, of_the_docs().replace(ADD, prints))

@@ -1,4 +1,4 @@
-"""The figures of a summary, held against the rows of its tables and against the summary of the same trials in memory.
+"""The metrics of a summary, held against the rows of its tables and against the summary of the same trials in memory.
 
 Source: docs/results.md, summary.json.
 """
@@ -17,7 +17,7 @@ import pyarrow as pa
 from evedrop.model.checks import MOST_SLOTS
 
 _ROUNDED = 1e-9
-"""Relative difference of figures that a live run adds up in another order."""
+"""Relative difference of metrics that a live run adds up in another order."""
 _OF_CLOCK = frozenset({"wall_seconds", "slots_per_second", "mean_solve_seconds", "longest_solve_seconds", "replay"})
 """Entries that the clock or the folder decides."""
 _OF_A_LIVE_RUN = frozenset({"mode", "ended", "outages", "verification", "misdelivered"})
@@ -60,13 +60,13 @@ def same(value: Any, wanted: Any) -> bool:
     return bool(value == wanted)
 
 
-def slots_of_figures(summary: Mapping[str, Any], shards: int = 1) -> int | None:
-    """The slot before which all rows count in the figures of a summary; None if it has none, or they cannot be told.
+def slots_of_metrics(summary: Mapping[str, Any], shards: int = 1) -> int | None:
+    """The slot before which all rows count in the metrics of a summary; None if it has none, or they cannot be told.
 
-    A run that was killed has figures of an earlier moment than its rows, and says so; of a run in shards, only those of some
-    shards are. Otherwise the figures of shards cover all rows, however far each shard came.
+    A run that was killed has metrics of an earlier moment than its rows, and says so; of a run in shards, only those of some
+    shards are. Otherwise the metrics of shards cover all rows, however far each shard came.
     """
-    earlier = re.search(r"the figures are as of slot (\d+)", str(summary["ended"]))
+    earlier = re.search(r"the metrics are as of slot (\d+)", str(summary["ended"]))
     if shards > 1:
         begun = any(link["offered"] for link in summary["links"].values())
         return MOST_SLOTS if begun and not earlier else None
@@ -75,24 +75,24 @@ def slots_of_figures(summary: Mapping[str, Any], shards: int = 1) -> int | None:
 
 
 def unlike_rows(summary: Mapping[str, Any], tables: Mapping[str, pa.Table], shards: int = 1) -> Iterator[str]:
-    """The figures of receivers and links that are not those of the rows, which may be of a run that ended early."""
-    slots = slots_of_figures(summary, shards)
+    """The metrics of receivers and links that are not those of the rows, which may be of a run that ended early."""
+    slots = slots_of_metrics(summary, shards)
     if slots is None:
         return
     means, links = _means(tables["slots"], slots), _accounts(tables["journal"], slots)
     without = [name for name in summary["peers"] if name not in means or name not in links]
     if without:
-        yield f"the figures are of {slots} slots, and the tables have no rows of {', '.join(without)}"
+        yield f"the metrics are of {slots} slots, and the tables have no rows of {', '.join(without)}"
         return
     latecomers = {name: account["late"] for name, account in links.items()}
     for name, peer in summary["peers"].items():
         found, late = means[name], latecomers[name]
-        for figure in _MEANS:
+        for metric in _MEANS:
             # A late packet counts as received, and perhaps as used, when it arrives; rows of slots have none of them.
-            least = found[figure] / found["trials"]
-            most = least + (late / found["trials"] if figure in _FRACTIONS else 0.0)
-            if not (same(peer[figure], least) or same(peer[figure], most) or least < peer[figure] < most):
-                yield f"{figure} of {name} is {peer[figure]}, and by the rows of slots {least}"
+            least = found[metric] / found["trials"]
+            most = least + (late / found["trials"] if metric in _FRACTIONS else 0.0)
+            if not (same(peer[metric], least) or same(peer[metric], most) or least < peer[metric] < most):
+                yield f"{metric} of {name} is {peer[metric]}, and by the rows of slots {least}"
     for name, link in summary["links"].items():
         account = links[name]
         offered, lost_by = account["offered"], account["lost_by"]
@@ -126,14 +126,14 @@ def unlike_digests(summary: Mapping[str, Any], digests: pa.Table) -> Iterator[st
 
 
 def _means(slots: pa.Table, end: int) -> dict[str, dict[str, float]]:
-    """Receiver → figure → its sum over slots and trials; and the number of these, as `trials`."""
+    """Receiver → metric → its sum over slots and trials; and the number of these, as `trials`."""
     sums: dict[str, dict[str, float]] = defaultdict(lambda: dict.fromkeys((*_MEANS, "trials"), 0.0))
     for row in slots.select(["slot", "peer", "trials", *_MEANS]).to_pylist():
         if row["slot"] < end:
             sums_of_peer = sums[row["peer"]]
             sums_of_peer["trials"] += row["trials"]
-            for figure in _MEANS:
-                sums_of_peer[figure] += row[figure] * row["trials"]
+            for metric in _MEANS:
+                sums_of_peer[metric] += row[metric] * row["trials"]
     return sums
 
 

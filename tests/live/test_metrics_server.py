@@ -10,7 +10,7 @@ import pytest
 
 from evedrop import montecarlo, run
 from evedrop.errors import UsageError
-from evedrop.live.launch.metrics import MetricsAddress, RunMetrics, metrics_served
+from evedrop.live.launch.metrics_server import MetricsAddress, RunMetrics, metrics_served
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
 from evedrop.scenario.progress_events import (
@@ -42,8 +42,8 @@ def scraped(page: str) -> Samples:
     }
 
 
-def test_a_scrape_has_the_figures_of_the_run(tmp_path: Path) -> None:
-    """During a real run the slots grow; at its end every metric is the figure of the summary."""
+def test_a_scrape_has_the_metrics_of_the_run(tmp_path: Path) -> None:
+    """During a real run the slots grow; at its end every metric is that of the summary."""
     scenario = load("restart")
     seen: list[Samples] = []
 
@@ -62,9 +62,9 @@ def test_a_scrape_has_the_figures_of_the_run(tmp_path: Path) -> None:
     assert last["evedrop_running",] == 1
     assert all(one["evedrop_slots_per_second",] > 0 for one in seen)
     summary = Results.read(tmp_path / "run").summary
-    for name, figures in summary["peers"].items():
-        for figure in ("mean_squared_error", "mean_trace_covariance", "received_fraction", "used_fraction"):
-            assert last[f"evedrop_{figure}", name] == figures[figure]
+    for name, metrics in summary["peers"].items():
+        for metric in ("mean_squared_error", "mean_trace_covariance", "received_fraction", "used_fraction"):
+            assert last[f"evedrop_{metric}", name] == metrics[metric]
         assert last["evedrop_recent_squared_error", name] >= 0
     fates = {key[1:]: value for key, value in last.items() if key[0] == "evedrop_packets_total"}
     wanted = {}
@@ -78,7 +78,7 @@ def test_a_scrape_has_the_figures_of_the_run(tmp_path: Path) -> None:
 
 
 def test_a_lost_connection_is_counted(tmp_path: Path) -> None:
-    """By process; the events go on to the terminal, and without figures on disk the rest is served."""
+    """By process; the events go on to the terminal, and without metrics on disk the rest is served."""
     told: list[ProgressEvent] = []
     metrics = RunMetrics(load("vehicle"), tmp_path, told.append)
     events = [Started(), *[ConnectionOutage("smart", slot, slot + 1, 0.5) for slot in (3, 9)]]
@@ -134,7 +134,7 @@ def test_a_run_that_is_paused_is_held(tmp_path: Path) -> None:
     assert held == [0, 1, 0]
 
 
-def test_figures_are_those_of_the_folder_and_alarms_of_the_watermark(tmp_path: Path) -> None:
+def test_metrics_are_those_of_the_folder_and_alarms_of_the_watermark(tmp_path: Path) -> None:
     """A folder that has been renamed is found again."""
     montecarlo("replay-attack", trials=10, out=tmp_path / "after")
     metrics = RunMetrics(load("replay-attack"), tmp_path / "before", silent)
@@ -144,8 +144,8 @@ def test_figures_are_those_of_the_folder_and_alarms_of_the_watermark(tmp_path: P
         found = scraped(page)
     summary = Results.read(tmp_path / "after").summary
     assert found["evedrop_mean_squared_error", "legitimate"] == summary["peers"]["legitimate"]["mean_squared_error"]
-    for figure in ("false_alarm_fraction", "detected_fraction"):
-        assert found[f"evedrop_{figure}",] == summary["integrity"][figure]
+    for metric in ("false_alarm_fraction", "detected_fraction"):
+        assert found[f"evedrop_{metric}",] == summary["integrity"][metric]
     assert ("evedrop_watermark_fraction",) not in found  # only those that the application names
 
 

@@ -6,12 +6,12 @@ from typing import final
 
 import numpy as np
 
-from evedrop.model.figures.figure import (
-    FigureColumn,
-    MeanFigure,
+from evedrop.model.metrics.metric import (
+    MeanMetric,
+    MetricColumn,
     ReceiverTotals,
     ScoredSlots,
-    TotalsFigure,
+    TotalsMetric,
     TrialTotals,
 )
 from evedrop.model.process import Floats
@@ -19,12 +19,12 @@ from evedrop.model.receiver import Action
 
 
 @final
-class ReceivedFraction(MeanFigure, TotalsFigure):
+class ReceivedFraction(MeanMetric, TotalsMetric):
     """The fraction of packets that were received."""
 
     meaning = "packets received"
     rests_on = "observer"
-    column = FigureColumn("received", 0, ".4f")
+    column = MetricColumn("received", 0, ".4f")
 
     @classmethod
     def of_totals(cls, totals: ReceiverTotals) -> float:
@@ -44,11 +44,11 @@ class ReceivedFraction(MeanFigure, TotalsFigure):
 
 
 @final
-class UsedFraction(MeanFigure, TotalsFigure):
+class UsedFraction(MeanMetric, TotalsMetric):
     """The fraction of packets that were received and used."""
 
     meaning = "packets received and used"
-    column = FigureColumn("used", 1, ".4f")
+    column = MetricColumn("used", 1, ".4f")
 
     @classmethod
     def of_totals(cls, totals: ReceiverTotals) -> float:

@@ -1,8 +1,8 @@
-"""The base classes of figures: numbers that the summary has for every receiver, or for every eavesdropper.
+"""The base classes of metrics: numbers that the summary has for every receiver, or for every eavesdropper.
 
-The class of a figure says how it is summed, merged, checked and shown. No other code depends on its name.
+The class of a metric says how it is summed, merged, checked and shown. No other code depends on its name.
 
-Source: docs/results.md, summary.json; docs/your-own.md, a figure.
+Source: docs/results.md, summary.json; docs/your-own.md, a metric.
 """
 
 from __future__ import annotations
@@ -65,8 +65,8 @@ class ScoredSlots:
         )
 
 
-class FigureTally(ABC):
-    """A figure's totals over a set of trials, whose slots come in order. Pickled between processes.
+class MetricTally(ABC):
+    """A metric's totals over a set of trials, whose slots come in order. Pickled between processes.
 
     A trial's numbers should be added slot by slot, so that they have the same bits however slots and trials were divided.
     """
@@ -83,11 +83,11 @@ class FigureTally(ABC):
     @property
     @abstractmethod
     def value(self) -> float | None:
-        """The figure over the slots so far; None if it has no value."""
+        """The metric over the slots so far; None if it has no value."""
 
     @property
     def of_trials(self) -> Floats | None:
-        """The figure of every trial, (R,); None for a figure that is not `by_trial`."""
+        """The metric of every trial, (R,); None for a metric that is not `by_trial`."""
         return None
 
 
@@ -126,8 +126,8 @@ class ReceiverTotals:
     """Reason → packets."""
 
 
-class FigureColumn(NamedTuple):
-    """A column of a table in the terminal. Figures with equal columns share one, because no run has both."""
+class MetricColumn(NamedTuple):
+    """A column of a table in the terminal. Metrics with equal columns share one, because no run has both."""
 
     heading: str
     place: int = 99
@@ -135,7 +135,7 @@ class FigureColumn(NamedTuple):
     format: str = ".4g"
 
 
-class Figure(ABC):
+class Metric(ABC):
     """A number of a receiver. A class, never an instance, is registered; its name in the registry is that in the summary."""
 
     of: ClassVar[Literal["receiver", "eavesdropper"]] = "receiver"
@@ -149,37 +149,37 @@ class Figure(ABC):
     of_error: ClassVar[bool] = False
     """Whether it is a mean of errors or covariances: no standard error where theory says that their variance is infinite."""
     expected: ClassVar[str | None] = None
-    """The figure of theory that it estimates, if there is one: the summary then has its z."""
+    """The metric of theory that it estimates, if there is one: the summary then has its z."""
     needs_states: ClassVar[bool] = False
     """Whether it needs states and estimates; it is null in modes without them."""
     needs_theory: ClassVar[bool] = False
     """Whether it is null for a receiver without theory."""
     only_in_mode: ClassVar[str | None] = None
-    """The only mode whose summaries have it; no expectation can name such a figure."""
+    """The only mode whose summaries have it; no expectation can name such a metric."""
     not_in_mode: ClassVar[str | None] = None
     """The mode in which it is null."""
     rests_on: ClassVar[Literal["observer", "recorded trials", "receiver", "theory"]] = "receiver"
     """Its source in a live run: the observer, for all trials or only for recorded ones; the receiver's word alone; or theory."""
-    column: ClassVar[FigureColumn | None] = None
+    column: ClassVar[MetricColumn | None] = None
     """Its column in the closing table, if it has one."""
-    sweep_column: ClassVar[FigureColumn | None] = None
-    """Its column in the printed table of a sweep, if it has one. The table on disk has every figure."""
+    sweep_column: ClassVar[MetricColumn | None] = None
+    """Its column in the printed table of a sweep, if it has one. The table on disk has every metric."""
     sweep_picture: ClassVar[Literal["marks", "lines"] | None] = None
     """How the picture of a sweep shows it, if it does."""
 
     @classmethod
     @abstractmethod
-    def tally(cls, trials: int) -> FigureTally:
+    def tally(cls, trials: int) -> MetricTally:
         """A tally of no slots yet, for this many trials. Expectations over some slots use it, too."""
 
 
-class TotalsFigure(Figure):
-    """A figure that is computed from `ReceiverTotals` for a whole run, without a tally."""
+class TotalsMetric(Metric):
+    """A metric that is computed from `ReceiverTotals` for a whole run, without a tally."""
 
     @classmethod
     @abstractmethod
     def of_totals(cls, totals: ReceiverTotals) -> float:
-        """The figure of a whole run; NaN if it has none."""
+        """The metric of a whole run; NaN if it has none."""
 
     @classmethod
     def sums_of_trials(cls, totals: TrialTotals) -> Floats | None:
@@ -189,7 +189,7 @@ class TotalsFigure(Figure):
 
 
 @final
-class MeanTally(FigureTally):
+class MeanTally(MetricTally):
     """Sums of a value over slots, for each trial or for all trials together."""
 
     def __init__(self, values: Callable[[ScoredSlots], Floats], trials: int, by_trial: bool) -> None:
@@ -224,7 +224,7 @@ class MeanTally(FigureTally):
         return float(self.of_trials.sum()) / self._trials if self._slots else None
 
 
-class MeanFigure(Figure):
+class MeanMetric(Metric):
     """A mean over slots and trials."""
 
     by_trial = True
@@ -233,9 +233,9 @@ class MeanFigure(Figure):
     @staticmethod
     @abstractmethod
     def values(slots: ScoredSlots) -> Floats:
-        """The value in every slot and trial, (c, R); or its sum over trials, (c, 1), of a figure that is not `by_trial`."""
+        """The value in every slot and trial, (c, R); or its sum over trials, (c, 1), of a metric that is not `by_trial`."""
 
     @classmethod
-    def tally(cls, trials: int) -> FigureTally:
+    def tally(cls, trials: int) -> MetricTally:
         """Sums over no slots yet, for this many trials."""
         return MeanTally(cls.values, trials, cls.by_trial)

@@ -1,4 +1,4 @@
-"""Each figure that a wire file can expect of a link is its own number of the summary, and none where nothing was heard."""
+"""Each metric that a wire file can expect of a link is its own number of the summary, and none where nothing was heard."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from evedrop.results.wire_summary import WireLinkSummary
-from evedrop.wire.figures import WIRE_FIGURES
+from evedrop.wire.metrics import WIRE_METRICS
 
 DELAYS: Any = SimpleNamespace(delay_quantile=lambda quantile: quantile)
 """The tally of messages whose delay has the quantile q at q seconds."""
@@ -37,12 +37,12 @@ def link(heard: int) -> WireLinkSummary:
 
 
 @pytest.mark.parametrize(("name", "value"), [("delivery", 0.25), ("gap_messages", 4), ("gap_seconds", 0.7)])
-def test_a_figure_is_a_number_of_the_summary(name: str, value: float) -> None:
+def test_a_metric_is_a_number_of_the_summary(name: str, value: float) -> None:
     """None if the link heard nothing."""
-    assert WIRE_FIGURES[name].value(link(12), DELAYS, None) == value
-    assert WIRE_FIGURES[name].value(link(0), DELAYS, None) is None
+    assert WIRE_METRICS[name].value(link(12), DELAYS, None) == value
+    assert WIRE_METRICS[name].value(link(0), DELAYS, None) is None
 
 
 def test_a_latency_is_the_quantile_that_is_asked_for() -> None:
     """By default the median."""
-    assert [WIRE_FIGURES["latency"].value(link(12), DELAYS, one) for one in (0.9, None)] == [0.9, 0.5]
+    assert [WIRE_METRICS["latency"].value(link(12), DELAYS, one) for one in (0.9, None)] == [0.9, 0.5]
