@@ -145,8 +145,8 @@ def _links(of: RunSource) -> Iterator[Markup]:
         table.add(
             name,
             *(f"{count:,}" for count in (one.offered, one.delivered, one.late, one.lost)),
-            figure_text(one.rate, ".4f"),
-            figure_text(one.expected_rate, ".4f"),
+            number_text(one.rate, ".4f"),
+            number_text(one.expected_rate, ".4f"),
             "–" if one.interval is None else f"{one.interval[0]:.4f} to {one.interval[1]:.4f}",
             {True: "yes", False: "NO", None: "–"}[one.within_interval],
             ", ".join(f"{count:,} {reason}" for reason, count in one.lost_by.items()) or "–",
