@@ -90,7 +90,7 @@ def theory(slots: int, rounds: int) -> None:
             expected = expectations_of(load(MARGINAL, {"slots": slots, **changes}))["legitimate"]
             started = time.process_time()
             stream = expected.stream()
-            for _ in range(slots // 20):  # as an observer asks for them, some slots at a time
+            for _ in range(slots // 20):  # as a recorder asks for them, some slots at a time
                 stream.next_traces(20)
             taken[name].append((time.process_time() - started) / slots * 1e6)
     each = ", ".join(f"{name} {statistics.median(times):.2f} µs a slot" for name, times in taken.items())

@@ -23,11 +23,11 @@ import zenoh
 from table import Row, judged, run_alone
 from zenoh_peers import Load, Peer, Present, Times, carry, envelope, session_of
 
-from evedrop.names import LEGITIMATE, OBSERVER, ROUTER, SENSOR
+from evedrop.names import LEGITIMATE, RECORDER, ROUTER, SENSOR
 from evedrop.system.ports import free_port
 
 RATE = 1000.0
-_NOT_RECEIVERS = (ROUTER, SENSOR, OBSERVER)
+_NOT_RECEIVERS = (ROUTER, SENSOR, RECORDER)
 _APPEAR_SECONDS = 30.0
 _LEAVE_SECONDS = 20.0
 
@@ -61,16 +61,16 @@ def routed(slots: int) -> Times:
 
 
 def _through(router: subprocess.Popen[bytes], endpoint: str, briefs: dict[str, Any], load: Load) -> Times:
-    """Take the observer's place: wait for all, read the journal, and end the router."""
-    observer = briefs[OBSERVER]
-    prefix = f"evedrop/{observer['run']}"
+    """Take the recorder's place: wait for all, read the journal, and end the router."""
+    recorder = briefs[RECORDER]
+    prefix = f"evedrop/{recorder['run']}"
     receivers = [name for name in briefs if name not in _NOT_RECEIVERS]
     assert LEGITIMATE in receivers, sorted(briefs)
 
     def peer(name: str, key: str) -> Peer:
         return Peer(f"{prefix}/{key}", f"{prefix}/alive/{name}", briefs[name]["user"], briefs[name]["password"])
 
-    with _connected(router, endpoint, observer) as session:
+    with _connected(router, endpoint, recorder) as session:
         journal = session.declare_subscriber(f"{prefix}/journal", lambda _: None)
         Present(session, [f"{prefix}/alive/{ROUTER}"]).wait([router])
         times = carry(
@@ -84,7 +84,7 @@ def _through(router: subprocess.Popen[bytes], endpoint: str, briefs: dict[str, A
 
 
 def _connected(router: subprocess.Popen[bytes], endpoint: str, brief: dict[str, Any]) -> zenoh.Session:
-    """A session of the observer's, when the router listens."""
+    """A session of the recorder's, when the router listens."""
     deadline = time.monotonic() + _APPEAR_SECONDS
     while True:
         try:

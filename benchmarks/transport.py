@@ -1,4 +1,4 @@
-"""What other ways for messages would save: reports straight to the observer, and Unix sockets in place of TCP.
+"""What other ways for messages would save: reports straight to the recorder, and Unix sockets in place of TCP.
 
     python benchmarks/transport.py [--quick]
 

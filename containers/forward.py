@@ -1,6 +1,6 @@
-"""Passes connections on to the observer's view: the observer is on no network that leads to the host, and cannot publish a port.
+"""Passes connections on to the recorder's view: the recorder is on no network that leads to the host, and cannot publish a port.
 
-It has no brief and no results, and connects to the observer alone. It ends when the observer has ended.
+It has no brief and no results, and connects to the recorder alone. It ends when the recorder has ended.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import asyncio
 import contextlib
 import sys
 
-HOST = "observer"
+HOST = "recorder"
 PORTS = (17450, 17451)
 PROBED = 17449
 """A port on which nobody listens: a host that is there refuses at once, and one that is not says nothing."""
@@ -37,7 +37,7 @@ async def forward(port: int, reader: asyncio.StreamReader, writer: asyncio.Strea
 
 
 async def is_there() -> bool:
-    """Whether the observer's container runs."""
+    """Whether the recorder's container runs."""
     try:
         async with asyncio.timeout(POLL_SECONDS):
             _, writer = await asyncio.open_connection(HOST, PROBED)
@@ -50,7 +50,7 @@ async def is_there() -> bool:
 
 
 async def main() -> None:
-    """Pass connections on as long as the observer is there."""
+    """Pass connections on as long as the recorder is there."""
     for port in PORTS:
         await asyncio.start_server(lambda *both, port=port: forward(port, *both), "0.0.0.0", port)  # noqa: S104 - Docker publishes it
     silent = 0

@@ -30,7 +30,7 @@ def steer(brief: Brief[ControllerPart], connect: Callable[[AnyBrief], ProcessSes
     with connect(brief) as session:
         key, name = (session.keys.state, "x") if on_truth else (session.keys.estimate, "x_hat")
         subscription, put = session.subscribe(key), kept_decisive(session, session.keys.input, brief, assignment.period)
-        # The observer joins slots without the controller's reports, so all kept reports are sent again.
+        # The recorder joins slots without the controller's reports, so all kept reports are sent again.
         kept = brief.flow.window + 1 + assignment.period
         telemetry = session.replaying_publisher(session.keys.telemetry(CONTROLLER), kept, back=kept)
         due = GapDetector(key, brief.flow.longest_outage)

@@ -133,7 +133,7 @@ class ReceiverLoop:
 
 @final
 class ReceiverReplies:
-    """A receiver's messages to processes other than the observer: acknowledgements, and its estimate to a controller."""
+    """A receiver's messages to processes other than the recorder: acknowledgements, and its estimate to a controller."""
 
     def __init__(
         self, brief: AnyBrief, session: ProcessSession, acknowledges: bool, consultation: Consultation | None

@@ -34,7 +34,7 @@ from evedrop.model.schemes import scheme_of
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.slot.plant import PlantCore
 from evedrop.model.slot.sensor import SensorCore, Sent
-from evedrop.names import OBSERVER, SENSOR
+from evedrop.names import RECORDER, SENSOR
 from evedrop.peers.closed_loop import Steered
 from evedrop.scenario.conformance.checked import checked_encoder
 from evedrop.scenario.conformance.problems import Problem
@@ -190,7 +190,7 @@ class SensorLoop:
         self._program, self._clock = program, clock
         self._brief, self._session, self._core = brief, session, core
         self._send = session.replaying_publisher(session.keys.uplink, head=resend, back=part.history)
-        self._window = Window(session, (*part.receivers, OBSERVER), brief.flow.window, self._send)
+        self._window = Window(session, (*part.receivers, RECORDER), brief.flow.window, self._send)
         self._back = Acknowledgements(brief, session) if scheme.needs_acknowledgements else None
         self._steered = None
         inputs = 0

@@ -21,7 +21,7 @@ from evedrop.live.launch.preloading import process_starter
 from evedrop.live.launch.starter import StartedProcess, Starter
 from evedrop.live.network.endpoint import Endpoint
 from evedrop.live.protocol.brief import read_brief
-from evedrop.names import OBSERVER
+from evedrop.names import RECORDER
 from evedrop.results.reading import Results
 from evedrop.scenario.tables import Scenario
 from tests.conftest import wait_until
@@ -70,7 +70,7 @@ class ByHand:
     def names(self) -> tuple[str, ...]:
         """All processes."""
         relay = () if self.relay is None else ("relay",)
-        return ("router", *relay, "sensor", *self.scenario.digested, "observer")
+        return ("router", *relay, "sensor", *self.scenario.digested, "recorder")
 
     def start(self, *names: str) -> None:
         """Start these processes, or all; the router first if others find it through a proxy, which lets them in without it."""
@@ -82,9 +82,9 @@ class ByHand:
             path = self.folder / "briefs" / f"{name}.json"
             with self.log(name).open("ab") as log:
                 process = self.processes[name] = self._started(read_brief(path).role, path, log)
-            if name != OBSERVER and process.stdout is not None:
+            if name != RECORDER and process.stdout is not None:
                 process.stdout.close()  # a router that is started by hand tells nothing there
-        if "observer" in (names or self.names):
+        if "recorder" in (names or self.names):
             threading.Thread(target=self._listen, daemon=True).start()
 
     def _started(self, role: str, path: Path, log: IO[bytes]) -> StartedProcess:
@@ -97,13 +97,13 @@ class ByHand:
         return subprocess.Popen(
             [*enter, sys.executable, "-m", "evedrop", role, str(path)],
             stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE if role == OBSERVER else log,
+            stdout=subprocess.PIPE if role == RECORDER else log,
             stderr=log,
             env=environment,
         )
 
     def _listen(self) -> None:
-        lines = self.processes["observer"].stdout
+        lines = self.processes["recorder"].stdout
         assert lines is not None
         with lines:
             for line in lines:
@@ -124,14 +124,14 @@ class ByHand:
         return self.folder / f"{name}.log"
 
     def done(self) -> int:
-        """How many slots the observer says are joined."""
+        """How many slots the recorder says are joined."""
         return max(self._done, default=0)
 
     def running(self, more_than: int = 0) -> None:
         """Wait until more than this number of slots is joined."""
-        observer = self.processes["observer"]
-        wait_until(lambda: self.done() > more_than or observer.poll() is not None, "a run under way", LONG)
-        assert observer.poll() is None, self.log("observer").read_text()
+        recorder = self.processes["recorder"]
+        wait_until(lambda: self.done() > more_than or recorder.poll() is not None, "a run under way", LONG)
+        assert recorder.poll() is None, self.log("recorder").read_text()
 
     def kill(self, name: str) -> None:
         """Kill -9."""

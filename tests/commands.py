@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import IO, Any, Protocol
 from unittest.mock import patch
 
-from evedrop.live.launch.preloading import OF_OBSERVERS, OF_OTHERS, OF_SUMMARIES, ForkServer, fork_servers
+from evedrop.live.launch.preloading import OF_OTHERS, OF_RECORDERS, OF_SUMMARIES, ForkServer, fork_servers
 
 _MODULES = (
     *OF_OTHERS,
-    *OF_OBSERVERS,
+    *OF_RECORDERS,
     *OF_SUMMARIES,
     "evedrop.cli.commands.run",
     "evedrop.live.launch.launcher",

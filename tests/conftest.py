@@ -116,7 +116,7 @@ class Done:
 
 
 def cause_of(ended: str) -> str:
-    """Why a run ended, by its summary, without the moment of its metrics, which a killed observer's summary may add."""
+    """Why a run ended, by its summary, without the moment of its metrics, which a killed recorder's summary may add."""
     return re.sub(r" \(the metrics are as of [^)]*\)", "", ended)
 
 

@@ -65,7 +65,7 @@ def loaded() -> dict[str, set[str]]:
     peers = (*modules_of("peers"), *modules_of("live.network"), *modules_of("live.protocol"))
     others = ("live", "simulate", "scenario", "score", "results")
     rest = (module for package in others for module in modules_of(package))
-    return loaded_by("evedrop.model.controllers", *model(), *peers, "evedrop.live.observer.observer", *rest)
+    return loaded_by("evedrop.model.controllers", *model(), *peers, "evedrop.live.recorder.recorder", *rest)
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +131,7 @@ def test_launcher_and_memory_load_neither_zenoh_nor_rerun(
 
 STARTS = {
     "evedrop.live.launch.launcher": {"numpy", "xxhash", "pydantic", "cryptography", "tomli_w"},
-    "evedrop.live.observer.observer": {
+    "evedrop.live.recorder.recorder": {
         "numpy",
         "xxhash",
         "pydantic",

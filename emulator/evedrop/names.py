@@ -7,13 +7,13 @@ from enum import StrEnum
 SENSOR = "sensor"
 LEGITIMATE = "legitimate"
 ROUTER = "router"
-OBSERVER = "observer"
+RECORDER = "recorder"
 OPERATOR = "operator"
 CONTROLLER = "controller"
 ACKNOWLEDGEMENTS = "acknowledgements"
 """Not a process: the name of the link of acknowledgements, whose random stream is `link/acknowledgements`."""
 RELAY = "relay"
-RESERVED = (SENSOR, LEGITIMATE, ROUTER, RELAY, OBSERVER, OPERATOR, CONTROLLER, ACKNOWLEDGEMENTS)
+RESERVED = (SENSOR, LEGITIMATE, ROUTER, RELAY, RECORDER, OPERATOR, CONTROLLER, ACKNOWLEDGEMENTS)
 
 
 class ProcessAction(StrEnum):

@@ -294,7 +294,7 @@ def test_a_brief_of_another_role_is_refused(evedrop: Evedrop) -> None:
     assert evedrop("brief", "numerical", "--out", "briefs").status == 0
     briefs = sorted((evedrop.folder / "briefs").iterdir())
     assert [path.name for path in briefs] == [
-        f"{name}.json" for name in sorted({"observer", "router", "sensor", *load("numerical").receivers})
+        f"{name}.json" for name in sorted({"recorder", "router", "sensor", *load("numerical").receivers})
     ]
     assert {path.stat().st_mode & 0o777 for path in briefs} == {0o600}
     refused(evedrop.process("sensor", "briefs/smart.json"), "is the brief of a eavesdropper; expected one of a sensor")
@@ -303,11 +303,11 @@ def test_a_brief_of_another_role_is_refused(evedrop: Evedrop) -> None:
     refused(evedrop.process("eavesdropper", "briefs/smart.json"), "readable by others")
 
 
-def test_an_observer_that_cannot_write_says_so(evedrop: Evedrop) -> None:
+def test_a_recorder_that_cannot_write_says_so(evedrop: Evedrop) -> None:
     """Started by hand, with a file where its results should go: one line with the place, exit 2."""
     assert evedrop("brief", "numerical", "--out", "briefs", "--results", "results").status == 0
     (evedrop.folder / "results").touch()
-    refused(evedrop.process("observer", "briefs/observer.json"), "results is a file; give another folder")
+    refused(evedrop.process("recorder", "briefs/recorder.json"), "results is a file; give another folder")
 
 
 def test_a_reader_that_leaves_does_no_harm(evedrop: Evedrop) -> None:

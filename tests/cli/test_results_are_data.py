@@ -51,7 +51,7 @@ LOOKS = {
 """Commands that take a folder, and do not run its scenario → the arguments that follow the folder."""
 NEITHER = frozenset(
     {"list", "show", "new", "wire", "figures", "paper", "docs", "completion", "selftest", "health", "host"}
-    | {"router", "relay", "sensor", "legitimate", "eavesdropper", "controller", "observer"}
+    | {"router", "relay", "sensor", "legitimate", "eavesdropper", "controller", "recorder"}
 )
 """Commands that take neither a scenario nor a results folder. The process of a run takes a brief, which the launcher wrote."""
 EVIL = """from pathlib import Path

@@ -76,7 +76,7 @@ def prints_tables(module: str, name: str) -> bool:
 def test_every_command_that_prints_a_table_writes_it() -> None:
     """By the source of all commands: one that makes a console for tables takes --csv and --latex, and no other one does.
 
-    Processes of a run take a brief and nothing else; the observer among them prints the report, which `view --table` does again.
+    Processes of a run take a brief and nothing else; the recorder among them prints the report, which `view --table` does again.
     """
     commands = [
         (module, command)

@@ -18,7 +18,7 @@ from tests.containers.machine import Docker
 from tests.debian import ROOT
 from tests.privileged import run
 
-ROLES = ("router", "sensor", "legitimate", "suspicious", "smart", "observer")
+ROLES = ("router", "sensor", "legitimate", "suspicious", "smart", "recorder")
 """The services that are processes of a run."""
 
 ENDLESS = "--slots 1000000 --pace 0.002 --set longest_outage=2.0"
@@ -86,13 +86,13 @@ class Project:
 
     def progress(self) -> int:
         """The slots that the run has done."""
-        lines = [line for line in self.said("observer").splitlines() if line.startswith("{") and '"progress"' in line]
+        lines = [line for line in self.said("recorder").splitlines() if line.startswith("{") and '"progress"' in line]
         return max((json.loads(line)["done"] for line in lines), default=0)
 
     def running(self, more_than: int = 0) -> None:
         """Wait until more than this number of slots is done."""
         wait_until(lambda: self.progress() > more_than, "a run under way")
-        assert self.state("observer")["Running"], "the run must not end before it is disturbed"
+        assert self.state("recorder")["Running"], "the run must not end before it is disturbed"
 
     def listening(self) -> set[str]:
         """The ports of the machine that are listened on; all of them on loopback."""

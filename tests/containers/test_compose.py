@@ -53,11 +53,11 @@ def test_up_alone_runs_the_demo(project: Make) -> None:
 
 
 def test_the_recipe_for_a_script_gives_table_and_status(project: Make) -> None:
-    """Word by word as docs/containers.md has it: all that the observer says, the table too, and the status of the run."""
+    """Word by word as docs/containers.md has it: all that the recorder says, the table too, and the status of the run."""
     tested = project(EVEDROP_OPTIONS=f"{SHORT} --set expect=[{{metric='smart.mean_squared_error',below=0}}]")
     tested.compose("up", "--detach")
-    said = tested.compose("logs", "--follow", "observer").stdout
-    identity = tested.compose("ps", "--all", "--quiet", "observer").stdout.strip()
+    said = tested.compose("logs", "--follow", "recorder").stdout
+    identity = tested.compose("ps", "--all", "--quiet", "recorder").stdout.strip()
     assert tested.docker("wait", identity) == "1"
     complete(tested, 600)
     ended = said.index('"ended"')
@@ -86,17 +86,17 @@ def test_files_for_a_scenario_with_controller_and_relay(tmp_path: Path, project:
     grid = Project.of(tmp_path / "grid", project().docker, EVEDROP_OPTIONS="--pace 0")
     try:
         grid.compose("up")
-        processes = ("router", "relay", "sensor", "legitimate", "controller", "eavesdropper-view", "observer")
+        processes = ("router", "relay", "sensor", "legitimate", "controller", "eavesdropper-view", "recorder")
         assert {service: grid.state(service)["ExitCode"] for service in processes} == dict.fromkeys(processes, 0)
         complete(grid, 96, grid.folder / "own.toml")
     finally:
         grid.down()
 
 
-SERVICES = "docker-compose.yml has services for: legitimate observer router sensor smart suspicious; write files"
+SERVICES = "docker-compose.yml has services for: legitimate recorder router sensor smart suspicious; write files"
 WRONG = {
-    "one.toml": f"one.toml has the processes: legitimate observer router sensor smart, and {SERVICES}",
-    "vehicle": f"vehicle has the processes: legitimate naive observer router sensor smart suspicious, and {SERVICES}",
+    "one.toml": f"one.toml has the processes: legitimate recorder router sensor smart, and {SERVICES}",
+    "vehicle": f"vehicle has the processes: legitimate naive recorder router sensor smart suspicious, and {SERVICES}",
     "two.toml": f"two.toml has two routers, and {SERVICES}",
     "two-eavesdropers": "no scenario two-eavesdropers",
 }
@@ -129,8 +129,8 @@ def test_a_killed_container_ends_the_run_and_the_next_one_goes_well(project: Mak
     one.compose("up", "--detach")
     one.running()
     one.docker("kill", one.container("smart"))
-    assert one.ended("observer") == 3
-    assert "smart cut off from the network for 2 s" in one.said("observer")
+    assert one.ended("recorder") == 3
+    assert "smart cut off from the network for 2 s" in one.said("recorder")
     assert one.results().slots.num_rows > 0
     assert {service: one.ended(service) for service in ROLES} == {**dict.fromkeys(ROLES, 3), "smart": 137}
     again = project(EVEDROP_OPTIONS=SHORT)
@@ -151,5 +151,5 @@ def test_a_router_started_again_and_a_network_that_was_away_change_nothing(proje
     health = ("docker", "-H", one.docker.address, "exec", smart, "evedrop", "health", "/brief/brief.json")
     wait_until(lambda: subprocess.run(health, capture_output=True, check=False).returncode, "an eavesdropper cut off")
     one.docker("network", "connect", network, smart)
-    assert one.ended("observer") == 0, one.said("observer")
+    assert one.ended("recorder") == 0, one.said("recorder")
     complete(one, 3000)

@@ -102,12 +102,12 @@ def test_every_process_has_a_service_a_brief_and_a_network(own: Path) -> None:
     services = found["services"]
     mounts = [one.split(":") for one in services["briefs"]["volumes"][2:]]
     by_process = {path.rpartition("/")[2]: name for name, path in mounts}
-    assert set(by_process) == {"router", "relay", "sensor", "legitimate", "controller", "observer", *NAMES}
+    assert set(by_process) == {"router", "relay", "sensor", "legitimate", "controller", "recorder", *NAMES}
     assert set(by_process.values()) == set(found["volumes"])
     for process, name in by_process.items():
         volumes = services[name]["volumes"]
         assert volumes[0] == f"{name}:/brief:ro"
-        assert len(volumes) == (2 if process == "observer" else 1)
+        assert len(volumes) == (2 if process == "recorder" else 1)
         role = "eavesdropper" if process in NAMES else process
         assert services[name]["command"][:2] == [role, "/brief/brief.json"]
         hub = "router" if process in {"sensor", "relay"} else "relay"
@@ -121,7 +121,7 @@ def test_every_process_has_a_service_a_brief_and_a_network(own: Path) -> None:
         hub = "router" if process in {"sensor", "relay"} else "relay"
         if process != "router":
             assert networks.pop(f"to-{name}") == {name, hub}
-    assert networks == {"to-view": {"observer", "view"}, "view": {"view", "finished"}}
+    assert networks == {"to-view": {"recorder", "view"}, "view": {"view", "finished"}}
     scenario = load(own / services["briefs"]["environment"]["EVEDROP_SCENARIO"][len("${EVEDROP_SCENARIO:-") : -1])
     assert set(scenario.eavesdroppers) == set(NAMES)
 

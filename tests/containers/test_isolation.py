@@ -90,7 +90,7 @@ def test_who_can_reach_what(going: Project) -> None:
         found = json.loads(seen[service])
         assert found["names"] == sorted({"router", service}, key=ROLES.index)
         own = {f"{everybody['router'][f'to-{service}']}:7447"}
-        if service == "observer":
+        if service == "recorder":
             own |= {f"{host}:17450" for host in everybody[service].values()}
         assert set(found["reached"]) == own
         assert found["files"] == ["/brief/brief.json"]
@@ -189,7 +189,7 @@ def test_a_container_cannot_take_the_whole_machine(going: Project) -> None:
 
 
 def test_the_view_is_on_loopback_alone(going: Project) -> None:
-    """The page answers at the address that the observer tells, and nothing else of the machine's listens for others."""
-    address = next(line for line in going.said("observer").splitlines() if '"view"' in line)
+    """The page answers at the address that the recorder tells, and nothing else of the machine's listens for others."""
+    address = next(line for line in going.said("recorder").splitlines() if '"view"' in line)
     assert "http://127.0.0.1:17450/?url=" in address
     going.shown()

@@ -28,7 +28,7 @@ CONFUSED_FILE = "confused"
 """In the folder of a run whose router has confused keys."""
 CLEANER = "cleaner"
 FORK_SERVERS = ("first fork server", "second fork server")
-"""Those of the observer and of all others: the second is forked from the first."""
+"""Those of the recorder and of all others: the second is forked from the first."""
 _DISK_BYTES = 24 * 2**20
 _ROOT = Path(__file__).parents[2]
 

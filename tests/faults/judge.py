@@ -29,7 +29,7 @@ OUTCOMES = ("as if undisturbed", "failed by name", "interrupted", "launcher kill
 _HEEDED_SECONDS = 1.0
 """After a signal to the launcher a run that has slots to come does not complete."""
 _LEAVE_SECONDS = 40.0
-"""For processes whose launcher was killed to write the results and end; and for all others. An observer takes 30 at most."""
+"""For processes whose launcher was killed to write the results and end; and for all others. A recorder takes 30 at most."""
 _OF_C_LIBRARY, _ENDED_BY_C_LIBRARY = 127, "cannot allocate memory for thread-local data: ABORT"
 _OF_ZENOH = re.compile(r"panicked at \S*/zenoh[^\s/]*/\S+\.rs")
 
@@ -279,7 +279,7 @@ def _of_summary(
     # A signal may come when the run is complete, and end a launcher that prints its report.
     elif summary["ended"] == "complete" and status not in (KILLED, INTERRUPTED):
         yield f"status {status}, and the summary says complete"
-    if any(fault.target in ("observer", "launcher", *FORK_SERVERS) and fault.kind in KILLING for fault in hits):
+    if any(fault.target in ("recorder", "launcher", *FORK_SERVERS) and fault.kind in KILLING for fault in hits):
         return
     if summary["slots"] < run.done:
         yield f"{run.done} slots were done, and the summary has {summary['slots']}"

@@ -123,9 +123,9 @@ class Fault:
         if self.target in FORK_SERVERS:
             return ("fork server",)
         if self.target == EVERYBODY:
-            return (*_ROUTERS, "observer")
+            return (*_ROUTERS, "recorder")
         # Whose own connection is gone cannot tell who is at fault: to it all others vanish behind the router.
-        return (self.target, *(_ROUTERS if self.target in ("observer", *_ROUTERS) else ()))
+        return (self.target, *(_ROUTERS if self.target in ("recorder", *_ROUTERS) else ()))
 
 
 _T = TypeVar("_T")
@@ -238,7 +238,7 @@ def _fill(fault: Fault, run: Disturbed) -> bool:
     if run.fill():
         return True
     hit = False
-    for name in ("observer", "launcher"):
+    for name in ("recorder", "launcher"):
         for shard in range(run.variant.shards):
             for pid in run.pids(name, shard):
                 with suppress(ProcessLookupError):

@@ -41,14 +41,14 @@ def wrong_outages(
             yield f"an outage of {entry['seconds']} s"
     for fault, at in struck.items():
         killed = fault.kind == "kill" and fault.target == "router" and _went_on(told, at, slots)
-        if complete and killed and not {entry["process"] for entry in listed} & {*_ROUTERS, "observer"}:
+        if complete and killed and not {entry["process"] for entry in listed} & {*_ROUTERS, "recorder"}:
             yield "the router was killed in the middle of the run, and the summary lists no outage"
 
 
 def _explained(process: str, struck: Mapping[Fault, float], complete: bool) -> bool:
-    """Whether a fault can have cut a process off. Routers, and the observer, stand for all that were connected to them.
+    """Whether a fault can have cut a process off. Routers, and the recorder, stand for all that were connected to them.
 
-    To an observer whose own connection flaps, the others are back one after the other, and no longer all at once.
+    To a recorder whose own connection flaps, the others are back one after the other, and no longer all at once.
     """
     for fault in struck:
         if fault.kind in _CUTTING and host_of(fault.target):
@@ -56,7 +56,7 @@ def _explained(process: str, struck: Mapping[Fault, float], complete: bool) -> b
                 continue  # the processes on a host talk with their router directly
             return True  # and end with the connection of their host
         if fault.kind in _CUTTING and (
-            fault.target in (process, EVERYBODY, "observer") or process in (*_ROUTERS, "observer")
+            fault.target in (process, EVERYBODY, "recorder") or process in (*_ROUTERS, "recorder")
         ):
             return True
         if fault.kind not in _CUTTING and fault.target not in ("results", "cleaner"):

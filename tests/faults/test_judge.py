@@ -268,7 +268,7 @@ def test_an_outage_is_explained_by_a_fault_that_can_cause_it(complete: bool) -> 
         flap = Fault("flap", target, Moment("run", 0.5), seconds=1.0, count=3)
         return list(wrong_outages(listed, [], {flap: 1.0}, 400, complete))
 
-    assert unexplained("naive", "observer") == unexplained("naive", "naive") == unexplained("router", "naive") == []
+    assert unexplained("naive", "recorder") == unexplained("naive", "naive") == unexplained("router", "naive") == []
     assert unexplained("naive", "smart")
     assert bool(unexplained("relay", "connection of beta")) == complete
 

@@ -61,7 +61,7 @@ class Variant:
     @property
     def processes(self) -> tuple[str, ...]:
         """All that the launcher starts, for each shard."""
-        return ("router", "sensor", "observer", *self.receivers, *self.more)
+        return ("router", "sensor", "recorder", *self.receivers, *self.more)
 
     def path(self, folder: Path) -> str:
         """What is typed for it: the name of a shipped scenario, or a file written into a folder."""

@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from evedrop.errors import EvedropError
-from evedrop.live.launch.briefs import ObserverTask, briefs_of
+from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.network.control_file import Control, read_controls
 from evedrop.live.protocol.brief import read_brief
 from evedrop.live.protocol.brief_use import expect_usable
@@ -49,7 +49,7 @@ def _results() -> dict[str, bytes]:
 
 @cache
 def _cut_short() -> dict[str, bytes]:
-    """The same of a run whose observer was killed after three rounds."""
+    """The same of a run whose recorder was killed after three rounds."""
     with TemporaryDirectory() as name:
         folder = Path(name) / "run"
         folder.mkdir(mode=0o700)
@@ -117,7 +117,7 @@ def _briefs() -> list[bytes]:
     found = []
     for name in ("eavesdroppers", "acknowledged", "microgrid", "restart"):
         scenario = load(name, {"slots": 8, "trials": 2, "record_trials": 1, "expect": [], "event": []})
-        for brief in briefs_of(scenario, "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False)).values():
+        for brief in briefs_of(scenario, "tcp/127.0.0.1:1", RecorderTask(Path("nowhere"), False)).values():
             found.append(json.dumps({**json.loads(brief.text), "run": "r00000000", "password": "p"}).encode())
     return found
 

@@ -22,7 +22,7 @@ from tests.conftest import wait_until
 from tests.hosts.lan import Lan, lan
 
 PORT = 7447
-HOSTS = ("router", "sensor", "legitimate", "eve", "observer")
+HOSTS = ("router", "sensor", "legitimate", "eve", "recorder")
 
 
 def on_hosts(**changes: Any) -> Scenario:
@@ -107,7 +107,7 @@ def test_hosts_of_their_own_change_nothing_and_show_nothing(tmp_path: Path) -> N
         run.start()
         run.running()
         evedrop = (sys.executable, "-m", "evedrop")
-        network.run("observer", *evedrop, "pause", str(run.folder / "run"))  # however long the scan takes
+        network.run("recorder", *evedrop, "pause", str(run.folder / "run"))  # however long the scan takes
         router = network.addresses["router"]
         found = network.run("eve", sys.executable, "-c", SCAN, "65535", router)
         assert found.split() == [router, str(PORT)]
@@ -116,7 +116,7 @@ def test_hosts_of_their_own_change_nothing_and_show_nothing(tmp_path: Path) -> N
         for host in HOSTS:  # what listens at all, of any protocol, is what was scanned for
             listening = network.run(host, "ss", "-Hlntu").splitlines()
             assert [line.split()[4] for line in listening] == [f"{router}:{PORT}"] * (host == "router")
-        network.run("observer", *evedrop, "resume", str(run.folder / "run"))
+        network.run("recorder", *evedrop, "resume", str(run.folder / "run"))
         assert set(run.statuses().values()) == {0}
         as_if_undisturbed(run.summary, scenario, tmp_path / "memory")
         assert run.summary["outages"] == []
@@ -152,10 +152,10 @@ def test_a_pulled_cable_is_an_outage(host: str, tmp_path: Path) -> None:
         assert set(run.statuses().values()) == {0}
         as_if_undisturbed(run.summary, scenario, tmp_path / "memory")
         outages = run.summary["outages"]
-        # If the router's cable is out, the observer sees that it reaches nobody, and finds the same router again. The router may
-        # notice later than the observer that another process has lost its connection, too: that is an outage of its own.
+        # If the router's cable is out, the recorder sees that it reaches nobody, and finds the same router again. The router may
+        # notice later than the recorder that another process has lost its connection, too: that is an outage of its own.
         assert "router" not in {outage["process"] for outage in outages}
-        assert outages[0]["process"] == {"eve": "eve", "router": "observer"}[host]
+        assert outages[0]["process"] == {"eve": "eve", "router": "recorder"}[host]
         assert len(outages) == 1 or host == "router"
         assert len({outage["slot"] for outage in outages}) == 1
         assert all(outage["seconds"] > 4.0 for outage in outages)
@@ -189,7 +189,7 @@ def test_two_routers_lose_each_other(tmp_path: Path) -> None:
         assert set(run.statuses().values()) == {0}
         as_if_undisturbed(run.summary, scenario, tmp_path / "memory")
         cut_off = {outage["process"] for outage in run.summary["outages"]}
-        # The observer is behind the relay: with the router's cable it loses sight of the sensor, too.
+        # The recorder is behind the relay: with the router's cable it loses sight of the sensor, too.
         assert {"router"} <= cut_off <= {"router", "sensor"}
 
 

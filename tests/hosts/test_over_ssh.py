@@ -25,7 +25,7 @@ from tests.sshd import sshd
 
 PORT = 7447
 PLACES = {"alpha": ("router", "sensor", "legitimate"), "beta": ("eve",)}
-"""Host → its processes; the observer is on the host of the launcher."""
+"""Host → its processes; the recorder is on the host of the launcher."""
 
 
 @contextmanager

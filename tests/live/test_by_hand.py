@@ -21,7 +21,7 @@ from tests.commands import ForkedCommand
 from tests.conftest import LIMIT, Done, Evedrop, Live, wait_until
 from tests.examples import mostly_long
 
-ROLES = ("router", "relay", "sensor", "legitimate", "observer")
+ROLES = ("router", "relay", "sensor", "legitimate", "recorder")
 SOON = 5.0
 """Seconds within which a mistake is to be said; how long the machine took for all else is not counted."""
 
@@ -41,7 +41,7 @@ def begun(evedrop: Evedrop, name: str, path: str, *options: str, folder: Path | 
 
 
 def closing(done: Done) -> list[str]:
-    """What an observer printed after its events, but for the folder's name and how fast it was."""
+    """What a recorder printed after its events, but for the folder's name and how fast it was."""
     events = [line for line in done.out.splitlines() if line.startswith("{")]
     lines = done.out.splitlines()
     assert lines[: len(events)] == events
@@ -104,7 +104,7 @@ def test_started_by_hand_it_is_the_same_run(options: tuple[str, ...], backwards:
 @pytest.mark.parametrize(
     "below", [pytest.param(1.0, marks=pytest.mark.long, id="held"), pytest.param(0.0, id="failed")]
 )
-def test_by_hand_the_observer_prints_and_ends_as_run_does(below: float, evedrop: Evedrop) -> None:
+def test_by_hand_the_recorder_prints_and_ends_as_run_does(below: float, evedrop: Evedrop) -> None:
     """The table and the verdict of `evedrop run`, and its exit status, be it that an expectation failed."""
     expect = f"expect=[{{metric='legitimate.mean_squared_error', below={below}}}]"
     launched = evedrop("run", "eavesdroppers", "--slots", "200", "--view", "off", "--set", expect, "--out", "launched")
@@ -112,25 +112,25 @@ def test_by_hand_the_observer_prints_and_ends_as_run_does(below: float, evedrop:
     briefs = written(evedrop, "--listen", f"tcp/127.0.0.1:{free_port()}", "--set", expect)
     running = {name: begun(evedrop, name, path) for name, path in briefs.items()}
     ended = {name: live.end() for name, live in running.items()}
-    assert ended["observer"].status == launched.status, ended["observer"].err
-    assert {done.status for name, done in ended.items() if name != "observer"} == {0}
-    found, expected = closing(ended["observer"]), comparable(launched.out.replace("launched", "results").splitlines())
+    assert ended["recorder"].status == launched.status, ended["recorder"].err
+    assert {done.status for name, done in ended.items() if name != "recorder"} == {0}
+    found, expected = closing(ended["recorder"]), comparable(launched.out.replace("launched", "results").splitlines())
     assert found == expected
     assert any("relative secrecy" in line for line in found)
 
 
 @pytest.mark.long
 def test_a_reader_that_leaves_early_changes_no_exit_status(evedrop: Evedrop) -> None:
-    """An observer whose output is no longer read still exits with the status of the run."""
+    """A recorder whose output is no longer read still exits with the status of the run."""
     expect = "expect=[{metric='smart.mean_squared_error', below=0}]"
     briefs = written(evedrop, "--listen", f"tcp/127.0.0.1:{free_port()}", "--set", expect)
-    observer_brief = briefs.pop("observer")
+    recorder_brief = briefs.pop("recorder")
     running = {name: begun(evedrop, name, path) for name, path in briefs.items()}
-    with evedrop.start(["-m", "evedrop"], ("observer", observer_brief), {}) as observer:
-        assert observer.stdout is not None
-        observer.stdout.readline()
-        observer.stdout.close()
-        assert observer.wait(LIMIT) == 1
+    with evedrop.start(["-m", "evedrop"], ("recorder", recorder_brief), {}) as recorder:
+        assert recorder.stdout is not None
+        recorder.stdout.readline()
+        recorder.stdout.close()
+        assert recorder.wait(LIMIT) == 1
     assert {live.end().status for live in running.values()} == {0}
 
 
@@ -145,8 +145,8 @@ def test_a_run_on_loopback_takes_certificates_too(evedrop: Evedrop) -> None:
     assert "PRIVATE KEY" in control["identity"]["key"]
     assert evedrop("status", "run").status == 0
     (evedrop.folder / "copy").mkdir()
-    (evedrop.folder / "copy" / "control.json").write_text(json.dumps({**control, "user": "observer"}))
-    told(evedrop("status", "copy"), 2, "copy/control.json: identity.certificate is that of operator, not of observer")
+    (evedrop.folder / "copy" / "control.json").write_text(json.dumps({**control, "user": "recorder"}))
+    told(evedrop("status", "copy"), 2, "copy/control.json: identity.certificate is that of operator, not of recorder")
     assert evedrop("pause", "run").out.startswith("held before slot")
     live.process.terminate()
     assert live.end().status == 130
@@ -177,7 +177,7 @@ def test_with_two_routers_a_run_is_the_same(scenario: str, evedrop: Evedrop) -> 
 
 @pytest.mark.long
 def test_a_run_of_two_routers_is_steered_and_ended_as_any(evedrop: Evedrop) -> None:
-    """The operator gets at the observer through the relay; a signal ends everybody, the relay too."""
+    """The operator gets at the recorder through the relay; a signal ends everybody, the relay too."""
     live = evedrop.live("eavesdroppers", "--slots", "100000", "--pace", "0.002", "--set", "network.routers=2")
     live.running()
     assert evedrop("link", "run", "smart", "quality=0.2").out.startswith("from slot")
@@ -199,13 +199,13 @@ def told(done: Done, status: int, *words: str) -> None:
 
 @pytest.mark.parametrize("protocol", mostly_long(["tcp", "tls"], ["tls"]))
 def test_a_brief_of_another_run_is_told_apart(protocol: str, evedrop: Evedrop) -> None:
-    """Of a process, and of the observer, which leaves no results: long before anybody's patience ends."""
+    """Of a process, and of the recorder, which leaves no results: long before anybody's patience ends."""
     endpoint = f"{protocol}/127.0.0.1:{free_port()}"
     ours = written(evedrop, "--listen", endpoint)
     others = written(evedrop, "--listen", endpoint, out="others")
     with Router(evedrop, ours["router"], endpoint) as router:
         runs = {name: json.loads((evedrop.folder / path).read_text())["run"] for name, path in others.items()}
-        for name in ("sensor", "smart", "observer"):
+        for name in ("sensor", "smart", "recorder"):
             words = [f"others/{name}.json: ", endpoint, runs[name], "start the router of this run"]
             told(begun(evedrop, name, others[name]).end(), 2, *words)
         assert router.process.poll() is None
@@ -255,7 +255,7 @@ def test_an_address_of_another_host_is_said(evedrop: Evedrop) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", mostly_long(["sensor", "observer", "router"], ["sensor", "router"]))
+@pytest.mark.parametrize("name", mostly_long(["sensor", "recorder", "router"], ["sensor", "router"]))
 def test_a_host_that_is_not_known_is_said(name: str, evedrop: Evedrop) -> None:
     """A name that does not resolve, for processes that connect and for the one that listens."""
     briefs = written(evedrop, "--listen", "tls/nowhere.invalid:7447")
@@ -273,44 +273,44 @@ def test_a_certificate_of_another_process_is_said(evedrop: Evedrop) -> None:
 
 @pytest.mark.long
 def test_who_does_not_come_is_named(evedrop: Evedrop) -> None:
-    """After the time that `--wait` gives, the observer names who is missing; exit 3, and a folder that says so."""
+    """After the time that `--wait` gives, the recorder names who is missing; exit 3, and a folder that says so."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     briefs = written(evedrop, "--listen", endpoint, "--wait", "15")
     lives = {name: begun(evedrop, name, path) for name, path in briefs.items() if name != "smart"}
-    done = lives["observer"].end()
+    done = lives["recorder"].end()
     assert done.status == 3
     assert done.err == "evedrop: smart did not appear within 15 s; start it, or look at its log\n"
     assert closing(done)[0] == "smart did not appear within 15 s; start it, or look at its log; the results so far:"
     assert Results.read(evedrop.folder / "results").summary["ended"].startswith("smart did not appear")
-    said = {name: live.end() for name, live in lives.items() if name != "observer"}
+    said = {name: live.end() for name, live in lives.items() if name != "recorder"}
     assert {name: one.status for name, one in said.items()} == dict.fromkeys(said, 3)
     for name, one in said.items():
-        assert one.err.startswith(f"evedrop: {name}: the observer gave the run up: smart did not appear")
+        assert one.err.startswith(f"evedrop: {name}: the recorder gave the run up: smart did not appear")
 
 
 @pytest.mark.long
-def test_who_ends_the_observer_ends_the_run(evedrop: Evedrop) -> None:
+def test_who_ends_the_recorder_ends_the_run(evedrop: Evedrop) -> None:
     """Ctrl-C on its host: what was measured is on disk, and everybody else ends, saying why."""
     endpoint = f"tls/127.0.0.1:{free_port()}"
     briefs = written(evedrop, "--listen", endpoint, "--set", "pace=0.002", slots=100_000)
     lives = {name: begun(evedrop, name, path) for name, path in briefs.items()}
     wait_until((evedrop.folder / "results" / "control.json").exists, "a run under way")
-    lives["observer"].process.send_signal(signal.SIGINT)
+    lives["recorder"].process.send_signal(signal.SIGINT)
     ended = {name: live.end() for name, live in lives.items()}
-    assert ended["observer"].status == 130
-    assert closing(ended["observer"])[0] == "interrupted; the results so far:"
+    assert ended["recorder"].status == 130
+    assert closing(ended["recorder"])[0] == "interrupted; the results so far:"
     assert Results.read(evedrop.folder / "results").summary["ended"] == "interrupted"
-    others = {name: done for name, done in ended.items() if name != "observer"}
+    others = {name: done for name, done in ended.items() if name != "recorder"}
     assert {name: (done.status, done.err) for name, done in others.items()} == {
-        name: (3, f"evedrop: {name}: the observer gave the run up: interrupted\n") for name in others
+        name: (3, f"evedrop: {name}: the recorder gave the run up: interrupted\n") for name in others
     }
 
 
 def test_without_a_router_everybody_says_so(evedrop: Evedrop) -> None:
-    """If the router is never started, each process names where it should be, exit 3; the observer leaves no results."""
+    """If the router is never started, each process names where it should be, exit 3; the recorder leaves no results."""
     endpoint = f"tls/127.0.0.1:{free_port()}"
     briefs = written(evedrop, "--listen", endpoint, "--wait", "1")
-    for name in ("sensor", "observer"):
+    for name in ("sensor", "recorder"):
         told(
             begun(evedrop, name, briefs[name]).end(),
             3,
@@ -320,15 +320,15 @@ def test_without_a_router_everybody_says_so(evedrop: Evedrop) -> None:
     assert list((evedrop.folder / "results").iterdir()) == []
 
 
-def test_the_results_are_where_the_observer_is_told(evedrop: Evedrop) -> None:
+def test_the_results_are_where_the_recorder_is_told(evedrop: Evedrop) -> None:
     """Relative to where it is started; --out has the last word; a folder with something in it is refused."""
     briefs = written(evedrop, "--listen", "tcp/127.0.0.1:7447", "--wait", "1", "--results", "there/results")
     (evedrop.folder / "host").mkdir()
-    assert begun(evedrop, "observer", "../briefs/observer.json", folder=evedrop.folder / "host").end().status == 3
+    assert begun(evedrop, "recorder", "../briefs/recorder.json", folder=evedrop.folder / "host").end().status == 3
     assert (evedrop.folder / "host" / "there" / "results").is_dir()
     (evedrop.folder / "full").mkdir()
     (evedrop.folder / "full" / "old").touch()
-    told(begun(evedrop, "observer", briefs["observer"], "--out", "full").end(), 2, "full is not empty")
+    told(begun(evedrop, "recorder", briefs["recorder"], "--out", "full").end(), 2, "full is not empty")
 
 
 def test_what_is_refused_leaves_no_folder(evedrop: Evedrop) -> None:
@@ -343,7 +343,7 @@ def test_what_is_refused_leaves_no_folder(evedrop: Evedrop) -> None:
 
 @pytest.mark.long
 def test_when_one_is_killed_nobody_is_left(evedrop: Evedrop) -> None:
-    """There is no launcher: the observer tells the others why the run has failed, and they end, whatever they wait for."""
+    """There is no launcher: the recorder tells the others why the run has failed, and they end, whatever they wait for."""
     briefs = written(
         evedrop, "--listen", f"tcp/127.0.0.1:{free_port()}", "--set", "longest_outage=1.0", slots=10_000_000
     )
@@ -354,6 +354,6 @@ def test_when_one_is_killed_nobody_is_left(evedrop: Evedrop) -> None:
     assert {name: done.status for name, done in ended.items()} == {**dict.fromkeys(briefs, 3), "smart": -9}
     why = "smart cut off from the network for 1 s; look at the logs"
     for name, done in ended.items():
-        assert name in {"smart", "observer"} or f"evedrop: {name}: the observer gave the run up: {why}" in done.err, (
+        assert name in {"smart", "recorder"} or f"evedrop: {name}: the recorder gave the run up: {why}" in done.err, (
             name
         )

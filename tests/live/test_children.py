@@ -1,4 +1,4 @@
-"""The launcher's view of its children: their briefs, the observer's events, and how a run ended; no process is started."""
+"""The launcher's view of its children: their briefs, the recorder's events, and how a run ended; no process is started."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import IO
 import pytest
 
 from evedrop.errors import Interrupted, MalformedMessage, MissingProcesses
-from evedrop.live.launch.briefs import ObserverTask, briefs_of
+from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.launch.children import Children, ProcessExit
 from evedrop.live.launch.process_set import follow_to_end
 from evedrop.live.protocol.brief import read_brief
@@ -56,7 +56,7 @@ class Ended:
 
 @dataclass
 class FakeStarter:
-    """Starts processes that end at once; an observer writes these lines first."""
+    """Starts processes that end at once; a recorder writes these lines first."""
 
     lines: bytes = b""
     status: int = 0
@@ -68,7 +68,7 @@ class FakeStarter:
     def __call__(self, role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> Ended:  # noqa: ARG002 - nothing is run
         """Start one."""
         self.begun.append(brief.stem)
-        stdout = BytesIO(self.lines) if role == "observer" else self.pipes.get(brief.stem)
+        stdout = BytesIO(self.lines) if role == "recorder" else self.pipes.get(brief.stem)
         return Ended(next(self.pids), stdout, None, self.status)
 
 
@@ -79,7 +79,7 @@ class Bench:
         self.private, self.results = folder / "private", new_folder(folder / "run")
         self.private.mkdir()
         (self.results / "logs").mkdir(exist_ok=True)
-        self.briefs = briefs_of(small_network(), "tcp/127.0.0.1:1", ObserverTask(self.results, False))
+        self.briefs = briefs_of(small_network(), "tcp/127.0.0.1:1", RecorderTask(self.results, False))
         self.starter = FakeStarter()
         self.held = HeldFolder(self.results)
         self.children = Children(self.held, self.private, starter=self.starter)
@@ -89,20 +89,20 @@ class Bench:
         word.leave(last_word_file(self.private, name))
 
     def tells(self, *lines: bytes) -> list[ProgressEvent]:
-        """The observer writes these lines and ends: what the launcher shows of them."""
+        """The recorder writes these lines and ends: what the launcher shows of them."""
         self.starter.lines = b"".join(lines)
-        self.children.start(self.briefs["observer"])
+        self.children.start(self.briefs["recorder"])
         found: list[ProgressEvent] = []
 
         def ended() -> bool:
             match self.children.next_event(0.1):
-                case ProcessExit("observer"):
+                case ProcessExit("recorder"):
                     return True
                 case ProgressEvent() as event:
                     found.append(event)
             return False
 
-        wait_until(ended, "the observer's end")
+        wait_until(ended, "the recorder's end")
         return found
 
 
@@ -115,19 +115,19 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
 
 
 def test_a_signal_that_comes_when_the_run_is_complete_changes_nothing(bench: Bench) -> None:
-    """The observer, told to end, says that it was complete: so its summary does, and the exit status follows."""
+    """The recorder, told to end, says that it was complete: so its summary does, and the exit status follows."""
     stop = threading.Event()
     stop.set()
     bench.starter.lines = RunEnded(1, "complete").line
-    bench.children.start(bench.briefs["observer"])
+    bench.children.start(bench.briefs["recorder"])
     assert follow_to_end(bench.children, stop, silent) == 1
     bench.starter.lines = RunEnded(130, "interrupted").line
-    bench.children.start(bench.briefs["observer"])
+    bench.children.start(bench.briefs["recorder"])
     with pytest.raises(Interrupted):
         follow_to_end(bench.children, stop, silent)
 
 
-MISSED = LastWord.about(MissingProcesses("eve", ("legitimate", "observer"), "within 30 s; start them"))
+MISSED = LastWord.about(MissingProcesses("eve", ("legitimate", "recorder"), "within 30 s; start them"))
 CUT_OFF = LastWord(Cause.NO_CONNECTION, "it has had no connection with the router for 30 s")
 
 
@@ -150,16 +150,16 @@ def test_why_zenoh_panicked_is_shown_without_its_stack(bench: Bench) -> None:
     assert report.splitlines()[-1] == "    OS can't spawn worker thread: Resource temporarily unavailable (os error 11)"
 
 
-@pytest.mark.parametrize("first", [ProcessExit("eve", 3), ProcessExit("observer", 3)])
-def test_who_ends_for_lack_of_an_observer_is_not_at_fault(bench: Bench, first: ProcessExit) -> None:
-    """Cut off from the router, the observer and all others give up after the same time; it is named, and why."""
-    for name in ("eve", "observer"):
+@pytest.mark.parametrize("first", [ProcessExit("eve", 3), ProcessExit("recorder", 3)])
+def test_who_ends_for_lack_of_a_recorder_is_not_at_fault(bench: Bench, first: ProcessExit) -> None:
+    """Cut off from the router, the recorder and all others give up after the same time; it is named, and why."""
+    for name in ("eve", "recorder"):
         bench.starter.status = 3
         bench.children.start(bench.briefs[name])
     bench.leaves("eve", MISSED)
     report = bench.children.failure_report(first, RunEnded(3, "no router answered at tcp/127.0.0.1:1 within 30 s"))
-    assert report.startswith("observer"), report
-    assert "logs/observer.log" in report
+    assert report.startswith("recorder"), report
+    assert "logs/recorder.log" in report
     assert "logs/eve.log" not in report
 
 
@@ -170,12 +170,12 @@ def test_who_ends_for_lack_of_an_observer_is_not_at_fault(bench: Bench, first: P
         ("ack/delivered", "router"),
         ("uplink", "sensor"),
         ("telemetry/eve", "eve"),
-        ("control/eve", "observer"),
+        ("control/eve", "recorder"),
     ],
 )
 def test_the_sender_of_a_malformed_message_is_named(bench: Bench, key: str, sender: str) -> None:
     """By the key that the message was put on, no matter which process complains."""
-    for name in ("legitimate", "router", "sensor", "eve", "observer"):
+    for name in ("legitimate", "router", "sensor", "eve", "recorder"):
         bench.children.start(bench.briefs[name])
     error = MalformedMessage(f"evedrop/r1/{key}", "3", "4", b"")
     bench.leaves("naive", LastWord.about(error))
@@ -194,7 +194,7 @@ def test_a_router_that_all_have_lost_is_at_fault(bench: Bench) -> None:
     assert bench.children.failure_report(ProcessExit("eve", 3), RunEnded(3, "", suspects=["eve"])).startswith(
         "eve ended with"
     )
-    for name in bench.briefs.keys() - {"router", "observer"}:
+    for name in bench.briefs.keys() - {"router", "recorder"}:
         bench.leaves(name, CUT_OFF)
     assert bench.children.failure_report(ProcessExit("eve", 3), None).startswith("router ended with")
 
@@ -213,7 +213,7 @@ def test_a_process_starts_again_only_when_its_router_listens(bench: Bench) -> No
     bench.children.start(bench.briefs["router"])
     bench.children.start(bench.briefs["eve"])
     bench.starter.lines = ProcessRequest(ProcessAction.START, "eve", 3, 1).line
-    bench.children.start(bench.briefs["observer"])
+    bench.children.start(bench.briefs["recorder"])
     begun = len(bench.starter.begun)
     for _ in range(10):
         bench.children.next_event(0.01)
@@ -270,8 +270,8 @@ MALFORMED = {
 
 @pytest.mark.parametrize("line", MALFORMED)
 def test_malformed_news_are_refused(line: bytes, bench: Bench) -> None:
-    """The launcher goes on with the next line, and the observer's log says what was wrong."""
+    """The launcher goes on with the next line, and the recorder's log says what was wrong."""
     assert bench.tells(line + b"\n", PROGRESS.line) == [PROGRESS]
-    log = (bench.results / "logs" / "observer.log").read_text()
+    log = (bench.results / "logs" / "recorder.log").read_text()
     assert log.startswith("evedrop: the launcher refused a malformed event: ")
     assert MALFORMED[line] in log

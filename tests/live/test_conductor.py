@@ -7,10 +7,10 @@ from collections.abc import Callable
 import pytest
 
 from evedrop.errors import Interrupted, RunError
-from evedrop.live.observer.conductor import Conductor, Stop
 from evedrop.live.protocol.codec import end_report
 from evedrop.live.protocol.commands import Abandon, Start
-from evedrop.names import OBSERVER
+from evedrop.live.recorder.conductor import Conductor, Stop
+from evedrop.names import RECORDER
 from tests.clock import TestClock
 from tests.live.test_ending import Network
 
@@ -60,7 +60,7 @@ def test_a_run_begins_when_all_are_there() -> None:
     conductor.start()
     assert network.said == [("sensor", Start().pack(), 0.0)]
     conductor.report_progress(7)
-    assert network.said[-1][0] == OBSERVER
+    assert network.said[-1][0] == RECORDER
 
 
 @pytest.mark.parametrize(

@@ -230,7 +230,7 @@ def test_an_interrupted_pause_leaves_nothing(number: signal.Signals, steered: St
     assert [one["event"] for one in summary["events"]] == ["pause the run", "step 40 slots", "cut smart"]
 
 
-@pytest.mark.parametrize("name", mostly_long(["sensor", "observer", "router"], ["router"]))
+@pytest.mark.parametrize("name", mostly_long(["sensor", "recorder", "router"], ["router"]))
 def test_who_waits_is_told_of_the_end(name: str, steered: Start, evedrop: Evedrop) -> None:
     """A process that is killed while a step goes on ends the step's command too, with status 2; a router comes back."""
     run = steered(slots=100_000, pace=0.005)

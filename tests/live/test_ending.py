@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from evedrop.live.observer.conductor import Conductor, Stop
 from evedrop.live.protocol.codec import end_report
 from evedrop.live.protocol.commands import EndRun
 from evedrop.live.protocol.keys import RunKeys
+from evedrop.live.recorder.conductor import Conductor, Stop
 from tests.clock import TestClock
 
 RUN = "r"

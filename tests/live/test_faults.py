@@ -41,7 +41,7 @@ def tables_whole(live: Live) -> int:
 
 
 def test_a_killed_process_is_named_and_the_results_are_kept(evedrop: Evedrop) -> None:
-    """Kill -9 of any process but router and observer ends the run at once, and costs no slot that was scored."""
+    """Kill -9 of any process but router and recorder ends the run at once, and costs no slot that was scored."""
     live = evedrop.live("eavesdroppers", *ENDLESS)
     live.running()
     live.kill("smart")
@@ -51,12 +51,12 @@ def test_a_killed_process_is_named_and_the_results_are_kept(evedrop: Evedrop) ->
     tables_whole(live)
 
 
-def test_a_killed_observer_is_named_and_what_it_wrote_is_kept(evedrop: Evedrop) -> None:
-    """The launcher makes whole tables of what the observer had written; the summary says why."""
+def test_a_killed_recorder_is_named_and_what_it_wrote_is_kept(evedrop: Evedrop) -> None:
+    """The launcher makes whole tables of what the recorder had written; the summary says why."""
     live = evedrop.live("eavesdroppers", *ENDLESS)
     wait_until(lambda: last_round(live.folder).slots > 0, "slots on disk")
-    live.kill("observer")
-    assert "observer was ended by signal 9" in ended_by_fault(live)
+    live.kill("recorder")
+    assert "recorder was ended by signal 9" in ended_by_fault(live)
     assert tables_whole(live) > 0
     assert not (live.folder / "unfinished").exists()
 
@@ -161,7 +161,7 @@ def test_an_interrupted_run_has_no_digest(evedrop: Evedrop) -> None:
 
 
 def test_nothing_outlives_a_killed_launcher(evedrop: Evedrop) -> None:
-    """Children notice that their launcher is gone; the observer still writes what there is."""
+    """Children notice that their launcher is gone; the recorder still writes what there is."""
     live = evedrop.live("eavesdroppers", *ENDLESS)
     live.running()
     live.process.kill()
@@ -306,7 +306,7 @@ def test_a_process_that_stays_stopped_ends_the_run(evedrop: Evedrop, name: str) 
     live.kill(name, signal.SIGSTOP)
     done = live.end()
     assert done.status == 3
-    # Zenoh only notices that a process is lost while it can send to it: a full socket leaves this to the observer.
+    # Zenoh only notices that a process is lost while it can send to it: a full socket leaves this to the recorder.
     said = r"( stopped responding: hung, suspended or cut off|: alive, and silent for \d+ s while the run waits)"
     assert re.match(f"evedrop: {name}{said}", done.err), done.err
     live.nothing_left()

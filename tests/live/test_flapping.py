@@ -93,7 +93,7 @@ def disturbed(seed: int, evedrop: Evedrop, how: str) -> None:
     with ExitStack() as stack:
         wire = stack.enter_context(cable(port))
         run = stack.enter_context(by_hand(scenario, folder, f"tcp/127.0.0.1:{port}", paused=True))
-        everybody = ("sensor", *scenario.receivers, "observer")
+        everybody = ("sensor", *scenario.receivers, "recorder")
         run.write(**(dict.fromkeys(everybody, wire.endpoint) if how == "proxy" else {}))
         run.start()
         for waits in flaps(seed):
@@ -144,10 +144,10 @@ def test_a_message_of_another_key_is_dropped_counted_and_sent_again(evedrop: Eve
         run.start()
         with stepping(evedrop, run.results, 100):
             run.running()
-        # The observer may write there: its credentials stand in for a connection that takes one key for the other.
-        observer = read_brief(tmp_path / "briefs" / "observer.json")
-        keys = RunKeys(observer.run)
-        with zenoh.open(zenoh.Config.from_json5(json.dumps(client_config(observer)))) as session:
+        # The recorder may write there: its credentials stand in for a connection that takes one key for the other.
+        recorder = read_brief(tmp_path / "briefs" / "recorder.json")
+        keys = RunKeys(recorder.run)
+        with zenoh.open(zenoh.Config.from_json5(json.dumps(client_config(recorder)))) as session:
             for name in ("other", "sensor"):
                 publisher = session.declare_publisher(keys.control(name))
                 wait_until(partial(is_matched, publisher), f"{name} to read")

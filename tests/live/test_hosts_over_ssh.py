@@ -90,7 +90,7 @@ def test_over_ssh_it_is_the_same_run(evedrop: Evedrop, server: Sshd) -> None:
     assert evedrop("montecarlo", "restart", *changes, "--out", "memory").status == 0
     assert digests_of(evedrop.folder / "run") == digests_of(evedrop.folder / "memory")
     logs = {log.stem for log in (evedrop.folder / "run" / "logs").iterdir()}
-    assert logs == {"router", "sensor", "legitimate", "smart", "naive", "observer"}
+    assert logs == {"router", "sensor", "legitimate", "smart", "naive", "recorder"}
     secret = [key.hex() for key in StreamKeys.from_scenario(load("restart")).secret(("schedule", "noise")).values()]
     received = {host: (evedrop.folder / f"{host}.received").read_text() for host in PLACES}
     assert all(key in received["alpha"] and key not in received["beta"] for key in secret)
@@ -267,7 +267,7 @@ connect = "tcp/alpha.lan:7447"
 listen = "tls/beta.lan:7447"
 [hosts.alpha]
 address = "alpha.lan"
-processes = ["router", "smrt", "observer"]
+processes = ["router", "smrt", "recorder"]
 [hosts.beta]
 address = "beta.lan"
 processes = ["router"]
@@ -292,7 +292,7 @@ processes = ["router"]
             [
                 "hosts.alpha.processes: names smrt; expected router, sensor, legitimate, smart or naive; did you mean smart? "
                 "(line 9)",
-                "hosts.alpha.processes: names observer, which is always on this machine, where it writes the results (line 9)",
+                "hosts.alpha.processes: names recorder, which is always on this machine, where it writes the results (line 9)",
                 "hosts.beta.processes: names router, which is on alpha already; expected one host for it (line 12)",
                 "router.listen: tcp/0.0.0.0:7447 is not encrypted, and other machines can reach it: they could read everything, "
                 "and pose as the router; give tls/0.0.0.0:7447, or add insecure = true (line 3)",

@@ -243,13 +243,13 @@ def test_nohup_keeps_a_run_from_hanging_up(evedrop: Evedrop) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("number", SIGNALS)
 def test_a_process_by_hand_ends_with_130_too(tmp_path: Path, number: signal.Signals) -> None:
-    """A receiver, the sensor and the router at once, and the observer with its results, whatever they wait for."""
+    """A receiver, the sensor and the router at once, and the recorder with its results, whatever they wait for."""
     with by_hand(load("eavesdroppers", {"slots": 1_000_000}), tmp_path, f"tcp/127.0.0.1:{free_port()}") as run:
         run.write()
         run.start()
         wait_until(lambda: last_round(run.folder / "run").slots > 0, "slots on disk")
-        run.processes["observer"].send_signal(number)
-        assert run.processes["observer"].wait(LIMIT) == 130
+        run.processes["recorder"].send_signal(number)
+        assert run.processes["recorder"].wait(LIMIT) == 130
         results = Results.read(run.folder / "run")
         assert results.summary["ended"] == "interrupted"
         assert results.slots.num_rows == 4 * results.summary["slots"] > 0
@@ -270,7 +270,7 @@ def test_a_signal_waits_until_a_process_of_a_run_heeds_it(evedrop: Evedrop, numb
     begin = (
         "import os, sys\n"
         "def forked():\n"
-        "    if 'evedrop.live.observer.observer' in sys.modules:\n"
+        "    if 'evedrop.live.recorder.recorder' in sys.modules:\n"
         "        os.kill(os.getpid(), NUMBER)\n"
         "os.register_at_fork(after_in_child=forked)\n"
     )
@@ -279,6 +279,6 @@ def test_a_signal_waits_until_a_process_of_a_run_heeds_it(evedrop: Evedrop, numb
     live = evedrop.live("eavesdroppers", *ENDLESS, env=environment, interpreter=True)
     done = live.end()
     assert done.status == 3
-    assert done.err.startswith("evedrop: observer was interrupted by a signal")
+    assert done.err.startswith("evedrop: recorder was interrupted by a signal")
     assert "Traceback" not in done.err
     live.nothing_left()

@@ -1,4 +1,4 @@
-"""The observer joins the messages of all processes into slots: nothing is lost, moved or counted twice, however they are cut."""
+"""The recorder joins the messages of all processes into slots: nothing is lost, moved or counted twice, however they are cut."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from evedrop.live.observer.joiner import Joiner
 from evedrop.live.protocol.closed_loop import Decisions
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.telemetry import Extent, Journal, Report, Truth
+from evedrop.live.recorder.joiner import Joiner
 from evedrop.model.digest import Blocks
 from evedrop.model.links.link import REASONS
 from evedrop.model.slot.account import COUNTED_BURSTS, Account

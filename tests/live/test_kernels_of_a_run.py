@@ -62,7 +62,7 @@ def test_a_live_run_with_numpy_has_the_digests_of_memory_with_c(evedrop: Evedrop
     # A fork of this process, or of its server, would have chosen the kernels already.
     live = evedrop.begun("run", "mine.toml", "--view", "off", "--out", "live", env=environment).end()
     assert live.status == 0, live.err
-    for process in ("sensor", "legitimate", "naive", "observer"):
+    for process in ("sensor", "legitimate", "naive", "recorder"):
         log = (evedrop.folder / "live" / "logs" / f"{process}.log").read_text()
         assert f"the kernels are numpy, as {KERNELS_VARIABLE} says" in log, process
     found = digests_of(evedrop.folder / "live")

@@ -229,7 +229,7 @@ class Routers:
             if self.stop is not None:
                 self.stop.set()
             return Silent(number, BytesIO(self.lines.get(role, b"")))
-        return Ended(number, BytesIO() if role == "observer" else None, None, 2)
+        return Ended(number, BytesIO() if role == "recorder" else None, None, 2)
 
 
 TWO = "tls/127.0.0.1:1", None, "tls/127.0.0.1:2"
@@ -262,12 +262,12 @@ def test_no_process_starts_before_the_routers_say_that_they_listen(
 
 
 def test_the_processes_start_once_the_routers_listen(tmp_path: Path) -> None:
-    """All of them, the observer last."""
+    """All of them, the recorder last."""
     routers = Routers({name: RouterListens(name).line for name in ("router", "relay")})
     with pytest.raises(RunError):
         launch(tmp_path, routers, endpoints_at(*TWO), scenario=small_network(network={"routers": 2}))
     assert routers.started[:2] == ["router", "relay"]
-    assert routers.started[-1] == "observer"
+    assert routers.started[-1] == "recorder"
     assert len(routers.started) > 4
 
 

@@ -15,7 +15,7 @@ from tempfile import mkdtemp
 import pytest
 
 from evedrop import preloaded
-from evedrop.live.launch.briefs import ObserverTask, briefs_of
+from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.launch.ports import loopback_endpoints
 from evedrop.live.launch.preloading import fork_servers, process_starter
 from evedrop.live.launch.starter import FORK_SERVER_LOST, StartedProcess, Starter, start_process
@@ -39,7 +39,7 @@ class Bench:
         """Start a process; brief: None for that of a router with a port of its own."""
         if brief is None:
             briefs = briefs_of(
-                small_network(), loopback_endpoints(None, None, False), ObserverTask(self._folder, False)
+                small_network(), loopback_endpoints(None, None, False), RecorderTask(self._folder, False)
             )
             brief = briefs["router"].write(Path(mkdtemp(dir=self._folder)))  # which it removes
         with process_starter() as starter, self.log.open("wb") as log:
@@ -81,7 +81,7 @@ def test_a_process_has_a_folder_a_session_and_a_name_of_its_own(
     assert Path(f"/proc/{router.pid}/cwd").resolve() == tmp_path.resolve()
 
 
-@pytest.mark.parametrize("role", ["observer", "sensor"])
+@pytest.mark.parametrize("role", ["recorder", "sensor"])
 def test_its_status_and_its_complaint_are_its_own(bench: Bench, role: str) -> None:
     """Of two processes that run at the same time, one ends: its status, its log."""
     router = bench.start()
@@ -198,7 +198,7 @@ def test_a_process_has_the_environment_it_was_given_and_no_more(
 
 @pytest.mark.long
 def test_a_further_server_has_modules_that_the_first_has_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those of an observer have no place in other processes; both end with the block."""
+    """Those of a recorder have no place in other processes; both end with the block."""
     (tmp_path / "spy.py").write_text(SPY)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     given = {"PATH": os.environ["PATH"], "TMPDIR": str(tmp_path)}

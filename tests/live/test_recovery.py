@@ -127,7 +127,7 @@ def test_a_relay_gives_up_an_attempt_that_is_not_answered(evedrop: Evedrop, tmp_
             between.swallow()
             wait_until(lambda: between.swallowed, "an attempt that is not answered")
         assert evedrop("resume", str(run.results)).status == 0
-        assert set(run.statuses().values()) == {0}, run.log("observer").read_text()
+        assert set(run.statuses().values()) == {0}, run.log("recorder").read_text()
         as_if_undisturbed(run.summary, scenario, tmp_path / "memory")
         assert [one["process"] for one in run.summary["outages"]] == ["router"]
 
@@ -184,7 +184,7 @@ def test_a_router_that_never_comes_back_ends_the_run(tmp_path: Path) -> None:
         statuses = run.statuses()
         assert statuses.pop("router") == -9
         assert set(statuses.values()) == {3}
-        assert "router cut off from the network for 2 s" in run.log("observer").read_text()
+        assert "router cut off from the network for 2 s" in run.log("recorder").read_text()
         assert "smart has had no connection with the router at tcp/127.0.0.1" in run.log("smart").read_text()
         assert run.summary["slots"] > 0
         outage = run.summary["outages"][-1]
@@ -234,7 +234,7 @@ def is_taken_up(
 
 @long
 @pytest.mark.parametrize("how", ["closed", "silent"])
-@pytest.mark.parametrize("name", ["sensor", "legitimate", "observer"])
+@pytest.mark.parametrize("name", ["sensor", "legitimate", "recorder"])
 def test_a_cut_connection_costs_nothing_but_time(name: str, how: str, evedrop: Evedrop, tmp_path: Path) -> None:
     """Closed for a second, or without a word for longer than its lease: the outage is listed, and all else is as ever."""
     _, scenario = scenario_in(tmp_path, encoding=SCHEDULED, strategy="naive", more=ACKNOWLEDGED)
@@ -264,7 +264,7 @@ def test_a_loop_is_taken_up_where_it_was_cut(name: str, evedrop: Evedrop, tmp_pa
 
 
 def test_a_process_that_stays_cut_off_ends_the_run(tmp_path: Path) -> None:
-    """Longer than the scenario lets it: the observer names it, and it ends by itself."""
+    """Longer than the scenario lets it: the recorder names it, and it ends by itself."""
     _, scenario = scenario_in(tmp_path, slots=1_000_000, longest_outage=2.0)
     port = free_port()
     with ExitStack() as stack:
@@ -274,6 +274,6 @@ def test_a_process_that_stays_cut_off_ends_the_run(tmp_path: Path) -> None:
         run.start()
         run.running()
         wire.cut()
-        for process in ("smart", "observer"):
+        for process in ("smart", "recorder"):
             wait_until(partial(has_ended, run.processes[process], 3), f"the end of {process}")
-        assert "smart cut off from the network for 2 s" in run.log("observer").read_text()
+        assert "smart cut off from the network for 2 s" in run.log("recorder").read_text()

@@ -1,4 +1,4 @@
-"""When the observer begins rounds of resending, and which outages it lists: with a clock, and connections in the test's hands."""
+"""When the recorder begins rounds of resending, and which outages it lists: with a clock, and connections in the test's hands."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import Any
 import pytest
 
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
-from evedrop.live.observer.conductor import Conductor, Stop
-from evedrop.live.observer.recovery import Recovery
-from evedrop.live.observer.stall import patience_of
 from evedrop.live.protocol.brief import Flow
 from evedrop.live.protocol.commands import Again, ControlCommand
+from evedrop.live.recorder.conductor import Conductor, Stop
+from evedrop.live.recorder.recovery import Recovery
+from evedrop.live.recorder.stall import patience_of
 from evedrop.scenario.progress_events import ProgressEvent
 from tests.clock import TestClock
 from tests.live.test_ending import Network
@@ -149,7 +149,7 @@ def test_a_round_waits_for_processes_that_are_back_and_cannot_be_told_yet() -> N
 
 @pytest.mark.parametrize("done", [0, 10])
 def test_a_round_repeats_the_commands_that_may_have_been_lost(done: int) -> None:
-    """The start of a run of which nothing is joined yet, what the operator ordered, and how far the observer is."""
+    """The start of a run of which nothing is joined yet, what the operator ordered, and how far the recorder is."""
     conducted = Conducted()
     recovery = recovery_of(conducted, TestClock(), 30.0)
     if done:

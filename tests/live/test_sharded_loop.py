@@ -121,9 +121,9 @@ def test_a_loop_with_a_solver_is_made_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", ["controller", "observer"])
+@pytest.mark.parametrize("name", ["controller", "recorder"])
 def test_a_loop_that_is_cut_short_is_made_one(evedrop: Evedrop, name: str) -> None:
-    """Inputs, and the metrics of controller and house, as far as each shard came, or as its observer had written them."""
+    """Inputs, and the metrics of controller and house, as far as each shard came, or as its recorder had written them."""
     words = ("--trials", "5", "--set", "shards=2", "--set", "expect=[]", "--set", f"record_trials={RECORDED}")
     live = evedrop.live("microgrid", *words)
     wait_until(lambda: all(last_round(live.folder / "shards" / one).slots > 100 for one in "12"), "slots on disk")

@@ -258,8 +258,8 @@ def test_a_killed_process_of_a_shard_ends_all(evedrop: Evedrop, name: str) -> No
 
 
 @pytest.mark.long
-def test_a_killed_observer_costs_no_slot_that_is_on_disk(evedrop: Evedrop) -> None:
-    """The slots of both shards are in the folder, up to those that the observer had written when it was killed.
+def test_a_killed_recorder_costs_no_slot_that_is_on_disk(evedrop: Evedrop) -> None:
+    """The slots of both shards are in the folder, up to those that the recorder had written when it was killed.
 
     The summary says that its last metrics were of an earlier slot.
     """
@@ -267,10 +267,10 @@ def test_a_killed_observer_costs_no_slot_that_is_on_disk(evedrop: Evedrop) -> No
     second = live.folder / "shards" / "2"
     wait_until(lambda: last_round(second).slots > 0, "slots of the second shard on disk")
     wait_until(lambda: "the tables have more" in age_of_metrics(second), "rows that are later than the metrics")
-    os.kill(child(live, 2, "observer"), signal.SIGKILL)
+    os.kill(child(live, 2, "recorder"), signal.SIGKILL)
     done = live.end()
     assert done.status == 3
-    assert "shard 2 (trials 2 to 4): observer was ended by signal 9" in done.err
+    assert "shard 2 (trials 2 to 4): recorder was ended by signal 9" in done.err
     live.nothing_left()
     results = live.results
     assert results.slots.num_rows == results.journal.num_rows

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from evedrop.errors import Interrupted
-from evedrop.live.observer.conductor import Stop
+from evedrop.live.recorder.conductor import Stop
 from evedrop.system.signals import stop_on_signals
 from tests.conftest import LIMIT
 

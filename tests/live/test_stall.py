@@ -7,9 +7,9 @@ from collections.abc import Mapping
 import pytest
 
 from evedrop.errors import Silence
-from evedrop.live.observer.stall import Stall, patience_of, silent_of
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.process_status import ProcessStatus
+from evedrop.live.recorder.stall import Stall, patience_of, silent_of
 from tests.clock import TestClock
 
 KEYS = RunKeys("r")
@@ -76,7 +76,7 @@ RUNS = {
     ),
     "a router that keeps no journal": (
         {"sensor": 150, "router": 50, "legitimate": 150, "eve": 150},
-        {"sensor": at(150, KEYS.progress("observer")), "router": at(150, KEYS.uplink)},
+        {"sensor": at(150, KEYS.progress("recorder")), "router": at(150, KEYS.uplink)},
         ["router"],
     ),
     "a controller that sleeps": (

@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from evedrop.live.network.operator import Answer, Order, read_answer
-from evedrop.live.observer.steering import Steering
 from evedrop.live.protocol.commands import ControlCommand, Go, Hold, LinkChange
 from evedrop.live.protocol.requests import REQUESTS
+from evedrop.live.recorder.steering import Steering
 from evedrop.model.slot.link import Change
 from evedrop.scenario.loading import checked
 from evedrop.scenario.progress_events import Held, ProgressEvent
@@ -27,7 +27,7 @@ Sent = tuple[str, ControlCommand]
 
 @dataclass
 class Asked:
-    """A question as the observer has it: keeps its answer."""
+    """A question as the recorder has it: keeps its answer."""
 
     payload: bytes = b""
     answers: list[Answer] = field(default_factory=list)

@@ -18,7 +18,7 @@ from tests.examples import mostly_long
 from tests.processes import parent_of
 
 ENDLESS = ("--slots", "1000000")
-WHICH = {"that of observers": ["observer"], "that of others": ["sensor"], "both": ["observer", "sensor"]}
+WHICH = {"that of recorders": ["recorder"], "that of others": ["sensor"], "both": ["recorder", "sensor"]}
 """Fork servers → a process of each."""
 
 
@@ -82,7 +82,7 @@ def test_a_suspended_fork_server_does_not_outlive_a_killed_launcher(evedrop: Eve
     assert list(live.temporary.iterdir()) == []
 
 
-@pytest.mark.parametrize("which", mostly_long(["that of observers", "that of others"], ["that of others"]))
+@pytest.mark.parametrize("which", mostly_long(["that of recorders", "that of others"], ["that of others"]))
 def test_a_killed_fork_server_is_named_and_no_victim(evedrop: Evedrop, which: str) -> None:
     """Its processes are ended by the launcher: none of them is at fault."""
     live = evedrop.live("eavesdroppers", *ENDLESS)
@@ -92,7 +92,7 @@ def test_a_killed_fork_server_is_named_and_no_victim(evedrop: Evedrop, which: st
     done = live.end()
     assert done.status == 3
     assert done.err.startswith("evedrop: the fork server of "), done.err
-    assert ("observer" in done.err.splitlines()[0]) == (which == "that of observers")
+    assert ("recorder" in done.err.splitlines()[0]) == (which == "that of recorders")
     assert "was ended by signal" not in done.err
     live.nothing_left()
     assert cause_of(live.results.summary["ended"]) in done.err

@@ -1,4 +1,4 @@
-"""The observer verifies reports: honest ones pass, and each kind of contradiction is found, with both values."""
+"""The recorder verifies reports: honest ones pass, and each kind of contradiction is found, with both values."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evedrop.errors import Contradiction, MalformedMessage
-from evedrop.live.observer.verification import Verifier
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.telemetry import Extent, Journal, Report, read_journal, read_report
+from evedrop.live.recorder.verification import Verifier
 from evedrop.model.block_sums import BlockSums
 from evedrop.model.digest import BlockDigests, Blocks
 from evedrop.model.links.link import REASONS

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from evedrop import montecarlo
-from evedrop.live.launch.briefs import ObserverTask, briefs_of
+from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
 from evedrop.model.digest import BlockDigests, Blocks, Digests, RunDigest
@@ -48,7 +48,7 @@ def test_same_deliveries_same_bits(process: Process, slots: int, first_trial: in
     """Fed with the deliveries of a run, it has our digest, and reports what we report."""
     scenario = scenario_of(process, slots=slots, first_trial=first_trial, **TABLES)
     keys, batch = StreamKeys.from_scenario(scenario), Batch(slots, 9, first_trial)
-    made = briefs_of(scenario, "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False))
+    made = briefs_of(scenario, "tcp/127.0.0.1:1", RecorderTask(Path("nowhere"), False))
     peer = Estimator(json.loads(made["legitimate"].text))
     model = scenario.process.process
     trajectory = Trajectory(model, keys.process, batch)
@@ -78,18 +78,18 @@ def test_same_deliveries_same_bits(process: Process, slots: int, first_trial: in
 def test_it_refuses_a_gap() -> None:
     """A slot that is not due is an error, as the protocol says."""
     scenario = scenario_of(UNSTABLE, slots=10, **TABLES)
-    made = briefs_of(scenario, "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False))
+    made = briefs_of(scenario, "tcp/127.0.0.1:1", RecorderTask(Path("nowhere"), False))
     peer = Estimator(json.loads(made["legitimate"].text))
     with pytest.raises(ValueError, match="slot 1 arrived, slot 0 was due"):
         peer.receive(packets.delivery(1, b"\0\0", b""))
 
 
 def test_it_takes_part_in_a_real_run(tmp_path: Path) -> None:
-    """In the place of our estimator, among our router, sensor, eavesdroppers and observer, it ends with our digest."""
+    """In the place of our estimator, among our router, sensor, eavesdroppers and recorder, it ends with our digest."""
     scenario = load("eavesdroppers", {"slots": 300, "trials": 2})
     out = tmp_path / "out"
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    briefs = briefs_of(scenario, endpoint, ObserverTask(out, False), ends_with_stdin=False)
+    briefs = briefs_of(scenario, endpoint, RecorderTask(out, False), ends_with_stdin=False)
     with ExitStack() as stack:
         running = {}
         for name, brief in briefs.items():

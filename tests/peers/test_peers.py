@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from evedrop.errors import EvedropError, Gap, MalformedMessage
-from evedrop.live.launch.briefs import ObserverTask, briefs_of
+from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.network.reporting import is_due
 from evedrop.live.network.resending import ReplayBuffer
 from evedrop.live.protocol import codec as wire
@@ -53,7 +53,7 @@ TABLES: dict[str, Any] = {
 def briefs(**changes: Any) -> dict[str, AnyBrief]:
     """Briefs with a small window."""
     made = briefs_of(
-        scenario_of(PROCESS, **{**TABLES, **changes}), "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False)
+        scenario_of(PROCESS, **{**TABLES, **changes}), "tcp/127.0.0.1:1", RecorderTask(Path("nowhere"), False)
     )
     return {name: replace(brief, flow=Flow(WINDOW, BATCH)) for name, brief in made.items()}
 
@@ -212,7 +212,7 @@ def test_what_was_acknowledged_is_acknowledged_once_more(stage: Stage) -> None:
 
 @pytest.mark.parametrize("name", ["legitimate", "smart"])
 def test_a_report_is_kept_for_a_window(name: str, stage: Stage) -> None:
-    """Reports that the observer may not have joined yet can be sent again, and no older ones; the last progress too."""
+    """Reports that the recorder may not have joined yet can be sent again, and no older ones; the last progress too."""
     brief = replace(briefs()[name], run="r")
     stage.fill(RunKeys("r").downlink(name), deliveries())
     stage.commands.put(EndRun().pack())
@@ -260,13 +260,13 @@ class SensorThread:
 
 
 def test_sensor_sends_as_its_followers_let_it(stage: Stage) -> None:
-    """It waits for `start`, sends a window, then what the slowest of receivers and observer lets it, and ends on `end`."""
+    """It waits for `start`, sends a window, then what the slowest of receivers and recorder lets it, and ends on `end`."""
     brief = briefs()["sensor"]
     sensor = SensorThread(stage, brief)
     assert stage.put.empty()
     stage.commands.put(Start().pack())
     sensor.packets(0, WINDOW)
-    everybody = [*part_of(brief, SensorPart).receivers, "observer"]
+    everybody = [*part_of(brief, SensorPart).receivers, "recorder"]
     assert len(everybody) == 5
     sent = WINDOW
     for done in (
@@ -275,10 +275,10 @@ def test_sensor_sends_as_its_followers_let_it(stage: Stage) -> None:
         20,
         32,
         40,
-    ):  # the observer alone is behind: each of its reports lets exactly as many slots through
+    ):  # the recorder alone is behind: each of its reports lets exactly as many slots through
         for name in everybody[:-1]:
             sensor.progress(name, sent)
-        sensor.progress("observer", done)
+        sensor.progress("recorder", done)
         sensor.packets(sent, sent := min(SLOTS, done + WINDOW))
     stage.commands.put(EndRun().pack())
     sensor.thread.join(LIMIT)
@@ -293,7 +293,7 @@ def test_sensor_sends_once_more_what_is_not_done(stage: Stage) -> None:
     sensor = SensorThread(stage, brief)
     stage.commands.put(Start().pack())
     sensor.packets(0, WINDOW)
-    for name in (*part_of(brief, SensorPart).receivers, "observer"):
+    for name in (*part_of(brief, SensorPart).receivers, "recorder"):
         sensor.progress(name, 8)
     sensor.packets(WINDOW, WINDOW + 8)
     stage.kept[sensor.keys.uplink].again(4, 10)
@@ -322,10 +322,10 @@ class Impatient(TestClock):
         return super().next(queue, timeout)
 
 
-@pytest.mark.parametrize("slowest", ["a", "b", "observer"])
+@pytest.mark.parametrize("slowest", ["a", "b", "recorder"])
 def test_sensor_is_never_a_window_ahead_of_the_slowest(slowest: str, stage: Stage) -> None:
     """It sends slot k exactly if k < window + the lowest progress; no process's progress replaces another's."""
-    followers = ("a", "b", "observer")
+    followers = ("a", "b", "recorder")
     session = stage.session(briefs()["sensor"])
     window = Window(session, followers, 10, ReplayBuffer(print), Impatient())
 

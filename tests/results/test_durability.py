@@ -44,7 +44,7 @@ from tests.steps import stepping
 ENDLESS = ("--slots", "1000000")
 WAITS_FOR_OTHERS = """
 import threading
-from evedrop.live.observer.conductor import Conductor
+from evedrop.live.recorder.conductor import Conductor
 Conductor.end = lambda self, patience: threading.Event().wait()
 from evedrop.results.writer import ResultsWriter
 ResultsWriter.checkpoint = lambda *all: None
@@ -370,9 +370,9 @@ def test_the_end_of_a_run_without_metrics_keeps_its_rows(tmp_path: Path) -> None
     for receiver in scenario.receivers:
         writer.slot_rows(0, receiver, sums(10), np.zeros(10))
     writer.write_rows("slot 10")
-    note_end(tmp_path, scenario, "observer was ended by signal 9")
+    note_end(tmp_path, scenario, "recorder was ended by signal 9")
     results = Results.read(tmp_path)
-    why = "observer was ended by signal 9 (the metrics are as of slot 0; the tables have more)"
+    why = "recorder was ended by signal 9 (the metrics are as of slot 0; the tables have more)"
     assert (results.summary["ended"], results.summary["slots"]) == (why, 10)
     assert results.slots.num_rows == 10 * len(scenario.receivers)
 
@@ -390,11 +390,11 @@ def test_the_end_of_a_killed_run_says_which_slot_its_metrics_are_of(tmp_path: Pa
             writer.settle(at, replace(empty, slots=10))
         else:
             writer.write_rows(at)
-    note_end(tmp_path, scenario, "observer was ended by signal 9\nits log:\n    nothing")
+    note_end(tmp_path, scenario, "recorder was ended by signal 9\nits log:\n    nothing")
     summary = Results.read(tmp_path).summary
     assert summary["slots"] == 30
     assert summary["ended"].splitlines() == [
-        "observer was ended by signal 9 (the metrics are as of slot 10; the tables have more)",
+        "recorder was ended by signal 9 (the metrics are as of slot 10; the tables have more)",
         "its log:",
         "    nothing",
     ]
@@ -405,12 +405,12 @@ def sizes(folder: Path) -> dict[str, int]:
     return {path.name: path.stat().st_size for path in (folder / UNFINISHED).iterdir()}
 
 
-def test_all_rows_are_on_disk_before_the_observer_waits_for_the_others_to_end(evedrop: Evedrop) -> None:
-    """A router that is gone never confirms: an observer that is killed while it waits has lost nothing."""
-    rogue = with_rogue(evedrop, "observer", WAITS_FOR_OTHERS)
+def test_all_rows_are_on_disk_before_the_recorder_waits_for_the_others_to_end(evedrop: Evedrop) -> None:
+    """A router that is gone never confirms: a recorder that is killed while it waits has lost nothing."""
+    rogue = with_rogue(evedrop, "recorder", WAITS_FOR_OTHERS)
     live = evedrop.live("eavesdroppers", "--slots", "60", "--pace", "0", env=rogue)
     wait_until(lambda: last_round(live.folder).slots == 60, "all slots on disk")
-    os.kill(live.child("observer"), signal.SIGKILL)
+    os.kill(live.child("recorder"), signal.SIGKILL)
     done = live.end()
     assert done.status == 3, done.err
     assert live.results.slots.num_rows == 4 * 60

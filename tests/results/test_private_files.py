@@ -182,7 +182,7 @@ def check_as_nobody(evedrop: Evedrop, live: Live) -> None:
     ):  # pytest's own folders are private: give the other user a way there
         if folder.stat().st_uid == os.getuid() and folder != Path("/"):
             folder.chmod(folder.stat().st_mode | 0o011)
-    names = ("scenario.toml", "control.json", "slots.parquet", "logs", "logs/observer.log")
+    names = ("scenario.toml", "control.json", "slots.parquet", "logs", "logs/recorder.log")
     places = [live.folder, *(live.folder / name for name in names), *live.temporary.glob("evedrop-*")]
     command: list[Any] = [sys.executable, "-c", LOOK, evedrop.folder / "run.news", *places]
     said = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()

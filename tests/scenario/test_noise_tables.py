@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop.live.launch.briefs import ObserverTask, briefs_of
+from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.protocol.brief_parts import EavesdropperPart
 from evedrop.model.local_filter import settled
 from evedrop.model.noise_law import PACKETS, NoiseLaw
@@ -17,7 +17,7 @@ from evedrop.scenario.loading import checked, load
 from evedrop.scenario.tables import Scenario
 from tests.builders import mistakes_of, part_of
 
-_TASK = ObserverTask(Path("nowhere"), False)
+_TASK = RecorderTask(Path("nowhere"), False)
 
 
 def noise_tables(**entries: Any) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The memory that scoring takes does not grow with the slots of a run: an observer scores runs of any length."""
+"""The memory that scoring takes does not grow with the slots of a run: a recorder scores runs of any length."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_what_is_expected_of_a_long_run_is_not_stored() -> None:
 
 @pytest.mark.long
 def test_a_summary_does_not_take_more_memory_the_longer_the_run() -> None:
-    """An observer makes one every few seconds, and what it has taken it may never give back."""
+    """A recorder makes one every few seconds, and what it has taken it may never give back."""
     scenario = load("eavesdroppers", {"slots": 10 * SLOTS, **SCENARIO})
     totals, digests = Scorekeeper(scenario, 1).totals, dict.fromkeys(scenario.receivers)
 

@@ -191,11 +191,11 @@ def test_a_metric_that_fails_costs_no_other(evedrop: Evedrop, case: str, how: st
 
 
 def test_what_a_metric_prints_does_not_mix_with_the_events(evedrop: Evedrop) -> None:
-    """It goes to the observer's log, and the launcher reads every event."""
+    """It goes to the recorder's log, and the launcher reads every event."""
     prints = f"        print('hello', end='')\n        import os; os.write(1, b'again')\n{ADD}"
     environment = installed(evedrop, of_the_docs().replace(ADD, prints))
     done = evedrop.process("run", "eavesdroppers", "--slots", "60", "--view", "off", "--out", "run", env=environment)
     assert done.status == 0, done.err
-    log = (evedrop.folder / "run" / "logs" / "observer.log").read_text()
+    log = (evedrop.folder / "run" / "logs" / "recorder.log").read_text()
     assert log
     assert log.replace("hello", "").replace("again", "") == ""

@@ -16,7 +16,7 @@ from evedrop.live.network.operator import ask
 from evedrop.live.protocol.envelope import enclosed
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.requests import OperatorRequest
-from evedrop.names import OBSERVER
+from evedrop.names import RECORDER
 from evedrop.wire.conductor import WireConductor
 from evedrop.wire.control import WireControl
 from evedrop.wire.scorekeeper import WireScorekeeper
@@ -97,7 +97,7 @@ def test_what_cannot_be_done_is_refused(tmp_path: Path, capsys: pytest.CaptureFi
         answer = ask(control, NoEvent(), LIMIT)
         assert answer is not None
         assert answer.refused
-        key = RunKeys(control.run).control(OBSERVER)
+        key = RunKeys(control.run).control(RECORDER)
         with pytest.raises(zenoh.ZError):
             program([control.router])
         other = program(

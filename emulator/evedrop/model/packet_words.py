@@ -23,7 +23,7 @@ MISLED = "misled"
 TYPES = (STATE, INNOVATION, NOTHING)
 """What the sensor sent. The index of a word of a packet is ν."""
 ACTIONS = (DROPPED, STATE, INNOVATION, DISCARDED, MISLED)
-"""A receiver's actions as the observer knows them. The index of a word is its `Action`, except for the last one."""
+"""A receiver's actions as the recorder knows them. The index of a word is its `Action`, except for the last one."""
 ACTION_OF: Mapping[str, Action] = {
     DROPPED: Action.LOST,
     STATE: Action.STATE,

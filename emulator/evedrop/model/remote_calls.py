@@ -1,6 +1,6 @@
 """Calls of classes that must not run in this process: each class answers in a process of its own.
 
-Anybody may write an eavesdropper's class, and launcher and observer hold the seed and the truth. So they do not import it.
+Anybody may write an eavesdropper's class, and launcher and recorder hold the seed and the truth. So they do not import it.
 A child process imports it; the child has an empty environment and is told the class's name, its parameters in the
 scenario and where modules are. The answers are JSON, and the process that asks checks them.
 

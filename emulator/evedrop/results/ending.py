@@ -1,4 +1,4 @@
-"""The end of a run that its own observer could not complete: it was killed, or its disk was full.
+"""The end of a run that its own recorder could not complete: it was killed, or its disk was full.
 
 Source: docs/results.md, while a run goes on.
 """

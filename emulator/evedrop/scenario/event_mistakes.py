@@ -38,7 +38,7 @@ def event_mistakes(tables: ValidTables) -> Iterator[str]:
             yield from _when_mistakes(path, event, tables.slots)
         for name in event.names:
             if name not in tables.receivers:
-                hint = ": it is not a receiver" if name in ("sensor", "router", "observer") else ""
+                hint = ": it is not a receiver" if name in ("sensor", "router", "recorder") else ""
                 yield f"{path}.{event.names_in}: names {as_toml(name)}{hint}; expected {listed(tables.receivers)}"
         yield from _own(path, type(event), partial(_compared, path, event, surroundings))
         for act in event.acts():

@@ -1,6 +1,6 @@
 """The events of progress of a run or study: a class for each kind.
 
-The observer sends it to its launcher as lines of JSON: `event`, and the entries of that kind.
+The recorder sends it to its launcher as lines of JSON: `event`, and the entries of that kind.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class RunProgress(ProgressEvent):
 
 @dataclass(frozen=True)
 class RunEnded(ProgressEvent):
-    """The end of a run, as the observer sees it."""
+    """The end of a run, as the recorder sees it."""
 
     kind = "ended"
     status: int = field(metadata=entry(whole(0, 255)))

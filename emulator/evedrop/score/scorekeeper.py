@@ -264,8 +264,8 @@ def verification_of(scenario: Scenario, accused: Collection[str] = ()) -> dict[s
     recorded = _recorded_of(scenario)
     found = {}
     for name in scenario.receivers:
-        metrics = {who: _resting_on(who, name) for who in ("observer", "receiver", "recorded trials")}
-        checked, of_recorded = metrics["observer"], [*metrics["recorded trials"], "digest"]
+        metrics = {who: _resting_on(who, name) for who in ("recorder", "receiver", "recorded trials")}
+        checked, of_recorded = metrics["recorder"], [*metrics["recorded trials"], "digest"]
         verified = [] if name in accused else checked + (of_recorded if recorded == scenario.trials else [])
         own_word = [one for one in (*checked, *metrics["receiver"], *of_recorded) if one not in verified]
         found[name] = Verification(0 if name in accused else recorded, verified, own_word)

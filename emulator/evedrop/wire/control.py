@@ -29,7 +29,7 @@ from evedrop.live.protocol.envelope import Dropped
 from evedrop.live.protocol.keys import RunKeys, ZenohConfig
 from evedrop.live.protocol.requests import LinkRequest, OperatorRequest, StatusRequest
 from evedrop.live.protocol.wire_status import WireLinkStatus, WireStatus
-from evedrop.names import OBSERVER, OPERATOR
+from evedrop.names import OPERATOR, RECORDER
 from evedrop.system.output import warn
 from evedrop.system.ports import free_port
 from evedrop.wire.conductor import WireConductor
@@ -58,7 +58,7 @@ class WireControl:
         self._folder, self._relay, self._conductor = folder, relay, conductor
         self._scorekeeper, self._journal, self._events = scorekeeper, journal, events
         self._run = f"wire-{secrets.token_hex(8)}"
-        self._key = RunKeys(self._run).control(OBSERVER)
+        self._key = RunKeys(self._run).control(RECORDER)
         self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> Self:

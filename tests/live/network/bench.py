@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from evedrop.live.launch.briefs import ObserverTask, briefs_of
+from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.launch.ports import loopback_endpoints
 from evedrop.live.network.session import client_config
 from evedrop.live.protocol.brief import AnyBrief, Flow, brief_from
@@ -91,10 +91,10 @@ class Bench:
     """A router process, and sessions with everybody else's credentials in the test's hands."""
 
     def __init__(self, scenario: Scenario, folder: Path, stack: ExitStack, protocol: str = "tcp") -> None:
-        observation = ObserverTask(folder / "results", False)
+        task = RecorderTask(folder / "results", False)
         listen = f"{protocol}/127.0.0.1:{free_port()}"
         endpoints = loopback_endpoints(listen, None, scenario.relayed)
-        made = briefs_of(scenario, endpoints, observation, ends_with_stdin=False)
+        made = briefs_of(scenario, endpoints, task, ends_with_stdin=False)
         self.briefs: Mapping[str, AnyBrief] = {
             name: replace(brief, flow=Flow(32, 8, scenario.longest_outage)) for name, brief in made.items()
         }
@@ -108,17 +108,17 @@ class Bench:
         self.router = self._started("router", folder, stack)
         if scenario.relayed:
             self.relay = self._started("relay", folder, stack)
-        names = ("sensor", *scenario.receivers, "observer")
+        names = ("sensor", *scenario.receivers, "recorder")
         self.sessions = {name: stack.enter_context(connect(self.briefs[name])) for name in names}
         self.downlinks = {name: self.listen(name, self.keys.downlink(name)) for name in scenario.receivers}
         self.controls = {name: self.listen(name, self.keys.control(name)) for name in ("sensor", *scenario.receivers)}
-        self.progress = {n: self.listen("sensor", self.keys.progress(n)) for n in (*scenario.receivers, "observer")}
+        self.progress = {n: self.listen("sensor", self.keys.progress(n)) for n in (*scenario.receivers, "recorder")}
         processes = ("sensor", *scenario.receivers)
-        self.telemetry = {name: self.listen("observer", self.keys.telemetry(name)) for name in processes}
-        self.journal = self.listen("observer", self.keys.journal)
+        self.telemetry = {name: self.listen("recorder", self.keys.telemetry(name)) for name in processes}
+        self.journal = self.listen("recorder", self.keys.journal)
         self.tokens = Ear()
         for name in (*processes, "router"):
-            self.sessions["observer"].liveliness().declare_subscriber(self.keys.alive(name), self.tokens, history=True)
+            self.sessions["recorder"].liveliness().declare_subscriber(self.keys.alive(name), self.tokens, history=True)
         # That the router knows all subscriptions is seen here: what was declared before on a connection, it knows before.
         assert self.tokens.hear() == (self.keys.alive("router"), b"")
         self._publishers: dict[tuple[str, str], zenoh.Publisher] = {}
@@ -175,7 +175,7 @@ def bench_of(scenario: Scenario, folder: Path, protocol: str = "tcp") -> Iterato
 
 def brief_of_eve(**part: Any) -> AnyBrief:
     """The brief of the smart eavesdropper of that scenario, as it is read; part: entries of its part that differ."""
-    brief = briefs_of(small_network(), loopback_endpoints(None, None, False), ObserverTask(Path("nowhere"), False))[
+    brief = briefs_of(small_network(), loopback_endpoints(None, None, False), RecorderTask(Path("nowhere"), False))[
         "eve"
     ]
     return brief_from(json.loads(replace(brief, part=replace(brief.part, **part)).text))

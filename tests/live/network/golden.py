@@ -93,7 +93,7 @@ def encode_report(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
 
 
 def decode_report(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
-    """As the observer reads it."""
+    """As the recorder reads it."""
     window = shape.get("window", 0)
     report = telemetry.read_report(wire.Reader(KEY, raw), value["k"], extent_of(shape), Blocks(SLOTS), window)
     columns = {name: getattr(report, name).tolist() for name in ("x_hat", "action", "P", "trace")}
@@ -111,7 +111,7 @@ def encode_truth(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
 
 
 def decode_truth(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
-    """As the observer reads it."""
+    """As the recorder reads it."""
     inputs = shape.get("inputs", 0)
     truth = telemetry.read_truth(wire.Reader(KEY, raw), value["k"], extent_of(shape))
     found = {"k": truth.first, "c": truth.count, "x": truth.x.tolist(), "nu": truth.nu.astype(int).tolist()}
@@ -133,7 +133,7 @@ def decode_known(name: str) -> Decode:
 
 
 def decode_over(raw: bytes) -> dict[str, Any]:
-    """As the observer reads it."""
+    """As the recorder reads it."""
     message = wire.Reader(KEY, raw)
     assert wire.is_over(message)
     dropped = wire.read_over(message)
@@ -168,7 +168,7 @@ def encode_decisions(_shape: dict[str, Any], value: dict[str, Any]) -> bytes:
 
 
 def decode_decisions(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
-    """As the observer reads it."""
+    """As the recorder reads it."""
     extent = extent_of({"n": 1, **shape})
     found = loop_wire.read_decisions(wire.Reader(KEY, raw), value["k"], extent, Blocks(SLOTS), shape["period"])
     digests = {str(block): [bytes(one).hex() for one in rows] for block, rows in found.digests.items()}
@@ -189,7 +189,7 @@ def encode_journal(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
 
 
 def decode_journal(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
-    """As the observer reads it."""
+    """As the recorder reads it."""
     journal = telemetry.read_journal(wire.Reader(KEY, raw), value["k"], shape["windows"], extent_of({"n": 1, **shape}))
     links = {
         name: {
@@ -205,13 +205,13 @@ def decode_journal(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> 
 
 
 def decode_process_status(_shape: dict[str, Any], _value: dict[str, Any], raw: bytes) -> dict[str, Any]:
-    """As the observer reads it."""
+    """As the recorder reads it."""
     status = read_process_status(wire.Reader(KEY, raw), SLOTS)
     return {"k": status.slot, "waits": list(status.waits)}
 
 
 def decode_refusal(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
-    """As the observer reads it from the sensor; the observer refuses messages that an eavesdropper wrote."""
+    """As the recorder reads it from the sensor; the recorder refuses messages that an eavesdropper wrote."""
     message = wire.Reader(KEY, raw)
     assert wire.is_refusal(message)
     refusal = wire.read_refusal(message, "sensor")
@@ -227,7 +227,7 @@ def encode_leaving(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
 
 
 def decode_leaving(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
-    """As the observer reads it."""
+    """As the recorder reads it."""
     message = wire.Reader(KEY, raw)
     assert telemetry.is_leaving(message)
     k, belief = telemetry.read_leaving(message, extent_of(shape))
@@ -250,7 +250,7 @@ def decode_resend(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> 
 
 
 def decode_held(_shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
-    """As the observer reads it."""
+    """As the recorder reads it."""
     message = wire.Reader(KEY, raw)
     assert telemetry.is_held(message)
     return {"k": message.slot(value["k"]), "held": message.flag("held")}
@@ -304,13 +304,13 @@ def encode_request(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
 
 
 def decode_request(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
-    """As the observer reads it."""
+    """As the recorder reads it."""
     request = read_request(KEY, raw)
     return {"do": request.do, **vars(request)}
 
 
 def encode_answer(shape: dict[str, Any], value: dict[str, Any]) -> bytes:
-    """As the observer makes it."""
+    """As the recorder makes it."""
     refused = tuple(value.get("refused", ()))
     status = read(RunStatus, value["status"]) if "status" in value else None
     return operator.Answer(value.get("k"), value.get("said", ""), refused, status).pack()

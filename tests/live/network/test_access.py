@@ -59,7 +59,7 @@ def all_keys(stage: Bench) -> dict[str, str]:
     """Every key of the run, by its kind."""
     keys = stage.keys
     found = {"uplink": keys.uplink, "journal": keys.journal}
-    for name in (*PROCESSES, "router", "observer"):
+    for name in (*PROCESSES, "router", "recorder"):
         for kind in ("telemetry", "progress", "control", "alive"):
             found[f"{kind}/{name}"] = getattr(keys, kind)(name)
     found |= {f"downlink/{name}": keys.downlink(name) for name in PROCESSES[1:]}
@@ -83,10 +83,10 @@ def talk(stage: Bench) -> None:
         if name != "sensor":
             stage.put(name, stage.keys.progress(name), wire.progress(1))
             assert stage.progress[name].hear()[1] == wire.progress(1)
-        stage.put("observer", stage.keys.control(name), Unknown().pack())
+        stage.put("recorder", stage.keys.control(name), Unknown().pack())
         assert stage.controls[name].hear()[1] == Unknown().pack()
-    stage.put("observer", stage.keys.progress("observer"), wire.progress(1))
-    assert stage.progress["observer"].hear()[1] == wire.progress(1)
+    stage.put("recorder", stage.keys.progress("recorder"), wire.progress(1))
+    assert stage.progress["recorder"].hear()[1] == wire.progress(1)
 
 
 MODES: dict[str, dict[str, Any]] = {
@@ -169,10 +169,10 @@ def test_wildcard_alone_hears_nothing(key: str, stage: Bench) -> None:
 
 def test_eavesdropper_gets_nothing_by_asking(stage: Bench) -> None:
     """Queries for all keys and every wildcard, the router's own administration too, come back empty."""
-    # The observer answers on each of its keys: the question must not reach it.
+    # The recorder answers on each of its keys: the question must not reach it.
     asked: list[str] = []
     for name in PROCESSES:
-        stage.sessions["observer"].declare_queryable(
+        stage.sessions["recorder"].declare_queryable(
             stage.keys.telemetry(name), lambda q: asked.append(str(q.key_expr))
         )
     with connect(stage.briefs[EVE]) as attacker:
@@ -191,7 +191,7 @@ def key_of(reply: zenoh.Reply) -> str:
 
 
 def test_eavesdropper_sees_nobody_alive(stage: Bench) -> None:
-    """It learns of no token but its own, neither by watching, with history, nor by asking; the observer sees them."""
+    """It learns of no token but its own, neither by watching, with history, nor by asking; the recorder sees them."""
     with connect(stage.briefs[EVE]) as attacker, ExitStack() as stack:
         ear, control = Ear(), Ear()
         alive = {name: stage.keys.alive(name) for name in PROCESSES}
@@ -238,7 +238,7 @@ def test_eavesdropper_cannot_feign_another_process(stage: Bench) -> None:
     """No process sees a token that it declares for another process, or the withdrawal of such a token."""
     with connect(stage.briefs[EVE]) as attacker:
         tokens = [
-            attacker.liveliness().declare_token(stage.keys.alive(name)) for name in (*PROCESSES, "router", "observer")
+            attacker.liveliness().declare_token(stage.keys.alive(name)) for name in (*PROCESSES, "router", "recorder")
         ]
         assert stage.tokens.hear() == (stage.keys.alive(EVE), b"")
         for token in tokens:
@@ -249,13 +249,13 @@ def test_eavesdropper_cannot_feign_another_process(stage: Bench) -> None:
 
 
 def test_eavesdropper_answers_no_question(stage: Bench) -> None:
-    """No process, not even the observer, asks a queryable that it offers for every key."""
+    """No process, not even the recorder, asks a queryable that it offers for every key."""
     asked: list[str] = []
     with connect(stage.briefs[EVE]) as attacker:
         for key in [*all_keys(stage).values(), "**", "evedrop/**"]:
             attacker.declare_queryable(key, lambda query: asked.append(str(query.key_expr)))
         assert_heard(stage, attacker)
-        for name in ("observer", "sensor", "legitimate"):
+        for name in ("recorder", "sensor", "legitimate"):
             for key in all_keys(stage).values():
                 assert list(stage.sessions[name].get(key, timeout=5.0)) == []
     assert asked == []
@@ -266,7 +266,7 @@ WRONG = {
     "wrong password": ("eve", "guessed"),
     "empty password": ("eve", ""),
     "unknown user": ("trudy", "guessed"),
-    "another's name": ("observer", "guessed"),
+    "another's name": ("recorder", "guessed"),
     "the operator": ("operator", ""),
 }
 

@@ -1,4 +1,4 @@
-"""A request to a run whose observer has lost its connection for a moment."""
+"""A request to a run whose recorder has lost its connection for a moment."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from evedrop.live.network.control_file import Control, remove_control
 from evedrop.live.network.operator import Answer
 from evedrop.live.protocol.envelope import enclosed
 from evedrop.live.protocol.keys import RunKeys
-from evedrop.names import OBSERVER
+from evedrop.names import RECORDER
 from evedrop.system.ports import free_port
 
-KEY = RunKeys("one").control(OBSERVER)
+KEY = RunKeys("one").control(RECORDER)
 
 
-class Observer:
-    """A router, and an observer there that lets the first requests go unanswered."""
+class Recorder:
+    """A router, and a recorder there that lets the first requests go unanswered."""
 
     def __init__(self, folder: Path, unanswered: int) -> None:
         port = free_port()
@@ -46,11 +46,11 @@ class Observer:
 
 
 def test_a_request_that_may_be_repeated_is_asked_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Until the observer is back."""
-    observer = Observer(tmp_path, unanswered=2)
-    with observer.session:
+    """Until the recorder is back."""
+    recorder = Recorder(tmp_path, unanswered=2)
+    with recorder.session:
         assert main(["pause", str(tmp_path)]) == 0
-    assert observer.asked == 3
+    assert recorder.asked == 3
     assert capsys.readouterr().out == "held before slot 3\n"
 
 
@@ -65,8 +65,8 @@ def test_a_request_is_asked_once(
     words: list[str], unanswered: int, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """If it may not be repeated, or the run is over."""
-    observer = Observer(tmp_path, unanswered)
-    with observer.session:
+    recorder = Recorder(tmp_path, unanswered)
+    with recorder.session:
         assert main([words[0], str(tmp_path), *words[1:]]) == 2
-    assert observer.asked == 1
+    assert recorder.asked == 1
     assert said in capsys.readouterr().err

@@ -252,14 +252,14 @@ def test_malformed_progress_is_its_senders(evedrop: Evedrop, what: str) -> None:
 def test_the_sender_is_named_where_everybody_is_started_by_hand(
     evedrop: Evedrop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The sensor, on another host perhaps, tells the observer what it refuses before it ends, so the sender is named."""
+    """The sensor, on another host perhaps, tells the recorder what it refuses before it ends, so the sender is named."""
     rogue = with_rogue(evedrop, "naive", "reporting.progress = lambda k: pack({'k': 10**9})")
     monkeypatch.setenv("PYTHONPATH", rogue["PYTHONPATH"])
     scenario = load("eavesdroppers", {"slots": 100_000})
     with by_hand(scenario, evedrop.folder, f"tcp/127.0.0.1:{free_port()}") as run:
         run.write()
         run.start()
-        assert run.statuses()["observer"] == 3
+        assert run.statuses()["recorder"] == 3
         said = run.summary["ended"]
     assert re.match(
         r"malformed message on evedrop/\w+/progress/naive: k = 1000000000; .*Check that naive speaks", said
@@ -297,7 +297,7 @@ BeliefReporter.add_slots = add_slots
 def test_messages_of_megabytes_harm_nobody(evedrop: Evedrop) -> None:
     """The router drops messages larger than any of the run; the run goes on to its end, and no process takes more memory."""
     live = evedrop.live("eavesdroppers", "--slots", "1200", "--json", env=with_rogue(evedrop, "naive", BOMB))
-    largest = dict.fromkeys(("observer", "sensor", "router"), 0.0)
+    largest = dict.fromkeys(("recorder", "sensor", "router"), 0.0)
     while live.process.poll() is None:
         for name, pid in live.children().items():
             with suppress(OSError, IndexError):
@@ -307,6 +307,6 @@ def test_messages_of_megabytes_harm_nobody(evedrop: Evedrop) -> None:
     done = live.end()
     assert done.status in {0, 1}, done.err
     assert done.summary["slots"] == 1200
-    assert 0.0 < largest["observer"] < 500.0
+    assert 0.0 < largest["recorder"] < 500.0
     assert 0.0 < largest["sensor"] < 200.0
     assert 0.0 < largest["router"] < 250.0

@@ -23,13 +23,13 @@ from evedrop.results.reading import Results
 from tests.conftest import Evedrop, Live, wait_until
 
 SEED = 7318529640182736451
-"""That no process knows but the launcher and the observer, and that nothing holds by chance."""
+"""That no process knows but the launcher and the recorder, and that nothing holds by chance."""
 
 OURS = tuple(
     f"evedrop.{module}"
     for module in (
         "live.launch",
-        "live.observer",
+        "live.recorder",
         "live.network.router",
         "simulate",
         "results",
@@ -178,7 +178,7 @@ def test_no_process_finds_it_where_it_only_asks(evedrop: Evedrop) -> None:
     pids = {one["pid"] for one in spied(evedrop.folder)}
     assert pids
     assert os.getpid() not in pids
-    told = json.loads((evedrop.folder / "briefs" / "observer.json").read_text())["part"]["classes"]
+    told = json.loads((evedrop.folder / "briefs" / "recorder.json").read_text())["part"]["classes"]
     assert any('"use_probabilities"' in question for question in told)
 
 

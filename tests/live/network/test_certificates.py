@@ -20,7 +20,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from evedrop.errors import BriefError, RunError, UsageError
 from evedrop.live.launch.authority import Authority
-from evedrop.live.launch.briefs import ObserverTask, briefs_of
+from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.launch.ports import endpoints_at
 from evedrop.live.network.certificates import check_identity
 from evedrop.live.network.connecting import RouterAddress, connected
@@ -29,7 +29,7 @@ from evedrop.live.network.session import client_config, router_address_of
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets
 from evedrop.live.protocol.brief import AnyBrief, read_brief
-from evedrop.live.protocol.brief_parts import Identity, ObserverPart
+from evedrop.live.protocol.brief_parts import Identity, RecorderPart
 from evedrop.system.ports import free_port
 from tests.conftest import wait_until
 from tests.live.network.bench import Bench, Ear, bench_of, connect, small_network
@@ -114,11 +114,11 @@ def test_without_a_certificate_there_is_no_session(protocol: str, stage: Bench) 
     flow(stage)
 
 
-@pytest.mark.parametrize(("user", "shown"), [(MALLORY, EVE), (EVE, MALLORY), ("observer", EVE)])
+@pytest.mark.parametrize(("user", "shown"), [(MALLORY, EVE), (EVE, MALLORY), ("recorder", EVE)])
 def test_a_certificate_opens_nothing_under_another_user(user: str, shown: str, stage: Bench) -> None:
     """A process with another's user and password, but its own certificate, cannot read or write the other's keys."""
     thief = replace(stage.briefs[user], identity=stage.briefs[shown].identity)
-    telemetry = stage.keys.telemetry(user if user != "observer" else EVE)
+    telemetry = stage.keys.telemetry(user if user != "recorder" else EVE)
     with connect(thief) as attacker, connect(stage.briefs[user]) as rightful:
         stolen, own = Ear(), Ear()
         for key in (stage.keys.downlink(EVE), stage.keys.downlink(MALLORY), stage.keys.telemetry("sensor")):
@@ -188,16 +188,16 @@ def test_a_router_is_believed_at_its_own_names_alone(stage: Bench) -> None:
 
 def test_another_runs_router_is_told_apart(stage: Bench) -> None:
     """A brief of another run says whose router it found, within seconds."""
-    other = briefs_of(stage.scenario, stage.briefs[EVE].router, ObserverTask(Path("nowhere"), False))[EVE]
+    other = briefs_of(stage.scenario, stage.briefs[EVE].router, RecorderTask(Path("nowhere"), False))[EVE]
     with pytest.raises(BriefError) as caught:
         connected(router_address_of(other), 60.0)
     assert f"has a certificate of evedrop {stage.keys.run}, and this brief is of run {other.run}" in str(caught.value)
 
 
 def test_the_operator_has_a_certificate_too(stage: Bench, tmp_path: Path) -> None:
-    """The file that the observer writes into its folder opens a session; without the certificate in it, none opens."""
-    part = stage.briefs["observer"].part
-    assert isinstance(part, ObserverPart)
+    """The file that the recorder writes into its folder opens a session; without the certificate in it, none opens."""
+    part = stage.briefs["recorder"].part
+    assert isinstance(part, RecorderPart)
     control = Control(stage.keys.run, stage.briefs[EVE].router, "operator", part.operator, part.operator_identity)
     control.write(tmp_path)
     assert (tmp_path / "control.json").stat().st_mode & 0o777 == 0o600
@@ -213,9 +213,9 @@ def test_the_operator_has_a_certificate_too(stage: Bench, tmp_path: Path) -> Non
 
 
 def test_private_keys_are_in_the_own_brief_alone(tmp_path: Path) -> None:
-    """Every process has a key of its own, the operator's is with the observer, and the authority's is nowhere."""
+    """Every process has a key of its own, the operator's is with the recorder, and the authority's is nowhere."""
     made = briefs_of(
-        small_network(), endpoints_at("tls/0.0.0.0:7447", "tls/router.lan:7447"), ObserverTask(tmp_path, False)
+        small_network(), endpoints_at("tls/0.0.0.0:7447", "tls/router.lan:7447"), RecorderTask(tmp_path, False)
     )
     texts = {name: brief.write(tmp_path).read_text() for name, brief in made.items()}
     keys = {name: json.loads(text)["identity"]["key"] for name, text in texts.items()}
@@ -223,7 +223,7 @@ def test_private_keys_are_in_the_own_brief_alone(tmp_path: Path) -> None:
     for name, key in keys.items():
         assert [other for other, text in texts.items() if json.dumps(key) in text] == [name]
     assert {name: text.count("PRIVATE KEY") // 2 for name, text in texts.items()} == {
-        name: 2 if name == "observer" else 1 for name in made
+        name: 2 if name == "recorder" else 1 for name in made
     }
     assert len({brief.identity.authority for brief in made.values() if brief.identity}) == 1
     for name in made:
@@ -239,7 +239,7 @@ def certificate_of(brief: AnyBrief) -> x509.Certificate:
 def test_certificates_say_what_they_are_for(tmp_path: Path) -> None:
     """The router's names its hosts and is for a server; all are for a client, and the others' name no host."""
     made = briefs_of(
-        small_network(), endpoints_at("tls/10.0.0.7:7447", "tls/router.lan:7447"), ObserverTask(tmp_path, False)
+        small_network(), endpoints_at("tls/10.0.0.7:7447", "tls/router.lan:7447"), RecorderTask(tmp_path, False)
     )
     names = certificate_of(made["router"]).extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     assert names.get_values_for_type(x509.DNSName) == ["router.lan"]

@@ -26,7 +26,7 @@ from evedrop.live.protocol.commands import EndRun
 from evedrop.live.protocol.envelope import enclosed
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.model.streams import stream_key
-from evedrop.names import OBSERVER
+from evedrop.names import RECORDER
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
 from evedrop.scenario.stream_keys import StreamKeys
@@ -72,8 +72,8 @@ Brief.write = lambda brief, folder: write(brief, Path(sys.argv[1])) and write(br
 raise SystemExit(main(sys.argv[2:]))
 """  # a run as it is, and a copy of every brief it writes
 PROCESSES = ("sensor", "legitimate", "eve", "mallory", "nadia")
-EVERYBODY = (*PROCESSES, "router", "observer")
-SERVERS = ("server of observers", "server of others")
+EVERYBODY = (*PROCESSES, "router", "recorder")
+SERVERS = ("server of recorders", "server of others")
 TOKEN = "only-the-launcher-has-this"  # noqa: S105 - an example
 ENOUGH = 20  # messages on each of the keys that are meant to be heard
 
@@ -156,7 +156,7 @@ def processes_of(pid: int) -> dict[str, int]:
             found[Path(last).stem] = child
         elif "evedrop.fork_server" in options:
             found[SERVERS["evedrop.fork_server" not in words_of(parent_of(child))]] = (
-                child  # that of observers is a fork
+                child  # that of recorders is a fork
             )
     return found
 
@@ -189,8 +189,8 @@ def attack(folder: Path) -> Evidence:
         briefs = {name: read_brief(kept / f"{name}.json") for name in EVERYBODY}
         keys, eve = RunKeys(briefs["eve"].run), briefs["eve"]
         meant = {keys.downlink(name): name for name in PROCESSES[1:]}
-        meant |= {keys.telemetry(name): "observer" for name in PROCESSES} | {keys.journal: "observer"}
-        meant |= {keys.progress(name): "sensor" for name in (*PROCESSES[1:], "observer")}
+        meant |= {keys.telemetry(name): "recorder" for name in PROCESSES} | {keys.journal: "recorder"}
+        meant |= {keys.progress(name): "sensor" for name in (*PROCESSES[1:], "recorder")}
         counts = {key: Ear() for key in meant}
         for key, name in meant.items():
             stack.enter_context(connect(briefs[name])).declare_subscriber(key, counts[key])
@@ -216,7 +216,7 @@ def attack(folder: Path) -> Evidence:
             name: {
                 "brief": (kept / f"{name}.json").read_bytes(),
                 # The system shows the environment of a fork's server as the fork's.
-                "environment": Path(f"/proc/{servers[name != OBSERVER]}/environ").read_bytes(),
+                "environment": Path(f"/proc/{servers[name != RECORDER]}/environ").read_bytes(),
                 "arguments": Path(f"/proc/{pid}/cmdline").read_bytes(),
             }
             for name, pid in found.items()

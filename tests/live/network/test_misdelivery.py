@@ -14,7 +14,7 @@ import pytest
 import zenoh
 
 from evedrop.errors import MalformedMessage
-from evedrop.live.launch.briefs import ObserverTask, briefs_of
+from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.network.control_file import Control
 from evedrop.live.network.declared import Question, SubscriptionClosedError
 from evedrop.live.network.operator import Answer, ask
@@ -46,8 +46,8 @@ class Stage:
     def __init__(self, folder: Path, stack: ExitStack) -> None:
         port = free_port()
         self.cable: Cable = stack.enter_context(cable(port))
-        observation = ObserverTask(folder / "results", False)
-        self.briefs = briefs_of(small_network(), self.cable.endpoint, observation, ends_with_stdin=False)
+        task = RecorderTask(folder / "results", False)
+        self.briefs = briefs_of(small_network(), self.cable.endpoint, task, ends_with_stdin=False)
         with users_file({"operator": "password", **{one.user: one.password for one in self.briefs.values()}}) as users:
             config = {
                 "mode": "router",
@@ -105,7 +105,7 @@ def test_a_subscription_drops_what_names_another_key(stage: Stage, capfd: pytest
 def test_a_callback_subscription_drops_what_names_another_key(stage: Stage) -> None:
     """As an subscription, whatever the key is."""
     key, heard = stage.keys.telemetry("eve"), SimpleQueue[bytes]()
-    with Session(stage.briefs["observer"]) as session:
+    with Session(stage.briefs["recorder"]) as session:
         session.subscribe_with(key, heard.put)
         stage.put(key, [*foreign(stage.keys, key), enclosed(key, GOOD)])
         assert heard.get(timeout=LIMIT) == GOOD
@@ -124,8 +124,8 @@ def test_commands_that_name_another_process_are_dropped(stage: Stage) -> None:
 
 def test_a_question_that_names_another_key_is_not_answered(stage: Stage) -> None:
     """Nor handed on; one that names its key is."""
-    key, asked = stage.keys.control("observer"), SimpleQueue[Question]()
-    with Session(stage.briefs["observer"]) as session:
+    key, asked = stage.keys.control("recorder"), SimpleQueue[Question]()
+    with Session(stage.briefs["recorder"]) as session:
         session.asked(key, asked.put)
         querier = stage.router.declare_querier(key)
         wait_until(lambda: is_matched(querier), "somebody to be asked")
@@ -141,7 +141,7 @@ def test_a_question_that_names_another_key_is_not_answered(stage: Stage) -> None
 
 def test_an_answer_that_names_another_key_is_none(stage: Stage) -> None:
     """The operator takes an answer for its own only if it names the key at which it asked."""
-    key, answers = stage.keys.control("observer"), SimpleQueue[bytes]()
+    key, answers = stage.keys.control("recorder"), SimpleQueue[bytes]()
 
     def answer(query: zenoh.Query) -> None:
         query.reply(key, answers.get())

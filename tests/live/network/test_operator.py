@@ -1,4 +1,4 @@
-"""Questions to the observer, with real sessions: the operator alone may ask, and the observer alone may answer.
+"""Questions to the recorder, with real sessions: the operator alone may ask, and the recorder alone may answer.
 
 As in test_access.py nothing waits for silence: a question that is answered proves that what came before it was dealt with.
 """
@@ -16,7 +16,7 @@ import zenoh
 from evedrop.live.network.control_file import Control
 from evedrop.live.network.operator import Answer, ask
 from evedrop.live.protocol.brief import AnyBrief
-from evedrop.live.protocol.brief_parts import ObserverPart
+from evedrop.live.protocol.brief_parts import RecorderPart
 from evedrop.live.protocol.envelope import enclosed, payload_of
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.requests import PauseRequest, StatusRequest, StepRequest
@@ -30,15 +30,15 @@ PATIENCE = 5.0
 
 @pytest.fixture(scope="module")
 def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    """One router for all tests of this file, and an observer that answers."""
+    """One router for all tests of this file, and a recorder that answers."""
     with bench_of(small_network(), tmp_path_factory.mktemp("operator")) as one:
         yield one
 
 
 def operator(stage: Bench) -> AnyBrief:
-    """The operator's credentials, as an observer's brief would have them."""
-    observer = stage.briefs["observer"]
-    return replace(observer, process="operator", user="operator", password=part_of(observer, ObserverPart).operator)
+    """The operator's credentials, as a recorder's brief would have them."""
+    recorder = stage.briefs["recorder"]
+    return replace(recorder, process="operator", user="operator", password=part_of(recorder, RecorderPart).operator)
 
 
 def control(stage: Bench, **changes: Any) -> Control:
@@ -51,8 +51,8 @@ def control(stage: Bench, **changes: Any) -> Control:
 
 @contextmanager
 def answering(stage: Bench) -> Iterator[list[bytes]]:
-    """The observer answers "yes"; what it was asked."""
-    key, asked = stage.keys.control("observer"), list[bytes]()
+    """The recorder answers "yes"; what it was asked."""
+    key, asked = stage.keys.control("recorder"), list[bytes]()
 
     def answer(query: zenoh.Query) -> None:
         message = query.payload.to_bytes() if query.payload is not None else b""
@@ -60,17 +60,17 @@ def answering(stage: Bench) -> Iterator[list[bytes]]:
         query.reply(key, enclosed(key, Answer(7, "yes").pack()))
         query.drop()
 
-    queryable = stage.sessions["observer"].declare_queryable(key, answer)
-    wait_until(lambda: ask(control(stage), StatusRequest(), PATIENCE), "an observer that answers")
+    queryable = stage.sessions["recorder"].declare_queryable(key, answer)
+    wait_until(lambda: ask(control(stage), StatusRequest(), PATIENCE), "a recorder that answers")
     asked.clear()
     yield asked
     queryable.undeclare()
 
 
 def attempts(stage: Bench) -> list[str]:
-    """The key at which the observer is asked, and wildcards that have it in them."""
+    """The key at which the recorder is asked, and wildcards that have it in them."""
     under = f"evedrop/{stage.keys.run}"
-    return [stage.keys.control("observer"), f"{under}/control/*", f"{under}/**", "evedrop/**", "**"]
+    return [stage.keys.control("recorder"), f"{under}/control/*", f"{under}/**", "evedrop/**", "**"]
 
 
 def replies(session: zenoh.Session, key: str) -> list[bytes]:
@@ -82,7 +82,7 @@ def replies(session: zenoh.Session, key: str) -> list[bytes]:
 
 
 def test_the_operator_is_answered(stage: Bench) -> None:
-    """Its question reaches the observer as it was put, and the answer comes back."""
+    """Its question reaches the recorder as it was put, and the answer comes back."""
     with answering(stage) as asked:
         assert ask(control(stage), StepRequest(3), PATIENCE) == Answer(7, "yes")
         assert asked == [StepRequest(3).pack()]
@@ -90,7 +90,7 @@ def test_the_operator_is_answered(stage: Bench) -> None:
 
 @pytest.mark.parametrize("who", OTHERS)
 def test_nobody_else_may_ask(who: str, stage: Bench) -> None:
-    """Neither sensor nor receiver gets an answer, at the key or any wildcard, and the observer hears nothing of it."""
+    """Neither sensor nor receiver gets an answer, at the key or any wildcard, and the recorder hears nothing of it."""
     with answering(stage) as asked, connect(stage.briefs[who]) as session:
         for key in attempts(stage):
             assert replies(session, key) == [], key
@@ -119,7 +119,7 @@ def test_a_stranger_gets_no_session(wrong: dict[str, str], stage: Bench) -> None
 
 
 def test_nobody_else_may_answer(stage: Bench) -> None:
-    """No other process that offers to answer is asked, with or without the observer."""
+    """No other process that offers to answer is asked, with or without the recorder."""
     feigned: list[str] = []
     sessions = [connect(stage.briefs[who]) for who in OTHERS] + [connect(operator(stage))]
     try:
@@ -149,26 +149,26 @@ def test_the_operator_may_do_nothing_else(stage: Bench) -> None:
     keys = stage.keys
     ear = Ear()
     every = [keys.uplink, keys.journal, *(keys.downlink(name) for name in OTHERS[1:])]
-    for name in (*OTHERS, "router", "observer", "operator"):
+    for name in (*OTHERS, "router", "recorder", "operator"):
         every += [keys.telemetry(name), keys.progress(name), keys.control(name), keys.alive(name)]
     with answering(stage) as asked, connect(operator(stage)) as session:
         for key in (*every, *attempts(stage)):
             session.declare_subscriber(key, ear)
             session.liveliness().declare_subscriber(key, ear, history=True)
         with connect(operator(stage)) as writer:  # its own puts and tokens would reach its own ears
-            tokens = [writer.liveliness().declare_token(keys.alive(name)) for name in (*OTHERS, "router", "observer")]
+            tokens = [writer.liveliness().declare_token(keys.alive(name)) for name in (*OTHERS, "router", "recorder")]
             for key in every:
                 writer.put(key, b"\xc1", congestion_control=zenoh.CongestionControl.BLOCK)
                 writer.delete(key, congestion_control=zenoh.CongestionControl.BLOCK)
-            assert replies(writer, keys.control("observer")) == [Answer(7, "yes").pack()]
+            assert replies(writer, keys.control("recorder")) == [Answer(7, "yes").pack()]
             for token in tokens:
                 token.undeclare()
-            assert replies(writer, keys.control("observer")) == [Answer(7, "yes").pack()]
+            assert replies(writer, keys.control("recorder")) == [Answer(7, "yes").pack()]
         for name in OTHERS:
             stage.settle(name)
-            stage.put("observer", keys.control(name), b"noted")
+            stage.put("recorder", keys.control(name), b"noted")
             assert stage.controls[name].hear() == (keys.control(name), b"noted")
-        assert replies(session, keys.control("observer")) == [Answer(7, "yes").pack()]
+        assert replies(session, keys.control("recorder")) == [Answer(7, "yes").pack()]
         assert len(asked) == 3
     assert ear.all() == []
     for ears in (stage.downlinks, stage.controls, stage.progress, stage.telemetry):
@@ -180,5 +180,5 @@ def test_the_operator_may_do_nothing_else(stage: Bench) -> None:
 def test_of_another_run_nothing_can_be_asked(stage: Bench) -> None:
     """The operator's rights end with the keys of its run."""
     with answering(stage) as asked, connect(operator(stage)) as session:
-        assert replies(session, RunKeys("another").control("observer")) == []
+        assert replies(session, RunKeys("another").control("recorder")) == []
         assert asked == []

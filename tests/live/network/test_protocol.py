@@ -124,13 +124,13 @@ def test_table_of_keys_is_the_access_table() -> None:
     receivers = ("legitimate", "eve")
     prefix = f"evedrop/{'r'}/"
     documented: dict[tuple[str, str], set[str]] = {}
-    everybody = {"sensor": ["sensor"], "router": ["router"], "observer": ["observer"], "receiver": list(receivers)}
+    everybody = {"sensor": ["sensor"], "router": ["router"], "recorder": ["recorder"], "receiver": list(receivers)}
     everybody |= {"legitimate": ["legitimate"], "controller": ["controller"]}
     rows = re.findall(r"^\| (`[a-z]+(?:/.*?)?`.*?) \| (.*?) \| (.*?) \| (.*?) \|$", TEXT.split("## A run")[0], re.M)
     assert len(rows) == 14
     for paths, _, writers, readers in rows:
         for path in re.findall(r"`(.*?)`", paths):
-            names = [*receivers, "sensor", "router", "observer", "controller"] if "<process>" in path else receivers
+            names = [*receivers, "sensor", "router", "recorder", "controller"] if "<process>" in path else receivers
             for name in names if "<" in path else [""]:
                 key = prefix + re.sub(r"<\w+>", name, path)
                 for what, who in (("writes", writers), ("reads", readers)):
@@ -145,17 +145,17 @@ def test_table_of_keys_is_the_access_table() -> None:
                 granted.setdefault((what, key), set()).add(grant.process)
     keys = RunKeys("r")
     no_row = {
-        ("writes", keys.control("observer")),
-        ("reads", keys.control("observer")),
-        ("reads", keys.alive("observer")),
+        ("writes", keys.control("recorder")),
+        ("reads", keys.control("recorder")),
+        ("reads", keys.alive("recorder")),
     }
     assert {entry: users for entry, users in documented.items() if users and entry not in no_row} == granted
     for loop in (None, Wiring("estimate", False)):
         legitimate = next(grant for grant in grants("r", receivers, loop) if grant.process == "legitimate")
         assert keys.input not in legitimate.reads, "the inputs are for an estimator that is to know them"
     assert {grant.process: grant.asks for grant in grants("r", receivers) if grant.asks} == {
-        "operator": (keys.control("observer"),)
+        "operator": (keys.control("recorder"),)
     }
     assert {grant.process: grant.answers for grant in grants("r", receivers) if grant.answers} == {
-        "observer": (keys.control("observer"),)
+        "recorder": (keys.control("recorder"),)
     }

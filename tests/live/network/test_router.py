@@ -18,7 +18,7 @@ import pytest
 from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
 
 from evedrop.errors import RunError
-from evedrop.live.launch.briefs import ObserverTask, briefs_of
+from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.network.router import RouterLoop
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
@@ -63,7 +63,7 @@ class MemoryBench:
 
     def __init__(self, **changes: Any) -> None:
         self.scenario = small_network(**changes)
-        self.briefs = briefs_of(self.scenario, "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False))
+        self.briefs = briefs_of(self.scenario, "tcp/127.0.0.1:1", RecorderTask(Path("nowhere"), False))
         brief = self.briefs["router"]
         assert isinstance(brief.part, RouterPart)
         self.brief = cast(Brief[RouterPart], replace(brief, flow=Flow(32, 8, self.scenario.longest_outage)))
@@ -133,7 +133,7 @@ def test_every_packet_is_accounted_for(bench: Callable[..., Bench]) -> None:
         key = stage.briefs["router"].stream_keys[f"link/{name}"]
         quality = stage.scenario.quality[name]
         assert np.array_equal(gamma, uniforms_of(key, 61, range(1000, 1005)) < quality)
-    stage.put("observer", stage.keys.control("router"), EndRun().pack())
+    stage.put("recorder", stage.keys.control("router"), EndRun().pack())
     assert stage.router.wait(LIMIT) == 0
     assert stage.log.read_text() == ""
 

@@ -61,7 +61,7 @@ def test_everything_that_is_granted_crosses(stage: Bench) -> None:
         stage.settle(name)
     stage.settle("sensor")
     for name in ("sensor", *RECEIVERS):
-        stage.put("observer", stage.keys.control(name), Unknown().pack())
+        stage.put("recorder", stage.keys.control(name), Unknown().pack())
         assert stage.controls[name].hear() == (stage.keys.control(name), Unknown().pack())
 
 
@@ -101,7 +101,7 @@ def test_an_eavesdropper_at_the_relay_cannot_write_for_others(stage: Bench) -> N
             keys.journal,
             keys.acknowledged,
             *(keys.downlink(name) for name in RECEIVERS),
-            *(keys.progress(name) for name in ("legitimate", "observer")),
+            *(keys.progress(name) for name in ("legitimate", "recorder")),
             *(keys.control(name) for name in ("sensor", "router", "relay", "legitimate")),
             *(keys.telemetry(name) for name in ("sensor", "legitimate")),
         ):
@@ -123,7 +123,7 @@ def test_each_router_is_asked_for_itself(stage: Bench, monkeypatch: pytest.Monke
     assert not is_there(replace(stage.briefs["relay"], password="of another run"))  # noqa: S106 - that is the point
 
 
-@pytest.mark.parametrize("who", ["eve", "legitimate", "observer"])
+@pytest.mark.parametrize("who", ["eve", "legitimate", "recorder"])
 def test_who_belongs_to_the_relay_is_not_let_in_at_the_router(who: str, stage: Bench) -> None:
     """The router's only clients are the sensor and the relay, and no other process has a password there."""
     near = stage.briefs["sensor"].router
@@ -155,7 +155,7 @@ def test_each_process_has_its_own_place(stage: Bench) -> None:
     """The sensor and the relay connect to the router, all others to the relay; each router knows those it lets in, and itself."""
     router, relay = stage.briefs["router"], stage.briefs["relay"]
     assert set(part_of(router, RouterPart).users) == {"router", "sensor", "relay"}
-    assert set(part_of(relay, RelayPart).users) == {*RECEIVERS, "relay", "observer", "operator"}
+    assert set(part_of(relay, RelayPart).users) == {*RECEIVERS, "relay", "recorder", "operator"}
     assert {name for name, brief in stage.briefs.items() if brief.router == router.router} == {
         "router",
         "relay",
@@ -178,7 +178,7 @@ def test_what_crosses_is_no_more_than_it_must_be() -> None:
     }
     assert set(relay.writes) == {
         keys.acknowledged,
-        *(keys.progress(name) for name in ("legitimate", "eve", "observer")),
+        *(keys.progress(name) for name in ("legitimate", "eve", "recorder")),
         *(keys.control(name) for name in ("sensor", "router")),
     }
     assert (router.writes, router.reads) == (relay.reads, relay.writes)

@@ -17,10 +17,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from evedrop.errors import EvedropError, Gap, MalformedMessage, RunError
-from evedrop.live.observer.joiner import Joiner
 from evedrop.live.protocol import packets, telemetry
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.keys import writer_of
+from evedrop.live.recorder.joiner import Joiner
 from evedrop.model.digest import Blocks
 from evedrop.model.flag_bits import packed_flags
 from evedrop.model.links.link import REASONS
@@ -364,7 +364,7 @@ TELEMETRY = {
 
 @pytest.mark.parametrize("second", [0, 1, 3, 4])
 @pytest.mark.parametrize("what", TELEMETRY)
-def test_observer_notices_gaps_and_doubles(what: str, second: int) -> None:
+def test_recorder_notices_gaps_and_doubles(what: str, second: int) -> None:
     """Truth, report or journal that does not begin where the last one ended is a gap."""
     joiner = Joiner(extent(1, 3), {"a": 0}, {"a": Blocks(9)})
     takes: dict[str, Callable[[bytes], object]] = {

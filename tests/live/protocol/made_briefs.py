@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from evedrop.errors import BriefError
-from evedrop.live.launch.briefs import ObserverTask, briefs_of
+from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.protocol.brief import AnyBrief, Brief, Flow, Model, read_brief
 from evedrop.live.protocol.brief_parts import EavesdropperPart
 from evedrop.live.protocol.brief_use import expect_usable
@@ -51,7 +51,7 @@ def briefed(seed: int = 3, **changes: Any) -> Scenario:
 
 def made(scenario: Scenario) -> dict[str, AnyBrief]:
     """The briefs of a scenario."""
-    return briefs_of(scenario, "tcp/127.0.0.1:1", ObserverTask(Path("nowhere"), False))
+    return briefs_of(scenario, "tcp/127.0.0.1:1", RecorderTask(Path("nowhere"), False))
 
 
 _NONE: dict[str, Any] = {}

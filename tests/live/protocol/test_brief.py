@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from evedrop.errors import BriefError
-from evedrop.live.launch.briefs import ObserverTask, briefs_of
+from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.launch.ports import endpoints_at
 from evedrop.live.protocol.brief import has_part, read_brief
-from evedrop.live.protocol.brief_parts import EavesdropperPart, ObserverPart, RouterPart, SensorPart
+from evedrop.live.protocol.brief_parts import EavesdropperPart, RecorderPart, RouterPart, SensorPart
 from evedrop.scenario.stream_keys import StreamKeys
 from tests.conftest import Evedrop
 from tests.examples import mostly_long
@@ -129,7 +129,7 @@ def test_who_is_given_which_keys() -> None:
         "naive": set(),
         "smart": {"schedule"},
         "doubtful": {"schedule", "coin"},
-        "observer": set(),
+        "recorder": set(),
     }
 
 
@@ -169,11 +169,11 @@ def test_passwords_and_run_are_made_afresh() -> None:
     assert min(map(len, passwords)) >= 32
     assert first["router"].run != second["router"].run
     users = {n: b.password for n, b in first.items()}
-    router, observer = first["router"].part, first["observer"].part
+    router, recorder = first["router"].part, first["recorder"].part
     assert isinstance(router, RouterPart)
-    assert isinstance(observer, ObserverPart)
-    assert router.users == {**users, "operator": observer.operator}
-    assert observer.operator not in passwords
+    assert isinstance(recorder, RecorderPart)
+    assert router.users == {**users, "operator": recorder.operator}
+    assert recorder.operator not in passwords
 
 
 def test_an_added_eavesdropper_changes_nobody_elses_keys() -> None:
@@ -202,7 +202,7 @@ def test_model_is_the_only_thing_all_share() -> None:
 def test_no_secret_is_in_what_python_shows_of_a_brief() -> None:
     """Neither keys, passwords, private keys nor the seed: they would be in a traceback, and so in a log."""
     made_for = endpoints_at("tls/0.0.0.0:7447", "tls/router.lan:7447")
-    for brief in briefs_of(briefed(seed=987_654_321), made_for, ObserverTask(Path("nowhere"), False)).values():
+    for brief in briefs_of(briefed(seed=987_654_321), made_for, RecorderTask(Path("nowhere"), False)).values():
         shown, found = repr(brief), json.loads(brief.text)
         secrets = [brief.password, *brief.keys.values(), *found["part"].get("users", {}).values()]
         secrets += [found["part"].get("operator"), found["identity"]["key"], "PRIVATE KEY", "987654321"]
@@ -236,7 +236,7 @@ def test_probabilities_that_are_not_one_for_each_slot_are_refused(wrong: list[fl
     assert refusal(found, tmp_path) is None
 
 
-@pytest.mark.parametrize("role", ["router", "sensor", "legitimate", "smart", "observer"])
+@pytest.mark.parametrize("role", ["router", "sensor", "legitimate", "smart", "recorder"])
 def test_unknown_entries_of_a_part_are_refused(role: str, tmp_path: Path) -> None:
     """As those of the brief itself."""
     found = json.loads(made(briefed())[role].text)
@@ -287,7 +287,7 @@ USUAL = [
     *(f"replay-attack/{process}" for process in ("router", "sensor", "legitimate", "controller")),
     *(f"acknowledged/{process}" for process in ("router", "sensor")),
     *(f"colluding/{process}" for process in ("router", "legitimate", "equal")),
-    *(f"twin-track/{process}" for process in ("late", "observer")),
+    *(f"twin-track/{process}" for process in ("late", "recorder")),
     "eavesdroppers/suspicious",
     "noise-before/deaf",
 ]

@@ -1,4 +1,4 @@
-"""The observer's commands: each is read as it was packed, and a malformed one is refused with what was expected."""
+"""The recorder's commands: each is read as it was packed, and a malformed one is refused with what was expected."""
 
 from __future__ import annotations
 

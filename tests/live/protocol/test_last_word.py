@@ -12,7 +12,7 @@ from evedrop.errors import EvedropError, Gap, MalformedMessage, MissingProcesses
 from evedrop.live.protocol.last_word import Cause, LastWord, last_word_file, read_last_word
 
 ERRORS: list[tuple[EvedropError, Cause, tuple[str, ...]]] = [
-    (MissingProcesses("eve", ("router", "observer"), "in time"), Cause.MISSING_PROCESSES, ("router", "observer")),
+    (MissingProcesses("eve", ("router", "recorder"), "in time"), Cause.MISSING_PROCESSES, ("router", "recorder")),
     (MalformedMessage("evedrop/r/uplink", "3", "4", b"x"), Cause.BROKEN_PROTOCOL, ("sensor",)),
     (Gap("evedrop/r/downlink/eve", 3, 4), Cause.BROKEN_PROTOCOL, ("router",)),
     (Refusal("router", "evedrop/r/uplink", "sensor", "why"), Cause.BROKEN_PROTOCOL, ("sensor",)),

@@ -91,7 +91,7 @@ def test_the_view_shows_who_caused_an_event(by: str, line: str) -> None:
 
 
 def test_only_the_launcher_tells_that_the_folder_moved(capsys: pytest.CaptureFixture[str]) -> None:
-    """The launcher refuses an observer that writes it; a caller that ignores events prints nothing."""
+    """The launcher refuses a recorder that writes it; a caller that ignores events prints nothing."""
     moved: Any = FolderMoved("there")
     with pytest.raises(ValueError, match="it is not an object with an event of"):
         read_event(moved.line)

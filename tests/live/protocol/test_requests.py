@@ -1,4 +1,4 @@
-"""The operator's requests, as the observer reads them. docs/protocol.md has their bytes."""
+"""The operator's requests, as the recorder reads them. docs/protocol.md has their bytes."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from evedrop.live.protocol.status import LinkStatus, RunStatus, status_of_shards
 from evedrop.live.protocol.wire_status import WireLinkStatus, WireStatus
 from evedrop.scenario.progress_events import RunEvent
 
-KEY = "evedrop/r1/control/observer"
+KEY = "evedrop/r1/control/recorder"
 STATUS = RunStatus(
     40,
     80,

@@ -40,7 +40,7 @@ class Simulated:
     slots: SceneSlots
 
     def chunks(self, length: int) -> Iterator[SceneSlots]:
-        """The slots, as the observer hands them over: some at a time."""
+        """The slots, as the recorder hands them over: some at a time."""
         for first in range(0, self.scene.slots, length):
             part = slice(first, first + length)
             peers = {

@@ -24,7 +24,7 @@ OWN = {
     "LOCALHOST:9000": "localhost",
     "[::1]:9464": "[::1]",
     "[FE80::1]": "[fe80::1]",
-    "observer:9464": "observer",
+    "recorder:9464": "recorder",
     "view.localhost": "view.localhost",
     "host.docker.internal:9464": "host.docker.internal",
     "laboratory.example:80": "laboratory.example",

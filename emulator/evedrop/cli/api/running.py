@@ -34,7 +34,7 @@ def run(
     on_event: OnEvent | None = None,
     **changes: Any,
 ) -> RunResults:
-    """Run a scenario live, with sensor, router, estimators and observer in separate processes.
+    """Run a scenario live, with sensor, router, estimators and recorder in separate processes.
 
     scenario: a built-in name, a file, or a `Scenario`; out: the results folder, new or empty, by default a temporary one that is
     removed with the results; overwrite: replace the results in `out`; view: auto, native, web or off; listen: the router's

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-ROLES = ("router", "relay", "sensor", "legitimate", "eavesdropper", "controller", "observer")
+ROLES = ("router", "relay", "sensor", "legitimate", "eavesdropper", "controller", "recorder")
 """The roles of processes; each is a command that runs one."""
 
 GROUP = "evedrop.commands"

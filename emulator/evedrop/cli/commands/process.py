@@ -20,7 +20,7 @@ from evedrop.errors import BriefError, EvedropError, UsageError
 
 if TYPE_CHECKING:
     from evedrop.live.protocol.brief import AnyBrief, Brief
-    from evedrop.live.protocol.brief_parts import ObserverPart
+    from evedrop.live.protocol.brief_parts import RecorderPart
 
 
 _BY_HAND = ("results", "listen", "connect", "relay", "relay_connect", "wait", "insecure", "paused")
@@ -75,7 +75,7 @@ def _compose(options: argparse.Namespace) -> int:
 def process(options: argparse.Namespace) -> int:
     """Run one process of a run."""
     from evedrop.live.protocol.brief import read_brief
-    from evedrop.live.protocol.brief_parts import ImportingPart, ObserverPart, RoutingPart
+    from evedrop.live.protocol.brief_parts import ImportingPart, RecorderPart, RoutingPart
     from evedrop.scenario.plugins import look_in
     from evedrop.system.processes import continue_when_parent_dies
 
@@ -83,7 +83,7 @@ def process(options: argparse.Namespace) -> int:
     from evedrop.system.signals import leave_on_signals, show_stacks_on_request
 
     show_stacks_on_request()
-    if options.role != "observer":  # the observer ends the run in order
+    if options.role != "recorder":  # the recorder ends the run in order
         leave_on_signals()
     brief = read_brief(options.brief, options.role)
     if brief.ends_with_stdin:  # started by a launcher, which writes another brief if it restarts the process
@@ -93,7 +93,7 @@ def process(options: argparse.Namespace) -> int:
             from evedrop.live.network.launcher_pipe import keep_events_apart
 
             keep_events_apart(launched=True)  # before the modules of link classes print anything
-    if isinstance(brief.part, ObserverPart) and getattr(options, "out", None) is not None:
+    if isinstance(brief.part, RecorderPart) and getattr(options, "out", None) is not None:
         brief = replace(brief, part=replace(brief.part, results=str(options.out)))
     if isinstance(brief.part, ImportingPart) and brief.part.modules is not None:
         look_in(brief.part.modules)
@@ -109,20 +109,20 @@ def process(options: argparse.Namespace) -> int:
 
 
 def _play(brief: AnyBrief, serve: str | None) -> int:
-    """Run the process of a brief; returns its exit status. serve: where an observer shows the run to browsers."""
+    """Run the process of a brief; returns its exit status. serve: where a recorder shows the run to browsers."""
     from evedrop.live.protocol.brief import has_part
-    from evedrop.live.protocol.brief_parts import ObserverPart
+    from evedrop.live.protocol.brief_parts import RecorderPart
     from evedrop.live.protocol.brief_use import classes_known, expect_usable
 
     if brief.identity is not None:
         from evedrop.live.network.certificates import check_identity
 
         check_identity(brief.identity, brief.process)
-    if has_part(brief, ObserverPart):
+    if has_part(brief, RecorderPart):
         from evedrop.live.network.launcher_pipe import Heartbeat
 
         with Heartbeat() if brief.ends_with_stdin else contextlib.nullcontext():
-            return _observe(brief, serve)
+            return _record(brief, serve)
     expect_usable(brief)
     from evedrop.live.network.zenoh_log import zenoh_log_apart
 
@@ -141,7 +141,7 @@ def _listens(brief: AnyBrief) -> bool:
 
 
 def _take_part(brief: AnyBrief) -> None:
-    """Run the process of a brief that is not the observer's."""
+    """Run the process of a brief that is not the recorder's."""
     from evedrop.live.protocol import brief_parts as parts
     from evedrop.live.protocol.brief import has_part
 
@@ -171,16 +171,16 @@ def _take_part(brief: AnyBrief) -> None:
         steer(brief)
 
 
-def _observe(brief: Brief[ObserverPart], serve: str | None) -> int:
+def _record(brief: Brief[RecorderPart], serve: str | None) -> int:
     from pydantic import ValidationError
 
-    from evedrop.live.observer.observer import observe
     from evedrop.live.protocol.brief import WRITE_AGAIN
+    from evedrop.live.recorder.recorder import record
     from evedrop.scenario.sentences import sentences
     from evedrop.scenario.tables import Scenario
 
     try:
-        return observe(brief, _report, serve)
+        return record(brief, _report, serve)
     except ValidationError as error:
         lines = "; ".join(sentences(error, Scenario)[:_MOST_TOLD])
         raise BriefError(f"part.scenario has mistakes: {lines}; {WRITE_AGAIN}") from None
@@ -204,7 +204,7 @@ def health(options: argparse.Namespace) -> int:
     return 0 if there else 1
 
 
-def _observed(parser: argparse.ArgumentParser) -> None:
+def _results_folder(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, metavar="DIR", help="results folder, new or empty; default the brief's")
 
 
@@ -222,7 +222,7 @@ def _briefs(parser: argparse.ArgumentParser) -> None:
         type=Path,
         default=Path("results"),
         metavar="DIR",
-        help="the observer's results folder, on its host; relative to its working directory",
+        help="the recorder's results folder, on its host; relative to its working directory",
     )
     parser.add_argument(
         "--listen",
@@ -280,7 +280,7 @@ COMMANDS = (
             role,
             process,
             f"run only the {role}",
-            (_BRIEF, _role(role), *((_observed, served) if role == "observer" else ())),
+            (_BRIEF, _role(role), *((_results_folder, served) if role == "recorder" else ())),
             section="processes",
             example=f"{role} briefs/{role}.json",
             page="hosts",

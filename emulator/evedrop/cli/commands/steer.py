@@ -1,4 +1,4 @@
-"""The commands for a run or wire in progress: each asks the run's observer, or the wire, prints the answer, and ends.
+"""The commands for a run or wire in progress: each asks the run's recorder, or the wire, prints the answer, and ends.
 
 Slow imports are made only by the command that needs them.
 """
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from evedrop.live.protocol.requests import OperatorRequest
 
 _PATIENCE = 60.0  # seconds; a hold may wait for a process that the scenario has restarted
-_AWAY_SECONDS = 5.0  # for which a run may have no observer at its router
+_AWAY_SECONDS = 5.0  # for which a run may have no recorder at its router
 _AGAIN_SECONDS = 0.2
 _STEP_PATIENCE = 30 * 86_400.0  # a step takes as long as its slots do
 
@@ -105,7 +105,7 @@ def _ask(run: Path, request: OperatorRequest, what: str, patience: float = _PATI
 
 
 def _answer(run: Path, control: Control, request: OperatorRequest, what: str, patience: float) -> Answer:
-    """The answer of the observer of a run or a shard. Raises UsageError if it does not answer, or refuses."""
+    """The answer of the recorder of a run or a shard. Raises UsageError if it does not answer, or refuses."""
     import zenoh
 
     from evedrop.live.network.control_file import no_run, read_controls
@@ -121,7 +121,7 @@ def _answer(run: Path, control: Control, request: OperatorRequest, what: str, pa
             raise UsageError(f"{run / 'control.json'}: {error}") from error
     try:
         found = ask(control, request, patience)
-        # An observer that has lost its connection is back in a moment; these requests may be carried out twice.
+        # A recorder that has lost its connection is back in a moment; these requests may be carried out twice.
         while found is None and request.repeatable and time.monotonic() - began < _AWAY_SECONDS:
             read_controls(run)  # raises UsageError when the run is over
             time.sleep(_AGAIN_SECONDS)

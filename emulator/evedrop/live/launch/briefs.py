@@ -17,9 +17,9 @@ from evedrop.live.protocol.brief_parts import (
     EavesdropperPart,
     LegitimatePart,
     LinkEntry,
-    ObserverPart,
     Part,
     ProgramEntry,
+    RecorderPart,
     RelayPart,
     RouterPart,
     SensorPart,
@@ -28,7 +28,7 @@ from evedrop.live.protocol.message_limits import Sizes
 from evedrop.model.eavesdroppers import REMOTE_CALLS, STRATEGIES
 from evedrop.model.schemes import scheme_of
 from evedrop.model.slot.account import COUNTED_BURSTS
-from evedrop.names import ACKNOWLEDGEMENTS, CONTROLLER, LEGITIMATE, OBSERVER, OPERATOR, RELAY, ROUTER, SENSOR
+from evedrop.names import ACKNOWLEDGEMENTS, CONTROLLER, LEGITIMATE, OPERATOR, RECORDER, RELAY, ROUTER, SENSOR
 from evedrop.results.folder import new_folder
 from evedrop.scenario.controlled import monitor_of
 from evedrop.scenario.input_files import states_of
@@ -96,8 +96,8 @@ def history_of(scenario: Scenario) -> int:
 
 
 @dataclass(frozen=True)
-class ObserverTask:
-    """The observer's task, in addition to the scenario: the results folder, and whether to record the run for the view."""
+class RecorderTask:
+    """The recorder's task, in addition to the scenario: the results folder, and whether to record the run for the view."""
 
     results: Path
     recording: bool
@@ -110,7 +110,7 @@ class ObserverTask:
 def briefs_of(
     scenario: Scenario,
     endpoints: RouterEndpoints | str,
-    observation: ObserverTask,
+    task: RecorderTask,
     ends_with_stdin: bool = True,
     patience: int = LAUNCHED_PATIENCE,
 ) -> dict[str, AnyBrief]:
@@ -126,7 +126,7 @@ def briefs_of(
     keys = StreamKeys.from_scenario(scenario)
     steered = () if scenario.controller is None else (CONTROLLER,)
     users = {
-        name: secrets.token_urlsafe(24) for name in (ROUTER, SENSOR, *scenario.receivers, *steered, OBSERVER, OPERATOR)
+        name: secrets.token_urlsafe(24) for name in (ROUTER, SENSOR, *scenario.receivers, *steered, RECORDER, OPERATOR)
     }
     routers = Routers.for_users(users, endpoints)
     spec = scenario.encoding.spec
@@ -190,7 +190,7 @@ def briefs_of(
         pace=scenario.pace,
         receivers=scenario.receivers,
         holds=sorted(
-            {slot for slot in scenario.timeline.holds if slot < scenario.slots} | ({0} if observation.paused else set())
+            {slot for slot in scenario.timeline.holds if slot < scenario.slots} | ({0} if task.paused else set())
         ),
         history=history_of(scenario),
         leaks=leaks,
@@ -211,17 +211,17 @@ def briefs_of(
         modules=modules(scheme=spec),
     )
     made.append(brief(LEGITIMATE, keys.secret(scheme.estimator_streams), legitimate))
-    observer = ObserverPart(
+    recorder = RecorderPart(
         scenario=scenario.model_dump(mode="json"),
-        results=str(observation.results),
-        recording=observation.recording,
+        results=str(task.results),
+        recording=task.recording,
         operator=users[OPERATOR],
-        shard=observation.shard,
-        paused=observation.paused,
+        shard=task.shard,
+        paused=task.paused,
         operator_identity=identities.get(OPERATOR),
         classes=_answers(scenario),
     )
-    made.append(brief(OBSERVER, {}, observer))
+    made.append(brief(RECORDER, {}, recorder))
     if loop.of_controller is not None:
         made.append(brief(CONTROLLER, {}, loop.of_controller))
     for name, table in scenario.eavesdroppers.items():
@@ -248,7 +248,7 @@ def _program_of(process: ProcessTable) -> ProgramEntry | None:
 
 
 def _answers(scenario: Scenario) -> dict[str, Any]:
-    """The answers of eavesdroppers' classes that are not built in to all questions that the observer will ask."""
+    """The answers of eavesdroppers' classes that are not built in to all questions that the recorder will ask."""
     tables = scenario.eavesdroppers
     names = {one for table in tables.values() for one in (table.strategy, table.reads_as) if one is not None}
     foreign = {name for name in names if STRATEGIES.foreign(name)}
@@ -275,8 +275,8 @@ def write_briefs(
 ) -> list[Path]:
     """Write the briefs into a folder, for processes that are started by hand, on any hosts.
 
-    results: the observer's folder, on its host, relative to its working directory. patience: how many seconds processes
-    wait for each other. paused: as in `ObserverTask`. Raises UsageError if the folder is not empty or cannot be
+    results: the recorder's folder, on its host, relative to its working directory. patience: how many seconds processes
+    wait for each other. paused: as in `RecorderTask`. Raises UsageError if the folder is not empty or cannot be
     written, and for a scenario in shards.
     """
     if scenario.shards > 1:
@@ -285,7 +285,7 @@ def write_briefs(
             "separately, with its own --first-trial and --trials"
         )
     made = briefs_of(
-        scenario, endpoints, ObserverTask(results, True, paused=paused), ends_with_stdin=False, patience=patience
+        scenario, endpoints, RecorderTask(results, True, paused=paused), ends_with_stdin=False, patience=patience
     )
     try:
         new_folder(folder)

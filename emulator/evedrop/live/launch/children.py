@@ -34,7 +34,7 @@ from evedrop.live.protocol.launcher_events import (
     SlotsDone,
     read_event,
 )
-from evedrop.names import OBSERVER, RELAY, ROUTER, SENSOR, ProcessAction
+from evedrop.names import RECORDER, RELAY, ROUTER, SENSOR, ProcessAction
 from evedrop.results.folder import HeldFolder, private_opener
 from evedrop.scenario.progress_events import OnEvent, ProgressEvent, RunEnded, Started
 from evedrop.system.environment import SINGLE_THREADED, check_zenoh_runtime, lock_step_environment, own_environment
@@ -42,13 +42,13 @@ from evedrop.system.processes import wait_for
 from evedrop.system.signals import INTERRUPTED
 
 ROUTER_RESTARTS = 3  # how often routers that were ended by a signal are restarted in a run
-SILENCE_SECONDS = 30.0  # after which the launcher gives up on a silent observer, which sends a heartbeat every second
-_BEGIN_SECONDS = 30.0  # for a living observer to begin to write its results
+SILENCE_SECONDS = 30.0  # after which the launcher gives up on a silent recorder, which sends a heartbeat every second
+_BEGIN_SECONDS = 30.0  # for a living recorder to begin to write its results
 _FINISH_SECONDS = 600.0  # for it to write them: 10⁶ slots take some seconds
 _GONE_SECONDS = 5.0  # for a process that has left the network to end, and to say why in its log
 _AGAIN_SECONDS = 0.02  # until a request that cannot be carried out yet is looked at again
 _LOG_LINES = 12
-_HUBS = frozenset({ROUTER, RELAY, OBSERVER})
+_HUBS = frozenset({ROUTER, RELAY, RECORDER})
 _FRAME = re.compile(r"stack backtrace:$|\s+\d+: |\s+at \S+:\d+")
 """A line of a stack that Zenoh shows when it panics; the line before them says why."""
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
@@ -90,7 +90,7 @@ class Children:
         self._processes: dict[str, StartedProcess] = {}
         self._events: SimpleQueue[ProgressEvent | ProcessExit] = SimpleQueue()
         self.silent_seconds = 0.0
-        """How many seconds the observer has been silent for."""
+        """How many seconds the recorder has been silent for."""
         self.started = False
         """Whether the conductor has started the run."""
         self.over = False
@@ -112,7 +112,7 @@ class Children:
     def start(self, brief: AnyBrief, again: bool = False) -> None:
         """Start the process of a brief, or restart it (`again`).
 
-        Its output goes to its log, the events of an observer or a router to the launcher. Raises
+        Its output goes to its log, the events of a recorder or a router to the launcher. Raises
         RunError if the system cannot start it, and UsageError if it could not open a session with this environment.
         """
         check_zenoh_runtime()
@@ -156,8 +156,8 @@ class Children:
                 for line in lines:
                     try:
                         event = read_event(line)
-                        if name != OBSERVER and event != RouterListens(name):
-                            raise ValueError("only the observer sends such events")
+                        if name != RECORDER and event != RouterListens(name):
+                            raise ValueError("only the recorder sends such events")
                         self._events.put(event)
                     except ValueError as error:
                         self._refuse(name, error)
@@ -189,7 +189,7 @@ class Children:
         return True
 
     def act(self, request: ProcessRequest) -> None:
-        """Carry out the observer's request on a process, and confirm it as soon as it is carried out.
+        """Carry out the recorder's request on a process, and confirm it as soon as it is carried out.
 
         Raises RunError if a process cannot be restarted.
         """
@@ -214,11 +214,11 @@ class Children:
         self._confirm(request)
 
     def _confirm(self, request: ProcessRequest) -> None:
-        observer = self._processes[OBSERVER].stdin
-        if observer is not None:
+        recorder = self._processes[RECORDER].stdin
+        if recorder is not None:
             with contextlib.suppress(OSError):
-                observer.write(b"%d\n" % request.number)
-                observer.flush()
+                recorder.write(b"%d\n" % request.number)
+                recorder.flush()
 
     def next_event(self, seconds: float) -> ProgressEvent | ProcessExit | None:
         """The next event or exit that concerns the caller, or None; waits for `seconds` at most.
@@ -250,11 +250,11 @@ class Children:
         return None if isinstance(event, Alive | RouterListens | ProcessRequest | SlotsDone | SaveStarted) else event
 
     def conclude(self, on_event: OnEvent, patience: float = 0.0) -> RunEnded | None:
-        """End the observer, at once or after `patience` seconds; returns its `RunEnded`, or None if it sent none.
+        """End the recorder, at once or after `patience` seconds; returns its `RunEnded`, or None if it sent none.
 
         Once it has begun to write the results, it may take `_FINISH_SECONDS`, as long as it sends heartbeats.
         """
-        self.terminate(OBSERVER, patience)
+        self.terminate(RECORDER, patience)
         begun = time.monotonic()
         ending: RunEnded | None = None
         while self.silent_seconds < SILENCE_SECONDS and (
@@ -262,7 +262,7 @@ class Children:
         ):
             event = self.next_event(0.05)
             if isinstance(event, ProcessExit):
-                if event.process == OBSERVER:
+                if event.process == RECORDER:
                     break
             elif event is not None:
                 on_event(event)
@@ -286,7 +286,7 @@ class Children:
     def failure_report(self, first: ProcessExit | None, ending: RunEnded | None) -> str:
         """The failure in words: the process at fault, and the last lines of its log and of the log that accuses it.
 
-        first: the first process that ended too early, if any; ending: the end as the observer reported it, if it did.
+        first: the first process that ended too early, if any; ending: the end as the recorder reported it, if it did.
         """
         if orphans := [name for name, process in self._processes.items() if process.poll() == FORK_SERVER_LOST]:
             theirs = ", ".join(orphans)
@@ -296,11 +296,11 @@ class Children:
         lost = None if first is None else self._lost_by_all(first.process, suspects)
         if lost is not None:
             first, suspects = None, [lost]  # the router is at fault, not the process that gave up first
-        if first is not None and self._missed_observer(first.process):
+        if first is not None and self._missed_recorder(first.process):
             return "\n".join(
-                [f"{OBSERVER}: {why}" if why else f"{OBSERVER} did not appear", *self._log_lines(OBSERVER)]
+                [f"{RECORDER}: {why}" if why else f"{RECORDER} did not appear", *self._log_lines(RECORDER)]
             )
-        if not accused and (first is None or (first.process == OBSERVER and first.status > 0)):
+        if not accused and (first is None or (first.process == RECORDER and first.status > 0)):
             first = self._first_failure(suspects) or first
         broken_by = None if ending is None else ending.broken_by
         if accused and why:
@@ -323,16 +323,16 @@ class Children:
         return "\n".join([head, *(line for name in named for line in self._log_lines(name))])
 
     def _first_failure(self, suspects: list[str]) -> ProcessExit | None:
-        """A child that failed or left too early, other than the observer. Waits a moment for missing processes to end."""
+        """A child that failed or left too early, other than the recorder. Waits a moment for missing processes to end."""
         deadline = time.monotonic() + (_GONE_SECONDS if suspects else 0.0)
         while True:
             ended = {
                 name: process.poll()
                 for name, process in self._processes.items()
-                if name != OBSERVER and process.pid not in self._killed
+                if name != RECORDER and process.pid not in self._killed
             }
             for name, status in ended.items():
-                for_others = self._missed_observer(name) or (
+                for_others = self._missed_recorder(name) or (
                     {ROUTER, RELAY} & set(suspects) and self._lost_router(name)
                 )
                 if status and not for_others:
@@ -343,10 +343,10 @@ class Children:
                 return None
             time.sleep(0.01)
 
-    def _missed_observer(self, name: str) -> bool:
-        """Whether a process ended because the observer did not appear."""
+    def _missed_recorder(self, name: str) -> bool:
+        """Whether a process ended because the recorder did not appear."""
         word = self._last_word(name)
-        return word is not None and word.cause is Cause.MISSING_PROCESSES and OBSERVER in word.blamed
+        return word is not None and word.cause is Cause.MISSING_PROCESSES and RECORDER in word.blamed
 
     def _lost_router(self, name: str) -> bool:
         """Whether a process ended because it could no longer reach its router."""
@@ -354,7 +354,7 @@ class Children:
         return word is not None and word.cause is Cause.NO_CONNECTION
 
     def _lost_by_all(self, name: str, suspects: list[str]) -> str | None:
-        """The router that a process gave up on, if the observer or all its other users miss it, too; otherwise None."""
+        """The router that a process gave up on, if the recorder or all its other users miss it, too; otherwise None."""
         if not self._lost_router(name):
             return None
         if missed := next((one for one in (RELAY, ROUTER) if one in suspects), None):

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from evedrop.errors import UsageError
-from evedrop.names import CONTROLLER, LEGITIMATE, OBSERVER, RELAY, ROUTER, SENSOR
+from evedrop.names import CONTROLLER, LEGITIMATE, RECORDER, RELAY, ROUTER, SENSOR
 from evedrop.results.folder import make_private, write_private
 from evedrop.results.resolved_scenario import input_texts, resolved
 from evedrop.scenario.loading import shipped
@@ -102,7 +102,7 @@ _BUILD = """\
 """
 
 _VIEW = """
-  # Shows the observer's view on the host. It alone is on a network that leads to the host; it has no brief.
+  # Shows the recorder's view on the host. It alone is on a network that leads to the host; it has no brief.
   view:
     <<: *confined
     user: "${EVEDROP_USER:-1000:1000}"
@@ -110,7 +110,7 @@ _VIEW = """
     command: []
     healthcheck: {disable: true}
     depends_on:
-      observer: {condition: service_started}
+      recorder: {condition: service_started}
     ports: &ports ["127.0.0.1:17450:17450", "127.0.0.1:17451:17451"]
     networks: [to-view, view]
 
@@ -231,7 +231,7 @@ def _services(scenario: Scenario) -> list[_Service]:
     """The processes, routers first; the name of a service is that of its process unless another service has it."""
     relay = [RELAY] if scenario.relayed else []
     steered = [] if scenario.controller is None else [CONTROLLER]
-    processes = [ROUTER, *relay, SENSOR, LEGITIMATE, *steered, *scenario.eavesdroppers, OBSERVER]
+    processes = [ROUTER, *relay, SENSOR, LEGITIMATE, *steered, *scenario.eavesdroppers, RECORDER]
     found = []
     for process in processes:
         name = process
@@ -247,7 +247,7 @@ def _service(one: _Service, services: Sequence[_Service]) -> str:
     base = "process" if one.process == ROUTER else "far-client" if one.far else "client"
     command = f"[{one.role}, /brief/brief.json"
     lines = [f"  {_key(one.name)}:", f"    <<: *{base}"]
-    if one.process == OBSERVER:
+    if one.process == RECORDER:
         lines += [
             f'    command: {command}, --serve, "0.0.0.0:17450"]',
             "    stop_grace_period: 1m # to write the results",
@@ -260,7 +260,7 @@ def _service(one: _Service, services: Sequence[_Service]) -> str:
 
 
 def _networks(one: _Service, services: Sequence[_Service]) -> Iterator[str]:
-    """The networks of a process that is not the observer: its own, and those of the processes that connect to it."""
+    """The networks of a process that is not the recorder: its own, and those of the processes that connect to it."""
     if one.process != ROUTER:
         yield one.network
     if one.process in {ROUTER, RELAY}:

@@ -114,7 +114,7 @@ def _blocks(shard: Shard, name: str) -> dict[int, Digests]:
 
 
 def _age_of_metrics(shards: Sequence[Shard], scores: Sequence[Totals], summaries: Mapping[int, Summary]) -> str:
-    """What `ended` adds about shards whose observers were killed after their last metrics."""
+    """What `ended` adds about shards whose recorders were killed after their last metrics."""
     earlier = [
         f"slot {score.tallies[LEGITIMATE].done} in shard {shard.number}"
         for shard, score in zip(shards, scores, strict=True)

@@ -32,7 +32,7 @@ from evedrop.live.launch.host_messages import (
     order_in,
     own_version,
 )
-from evedrop.live.launch.preloading import preloaded_without_observer
+from evedrop.live.launch.preloading import preloaded_without_recorder
 from evedrop.live.launch.private_folder import private_folder
 from evedrop.live.launch.starter import FORK_SERVER_LOST, StartedProcess, Starter, end_all
 from evedrop.live.protocol.brief import AnyBrief
@@ -56,7 +56,7 @@ def serve_launcher() -> None:
     os.umask(0o077)
     answers = os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)  # so that nothing else can write between the messages
-    with raise_on_signals(), private_folder() as private, preloaded_without_observer() as start:
+    with raise_on_signals(), private_folder() as private, preloaded_without_recorder() as start:
         host, silence = HostProcesses(private, start, answers.write), _Silence()
         try:
             host.answer(Greeting(own_version()))

@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field, ValidationError
 
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.live.launch.ports import RouterEndpoint, RouterEndpoints, router_endpoint
-from evedrop.names import CONTROLLER, LEGITIMATE, OBSERVER, RELAY, ROUTER, SENSOR
+from evedrop.names import CONTROLLER, LEGITIMATE, RECORDER, RELAY, ROUTER, SENSOR
 from evedrop.scenario.loading import tables_in
 from evedrop.scenario.loading.line_numbers import with_line_numbers
 from evedrop.scenario.sentences import sentences
@@ -128,7 +128,7 @@ def load_hosts(path: Path, scenario: Scenario) -> HostsPlan:
 
 
 def processes_of(scenario: Scenario) -> tuple[str, ...]:
-    """The processes of a run that can be on other hosts: all but the observer."""
+    """The processes of a run that can be on other hosts: all but the recorder."""
     relay = (RELAY,) if scenario.relayed else ()
     steered = () if scenario.controller is None else (CONTROLLER,)
     return (ROUTER, *relay, SENSOR, LEGITIMATE, *steered, *scenario.eavesdroppers)
@@ -140,8 +140,8 @@ def _of_processes(file: HostsFile, scenario: Scenario) -> list[str]:
     for name, host in file.hosts.items():
         for process in host.processes:
             where = f"hosts.{name}.processes"
-            if process == OBSERVER:
-                found.append(f"{where}: names {OBSERVER}, which is always on this machine, where it writes the results")
+            if process == RECORDER:
+                found.append(f"{where}: names {RECORDER}, which is always on this machine, where it writes the results")
             elif process not in known:
                 found.append(f"{where}: names {process}; expected {listed(known)}{near(process, known)}")
             elif process in seen:

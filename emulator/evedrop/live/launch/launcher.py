@@ -38,7 +38,7 @@ def launch(
     paused: bool = False,
     hosts: HostsPlan | None = None,
 ) -> FinishedRun:
-    """Run a scenario live into a results folder; `on_event` gets the observer's events as they come.
+    """Run a scenario live into a results folder; `on_event` gets the recorder's events as they come.
 
     view: auto, native, web or off; listen, relay: the endpoints of router and relay, if there is one; by default no
     port, or free ports for two routers; paused: whether the run is held before slot 0, until the operator lets it continue;

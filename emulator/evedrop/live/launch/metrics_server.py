@@ -1,6 +1,6 @@
 """Metrics of a live run for Prometheus, by HTTP.
 
-They are made from the events of the observer and, at each scrape, from the metrics that the run has on disk; the run itself does
+They are made from the events of the recorder and, at each scrape, from the metrics that the run has on disk; the run itself does
 nothing for them. prometheus_client is imported only here: a run without metrics needs neither it nor a web server.
 
 Source: docs/results.md, metrics of a live run.

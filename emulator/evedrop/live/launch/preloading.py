@@ -31,7 +31,7 @@ from evedrop.live.launch.starter import (
     Starter,
     start_process,
 )
-from evedrop.names import OBSERVER
+from evedrop.names import RECORDER
 from evedrop.system.environment import SINGLE_THREADED, own_environment
 from evedrop.system.processes import KILLED_SECONDS, KillableProcess, kill
 from evedrop.system.signals import held_back
@@ -53,8 +53,8 @@ _EVERY_ROLE = (
 )
 OF_OTHERS = (*_EVERY_ROLE, "evedrop.peers.eavesdropper", "evedrop.peers.legitimate")
 """What the processes of most roles import; not the modules of sensor and router, which have no place in an eavesdropper."""
-OF_OBSERVERS = ("evedrop.live.observer.observer",)
-"""What an observer imports in addition."""
+OF_RECORDERS = ("evedrop.live.recorder.recorder",)
+"""What a recorder imports in addition."""
 OF_SUMMARIES = ("scipy.special",)
 """What it imports once it makes a summary, which takes an eighth of a second."""
 
@@ -263,7 +263,7 @@ def fork_servers(*modules: Sequence[str]) -> Iterator[tuple[ForkServer, ...]]:
 
 @final
 class PreloadedStarter:
-    """Starts an observer from the last of some fork servers, and all others, which need fewer modules, from the first.
+    """Starts a recorder from the last of some fork servers, and all others, which need fewer modules, from the first.
 
     stop: once it is set, no fork server is waited for.
     """
@@ -277,7 +277,7 @@ class PreloadedStarter:
 
     def __call__(self, role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:
         """Start `evedrop ROLE BRIEF`. Raises OSError, and Interrupted if it is stopped before."""
-        server = self._servers[-1 if role == OBSERVER else 0]
+        server = self._servers[-1 if role == RECORDER else 0]
         return server.start(role, brief, log, environment, self._stop)
 
 
@@ -309,7 +309,7 @@ def process_starter(stop: threading.Event | None = None) -> Iterator[Starter]:
     """
     with ExitStack() as stack:
         usable = bool(_kept) and _kept[-1].usable
-        starter = _kept[-1].starter if usable else stack.enter_context(_kept_servers(OF_OTHERS, OF_OBSERVERS))
+        starter = _kept[-1].starter if usable else stack.enter_context(_kept_servers(OF_OTHERS, OF_RECORDERS))
         if stop is not None and isinstance(starter, PreloadedStarter):
             starter = starter.until(stop)
         yield starter
@@ -324,13 +324,13 @@ def preloaded() -> Iterator[Starter]:
     >>> with preloaded():                                                               # doctest: +SKIP
     ...     found = [run("eavesdroppers", slots=1000, seed=seed) for seed in range(10)]
     """
-    with _kept_servers(OF_OTHERS, (*OF_OBSERVERS, *OF_SUMMARIES)) as starter:
+    with _kept_servers(OF_OTHERS, (*OF_RECORDERS, *OF_SUMMARIES)) as starter:
         yield starter
 
 
 @contextmanager
-def preloaded_without_observer() -> Iterator[Starter]:
-    """The same on a host that carries only other processes of a run: the imports of an observer are not made. Raises OSError."""
+def preloaded_without_recorder() -> Iterator[Starter]:
+    """The same on a host that carries only other processes of a run: the imports of a recorder are not made. Raises OSError."""
     with _kept_servers(OF_OTHERS) as starter:
         yield starter
 

@@ -15,13 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from evedrop.errors import EvedropError, Interrupted, RunError, UsageError
-from evedrop.live.launch.briefs import LAUNCHED_PATIENCE, ObserverTask, briefs_of
+from evedrop.live.launch.briefs import LAUNCHED_PATIENCE, RecorderTask, briefs_of
 from evedrop.live.launch.children import SILENCE_SECONDS, Children, ProcessExit
 from evedrop.live.launch.ports import RouterEndpoints, socket_endpoints
 from evedrop.live.launch.private_folder import private_folder, socket_folder
 from evedrop.live.launch.starter import Starter
 from evedrop.live.network.control_file import remove_control
-from evedrop.names import OBSERVER, RELAY, ROUTER
+from evedrop.names import RECORDER, RELAY, ROUTER
 from evedrop.results.folder import HeldFolder, make_private, new_folder
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.scenario.progress_events import FolderMoved, OnEvent, RunEnded, ViewOpened
@@ -72,11 +72,11 @@ def launch_one(
         viewer = None
         try:
             # At once, so that a run that is interrupted or killed in its first moments can be run again.
-            with contextlib.suppress(OSError):  # the observer writes it, too, and reports why it cannot
+            with contextlib.suppress(OSError):  # the recorder writes it, too, and reports why it cannot
                 write_resolved(folder, scenario)
-            task = ObserverTask(folder.absolute(), view != "off", shard, paused)
+            task = RecorderTask(folder.absolute(), view != "off", shard, paused)
             briefs = briefs_of(scenario, at, task, patience=patience)
-            observer = briefs.pop(OBSERVER)
+            recorder = briefs.pop(RECORDER)
             with Children(held, private, scenario.controller is not None, starter) as children:
                 for name in (ROUTER, RELAY):
                     if name in briefs:
@@ -88,7 +88,7 @@ def launch_one(
                 viewer = Viewer.start(view, folder / "logs", folder.absolute() / "recording.rrd")
                 if viewer is not None:
                     on_event(ViewOpened(viewer.address, viewer.warning))
-                children.start(observer)
+                children.start(recorder)
                 status = follow_to_end(children, stop, on_event)
                 if viewer is not None:
                     viewer.complete()
@@ -158,7 +158,7 @@ def _forget(folder: Path) -> None:
 
 
 def follow_to_end(children: Children, stop: threading.Event, on_event: OnEvent) -> int:
-    """Follow the run to its end; returns the exit status that the observer gives it."""
+    """Follow the run to its end; returns the exit status that the recorder gives it."""
     early: tuple[ProcessExit, float] | None = None
     ending: RunEnded | None
     while True:
@@ -168,18 +168,18 @@ def follow_to_end(children: Children, stop: threading.Event, on_event: OnEvent) 
             ending = _stopped(children, on_event)
             break
         if children.silent_seconds > SILENCE_SECONDS:
-            raise RunError(children.failure_report(None, RunEnded(RunError.exit_status, "", [OBSERVER])))
+            raise RunError(children.failure_report(None, RunEnded(RunError.exit_status, "", [RECORDER])))
         event = children.next_event(_POLL_SECONDS)
         ending = None
         if isinstance(event, ProcessExit):
             if _meant_us_too(event, stop) or (
-                event.process != OBSERVER and (event.status == 0 or children.restart_router(event))
+                event.process != RECORDER and (event.status == 0 or children.restart_router(event))
             ):
                 # A process that leaves at the end may be faster than the event that the run is over.
                 early = early or ((event, time.monotonic()) if event.status == 0 else None)
                 continue
-            if event.process != OBSERVER:
-                # An observer that has just ended may still report so; a running one would wait for the lost process in vain.
+            if event.process != RECORDER:
+                # A recorder that has just ended may still report so; a running one would wait for the lost process in vain.
                 ending = children.conclude(on_event)
             if ending is None or not ending.well:
                 raise RunError(children.failure_report(event, ending))

@@ -1,7 +1,7 @@
 """A live run in shards: contiguous ranges of its trials, each carried by a run of its own, all under one launcher.
 
 Trials share only the scenario, and every random number is addressed by its trial. So a shard is a complete run, with router,
-sensor, receivers and observer, independent of all others. `gathering` merges their results.
+sensor, receivers and recorder, independent of all others. `gathering` merges their results.
 
 Source: docs/scale.md.
 """

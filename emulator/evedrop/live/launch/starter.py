@@ -12,11 +12,11 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import IO, Protocol
 
-from evedrop.names import OBSERVER, RELAY, ROUTER
+from evedrop.names import RECORDER, RELAY, ROUTER
 from evedrop.system.processes import kill, wait_for
 from evedrop.system.signals import SHOW_STACKS, held_back
 
-TELLING = frozenset({OBSERVER, ROUTER, RELAY})
+TELLING = frozenset({RECORDER, ROUTER, RELAY})
 """The roles whose processes send the launcher events on their standard output."""
 GRACE_SECONDS = 3.0  # for all processes to leave
 CONNECTION_LOST = 1000
@@ -39,7 +39,7 @@ class StartedProcess(Protocol):
 
     @property
     def stdout(self) -> IO[bytes] | None:
-        """The events of an observer or a router; None for others, and for a process on another host."""
+        """The events of a recorder or a router; None for others, and for a process on another host."""
 
     def poll(self) -> int | None:
         """Its exit status; None while it runs."""

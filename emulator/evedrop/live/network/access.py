@@ -4,7 +4,7 @@ Readers name every key they read: exact rules do not cover a wildcard subscripti
 
 With two linked routers, the table also says which process connects to which, and which keys cross between them:
 
-    sensor ── router ═════ relay ── receivers, observer, operator
+    sensor ── router ═════ relay ── receivers, recorder, operator
 
 The router, at the sensor's site, decides every fate; the relay, at the receivers' site, only passes messages on.
 
@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 from evedrop.live.protocol.brief_closed_loop import Wiring
 from evedrop.live.protocol.keys import RunKeys, ZenohConfig
-from evedrop.names import CONTROLLER, LEGITIMATE, OBSERVER, OPERATOR, RELAY, ROUTER, SENSOR
+from evedrop.names import CONTROLLER, LEGITIMATE, OPERATOR, RECORDER, RELAY, ROUTER, SENSOR
 
 
 @dataclass(frozen=True)
@@ -45,10 +45,10 @@ class Grant:
 def grants(run: str, receivers: tuple[str, ...], loop: Wiring | None = None, relayed: bool = False) -> list[Grant]:
     """The table of docs/protocol.md for a run, with a controller if there is a loop; routers may only ask for their own token.
 
-    relayed: whether there is a relay, which the observer watches, and tells when the run ends.
+    relayed: whether there is a relay, which the recorder watches, and tells when the run ends.
     """
     keys = RunKeys(run)
-    followers = (*receivers, OBSERVER)
+    followers = (*receivers, RECORDER)
     processes = (SENSOR, *receivers) if loop is None else (SENSOR, *receivers, CONTROLLER)
     state = (keys.state,) if loop is not None and loop.on_truth else ()
     estimate = (keys.estimate,) if loop is not None and not loop.on_truth else ()
@@ -67,15 +67,15 @@ def grants(run: str, receivers: tuple[str, ...], loop: Wiring | None = None, rel
             checks=(keys.alive(SENSOR),),
         ),
         Grant(
-            OBSERVER,
-            writes=(keys.progress(OBSERVER), *(keys.control(name) for name in (*processes, *routers))),
+            RECORDER,
+            writes=(keys.progress(RECORDER), *(keys.control(name) for name in (*processes, *routers))),
             reads=(*(keys.telemetry(name) for name in processes), keys.journal),
-            token=keys.alive(OBSERVER),
-            checks=(keys.alive(OBSERVER),),
+            token=keys.alive(RECORDER),
+            checks=(keys.alive(RECORDER),),
             watches=tuple(keys.alive(name) for name in (*processes, *routers)),
-            answers=(keys.control(OBSERVER),),
+            answers=(keys.control(RECORDER),),
         ),
-        Grant(OPERATOR, writes=(), reads=(), token=None, asks=(keys.control(OBSERVER),)),
+        Grant(OPERATOR, writes=(), reads=(), token=None, asks=(keys.control(RECORDER),)),
         *(Grant(name, writes=(), reads=(), token=None, checks=(keys.alive(name),)) for name in routers),
     ]
     if loop is not None:

@@ -1,4 +1,4 @@
-"""A process that has had no connection with its router for too long ends itself: the observer cannot tell it to end."""
+"""A process that has had no connection with its router for too long ends itself: the recorder cannot tell it to end."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Sends events to the launcher: that a router listens, and the observer's events, including its heartbeat.
+"""Sends events to the launcher: that a router listens, and the recorder's events, including its heartbeat.
 
-The launcher gives up on an observer that is silent for half a minute. So the heartbeat has its own thread: it continues
-while the observer imports, computes or writes, however long that takes on a busy machine.
+The launcher gives up on a recorder that is silent for half a minute. So the heartbeat has its own thread: it continues
+while the recorder imports, computes or writes, however long that takes on a busy machine.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from evedrop.live.protocol.requests import OperatorRequest, read_request
 from evedrop.live.protocol.status import RunStatus
 from evedrop.live.protocol.wire_status import WireStatus
 from evedrop.model.entries import expect, read, table_of
-from evedrop.names import OBSERVER, OPERATOR
+from evedrop.names import OPERATOR, RECORDER
 
 _STATUSES: Mapping[str, type[RunStatus | WireStatus]] = {"status": RunStatus, "wire": WireStatus}
 
@@ -98,12 +98,12 @@ def read_answer(key: str, payload: bytes) -> Answer:
 
 
 def ask(control: Control, request: OperatorRequest, patience: float) -> Answer | None:
-    """Ask the observer of a run; None if it does not answer within `patience` seconds, because the run is over or ends.
+    """Ask the recorder of a run; None if it does not answer within `patience` seconds, because the run is over or ends.
 
     Raises zenoh.ZError if the router is not there or refuses the operator.
     """
     zenoh.init_log_from_env_or("off")
-    key = RunKeys(control.run).control(OBSERVER)
+    key = RunKeys(control.run).control(RECORDER)
     # A run in progress has a router: one attempt is enough.
     with open_session(zenoh.Config.from_json5(json.dumps(client_config(control)))) as session:
         for reply in session.get(key, payload=enclosed(key, request.pack()), timeout=patience):

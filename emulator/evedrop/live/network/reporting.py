@@ -196,7 +196,7 @@ class BeliefReporter:
         self._put_progress(end - 1, progress(end))
 
     def skip(self, end: int) -> None:
-        """Go on from slot `end`: the observer reports the slots before it, in which this receiver was absent."""
+        """Go on from slot `end`: the recorder reports the slots before it, in which this receiver was absent."""
         self._first = end
 
     def _report(self, end: int) -> None:

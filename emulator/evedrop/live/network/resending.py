@@ -1,6 +1,6 @@
 """Messages that may be lost with a connection are kept, and sent again when the conductor asks for them.
 
-Messages are not acknowledged one by one. The sensor is never further than the window ahead of the slots that the observer
+Messages are not acknowledged one by one. The sensor is never further than the window ahead of the slots that the recorder
 has written, so messages older than a window are no longer needed and are forgotten.
 
 Source: docs/protocol.md, lost connections.

@@ -46,7 +46,7 @@ from evedrop.live.protocol.keys import RunKeys, ZenohConfig, reader_of
 from evedrop.live.protocol.launcher_events import RouterListens
 from evedrop.live.protocol.message_limits import low_pass
 from evedrop.live.protocol.process_status import StatusReporter
-from evedrop.names import OBSERVER, ROUTER
+from evedrop.names import RECORDER, ROUTER
 
 READY_SECONDS = 30.0
 _POLL_SECONDS = 0.004
@@ -172,7 +172,7 @@ class Session:
         """How many unread bytes of one sender may wait."""
         self._room = _WINDOWS * (brief.flow.window + 8)
         self._dropped = Dropped(brief.process, self._mistaken)
-        self._watchdog = ConnectionWatchdog(brief) if brief.role not in ("router", "relay", "observer") else None
+        self._watchdog = ConnectionWatchdog(brief) if brief.role not in ("router", "relay", "recorder") else None
         self._wait = WaitReporter(brief.process, brief.router, clock)
         if config is None or listen is None:
             address = _once(router_address_of(brief))
@@ -208,7 +208,7 @@ class Session:
         self.connection.close()
 
     def _complain(self, error: MalformedMessage | Gap) -> None:
-        """Tell the observer which message cannot be read, and why; wait a moment for it to end the run."""
+        """Tell the recorder which message cannot be read, and why; wait a moment for it to end the run."""
         publisher = self._reporting
         if publisher is not None and publisher.matched:
             publisher(refusal(error.key, str(error)))
@@ -217,7 +217,7 @@ class Session:
 
     @property
     def _reporting(self) -> Publisher | None:
-        """The publisher for reports to the observer, if this process has one."""
+        """The publisher for reports to the recorder, if this process has one."""
         key = self.keys.journal if self._process == ROUTER else self.keys.telemetry(self._process)
         return self._publishers.get(key)
 
@@ -301,12 +301,12 @@ class Session:
         """Wait until every publisher has a reader, then show that this process is present.
 
         Raises MissingProcesses after the brief's patience, naming them and the keys without a reader. While the
-        observer is present, this process waits on: the observer reports the missing processes.
+        recorder is present, this process waits on: the recorder reports the missing processes.
         """
         deadline = time.monotonic() + self.patience
         while unread := self._unread():
             missing = dict.fromkeys(reader_of(key) for key in unread)
-            if OBSERVER not in missing and self._process != OBSERVER:
+            if RECORDER not in missing and self._process != RECORDER:
                 deadline = time.monotonic() + self.patience
             if time.monotonic() > deadline:
                 raise MissingProcesses(
@@ -358,7 +358,7 @@ class Session:
             match self._read(payload):
                 case Abandon(why) if self._by_hand:
                     # Its messages will not come, and there is no launcher to end it.
-                    sys.stderr.write(f"evedrop: {self._process}: the observer gave the run up: {why}\n")
+                    sys.stderr.write(f"evedrop: {self._process}: the recorder gave the run up: {why}\n")
                     sys.stderr.flush()
                     os._exit(RunError.exit_status)
                 case ReportStatus():

@@ -1,6 +1,6 @@
 """Briefs: a brief has everything that one process may know; the launcher writes it, and its path is the only argument.
 
-A brief is `<process>.json`, mode 0600. It holds the keys of the streams that the process owns; only the observer's brief
+A brief is `<process>.json`, mode 0600. It holds the keys of the streams that the process owns; only the recorder's brief
 holds the scenario's seed.
 """
 
@@ -41,7 +41,7 @@ from evedrop.model.streams import MOST_SLOTS, Batch
 from evedrop.system.files import Unreadable, opened, why_of
 
 _MOST_TRIALS, _LAST_TRIAL = 1_000_000, 2**48
-_MOST_BYTES = 2**30  # the observer's brief holds the complete scenario
+_MOST_BYTES = 2**30  # the recorder's brief holds the complete scenario
 WRITE_AGAIN = "write it again with `evedrop brief`"
 
 
@@ -50,7 +50,7 @@ class Flow:
     """End-to-end flow control, both in slots."""
 
     window: int = field(metadata=entry(whole(1)))
-    """The sensor is at most this far ahead of the slowest receiver and of the observer."""
+    """The sensor is at most this far ahead of the slowest receiver and of the recorder."""
     batch: int = field(metadata=entry(whole(1)))
     """Telemetry, journal and progress are sent at least this often."""
     longest_outage: float = field(default=30.0, metadata=entry(not_negative))

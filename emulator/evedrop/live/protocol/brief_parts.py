@@ -264,10 +264,10 @@ class ControllerPart:
 
 
 @dataclass(frozen=True)
-class ObserverPart:
-    """The observer's part: everything about the run."""
+class RecorderPart:
+    """The recorder's part: everything about the run."""
 
-    role: ClassVar[str] = "observer"
+    role: ClassVar[str] = "recorder"
     scenario: Mapping[str, Any] = field(repr=False, metadata=entry(named(anything)))
     """The whole scenario, with its seed."""
     results: str = field(metadata=entry(text))
@@ -289,9 +289,9 @@ RoutingPart = RouterPart | RelayPart
 ReceiverPart = LegitimatePart | EavesdropperPart
 ImportingPart = RouterPart | SensorPart | LegitimatePart | EavesdropperPart
 """Parts of roles that may import classes that are not built in."""
-Part = RouterPart | RelayPart | SensorPart | LegitimatePart | EavesdropperPart | ControllerPart | ObserverPart
+Part = RouterPart | RelayPart | SensorPart | LegitimatePart | EavesdropperPart | ControllerPart | RecorderPart
 PARTS: Mapping[str, type[Part]] = {
     kind.role: kind
-    for kind in (RouterPart, RelayPart, SensorPart, LegitimatePart, EavesdropperPart, ControllerPart, ObserverPart)
+    for kind in (RouterPart, RelayPart, SensorPart, LegitimatePart, EavesdropperPart, ControllerPart, RecorderPart)
 }
 """Role → its part."""

@@ -1,4 +1,4 @@
-"""The observer's commands to the other processes, a class for each.
+"""The recorder's commands to the other processes, a class for each.
 
 Source: docs/protocol.md, control.
 """
@@ -22,7 +22,7 @@ class Bounds:
     slots: int
     """The slots of the run."""
     receivers: Collection[str] | None = None
-    """The names that it may have: of receivers, and to the sensor also the observer; None: any."""
+    """The names that it may have: of receivers, and to the sensor also the recorder; None: any."""
 
 
 @dataclass(frozen=True)

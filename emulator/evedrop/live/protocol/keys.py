@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from evedrop.names import CONTROLLER, LEGITIMATE, OBSERVER, OPERATOR, ROUTER, SENSOR
+from evedrop.names import CONTROLLER, LEGITIMATE, OPERATOR, RECORDER, ROUTER, SENSOR
 
 KINDS = ("uplink", "downlink", "ack", "estimate", "state", "input", "telemetry", "journal", "progress", "control")
 """The kinds of a run's keys, as they follow the run's name."""
@@ -30,7 +30,7 @@ class RunKeys:
 
     @property
     def journal(self) -> str:
-        """Fates, router to observer."""
+        """Fates, router to recorder."""
         return self._under("journal")
 
     @property
@@ -63,11 +63,11 @@ class RunKeys:
         return self._under(f"downlink/{receiver}")
 
     def telemetry(self, process: str) -> str:
-        """Reports, one process to observer."""
+        """Reports, one process to recorder."""
         return self._under(f"telemetry/{process}")
 
     def progress(self, process: str) -> str:
-        """Progress, a receiver or the observer to the sensor."""
+        """Progress, a receiver or the recorder to the sensor."""
         return self._under(f"progress/{process}")
 
     def control(self, process: str) -> str:
@@ -86,8 +86,8 @@ def reader_of(key: str) -> str:
         return ROUTER if name == "sent" else SENSOR
     readers = {
         "uplink": ROUTER,
-        "journal": OBSERVER,
-        "telemetry": OBSERVER,
+        "journal": RECORDER,
+        "telemetry": RECORDER,
         "progress": SENSOR,
         "estimate": CONTROLLER,
         "state": CONTROLLER,
@@ -105,7 +105,7 @@ def writer_of(key: str) -> str:
         "uplink": SENSOR,
         "downlink": ROUTER,
         "journal": ROUTER,
-        "control": OPERATOR if name == OBSERVER else OBSERVER,
+        "control": OPERATOR if name == RECORDER else RECORDER,
         "estimate": LEGITIMATE,
         "state": SENSOR,
         "input": CONTROLLER,

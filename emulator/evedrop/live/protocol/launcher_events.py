@@ -1,4 +1,4 @@
-"""The lines that observer and routers write for their launcher: JSON objects with `event`, its kind, and its entries.
+"""The lines that recorder and routers write for their launcher: JSON objects with `event`, its kind, and its entries.
 
 Kinds that only the launcher needs are defined here; it passes the others, which are in `evedrop.scenario.progress_events`, on
 to be shown.
@@ -25,7 +25,7 @@ from evedrop.scenario.progress_events import (
 
 @dataclass(frozen=True)
 class Alive(ProgressEvent):
-    """The observer's heartbeat."""
+    """The recorder's heartbeat."""
 
     kind = "alive"
 
@@ -40,7 +40,7 @@ class RouterListens(ProgressEvent):
 
 @dataclass(frozen=True)
 class ProcessRequest(ProgressEvent):
-    """The observer asks the launcher to act on a process, and to confirm it."""
+    """The recorder asks the launcher to act on a process, and to confirm it."""
 
     kind = "act"
     do: ProcessAction = field(metadata=entry(choice(ProcessAction), ProcessAction))
@@ -60,7 +60,7 @@ class SlotsDone(ProgressEvent):
 
 @dataclass(frozen=True)
 class SaveStarted(ProgressEvent):
-    """The observer begins to write the results."""
+    """The recorder begins to write the results."""
 
     kind = "finishing"
 
@@ -84,7 +84,7 @@ _KINDS: Mapping[str, type[ProgressEvent]] = {
 
 
 def read_event(line: bytes) -> ProgressEvent:
-    """Read a line of the observer or a router. Raises ValueError if it is malformed."""
+    """Read a line of the recorder or a router. Raises ValueError if it is malformed."""
     try:
         found = json.loads(line)
     except RecursionError as error:

@@ -77,7 +77,7 @@ def low_pass(run: str, kinds: Mapping[str, int]) -> list[ZenohConfig]:
         return {"id": name, "flows": ["ingress"], "messages": messages, "key_exprs": keys, "size_limit": size}
 
     under = {kind: [f"evedrop/{run}/{kind}", f"evedrop/{run}/{kind}/**"] for kind in kinds}
-    asked = [f"evedrop/{run}/control/observer"]
+    asked = [f"evedrop/{run}/control/recorder"]
     return [
         *(rule(kind, under[kind], size, ["put", "delete"]) for kind, size in kinds.items()),
         rule("question", asked, _QUESTION_BYTES, ["query"]),

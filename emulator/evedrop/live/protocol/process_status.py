@@ -1,6 +1,6 @@
 """A process's report, on request, of the slot that it is at and of the keys on which it waits for messages.
 
-Only by asking all processes can the observer tell a connected process that does nothing from those that wait for it.
+Only by asking all processes can the recorder tell a connected process that does nothing from those that wait for it.
 
 Source: docs/protocol.md, silence.
 """
@@ -67,7 +67,7 @@ class StatusReporter:
             self.waits = ()
 
     def request(self) -> None:
-        """Take a request from the observer."""
+        """Take a request from the recorder."""
         self._requests.put(None)
 
     def answer(self, put: Callable[[bytes], None]) -> None:

@@ -1,4 +1,4 @@
-"""The status of a run in progress, which its observer sends to an operator on request.
+"""The status of a run in progress, which its recorder sends to an operator on request.
 
 Source: docs/protocol.md, request and answer.
 """

@@ -1,4 +1,4 @@
-"""Messages to the observer: the true states, the receivers' beliefs, and the journal of every packet's fate.
+"""Messages to the recorder: the true states, the receivers' beliefs, and the journal of every packet's fate.
 
 Source: docs/protocol.md, messages.
 """

@@ -46,7 +46,7 @@ class MeanSquaredError(MeanError):
 
     meaning = "of |x − x̂|²; null in a covariance-only study"
     not_in_mode = COVARIANCE_ONLY
-    rests_on = "observer"
+    rests_on = "recorder"
     column = MetricColumn("mean |x−x̂|²", 2)
 
 

@@ -158,8 +158,8 @@ class Metric(ABC):
     """The only mode whose summaries have it; no expectation can name such a metric."""
     not_in_mode: ClassVar[str | None] = None
     """The mode in which it is null."""
-    rests_on: ClassVar[Literal["observer", "recorded trials", "receiver", "theory"]] = "receiver"
-    """Its source in a live run: the observer, for all trials or only for recorded ones; the receiver's word alone; or theory."""
+    rests_on: ClassVar[Literal["recorder", "recorded trials", "receiver", "theory"]] = "receiver"
+    """Its source in a live run: the recorder, for all trials or only for recorded ones; the receiver's word alone; or theory."""
     column: ClassVar[MetricColumn | None] = None
     """Its column in the closing table, if it has one."""
     sweep_column: ClassVar[MetricColumn | None] = None

@@ -23,7 +23,7 @@ class ReceivedFraction(MeanMetric, TotalsMetric):
     """The fraction of packets that were received."""
 
     meaning = "packets received"
-    rests_on = "observer"
+    rests_on = "recorder"
     column = MetricColumn("received", 0, ".4f")
 
     @classmethod

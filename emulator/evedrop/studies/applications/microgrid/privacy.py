@@ -1,7 +1,7 @@
-"""How much an observer of a house's battery can infer about the house: when people are at home and active.
+"""How much an estimate of a house's battery reveals about the house: when people are at home and active.
 
 A day is divided into windows. In some of them the house is *active*: its mean load is at or above a threshold, which hardly
-happens unless somebody cooks or washes. An observer that has guessed the load of every window takes the larger guesses
+happens unless somebody cooks or washes. A receiver that has guessed the load of every window takes the larger guesses
 for activity. The measure of success is the area under the curve of detections over false alarms: 1 if the guess for every
 active window is above that for every quiet one, ½ for a coin.
 
@@ -45,7 +45,7 @@ def area(score: Floats, truth: Flags) -> float:
 def detection_rate(score: Floats, truth: Flags, false_alarms: float) -> float:
     """Share of active windows that are detected if the share `false_alarms` of the quiet ones is taken for active.
 
-    A coin decides between windows with equal scores at the threshold, so that an observer without knowledge detects the
+    A coin decides between windows with equal scores at the threshold, so that a receiver without knowledge detects the
     share `false_alarms`. NaN without both kinds of windows.
     """
     on, off = score[truth], np.sort(score[~truth])[::-1]

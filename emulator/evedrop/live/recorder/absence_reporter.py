@@ -20,7 +20,7 @@ from evedrop.scenario.timeline import Away
 class AbsenceReporter:
     """Reports the beliefs of a receiver that is away, computed from its belief when it left.
 
-    brief: of the observer; put: takes the reports as if they were the receiver's own.
+    brief: of the recorder; put: takes the reports as if they were the receiver's own.
     """
 
     def __init__(

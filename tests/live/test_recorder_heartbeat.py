@@ -1,4 +1,4 @@
-"""An observer that lives is not given up, however long it takes to finish; one that stands still is."""
+"""A recorder that lives is not given up, however long it takes to finish; one that stands still is."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ children.GRACE_SECONDS = children._GONE_SECONDS = starter.GRACE_SECONDS = {grace
 heartbeat.Heartbeat.__init__.__defaults__ = (0.1,)
 children.Children.next_event = next_event
 """
-"""How long an observer takes to make Parquet files, after how long a silence in a run its launcher gives it up, and how long
+"""How long a recorder takes to make Parquet files, after how long a silence in a run its launcher gives it up, and how long
 processes that are told to end may take."""
 
 
@@ -49,7 +49,7 @@ def slow(evedrop: Evedrop, finish: float, silence: float, *arguments: str, grace
 
 @pytest.mark.long
 def test_a_run_that_takes_long_to_finish_is_not_given_up(evedrop: Evedrop) -> None:
-    """More than twice as long as a silence may last: the observer says that it lives, and the run is complete."""
+    """More than twice as long as a silence may last: the recorder says that it lives, and the run is complete."""
     live = slow(evedrop, 6.5, 3.0)
     done = live.end()
     assert done.status == 0, done.err
@@ -60,7 +60,7 @@ def test_a_run_that_takes_long_to_finish_is_not_given_up(evedrop: Evedrop) -> No
 
 @pytest.mark.long
 def test_a_run_that_is_interrupted_while_it_finishes_is_complete(evedrop: Evedrop) -> None:
-    """The launcher waits as long as the observer says that it lives; all slots were done before the signal."""
+    """The launcher waits as long as the recorder says that it lives; all slots were done before the signal."""
     live = slow(evedrop, 6.5, 3.0)
     wait_until(lambda: last_round(live.folder).slots == 300, "all slots on disk")
     live.process.send_signal(signal.SIGINT)
@@ -72,14 +72,14 @@ def test_a_run_that_is_interrupted_while_it_finishes_is_complete(evedrop: Evedro
     assert live.results.trials.num_rows == 4 * 300
 
 
-def test_an_observer_that_stands_still_is_named_and_its_rows_are_kept(evedrop: Evedrop) -> None:
+def test_a_recorder_that_stands_still_is_named_and_its_rows_are_kept(evedrop: Evedrop) -> None:
     """Stopped, it says nothing; the launcher ends the run and makes tables of what it had written."""
     live = slow(evedrop, 0.0, 2.0, "--slots", "1000000", grace=0.5)
     wait_until(lambda: last_round(live.folder).slots > 0, "slots on disk")
-    os.kill(live.child("observer"), signal.SIGSTOP)
+    os.kill(live.child("recorder"), signal.SIGSTOP)
     done = live.end()
     assert done.status == 3
-    assert done.err.startswith("evedrop: observer stopped responding")
+    assert done.err.startswith("evedrop: recorder stopped responding")
     live.nothing_left()
     assert live.results.slots.num_rows == 4 * live.results.summary["slots"] > 0
 

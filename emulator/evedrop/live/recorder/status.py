@@ -5,9 +5,9 @@ Source: docs/protocol.md.
 
 from __future__ import annotations
 
-from evedrop.live.observer.conductor import Conductor
-from evedrop.live.observer.steering import Steering
 from evedrop.live.protocol.status import LinkStatus, RunStatus
+from evedrop.live.recorder.conductor import Conductor
+from evedrop.live.recorder.steering import Steering
 from evedrop.model.metrics.links import LinkAccount
 from evedrop.scenario.tables import Scenario
 from evedrop.score.totals import Totals

@@ -17,10 +17,10 @@ from typing import Any, final
 from evedrop.errors import RunError, ScenarioError
 from evedrop.live.network.operator import Order
 from evedrop.live.network.session import READY_SECONDS
-from evedrop.live.observer.conductor import Conductor
 from evedrop.live.protocol.commands import Go, Hold, LinkChange
 from evedrop.live.protocol.launcher_events import ProcessRequest
 from evedrop.live.protocol.requests import LinkRequest, PauseRequest, ResumeRequest, StepRequest
+from evedrop.live.recorder.conductor import Conductor
 from evedrop.model.slot.link import Change
 from evedrop.names import ROUTER, SENSOR, ProcessAction
 from evedrop.scenario.events.event import Act

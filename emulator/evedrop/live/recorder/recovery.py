@@ -12,12 +12,12 @@ from __future__ import annotations
 from typing import final
 
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
-from evedrop.live.observer.conductor import Conductor
-from evedrop.live.observer.stall import patience_of
-from evedrop.live.observer.steering import Steering
 from evedrop.live.protocol.brief import Flow
 from evedrop.live.protocol.commands import Again
-from evedrop.names import OBSERVER, RELAY, ROUTER
+from evedrop.live.recorder.conductor import Conductor
+from evedrop.live.recorder.stall import patience_of
+from evedrop.live.recorder.steering import Steering
+from evedrop.names import RECORDER, RELAY, ROUTER
 from evedrop.scenario.progress_events import ConnectionOutage, OnEvent
 
 _SOON_SECONDS = 0.5  # after which a round without effect is repeated; the wait doubles each time
@@ -122,11 +122,11 @@ class Recovery:
 
     def _all_back(self, now: float) -> None:
         found = self._missing
-        # All processes vanish with the observer's own router, or with the connection to it. Behind a relay, the sensor
+        # All processes vanish with the recorder's own router, or with the connection to it. Behind a relay, the sensor
         # vanishes with the router, and both with the link between the routers.
         own = RELAY if self._conductor.relayed else ROUTER
         if own in found:
-            found = {own if self._conductor.router_changed() else OBSERVER: found[own]}
+            found = {own if self._conductor.router_changed() else RECORDER: found[own]}
         elif ROUTER in found:
             found = {ROUTER: found[ROUTER]}
         for name, beginning in found.items():

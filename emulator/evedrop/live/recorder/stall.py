@@ -1,6 +1,6 @@
 """Finds the process at fault when a run stands still although all processes are on the network.
 
-    observer ── waits for reports of the process furthest behind ── waits for a message of … ── waits for no process
+    recorder ── waits for reports of the process furthest behind ── waits for a message of … ── waits for no process
 
 Every process is asked what it waits for. The run waits for the process at the end of such a chain. Work that no other
 process waits for does not count as progress.
@@ -17,13 +17,13 @@ from evedrop.errors import Silence
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.protocol.keys import writer_of
 from evedrop.live.protocol.process_status import ProcessStatus
-from evedrop.names import OBSERVER
+from evedrop.names import RECORDER
 
 LEAST_SECONDS = 5.0
 """The least of these: a busy machine may not let a process work for some seconds."""
 _POLL_SECONDS = 0.25
 _STEP_SECONDS = (
-    1.0  # the most that counts between two polls: time in which the observer itself did not run does not count
+    1.0  # the most that counts between two polls: time in which the recorder itself did not run does not count
 )
 
 
@@ -152,7 +152,7 @@ def silent_of(
         for name in chain
         for key in answers[name].waits
         if (writer := writer_of(key)) in answers
-        and writer != OBSERVER
+        and writer != RECORDER
         and ("/progress/" in key or answers[writer].slot > answers[name].slot)
     }
     return [name for name in places if name in owing] or behind

@@ -1,4 +1,4 @@
-"""The observer's work on one run: conducts, scores, records and steers it, and writes the results folder."""
+"""The recorder's work on one run: conducts, scores, records and steers it, and writes the results folder."""
 
 from __future__ import annotations
 
@@ -18,16 +18,8 @@ from evedrop.live.network.launcher_pipe import emit
 from evedrop.live.network.operator import Answer, Order
 from evedrop.live.network.resending import GapDetector
 from evedrop.live.network.session import Session
-from evedrop.live.observer.absence_reporter import AbsenceReporter
-from evedrop.live.observer.conductor import Conductor, Stop
-from evedrop.live.observer.joiner import Joiner
-from evedrop.live.observer.recovery import Recovery
-from evedrop.live.observer.stall import Stall, patience_of
-from evedrop.live.observer.status import status_of
-from evedrop.live.observer.steering import Steering
-from evedrop.live.observer.verification import Verifier, extent_of
 from evedrop.live.protocol.brief import Brief
-from evedrop.live.protocol.brief_parts import ObserverPart
+from evedrop.live.protocol.brief_parts import RecorderPart
 from evedrop.live.protocol.codec import Reader, is_refusal, read_refusal
 from evedrop.live.protocol.commands import ReportStatus
 from evedrop.live.protocol.last_word import protocol_breaker
@@ -36,8 +28,16 @@ from evedrop.live.protocol.process_status import is_process_status, read_process
 from evedrop.live.protocol.requests import StatusRequest
 from evedrop.live.protocol.status import RunStatus
 from evedrop.live.protocol.telemetry import is_held, is_leaving, read_leaving
+from evedrop.live.recorder.absence_reporter import AbsenceReporter
+from evedrop.live.recorder.conductor import Conductor, Stop
+from evedrop.live.recorder.joiner import Joiner
+from evedrop.live.recorder.recovery import Recovery
+from evedrop.live.recorder.stall import Stall, patience_of
+from evedrop.live.recorder.status import status_of
+from evedrop.live.recorder.steering import Steering
+from evedrop.live.recorder.verification import Verifier, extent_of
 from evedrop.model.digest import Blocks
-from evedrop.names import CONTROLLER, OBSERVER, OPERATOR, ROUTER, SENSOR
+from evedrop.names import CONTROLLER, OPERATOR, RECORDER, ROUTER, SENSOR
 from evedrop.results.ending import note_end
 from evedrop.results.folder import HeldFolder
 from evedrop.results.resolved_scenario import write_resolved
@@ -63,11 +63,11 @@ _PROGRESS_SECONDS = 0.25
 
 
 @final
-class ObservedRun:
-    """The observer's work on one run."""
+class RecordedRun:
+    """The recorder's work on one run."""
 
     def __init__(
-        self, brief: Brief[ObserverPart], scenario: Scenario, confirmations: SimpleQueue[bytes], by_hand: bool = False
+        self, brief: Brief[RecorderPart], scenario: Scenario, confirmations: SimpleQueue[bytes], by_hand: bool = False
     ) -> None:
         """by_hand: whether the processes were started by hand, so that there is no launcher to end them."""
         self._place = Path(brief.part.results)
@@ -174,7 +174,7 @@ class ObservedRun:
             finally:
                 self._misdelivered = {name: count for name, count in conductor.misdelivered.items() if count}
                 if session.dropped:
-                    self._misdelivered[OBSERVER] = session.dropped
+                    self._misdelivered[RECORDER] = session.dropped
 
     def _blame(self, missing: list[str], error: EvedropError) -> None:
         """Note which processes are at fault for the end of the run, as far as this process can know."""

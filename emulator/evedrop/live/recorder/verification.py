@@ -1,6 +1,6 @@
 """Verifies the claims of receivers and sensor against the receivers' own reports and the router's journal.
 
-For the recorded trials a receiver reports everything that enters its digests, so the observer computes the digests again.
+For the recorded trials a receiver reports everything that enters its digests, so the recorder computes the digests again.
 For all trials it reports whether it received a packet in each slot, and so does the router. Claims that can be checked
 neither way rest on the receiver's word alone.
 

@@ -1,4 +1,4 @@
-"""The conductor, a part of the observer: waits for all processes, starts the run, passes on their reports, and ends it."""
+"""The conductor, a part of the recorder: waits for all processes, starts the run, passes on their reports, and ends it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from evedrop.live.network.mailbox import Mailbox
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.codec import Reader, is_over, progress, read_over
 from evedrop.live.protocol.commands import Abandon, ControlCommand, EndRun, Start
-from evedrop.names import OBSERVER, RELAY, ROUTER, SENSOR
+from evedrop.names import RECORDER, RELAY, ROUTER, SENSOR
 from evedrop.system.signals import AFTERTHOUGHT_SECONDS
 
 _ABANDON_SECONDS = 2.0  # for processes to leave when told to
@@ -60,7 +60,7 @@ class Conductor:
         self._stop = stop
         self._present = dict.fromkeys((ROUTER, *((RELAY,) if relayed else ()), SENSOR, *reporters), False)
         self.relayed = relayed
-        """Whether the observer is connected to a relay, and not to the router itself."""
+        """Whether the recorder is connected to a relay, and not to the router itself."""
         self._router: str | None = None
         self.lost: dict[str, float] = {}
         """Process that has vanished from the network → when, on the clock."""
@@ -78,9 +78,9 @@ class Conductor:
         """Processes that are away because the scenario says so; they do not count as missing."""
         self.questions: SimpleQueue[Question] = SimpleQueue()
         """The operator's questions."""
-        session.asked(keys.control(OBSERVER), self.questions.put)
+        session.asked(keys.control(RECORDER), self.questions.put)
         self._commands = {name: session.publisher(keys.control(name)) for name in self._present}
-        self._progress = session.publisher(keys.progress(OBSERVER))
+        self._progress = session.publisher(keys.progress(RECORDER))
 
     @property
     def missing(self) -> list[str]:
@@ -88,7 +88,7 @@ class Conductor:
         return [name for name, there in self._present.items() if not there and name not in self.absent]
 
     def router_changed(self) -> bool:
-        """Whether the observer is connected to another router than at the previous call, or at the start of the run."""
+        """Whether the recorder is connected to another router than at the previous call, or at the start of the run."""
         before, self._router = self._router, self._session.router_id
         return before != self._router
 

@@ -1,1 +1,0 @@
-"""The observer: conducts a live run, joins the reports of all processes, and hands them on to be scored and recorded."""
