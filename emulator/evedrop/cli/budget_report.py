@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rich.box import SIMPLE_HEAD
-from rich.table import Table
-
 from evedrop.cli.report import left_out_line, terminal
 from evedrop.model.metrics.text import finite_text, number_text
+from evedrop.show.report.text_table import TextTable
 
 if TYPE_CHECKING:
     from evedrop.scenario.expected.energy_budget import BudgetDesign
@@ -21,21 +19,19 @@ def print_budget(design: BudgetDesign) -> None:
         f"a packet in clear costs {design.in_clear:g}, an encrypted one {design.encrypted:g}; errors are traces in the limit; "
         f"the user's is {finite_text(design.user)}"
     )
-    shown = Table(box=SIMPLE_HEAD)
     names = list(design.best.eavesdroppers)
-    for head in ("threshold θ", "encrypted", "energy", *(f"error of {name}" for name in names)):
-        shown.add_column(head, justify="right", no_wrap=True)
-    shown.add_column("")
+    errors = [f"error of {name}" for name in names]
+    shown = TextTable.headed([], ["threshold θ", "encrypted", "energy", *errors], [""])
     for one in sorted({round(each.threshold, 9): each for each in (*design.others, design.best)}.items()):
         metrics = one[1]
-        shown.add_row(
+        shown.add(
             number_text(metrics.threshold, ".6g"),
             number_text(metrics.encrypted_fraction, ".4f"),
             number_text(metrics.energy, ".6g"),
             *(finite_text(metrics.eavesdroppers[name]) for name in names),
             "the budget's" if metrics is design.best else "",
         )
-    console.print(shown)
+    console.show(shown)
     if design.left_out:
         console.print(left_out_line(design.left_out, "no closed form of its error is known under this scheme"))
     console.print(f"threshold = {design.best.threshold!r}")

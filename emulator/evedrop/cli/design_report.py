@@ -6,11 +6,9 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
-from rich.box import SIMPLE_HEAD
-from rich.table import Table
-
 from evedrop.cli.report import terminal
 from evedrop.model.metrics.text import finite_text, number_text
+from evedrop.show.report.text_table import TextTable
 
 if TYPE_CHECKING:
     from evedrop.model.theory.design import Design
@@ -38,9 +36,7 @@ def print_design(design: Design) -> None:
     if design.choice is not None:
         for line in _chosen(design.choice, design.left_out):
             console.print(line)
-    table = Table(box=SIMPLE_HEAD)
-    table.add_column("against", no_wrap=True)
-    for head in (
+    heads = (
         "bounded from",
         "perfect secrecy",
         "relative secrecy",
@@ -49,10 +45,10 @@ def print_design(design: Design) -> None:
         "its trace",
         "J_e/J",
         "from slot",
-    ):
-        table.add_column(head, justify="right", no_wrap=True)
+    )
+    table = TextTable.headed(["against"], heads)
     for name, against in design.eavesdroppers.items():
-        table.add_row(
+        table.add(
             name,
             finite_text(against.bound, ".6g"),
             "none" if against.perfect is None else _half_open(against.perfect, against.bound),
@@ -65,7 +61,7 @@ def print_design(design: Design) -> None:
             "–" if math.isnan(against.ratio) else finite_text(against.ratio),
             "–" if against.relative_from is None else str(against.relative_from),
         )
-    console.print(table)
+    console.show(table)
     if design.omission is not None:
         console.print(design.omission)
 

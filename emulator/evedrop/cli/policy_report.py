@@ -5,11 +5,9 @@ from __future__ import annotations
 from itertools import groupby
 from typing import TYPE_CHECKING
 
-from rich.box import SIMPLE_HEAD
-from rich.table import Table
-
 from evedrop.cli.report import left_out_line, terminal
 from evedrop.model.metrics.text import finite_text, number_text
+from evedrop.show.report.text_table import TextTable
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -28,9 +26,9 @@ def print_policies(design: PolicyDesign) -> None:
     )
     for name, front in design.fronts.items():
         console.print(f"\nagainst {name}, the scheme with its threshold:")
-        console.print(_thresholds(front))
+        console.show(_thresholds(front))
         console.print(f"the best policy if the sensor also knew how long ago {name} heard a packet, which it does not:")
-        console.print(_policies(front, design.states))
+        console.show(_policies(front, design.states))
         if front.never:
             for price in sorted({price for _, price in front.never}):
                 weights = ", ".join(f"{weight:g}" for weight, one in front.never if one == price)
@@ -44,23 +42,19 @@ def print_policies(design: PolicyDesign) -> None:
         console.print(left_out_line(design.left_out, "no closed form of its error is known under this scheme"))
 
 
-def _thresholds(front: Front) -> Table:
-    shown = Table(box=SIMPLE_HEAD)
-    for head in ("threshold θ", *_METRICS):
-        shown.add_column(head, justify="right", no_wrap=True)
+def _thresholds(front: Front) -> TextTable:
+    shown = TextTable.headed([], ["threshold θ", *_METRICS])
     for i, metrics in enumerate(front.thresholds):
-        shown.add_row(str(i + 1), *_metrics(metrics))
+        shown.add(str(i + 1), *_metrics(metrics))
     return shown
 
 
-def _policies(front: Front, states: int) -> Table:
-    shown = Table(box=SIMPLE_HEAD)
-    for head in ("weight", "λ", *_METRICS, "best θ"):
-        shown.add_column(head, justify="right", no_wrap=True)
-    shown.add_column("send from h ≥, by its holding time 1, 2 …")
+def _policies(front: Front, states: int) -> TextTable:
+    last = "send from h ≥, by its holding time 1, 2 …"
+    shown = TextTable.headed([], ["weight", "λ", *_METRICS, "best θ"], [last], wrapped=[last])
     for point in front.points:
         low, high = point.weights
-        shown.add_row(
+        shown.add(
             f"{low:g}" if low == high else f"{low:g} … {high:g}",
             number_text(point.price, "g"),
             *_metrics(point.metrics),

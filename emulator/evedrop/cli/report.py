@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from evedrop.cli.console import StyledConsole
-from evedrop.cli.narrow import fitted
-from evedrop.cli.tables import TAKEN, text_table
+from evedrop.cli.tables import TAKEN
 from evedrop.score.summary import Summary
 from evedrop.show.report import closing
 from evedrop.show.report.sweep import sweep_table
 from evedrop.show.report.text_table import TextTable
+from evedrop.show.terminal_tables import fitted, rich_table
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -25,39 +24,16 @@ _DIGEST_WIDTH = 100
 """The least width of a terminal, in columns, to show digests, and the standard error of every metric."""
 
 
-def rich_table(table: TextTable, *, tight: bool = True, short_heads: bool = False) -> Table:
-    """A table for the terminal. tight: without room at its sides and between columns; short_heads: on two lines."""
-    found = Table(
-        title=table.title or None,
-        title_justify="left",
-        box=SIMPLE_HEAD,
-        pad_edge=not tight,
-        collapse_padding=tight,
-    )
-    for column in table.columns:
-        heading = column.heading.replace(" ", "\n", 1) if short_heads else column.heading
-        found.add_column(heading, justify="right" if column.number else "left", no_wrap=True)
-    for row in table.rows:
-        found.add_row(*row)
-    return found
-
-
-def closing_table(summary: Summary, width: int) -> Table:
-    """The table of the receivers: their metrics and, if there is room, their digests; width: of the terminal, in columns."""
-    wide = width >= _DIGEST_WIDTH
-    return rich_table(closing.receivers_table(summary, wide), tight=not wide, short_heads=not wide)
-
-
 def print_summary(summary: Summary, folder: str, replay: str | None = None) -> None:
     """Print the closing report on standard output; replay: the beginning of the command that shows one trial live."""
     console = terminal()
     if summary.ended != "complete":
         console.print(f"{summary.ended.splitlines()[0]}; the results so far:")
-    console.print(closing_table(summary, console.width), whole=closing.receivers_table(summary))
+    console.show(closing.receivers_table(summary), closing_table(summary, console.width))
     for line in (*closing.remarks(summary), *closing.verdicts(summary)):
         console.print(line)
     if summary.directions:
-        console.print(rich_table(closing.directions_table(summary.directions)))
+        console.show(closing.directions_table(summary.directions), tight=True)
     for line in (*closing.doubts(summary), *closing.application_lines(summary)):
         console.print(line)
     for expectation in summary.expectations:
@@ -72,10 +48,16 @@ def print_summary(summary: Summary, folder: str, replay: str | None = None) -> N
     console.print(f"results: {folder}; to look at them: evedrop view {folder}")
 
 
+def closing_table(summary: Summary, width: int) -> Table:
+    """The table of the receivers: their metrics and, if there is room, their digests; width: of the terminal, in columns."""
+    wide = width >= _DIGEST_WIDTH
+    return rich_table(closing.receivers_table(summary, wide), tight=not wide, short_heads=not wide)
+
+
 def print_sweep(table: pa.Table, keys: tuple[str, ...], folder: str) -> None:
     """Print the table of a sweep: one row for each point and peer."""
     console = terminal()
-    console.print(rich_table(sweep_table(table.to_pylist(), keys), tight=False))
+    console.show(sweep_table(table.to_pylist(), keys))
     console.print(f"results: {folder}/sweep.parquet, sweep.png")
 
 
@@ -86,12 +68,15 @@ def left_out_line(left_out: Mapping[str, str], why: str) -> str:
 
 
 class _Console(StyledConsole):
-    def print(self, *objects: Any, whole: TextTable | None = None, **named: Any) -> None:
-        """Show a table that is wider than the terminal row by row. whole: the table for files, if another one is shown."""
+    def show(self, table: TextTable, drawn: Table | None = None, **how: bool) -> None:
+        """Show a table, row by row if it is wider than the terminal; drawn: what is shown of it, if that is not all.
+
+        how: arguments of `rich_table`.
+        """
         taken = TAKEN.get()
         if taken is not None:
-            taken += [whole or text_table(one) for one in objects if isinstance(one, Table)]
-        super().print(*(fitted(one, self) if isinstance(one, Table) else one for one in objects), **named)
+            taken.append(table)
+        self.print(fitted(rich_table(table, **how) if drawn is None else drawn, self))
 
 
 def terminal() -> _Console:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rich.box import SIMPLE_HEAD
-from rich.table import Table
-
 from evedrop.cli.report import left_out_line, terminal
 from evedrop.model.checks import toml_of
 from evedrop.model.metrics.text import number_text
+from evedrop.show.report.text_table import TextTable
 
 if TYPE_CHECKING:
     from evedrop.model.theory.schedules import MeanSchedule, ScheduleDesign
@@ -23,7 +21,7 @@ def print_schedules(design: ScheduleDesign) -> None:
             f"against {name}: the sum is {found.best.value:.6g} with this schedule, "
             f"and {found.constant.value:.6g} with the best constant μ_d, {found.constant.mu_d[1]:.6g}"
         )
-        console.print(_slots(found.best))
+        console.show(_slots(found.best))
         on_grid = (
             "the best schedule of the grid"
             if found.exact
@@ -40,12 +38,10 @@ def print_schedules(design: ScheduleDesign) -> None:
         console.print(left_out_line(design.left_out, "no closed form of its error is known"))
 
 
-def _slots(schedule: MeanSchedule) -> Table:
+def _slots(schedule: MeanSchedule) -> TextTable:
     """One row for each slot."""
-    shown = Table(box=SIMPLE_HEAD)
-    for head in ("slot", "μ_d", "user's error", "its error"):
-        shown.add_column(head, justify="right", no_wrap=True)
+    shown = TextTable.headed([], ["slot", "μ_d", "user's error", "its error"])
     for k, row in enumerate(zip(schedule.mu_d, schedule.user, schedule.eavesdropper, strict=True)):
         mu_d, ours, theirs = row
-        shown.add_row(str(k), number_text(mu_d, ".6g"), number_text(ours), number_text(theirs))
+        shown.add(str(k), number_text(mu_d, ".6g"), number_text(ours), number_text(theirs))
     return shown

@@ -17,8 +17,6 @@ from typing import TYPE_CHECKING
 from evedrop.errors import UsageError
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from evedrop.show.report.text_table import TextTable
 
 TAKEN: ContextVar[list[TextTable] | None] = ContextVar("TAKEN", default=None)
@@ -61,12 +59,3 @@ def _write(taken: Sequence[TextTable], as_csv: Path | None, latex: Path | None) 
         write_csv(taken, as_csv)
     if latex is not None and taken:
         write_latex(taken, latex)
-
-
-def text_table(table: Table) -> TextTable:
-    """A table of the terminal as the texts in it."""
-    from evedrop.show.report.text_table import TextColumn, TextTable
-
-    columns = [TextColumn(" ".join(str(one.header).split()), one.justify == "right") for one in table.columns]
-    cells = [[cell if isinstance(cell, str) else str(cell) for cell in one.cells] for one in table.columns]
-    return TextTable(columns, [*zip(*cells, strict=True)], str(table.title or ""))

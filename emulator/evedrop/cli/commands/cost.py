@@ -32,27 +32,23 @@ def cost(options: argparse.Namespace) -> int:
 
 def _print(found: SecrecyCost) -> None:
     """Print the table."""
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
     from evedrop.cli.report import terminal
+    from evedrop.show.report.text_table import TextTable
 
     names = {"scheme": found.scheme, "plain": "plain", "truth": "the truth"}
-    table = Table(box=SIMPLE_HEAD)
-    table.add_column("")
-    for heading in ("mean", "standard error", "95 % interval"):
-        table.add_column(heading, justify="right")
+    heads = ("mean", "standard error", "95 % interval")
+    table = TextTable.headed([""], heads, wrapped=["", *heads])
     for name, one in found.more_than_plain.items():
-        table.add_row(f"{name.replace('_', ' ')}: {found.scheme} less plain", *_cells(one, 1.0, " Wh"))
+        table.add(f"{name.replace('_', ' ')}: {found.scheme} less plain", *_cells(one, 1.0, " Wh"))
     for pair, measures in found.differences.items():
         ours, _, theirs = pair.partition("_from_")
         for measure, one in measures.items():
-            table.add_row(f"{measure}: {names[ours]} from {names[theirs]}", *_cells(one, 100.0, " %"))
+            table.add(f"{measure}: {names[ours]} from {names[theirs]}", *_cells(one, 100.0, " %"))
     console = terminal()
     console.print(
         f"{found.trials} days, each with {found.scheme} and with plain, over the same link and with the same noise"
     )
-    console.print(table)
+    console.show(table)
 
 
 def _cells(one: MeanEstimate, scale: float, unit: str) -> tuple[str, str, str]:

@@ -34,44 +34,35 @@ def learned(options: argparse.Namespace) -> int:
 
 def _print(rows: list[LearningRow], trials: int) -> None:
     """Print both tables."""
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
     from evedrop.cli.report import terminal
+    from evedrop.show.report.text_table import TextTable
 
     console = terminal()
     console.print(
         f"{trials} trials: the error of each estimate over the truth, median over trials (mean ± standard error)"
     )
-    table = Table(box=SIMPLE_HEAD)
-    for heading in ("slots", "learner", "A", "Q", "μ_d"):
-        table.add_column(heading, justify="right")
+    heads = ["slots", "learner", "A", "Q", "μ_d"]
+    table = TextTable.headed([], heads, wrapped=heads)
     for row in rows:
         for learner, values in row.parameters.items():
             cells = (
                 number_text(one.median, ".3g") + f" ({_with_error(one.mean, one.standard_error)})"
                 for one in values.values()
             )
-            table.add_row(str(row.stop), learner, *cells)
-    console.print(table)
+            table.add(str(row.stop), learner, *cells)
+    console.show(table)
     console.print("mean |x − x̂|² of the slots between, ± standard error, and the learner's over it")
-    table = Table(box=SIMPLE_HEAD)
-    for heading in (
-        "from slot",
-        "before",
-        "receiver",
-        "mean |x − x̂|²",
-        *(f"{name} / it" for name in rows[0].parameters),
-    ):
-        table.add_column(heading, justify="right")
+    ratios_of = [f"{name} / it" for name in rows[0].parameters]
+    heads = ["from slot", "before", "receiver", "mean |x − x̂|²", *ratios_of]
+    table = TextTable.headed([], heads, wrapped=heads)
     for row in rows:
         for name, error in row.errors.items():
             ratios = (one.get(name) for one in row.ratios.values())
             cells = (
                 ShownNumber("", None) if one is None else _with_error(one.ratio, one.standard_error) for one in ratios
             )
-            table.add_row(str(row.first), str(row.stop), name, _with_error(error, row.standard_errors[name]), *cells)
-    console.print(table)
+            table.add(str(row.first), str(row.stop), name, _with_error(error, row.standard_errors[name]), *cells)
+    console.show(table)
 
 
 def _with_error(value: float, error: float | None) -> ShownNumber:

@@ -79,24 +79,18 @@ def _writable(folder: Path) -> Iterator[None]:
 
 def _print(found: Reproduction) -> None:
     """Print the table, and below it a line for each reason."""
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
     from evedrop.cli.report import terminal
+    from evedrop.show.report.text_table import TextTable
 
     console = terminal()
     console.print(f"{found.title} · {found.authors} · {found.published}")
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
-    for heading in ("where", "what"):
-        table.add_column(heading)
-    for heading in ("theirs", "ours", "tolerance"):
-        table.add_column(heading, justify="right")
-    table.add_column("verdict", no_wrap=True)
+    words, numbers = ["where", "what"], ["theirs", "ours", "tolerance"]
+    table = TextTable.headed(words, numbers, ["verdict"], wrapped=[*words, *numbers])
     reasons: dict[str, int] = {}
     for row in found.rows:
         note = f" [{reasons.setdefault(row.reason, len(reasons) + 1)}]" if row.reason else ""
-        table.add_row(row.where, row.what, row.their_text, row.our_text, row.tolerance or "–", f"{row.verdict}{note}")
-    console.print(table)
+        table.add(row.where, row.what, row.their_text, row.our_text, row.tolerance or "–", f"{row.verdict}{note}")
+    console.show(table, tight=True)
     for reason, number in reasons.items():
         console.print(f"[{number}] {reason}")
     console.print(f"{', '.join(f'{verdict}: {count}' for verdict, count in found.counts.items())}. {found.scope}")

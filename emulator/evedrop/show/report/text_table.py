@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
 
@@ -13,6 +13,8 @@ class TextColumn:
     heading: str
     number: bool = True
     """Whether its cells are numbers, which are aligned to the right."""
+    wraps: bool = False
+    """Whether the terminal may break its cells into lines."""
 
 
 @dataclass
@@ -25,17 +27,18 @@ class TextTable:
 
     @classmethod
     def headed(
-        cls, words: Sequence[str], numbers: Sequence[str], after: Sequence[str] = (), title: str = ""
+        cls,
+        words: Sequence[str],
+        numbers: Sequence[str],
+        after: Sequence[str] = (),
+        title: str = "",
+        wrapped: Collection[str] = (),
     ) -> TextTable:
-        """A table without rows: columns of words, then of numbers, then again of words."""
-        return cls(
-            [
-                *(TextColumn(heading, number=False) for heading in words),
-                *(TextColumn(heading) for heading in numbers),
-                *(TextColumn(heading, number=False) for heading in after),
-            ],
-            title=title,
+        """A table without rows: columns of words, then of numbers, then again of words; wrapped: the headings that may wrap."""
+        heads = (
+            [(head, False) for head in words] + [(head, True) for head in numbers] + [(head, False) for head in after]
         )
+        return cls([TextColumn(head, number, head in wrapped) for head, number in heads], title=title)
 
     def add(self, *cells: str) -> None:
         """Add a row."""

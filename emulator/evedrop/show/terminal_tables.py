@@ -1,9 +1,11 @@
-"""Tables on narrow terminals: a table that does not fit is shown row by row, one entry per line."""
+"""Tables on the terminal, drawn by Rich: one that does not fit is shown row by row, one entry per line. Nothing is cut off."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import pairwise
 
+from rich.box import SIMPLE_HEAD
 from rich.cells import cell_len
 from rich.console import Console, Group
 from rich.measure import Measurement
@@ -11,7 +13,30 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
+from evedrop.show.report.text_table import TextTable
+
 _ENDLESS = 10_000  # columns
+
+
+def rich_table(table: TextTable, *, tight: bool = False, short_heads: bool = False, sections: bool = False) -> Table:
+    """A table for the terminal.
+
+    tight: without room at its sides and between columns; short_heads: on two lines; sections: with a line above each row whose
+    first cell is not empty.
+    """
+    shown = Table(
+        title=table.title or None,
+        title_justify="left",
+        box=SIMPLE_HEAD,
+        pad_edge=not tight,
+        collapse_padding=tight,
+    )
+    for column in table.columns:
+        heading = column.heading.replace(" ", "\n", 1) if short_heads else column.heading
+        shown.add_column(heading, justify="right" if column.number else "left", no_wrap=not column.wraps)
+    for row, following in pairwise([*table.rows, ("",)]):
+        shown.add_row(*row, end_section=sections and bool(following[0]))
+    return shown
 
 
 def fitted(table: Table, console: Console) -> Table | Group:
