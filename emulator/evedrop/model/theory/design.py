@@ -18,6 +18,7 @@ from evedrop.model.process import Process
 from evedrop.model.receiver import Flags
 from evedrop.model.theory.adversary import ATTAINED, Adversary, adversary_bound, points_between, traces_of
 from evedrop.model.theory.covariances import Outcomes, expected_traces, limit_trace, stability_bound
+from evedrop.model.theory.json_values import json_value
 from evedrop.model.theory.ratio import Choice, LargestRatio, cheapest, largest_ratio, ratio_of
 
 Interval = tuple[float, float]
@@ -57,16 +58,9 @@ class Against:
 
     def as_dict(self) -> dict[str, Any]:
         """The JSON of `evedrop design`; inf is null."""
-        return {
-            "bound": _finite(self.bound),
-            "perfect": None if self.perfect is None else list(self.perfect),
-            "relative": [list(interval) for interval in self.relative],
-            "best_difference": self.best_difference,
-            "best_ratio": self.best_ratio,
-            "ratio": _finite(self.ratio),
-            "largest_ratio": None if self.largest is None else self.largest.as_dict(),
-            "trace": _finite(self.trace),
-        }
+        before = ("bound", "perfect", "relative", "best_difference", "best_ratio", "ratio")
+        found = {name: json_value(getattr(self, name)) for name in before}
+        return {**found, "largest_ratio": json_value(self.largest), "trace": json_value(self.trace)}
 
 
 @dataclass(frozen=True)
@@ -125,7 +119,7 @@ class Design:
 
     def as_dict(self) -> dict[str, Any]:
         """The JSON of `evedrop design`; inf is null; `minimum`, `choice` and `left_out` are present only if they have values."""
-        legitimate: dict[str, Any] = {"bound": _finite(self.bound), "trace": _finite(self.trace)}
+        legitimate: dict[str, Any] = {"bound": json_value(self.bound), "trace": json_value(self.trace)}
         if self.minimum is not None:
             legitimate["minimum"] = self.minimum
         found = {
@@ -316,7 +310,3 @@ def _stretches(flags: Flags) -> tuple[tuple[int, int], ...]:
     """(first, last) of each stretch of true flags; the first flag is that of slot 1."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8))) + 1
     return tuple((int(first), int(end) - 1) for first, end in edges.reshape(-1, 2))
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from evedrop.model.process import Floats, Process
 from evedrop.model.theory.closed_forms import SensorChain, scheduled
+from evedrop.model.theory.json_values import JsonFields
 from evedrop.model.theory.policy import best_policy
 
 
@@ -50,7 +51,7 @@ def policy_chains(send: NDArray[np.bool_], mu: float, mu_e: float) -> tuple[Sens
 
 
 @dataclass(frozen=True)
-class PolicyMetrics:
+class PolicyMetrics(JsonFields):
     """The metrics of one policy in the limit: exact, by the stationary law of its chain."""
 
     user: float
@@ -77,14 +78,6 @@ class PolicyMetrics:
         gained = (1.0 - weight) * self.eavesdropper if weight < 1.0 else 0.0
         paid = weight * self.user if weight > 0.0 else 0.0
         return math.inf if math.isinf(paid) else paid - gained + price * self.transmissions
-
-    def as_dict(self) -> dict[str, float | None]:
-        """For JSON; inf is null."""
-        return {
-            "user": self.user if math.isfinite(self.user) else None,
-            "eavesdropper": self.eavesdropper if math.isfinite(self.eavesdropper) else None,
-            "transmissions": self.transmissions,
-        }
 
 
 @dataclass(frozen=True)

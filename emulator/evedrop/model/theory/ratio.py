@@ -10,19 +10,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
-from typing import Any
 
 from evedrop.errors import UsageError
 from evedrop.model.process import Process
 from evedrop.model.theory.adversary import ATTAINED, Adversary, adversary_bound, points_between, traces_of
 from evedrop.model.theory.covariances import Outcomes, limit_trace, stability_bound
+from evedrop.model.theory.json_values import JsonFields
 
 _XTOL = 1e-13
 _ROUNDING = 1e-12  # relative difference within which a ratio counts as the one asked for
 
 
 @dataclass(frozen=True)
-class LargestRatio:
+class LargestRatio(JsonFields):
     """The largest J_e / J, the least of the eavesdroppers' if there are several."""
 
     ratio: float
@@ -34,14 +34,9 @@ class LargestRatio:
     cost: float
     """J(μ_d) / J(1); inf where J is unbounded."""
 
-    def as_dict(self) -> dict[str, Any]:
-        """As JSON; inf is null."""
-        finite = {name: value if math.isfinite(value) else None for name, value in vars(self).items()}
-        return {**finite, "attained": self.attained}
-
 
 @dataclass(frozen=True)
-class Choice:
+class Choice(JsonFields):
     """The μ_d of least legitimate error at which J_e / J is large enough against every eavesdropper."""
 
     min_ratio: float
@@ -55,11 +50,6 @@ class Choice:
     """J(μ_d) / J(1)."""
     ratios: dict[str, float]
     """Eavesdropper → its J_e / J at μ_d."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """As JSON; inf is null."""
-        ratios = {name: ratio if math.isfinite(ratio) else None for name, ratio in self.ratios.items()}
-        return {**vars(self), "intervals": [list(one) for one in self.intervals], "ratios": ratios}
 
 
 def ratio_of(ours: float, theirs: float) -> float:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from evedrop.errors import UsageError
 from evedrop.model.process import Floats, Process
 from evedrop.model.theory.covariances import Outcomes, OutcomesAt
+from evedrop.model.theory.json_values import JsonFields, json_value
 from evedrop.model.theory.schedule_climb import climbed, patterns
 from evedrop.model.theory.schedule_problem import ROUNDING, ScheduleProblem, SlotRecursion
 
@@ -28,7 +29,7 @@ _GAIN = 1e-10  # an improvement of the sum below which the ascent ends, relative
 
 
 @dataclass(frozen=True)
-class MeanSchedule:
+class MeanSchedule(JsonFields):
     """A schedule with the errors that it leads to."""
 
     mu_d: tuple[float, ...]
@@ -40,18 +41,9 @@ class MeanSchedule:
     value: float
     """Σ_k (1 − weight) tr E Pᵉ_k − weight tr E P_k."""
 
-    def as_dict(self) -> dict[str, object]:
-        """For JSON."""
-        return {
-            "mu_d": list(self.mu_d),
-            "user": list(self.user),
-            "eavesdropper": list(self.eavesdropper),
-            "value": self.value,
-        }
-
 
 @dataclass(frozen=True)
-class BestSchedule:
+class BestSchedule(JsonFields):
     """The best schedule found, the best that is constant from slot 1 on, and how far the search was exhaustive."""
 
     best: MeanSchedule
@@ -60,15 +52,6 @@ class BestSchedule:
     """The best schedule of the grid, from which the best one was improved."""
     exact: bool
     """Whether `grid` is certainly the best of the grid; otherwise some candidates were dropped."""
-
-    def as_dict(self) -> dict[str, object]:
-        """For JSON."""
-        return {
-            "best": self.best.as_dict(),
-            "constant": self.constant.as_dict(),
-            "grid": self.grid.as_dict(),
-            "exact": self.exact,
-        }
 
 
 @dataclass(frozen=True)
@@ -81,7 +64,7 @@ class ScheduleDesign:
 
     def as_dict(self) -> dict[str, object]:
         """The JSON of `evedrop design --schedule`; `left_out` is present only if it has values."""
-        found: dict[str, object] = {"eavesdroppers": {name: one.as_dict() for name, one in self.schedules.items()}}
+        found: dict[str, object] = {"eavesdroppers": json_value(self.schedules)}
         return {**found, "left_out": self.left_out} if self.left_out else found
 
 

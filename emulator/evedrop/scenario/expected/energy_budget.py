@@ -6,12 +6,13 @@ Source: docs/mathematics.md, quantised packets.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 from evedrop.errors import UsageError
 from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.theory.closed_forms import encrypted_fraction, threshold_for
 from evedrop.model.theory.covariances import LARGEST_OPERATOR
+from evedrop.model.theory.json_values import JsonFields
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.expected.closed_forms import conditions_of, stated_form
 from evedrop.scenario.tables import Scenario
@@ -20,12 +21,8 @@ from evedrop.scenario.words import listed
 _SHOWN = 5  # whole thresholds
 
 
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
 @dataclass(frozen=True)
-class ThresholdMetrics:
+class ThresholdMetrics(JsonFields):
     """What one threshold costs and achieves in the long run."""
 
     threshold: float
@@ -35,14 +32,9 @@ class ThresholdMetrics:
     eavesdroppers: dict[str, float]
     """Eavesdropper → the trace of its expected error covariance in the limit; inf if it is unbounded."""
 
-    def as_dict(self) -> dict[str, object]:
-        """For JSON, where null is unbounded."""
-        errors = {name: _finite(error) for name, error in self.eavesdroppers.items()}
-        return {**asdict(self), "eavesdroppers": errors}
-
 
 @dataclass(frozen=True)
-class BudgetDesign:
+class BudgetDesign(JsonFields):
     """The threshold for a budget, between others."""
 
     budget: float
@@ -61,15 +53,7 @@ class BudgetDesign:
 
     def as_dict(self) -> dict[str, object]:
         """The JSON of `evedrop design --budget`; `left_out` is present only if it has values."""
-        found: dict[str, object] = {
-            "budget": self.budget,
-            "in_clear": self.in_clear,
-            "encrypted": self.encrypted,
-            "user": _finite(self.user),
-            "best": self.best.as_dict(),
-            "others": [one.as_dict() for one in self.others],
-        }
-        return {**found, "left_out": self.left_out} if self.left_out else found
+        return {name: value for name, value in super().as_dict().items() if value or name != "left_out"}
 
 
 def budget_of(scenario: Scenario, budget: float) -> BudgetDesign:
