@@ -111,12 +111,14 @@ FORMER = {
     "observer": "recorder",
     "read_news": "read_event",
     "recordings_located": "locate_recordings",
+    "ReceiverTotals": "ReceiverTally",
     "rooms": "packages",
     "set_news_apart": "keep_events_apart",
     "stand_in": "remote_class, absence_reporter",
     "StandIn": "RemoteClass, AbsenceReporter",
     "tables_located": "locate_tables",
     "tables_read": "read_tables",
+    "TrialTotals": "TrialTally",
     "whereabouts": "process status",
 }
 """Former word → the word of the glossary, or the name, in its place. Parts of names count: `open_rooms`, `openRooms`."""

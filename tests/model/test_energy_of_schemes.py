@@ -10,7 +10,7 @@ from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.plain import Plain
 from evedrop.model.schemes.scheme import PacketBlock
 from evedrop.model.streams import Batch
-from evedrop.simulate.packet_counts import PacketCounts
+from evedrop.simulate.packet_tally import PacketTally
 from tests.model.slot_loop import coins, play
 
 PROCESS = Process(np.eye(2), np.eye(2), np.eye(2))
@@ -52,12 +52,12 @@ def test_packets_that_are_not_sent_are_not_counted() -> None:
     """Slots add up, also in parts; an encrypted packet that is not sent costs nothing."""
     encrypted = np.array([[True, False, True], [True, True, True]])
     sent = np.array([[True, True, False], [True, False, True]])
-    counts = PacketCounts.zero(3)
+    counts = PacketTally.zero(3)
     counts.add_slots(encrypted, sent)
     counts.add_slots(encrypted[:1], None)
     assert counts.sent.tolist() == [3, 2, 2]
     assert counts.encrypted.tolist() == [3, 0, 2]
-    whole = PacketCounts.merged([counts.part(slice(2, 3)), counts])
+    whole = PacketTally.merged([counts.part(slice(2, 3)), counts])
     assert whole.sent.tolist() == [2, 3, 2, 2]
     whole.add_counts(whole)
     assert whole.encrypted.tolist() == [4, 6, 0, 4]

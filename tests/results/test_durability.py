@@ -31,10 +31,10 @@ from evedrop.results.summary_file import unwritten
 from evedrop.results.writer import ResultsWriter
 from evedrop.scenario.loading import load
 from evedrop.scenario.tables import Scenario
+from evedrop.score.run_tally import RunTally
 from evedrop.score.scorekeeper import RunOutcome, summary_of
 from evedrop.score.summary import Summary
 from evedrop.score.sums import SlotSums
-from evedrop.score.totals import Totals
 from evedrop.show.view.replay import replay
 from tests.conftest import Evedrop, Live, wait_until
 from tests.examples import examples, mostly_long
@@ -311,7 +311,7 @@ def test_no_rows_are_on_disk_before_the_first_metrics(tmp_path: Path) -> None:
     """Or a run that is killed just then could not be looked at: only its own classes could make metrics of nothing."""
     scenario = microgrid()
     nothing = summary_of(
-        scenario, Totals.nothing(scenario, 1), dict.fromkeys(scenario.digested), RunOutcome(0.0, "slot 10")
+        scenario, RunTally.nothing(scenario, 1), dict.fromkeys(scenario.digested), RunOutcome(0.0, "slot 10")
     )
 
     def metrics() -> Summary:
@@ -336,7 +336,7 @@ def test_a_score_is_saved_only_with_rows(tmp_path: Path) -> None:
     """What a shard saves together with its metrics: if it is killed before, it has neither score nor rows."""
     scenario = microgrid()
     nothing = summary_of(
-        scenario, Totals.nothing(scenario, 1), dict.fromkeys(scenario.digested), RunOutcome(0.0, "slot 10")
+        scenario, RunTally.nothing(scenario, 1), dict.fromkeys(scenario.digested), RunOutcome(0.0, "slot 10")
     )
     events: list[str] = []
 
@@ -381,7 +381,7 @@ def test_the_end_of_a_killed_run_says_which_slot_its_metrics_are_of(tmp_path: Pa
     """They were written when fewer slots were done; an excerpt of a log follows in lines of its own."""
     scenario = microgrid()
     write_resolved(tmp_path, scenario)
-    empty = summary_of(scenario, Totals.nothing(scenario, 1), dict.fromkeys(scenario.digested), RunOutcome(0.0, ""))
+    empty = summary_of(scenario, RunTally.nothing(scenario, 1), dict.fromkeys(scenario.digested), RunOutcome(0.0, ""))
     writer = ResultsWriter.of(tmp_path, scenario)
     for first, at in ((0, "slot 10"), (10, "slot 30")):
         for receiver in scenario.receivers:

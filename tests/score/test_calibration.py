@@ -21,9 +21,9 @@ from evedrop.scenario.expected.expectations import Expectation, expectations_of
 from evedrop.scenario.loading import checked, load
 from evedrop.scenario.tables import Scenario
 from evedrop.score.rare_events import z_of_error
+from evedrop.score.run_tally import RunTally
 from evedrop.score.scorekeeper import verdicts
 from evedrop.score.summary import RARE_SHARE, RareEvents
-from evedrop.score.totals import Totals
 from evedrop.score.verdict import Verdict
 from evedrop.simulate.simulation import Mode
 from evedrop.simulate.trials import carry_out, tasks_of
@@ -78,10 +78,10 @@ DOCUMENTED = [
 ]
 
 
-def totals_of(scenario: Scenario) -> Totals:
-    """The totals of all its trials, simulated in memory."""
+def tally_of(scenario: Scenario) -> RunTally:
+    """The tally of all its trials, simulated in memory."""
     batches = [carry_out(task, lambda _: None, lambda: False) for task in tasks_of(scenario, Mode.EXACT, 1)]
-    return Totals.merged([block.totals for batch in batches for block in batch.blocks])
+    return RunTally.merged([block.run_tally for batch in batches for block in batch.blocks])
 
 
 def rare_events(expected: Expectation, slots: int, trials: int) -> RareEvents | None:
@@ -93,11 +93,11 @@ def rare_events(expected: Expectation, slots: int, trials: int) -> RareEvents | 
 def z_scores(one: Documented) -> dict[str, list[float | None]]:
     """Receiver → the z-score of its mean squared error in each study; for receivers whose expectation is known."""
     scenario = one.scenario
-    totals, found = totals_of(scenario), {}
+    run_tally, found = tally_of(scenario), {}
     for name, expected in expectations_of(scenario).items():
         if not expected.known or expected.of_model:
             continue
-        means: Floats = totals.tallies[name].window_errors.sum(axis=0) / scenario.slots
+        means: Floats = run_tally.tallies[name].window_errors.sum(axis=0) / scenario.slots
         theory, rare = float(expected.traces(scenario.slots).mean()), rare_events(expected, scenario.slots, one.trials)
         found[name] = [
             z_of_error(study, theory, expected, scenario.slots, rare)
@@ -161,7 +161,7 @@ def test_no_verdict_is_false_where_rare_events_carry_the_users_error(seeds: int,
     found = []
     for seed in range(seeds):
         scenario = gambled(initial, seed)
-        (verdict,) = verdicts(scenario, totals_of(scenario).tallies)
+        (verdict,) = verdicts(scenario, tally_of(scenario).tallies)
         found.append(verdict.relative)
     assert Verdict.HELD not in found
 
@@ -171,6 +171,6 @@ def test_no_verdict_is_false_for_a_strategy_without_a_closed_form(seeds: int) ->
     """The same against an eavesdropper whose expected error nothing but the simulation tells."""
     for seed in range(seeds):
         scenario = gambled(1e6, seed, "bayesian")
-        (verdict,) = verdicts(scenario, totals_of(scenario).tallies)
+        (verdict,) = verdicts(scenario, tally_of(scenario).tallies)
         assert verdict.relative is not Verdict.HELD
         assert not expectations_of(scenario)["e"].known

@@ -16,7 +16,7 @@ from evedrop.model.theory.covariances import expected_covariances
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import load
 from evedrop.score.summary import Summary
-from evedrop.score.sums import DirectionErrors
+from evedrop.score.sums import DirectionTally
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
 from tests.builders import mistakes_in_good
@@ -134,15 +134,15 @@ def test_trials_and_slots_in_parts_have_the_same_bits() -> None:
     random = np.random.default_rng(4)
     x, x_hat = random.standard_normal((2, 40, 3, 6))
     v = np.array([1.0, 0.0, -0.3])
-    whole = DirectionErrors(v, 40, 6)
+    whole = DirectionTally(v, 40, 6)
     whole.add_slots(0, x, x_hat)
     parts = []
     for trials in (slice(0, 1), slice(1, 6)):
-        part = DirectionErrors(v, 40, trials.stop - trials.start)
+        part = DirectionTally(v, 40, trials.stop - trials.start)
         for first, end in ((0, 7), (7, 8), (8, 40)):
             part.add_slots(first, x[first:end, :, trials], x_hat[first:end, :, trials])
         parts.append(part)
-    merged = DirectionErrors.merged(parts)
+    merged = DirectionTally.merged(parts)
     np.testing.assert_array_equal(merged.window_errors, whole.window_errors)
     assert merged.done == 40
 

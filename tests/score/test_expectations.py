@@ -24,7 +24,7 @@ from evedrop.score.expectations_held import Evidence
 from evedrop.score.summary import Judged, LinkSummary, PeerSummary
 from evedrop.score.sums import Tally
 from evedrop.score.verdict import Secrecy, Verdict
-from evedrop.score.watched import IN_STEP, Watched, WatchedSlots
+from evedrop.score.watched_tally import IN_STEP, WatchedSlots, WatchedTally
 from evedrop.simulate.montecarlo import Plan
 from tests.conftest import Evedrop
 
@@ -148,15 +148,15 @@ def test_what_is_watched_does_not_depend_on_how_it_is_cut(cuts: set[int], blocks
     watches = [WatchedSlots(metric, *span) for metric in METRICS for span in ((0, 40), (7, 21))]
     steps = [WatchedSlots(IN_STEP, 0, 40), WatchedSlots(IN_STEP, 11, 40)]
 
-    def watched(trials: slice, ends: list[int]) -> Watched:
-        one = Watched([*watches, *steps], error[:, trials].shape[1])
+    def watched(trials: slice, ends: list[int]) -> WatchedTally:
+        one = WatchedTally([*watches, *steps], error[:, trials].shape[1])
         for first, end in zip([0, *ends], [*ends, 40], strict=True):
             nothing = np.zeros(end - first)
             one.add_slots(ScoredSlots(first, error[first:end, trials], action[first:end, trials], nothing, nothing))
         return one
 
     edges = [0, *sorted(blocks), 7]
-    parts = Watched.merged([watched(slice(*ends), sorted(cuts)) for ends in pairwise(edges)])
+    parts = WatchedTally.merged([watched(slice(*ends), sorted(cuts)) for ends in pairwise(edges)])
     whole = watched(slice(0, 7), [])
     for watch in watches:
         found, expected = parts.tally(watch).of_trials, whole.tally(watch).of_trials

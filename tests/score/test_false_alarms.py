@@ -44,7 +44,7 @@ def differences(studies: int) -> Floats:
     parts = []
     for start in range(0, scenario.trials, 2000):
         task = TrialsTask(scenario.model_dump(mode="json"), start, min(start + 2000, scenario.trials), Mode.EXACT)
-        tallies = [block.totals.tallies for block in carry_out(task, lambda _: None, lambda: False).blocks]
+        tallies = [block.run_tally.tallies for block in carry_out(task, lambda _: None, lambda: False).blocks]
         user, other = (merged([one[name] for one in tallies]) for name in ("legitimate", "alike"))
         parts.append(window_means(other) - window_means(user))
     whole = np.concatenate(parts, axis=1)

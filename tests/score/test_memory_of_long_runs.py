@@ -37,14 +37,14 @@ def test_what_is_expected_of_a_long_run_is_not_stored() -> None:
 def test_a_summary_does_not_take_more_memory_the_longer_the_run() -> None:
     """A recorder makes one every few seconds, and what it has taken it may never give back."""
     scenario = load("eavesdroppers", {"slots": 10 * SLOTS, **SCENARIO})
-    totals, digests = Scorekeeper(scenario, 1).totals, dict.fromkeys(scenario.receivers)
+    run_tally, digests = Scorekeeper(scenario, 1).run_tally, dict.fromkeys(scenario.receivers)
 
     def summarise(done: int) -> None:
-        for tally in totals.tallies.values():
+        for tally in run_tally.tallies.values():
             tally.done = tally.offered = done
             for direction in tally.directions.values():
                 direction.done = done
-        summary_of(scenario, totals, digests, RunOutcome(1.0, f"slot {done}"))
+        summary_of(scenario, run_tally, digests, RunOutcome(1.0, f"slot {done}"))
 
     summarise(100)  # which imports what a summary needs
     assert peak_of(lambda: summarise(SLOTS)) < MEGABYTES

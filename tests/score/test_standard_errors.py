@@ -19,7 +19,7 @@ from scipy.stats import t as student
 
 from evedrop.cli.api import montecarlo, run
 from evedrop.cli.report import closing_table, print_summary
-from evedrop.model.metrics.metric import MeanMetric, ScoredSlots, TotalsMetric
+from evedrop.model.metrics.metric import MeanMetric, ScoredSlots, TallyMetric
 from evedrop.model.metrics.packets import UsedFraction
 from evedrop.model.metrics.standard_error import ratio_error, standard_error, z_of
 from evedrop.model.metrics.text import estimate
@@ -96,13 +96,13 @@ def test_standard_errors_are_those_of_the_trials_means(recorded: Results, receiv
 def test_late_packets_count_in_the_trials_too() -> None:
     """A packet that comes late is received in its trial: the mean of the trials is the metric."""
     scenario = load("late", {"slots": 200, "trials": 6, "expect": []})
-    totals = merged(scenario).totals
-    for name, tally in totals.tallies.items():
+    run_tally = merged(scenario).run_tally
+    for name, tally in run_tally.tallies.items():
         for metric in ("received_fraction", "used_fraction"):
             means = tally.of_trials(metric)
             assert means is not None
             assert means.mean() == pytest.approx(tally.metric(metric), rel=1e-12), (name, metric)
-    assert any(tally.late for tally in totals.tallies.values())
+    assert any(tally.late for tally in run_tally.tallies.values())
 
 
 @pytest.mark.long
@@ -187,7 +187,7 @@ def test_trials_that_were_cut_short_have_no_standard_errors() -> None:
 
 
 def test_a_metric_that_is_not_known_trial_by_trial_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A mean that is kept for all trials together, and totals that say nothing about trials."""
+    """A mean that is kept for all trials together, and tallies that say nothing about trials."""
 
     class KeptFraction(MeanMetric):
         by_trial = False
@@ -201,7 +201,7 @@ def test_a_metric_that_is_not_known_trial_by_trial_has_none(monkeypatch: pytest.
     assert tally.of_trials("kept") is None
     monkeypatch.setattr("evedrop.score.sums.metric", lambda _: UsedFraction)
     assert tally.of_trials("used") is not None
-    monkeypatch.setattr(UsedFraction, "sums_of_trials", TotalsMetric.sums_of_trials)
+    monkeypatch.setattr(UsedFraction, "sums_of_trials", TallyMetric.sums_of_trials)
     assert tally.of_trials("used") is None
 
 

@@ -16,9 +16,9 @@ from evedrop.results.reading import Results
 from evedrop.results.summary_file import summary_text, write_summary
 from evedrop.scenario.loading import load
 from evedrop.scenario.progress_events import ConnectionOutage
+from evedrop.score.run_tally import RunTally
 from evedrop.score.scorekeeper import RunOutcome, summary_of
 from evedrop.score.summary import Summary
-from evedrop.score.totals import Totals
 from evedrop.simulate.montecarlo import Merger, Plan
 from evedrop.simulate.simulation import Mode
 from evedrop.simulate.trials import tasks_of
@@ -118,7 +118,7 @@ def test_theory_promises_the_same_however_soon_a_run_is_interrupted(name: str) -
     for result in in_this_process(tasks_of(scenario, Mode.EXACT, 1), lambda _: None, lambda: False):
         whole.add_batch(result)
     ending = RunOutcome(0.0, "interrupted")
-    nothing = summary_of(scenario, Totals.nothing(scenario, 2), dict.fromkeys(scenario.digested), ending)
+    nothing = summary_of(scenario, RunTally.nothing(scenario, 2), dict.fromkeys(scenario.digested), ending)
     for eavesdropper, verdict in whole.summary(RunOutcome(1.0)).secrecy.items():
         early = nothing.secrecy[eavesdropper]
         assert early.sentence.endswith(verdict.sentence.rpartition("; ")[2])

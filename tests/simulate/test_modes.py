@@ -124,7 +124,7 @@ def test_which_streams_are_drawn(mode: Mode, monkeypatch: pytest.MonkeyPatch) ->
     """Covariance-only touches neither the process's nor the noise's stream; error coordinates need noise for the misled."""
     drawn: set[bytes] = set()
 
-    class Watched(streams.Stream):
+    class WatchedTally(streams.Stream):
         def __init__(self, key: bytes, trials: range, per_trial: int) -> None:
             super().__init__(key, trials, per_trial)
             self.key = key
@@ -133,7 +133,7 @@ def test_which_streams_are_drawn(mode: Mode, monkeypatch: pytest.MonkeyPatch) ->
             drawn.add(self.key)
             return super().whole_blocks(slots)
 
-    monkeypatch.setattr(streams, "Stream", Watched)
+    monkeypatch.setattr(streams, "Stream", WatchedTally)
     for receivers, misled in (({"smart": SMART}, False), (ALL, True)):
         of = studied(MARGINAL, 40, **receivers)
         drawn.clear()

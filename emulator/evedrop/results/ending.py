@@ -15,9 +15,9 @@ from evedrop.results.growing_tables import UNFINISHED, finish, is_unfinished, la
 from evedrop.results.reading import Results, age_of_metrics
 from evedrop.results.writer import ResultsWriter, write_summary
 from evedrop.scenario.tables import Scenario
+from evedrop.score.run_tally import RunTally
 from evedrop.score.scorekeeper import RunOutcome, summary_of
 from evedrop.score.summary import Summary
-from evedrop.score.totals import Totals
 
 
 def note_end(folder: Path, scenario: Scenario, how: str) -> Summary:
@@ -33,8 +33,8 @@ def note_end(folder: Path, scenario: Scenario, how: str) -> Summary:
     try:
         summary = replace(Results.read(folder).typed_summary, ended=how)
     except UsageError:  # there are no metrics
-        totals = Totals.nothing(scenario, scenario.trials)
-        summary = summary_of(scenario, totals, dict.fromkeys(scenario.digested), RunOutcome(0.0, how))
+        run_tally = RunTally.nothing(scenario, scenario.trials)
+        summary = summary_of(scenario, run_tally, dict.fromkeys(scenario.digested), RunOutcome(0.0, how))
         summary = replace(summary, slots=rows.slots)
         if not rows.at:
             left_behind = False

@@ -288,8 +288,8 @@ def _no_metrics(folder: Path) -> dict[str, Any]:
     """The summary of a run that was killed before it wrote one. Raises UsageError if its scenario cannot be read."""
     # Only this case needs theory and the scenario to read results.
     from evedrop.scenario.loading.recorded import recorded  # noqa: PLC0415
+    from evedrop.score.run_tally import RunTally  # noqa: PLC0415
     from evedrop.score.scorekeeper import RunOutcome, summary_of  # noqa: PLC0415
-    from evedrop.score.totals import Totals  # noqa: PLC0415
 
     found = recorded(folder)
     if not found.complete:
@@ -298,7 +298,7 @@ def _no_metrics(folder: Path) -> dict[str, Any]:
             "none: look again when the run has metrics, or run the scenario again"
         )
     scenario = found.scenario
-    nothing = Totals.nothing(scenario, scenario.trials)
+    nothing = RunTally.nothing(scenario, scenario.trials)
     summary: dict[str, Any] = plain(
         summary_of(scenario, nothing, dict.fromkeys(scenario.digested), RunOutcome(0.0, "slot 0")).as_dict()
     )

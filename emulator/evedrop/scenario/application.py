@@ -99,7 +99,7 @@ class ControlledPlant:
 
 
 class ApplicationTally(ABC):
-    """An application's totals over a set of trials, whose slots come in order. Pickled between processes."""
+    """An application's tally over a set of trials, whose slots come in order. Pickled between processes."""
 
     @abstractmethod
     def add(self, x: Floats, u: Floats, estimates: Mapping[str, Floats]) -> None:
@@ -112,7 +112,7 @@ class ApplicationTally(ABC):
     @classmethod
     @abstractmethod
     def merged(cls, parts: Sequence[Self]) -> Self:
-        """The totals of several sets of trials, in order."""
+        """The tally of several sets of trials, in order."""
 
     @abstractmethod
     def summary(self) -> Summary:
@@ -234,7 +234,7 @@ class Application(ABC):
     @classmethod
     @abstractmethod
     def tally(cls, loop: ControlledPlant, table: Table, trials: int) -> ApplicationTally:
-        """New totals, of no slots yet; table: an instance of `cls.table`; trials: R."""
+        """A new tally, of no slots yet; table: an instance of `cls.table`; trials: R."""
 
     @classmethod
     def lines(cls, summary: Summary) -> list[str]:

@@ -16,7 +16,7 @@ from evedrop.names import LEGITIMATE
 from evedrop.scenario.expected.expectations import Expectation
 from evedrop.score.rare_events import rare_events_of, z_of_error
 from evedrop.score.summary import DirectionSummary, RareEvents
-from evedrop.score.sums import DirectionErrors, Tally, window_means
+from evedrop.score.sums import DirectionTally, Tally, window_means
 from evedrop.score.verdict import Verdict, perfect_verdict, relative_verdict, sign_of_mean, sign_of_median
 
 
@@ -38,7 +38,7 @@ def directions_of(
     return found
 
 
-def _measured(errors: DirectionErrors, expected: Expectation, rare: RareEvents | None) -> DirectionSummary:
+def _measured(errors: DirectionTally, expected: Expectation, rare: RareEvents | None) -> DirectionSummary:
     """The error, and what theory knows of it; rare: the receiver's rare events."""
     means = errors.window_errors.sum(axis=0) / errors.done
     mean, series = float(np.mean(means)), None if expected.of_model else expected.along(errors.v, errors.done)
@@ -52,7 +52,7 @@ def _measured(errors: DirectionErrors, expected: Expectation, rare: RareEvents |
 def _judged(
     one: DirectionSummary,
     user: DirectionSummary,
-    errors: tuple[DirectionErrors, DirectionErrors],
+    errors: tuple[DirectionTally, DirectionTally],
     expected: tuple[Expectation, Expectation],
 ) -> DirectionSummary:
     """The entry of an eavesdropper with its verdict; errors, expected: the user's and the eavesdropper's."""

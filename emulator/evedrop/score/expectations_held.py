@@ -20,7 +20,7 @@ from evedrop.scenario.tables import Scenario
 from evedrop.score.summary import MODES, DirectionSummary, Found, Judged, LinkSummary, PeerSummary
 from evedrop.score.sums import Tally
 from evedrop.score.verdict import Secrecy, Verdict
-from evedrop.score.watched import watch_of
+from evedrop.score.watched_tally import watch_of
 
 _THEORY = {True: "theory promises it", False: "theory denies it", None: "no theory covers these links"}
 _RUN = {Verdict.HELD.value: "the run shows it", Verdict.FAILED.value: "the run shows that it fails"}

@@ -28,10 +28,10 @@ from evedrop.score.filtering import true_errors
 from evedrop.score.histogram import LEVELS
 from evedrop.score.leak import HeardBitsStream
 from evedrop.score.rare_events import rare_events_of, z_of_error
+from evedrop.score.run_tally import RunTally
 from evedrop.score.slots import Slots
 from evedrop.score.summary import PeerSummary, Summary, SurprisingTrial, Verification
 from evedrop.score.sums import SlotSums, Tally, slot_sums, squared_errors, trial_means
-from evedrop.score.totals import Totals
 from evedrop.score.verdict import Secrecy, secrecy
 
 _ENOUGH_TO_SURPRISE = 10  # trials
@@ -61,7 +61,7 @@ class Scorekeeper:
             theory = {name: one.stream() for name, one in expectations_of(scenario).items()}
         self._theory = theory
         self._revealed = HeardBitsStream(scenario)
-        self.totals = Totals.from_scenario(scenario, trials)
+        self.run_tally = RunTally.from_scenario(scenario, trials)
 
     def add_slots(self, slots: Slots, known: Mapping[str, tuple[Floats, Floats]] | None = None) -> dict[str, Scored]:
         """Score the next slots: receiver → its errors, sums and theory.
@@ -79,7 +79,7 @@ class Scorekeeper:
             one = Scored(
                 errors, slot_sums(errors, receiver.action, receiver.trace), self._theory[name].next_traces(slots.count)
             )
-            tally = self.totals.tallies[name]
+            tally = self.run_tally.tallies[name]
             tally.add_slots(slots.first, *one)
             if tally.conditional is not None:
                 tally.conditional.add_actions(receiver.action)
@@ -105,14 +105,14 @@ class Scorekeeper:
 
     def _add_plant(self, slots: Slots) -> None:
         """Add the slots' alarms, the controller's decisions, and the true errors of a sensor that filters."""
-        totals, estimates = self.totals, {name: one.x_hat for name, one in slots.receivers.items()}
-        if slots.alarms is not None and totals.detection is not None:
-            totals.detection.add_alarms(slots.first, slots.alarms)
-        if slots.true is not None and totals.filter is not None:
-            totals.filter.add_errors(true_errors(slots.true, slots.x, estimates))
-        if slots.inputs is not None and totals.loop is not None:
+        run_tally, estimates = self.run_tally, {name: one.x_hat for name, one in slots.receivers.items()}
+        if slots.alarms is not None and run_tally.detection is not None:
+            run_tally.detection.add_alarms(slots.first, slots.alarms)
+        if slots.true is not None and run_tally.filter is not None:
+            run_tally.filter.add_errors(true_errors(slots.true, slots.x, estimates))
+        if slots.inputs is not None and run_tally.loop is not None:
             true = slots.x if slots.true is None else slots.true
-            totals.loop.add_slots(Acted(slots.inputs, slots.x, estimates, slots.receivers[LEGITIMATE].action, true))
+            run_tally.loop.add_slots(Acted(slots.inputs, slots.x, estimates, slots.receivers[LEGITIMATE].action, true))
 
 
 @dataclass(frozen=True)
@@ -142,13 +142,15 @@ def verdicts(scenario: Scenario, tallies: Mapping[str, Tally]) -> list[Secrecy]:
     return [secrecy(user, (name, tallies[name], expected[name])) for name in scenario.eavesdroppers]
 
 
-def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | None], ending: RunOutcome) -> Summary:
+def summary_of(
+    scenario: Scenario, run_tally: RunTally, digests: Mapping[str, str | None], ending: RunOutcome
+) -> Summary:
     """The summary of a run; digests: process → its digest, None if it has none or the run was cut short.
 
     An accused process has no digest either, because its reports were contradicted. A run to the end in which a package's
     metric failed is not `complete`: it ended with that failure.
     """
-    tallies, detection, loop = totals.tallies, totals.detection, totals.loop
+    tallies, detection, loop = run_tally.tallies, run_tally.detection, run_tally.loop
     digests = {name: None if name in ending.accused else one for name, one in digests.items()}
     expected = expectations_of(scenario)
     peers = {name: _peer(name, tally, expected[name], digests[name], ending.mode) for name, tally in tallies.items()}
@@ -159,7 +161,7 @@ def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | N
     directions = directions_of(tallies, expected)
     expectations = Evidence(scenario, peers, links, tallies, secret, applications, directions).judged(ending.replay)
     # Known only now that every metric has been computed.
-    failures = totals.failures if ending.how == RunOutcome.how else []
+    failures = run_tally.failures if ending.how == RunOutcome.how else []
     return Summary(
         scenario=scenario.title,
         mode=ending.mode,
@@ -180,8 +182,8 @@ def summary_of(scenario: Scenario, totals: Totals, digests: Mapping[str, str | N
         detection=None if detection is None else detection.summary(scenario),
         controller=None
         if loop is None
-        else loop.summary(scenario, peers[LEGITIMATE], totals.solve_times, digests[CONTROLLER]),
-        filter=None if totals.filter is None else totals.filter.summary(scenario),
+        else loop.summary(scenario, peers[LEGITIMATE], run_tally.solve_times, digests[CONTROLLER]),
+        filter=None if run_tally.filter is None else run_tally.filter.summary(scenario),
         applications=applications,
         surprising=_surprising(scenario, tallies),
         expectations=expectations,

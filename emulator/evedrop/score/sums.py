@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from evedrop.model.block_sums import BlockSums, added_in_order
 from evedrop.model.kernels.current import kernels
 from evedrop.model.metrics import metric
-from evedrop.model.metrics.metric import ReceiverTotals, TotalsMetric, TrialTotals
+from evedrop.model.metrics.metric import ReceiverTally, TallyMetric, TrialTally
 from evedrop.model.metrics.standard_error import standard_error
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Codes, Flags
 from evedrop.model.slot.account import COUNTED_BURSTS, Account
 from evedrop.score.conditional import ConditionalError
 from evedrop.score.leak import LeakTally
-from evedrop.score.watched import Watched, WatchedSlots
+from evedrop.score.watched_tally import WatchedSlots, WatchedTally
 
 WINDOWS = 8
 """The number of windows into which slots k ≥ 1 are divided for verdicts; their lengths differ by at most one slot."""
@@ -105,7 +105,7 @@ def window_bounds(slots: int) -> NDArray[np.intp]:
 
 
 @final
-class DirectionErrors:
+class DirectionTally:
     """The squared errors of vᵀx of one receiver, summed over the slots of each window and trial."""
 
     def __init__(self, v: Floats, slots: int, trials: int) -> None:
@@ -127,7 +127,7 @@ class DirectionErrors:
             self.window_errors[window] = added_in_order(self.window_errors[window], (error * error)[windows == window])
 
     @classmethod
-    def merged(cls, parts: Sequence[DirectionErrors]) -> DirectionErrors:
+    def merged(cls, parts: Sequence[DirectionTally]) -> DirectionTally:
         """The sums of disjoint sets of trials, in their order."""
         whole = cls(parts[0].v, parts[0].slots, 0)
         whole.window_errors = np.concatenate([part.window_errors for part in parts], axis=1)
@@ -137,21 +137,21 @@ class DirectionErrors:
 
 @final
 @dataclass
-class Tally(ReceiverTotals):
-    """One receiver's totals over a run."""
+class Tally(ReceiverTally):
+    """One receiver's tally over a run."""
 
     slots: int
     """The number of slots of the whole run."""
     trials: int
-    watched: Watched = field(default_factory=lambda: Watched((), 0))
-    """Further totals that its metrics and expectations need."""
+    watched: WatchedTally = field(default_factory=lambda: WatchedTally((), 0))
+    """The tallies that its metrics and expectations need."""
     done: int = 0
     """Slots that all trials have reached."""
     conditional: ConditionalError | None = None
     """The expected errors given what happened to the packets; None where that does not determine them."""
     leak: LeakTally | None = None
     """What its packets reveal without the secret; None where that is unknown."""
-    directions: dict[str, DirectionErrors] = field(default_factory=dict)
+    directions: dict[str, DirectionTally] = field(default_factory=dict)
     """The errors in the scenario's directions, by their names."""
     window_errors: Floats = field(init=False)
     """Sum of errors of each window and trial, (WINDOWS + 1, R); the last row is slot 0, which is in no window."""
@@ -248,9 +248,9 @@ class Tally(ReceiverTotals):
     def metric(self, name: str) -> float | None:
         """A metric of the run by its name; None if it has no value."""
         found = metric(name)
-        if not issubclass(found, TotalsMetric):
+        if not issubclass(found, TallyMetric):
             return self.watched.tally(WatchedSlots(name, 0, self.slots)).value
-        value = found.of_totals(self) if self.offered else math.nan
+        value = found.of_tally(self) if self.offered else math.nan
         return None if math.isnan(value) else value
 
     @property
@@ -266,9 +266,9 @@ class Tally(ReceiverTotals):
         found = metric(name)
         if not (found.averages_trials and self.alike):
             return None
-        if issubclass(found, TotalsMetric):
+        if issubclass(found, TallyMetric):
             error: Floats = self.window_errors.sum(axis=0)
-            sums = found.sums_of_trials(TrialTotals(error, self.traces, self.packets[0], self.packets[1]))
+            sums = found.sums_of_trials(TrialTally(error, self.traces, self.packets[0], self.packets[1]))
             return None if sums is None else sums / self.done
         return self.watched.tally(WatchedSlots(name, 0, self.slots)).of_trials if found.by_trial else None
 
@@ -288,7 +288,7 @@ def _counts_of_trials(flags: Flags) -> NDArray[np.int64]:
 _BYTE = 255  # the largest count in a byte
 
 
-def window_means(tally: Tally | DirectionErrors) -> Floats:
+def window_means(tally: Tally | DirectionTally) -> Floats:
     """Mean squared error of each window and trial, (WINDOWS, R); NaN for windows without slots."""
     lengths = np.diff(window_bounds(tally.slots))
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -296,19 +296,19 @@ def window_means(tally: Tally | DirectionErrors) -> Floats:
     return means
 
 
-def trial_means(tally: Tally | DirectionErrors) -> Floats:
+def trial_means(tally: Tally | DirectionTally) -> Floats:
     """Mean error of every trial over its slots, (R,)."""
     means: Floats = tally.window_errors.sum(axis=0) / tally.slots
     return means
 
 
-_COUNTED = [one.name for one in fields(ReceiverTotals) if one.name != "lost"]
+_COUNTED = [one.name for one in fields(ReceiverTally) if one.name != "lost"]
 
 
 def merged(parts: Sequence[Tally]) -> Tally:
     """The tally of several disjoint sets of trials, in their order."""
     total = Tally(parts[0].slots, sum(part.trials for part in parts))
-    total.watched = Watched.merged([part.watched for part in parts])
+    total.watched = WatchedTally.merged([part.watched for part in parts])
     total.done = min(part.done for part in parts)
     for part in parts:
         for name in _COUNTED:
@@ -322,7 +322,7 @@ def merged(parts: Sequence[Tally]) -> Tally:
     conditional = [part.conditional for part in parts if part.conditional is not None]
     total.conditional = ConditionalError.merged(conditional) if conditional else None
     for name in parts[0].directions:
-        total.directions[name] = DirectionErrors.merged([part.directions[name] for part in parts])
+        total.directions[name] = DirectionTally.merged([part.directions[name] for part in parts])
     leaks = [part.leak for part in parts if part.leak is not None]
     total.leak = LeakTally.merged(leaks) if leaks else None
     total.packets = np.concatenate([part.packets for part in parts], axis=1)

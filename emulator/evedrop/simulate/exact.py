@@ -42,7 +42,7 @@ from evedrop.score.sums import squared_errors
 from evedrop.simulate.chunk import Chunk, ReceiverChunk
 from evedrop.simulate.guarded_classes import Guard
 from evedrop.simulate.linked_receiver import LinkedReceiver
-from evedrop.simulate.packet_counts import PacketCounts
+from evedrop.simulate.packet_tally import PacketTally
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class ExactSimulation:
     """
 
     def __init__(
-        self, roles: Roles, digests: Mapping[str, dict[int, Digests]], times: SolveTimes, packets: PacketCounts
+        self, roles: Roles, digests: Mapping[str, dict[int, Digests]], times: SolveTimes, packets: PacketTally
     ) -> None:
         scenario, batch, keys = roles.scenario, roles.batch, roles.keys
         self._roles, self._digests, self._packets = roles, digests, packets

@@ -30,14 +30,14 @@ from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import listed
 from evedrop.score.expectations_held import replay_of
 from evedrop.score.histogram import SlotHistograms
+from evedrop.score.run_tally import RunTally
 from evedrop.score.scorekeeper import RunOutcome, events_of, summary_of
 from evedrop.score.slots import concatenated
 from evedrop.score.summary import Summary
 from evedrop.score.sums import SlotSums, squared_errors
-from evedrop.score.totals import Totals
 from evedrop.simulate.cluster import REACH_SECONDS
 from evedrop.simulate.kept_tasks import kept_tasks, study_of
-from evedrop.simulate.packet_counts import PacketCounts
+from evedrop.simulate.packet_tally import PacketTally
 from evedrop.simulate.sharing import Crew, crew_of
 from evedrop.simulate.simulation import Mode
 from evedrop.simulate.splitting import rare_estimates, work_of
@@ -249,8 +249,8 @@ class Merger:
         self._mode = mode
         names = scenario.receivers
         self._sums = {name: SlotSums.zero(scenario.slots) for name in names}
-        self._totals: list[Totals] = []
-        self._packets: list[PacketCounts] = []
+        self._run_tallies: list[RunTally] = []
+        self._packets: list[PacketTally] = []
         self._digests = {name: RunDigest() for name in scenario.digested}
         self._errors: dict[str, SlotHistograms] = {}
         self._traces: dict[str, SlotHistograms] = {}
@@ -265,7 +265,7 @@ class Merger:
     @property
     def complete(self) -> bool:
         """Whether every trial has every slot."""
-        done = (tally.done == tally.slots for totals in self._totals for tally in totals.tallies.values())
+        done = (tally.done == tally.slots for run_tally in self._run_tallies for tally in run_tally.tallies.values())
         return self.trials == self._scenario.trials and all(done)
 
     @np.errstate(over="ignore")
@@ -273,7 +273,7 @@ class Merger:
         """Add the next batch; writes its digests and recorded trials if there is a writer."""
         for block in result.blocks:
             self.trials += block.trials
-            self._totals.append(block.totals)
+            self._run_tallies.append(block.run_tally)
             self._packets.append(block.packets)
             for name in self._scenario.receivers:
                 self._sums[name].add_trials(0, block.sums[name])
@@ -314,20 +314,20 @@ class Merger:
             writer.slot_rows(0, name, sums, expected[name][:count], quantiles[:count], covariances)
 
     @property
-    def totals(self) -> Totals:
-        """The totals of all added batches."""
-        return Totals.merged(self._totals)
+    def run_tally(self) -> RunTally:
+        """The tally of all added batches."""
+        return RunTally.merged(self._run_tallies)
 
     @property
-    def packets(self) -> PacketCounts:
+    def packets(self) -> PacketTally:
         """The counts of packets in all added batches, at least one; in exact mode only."""
-        return PacketCounts.merged(self._packets)
+        return PacketTally.merged(self._packets)
 
     @np.errstate(over="ignore", invalid="ignore")
     def summary(self, ending: RunOutcome) -> Summary:
         """The summary of all added batches; fills in mode and events."""
-        totals = self.totals
+        run_tally = self.run_tally
         whole = self._whole and self.complete
         digests = {name: digest.hexadecimal if whole else None for name, digest in self._digests.items()}
-        events = events_of(self._scenario, min(tally.done for tally in totals.tallies.values()))
-        return summary_of(self._scenario, totals, digests, replace(ending, mode=self._mode.value, events=events))
+        events = events_of(self._scenario, min(tally.done for tally in run_tally.tallies.values()))
+        return summary_of(self._scenario, run_tally, digests, replace(ending, mode=self._mode.value, events=events))

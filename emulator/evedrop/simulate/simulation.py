@@ -36,7 +36,7 @@ from evedrop.score.closed_loop_tally import SolveTimes
 from evedrop.simulate.chunk import Chunk, ReceiverChunk
 from evedrop.simulate.exact import ExactSimulation, Roles
 from evedrop.simulate.guarded_classes import Guard
-from evedrop.simulate.packet_counts import PacketCounts
+from evedrop.simulate.packet_tally import PacketTally
 
 _CHUNK_NUMBERS = 64  # slots of a chunk times states: with 2000 trials side by side, a megabyte for each array
 
@@ -98,7 +98,7 @@ class Simulation:
         self.digests: dict[str, dict[int, Digests]] = {name: {} for name in scenario.digested}
         """Receiver, or controller → block number → digests, (R, 16); filled in exact mode only."""
         self.solve_times = SolveTimes()
-        self.packets = PacketCounts.zero(len(trials))
+        self.packets = PacketTally.zero(len(trials))
         """Counted in exact mode only."""
 
     def _informed(self, estimator: Receiver) -> Receiver:

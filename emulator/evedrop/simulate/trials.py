@@ -20,13 +20,13 @@ from evedrop.model.slot.account import Account, Accountant
 from evedrop.scenario.expected.expectations import KnownTraces, expected_traces_of
 from evedrop.scenario.tables import Scenario
 from evedrop.score.histogram import SlotHistograms
+from evedrop.score.run_tally import RunTally
 from evedrop.score.scorekeeper import Scorekeeper
 from evedrop.score.slots import Slots
 from evedrop.score.sums import SlotSums, slot_sums
-from evedrop.score.totals import Totals
 from evedrop.simulate.chunk import Chunk
 from evedrop.simulate.kept_tasks import KeptTasks
-from evedrop.simulate.packet_counts import PacketCounts
+from evedrop.simulate.packet_tally import PacketTally
 from evedrop.simulate.simulation import Mode, Simulation
 from evedrop.simulate.tasks import OnProgress, Stopped, Task
 
@@ -45,10 +45,10 @@ class TrialBlock:
     start: int
     trials: int
     sums: dict[str, SlotSums]
-    totals: Totals
+    run_tally: RunTally
     accountants: dict[str, Accountant]
     digests: dict[str, dict[int, Digests]]
-    packets: PacketCounts
+    packets: PacketTally
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class BatchResult:
     @property
     def complete(self) -> bool:
         """Whether every trial has every slot."""
-        return all(tally.done == tally.slots for block in self.blocks for tally in block.totals.tallies.values())
+        return all(tally.done == tally.slots for block in self.blocks for tally in block.run_tally.tallies.values())
 
 
 @final
@@ -85,7 +85,7 @@ class TrialsTask(Task[BatchResult]):
         expected = {name: np.zeros(scenario.slots) for name in scenario.receivers}
         histograms = {name: SlotHistograms(1, 1.0) for name in scenario.receivers}
         (block, _) = _empty_block(scenario, self, self.start, expected)
-        block.totals.begin()
+        block.run_tally.begin()
         return BatchResult(self.start, [block], histograms, histograms, [Slots.example(scenario.receivers)])
 
 
@@ -153,7 +153,7 @@ def carry_out(task: TrialsTask, on_progress: OnProgress, stopped: Stopped) -> Ba
         if stopped():
             break
     # All trials of the task were simulated side by side, so each decision was for all of them.
-    result.blocks[0].totals.solve_times.merge(simulation.solve_times)
+    result.blocks[0].run_tally.solve_times.merge(simulation.solve_times)
     for block in result.blocks:
         rows = slice(block.start - task.start, block.start - task.start + block.trials)
         block.packets.add_counts(simulation.packets.part(rows))
@@ -173,10 +173,10 @@ def _empty_block(
         start,
         trials,
         {name: SlotSums.zero(scenario.slots) for name in names},
-        keeper.totals if task.mode is Mode.EXACT else Totals.nothing(scenario, trials),
+        keeper.run_tally if task.mode is Mode.EXACT else RunTally.nothing(scenario, trials),
         {name: Accountant(scenario.window(name), trials) for name in names},
         {},
-        PacketCounts.zero(trials),
+        PacketTally.zero(trials),
     )
     return block, keeper
 
@@ -201,7 +201,7 @@ def _score(block: TrialBlock, keeper: Scorekeeper, rows: slice, chunk: Chunk, sl
             late_delivered=account.late,
             unsent=account.unsent,
         )
-        keeper.totals.tallies[name].count(account)
+        keeper.run_tally.tallies[name].count(account)
     known = {name: (one.error[:, rows], one.trace[:, rows]) for name, one in chunk.receivers.items()}
     for name, scored in keeper.add_slots(replace(part, receivers=receivers), known).items():
         block.sums[name].add_trials(chunk.first, scored.sums)
@@ -216,7 +216,7 @@ def _add(block: TrialBlock, mode: Mode, rows: slice, chunk: Chunk, expected: Map
         if one.error is not one.trace:
             sums = slot_sums(error, action, np.stack([trace.sum(axis=1), (trace * trace).sum(axis=1)], axis=1))
         block.sums[name].add_trials(chunk.first, sums)
-        tally = block.totals.tallies[name]
+        tally = block.run_tally.tallies[name]
         tally.watched.add_slots(ScoredSlots(chunk.first, error, action, sums.trace, expected[name]))
         tally.add_slots(chunk.first, error, sums, expected[name])
         if (

@@ -41,7 +41,7 @@ from evedrop.score.scorekeeper import verdicts
 from evedrop.score.sums import Tally, trial_means
 from evedrop.simulate.kept_tasks import kept_tasks, study_of
 from evedrop.simulate.montecarlo import Merger, Plan, progress_counter
-from evedrop.simulate.packet_counts import PacketCounts
+from evedrop.simulate.packet_tally import PacketTally
 from evedrop.simulate.simulation import Mode
 from evedrop.simulate.trials import BatchResult, tasks_of
 from evedrop.studies.matchups import Group, Matchups
@@ -128,9 +128,9 @@ def _comparison(matchups: Matchups, played: Sequence[tuple[Group, Merger]]) -> C
         groups = [(group, merger) for group, merger in played if group.scheme == scheme]
         cells = {one.adversary: Cell(one) for one in matchups.undefined if one.scheme == scheme}
         for group, merger in groups:
-            cells |= _cells(group, merger.totals.tallies)
+            cells |= _cells(group, merger.run_tally.tallies)
         scenario, merger = groups[0][0].scenario, groups[0][1]
-        user = merger.totals.tallies[LEGITIMATE]
+        user = merger.run_tally.tallies[LEGITIMATE]
         schemes[scheme] = SchemeResult(
             scheme,
             scenario.encoding.parameters,
@@ -154,7 +154,7 @@ def _cells(group: Group, totals: Mapping[str, Tally]) -> dict[str, Cell]:
     }
 
 
-def _needs(scenario: Scenario, packets: PacketCounts) -> Needs:
+def _needs(scenario: Scenario, packets: PacketTally) -> Needs:
     scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
     sent, encrypted = packets.sent / scenario.slots, packets.encrypted / scenario.slots
     of_trials = {
@@ -190,7 +190,7 @@ def _measured(scenario: Scenario, receiver: str, tally: Tally, expected: Expecta
     means = trial_means(tally)
     heavy = expected.infinite_variance
     error = None if heavy else standard_error(means)
-    mean, theory = MeanSquaredError.of_totals(tally), _theory(scenario, receiver, expected)
+    mean, theory = MeanSquaredError.of_tally(tally), _theory(scenario, receiver, expected)
     rare = None if expected.of_model else rare_events_of(expected, tally)
     exact = None if theory is None or theory.bound or expected.of_model else theory.mean
     return SimulatedError(

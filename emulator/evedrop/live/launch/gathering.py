@@ -37,9 +37,9 @@ from evedrop.results.writer import DIGESTS, ResultsWriter, write_summary
 from evedrop.scenario.progress_events import ConnectionOutage, RunEvent
 from evedrop.scenario.tables import Scenario
 from evedrop.score.expectations_held import replay_of
+from evedrop.score.run_tally import RunTally
 from evedrop.score.scorekeeper import RunOutcome, summary_of
 from evedrop.score.summary import Summary
-from evedrop.score.totals import Totals
 
 _RECORDING = "recording.rrd"
 
@@ -57,7 +57,7 @@ def gather(scenario: Scenario, folder: Path, shards: Sequence[Shard], started: f
         gathered.write([shard.folder / f"{name}.parquet" for shard in shards], folder / f"{name}.parquet")
     wall = 0.0 if started is None else time.monotonic() - started
     scores = [load_score(shard.folder, shard.scenario) for shard in shards]
-    totals = Totals.merged(scores)
+    run_tally = RunTally.merged(scores)
     replay = replay_of(folder, scenario)
     parts = _summaries(shards)
     ending = RunOutcome(
@@ -68,7 +68,7 @@ def gather(scenario: Scenario, folder: Path, shards: Sequence[Shard], started: f
         outages=_outages(parts),
         misdelivered=_misdelivered(parts),
     )
-    summary = summary_of(scenario, totals, digests, ending)
+    summary = summary_of(scenario, run_tally, digests, ending)
     write_summary(folder, summary)
     _tidy(folder, shards)
     return summary
@@ -113,7 +113,7 @@ def _blocks(shard: Shard, name: str) -> dict[int, Digests]:
     return {int(start): digests[starts == start] for start in np.unique(starts)}
 
 
-def _age_of_metrics(shards: Sequence[Shard], scores: Sequence[Totals], summaries: Mapping[int, Summary]) -> str:
+def _age_of_metrics(shards: Sequence[Shard], scores: Sequence[RunTally], summaries: Mapping[int, Summary]) -> str:
     """What `ended` adds about shards whose recorders were killed after their last metrics."""
     earlier = [
         f"slot {score.tallies[LEGITIMATE].done} in shard {shard.number}"

@@ -237,7 +237,7 @@ class RecordedRun:
         """The status of the run."""
         before, done = self._recent
         rate = (self._joiner.done - done) / max(time.monotonic() - before, 1e-3)
-        return status_of(self._scenario, self._joiner.done, rate, self._steering, conductor, self._keeper.totals)
+        return status_of(self._scenario, self._joiner.done, rate, self._steering, conductor, self._keeper.run_tally)
 
     def _take(self, conductor: Conductor, source: str, payload: bytes) -> None:
         message = Reader(conductor.keys[source], payload)
@@ -250,9 +250,9 @@ class RecordedRun:
             return
         if source == ROUTER:
             for name, account in self._joiner.add_journal(message).items():
-                self._keeper.totals.tallies[name].count(account)
+                self._keeper.run_tally.tallies[name].count(account)
         elif source == CONTROLLER:
-            self._keeper.totals.solve_times.add_seconds(self._joiner.add_decisions(message).tolist())
+            self._keeper.run_tally.solve_times.add_seconds(self._joiner.add_decisions(message).tolist())
         elif source != SENSOR and is_leaving(message):
             self._leave(source, message)
         elif source != SENSOR:
@@ -349,7 +349,7 @@ class RecordedRun:
     def _summary(self, how: str) -> Summary:
         if self._joiner.done == self._scenario.slots:
             for name, sums in self._joiner.trace_sums.items():
-                self._keeper.totals.tallies[name].know_traces(sums)
+                self._keeper.run_tally.tallies[name].know_traces(sums)
         digests = {name: digest_of(self._scenario, name, blocks) for name, blocks in self._joiner.digests.items()}
         replay, wall = replay_of(self.folder, self._scenario), self._ended - self._started
         ending = RunOutcome(
@@ -361,12 +361,12 @@ class RecordedRun:
             accused=self._accused,
             misdelivered=self._misdelivered,
         )
-        return summary_of(self._scenario, self._keeper.totals, digests, ending)
+        return summary_of(self._scenario, self._keeper.run_tally, digests, ending)
 
     def _dump_score(self) -> None:
         """Dump the score of a shard, for the summary of the whole run. Raises OSError."""
         if self._brief.part.shard:
-            dump_score(self._keeper.totals, self.folder, self._scenario)
+            dump_score(self._keeper.run_tally, self.folder, self._scenario)
 
     def settle(self, how: str) -> None:
         """Compute the summary, and save it and all rows to disk. Raises OSError if they cannot be written."""

@@ -10,14 +10,14 @@ from evedrop.live.recorder.conductor import Conductor
 from evedrop.live.recorder.steering import Steering
 from evedrop.model.metrics.links import LinkAccount
 from evedrop.scenario.tables import Scenario
-from evedrop.score.totals import Totals
+from evedrop.score.run_tally import RunTally
 
 
 def status_of(
-    scenario: Scenario, done: int, rate: float, steering: Steering, conductor: Conductor, totals: Totals
+    scenario: Scenario, done: int, rate: float, steering: Steering, conductor: Conductor, run_tally: RunTally
 ) -> RunStatus:
     """The status of a run; done: how many slots are scored; rate: slots per second."""
-    accounts = {name: LinkAccount.of(tally) for name, tally in totals.tallies.items()}
+    accounts = {name: LinkAccount.of(tally) for name, tally in run_tally.tallies.items()}
     return RunStatus(
         slot=done,
         slots=scenario.slots,

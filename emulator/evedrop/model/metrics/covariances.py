@@ -11,16 +11,16 @@ from evedrop.model.metrics.metric import (
     MeanMetric,
     MetricColumn,
     MetricTally,
-    ReceiverTotals,
+    ReceiverTally,
     ScoredSlots,
-    TotalsMetric,
-    TrialTotals,
+    TallyMetric,
+    TrialTally,
 )
 from evedrop.model.process import Floats
 
 
 @final
-class MeanTraceCovariance(MeanMetric, TotalsMetric):
+class MeanTraceCovariance(MeanMetric, TallyMetric):
     """The mean of tr P, where P is the covariance that the receiver believes."""
 
     meaning = "of tr P, the error covariance that the receiver believes"
@@ -31,14 +31,14 @@ class MeanTraceCovariance(MeanMetric, TotalsMetric):
     sweep_column = MetricColumn("believed tr P", 2)
 
     @classmethod
-    def of_totals(cls, totals: ReceiverTotals) -> float:
+    def of_tally(cls, tally: ReceiverTally) -> float:
         """Its mean over the run."""
-        return totals.trace / max(1, totals.offered)
+        return tally.trace / max(1, tally.offered)
 
     @classmethod
-    def sums_of_trials(cls, totals: TrialTotals) -> Floats | None:
+    def sums_of_trials(cls, tally: TrialTally) -> Floats | None:
         """The sum of tr P over the slots of every trial, (R,); None if not every trial's is known."""
-        return totals.trace
+        return tally.trace
 
     @staticmethod
     def values(slots: ScoredSlots) -> Floats:
@@ -47,7 +47,7 @@ class MeanTraceCovariance(MeanMetric, TotalsMetric):
 
 
 @final
-class ExpectedTraceCovariance(TotalsMetric):
+class ExpectedTraceCovariance(TallyMetric):
     """The mean trace of the actual error covariance that theory expects."""
 
     meaning = (
@@ -61,9 +61,9 @@ class ExpectedTraceCovariance(TotalsMetric):
     sweep_picture = "lines"
 
     @classmethod
-    def of_totals(cls, totals: ReceiverTotals) -> float:
+    def of_tally(cls, tally: ReceiverTally) -> float:
         """Its mean over the run; NaN without theory."""
-        return totals.expected_trace / max(1, totals.offered)
+        return tally.expected_trace / max(1, tally.offered)
 
     @classmethod
     def tally(cls, trials: int) -> MetricTally:

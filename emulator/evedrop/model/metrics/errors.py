@@ -8,15 +8,15 @@ from evedrop.model.metrics.metric import (
     COVARIANCE_ONLY,
     MeanMetric,
     MetricColumn,
-    ReceiverTotals,
+    ReceiverTally,
     ScoredSlots,
-    TotalsMetric,
-    TrialTotals,
+    TallyMetric,
+    TrialTally,
 )
 from evedrop.model.process import Floats
 
 
-class MeanError(MeanMetric, TotalsMetric):
+class MeanError(MeanMetric, TallyMetric):
     """The mean of the mode's error: |x − x̂|², or in a covariance-only study the trace of the actual covariance."""
 
     of_error = True
@@ -25,14 +25,14 @@ class MeanError(MeanMetric, TotalsMetric):
     sweep_picture = "marks"
 
     @classmethod
-    def of_totals(cls, totals: ReceiverTotals) -> float:
+    def of_tally(cls, tally: ReceiverTally) -> float:
         """Its mean over the run."""
-        return totals.error / max(1, totals.offered)
+        return tally.error / max(1, tally.offered)
 
     @classmethod
-    def sums_of_trials(cls, totals: TrialTotals) -> Floats | None:
+    def sums_of_trials(cls, tally: TrialTally) -> Floats | None:
         """Its sum over the slots of every trial, (R,)."""
-        return totals.error
+        return tally.error
 
     @staticmethod
     def values(slots: ScoredSlots) -> Floats:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Self
 
-from evedrop.model.metrics.metric import ReceiverTotals
+from evedrop.model.metrics.metric import ReceiverTally
 
 
 @dataclass(frozen=True)
@@ -23,14 +23,14 @@ class LinkAccount:
     """Packets for which the journal and another process disagree."""
 
     @classmethod
-    def of(cls, totals: ReceiverTotals) -> Self:
+    def of(cls, tally: ReceiverTally) -> Self:
         """The account of a receiver's link."""
         # In a run cut short, packets that are still under way count as lost; in a whole run, the router reports them itself.
-        lost = sum(totals.lost.values()) + max(0, totals.late_sent - totals.late)
-        delivered = totals.received + totals.late
-        offered = totals.offered - totals.unsent
+        lost = sum(tally.lost.values()) + max(0, tally.late_sent - tally.late)
+        delivered = tally.received + tally.late
+        offered = tally.offered - tally.unsent
         missing = abs(offered - delivered - lost)
-        return cls(offered, delivered, totals.late, lost, max(missing, totals.unexplained))
+        return cls(offered, delivered, tally.late, lost, max(missing, tally.unexplained))
 
 
 LINK_METRICS = (*(one.name for one in fields(LinkAccount)), "rate")

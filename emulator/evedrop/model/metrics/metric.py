@@ -66,7 +66,7 @@ class ScoredSlots:
 
 
 class MetricTally(ABC):
-    """A metric's totals over a set of trials, whose slots come in order. Pickled between processes.
+    """A metric's tally over a set of trials, whose slots come in order. Pickled between processes.
 
     A trial's numbers should be added slot by slot, so that they have the same bits however slots and trials were divided.
     """
@@ -78,7 +78,7 @@ class MetricTally(ABC):
     @classmethod
     @abstractmethod
     def merged(cls, parts: Sequence[Self]) -> Self:
-        """The totals of disjoint sets of trials, in their order."""
+        """The tally of disjoint sets of trials, in their order."""
 
     @property
     @abstractmethod
@@ -92,8 +92,8 @@ class MetricTally(ABC):
 
 
 @dataclass
-class TrialTotals:
-    """The totals of one receiver for each trial, (R,) each. Each entry is a sum over slots."""
+class TrialTally:
+    """The tally of one receiver for each trial, (R,) each. Each entry is a sum over slots."""
 
     error: Floats
     trace: Floats | None
@@ -104,8 +104,8 @@ class TrialTotals:
 
 
 @dataclass(kw_only=True)
-class ReceiverTotals:
-    """The totals of one receiver. Each entry is a sum over slots and trials."""
+class ReceiverTally:
+    """The tally of one receiver. Each entry is a sum over slots and trials."""
 
     offered: int = 0
     """Slots times trials: the packets that were sent, and the `unsent` ones."""
@@ -173,18 +173,18 @@ class Metric(ABC):
         """A tally of no slots yet, for this many trials. Expectations over some slots use it, too."""
 
 
-class TotalsMetric(Metric):
-    """A metric that is computed from `ReceiverTotals` for a whole run, without a tally."""
+class TallyMetric(Metric):
+    """A metric that is computed for a whole run from `ReceiverTally`, without a tally of its own."""
 
     @classmethod
     @abstractmethod
-    def of_totals(cls, totals: ReceiverTotals) -> float:
+    def of_tally(cls, tally: ReceiverTally) -> float:
         """The metric of a whole run; NaN if it has none."""
 
     @classmethod
-    def sums_of_trials(cls, totals: TrialTotals) -> Floats | None:
+    def sums_of_trials(cls, tally: TrialTally) -> Floats | None:
         """What it is the mean of, summed over the slots of every trial, (R,); None if that is not known."""
-        del totals
+        del tally
         return None
 
 

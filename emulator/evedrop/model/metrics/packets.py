@@ -9,17 +9,17 @@ import numpy as np
 from evedrop.model.metrics.metric import (
     MeanMetric,
     MetricColumn,
-    ReceiverTotals,
+    ReceiverTally,
     ScoredSlots,
-    TotalsMetric,
-    TrialTotals,
+    TallyMetric,
+    TrialTally,
 )
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action
 
 
 @final
-class ReceivedFraction(MeanMetric, TotalsMetric):
+class ReceivedFraction(MeanMetric, TallyMetric):
     """The fraction of packets that were received."""
 
     meaning = "packets received"
@@ -27,14 +27,14 @@ class ReceivedFraction(MeanMetric, TotalsMetric):
     column = MetricColumn("received", 0, ".4f")
 
     @classmethod
-    def of_totals(cls, totals: ReceiverTotals) -> float:
+    def of_tally(cls, tally: ReceiverTally) -> float:
         """The fraction over the run."""
-        return (totals.received + totals.late) / max(1, totals.offered)
+        return (tally.received + tally.late) / max(1, tally.offered)
 
     @classmethod
-    def sums_of_trials(cls, totals: TrialTotals) -> Floats | None:
+    def sums_of_trials(cls, tally: TrialTally) -> Floats | None:
         """Counts of packets received in every trial, (R,)."""
-        return totals.received.astype(np.float64)
+        return tally.received.astype(np.float64)
 
     @staticmethod
     def values(slots: ScoredSlots) -> Floats:
@@ -44,21 +44,21 @@ class ReceivedFraction(MeanMetric, TotalsMetric):
 
 
 @final
-class UsedFraction(MeanMetric, TotalsMetric):
+class UsedFraction(MeanMetric, TallyMetric):
     """The fraction of packets that were received and used."""
 
     meaning = "packets received and used"
     column = MetricColumn("used", 1, ".4f")
 
     @classmethod
-    def of_totals(cls, totals: ReceiverTotals) -> float:
+    def of_tally(cls, tally: ReceiverTally) -> float:
         """The fraction over the run."""
-        return (totals.used + totals.late_used) / max(1, totals.offered)
+        return (tally.used + tally.late_used) / max(1, tally.offered)
 
     @classmethod
-    def sums_of_trials(cls, totals: TrialTotals) -> Floats | None:
+    def sums_of_trials(cls, tally: TrialTally) -> Floats | None:
         """Counts of packets received and used in every trial, (R,)."""
-        return totals.used.astype(np.float64)
+        return tally.used.astype(np.float64)
 
     @staticmethod
     def values(slots: ScoredSlots) -> Floats:

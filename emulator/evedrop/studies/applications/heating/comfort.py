@@ -66,7 +66,7 @@ class _Range:
 
 @final
 class ComfortTally(ApplicationTally):
-    """A room's totals over a set of trials, whose slots come in order."""
+    """A room's tally over a set of trials, whose slots come in order."""
 
     def __init__(self, loop: ControlledPlant, table: ComfortTable, trials: int) -> None:
         self._range, self._plant = _Range(loop, table), loop.plant
@@ -90,7 +90,7 @@ class ComfortTally(ApplicationTally):
 
     @classmethod
     def merged(cls, parts: Sequence[Self]) -> Self:
-        """The totals of several sets of trials, in order."""
+        """The tally of several sets of trials, in order."""
         whole = copy(parts[0])
         for name in ("_outside", "_power", "_slots"):
             setattr(whole, name, np.concatenate([getattr(part, name) for part in parts]))
@@ -159,7 +159,7 @@ class Comfort(Application):
 
     @classmethod
     def tally(cls, loop: ControlledPlant, table: Table, trials: int) -> ComfortTally:
-        """Totals over no slots yet."""
+        """A tally over no slots yet."""
         return ComfortTally(loop, _room(table), trials)
 
     @classmethod

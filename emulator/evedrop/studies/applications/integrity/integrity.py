@@ -98,7 +98,7 @@ class Integrity(Application):
 
     @classmethod
     def tally(cls, loop: ControlledPlant, table: Table, trials: int) -> ApplicationTally:
-        """Totals over no slots yet."""
+        """A tally over no slots yet."""
         own, law = _own(table), loop_of(loop.assignment)
         policy, covariance = POLICIES[own.policy].of(own.parameters), own.covariance(loop.plant.inputs)
         spans = _spans(loop, own)

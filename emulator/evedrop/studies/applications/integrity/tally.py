@@ -50,7 +50,7 @@ class IntegrityCase:
 
 @final
 class IntegrityTally(ApplicationTally):
-    """Totals over a set of trials, whose slots come in order."""
+    """A tally over a set of trials, whose slots come in order."""
 
     def __init__(self, case: IntegrityCase, trials: int) -> None:
         self._case = case
@@ -102,7 +102,7 @@ class IntegrityTally(ApplicationTally):
 
     @classmethod
     def merged(cls, parts: Sequence[IntegrityTally]) -> IntegrityTally:
-        """The totals of several sets of trials, in order."""
+        """The tally of several sets of trials, in order."""
         whole = copy(parts[0])
         for name in ("_slots", "_first", "_marked", "_marked_before", "_cost"):
             setattr(whole, name, np.concatenate([getattr(part, name) for part in parts]))

@@ -64,7 +64,7 @@ class Household(Application):
 
     @classmethod
     def tally(cls, loop: ControlledPlant, table: Table, trials: int) -> HouseholdTally:
-        """Totals over no slots yet."""
+        """A tally over no slots yet."""
         return HouseholdTally(loop, _house(table), trials)
 
     @classmethod

@@ -71,7 +71,7 @@ class HousePower(PowerFeed):
 
 @final
 class HouseholdTally(ApplicationTally):
-    """A house's totals over a set of trials, whose slots come in order."""
+    """A house's tally over a set of trials, whose slots come in order."""
 
     def __init__(self, loop: ControlledPlant, table: HouseholdTable, trials: int) -> None:
         self._table = table
@@ -102,7 +102,7 @@ class HouseholdTally(ApplicationTally):
 
     @classmethod
     def merged(cls, parts: Sequence[Self]) -> Self:
-        """The totals of several sets of trials, in order. If some have fewer slots, guesses cover the slots that all have."""
+        """The tally of several sets of trials, in order. If some have fewer slots, guesses cover the slots that all have."""
         whole = copy(parts[0])
         whole.meter = Meter.of_all([part.meter for part in parts])
         whole.done = min(part.done for part in parts)

@@ -14,7 +14,7 @@ from evedrop.model.receiver import Flags
 
 @final
 @dataclass
-class PacketCounts:
+class PacketTally:
     """Counts over the slots of R trials."""
 
     sent: NDArray[np.int64]
@@ -23,12 +23,12 @@ class PacketCounts:
     """Those among them that were encrypted, (R,)."""
 
     @classmethod
-    def zero(cls, trials: int) -> PacketCounts:
+    def zero(cls, trials: int) -> PacketTally:
         """No packets yet."""
         return cls(np.zeros(trials, np.int64), np.zeros(trials, np.int64))
 
     @classmethod
-    def merged(cls, parts: Sequence[PacketCounts]) -> PacketCounts:
+    def merged(cls, parts: Sequence[PacketTally]) -> PacketTally:
         """The counts of several sets of trials, at least one, in order."""
         return cls(np.concatenate([one.sent for one in parts]), np.concatenate([one.encrypted for one in parts]))
 
@@ -41,11 +41,11 @@ class PacketCounts:
             encrypted = encrypted & sent
         self.encrypted += np.count_nonzero(encrypted, axis=0)
 
-    def add_counts(self, other: PacketCounts) -> None:
+    def add_counts(self, other: PacketTally) -> None:
         """Add the counts of further slots of the same trials."""
         self.sent += other.sent
         self.encrypted += other.encrypted
 
-    def part(self, trials: slice) -> PacketCounts:
+    def part(self, trials: slice) -> PacketTally:
         """The counts of some of the trials."""
-        return PacketCounts(self.sent[trials], self.encrypted[trials])
+        return PacketTally(self.sent[trials], self.encrypted[trials])

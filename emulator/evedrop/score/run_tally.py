@@ -1,4 +1,4 @@
-"""The totals of a set of trials, updated slot by slot, live or in memory; the summary is made from them."""
+"""The tally of a set of trials, updated slot by slot, live or in memory; the summary is made from them."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from evedrop.score.closed_loop_tally import LoopTally, SolveTimes
 from evedrop.score.conditional import conditional_error_of
 from evedrop.score.filtering import FilterTally
 from evedrop.score.leak import LeakTally, leak_is_known
-from evedrop.score.sums import DirectionErrors, Tally, merged
-from evedrop.score.watched import Watched, watches_of
+from evedrop.score.sums import DirectionTally, Tally, merged
+from evedrop.score.watched_tally import WatchedTally, watches_of
 
 
 @dataclass(frozen=True)
-class Totals:
-    """The totals of some trials. Those that do not concern receivers are None if the run or its mode does not have them."""
+class RunTally:
+    """The tallies of some trials. Those that do not concern receivers are None if the run or its mode does not have them."""
 
     tallies: Mapping[str, Tally]
     """Receiver → its tally."""
@@ -27,23 +27,23 @@ class Totals:
     solve_times: SolveTimes = field(default_factory=SolveTimes)
 
     @classmethod
-    def nothing(cls, scenario: Scenario, trials: int) -> Totals:
-        """Empty totals with tallies only: of trials without slots, or in a mode without states."""
+    def nothing(cls, scenario: Scenario, trials: int) -> RunTally:
+        """The empty tallies of receivers only: of trials without slots, or in a mode without states."""
         watches = watches_of(scenario)
         tallies = {
-            name: Tally(scenario.slots, trials, Watched(one, trials), cuts=scenario.outage_bounds(name))
+            name: Tally(scenario.slots, trials, WatchedTally(one, trials), cuts=scenario.outage_bounds(name))
             for name, one in watches.items()
         }
         for name, tally in tallies.items():
             tally.conditional = conditional_error_of(scenario, name, trials)
             for direction, v in scenario.process.directions_as_arrays.items():
-                tally.directions[direction] = DirectionErrors(v, scenario.slots, trials)
+                tally.directions[direction] = DirectionTally(v, scenario.slots, trials)
             tally.leak = LeakTally(trials) if leak_is_known(scenario, name) else None
         return cls(tallies)
 
     @classmethod
-    def from_scenario(cls, scenario: Scenario, trials: int) -> Totals:
-        """Empty totals of trials that are about to begin, in a mode with states."""
+    def from_scenario(cls, scenario: Scenario, trials: int) -> RunTally:
+        """An empty tally of trials that are about to begin, in a mode with states."""
         return cls(
             cls.nothing(scenario, trials).tallies,
             Detection(trials),
@@ -52,7 +52,7 @@ class Totals:
         )
 
     def begin(self) -> None:
-        """Make the tallies of packages' metrics now, not with the first slot: an example of all that totals consist of."""
+        """Make the tallies of packages' metrics now, not with the first slot: an example of all that a tally consists of."""
         for tally in self.tallies.values():
             tally.watched.begin()
 
@@ -62,8 +62,8 @@ class Totals:
         return [failure for tally in self.tallies.values() for failure in tally.watched.failures]
 
     @classmethod
-    def merged(cls, parts: Sequence[Totals]) -> Totals:
-        """The totals of disjoint sets of trials, in their order."""
+    def merged(cls, parts: Sequence[RunTally]) -> RunTally:
+        """The tally of disjoint sets of trials, in their order."""
         times = SolveTimes()
         for part in parts:
             times.merge(part.solve_times)

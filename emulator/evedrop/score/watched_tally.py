@@ -1,4 +1,4 @@
-"""Quantities of a receiver that its totals do not have: metrics over some slots, packages' metrics, when it was in step.
+"""Quantities of a receiver that its tally does not have: metrics over some slots, packages' metrics, when it was in step.
 
 They take a number for each trial and expectation. A trial's numbers are added slot by slot, so they have the same bits
 however its slots and the other trials were divided, live and in memory.
@@ -14,7 +14,7 @@ import numpy as np
 
 from evedrop.errors import NoAnswer
 from evedrop.model.metrics import METRICS, metric, metrics_of
-from evedrop.model.metrics.metric import MetricTally, ScoredSlots, TotalsMetric
+from evedrop.model.metrics.metric import MetricTally, ScoredSlots, TallyMetric
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action
 from evedrop.model.registry import place_of
@@ -45,7 +45,7 @@ class GuardedTally(MetricTally):
 
     @classmethod
     def merged(cls, parts: Sequence[GuardedTally]) -> GuardedTally:
-        """The totals of disjoint sets of trials, in their order."""
+        """The tally of disjoint sets of trials, in their order."""
         whole = cls(parts[0]._name, sum(part._trials for part in parts))
         whole.failure = next((part.failure for part in parts if part.failure), "")
         tallies = whole._asked(lambda: [part._begun for part in parts])
@@ -137,7 +137,7 @@ def watches_of(scenario: Scenario) -> dict[str, tuple[WatchedSlots, ...]]:
         own = [
             WatchedSlots(name, 0, scenario.slots)
             for name, one in metrics_of(receiver).items()
-            if not issubclass(one, TotalsMetric)
+            if not issubclass(one, TallyMetric)
         ]
         found[receiver] = tuple(dict.fromkeys([*own, *(watch for name, watch in wanted if name == receiver)]))
     return found
@@ -177,7 +177,7 @@ def _tally(what: str, trials: int) -> MetricTally:
 
 
 @final
-class Watched:
+class WatchedTally:
     """Keeps the tallies of these quantities over R trials."""
 
     def __init__(self, watches: Iterable[WatchedSlots], trials: int) -> None:
@@ -211,7 +211,7 @@ class Watched:
         return self._kept[watch]
 
     @classmethod
-    def merged(cls, parts: Sequence[Watched]) -> Watched:
+    def merged(cls, parts: Sequence[WatchedTally]) -> WatchedTally:
         """The quantities of disjoint sets of trials, in their order."""
         total = cls((), 0)
         total._kept = {
