@@ -40,7 +40,7 @@ initial_covariance = [[1.0, 0.0], [0.0, 1.0]]
 [legitimate]
 window = 3
 {more_of_legitimate}
-link = {{ quality = 0.8, delay = {{ model = "normal", mean = 1.0, deviation = 1.0 }}, duplicate = 0.1, corrupt = 0.02 }}
+link = {{ quality = 0.8, delay = {{ model = "normal", mean = 1.0, standard_deviation = 1.0 }}, duplicate = 0.1, corrupt = 0.02 }}
 [eavesdroppers.smart]
 strategy = "{strategy}"
 link = {{ loss = {{ model = "gilbert-elliott", p = 0.05, r = 0.3 }} }}

@@ -98,6 +98,7 @@ def test_no_two_test_files_have_the_same_name() -> None:
 GLOSSARY = ROOT / "docs" / "glossary.md"
 FORMER = {
     "Crossing": "WireFate",
+    "deviation": "standard_deviation",
     "figure": "metric",
     "figures": "metrics",
     "filter_noise_read": "replace_filter_noise",
@@ -123,6 +124,7 @@ FORMER = {
 }
 """Former word → the word of the glossary, or the name, in its place. Parts of names count: `open_rooms`, `openRooms`."""
 MEANT_OTHERWISE = {
+    "deviation": ("docs/glossary.md",),
     "figure": (
         "benchmarks/scale.py",
         "docs/errata.md",
@@ -148,14 +150,21 @@ MEANT_OTHERWISE = {
     ),
 }
 """Former word → the files in which it, or its plural, means something else: here a picture."""
-OTHER_TERMS = re.compile(r"evedrop figures|runs/figures|paper's figures")
-"""Terms that contain a former word, anywhere."""
+OTHER_TERMS = (
+    "deviation from",
+    "evedrop figures",
+    "paper's figures",
+    "permanent deviation",
+    "runs/figures",
+    "standard[ _]deviation",
+)
+"""Patterns of terms that contain a former word and stay, anywhere."""
 PROSE = [path for path in ROOT.glob("*.md") if path.name != "CHANGELOG.md"]
 
 
 def former_words(text: str) -> set[str]:
     """Those of the former words that a text has, as words or as parts of names."""
-    text = OTHER_TERMS.sub("", text)
+    text = re.sub("|".join(OTHER_TERMS), "", text)
     low = text.lower()
     return {word for word in FORMER if word.lower() in low and re.search(pattern_of(word), text)}
 

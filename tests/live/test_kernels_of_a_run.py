@@ -37,7 +37,7 @@ state_probability = 0.6
 
 [legitimate]
 window = 2
-link = { quality = 0.9, delay = { model = "normal", mean = 0.8, deviation = 0.5 } }
+link = { quality = 0.9, delay = { model = "normal", mean = 0.8, standard_deviation = 0.5 } }
 
 [eavesdroppers.naive]
 strategy = "saying:Eve"

@@ -124,8 +124,8 @@ def test_simulated_errors_agree_with_the_theory_of_bursts(every_model: Path, tmp
     judged = 0
     for i, slot in enumerate(table["slot"]):
         if slot % 20 == 0 and table["peer"][i] not in UNKNOWN:
-            deviation = table["mean_squared_error"][i] - table["expected_trace_covariance"][i]
-            assert abs(deviation) < 4.5 * table["standard_error"][i] + 1e-15, (slot, table["peer"][i])
+            difference = table["mean_squared_error"][i] - table["expected_trace_covariance"][i]
+            assert abs(difference) < 4.5 * table["standard_error"][i] + 1e-15, (slot, table["peer"][i])
             judged += 1
     assert judged == 7 * 5
 

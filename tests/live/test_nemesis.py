@@ -125,8 +125,8 @@ def test_faults_come_as_often_and_last_as_long_as_is_said() -> None:
     lengths = [(to or NEVER) - start for start, to, _ in spans[:-1]]
     gaps = [after[0] - (before[1] or NEVER) for before, after in pairwise(spans)]
     for found, mean in ((lengths, 12.0), (gaps, 30.0)):
-        deviation = (mean * (mean - 1.0)) ** 0.5
-        assert abs(sum(found) / len(found) - mean) < 5.0 * deviation / len(found) ** 0.5
+        standard_deviation = (mean * (mean - 1.0)) ** 0.5
+        assert abs(sum(found) / len(found) - mean) < 5.0 * standard_deviation / len(found) ** 0.5
         assert min(found) == 1
     kills = sum(kind == "kill" for _, _, kind in spans)
     assert abs(kills - len(spans) / 2) < 2.5 * len(spans) ** 0.5

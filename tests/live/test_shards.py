@@ -34,7 +34,7 @@ EVENTFUL: dict[str, Any] = {
     "first_trial": 11,
     "record_trials": 4,
     "legitimate__window": 2,
-    "legitimate__link": {"quality": 0.8, "delay": {"model": "normal", "mean": 0.5, "deviation": 1.0}},
+    "legitimate__link": {"quality": 0.8, "delay": {"model": "normal", "mean": 0.5, "standard_deviation": 1.0}},
     "event": [
         {"from": 40, "to": 130, "kill": "smart", "state": "last"},
         {"from": 50, "to": 60, "cut": "naive"},

@@ -26,9 +26,9 @@ def masked_in_words(process: Process, k: int, x: np.ndarray, trial: int) -> list
     words = Stream(KEY, range(trial, trial + 1), process.n).words(range(k, k + 1))[0, 0].tolist()
     found = []
     for i, word in enumerate(words):
-        deviation = float(np.sqrt(state_covariances(process, k + 1)[k, i, i]))
+        standard_deviation = float(np.sqrt(state_covariances(process, k + 1)[k, i, i]))
         H = 2.0**-200
-        while 16.0 * deviation >= H:
+        while 16.0 * standard_deviation >= H:
             H *= 2.0
         point = round(float(x[i]) * 2.0**52 / H)
         found.append((((point + 2**52 + (word >> 11)) % 2**53) - 2**52) * H / 2.0**52)

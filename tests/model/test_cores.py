@@ -44,7 +44,7 @@ PLANT = Plant(
     measurement_noise=0.01 * np.eye(2),
 )
 LINK: dict[str, Any] = {
-    "loss": {"model": "bernoulli", "quality": 0.7}, "delay": {"model": "normal", "mean": 1.2, "deviation": 1.0},
+    "loss": {"model": "bernoulli", "quality": 0.7}, "delay": {"model": "normal", "mean": 1.2, "standard_deviation": 1.0},
     "duplicate": 0.2,
 }  # fmt: skip
 SENSORS = [

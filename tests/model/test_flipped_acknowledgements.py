@@ -46,9 +46,9 @@ def test_a_flip_turns_each_acknowledgement_over_with_its_probability() -> None:
     """Independently in every slot and trial: δ = γ(1 − e) + (1 − γ)e, e of probability p within 4.5 standard errors."""
     gamma = np.arange(TRIALS) % 2 == 0
     flipped = arrived("flip", flip=FLIP) ^ gamma
-    deviation = np.sqrt(FLIP * (1 - FLIP) / (SLOTS * TRIALS / 2))
+    standard_deviation = np.sqrt(FLIP * (1 - FLIP) / (SLOTS * TRIALS / 2))
     for received in (gamma, ~gamma):
-        assert abs(flipped[:, received].mean() - FLIP) < 4.5 * deviation
+        assert abs(flipped[:, received].mean() - FLIP) < 4.5 * standard_deviation
     assert abs(np.corrcoef(flipped[1:].ravel(), flipped[:-1].ravel())[0, 1]) < 4.5 / np.sqrt(SLOTS * TRIALS)
     assert np.array_equal(arrived("flip", flip=1.0), np.broadcast_to(~gamma, flipped.shape))
     assert np.array_equal(arrived("flip", 0.7, flip=0.0), arrived("none", 0.7))

@@ -31,7 +31,7 @@ KEYS = stream_keys(5, ("process", "schedule", "noise", "coin"))
 MU_D = 0.5
 FULL = {
     "loss": {"model": "bernoulli", "quality": 0.8},
-    "delay": {"model": "normal", "mean": 1.5, "deviation": 1.5},
+    "delay": {"model": "normal", "mean": 1.5, "standard_deviation": 1.5},
     "duplicate": 0.3,
 }
 

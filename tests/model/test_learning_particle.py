@@ -152,7 +152,7 @@ def test_draws_have_the_law_of_the_posterior(knows: list[str]) -> None:
     else:
         assert found.mu_d.mean() == pytest.approx(0.6, abs=0.01)
         assert found.mu_d.std() == pytest.approx(np.sqrt(0.24 / 100.0), rel=0.1)
-    # The moments are about the new A: with it, the cross moments are those of the deviation.
+    # The moments are about the new A: with it, the cross moments are those of the difference.
     step = found.A - alike(A)
     assert np.allclose(after.cross, -np.einsum("ijr,jk->ikr", step, H))
 

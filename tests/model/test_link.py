@@ -21,7 +21,7 @@ PLAIN = {"loss": {"model": "bernoulli", "quality": 0.8}}
 BURSTS = {"loss": {"model": "gilbert-elliott", "p": 0.1, "r": 0.3, "good": 0.05, "bad": 0.9}}
 FULL = {
     **PLAIN,
-    "delay": {"model": "normal", "mean": 2.0, "deviation": 1.5},
+    "delay": {"model": "normal", "mean": 2.0, "standard_deviation": 1.5},
     "reorder": 0.1,
     "duplicate": 0.15,
     "corrupt": 0.05,
@@ -111,7 +111,7 @@ def reference(schedule: LinkSchedule, batch: Batch) -> tuple[np.ndarray, np.ndar
         for r in range(batch.trials):
             delay = wait
             if "delay" in setting and not chances[k, 1, r] < setting.get("reorder", 0.0):
-                delay += max(0.0, setting["delay"]["mean"] + setting["delay"]["deviation"] * numbers[k, r])
+                delay += max(0.0, setting["delay"]["mean"] + setting["delay"]["standard_deviation"] * numbers[k, r])
             delays[k, r] = arrives = math.floor(delay)
             away = [one.reason for one in schedule.outages if k < one.stop and k + arrives >= one.start]
             stops = (
@@ -188,7 +188,7 @@ def test_correlation_ties_losses_and_leaves_each_link_alone() -> None:
 
 SPECS: dict[str, dict[str, Any]] = {
     "constant": {"model": "constant", "value": 1.5},
-    "normal": {"model": "normal", "mean": 2.0, "deviation": 1.0},
+    "normal": {"model": "normal", "mean": 2.0, "standard_deviation": 1.0},
     "pareto": {"model": "pareto", "least": 0.7, "shape": 1.8},
     "trace": {"model": "trace", "values": [0.5, 2.0, 1.25]},
 }
@@ -215,7 +215,7 @@ def test_delays_have_the_law_they_say(name: str) -> None:
     ("model", "given_", "entries"),
     [
         ("constant", {"value": -1.0}, ["value"]),
-        ("normal", {"mean": math.nan, "deviation": "wide"}, ["mean", "deviation"]),
+        ("normal", {"mean": math.nan, "standard_deviation": "wide"}, ["mean", "standard_deviation"]),
         ("pareto", {"least": 1.0, "shape": 0.0}, ["shape"]),
         ("trace", {"values": []}, ["values"]),
         ("trace", {"values": [1.0, -2.0]}, ["values.1"]),

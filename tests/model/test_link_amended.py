@@ -12,7 +12,7 @@ BURSTS = {"model": "gilbert-elliott", "p": 0.2, "r": 0.4}
 COINS = {"model": "bernoulli", "quality": 0.6}
 DELAYED = {
     "loss": BURSTS,
-    "delay": {"model": "normal", "mean": 1.5, "deviation": 1.0},
+    "delay": {"model": "normal", "mean": 1.5, "standard_deviation": 1.0},
     "reorder": 0.2,
     "duplicate": 0.3,
 }

@@ -49,7 +49,7 @@ def traces(schedule: LinkSchedule) -> np.ndarray:
 PLAIN: dict[str, Any] = {"loss": {"model": "bernoulli", "quality": 0.6}}
 DELAYS = (
     {"model": "constant", "value": 2.0},
-    {"model": "normal", "mean": 1.5, "deviation": 1.0},
+    {"model": "normal", "mean": 1.5, "standard_deviation": 1.0},
     {"model": "pareto", "least": 0.4, "shape": 1.2},
 )
 
@@ -116,7 +116,7 @@ def test_a_receiver_that_goes_away(start: int, stop: int, keeps: bool) -> None:
 def test_a_chain_with_delays_is_a_chain_of_two_ends() -> None:
     """Bursts whose states are alike are not bursts, also with late packets; and a new chain begins in its own law."""
     alike = {"loss": {"model": "gilbert-elliott", "p": 0.1, "r": 0.3, "good": 0.4, "bad": 0.4}}
-    delay = {"delay": {"model": "normal", "mean": 1.5, "deviation": 1.0}}
+    delay = {"delay": {"model": "normal", "mean": 1.5, "standard_deviation": 1.0}}
     np.testing.assert_allclose(
         traces(LinkSchedule({**alike, **delay}, 4)), traces(LinkSchedule({**PLAIN, **delay}, 4)), rtol=1e-12
     )

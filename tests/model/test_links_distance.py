@@ -105,20 +105,20 @@ def test_a_million_packets_have_the_quality_of_their_slots(spec: dict[str, Any],
     assert np.abs(off).max() < 5.7
 
 
-@pytest.mark.parametrize("deviation", [0.0, 0.1, 1.0, 2.3, 6.9])
-def test_the_quality_is_exact(deviation: float) -> None:
-    """Compared with adaptive integration over the shadowing, deviations in nepers up to those of 30 dB: within 1e-11."""
-    for middle in np.linspace(-6.0 * deviation - 2.0, 4.0 * deviation + 2.0, 9):
+@pytest.mark.parametrize("standard_deviation", [0.0, 0.1, 1.0, 2.3, 6.9])
+def test_the_quality_is_exact(standard_deviation: float) -> None:
+    """Compared with adaptive integration over the shadowing, standard deviations in nepers up to those of 30 dB: within 1e-11."""
+    for middle in np.linspace(-6.0 * standard_deviation - 2.0, 4.0 * standard_deviation + 2.0, 9):
         needed = math.exp(middle)
-        if deviation == 0.0:
+        if standard_deviation == 0.0:
             expected = math.exp(-needed)
         else:
-            knee = float(np.clip(middle / deviation, -8.5, 8.5))
+            knee = float(np.clip(middle / standard_deviation, -8.5, 8.5))
             expected = quad(
-                lambda z, c=needed: math.exp(-c * math.exp(-deviation * z)) * stats.norm.pdf(z),
+                lambda z, c=needed: math.exp(-c * math.exp(-standard_deviation * z)) * stats.norm.pdf(z),
                 -9.0, 9.0, points=sorted({-8.9, knee, 8.9}), limit=500, epsabs=1e-14,
             )[0]  # fmt: skip
-        assert delivery_probability(np.array([needed]), deviation)[0] == pytest.approx(expected, abs=1e-11)
+        assert delivery_probability(np.array([needed]), standard_deviation)[0] == pytest.approx(expected, abs=1e-11)
 
 
 @pytest.mark.parametrize(

@@ -146,9 +146,9 @@ def test_the_rate_of_independent_losses_scatters_as_binomials_do() -> None:
     assert abs(rates.var() - expected) < 5 * expected * math.sqrt(2 / trials)
 
 
-def test_a_normal_delay_without_deviation_is_constant() -> None:
+def test_a_normal_delay_without_variance_is_constant() -> None:
     """It has arrived in the slot in which its mean ends, and never before."""
-    exact = delay_of({"model": "normal", "mean": 2.5, "deviation": 0.0})
+    exact = delay_of({"model": "normal", "mean": 2.5, "standard_deviation": 0.0})
     assert [exact.arrived(lag) for lag in range(4)] == [0.0, 0.0, 1.0, 1.0]
     assert exact.delays(0, np.array([[-3.0, 3.0]])).tolist() == [[2.5, 2.5]]
 

@@ -33,10 +33,12 @@ DITHER, MASK = stream_key(ROOT, "dither"), stream_key(ROOT, "mask")
 MU, MU_E, ARRIVES = 0.7, 0.6, 0.8
 
 
-def quantised_in_words(process: Process, k: int, x: float, i: int, trial: int, bits: int, deviations: float) -> float:
+def quantised_in_words(
+    process: Process, k: int, x: float, i: int, trial: int, bits: int, standard_deviations: float
+) -> float:
     """The value read of one state by docs/mathematics.md, from the words of the stream."""
     word = int(Stream(DITHER, range(trial, trial + 1), process.n).words(range(k, k + 1))[0, 0, i])
-    step = 2.0 * deviations * float(np.sqrt(state_covariances(process, k + 1)[k, i, i])) / 2.0**bits
+    step = 2.0 * standard_deviations * float(np.sqrt(state_covariances(process, k + 1)[k, i, i])) / 2.0**bits
     dither = ((word >> 11) / 2.0**53 - 0.5) * step
     level = min(max(int(np.floor((x + dither) / step)), -(2 ** (bits - 1))), 2 ** (bits - 1) - 1)
     return float((level + 0.5) * step - dither)
@@ -65,8 +67,8 @@ def test_the_error_is_white_and_uniform_whatever_the_state_is() -> None:
     """Of 20,000 trials with one state, and with normal ones: uniform over a step (p > 1e-4), and uncorrelated with the state."""
     trials = 20_000
     quantiser = DitheredQuantiser(STABLE, 3, 6.0, DITHER, Batch(4, trials))
-    deviations = np.sqrt(np.diag(state_covariances(STABLE, 4)[3]))[:, None]
-    for x in (np.full((2, trials), 0.3) * deviations, np.random.default_rng(1).normal(size=(2, trials)) * deviations):
+    scale = np.sqrt(np.diag(state_covariances(STABLE, 4)[3]))[:, None]
+    for x in (np.full((2, trials), 0.3) * scale, np.random.default_rng(1).normal(size=(2, trials)) * scale):
         error = (quantiser.read(3, quantiser.levels(3, x)) - x) / quantiser.steps(3)[:, None]
         for one, state in zip(error, x, strict=True):
             assert stats.kstest(one, "uniform", args=(-0.5, 1.0)).pvalue > 1e-4

@@ -175,9 +175,9 @@ def test_before_the_leak_it_is_half_way_between_the_tracks(process: Process) -> 
     """At least ½ tr A^k Σ0 A^kᵀ in the mean and, as soon as it has heard both tracks, no more; at five standard errors."""
     batch = Batch(15, 4000)
     found, bound = errors(believed(process, batch, coins(0.9, 15, 4000), 14)), twin_track_bound(process, 15)
-    mean, deviation = found.mean(axis=1), found.std(axis=1) / np.sqrt(4000)
-    assert np.all(mean[:14] + 5.0 * deviation[:14] > bound[:14])
-    assert np.all(mean[8:14] - 5.0 * deviation[8:14] < 1.01 * bound[8:14])
+    mean, error = found.mean(axis=1), found.std(axis=1) / np.sqrt(4000)
+    assert np.all(mean[:14] + 5.0 * error[:14] > bound[:14])
+    assert np.all(mean[8:14] - 5.0 * error[8:14] < 1.01 * bound[8:14])
     assert not found[14].any()
 
 

@@ -36,8 +36,8 @@ def test_errors_are_the_closed_form() -> None:
     ):
         expected = np.trace(expected_covariances(DRIFTING, outcomes, slots), axis1=1, axis2=2)
         for found in (played.squared_error(name), played.trace(name)):
-            deviation = np.abs(found.mean(1) - expected)
-            assert (deviation < 5.0 * found.std(1) / np.sqrt(trials) + 1e-15).all()
+            difference = np.abs(found.mean(1) - expected)
+            assert (difference < 5.0 * found.std(1) / np.sqrt(trials) + 1e-15).all()
 
 
 def test_the_limit_is_the_papers() -> None:

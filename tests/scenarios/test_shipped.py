@@ -156,8 +156,8 @@ def test_simulated_errors_agree_with_theory(tmp_path: Path) -> None:
     judged = 0
     for i, slot in enumerate(table["slot"]):
         if slot % 20 == 0:
-            deviation = table["mean_squared_error"][i] - table["expected_trace_covariance"][i]
-            assert abs(deviation) < 4.5 * table["standard_error"][i] + 1e-15, (slot, table["peer"][i])
+            difference = table["mean_squared_error"][i] - table["expected_trace_covariance"][i]
+            assert abs(difference) < 4.5 * table["standard_error"][i] + 1e-15, (slot, table["peer"][i])
             judged += 1
     assert judged == 12 * len(receivers)
     for name, metrics in receivers.items():

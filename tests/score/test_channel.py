@@ -33,7 +33,7 @@ LINKS: dict[str, dict[str, Any]] = {
             "shadowing_block": 20,
         }
     },
-    "slow": {"quality": 0.8, "delay": {"model": "normal", "mean": 2.0, "deviation": 1.0}},
+    "slow": {"quality": 0.8, "delay": {"model": "normal", "mean": 2.0, "standard_deviation": 1.0}},
     "narrow": {"quality": 0.8, "rate": 0.7, "queue": 4},
     "never": {"quality": 0.0},
     "always": {"quality": 1.0},

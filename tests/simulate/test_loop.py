@@ -124,7 +124,7 @@ LIVE: dict[str, dict[str, Any]] = {
         "trials": 3,
         "legitimate__knows_input": True,
         "legitimate__window": 3,
-        "legitimate__link": {"quality": 0.8, "delay": {"model": "normal", "mean": 1.0, "deviation": 1.0}},
+        "legitimate__link": {"quality": 0.8, "delay": {"model": "normal", "mean": 1.0, "standard_deviation": 1.0}},
         "event": [{"from": 101, "to": 120, "cut": "legitimate"}, {"from": 150, "to": 160, "kill": "smart"}],
     },
 }
@@ -317,7 +317,7 @@ def test_inputs_are_held_between_decisions(tmp_path: Path) -> None:
 
 def test_late_packets_are_followed_with_the_inputs(tmp_path: Path) -> None:
     """A window that goes back over slots with inputs: without noise and disturbances, a receiver with them soon knows all."""
-    link = {"quality": 0.9, "delay": {"model": "normal", "mean": 1.0, "deviation": 1.0}}
+    link = {"quality": 0.9, "delay": {"model": "normal", "mean": 1.0, "standard_deviation": 1.0}}
     late = {}
     for knows in (False, True):
         changes: dict[str, Any] = {"legitimate__link": link, "legitimate__window": 4, "legitimate__knows_input": knows}

@@ -47,7 +47,7 @@ RUNS: dict[str, dict[str, Any]] = {
         "A": STABLE,
         "threshold": 1.5,
         "bits": 4,
-        "deviations": 6.0,
+        "standard_deviations": 6.0,
         "attack": {"attack": "hijack", "jammer": "ref"},
         "event": [PAUSE],
     },

@@ -61,7 +61,10 @@ ACKNOWLEDGED = {
 }
 """The unstable case of Lücke, Lu and Quevedo."""
 LATE: dict[str, Any] = {
-    "legitimate": {"link": {**BURSTS, "delay": {"model": "normal", "mean": 1.0, "deviation": 0.7}}, "window": 3},
+    "legitimate": {
+        "link": {**BURSTS, "delay": {"model": "normal", "mean": 1.0, "standard_deviation": 0.7}},
+        "window": 3,
+    },
     "eavesdroppers": {
         "wise": {"strategy": "bayesian", "link": {"quality": 0.9}},
         "coin": {"strategy": "suspicious", "use_state": 0.8, "use_innovation": 0.3, "link": {"quality": 0.9}},

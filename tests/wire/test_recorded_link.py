@@ -23,7 +23,7 @@ from tests.conftest import Evedrop
 
 SETTINGS = {
     "loss": {"model": "gilbert-elliott", "p": 0.05, "r": 0.3},
-    "delay": {"model": "normal", "mean": 0.02, "deviation": 0.003},
+    "delay": {"model": "normal", "mean": 0.02, "standard_deviation": 0.003},
     "duplicate": 0.05,
     "corrupt": 0.04,
 }
@@ -80,7 +80,7 @@ def test_the_models_of_a_link_are_found_again(tmp_path: Path) -> None:
     assert settings["loss"]["p"] == pytest.approx(0.05, abs=0.013)
     assert settings["loss"]["r"] == pytest.approx(0.3, abs=0.065)
     assert settings["delay"]["mean"] == pytest.approx(0.02, abs=2e-4)
-    assert settings["delay"]["deviation"] == pytest.approx(0.003, abs=2e-4)
+    assert settings["delay"]["standard_deviation"] == pytest.approx(0.003, abs=2e-4)
     assert settings["duplicate"] == pytest.approx(0.05, abs=0.013)
     whole = len(found.recording.delays)  # of the delivered messages that were not damaged, which alone arrive twice
     assert settings["duplicate"] == pytest.approx(found.recording.series.repeated / whole, rel=0.005)

@@ -42,7 +42,7 @@ def test_the_example(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
         "  side  base      tcp/127.0.0.1:7449",
         "  side  listener  tcp/127.0.0.1:7450",
         '  link  scan      robot → base  robot/scan/**  loss = { model = "gilbert-elliott", p = 0.01, r = 0.2 }, '
-        'rate = 2000000.0, queue = 256000, delay = { model = "normal", mean = 0.02, deviation = 0.005 }',
+        'rate = 2000000.0, queue = 256000, delay = { model = "normal", mean = 0.02, standard_deviation = 0.005 }',
         '  link  radio     robot → base  **  loss = { model = "bernoulli", quality = 0.5 }, '
         'delay = { model = "constant", value = 0.01 }',
         '  link  orders    base → robot  **  loss = { model = "bernoulli", quality = 0.99 }',

@@ -55,7 +55,7 @@ def test_a_delayed_message_comes_later_and_in_order(tmp_path: Path) -> None:
 
 def test_messages_of_an_ordered_link_do_not_overtake_each_other(tmp_path: Path) -> None:
     """Although their delays differ by more than the time between them; without `ordered` some do."""
-    varying = {**PERFECT, "delay": {"model": "normal", "mean": 0.1, "deviation": 0.05}}
+    varying = {**PERFECT, "delay": {"model": "normal", "mean": 0.1, "standard_deviation": 0.05}}
     plan = plan_of(
         READY,
         link("robot", "base", varying, "in/**", name="in", ordered=True),

@@ -43,7 +43,7 @@ def test_the_example() -> None:
     assert [link.tap for link in plan.links] == [False, False, False, True]
     assert plan.named("scan").settings == {
         "loss": {"model": "gilbert-elliott", "p": 0.01, "r": 0.2},
-        "delay": {"model": "normal", "mean": 0.02, "deviation": 0.005},
+        "delay": {"model": "normal", "mean": 0.02, "standard_deviation": 0.005},
         "rate": 2e6,
         "queue": 256_000,
     }

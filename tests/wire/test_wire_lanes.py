@@ -160,7 +160,7 @@ def test_an_ordered_link_delays_a_message_as_long_as_the_one_before(
     """The losses, and the delays of messages that no earlier one holds up, are those of the same link without an order."""
     now = [100.0]
     monkeypatch.setattr("evedrop.wire.lanes.time", SimpleNamespace(monotonic=lambda: now[0]))
-    settings = {**LOSSY, "delay": {"model": "normal", "mean": 0.05, "deviation": 0.02}}
+    settings = {**LOSSY, "delay": {"model": "normal", "mean": 0.05, "standard_deviation": 0.02}}
     plan = plan_of(link("robot", "base", settings, ordered=True), link("base", "robot"))
     fates = KeyFates(plan.links[0], "scan", "put", plan.seed)
     with WireJournal(tmp_path, plan) as journal:

@@ -97,7 +97,7 @@ EVENTS = [
 
 def test_packets_have_the_fates_of_messages(tmp_path: Path) -> None:
     """With delays, faults, correlation, cuts and changes; live as in memory, and the results folder repeats the run."""
-    delay = {"model": "normal", "mean": "40 ms", "deviation": "30 ms"}
+    delay = {"model": "normal", "mean": "40 ms", "standard_deviation": "30 ms"}
     plan = wire(
         radio={"delay": delay, "duplicate": 0.05, "corrupt": 0.02, "reorder": 0.1},
         tap={"correlation": {"with": "radio", "strength": 0.5}},

@@ -113,7 +113,7 @@ DELAYED = """
 [[link]]
 from = "robot"
 to = "base"
-delay = { model = "normal", mean = "100 ms", deviation = "30 ms" }
+delay = { model = "normal", mean = "100 ms", standard_deviation = "30 ms" }
 """
 
 

@@ -162,8 +162,8 @@ def test_a_link_on_many_of_whose_messages_no_model_decides_is_judged_as_a_sample
     assert link.within_bounds is True
     assert link.bounds is not None
     # Of all messages the models let a binomial number through, and of those tried it is a sample: (1 + 1/4) times its variance.
-    deviation = math.sqrt(1.25 * quality * (1.0 - quality) / tried)
-    assert link.bounds[1] - link.bounds[0] == pytest.approx(2 * 2.576 * deviation, rel=0.03)
+    standard_deviation = math.sqrt(1.25 * quality * (1.0 - quality) / tried)
+    assert link.bounds[1] - link.bounds[0] == pytest.approx(2 * 2.576 * standard_deviation, rel=0.03)
 
 
 def test_what_no_model_decides_is_named_apart(tmp_path: Path) -> None:

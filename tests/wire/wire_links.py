@@ -15,7 +15,7 @@ LOSSES: dict[str, dict[str, Any]] = {
 }
 DELAYS: dict[str, dict[str, Any]] = {
     "constant": {"model": "constant", "value": 0.25},
-    "normal": {"model": "normal", "mean": 0.02, "deviation": 0.005},
+    "normal": {"model": "normal", "mean": 0.02, "standard_deviation": 0.005},
     "pareto": {"model": "pareto", "least": 0.01, "shape": 1.5},
     "trace": {"model": "trace", "values": [0.5, 2.0, 1.25]},
 }

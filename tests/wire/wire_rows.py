@@ -17,7 +17,7 @@ START = 1_800_000_000.0
 """When the wires of these tests start, in seconds since 1970."""
 
 BURSTS = {"model": "gilbert-elliott", "p": 0.03, "r": 0.2}
-NORMAL = {"model": "normal", "mean": 0.02, "deviation": 0.005}
+NORMAL = {"model": "normal", "mean": 0.02, "standard_deviation": 0.005}
 
 
 def plan_of(*links: tuple[str, str, str, Mapping[str, Any]]) -> WirePlan:

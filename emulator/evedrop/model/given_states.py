@@ -15,7 +15,7 @@ import numpy as np
 from evedrop.model.process import Floats, Process, product
 
 LARGEST = 1e100
-"""The largest deviation of a given state: its square, summed over trials, stays far within double precision."""
+"""The largest given state, as a deviation from the reference: the square, summed over trials, stays within double precision."""
 
 
 def deviations(levels: Floats, reference: Floats) -> Floats:

@@ -25,8 +25,10 @@ from evedrop.model.theory.horizon import UNIT_ROUNDOFF
 Slots = NDArray[np.int64]
 
 ROUNDING_OF_REFERENCES = 2.0**-44
-"""The deviation of the rounding of a packet with a reference, relative to the numbers that it is computed from."""
-_NEGLIGIBLE = 1e-75  # of the noise: the square of such a deviation is lost in rounding, and its own square in underflow
+"""The standard deviation of the rounding of a packet with a reference, relative to the numbers that it is computed from."""
+_NEGLIGIBLE = (
+    1e-75  # of the noise: the square of such a standard deviation is lost in rounding, and its own square in underflow
+)
 
 
 class Content(IntEnum):
@@ -151,7 +153,7 @@ class ReferenceReceiver(Receiver):
             after = after.replaced(some, self._filtered(k, known.taken(some), ~states, states, x[:, some]))
         X = np.zeros_like(after.X)
         for i in range(len(x)):
-            X[i, i] = UNIT_ROUNDOFF * (np.abs(x[i]) + self._code.deviation(k)[i])
+            X[i, i] = UNIT_ROUNDOFF * (np.abs(x[i]) + self._code.standard_deviation(k)[i])
         return Belief(x, np.zeros_like(belief.P), belief.action, after._replace(X=X))
 
     def _header(self, heard: Reception) -> tuple[Slots, Slots]:
@@ -179,7 +181,7 @@ class ReferenceReceiver(Receiver):
         top = np.where(state, X, X - R)
         if self._singular:
             # A direction without noise is known up to the rounding of x, r and z.
-            size = np.abs(x) + np.abs(r) + np.abs(z) + self._code.deviation(k)[:, None]
+            size = np.abs(x) + np.abs(r) + np.abs(z) + self._code.standard_deviation(k)[:, None]
             top = np.concatenate([top, ROUNDING_OF_REFERENCES * size[:, None, :] * np.eye(n)[:, :, None]], axis=1)
             R = np.concatenate([R, 0.0 * noise], axis=1)
         joint = np.concatenate([np.concatenate([noise, top], axis=1), np.concatenate([0.0 * noise, R], axis=1)])

@@ -20,7 +20,7 @@ NONE = -1
 """The reference slot of a packet that contains the state itself, because there is no reference."""
 _SLOTS_AT_ONCE = 64
 _NUMBERS_KEPT = 1 << 22  # of matrices L in memory, unless two blocks have more
-_LARGEST = 1e150  # a deviation of the state whose square is a double
+_LARGEST = 1e150  # a standard deviation of the state whose square is a double
 _OLDEST_KEPT = 1 << 12  # slots
 _WATCHED = 16  # references whose size is followed
 
@@ -51,7 +51,7 @@ class ReferenceCode:
         """L_k, (n, n), for k ≥ 1."""
         return self._block_of(k)[0][k % _SLOTS_AT_ONCE] if self.decorrelates else self._process.A
 
-    def deviation(self, k: int) -> Floats:
+    def standard_deviation(self, k: int) -> Floats:
         """The standard deviation of each entry of L_k x_{k−1}, (n,); 0 where L = A, whose rounding the horizon covers."""
         if not k or not self.decorrelates:
             return np.zeros(self._process.n)

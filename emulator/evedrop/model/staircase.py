@@ -24,9 +24,9 @@ NOT_REACHED = 2.0**-44
 REACHED = 2.0**-20
 """The same if it certainly is not. Double precision cannot tell what lies between the two."""
 ROUNDING = 2.0**-50
-"""The deviation of the rounding of a packet, relative to the numbers that it is computed from."""
+"""The standard deviation of the rounding of a packet, relative to the numbers that it is computed from."""
 _BY_CHANCE = 1e-6
-_DEVIATIONS = 40.0  # from the range, in deviations of rounding, at which a packet is outside of it
+_STANDARD_DEVIATIONS = 40.0  # from the range, in standard deviations of rounding, at which a packet is outside of it
 _REGULAR = 0.01 * 2.0**53  # a condition number of A up to which its inverse has correct digits
 _CHECKED_ONE_BY_ONE = 64  # slots; later ones whose number is a power of two, and the last
 
@@ -123,8 +123,8 @@ class Staircase:
         squared = L[:, :, 0] * L[:, :, 0]
         for j in range(1, L.shape[2]):
             squared += L[:, :, j] * L[:, :, j]
-        deviation = ROUNDING * product(self._errors, np.sqrt(squared).T.copy()).T
-        return np.ascontiguousarray(deviation * deviation)
+        standard_deviation = ROUNDING * product(self._errors, np.sqrt(squared).T.copy()).T
+        return np.ascontiguousarray(standard_deviation * standard_deviation)
 
     def outside(self, factor: Floats) -> Floats:
         """The part of a noise's factor (n, m) outside the range of Q, (l, m), relative to the numbers it is computed from."""
@@ -142,7 +142,7 @@ class Staircase:
         factors: L (c, n, n), with the covariances L Lᵀ of innovations; rounding: as from the method of that name, (c, n).
         """
         own = np.sqrt((factors[:, : self.later] ** 2).sum(axis=2))
-        near = _DEVIATIONS * np.sqrt(rounding[:, : self.later])
+        near = _STANDARD_DEVIATIONS * np.sqrt(rounding[:, : self.later])
         return bool((near > _BY_CHANCE * own).any())
 
 

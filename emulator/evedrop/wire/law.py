@@ -22,7 +22,7 @@ from evedrop.model.links.link import Chain, LossModel, count_variance
 from evedrop.model.process import Floats
 from evedrop.model.slot.link import NEVER, Change
 
-_DEVIATIONS = 2.5758293035489004  # of a normal variable, for 99 %
+_STANDARD_DEVIATIONS = 2.5758293035489004  # of a normal variable, for 99 %
 _AT_ONCE = 1 << 20
 
 
@@ -57,7 +57,7 @@ def expected(settings: Mapping[str, Any], changes: Iterable[Change], ranges: Ite
 
 def bounds(mean: float, variance: float, count: int) -> tuple[float, float]:
     """Between which numbers the deliveries among `count` messages are in 99 % of all wires."""
-    reach = _DEVIATIONS * math.sqrt(variance) + (0.5 if variance > 0.0 else 1e-6 * max(1.0, mean))
+    reach = _STANDARD_DEVIATIONS * math.sqrt(variance) + (0.5 if variance > 0.0 else 1e-6 * max(1.0, mean))
     return max(0.0, mean - reach), min(float(count), mean + reach)
 
 

@@ -26,7 +26,11 @@ LATE: dict[str, Any] = {
     "slots": SLOTS,
     "legitimate": {
         "window": 3,
-        "link": {"quality": 0.7, "duplicate": 0.3, "delay": {"model": "normal", "mean": 0.5, "deviation": 1.5}},
+        "link": {
+            "quality": 0.7,
+            "duplicate": 0.3,
+            "delay": {"model": "normal", "mean": 0.5, "standard_deviation": 1.5},
+        },
     },
     "eavesdroppers": {"eve": {"strategy": "smart", "link": {"quality": 0.05}}},
 }

@@ -221,7 +221,12 @@ def test_few_bursts_tell_nothing_of_the_fit(tmp_path: Path) -> None:
     [
         ("constant", np.full(500, 3.0), {"value": 3.0}, 0.0),
         ("constant", np.zeros(500), {"value": 0.0}, 0.0),
-        ("normal", 8.0 + 1.5 * np.random.default_rng(1).standard_normal(2000), {"mean": 8.0, "deviation": 1.5}, 0.15),
+        (
+            "normal",
+            8.0 + 1.5 * np.random.default_rng(1).standard_normal(2000),
+            {"mean": 8.0, "standard_deviation": 1.5},
+            0.15,
+        ),
         ("pareto", 2.0 * np.random.default_rng(1).random(2000) ** (-1 / 2.5), {"least": 2.0, "shape": 2.5}, 0.25),
     ],
 )

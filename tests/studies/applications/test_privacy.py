@@ -56,7 +56,7 @@ def test_detection_at_a_rate_of_false_alarms() -> None:
 
 
 def test_who_knows_nothing_is_a_coin() -> None:
-    """Scores that have nothing to do with the truth: ½, and as many found as are falsely alarmed, within four deviations."""
+    """Scores that have nothing to do with the truth: ½; found as often as falsely alarmed, within four standard deviations."""
     rng = np.random.default_rng(1)
     score, truth = rng.standard_normal(20_000), rng.random(20_000) < 0.2
     assert abs(area(score, truth) - 0.5) < 4 * (1 / (12 * 4000)) ** 0.5

@@ -14,30 +14,30 @@ from evedrop.model.process import Floats
 
 
 class Normal(DelayModel):
-    """Delays max(0, mean + deviation · N(0, 1)), independent, so packets may overtake each other.
+    """Delays max(0, mean + standard_deviation · N(0, 1)), independent, so packets may overtake each other.
 
     Source: docs/mathematics.md, late packets.
     """
 
-    parameters = MappingProxyType({"mean": 2.0, "deviation": 0.5})
-    lengths = ("mean", "deviation")
+    parameters = MappingProxyType({"mean": 2.0, "standard_deviation": 0.5})
+    lengths = ("mean", "standard_deviation")
     normal = True
 
-    def __init__(self, mean: float, deviation: float) -> None:
-        self._mean, self._deviation = float(mean), float(deviation)
+    def __init__(self, mean: float, standard_deviation: float) -> None:
+        self._mean, self._standard_deviation = float(mean), float(standard_deviation)
 
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
         """Neither length is negative."""
-        return length_mistakes(given, "mean", "deviation")
+        return length_mistakes(given, "mean", "standard_deviation")
 
     def delays(self, first: int, numbers: Floats) -> Floats:  # noqa: ARG002 - every slot alike
         """Each from a standard normal number."""
-        scattered: Floats = self._mean + self._deviation * numbers
+        scattered: Floats = self._mean + self._standard_deviation * numbers
         return np.maximum(0.0, scattered)
 
     def arrived(self, lag: int) -> float | None:
-        """Φ((lag + 1 − mean) / deviation)."""
-        if self._deviation == 0.0:
+        """Φ((lag + 1 − mean) / standard_deviation)."""
+        if self._standard_deviation == 0.0:
             return float(self._mean < lag + 1)
-        return 0.5 * math.erfc(-(lag + 1 - self._mean) / (self._deviation * math.sqrt(2.0)))
+        return 0.5 * math.erfc(-(lag + 1 - self._mean) / (self._standard_deviation * math.sqrt(2.0)))

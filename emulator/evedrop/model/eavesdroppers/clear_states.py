@@ -12,7 +12,9 @@ from evedrop.model.receiver import Action, Belief, Flags, Reception
 from evedrop.model.reference_code import initial_factor
 from evedrop.model.schemes.partial_encryption import INNOVATION_IN_CLEAR
 
-_NEGLIGIBLE = 1e-75  # of the noise: the square of such a deviation is lost in rounding, and its own square in underflow
+_NEGLIGIBLE = (
+    1e-75  # of the noise: the square of such a standard deviation is lost in rounding, and its own square in underflow
+)
 
 
 class ClearStates(PacketReader):

@@ -19,7 +19,9 @@ from evedrop.model.schedule import in_slot
 from evedrop.model.streams import Batch
 from evedrop.model.theory.leak import Leaks
 
-_NO_VARIANCE = 1e-300  # a packet in the range of a singular covariance is the state, unless it is 20 deviations away
+_NO_VARIANCE = (
+    1e-300  # a packet in the range of a singular covariance is the state, unless it is 20 standard deviations away
+)
 
 
 class Likelihood(PacketReader):

@@ -60,7 +60,7 @@ def drawn(
     """Parameters given the moments, and the moments about the new A; normals: (numbers_of(n), R).
 
     A | Q is normal about the regression's with the covariance Q ⊗ H⁻¹; the D of Q are scaled by χ² variables over their
-    means, and μ_d by a normal deviation of its logit.
+    means, and μ_d by a normal change of its logit.
     """
     n = len(theta.A)
     fitted, best = moments.most_likely(theta, scale, known.names)

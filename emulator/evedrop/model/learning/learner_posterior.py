@@ -19,7 +19,9 @@ from evedrop.model.receiver import Flags
 CAPACITY = 6
 """The most components of a trial's posterior."""
 _EARLY = 4  # packets whose mean square is the scale of all
-_FARTHEST = 4.0  # times the largest packet: no state and no deviation is taken to be larger, because A may be wrong
+_FARTHEST = (
+    4.0  # times the largest packet: no state and no standard deviation is taken to be larger, because A may be wrong
+)
 
 
 class LearnerPosterior(NamedTuple):
@@ -118,6 +120,6 @@ def bounded(x_hat: Floats, P: Floats, largest: Floats) -> tuple[Floats, Floats]:
     largest: the largest |z| of every state so far, (n, R).
     """
     bound = np.where(largest > 0.0, _FARTHEST * largest, 1e100)
-    deviation = np.sqrt(np.stack([P[i, i] for i in range(len(P))]))
-    share = np.where(deviation > bound, bound / np.maximum(deviation, bound), 1.0)
+    standard_deviation = np.sqrt(np.stack([P[i, i] for i in range(len(P))]))
+    share = np.where(standard_deviation > bound, bound / np.maximum(standard_deviation, bound), 1.0)
     return np.clip(x_hat, -bound, bound), P * (share[:, None] * share[None])

@@ -73,7 +73,7 @@ class Distance(LossModel):
         self._margin = (threshold - reference_snr) * _NEPER
         self._exponent = float(exponent)
         self._nearest = reference_distance * reference_distance
-        self._deviation = shadowing * _NEPER
+        self._standard_deviation = shadowing * _NEPER
         self._shadowing_block, self._fading_block = shadowing_block, fading_block
         self._fade: Floats | None = None  # of the current block, (R,)
         self._shadow: Floats | None = None
@@ -107,12 +107,12 @@ class Distance(LossModel):
     def quality(self) -> float:
         """The mean of `quality_at` over the slots up to the last waypoint, or over 4096 of them if there are more."""
         slots = np.unique(np.linspace(0, self._settled, min(_SAMPLE, self._settled + 1)).astype(np.int64))
-        return float(delivery_probability(self._needed(slots.astype(np.float64)), self._deviation).mean())
+        return float(delivery_probability(self._needed(slots.astype(np.float64)), self._standard_deviation).mean())
 
     @property
     def memoryless(self) -> bool:
         """Whether nothing is drawn for longer than a slot."""
-        return self._fading_block == 1 and (self._shadowing_block == 1 or self._deviation == 0.0)
+        return self._fading_block == 1 and (self._shadowing_block == 1 or self._standard_deviation == 0.0)
 
     @property
     def settles(self) -> bool:
@@ -124,14 +124,14 @@ class Distance(LossModel):
         needed, places = np.unique(
             self._needed(np.arange(slots.start, slots.stop, dtype=np.float64)), return_inverse=True
         )
-        return delivery_probability(needed, self._deviation)[places]
+        return delivery_probability(needed, self._standard_deviation)[places]
 
     def rate_variance(self, slots: range) -> float:
         """Exact where `fading_block` divides `shadowing_block` or there is no shadowing; otherwise an upper bound.
 
         The bound holds the shadowing for the least common multiple of both: sharing more only makes slots more alike.
         """
-        outer = math.lcm(self._fading_block, self._shadowing_block) if self._deviation else self._fading_block
+        outer = math.lcm(self._fading_block, self._shadowing_block) if self._standard_deviation else self._fading_block
         moving = range(slots.start, min(slots.stop, max(slots.start, -(-self._settled // outer) * outer)))
         resting = range(moving.stop, slots.stop)
         total = self._count_variance(moving, outer)
@@ -148,7 +148,7 @@ class Distance(LossModel):
         if not slots:
             return 0.0
         needed = self._needed(np.arange(slots.start, slots.stop, dtype=np.float64))
-        return count_variance(needed, slots.start, outer, self._fading_block, self._deviation)
+        return count_variance(needed, slots.start, outer, self._fading_block, self._standard_deviation)
 
     def fates(self, first: int, uniforms: Floats) -> Codes:
         """Lost where fading and shadowing together give less power than the slot needs."""
@@ -160,14 +160,14 @@ class Distance(LossModel):
         slots = range(first, first + len(uniforms))
         needed = self._needed(np.arange(slots.start, slots.stop, dtype=np.float64))
         power, self._fade = _held(slots, self._fading_block, uniforms[:, 0], self._fade, _exponential)
-        if self._deviation:
+        if self._standard_deviation:
             gain, self._shadow = _held(slots, self._shadowing_block, uniforms[:, 1], self._shadow, self._gain)
             power = power * gain
         return fates_of(power < needed[:, None])
 
     def _gain(self, u: Floats) -> Floats:
         """The shadowing's factor of the power: from the normal quantile of the upper 52 bits of a uniform number."""
-        return exp(self._deviation * normal_quantile((np.floor(u * 2.0**52) + 0.5) * 2.0**-52))
+        return exp(self._standard_deviation * normal_quantile((np.floor(u * 2.0**52) + 0.5) * 2.0**-52))
 
     def _needed(self, slots: Floats) -> Floats:
         """Power that fading and shadowing must give in each slot, (slots,), relative to its mean without shadowing."""

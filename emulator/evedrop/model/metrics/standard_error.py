@@ -113,8 +113,8 @@ def mean_skewness(of_trials: Floats) -> float:
 
 def _standardised(of_trials: Floats) -> Floats:
     """The distance of each trial from the mean in standard deviations, (R,)."""
-    mean, deviation = float(np.mean(of_trials)), float(np.std(of_trials))
-    return (of_trials - mean) / deviation if deviation > 0.0 else np.zeros(len(of_trials))
+    mean, standard_deviation = float(np.mean(of_trials)), float(np.std(of_trials))
+    return (of_trials - mean) / standard_deviation if standard_deviation > 0.0 else np.zeros(len(of_trials))
 
 
 def _student(freedom: float, t: float) -> float:

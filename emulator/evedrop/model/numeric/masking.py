@@ -14,7 +14,7 @@ from evedrop.model.numeric.state_variances import StateVariances
 from evedrop.model.process import Floats, Process
 from evedrop.model.streams import Ahead, Batch, BlockReader
 
-DEVIATIONS = 16.0
+STANDARD_DEVIATIONS = 16.0
 """The range extends at least this many standard deviations of the state to either side; beyond lies less than 2⁻¹⁸⁹."""
 _RANGE_BITS = 53  # so that every number of the range is a float64
 _HALF = 2**52
@@ -51,7 +51,7 @@ class Mask:
         exponent = self._exponent(k)[:, None]
         shift = _RANGE_BITS - 1 - exponent
         H = np.ldexp(1.0, exponent)
-        # A state beyond 16 deviations is clipped to the range, not wrapped.
+        # A state beyond 16 standard deviations is clipped to the range, not wrapped.
         points = np.rint(np.ldexp(np.minimum(np.maximum(values, -H), H), shift)).astype(np.int64)
         points = np.minimum(points, _HALF - 1)
         turned = (points + _HALF + sign * self._pad(k)) & (2 * _HALF - 1)
@@ -64,5 +64,5 @@ class Mask:
     def _exponent(self, k: int) -> NDArray[np.int32]:
         """The exponents of H in slot k, (n,); those of the last two slots are cached."""
         if k not in self._exponents:
-            self._exponents = {k: np.frexp(DEVIATIONS * np.sqrt(self._variances.at(k)))[1]}
+            self._exponents = {k: np.frexp(STANDARD_DEVIATIONS * np.sqrt(self._variances.at(k)))[1]}
         return self._exponents[k]

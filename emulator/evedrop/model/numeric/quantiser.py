@@ -21,15 +21,15 @@ MOST_BITS = 32
 class DitheredQuantiser:
     """Rounds a state plus dither to one of 2^bits levels; a reader of the level subtracts the dither.
 
-    State i of slot k has levels over [−H, H), H = `deviations` · √Σ_k[i, i], in steps Δ = 2H · 2^−bits. The dither d is uniform
-    on [−Δ/2, Δ/2). The value read differs from the state by a number that is uniform on (−Δ/2, Δ/2] and independent of the state,
-    as long as state plus dither lies in the range; beyond, it is cut to the last level (overload).
+    State i of slot k has levels over [−H, H), H = `standard_deviations` · √Σ_k[i, i], in steps Δ = 2H · 2^−bits. The dither d
+    is uniform on [−Δ/2, Δ/2). The value read differs from the state by a number that is uniform on (−Δ/2, Δ/2] and independent
+    of the state, as long as state plus dither lies in the range; beyond, it is cut to the last level (overload).
 
     Source: docs/mathematics.md, quantised packets.
     """
 
-    def __init__(self, process: Process, bits: int, deviations: float, key: bytes, batch: Batch) -> None:
-        self._bits, self._deviations = bits, deviations
+    def __init__(self, process: Process, bits: int, standard_deviations: float, key: bytes, batch: Batch) -> None:
+        self._bits, self._standard_deviations = bits, standard_deviations
         self._variances = StateVariances(process)
         self._steps: dict[int, Floats] = {}
         reader = BlockReader(key, batch, process.n)
@@ -38,7 +38,7 @@ class DitheredQuantiser:
     def steps(self, k: int) -> Floats:
         """Δ of every state in slot k, (n,)."""
         if k not in self._steps:
-            self._steps = {k: np.ldexp(self._deviations * np.sqrt(self._variances.at(k)), 1 - self._bits)}
+            self._steps = {k: np.ldexp(self._standard_deviations * np.sqrt(self._variances.at(k)), 1 - self._bits)}
         return self._steps[k]
 
     def levels(self, k: int, x: Floats) -> NDArray[np.int64]:

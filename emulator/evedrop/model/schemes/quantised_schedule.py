@@ -25,7 +25,7 @@ from evedrop.model.theory.closed_forms import always_sent
 from evedrop.model.theory.covariances import LARGEST_OPERATOR
 from evedrop.model.theory.quantisation import QuantisationError
 
-_WIDEST = 100.0  # deviations
+_WIDEST = 100.0  # standard deviations
 
 
 @final
@@ -106,7 +106,7 @@ class QuantisedSchedule(Scheme):
     best_reader = "selective"
     closed_forms = MappingProxyType({"legitimate": _always_read, "selective": _selective_form})
     meets_energy_budget = True
-    parameters = MappingProxyType({"threshold": 1.5, "bits": 8, "deviations": 6.0})
+    parameters = MappingProxyType({"threshold": 1.5, "bits": 8, "standard_deviations": 6.0})
     secret_streams = ("dither", "mask", "threshold")
     estimator_streams = ("dither", "mask")
     needs_acknowledgements = True
@@ -114,9 +114,9 @@ class QuantisedSchedule(Scheme):
     header = ("1 if encrypted, 0 if in clear",)
     secret_words = (0, 1)
 
-    def __init__(self, process: Process, threshold: float, bits: int, deviations: float) -> None:
+    def __init__(self, process: Process, threshold: float, bits: int, standard_deviations: float) -> None:
         super().__init__(process)
-        self.threshold, self._width, self._deviations = threshold, bits, deviations
+        self.threshold, self._width, self._standard_deviations = threshold, bits, standard_deviations
 
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -124,7 +124,7 @@ class QuantisedSchedule(Scheme):
         return [
             *number_mistakes(given, "threshold", 1.0, MOST_SLOTS),
             *count_mistakes(given, "bits", MOST_BITS),
-            *number_mistakes(given, "deviations", 1.0, _WIDEST),
+            *number_mistakes(given, "standard_deviations", 1.0, _WIDEST),
         ]
 
     @property
@@ -140,7 +140,7 @@ class QuantisedSchedule(Scheme):
     @property
     def quantisation(self) -> QuantisationError:
         """The error of the value read."""
-        return QuantisationError.of(self._width, self._deviations)
+        return QuantisationError.of(self._width, self._standard_deviations)
 
     def encrypted(self, packets: PacketBlock) -> Flags:
         """Those whose header says so, (c, R)."""
@@ -161,7 +161,7 @@ class QuantisedSchedule(Scheme):
         return QuantisedScheduleEstimator(self.process, batch.trials, *self._shared_parts(keys, batch))
 
     def _shared_parts(self, keys: Mapping[str, bytes], batch: Batch) -> tuple[DitheredQuantiser, LevelPad]:
-        quantiser = DitheredQuantiser(self.process, self._width, self._deviations, keys["dither"], batch)
+        quantiser = DitheredQuantiser(self.process, self._width, self._standard_deviations, keys["dither"], batch)
         return quantiser, LevelPad(self.process.n, self._width, keys["mask"], batch)
 
     def outcomes(self, mu: float) -> None:

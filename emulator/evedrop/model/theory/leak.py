@@ -25,7 +25,7 @@ from evedrop.model.staircase import Staircase
 from evedrop.model.streams import Ahead
 
 _SLOTS_AT_ONCE, _NUMBERS_AT_ONCE = 64, 1 << 16  # read ahead of need
-_AS_GOOD_AS_INFINITE = 1e60  # a deviation of the state, in those of the noise: its square is far from overflow
+_AS_GOOD_AS_INFINITE = 1e60  # a standard deviation of the state, in those of the noise: its square is far from overflow
 
 
 @final

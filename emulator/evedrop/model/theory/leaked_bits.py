@@ -23,7 +23,9 @@ from evedrop.model.kernels.elementary import cholesky
 from evedrop.model.process import Floats, Process, product
 from evedrop.model.theory.covariances import block_length
 
-_AS_GOOD_AS_INFINITE = 1e60  # a deviation of the state relative to the noise's, with which a packet reveals nothing
+_AS_GOOD_AS_INFINITE = (
+    1e60  # a standard deviation of the state relative to the noise's, with which a packet reveals nothing
+)
 
 
 @final

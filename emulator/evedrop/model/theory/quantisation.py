@@ -17,14 +17,14 @@ from evedrop.model.theory.covariances import NOBODY, limit, state_covariances
 @final
 @dataclass(frozen=True)
 class QuantisationError:
-    """White noise of covariance R_k = share · diag(Σ_k): the steps grow with the deviations of the states."""
+    """White noise of covariance R_k = share · diag(Σ_k): the steps grow with the standard deviations of the states."""
 
     share: float
 
     @classmethod
-    def of(cls, bits: int, deviations: float) -> QuantisationError:
-        """That of 2^bits steps over `deviations` standard deviations to either side: Δ²/12 each."""
-        return cls(deviations**2 / (3.0 * 4.0**bits))
+    def of(cls, bits: int, standard_deviations: float) -> QuantisationError:
+        """That of 2^bits steps over so many standard deviations to either side: Δ²/12 each."""
+        return cls(standard_deviations**2 / (3.0 * 4.0**bits))
 
     def covariances(self, process: Process, slots: int) -> Floats:
         """R_k for k = 0 … slots−1, (slots, n, n); inf from where Σ_k overflows."""

@@ -83,17 +83,17 @@ def delay_candidates(delays: Floats) -> list[Candidate]:
     count, least, mean = len(delays), float(delays.min()), float(delays.mean())
     if least == float(delays.max()):
         return [Candidate("constant", {"model": "constant", "value": rounded(least)}, 0.0, 1)]
-    deviation = float(delays.std())
-    spread = -0.5 * count * (math.log(2.0 * math.pi * deviation * deviation) + 1.0)
+    standard_deviation = float(delays.std())
+    spread = -0.5 * count * (math.log(2.0 * math.pi * standard_deviation * standard_deviation) + 1.0)
     found = [
         Candidate(
             "normal",
-            {"model": "normal", "mean": rounded(mean), "deviation": rounded(deviation)},
+            {"model": "normal", "mean": rounded(mean), "standard_deviation": rounded(standard_deviation)},
             spread,
             2,
             {
-                "mean": normal_interval(mean, deviation / math.sqrt(count)),
-                "deviation": normal_interval(deviation, deviation / math.sqrt(2.0 * count)),
+                "mean": normal_interval(mean, standard_deviation / math.sqrt(count)),
+                "standard_deviation": normal_interval(standard_deviation, standard_deviation / math.sqrt(2.0 * count)),
             },
         )
     ]

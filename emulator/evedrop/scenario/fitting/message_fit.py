@@ -79,7 +79,7 @@ class MessageFit:
         }
 
 
-_IN_SECONDS = frozenset({"value", "mean", "deviation", "least"})
+_IN_SECONDS = frozenset({"value", "mean", "standard_deviation", "least"})
 """The parameters of delay models that are times."""
 
 
