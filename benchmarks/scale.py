@@ -165,7 +165,7 @@ def named(power: float) -> str:
     return words[int(np.searchsorted((-0.1, 0.1, 0.9, 1.1), power))]
 
 
-def laws(runs: list[MeasuredRun]) -> None:
+def growth(runs: list[MeasuredRun]) -> None:
     """Growth along each axis, and what a slot costs."""
     alone = [run for run in runs if run.shards == 1]
     axes = {"trials": sorted({run.trials for run in alone}), "receivers": sorted({run.receivers for run in alone})}
@@ -189,10 +189,10 @@ def laws(runs: list[MeasuredRun]) -> None:
             ("memory is", [run.megabytes for run in alone], "MB"),
         ):
             weights = 1.0 / np.array(values)  # relative errors
-            law, *_ = np.linalg.lstsq(terms * weights[:, None], np.ones(len(alone)), rcond=None)
-            off = float(np.max(np.abs(terms @ law * weights - 1.0)))
+            fit, *_ = np.linalg.lstsq(terms * weights[:, None], np.ones(len(alone)), rcond=None)
+            off = float(np.max(np.abs(terms @ fit * weights - 1.0)))
             print(
-                f"{subject} about {law[0]:.3g} + {law[1]:.3g} · receivers + {law[2]:.3g} · trials + {law[3]:.3g} · trials · "
+                f"{subject} about {fit[0]:.3g} + {fit[1]:.3g} · receivers + {fit[2]:.3g} · trials + {fit[3]:.3g} · trials · "
                 f"receivers {unit}, within {100 * off:.0f} %"
             )
 
@@ -261,7 +261,7 @@ def main(quick: bool, picture: Path | None) -> None:
             f"{run.rate:>13,.0f} {run.cost:>9.3f} {run.cores:>11.2f}  {run.busiest:<11} {run.share:.2f} {run.megabytes:>9,.0f}",
             flush=True,
         )
-    laws(runs)
+    growth(runs)
     print(f"load after: {load_now()}")
     if picture is not None:
         draw(runs, picture)

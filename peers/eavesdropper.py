@@ -18,9 +18,9 @@ from evedrop.scenario.conformance.problems import Problem
 def eavesdrop(brief: Brief[EavesdropperPart], connect: Callable[[AnyBrief], ProcessSession] = Session) -> None:
     """Run the eavesdropper of a brief; connect: opens its session."""
     strategy, parameters = brief.part.strategy, brief.part.parameters
-    model, law = brief.model, brief.part.noise_law
+    model, distribution = brief.model, brief.part.noise_distribution
     mu_d, mu_d_of_slots = model.state_probability, model.state_probabilities
-    knowledge = Knowledge(model.process, mu_d, parameters, brief.stream_keys, mu_d_of_slots, law)
+    knowledge = Knowledge(model.process, mu_d, parameters, brief.stream_keys, mu_d_of_slots, distribution)
     receiver = STRATEGIES.imported(strategy)(knowledge, brief.batch)
     problem = Problem(model.process, brief.batch)
     follow(brief, checked_eavesdropper(receiver, brief.process, strategy, parameters, problem), connect=connect)

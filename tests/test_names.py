@@ -107,6 +107,8 @@ FORMER = {
     "funnel": "callback subscription",
     "heeding": "heed rule",
     "launcher_news": "launcher_pipe, launcher_events",
+    "law": "distribution",
+    "laws": "distributions",
     "lifeline": "watchdog",
     "look_seconds": "poll_seconds",
     "observer": "recorder",
@@ -155,6 +157,7 @@ OTHER_TERMS = (
     "evedrop figures",
     "paper's figures",
     "permanent deviation",
+    "power[- ]law",
     "runs/figures",
     "standard[ _]deviation",
 )

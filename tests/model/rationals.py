@@ -135,19 +135,19 @@ def behind_a_chain(
     Q: Matrix,
     initial: Matrix,
     transitions: Matrix,
-    law: Sequence[Fraction],
+    distribution: Sequence[Fraction],
     odds: Sequence[Callable[[str], Fraction]],
     slots: int,
 ) -> list[Fraction]:
     """Tr E P_k of a receiver behind a link that follows a Markov chain, by its states; odds: of every state."""
     sigmas = state_covariances(A, Q, initial)
     before = next(sigmas)
-    parts = [combined((one("initial") * p, initial)) for one, p in zip(odds, law, strict=True)]
+    parts = [combined((one("initial") * p, initial)) for one, p in zip(odds, distribution, strict=True)]
     found = [sum((trace(part) for part in parts), Fraction(0))]
     while len(found) < slots:
         sigma = next(sigmas)
         after = []
-        for s, (one, p) in enumerate(zip(odds, law, strict=True)):
+        for s, (one, p) in enumerate(zip(odds, distribution, strict=True)):
             mixed = combined(*((transitions[r][s], part) for r, part in enumerate(parts)))
             kept = one("predicted") + one("decoded") + one("leaked")
             terms = [

@@ -161,7 +161,7 @@ def test_a_betrayed_state_is_a_reference_like_any_other() -> None:
     assert np.allclose(belief.x_hat, x[k + 1], rtol=1e-12)
 
 
-def test_a_receiver_that_begins_later_knows_the_states_law() -> None:
+def test_a_receiver_that_begins_later_knows_the_states_distribution() -> None:
     """Before slot 5 the factor of its knowledge is that of its covariance in slot 4; it follows references since then."""
     for process in (UNSTABLE, STABLE):
         receiver = ReferenceReceiver(process, 2)

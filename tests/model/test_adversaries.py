@@ -101,8 +101,8 @@ def test_pooled_links_deliver_what_any_delivers(links: tuple[dict[str, Any], ...
     pool = loss_of(spec)
     assert pool.quality == pytest.approx(1.0 - np.prod([1.0 - model.quality for model in models]))
     assert pool.chain is not None
-    assert pool.chain.law @ pool.chain.quality == pytest.approx(pool.quality)
-    assert pool.chain.law @ pool.chain.transitions == pytest.approx(pool.chain.law)
+    assert pool.chain.stationary @ pool.chain.quality == pytest.approx(pool.quality)
+    assert pool.chain.stationary @ pool.chain.transitions == pytest.approx(pool.chain.stationary)
     # Bursts of two slots or so: the 400 slots of a trial count as 100 independent ones at least.
     assert abs(delivered.mean() - pool.quality) < 4.5 * np.sqrt(pool.quality * (1.0 - pool.quality) / (200 * 100))
 

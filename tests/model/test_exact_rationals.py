@@ -18,7 +18,7 @@ from evedrop.model.links.link import Chain
 from evedrop.model.modulated import ModulatedCovariance
 from evedrop.model.modulated import limit_trace as limit_behind
 from evedrop.model.process import Process, mistakes_of
-from evedrop.model.slot.link_law import LinkLaw
+from evedrop.model.slot.link_distribution import LinkDistribution
 from evedrop.model.theory.closed_forms import (
     encrypted_schedule,
     in_sync_probability,
@@ -202,18 +202,18 @@ def test_bursts(model: Model, p: float, r: float, good: float, bad: float, kind:
         lambda q: Outcomes.genie(q, 0.75),
     )[kind]
     transitions = np.array([[1.0 - p, p], [r, 1.0 - r]])
-    law = np.array([r, p]) / (p + r)
-    chain = Chain(transitions, law, np.array([good, bad]))
+    distribution = np.array([r, p]) / (p + r)
+    chain = Chain(transitions, distribution, np.array([good, bad]))
     expected = rationals.behind_a_chain(
         model.A,
         model.Q,
         model.initial,
         exact(transitions),
-        [Fraction(float(one)) for one in law],
+        [Fraction(float(one)) for one in distribution],
         [odds_of(at(good)), odds_of(at(bad))],
         SLOTS,
     )
-    found = ModulatedCovariance(model.process, LinkLaw.steady(chain), at).next_traces(SLOTS)
+    found = ModulatedCovariance(model.process, LinkDistribution.steady(chain), at).next_traces(SLOTS)
     assert all(close(one, value) for one, value in zip(found, expected, strict=True))
 
 
@@ -222,9 +222,9 @@ def test_bursts(model: Model, p: float, r: float, good: float, bad: float, kind:
 def test_limits_behind_bursts(model: Model, p: float, r: float, good: float) -> None:
     """The linear equations of all states of the link at once; the second state loses everything."""
     transitions = np.array([[1.0 - p, p], [r, 1.0 - r]])
-    law = np.array([r, p]) / (p + r)
+    distribution = np.array([r, p]) / (p + r)
     outcomes = [Outcomes.legitimate(good, 0.6), Outcomes.legitimate(0.0, 0.6)]
-    T, weights = exact(transitions), [Fraction(float(one)) for one in law]
+    T, weights = exact(transitions), [Fraction(float(one)) for one in distribution]
     n, kept = model.process.n, [Fraction(one.kept) for one in outcomes]
     places = [(s, i, j) for s in range(2) for i in range(n) for j in range(n)]
     equations = [
@@ -238,7 +238,7 @@ def test_limits_behind_bursts(model: Model, p: float, r: float, good: float) -> 
     solution = [row[0] for row in rationals.times(rationals.inverted(equations), source)]
     expected = sum((value for value, (_, i, j) in zip(solution, places, strict=True) if i == j), Fraction(0))
     found = limit_behind(
-        model.process, Chain(transitions, law, np.array([good, 0.0])), lambda q: Outcomes.legitimate(q, 0.6)
+        model.process, Chain(transitions, distribution, np.array([good, 0.0])), lambda q: Outcomes.legitimate(q, 0.6)
     )
     amplified = 1 + expected / trace(model.Q)
     assert close(found, expected, CLOSE * amplified)
@@ -279,21 +279,23 @@ def test_schedules_by_holding_time(
     acknowledged = (share * received, 0.5 * (1.0 - received))
     chain = (encrypted_schedule if encrypted else scheduled)(threshold, received, acknowledged)
     carried, all_ways = exact(chain.carried), exact(chain.carried + chain.reset)
-    law = [Fraction(float(one)) for one in chain.start]
-    n, states = model.process.n, len(law)
-    parts = [[[Fraction(0)] * n for _ in range(n)] for _ in law]
+    distribution = [Fraction(float(one)) for one in chain.start]
+    n, states = model.process.n, len(distribution)
+    parts = [[[Fraction(0)] * n for _ in range(n)] for _ in distribution]
     found = chain.covariances(model.process, SLOTS)
     for k in range(SLOTS):
         source = model.Q if k else model.initial
         grown = [
             rationals.combined((1, rationals.congruent(model.A, part)), (p, source))
-            for part, p in zip(parts, law, strict=True)
+            for part, p in zip(parts, distribution, strict=True)
         ]
         parts = [
             rationals.rounded(rationals.combined(*((carried[r][s], grown[r]) for r in range(states))))
             for s in range(states)
         ]
-        law = [sum((law[r] * all_ways[r][s] for r in range(states)), Fraction(0)) for s in range(states)]
+        distribution = [
+            sum((distribution[r] * all_ways[r][s] for r in range(states)), Fraction(0)) for s in range(states)
+        ]
         assert close(float(np.trace(found[k])), sum((trace(part) for part in parts), Fraction(0)))
     late = chain.covariances(model.process, 2000)[-PERIODS:].mean(axis=0)
     assert np.trace(chain.limit(model.process)) == pytest.approx(np.trace(late), rel=1e-9)

@@ -15,7 +15,7 @@ from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.links import loss_of
 from evedrop.model.process import Floats, Process, StateFactors
 from evedrop.model.receiver import Action
-from evedrop.model.slot.link_law import LinkLaw
+from evedrop.model.slot.link_distribution import LinkDistribution
 from evedrop.model.streams import Batch
 from evedrop.model.theory.covariances import (
     Outcomes,
@@ -201,10 +201,10 @@ def test_bursts_and_tails() -> None:
     bursts = loss_of({"model": "gilbert-elliott", "p": 0.05, "r": 0.8}).chain
     assert even is not None
     assert bursts is not None
-    found = modulated.ModulatedCovariance(EXAMPLE, LinkLaw.steady(even), at).next_traces(50)
+    found = modulated.ModulatedCovariance(EXAMPLE, LinkDistribution.steady(even), at).next_traces(50)
     assert np.allclose(found, expected_traces(EXAMPLE, Outcomes.genie(0.8, 0.8), 50), rtol=1e-12)
     for process in (EXAMPLE, MIXED):
-        late = modulated.ModulatedCovariance(process, LinkLaw.steady(bursts), at).next_traces(800)[-1]
+        late = modulated.ModulatedCovariance(process, LinkDistribution.steady(bursts), at).next_traces(800)[-1]
         assert late == pytest.approx(modulated.limit_trace(process, bursts, at), rel=1e-9)
     smart = Outcomes.eavesdropper(0.9, 0.7, 1.0, 0.0)
     assert tail_index(EXAMPLE, Outcomes.genie(0.9, 0.7)) == pytest.approx(tail_index(EXAMPLE, smart), rel=1e-14)

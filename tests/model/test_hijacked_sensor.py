@@ -144,7 +144,7 @@ def test_perfect_secrecy_needs_an_acknowledgement_channel_that_loses_nothing(
     if heed_rule is not None:
         chain = hijacked_schedule(threshold, MU, MU_E, heed_rule, hears("user"))
         assert np.allclose((chain.reset + chain.carried).sum(axis=1), 1.0)
-        in_last = chain.law[(threshold - 1) * (heed_rule.patience + 2) :].sum()
+        in_last = chain.stationary[(threshold - 1) * (heed_rule.patience + 2) :].sum()
         assert in_last == pytest.approx(1.0 / (MU * alpha) / (threshold - 1 + 1.0 / (MU * alpha)))
 
 

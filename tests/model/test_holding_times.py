@@ -115,16 +115,16 @@ def test_limits_are_where_the_expectations_go(threshold: int) -> None:
     for form in (closed_forms.scheduled, closed_forms.encrypted_schedule):
         chain = form(threshold, 0.9, (0.5, 0.2))
         assert np.allclose((chain.reset + chain.carried).sum(1), 1.0)
-        assert np.allclose(chain.law @ (chain.reset + chain.carried), chain.law)
+        assert np.allclose(chain.stationary @ (chain.reset + chain.carried), chain.stationary)
         found = chain.limit(STABLE)
         assert np.allclose(found, chain.covariances(STABLE, 2000)[-1], rtol=1e-9)
     user = closed_forms.scheduled(threshold, 0.9, (0.9, 0.0))
     assert np.isfinite(user.limit(UNSTABLE)).all()
     if threshold == 1:
         assert np.allclose(user.limit(UNSTABLE), limit(UNSTABLE, EncryptedSchedule(UNSTABLE, 1).outcomes(0.9)))
-    assert user.law[-1] == pytest.approx((1 / 0.9) / (threshold - 1 + 1 / 0.9))
+    assert user.stationary[-1] == pytest.approx((1 / 0.9) / (threshold - 1 + 1 / 0.9))
     hidden = closed_forms.encrypted_schedule(threshold, 0.9, (0.81, 0.09))
-    assert hidden.law[-1] == pytest.approx(0.1 ** (threshold - 1))
+    assert hidden.stationary[-1] == pytest.approx(0.1 ** (threshold - 1))
 
 
 def test_long_silences_keep_an_eavesdropper_out_of_an_unstable_process() -> None:

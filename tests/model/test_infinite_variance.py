@@ -45,13 +45,13 @@ def spread_of_reference(a: float, received: float, acknowledged: tuple[float, fl
 
 def spread_of_chain(a: float, chain: SensorChain, slots: int) -> float:
     """E P² / (E P)² in the last slot, from the moments of each state; scaled, so that nothing overflows."""
-    law, one, two = chain.start, np.zeros(len(chain.start)), np.zeros(len(chain.start))
+    distribution, one, two = chain.start, np.zeros(len(chain.start)), np.zeros(len(chain.start))
     scale = 1.0
     for _ in range(slots):
         q = 1.0 / scale
-        grown, squared = a * a * one + q * law, a**4 * two + 2.0 * q * a * a * one + q * q * law
+        grown, squared = a * a * one + q * distribution, a**4 * two + 2.0 * q * a * a * one + q * q * distribution
         one, two = grown @ chain.carried, squared @ chain.carried
-        law = law @ (chain.carried + chain.reset)
+        distribution = distribution @ (chain.carried + chain.reset)
         by = max(1.0, float(one.sum()))
         one, two, scale = one / by, two / by**2, scale * by
     return float(two.sum() / one.sum() ** 2)

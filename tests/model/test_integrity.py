@@ -53,7 +53,7 @@ def test_without_watermark_the_scalar_attack_stays_unseen() -> None:
     assert np.isfinite(simulated(none, 501, 400, REPLACED, [(1, 501)]).first_alarms(8.0)).mean() < 0.03
 
 
-def test_laws_of_two_dimensions_are_those_of_textbook_equations() -> None:
+def test_distributions_of_two_dimensions_are_those_of_textbook_equations() -> None:
     """K, Σ_g, L and BᵀΠB + U by scipy; y's covariance, and S under both attacks, from the joint recursion written out."""
     process, plant = PLANAR.process, PLANAR.plant
     A, B, C, W, V = process.A, plant.input_matrix, plant.output_matrix, plant.noise, plant.measurement_noise
@@ -87,7 +87,7 @@ def test_laws_of_two_dimensions_are_those_of_textbook_equations() -> None:
     assert np.allclose(WIDE.deceived(Z, SIGMA), seen @ joint @ seen.T + Z.noise, rtol=1e-8)
 
 
-def test_the_detector_knows_the_law_of_what_it_sees() -> None:
+def test_the_detector_knows_the_distribution_of_what_it_sees() -> None:
     """Innovations are standard normal without attack; under either attack their covariance is T + G Σ_e Gᵀ, in two dimensions."""
     replaced: tuple[str, dict[str, Any]] = ("replace", {"matrix": [[0.8, 0.1], [0.0, 0.6]]})
     unseen = ("always", {"threshold": 1e300})
@@ -219,7 +219,7 @@ def test_a_clipped_watermark_counts_as_far_as_it_enters() -> None:
 
 
 def test_a_plan_without_attack_is_designed_for_a_replay() -> None:
-    """It feeds the filter with what was measured, and assumes the law of a replay; slots are joined and cut."""
+    """It feeds the filter with what was measured, and assumes the distribution of a replay; slots are joined and cut."""
     plan = MonitorPlan.of(LOOP, 0.3 * ONE, ALWAYS, None)
     replay = MonitorPlan.of(LOOP, 0.3 * ONE, ALWAYS, ("replay", {"recorded": 5}))
     key = stream_keys(1, ("watermark",))["watermark"]
@@ -236,8 +236,8 @@ def test_a_plan_without_attack_is_designed_for_a_replay() -> None:
     assert whole.part(slice(0, 1)).statistic.tolist() == [[1.0], [2.0]]
 
 
-def test_evidence_is_weighed_by_the_law_of_its_own_slot() -> None:
-    """CUSUM and posterior after slots with a watermark and without, by the formula of each; the two laws differ."""
+def test_evidence_is_weighed_by_the_distribution_of_its_own_slot() -> None:
+    """CUSUM and posterior after slots with a watermark and without, by the formula of each; the two distributions differ."""
     entered, epsilon = np.array([[0.4, -0.7, 0.2]]), np.array([[1.3, -0.4, 2.2]])
     parsimonious = ("parsimonious", {"watch_from": 0.05, "alarm_from": 0.999, "attack_rate": 1e-3})
     for policy, marked in ((ALWAYS, True), (parsimonious, False)):
@@ -330,7 +330,7 @@ def test_wrong_parameters_of_a_policy_are_found(name: str, given: dict[str, floa
     assert POLICIES[name].mistakes(POLICIES[name].parameters) == []
 
 
-def test_what_has_no_stationary_law_is_refused() -> None:
+def test_what_has_no_stationary_distribution_is_refused() -> None:
     """A source that grows, slowly or fast, and a z that cannot have the covariance of y."""
     for factor in (1.0, 1e200):
         with pytest.raises(ValueError, match="stationary"):

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from evedrop.model.links import loss_of
 from evedrop.model.process import Floats, Process
 from evedrop.model.schemes import SCHEMES, scheme_of
-from evedrop.model.slot.link_law import LinkLaw
+from evedrop.model.slot.link_distribution import LinkDistribution
 from evedrop.model.theory.covariances import Outcomes, limit_trace, stability_bound
 from evedrop.model.theory.leak import remaining_limit
 from evedrop.model.theory.leaked_bits import LeakedBits
@@ -133,15 +133,17 @@ def test_the_rates_of_a_link() -> None:
     """Of bursts their stationary mean; of a receiver that is away 0."""
     chain = loss_of({"model": "gilbert-elliott", "p": 0.1, "r": 0.3}).chain
     assert chain is not None
-    steady = LinkLaw.steady(chain)
-    away = LinkLaw(steady.segments, ((2, 4, True), (5, 100, False)))
+    steady = LinkDistribution.steady(chain)
+    away = LinkDistribution(steady.segments, ((2, 4, True), (5, 100, False)))
     np.testing.assert_allclose(steady.rates(range(3)), 0.75)
     np.testing.assert_allclose(away.rates(range(6)), [0.75, 0.75, 0.0, 0.0, 0.75, 0.0])
     slow, good = (replace(steady.segments[0], arrived=np.array([0.5])), replace(steady.segments[0], start=2))
-    np.testing.assert_allclose(LinkLaw((slow, good)).rates(range(4)), [0.375, 0.375, 0.75, 0.75])
-    np.testing.assert_allclose(LinkLaw((slow, good)).rates(range(1)), [0.375])
-    for law in (away, LinkLaw((slow, good))):
-        assert np.array_equal([float(law.rates(range(k, k + 1))[0]) for k in range(6)], law.rates(range(6)))
+    np.testing.assert_allclose(LinkDistribution((slow, good)).rates(range(4)), [0.375, 0.375, 0.75, 0.75])
+    np.testing.assert_allclose(LinkDistribution((slow, good)).rates(range(1)), [0.375])
+    for distribution in (away, LinkDistribution((slow, good))):
+        assert np.array_equal(
+            [float(distribution.rates(range(k, k + 1))[0]) for k in range(6)], distribution.rates(range(6))
+        )
 
 
 @settings(deadline=None, max_examples=examples(30))

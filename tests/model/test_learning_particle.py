@@ -1,4 +1,4 @@
-"""The eavesdropper that learns by a particle filter, against the Bayesian one, the law of its draws, and itself."""
+"""The eavesdropper that learns by a particle filter, against the Bayesian one, the distribution of its draws, and itself."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_a_known_state_is_known_and_nothing_is_forgotten() -> None:
 
 
 @pytest.mark.parametrize("knows", [[], ["A"], ["Q"], ["mu_d"], ["A", "Q"]])
-def test_draws_have_the_law_of_the_posterior(knows: list[str]) -> None:
+def test_draws_have_the_distribution_of_the_posterior(knows: list[str]) -> None:
     """40 000 draws: A has mean Â and covariance Q ⊗ H⁻¹ where Q is known; D and μ_d scatter by their counts."""
     R, n = 40_000, 2
     random = np.random.default_rng(8)

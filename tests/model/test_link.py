@@ -1,4 +1,4 @@
-"""A link as a whole, against a slot-by-slot reference that is written here, and against the laws of its models."""
+"""A link as a whole, against a slot-by-slot reference that is written here, and against the distributions of its models."""
 
 from __future__ import annotations
 
@@ -195,7 +195,7 @@ SPECS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("name", DELAY_MODELS)
-def test_delays_have_the_law_they_say(name: str) -> None:
+def test_delays_have_the_distribution_they_say(name: str) -> None:
     """The fraction of packets that are there after each lag is as the model says, within 5 standard errors."""
     batch = Batch(300, 300)
     schedule = LinkSchedule({"loss": {"model": "bernoulli", "quality": 1.0}, "delay": SPECS[name]}, window=20)

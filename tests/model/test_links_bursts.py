@@ -1,4 +1,4 @@
-"""Links that remember: against a slot-by-slot reference, their marginal loss, their bursts, their stationary law."""
+"""Links that remember: against a slot-by-slot reference, their marginal loss, their bursts, their stationary distribution."""
 
 from __future__ import annotations
 
@@ -136,10 +136,10 @@ def test_marginal_loss_of_a_million_packets(spec: dict[str, Any]) -> None:
         assert lost == pytest.approx(sum(by_rote(spec, np.empty(slots))) / slots, abs=1e-12)
         assert loss == pytest.approx(spec["outcomes"].count("0") / len(spec["outcomes"]), abs=1e-12)
         return
-    memory, ahead, q = 1.0, np.eye(len(chain.law)), 1.0 - chain.quality
+    memory, ahead, q = 1.0, np.eye(len(chain.stationary)), 1.0 - chain.quality
     for _ in range(400):
         ahead = ahead @ chain.transitions
-        memory += 2.0 * float((chain.law * q) @ ahead @ q - loss**2) / (loss * (1.0 - loss))
+        memory += 2.0 * float((chain.stationary * q) @ ahead @ q - loss**2) / (loss * (1.0 - loss))
     effective = slots * trials / memory
     assert abs(lost - loss) < 4.9 * np.sqrt(loss * (1.0 - loss) / effective)
 
@@ -184,12 +184,12 @@ def test_gilbert_elliott_bursts_are_geometric() -> None:
     assert len(lengths) > 10_000
     last = 20
     counts = np.bincount(np.minimum(lengths, last), minlength=last + 1)[1:]
-    law = np.array([r * (1 - r) ** (length - 1) for length in range(1, last)] + [(1 - r) ** (last - 1)])
-    assert stats.chisquare(counts, law * counts.sum()).pvalue > 1e-6
+    distribution = np.array([r * (1 - r) ** (length - 1) for length in range(1, last)] + [(1 - r) ** (last - 1)])
+    assert stats.chisquare(counts, distribution * counts.sum()).pvalue > 1e-6
     assert lengths.mean() == pytest.approx(1 / r, rel=0.05)
 
 
-def test_slot_zero_has_the_stationary_law() -> None:
+def test_slot_zero_has_the_stationary_distribution() -> None:
     """The first packet is lost as often as any other, at 1e-6 confidence."""
     for spec in (BURSTS, SOFT, FOUR_STATES):
         fates = link_of(spec, KEY, Batch(1, 100_000)).fates(range(1)).codes
@@ -203,26 +203,26 @@ def test_two_states_are_a_markov_chain() -> None:
     assert one.quality == pytest.approx(other.quality, abs=1e-15)
     assert one.chain is not None
     assert other.chain is not None
-    for name in ("transitions", "law", "quality"):
+    for name in ("transitions", "stationary", "quality"):
         np.testing.assert_allclose(getattr(one.chain, name), getattr(other.chain, name), atol=1e-15)
 
 
 @settings(deadline=None)
 @given(matrices(7))
-def test_the_stationary_law_is_the_eigenvector(rows: list[list[float]]) -> None:
+def test_the_stationary_distribution_is_the_eigenvector(rows: list[list[float]]) -> None:
     """Elimination finds the left eigenvector of 1 that numpy finds, transient and periodic states among them."""
     T = np.array(rows)
     values, vectors = np.linalg.eig(T.T)
     vector = np.real(vectors[:, np.argmin(np.abs(values - 1.0))])
-    law = stationary(T)
-    np.testing.assert_allclose(law, vector / vector.sum(), atol=1e-9)
-    np.testing.assert_allclose(law @ T, law, atol=1e-14)
-    assert (law >= 0.0).all()
-    assert law.sum() == pytest.approx(1.0, abs=1e-14)
+    distribution = stationary(T)
+    np.testing.assert_allclose(distribution, vector / vector.sum(), atol=1e-9)
+    np.testing.assert_allclose(distribution @ T, distribution, atol=1e-14)
+    assert (distribution >= 0.0).all()
+    assert distribution.sum() == pytest.approx(1.0, abs=1e-14)
 
 
 @pytest.mark.parametrize(
-    ("rows", "law"),
+    ("rows", "distribution"),
     [
         ([[1.0]], [1.0]),
         ([[0.0, 1.0], [1.0, 0.0]], [0.5, 0.5]),
@@ -234,14 +234,14 @@ def test_the_stationary_law_is_the_eigenvector(rows: list[list[float]]) -> None:
     ],
     ids=["one state", "period 2", "period 3", "stays first", "stays last", "transient first", "transient between"],
 )
-def test_stationary_laws_that_are_known(rows: list[list[float]], law: list[float]) -> None:
+def test_stationary_distributions_that_are_known(rows: list[list[float]], distribution: list[float]) -> None:
     """Periodic chains have one too, and a state that is never come back to has probability exactly 0."""
     found = stationary(np.array(rows))
-    np.testing.assert_allclose(found, law, atol=1e-15)
-    assert [value == 0.0 for value in found] == [value == 0.0 for value in law]
+    np.testing.assert_allclose(found, distribution, atol=1e-15)
+    assert [value == 0.0 for value in found] == [value == 0.0 for value in distribution]
 
 
-def test_the_stationary_law_is_summed_in_order() -> None:
+def test_the_stationary_distribution_is_summed_in_order() -> None:
     """Its bits are those of the protocol's recipe, in binary64: no compensated sum, whatever Python's version does."""
     rows = [[0.1, 0.2, 0.3, 0.4], [0.7, 0.1, 0.1, 0.1], [0.3, 0.3, 0.2, 0.2], [0.15, 0.25, 0.35, 0.25]]
     T, last = np.array(rows), 3
@@ -250,10 +250,10 @@ def test_the_stationary_law_is_summed_in_order() -> None:
         T[:last, last] /= leaves
         T[:last, :last] += T[:last, last, None] * T[last, :last]
         last -= 1
-    law = np.ones(1)
+    distribution = np.ones(1)
     for state in range(1, 4):
-        law = np.append(law, np.cumsum(law * T[:state, state])[-1])
-    assert np.array_equal(stationary(np.array(rows)), law / np.cumsum(law)[-1])
+        distribution = np.append(distribution, np.cumsum(distribution * T[:state, state])[-1])
+    assert np.array_equal(stationary(np.array(rows)), distribution / np.cumsum(distribution)[-1])
 
 
 def test_states_that_are_never_come_back_to_are_no_part_of_the_chain() -> None:

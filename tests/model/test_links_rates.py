@@ -66,7 +66,7 @@ def test_a_million_packets(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["bursts", "soft bursts", "four states", "transient", "slow"])
 def test_one_rate_is_within_its_interval(name: str) -> None:
-    """Of 2000 trials about as many lie within two standard deviations as the normal law says: 95.4 %, within 3 %."""
+    """Of 2000 trials about as many lie within two standard deviations as the normal distribution says: 95.4 %, within 3 %."""
     loss = loss_of(SPECS[name])
     u = uniforms(Stream(KEY, range(TRIALS), loss.uniforms_per_slot).words(range(SLOTS))).transpose(0, 2, 1)
     rates = (loss.fates(0, u) == Fate.DELIVERED).mean(axis=0)

@@ -90,11 +90,11 @@ def test_what_is_certain_has_no_variance() -> None:
         assert loss.memoryless
 
 
-def enumerated(T: Floats, law: Floats, quality: Floats, slots: int) -> float:
+def enumerated(T: Floats, distribution: Floats, quality: Floats, slots: int) -> float:
     """Variance of the count delivered in some slots, from every way through the chain."""
     mean = second = 0.0
-    for path in product(range(len(law)), repeat=slots):
-        chance = law[path[0]] * np.prod([T[a, b] for a, b in pairwise(path)])
+    for path in product(range(len(distribution)), repeat=slots):
+        chance = distribution[path[0]] * np.prod([T[a, b] for a, b in pairwise(path)])
         q = quality[list(path)]
         mean += chance * q.sum()
         second += chance * (q.sum() ** 2 + (q * (1 - q)).sum())
@@ -116,8 +116,8 @@ def test_the_rate_of_a_chain_scatters_as_all_its_paths_do(
 ) -> None:
     """Exact for every number of slots, a periodic chain and a single state among them."""
     T, q = np.array(rows), np.array(quality)
-    law = stationary(T)
-    assert count_variance(T, law, q, slots) == pytest.approx(enumerated(T, law, q, slots), abs=1e-13)
+    distribution = stationary(T)
+    assert count_variance(T, distribution, q, slots) == pytest.approx(enumerated(T, distribution, q, slots), abs=1e-13)
 
 
 def test_the_rate_of_many_slots_has_its_limit() -> None:

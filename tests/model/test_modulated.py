@@ -16,7 +16,7 @@ from evedrop.model.links import loss_of
 from evedrop.model.links.link import Chain
 from evedrop.model.modulated import ModulatedCovariance, limit_of, limit_trace, tail_outcomes
 from evedrop.model.process import Floats, Process
-from evedrop.model.slot.link_law import LinkLaw, Segment
+from evedrop.model.slot.link_distribution import LinkDistribution, Segment
 from evedrop.model.theory.covariances import (
     Outcomes,
     expected_traces,
@@ -69,7 +69,9 @@ def test_a_link_whose_states_are_alike_is_the_papers(
     expected = expected_traces(process, outcomes_at(0.7), 60)
     for chain in (Chain(np.ones((1, 1)), np.ones(1), np.array([0.7])), bursts(0.1, 0.3, 0.3, 0.3)):
         np.testing.assert_allclose(
-            ModulatedCovariance(process, LinkLaw.steady(chain), outcomes_at).next_traces(60), expected, rtol=1e-12
+            ModulatedCovariance(process, LinkDistribution.steady(chain), outcomes_at).next_traces(60),
+            expected,
+            rtol=1e-12,
         )
         assert limit_trace(process, chain, outcomes_at) == pytest.approx(
             independent_limit(process, outcomes_at(0.7)), rel=1e-9
@@ -83,8 +85,8 @@ def test_a_link_whose_states_are_alike_is_the_papers(
 def test_slots_may_be_asked_for_in_any_pieces(good: float, bad: float, p: float, first: int) -> None:
     """The same numbers, whatever the pieces."""
     chain = bursts(p, 0.3, good, bad)
-    whole = ModulatedCovariance(MARGINAL, LinkLaw.steady(chain), RECEIVERS["suspicious"]).next_traces(50)
-    stream = ModulatedCovariance(MARGINAL, LinkLaw.steady(chain), RECEIVERS["suspicious"])
+    whole = ModulatedCovariance(MARGINAL, LinkDistribution.steady(chain), RECEIVERS["suspicious"]).next_traces(50)
+    stream = ModulatedCovariance(MARGINAL, LinkDistribution.steady(chain), RECEIVERS["suspicious"])
     assert np.array_equal(np.concatenate([stream.next_traces(first), stream.next_traces(50 - first)]), whole)
 
 
@@ -95,8 +97,8 @@ def enumerated(process: Process, chain: Chain, use: tuple[float, float] | None, 
     """
     A, Q, f = process.A, process.Q, misled_covariances(process, slots)
     traces = np.zeros(slots)
-    for states in itertools.product(range(len(chain.law)), repeat=slots):
-        path = chain.law[states[0]] * math.prod(chain.transitions[a, b] for a, b in itertools.pairwise(states))
+    for states in itertools.product(range(len(chain.stationary)), repeat=slots):
+        path = chain.stationary[states[0]] * math.prod(chain.transitions[a, b] for a, b in itertools.pairwise(states))
         for events in itertools.product(itertools.product((False, True), repeat=3), repeat=slots):
             weight, P = path, process.initial_covariance
             for k, (received, innovation, used) in enumerate(events):
@@ -122,7 +124,7 @@ def test_the_recursion_is_the_sum_over_all_words(use: tuple[float, float] | None
     """Every word of link states and packets, weighed and added up by hand, gives the recursion's last value."""
     chain = bursts(0.2, 0.4, 0.1, 0.9)
     outcomes_at = legitimate if use is None else eavesdropper(*use)
-    found = ModulatedCovariance(UNSTABLE, LinkLaw.steady(chain), outcomes_at).next_traces(slots)
+    found = ModulatedCovariance(UNSTABLE, LinkDistribution.steady(chain), outcomes_at).next_traces(slots)
     assert found[-1] == pytest.approx(enumerated(UNSTABLE, chain, use, slots)[-1], rel=1e-12)
 
 
@@ -158,7 +160,7 @@ def test_the_limit_is_that_of_the_recursion(
 ) -> None:
     """A finite limit is what the recursion comes to; where it is inf, the recursion grows on and on."""
     limit = limit_trace(process, chain, outcomes_at)
-    traces = ModulatedCovariance(process, LinkLaw.steady(chain), outcomes_at).next_traces(6000)
+    traces = ModulatedCovariance(process, LinkDistribution.steady(chain), outcomes_at).next_traces(6000)
     if math.isfinite(limit):
         assert traces[-1] == pytest.approx(limit, rel=1e-6)
     else:
@@ -171,7 +173,7 @@ def test_bursts_that_last_too_long_have_no_limit(r: float) -> None:
     chain, rho = bursts(0.05, r), UNSTABLE.spectral_radius
     bounded = (1.0 - r) * rho**2 < 1.0
     assert math.isfinite(limit_trace(UNSTABLE, chain, Outcomes.plain)) is bounded
-    traces = ModulatedCovariance(UNSTABLE, LinkLaw.steady(chain), Outcomes.plain).next_traces(4000)
+    traces = ModulatedCovariance(UNSTABLE, LinkDistribution.steady(chain), Outcomes.plain).next_traces(4000)
     assert bool(traces[-1] < 1.001 * traces[2000]) is bounded
 
 
@@ -183,16 +185,16 @@ def test_a_perfect_link_has_no_error() -> None:
         return Outcomes.legitimate(quality, 0.1)
 
     assert limit_trace(UNSTABLE, chain, rarely) == 0.0
-    assert not ModulatedCovariance(UNSTABLE, LinkLaw.steady(chain), rarely).next_traces(100).any()
+    assert not ModulatedCovariance(UNSTABLE, LinkDistribution.steady(chain), rarely).next_traces(100).any()
     assert math.isinf(tail_index(UNSTABLE, tail_outcomes(chain, rarely)))
 
 
 def test_a_bounded_expectation_stays_so_beyond_double_precision() -> None:
     """The state's covariance leaves double precision after some thousand slots; a smart eavesdropper's does not."""
     chain = bursts(0.05, 0.7)
-    traces = ModulatedCovariance(UNSTABLE, LinkLaw.steady(chain), eavesdropper(1.0, 0.0)).next_traces(3000)
+    traces = ModulatedCovariance(UNSTABLE, LinkDistribution.steady(chain), eavesdropper(1.0, 0.0)).next_traces(3000)
     assert traces[-1] == pytest.approx(limit_trace(UNSTABLE, chain, eavesdropper(1.0, 0.0)), rel=1e-9)
-    misled = ModulatedCovariance(UNSTABLE, LinkLaw.steady(chain), eavesdropper(1.0, 1.0)).next_traces(3000)
+    misled = ModulatedCovariance(UNSTABLE, LinkDistribution.steady(chain), eavesdropper(1.0, 1.0)).next_traces(3000)
     beyond = int(np.flatnonzero(np.isinf(misled))[0])
     assert np.isfinite(misled[:beyond]).all()
     assert np.isinf(misled[beyond:]).all()
@@ -215,7 +217,7 @@ def test_the_rate_of_the_tail_is_how_long_a_word_lasts() -> None:
     """P(no state packet in k slots), summed slot by slot over the chain, falls by the factor `kept` a slot."""
     chain = THREE
     kept = np.array([legitimate(q).kept for q in chain.quality])
-    alive = chain.law * kept
+    alive = chain.stationary * kept
     for _ in range(200):
         before, alive = alive.sum(), (alive @ chain.transitions) * kept
     assert alive.sum() / before == pytest.approx(tail_outcomes(chain, legitimate).kept, rel=1e-9)
@@ -225,7 +227,9 @@ def recursion(process: Process, chain: Chain, outcomes_at: Callable[[float], Out
     """Trace of E P_k as the module's docstring has it, slot by slot and state by state, (slots,)."""
     odds = [outcomes_at(float(quality)) for quality in chain.quality]
     f = misled_covariances(process, slots)
-    states = [law * one.initial * process.initial_covariance for law, one in zip(chain.law, odds, strict=True)]
+    states = [
+        weight * one.initial * process.initial_covariance for weight, one in zip(chain.stationary, odds, strict=True)
+    ]
     traces = [float(np.trace(sum(states)))]
     for k in range(1, slots):
         states = [
@@ -233,7 +237,7 @@ def recursion(process: Process, chain: Chain, outcomes_at: Callable[[float], Out
             * process.A
             @ sum(T * E for T, E in zip(chain.transitions[:, s], states, strict=True))
             @ process.A.T
-            + chain.law[s] * (one.predicted * process.Q + one.misled * f[k])
+            + chain.stationary[s] * (one.predicted * process.Q + one.misled * f[k])
             for s, one in enumerate(odds)
         ]
         traces.append(float(np.trace(sum(states))))
@@ -247,29 +251,29 @@ def test_blocks_of_slots_are_what_slot_by_slot_gives(
 ) -> None:
     """Over several blocks, to 1e-12; and to the bit the same however many slots are asked for at a time."""
     chain, slots = bursts(0.05, 0.3, 0.02, 0.7), 450
-    law = LinkLaw.steady(chain)
+    link = LinkDistribution.steady(chain)
     expected = recursion(process, chain, outcomes_at, slots)
-    whole = ModulatedCovariance(process, law, outcomes_at).next_traces(slots)
+    whole = ModulatedCovariance(process, link, outcomes_at).next_traces(slots)
     np.testing.assert_allclose(whole, expected, rtol=1e-12)
-    stream = ModulatedCovariance(process, law, outcomes_at)
+    stream = ModulatedCovariance(process, link, outcomes_at)
     parts = [stream.next_traces(count) for count in (0, 1, 2, 130, 17, 300)]
     assert np.array_equal(np.concatenate(parts), whole)
 
 
-def late(process: Process, law: LinkLaw, outcomes_at: Callable[[float], Outcomes], slots: int) -> Floats:
+def late(process: Process, link: LinkDistribution, outcomes_at: Callable[[float], Outcomes], slots: int) -> Floats:
     """The same with late packets, two segments and an outage: each slot from what is settled, (slots,).
 
     A packet of slot j counts in slot k with the probability that it has arrived by then.
     """
-    window, f = law.window, misled_covariances(process, slots)
+    window, f = link.window, misled_covariances(process, slots)
     found: list[float] = []
 
     def after(states: list[Floats] | None, j: int, k: int) -> list[Floats]:
-        segment = [one for one in law.segments if one.start <= j][-1]
-        away = any(start <= j < stop for start, stop, _ in law.outages)
+        segment = [one for one in link.segments if one.start <= j][-1]
+        away = any(start <= j < stop for start, stop, _ in link.outages)
         reached = 0.0 if away else segment.passes * float(segment.arrived[k - j])
         odds = [outcomes_at(reached * float(quality)) for quality in segment.chain.quality]
-        pi = segment.chain.law
+        pi = segment.chain.stationary
         if states is None:
             return [p * one.initial * process.initial_covariance for p, one in zip(pi, odds, strict=True)]
         fresh = j == segment.start
@@ -306,12 +310,12 @@ def test_blocks_of_slots_with_late_packets_are_what_slot_by_slot_gives(process: 
         Segment(0, bursts(0.05, 0.3, 0.02, 0.7), 0.9, arrived),
         Segment(270, bursts(0.2, 0.4), 1.0, np.array([0.5, 0.5, 1.0, 1.0])),
     )
-    law = LinkLaw(segments, ((530, 532, True),))
-    whole = ModulatedCovariance(process, law, outcomes_at).next_traces(slots)
-    expected = late(process, law, outcomes_at, slots)
+    link = LinkDistribution(segments, ((530, 532, True),))
+    whole = ModulatedCovariance(process, link, outcomes_at).next_traces(slots)
+    expected = late(process, link, outcomes_at, slots)
     known = np.isfinite(expected)
     np.testing.assert_allclose(whole[known], expected[known], rtol=1e-12)
-    stream = ModulatedCovariance(process, law, outcomes_at)
+    stream = ModulatedCovariance(process, link, outcomes_at)
     assert np.array_equal(np.concatenate([stream.next_traces(count) for count in (1, 2, 130, 17, 390)]), whole)
 
 
@@ -319,14 +323,14 @@ def test_errors_beyond_double_precision_are_infinite_from_there_on() -> None:
     """Within a block that overflows slots are taken one by one: up to there the traces are those of the recursion."""
     process = Process(np.diag([1.5, 0.5]), np.eye(2), np.eye(2))
     chain = bursts(0.1, 0.4)
-    covariance = ModulatedCovariance(process, LinkLaw.steady(chain), Outcomes.plain)
+    covariance = ModulatedCovariance(process, LinkDistribution.steady(chain), Outcomes.plain)
     traces = covariance.next_traces(3000)
     first = int(np.argmax(np.isinf(traces)))
     assert np.isinf(traces[first:]).all()
     assert np.isfinite(traces[:first]).all()
     assert traces[first - 1] > 1e306
     growth = traces[first - 10 : first] / traces[first - 11 : first - 1]
-    slow = ModulatedCovariance(process, LinkLaw.steady(chain), Outcomes.plain)
+    slow = ModulatedCovariance(process, LinkDistribution.steady(chain), Outcomes.plain)
     assert np.array_equal(np.concatenate([slow.next_traces(7) for _ in range(400)])[:first], traces[:first])
     assert np.allclose(growth, growth[0], rtol=1e-6)
     assert growth[0] > 1.0
@@ -335,9 +339,9 @@ def test_errors_beyond_double_precision_are_infinite_from_there_on() -> None:
 def test_limits_that_are_too_large_to_compute_are_not_a_number() -> None:
     """And a receiver without a limit has an infinite one."""
     many = Process(0.5 * np.eye(17), np.eye(17), np.eye(17))
-    assert math.isnan(limit_of(many, LinkLaw.steady(bursts(0.1, 0.4)), Outcomes.plain))
-    assert math.isinf(limit_of(UNSTABLE, LinkLaw.steady(bursts(0.9, 0.1)), Outcomes.plain))
-    assert limit_of(STABLE, LinkLaw.steady(bursts(0.1, 0.4)), Outcomes.plain) == pytest.approx(
+    assert math.isnan(limit_of(many, LinkDistribution.steady(bursts(0.1, 0.4)), Outcomes.plain))
+    assert math.isinf(limit_of(UNSTABLE, LinkDistribution.steady(bursts(0.9, 0.1)), Outcomes.plain))
+    assert limit_of(STABLE, LinkDistribution.steady(bursts(0.1, 0.4)), Outcomes.plain) == pytest.approx(
         limit_trace(STABLE, bursts(0.1, 0.4), Outcomes.plain)
     )
 
@@ -347,9 +351,11 @@ def test_many_states_are_followed_slot_by_slot() -> None:
     rates = np.linspace(0.5, 1.05, 9)
     chain = bursts(0.2, 0.5)
     many = Process(np.diag(rates), np.eye(9), 2.0 * np.eye(9))
-    found = ModulatedCovariance(many, LinkLaw.steady(chain), Outcomes.plain).next_traces(400)
+    found = ModulatedCovariance(many, LinkDistribution.steady(chain), Outcomes.plain).next_traces(400)
     one_by_one = [
-        ModulatedCovariance(Process(np.array([[a]]), np.eye(1), 2.0 * np.eye(1)), LinkLaw.steady(chain), Outcomes.plain)
+        ModulatedCovariance(
+            Process(np.array([[a]]), np.eye(1), 2.0 * np.eye(1)), LinkDistribution.steady(chain), Outcomes.plain
+        )
         for a in rates
     ]
     assert np.allclose(found, sum(one.next_traces(400) for one in one_by_one), rtol=1e-10)

@@ -14,7 +14,7 @@ from evedrop.model.links.link import Chain
 from evedrop.model.modulated import ModulatedCovariance
 from evedrop.model.modulated_streaks import modulated_streaks
 from evedrop.model.process import Floats, Process
-from evedrop.model.slot.link_law import LinkLaw, Segment
+from evedrop.model.slot.link_distribution import LinkDistribution, Segment
 from evedrop.model.theory.covariances import NOBODY, Outcomes, OutcomesAt, expected_traces
 from evedrop.model.theory.leak import RemainingCovariances
 from evedrop.model.theory.rare_events import Streaks, streaks
@@ -39,9 +39,9 @@ def enumerated(process: Process, chain: Chain, outcomes_in: Callable[[int], Outc
     for _ in range(1, SLOTS):
         sigma.append(process.A @ sigma[-1] @ process.A.T + process.Q)
     names = ("predicted", "decoded", "state", "misled", "leaked")
-    for states in itertools.product(range(len(chain.law)), repeat=SLOTS):
+    for states in itertools.product(range(len(chain.stationary)), repeat=SLOTS):
         odds = [outcomes_in(k)(float(chain.quality[s])) for k, s in enumerate(states)]
-        likely = chain.law[states[0]] * np.prod([chain.transitions[pair] for pair in itertools.pairwise(states)])
+        likely = chain.stationary[states[0]] * np.prod([chain.transitions[pair] for pair in itertools.pairwise(states)])
         for unused in (False, True):
             for course in itertools.product(names, repeat=SLOTS - 1):
                 weight = likely * (odds[0].initial if unused else 1.0 - odds[0].initial)
@@ -66,10 +66,10 @@ def enumerated(process: Process, chain: Chain, outcomes_in: Callable[[int], Outc
     return number, carried
 
 
-def found_in(law: LinkLaw, at: OutcomesAt, slots: int, process: Process = PLANE) -> Streaks:
+def found_in(link: LinkDistribution, at: OutcomesAt, slots: int, process: Process = PLANE) -> Streaks:
     """The streaks of a run that has them."""
-    total = float(ModulatedCovariance(process, law, at).next_traces(slots).sum())
-    found = modulated_streaks(process, law, at, slots, total)
+    total = float(ModulatedCovariance(process, link, at).next_traces(slots).sum())
+    found = modulated_streaks(process, link, at, slots, total)
     assert found is not None
     return found
 
@@ -78,10 +78,10 @@ def found_in(law: LinkLaw, at: OutcomesAt, slots: int, process: Process = PLANE)
 @pytest.mark.parametrize("chain", [BURSTS, STEADY], ids=["bursts", "steady"])
 def test_streaks_are_those_of_all_courses_of_a_run(chain: Chain, reader: str) -> None:
     """Kind by kind and length by length, with a μ_d for each slot and with one for all."""
-    law, mean = LinkLaw.steady(chain), AT[reader](0.5)
+    link, mean = LinkDistribution.steady(chain), AT[reader](0.5)
     for slots_at in (lambda k: AT[reader](MU_D[min(k, SLOTS - 1)]), None):
-        total = float(ModulatedCovariance(PLANE, law, mean, slots_at).next_traces(SLOTS).sum())
-        found = modulated_streaks(PLANE, law, mean, SLOTS, total, slots_at)
+        total = float(ModulatedCovariance(PLANE, link, mean, slots_at).next_traces(SLOTS).sum())
+        found = modulated_streaks(PLANE, link, mean, SLOTS, total, slots_at)
         assert found is not None
         number, carried = enumerated(PLANE, chain, slots_at or (lambda _: mean))
         assert found.number == pytest.approx(number, rel=1e-9, abs=1e-15)
@@ -95,7 +95,11 @@ def test_streaks_are_those_of_all_courses_of_a_run(chain: Chain, reader: str) ->
 def test_independent_losses_have_the_streaks_of_the_closed_form(outcomes: Outcomes) -> None:
     """A chain of one state, in a longer run."""
     found = modulated_streaks(
-        PLANE, LinkLaw.steady(STEADY), lambda _: outcomes, 40, float(expected_traces(PLANE, outcomes, 40).sum())
+        PLANE,
+        LinkDistribution.steady(STEADY),
+        lambda _: outcomes,
+        40,
+        float(expected_traces(PLANE, outcomes, 40).sum()),
     )
     closed = streaks(PLANE, outcomes, 40)
     assert found is not None
@@ -106,13 +110,17 @@ def test_independent_losses_have_the_streaks_of_the_closed_form(outcomes: Outcom
 
 
 def test_a_link_that_changes_during_the_run() -> None:
-    """In the slot of a change the new chain begins in its stationary law; all of the error is carried."""
+    """In the slot of a change the new chain begins in its stationary distribution; all of the error is carried."""
     better = Chain(np.array([[0.9, 0.1], [0.1, 0.9]]), np.array([0.5, 0.5]), np.array([1.0, 0.6]))
-    law = LinkLaw(
-        (*LinkLaw.steady(BURSTS).segments, Segment(20, better, 0.9, np.ones(1)), Segment(99, BURSTS, 1.0, np.ones(1)))
+    link = LinkDistribution(
+        (
+            *LinkDistribution.steady(BURSTS).segments,
+            Segment(20, better, 0.9, np.ones(1)),
+            Segment(99, BURSTS, 1.0, np.ones(1)),
+        )
     )
     at = AT["suspicious"](0.4)
-    found = found_in(law, at, 60)
+    found = found_in(link, at, 60)
     assert found.carried.sum() == pytest.approx(found.total, rel=2e-9)
     assert np.all(np.diff(found.number) <= 0.0)
 
@@ -122,21 +130,21 @@ def test_bursts_make_rare_events_rarer_and_larger() -> None:
     at, process = AT["legitimate"](0.6), Process(np.eye(1), np.eye(1), np.eye(1))
     long = Chain(np.array([[0.99, 0.01], [0.09, 0.91]]), np.array([0.9, 0.1]), np.array([1.0, 0.0]))
     alike = replace(STEADY, quality=np.array([0.9]))
-    shares = [found_in(LinkLaw.steady(chain), at, 100, process).share(20) for chain in (long, alike)]
+    shares = [found_in(LinkDistribution.steady(chain), at, 100, process).share(20) for chain in (long, alike)]
     assert shares[0] > 5.0 * shares[1] > 0.0
 
 
 def test_what_is_not_computed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Late packets, outages, models with other states, errors beyond double precision, and more numbers than are allowed."""
-    at, law = AT["legitimate"](0.5), LinkLaw.steady(BURSTS)
-    late = LinkLaw((replace(law.segments[0], arrived=np.array([0.5, 1.0])),))
-    away = replace(law, outages=((3, 5, True),))
-    other = LinkLaw((*law.segments, Segment(3, STEADY, 1.0, np.ones(1))))
+    at, link = AT["legitimate"](0.5), LinkDistribution.steady(BURSTS)
+    late = LinkDistribution((replace(link.segments[0], arrived=np.array([0.5, 1.0])),))
+    away = replace(link, outages=((3, 5, True),))
+    other = LinkDistribution((*link.segments, Segment(3, STEADY, 1.0, np.ones(1))))
     for one in (late, away, other):
         assert modulated_streaks(PLANE, one, at, 9, 1.0) is None
-    assert modulated_streaks(PLANE, law, at, 9, float("inf")) is None
-    total = found_in(law, at, 9).total
+    assert modulated_streaks(PLANE, link, at, 9, float("inf")) is None
+    total = found_in(link, at, 9).total
     for name, most in (("_LARGEST_RUN", 9 * 4 * 2 - 1), ("MOST_NUMBERS", 9 * 4 * 2 * 3)):
         with monkeypatch.context() as patch:
             patch.setattr(module, name, most)
-            assert modulated_streaks(PLANE, law, at, 9, total) is None
+            assert modulated_streaks(PLANE, link, at, 9, total) is None

@@ -15,7 +15,7 @@ from evedrop.model.eavesdroppers.bayesian import Bayesian
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.kernels import reference
 from evedrop.model.kernels.elementary import cholesky
-from evedrop.model.noise_law import PACKETS, NoiseLaw
+from evedrop.model.noise_distribution import PACKETS, NoiseDistribution
 from evedrop.model.outcomes import uses_of
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Action, Receiver, Reception
@@ -32,14 +32,14 @@ from tests.model.slot_loop import STABLE, Played, coins, keys_of, play
 
 SMALL = [[0.02, 0.004], [0.004, 0.03]]
 """A covariance of noise that is smaller than that of the states of `STABLE`."""
-LAWS = pytest.mark.parametrize("given", [SMALL, PACKETS], ids=["matrix", "packets"])
+DISTRIBUTIONS = pytest.mark.parametrize("given", [SMALL, PACKETS], ids=["matrix", "packets"])
 
 
 def spy(name: str, given: Any, batch: Batch, mu_d: float = 0.6, **parameters: float) -> Receiver:
-    """An eavesdropper that knows the law of the noise."""
+    """An eavesdropper that knows the distribution of the noise."""
     strategy = STRATEGIES[name]
     keys = keys_of(strategy.streams(parameters))
-    return strategy(Knowledge(STABLE, mu_d, parameters, keys, None, NoiseLaw(given)), batch)
+    return strategy(Knowledge(STABLE, mu_d, parameters, keys, None, NoiseDistribution(given)), batch)
 
 
 def covariance_of(given: Any, k: int) -> Floats:
@@ -47,7 +47,7 @@ def covariance_of(given: Any, k: int) -> Floats:
     return state_covariances(STABLE, k + 1)[k] if given == PACKETS else np.array(given)
 
 
-@LAWS
+@DISTRIBUTIONS
 def test_packets_are_states_or_noise_of_the_given_covariance(given: Any) -> None:
     """Noise is white, normal, of covariance N_k and independent of the state, at 1e-6 confidence; the rest are states."""
     trials = 20_000
@@ -65,7 +65,7 @@ def test_packets_are_states_or_noise_of_the_given_covariance(given: Any) -> None
             assert max(abs(float(one.mean())) for one in products) < 5.5 / np.sqrt(noise.shape[1])
 
 
-@LAWS
+@DISTRIBUTIONS
 def test_blocks_of_packets_are_those_of_single_slots(given: Any) -> None:
     """To the bit, wherever a block begins."""
     scheme, batch = Noise(STABLE, 0.4, given), Batch(9, 4)
@@ -90,7 +90,7 @@ def taken_by(scheme: Noise, strategy: str, mu_e: float, **parameters: float) -> 
     return form.taken
 
 
-@LAWS
+@DISTRIBUTIONS
 def test_errors_are_the_closed_forms(given: Any) -> None:
     """User, smart, naive and suspicious: the mean squared error is that of theory in every slot, at 5 standard errors."""
     slots, trials, scheme = 15, 20_000, Noise(STABLE, 0.4, given)
@@ -117,9 +117,9 @@ def test_noise_may_begin_later() -> None:
     mu_d = [1.0] * 6 + [0.3] * 6
     scheme, batch = Noise(STABLE, mu_d, SMALL), Batch(12, 20_000)
     gamma = {name: coins(0.8, 12, 20_000, i) for i, name in enumerate(("legitimate", "naive", "power-test"))}
-    law, keys = NoiseLaw(SMALL), dict[str, bytes]()
+    distribution, keys = NoiseDistribution(SMALL), dict[str, bytes]()
     made = {
-        name: STRATEGIES[name](Knowledge(STABLE, scheme.state_probability, {}, keys, scheme.mu_d, law), batch)  # type: ignore[arg-type]
+        name: STRATEGIES[name](Knowledge(STABLE, scheme.state_probability, {}, keys, scheme.mu_d, distribution), batch)  # type: ignore[arg-type]
         for name in ("naive", "power-test")
     }
     played = play(scheme, batch, gamma, made)
@@ -134,12 +134,12 @@ def test_noise_may_begin_later() -> None:
     assert (actions[6:] == Action.DISCARDED).any()
 
 
-@LAWS
+@DISTRIBUTIONS
 def test_the_error_of_taking_noise_is_that_of_all_courses(given: Any) -> None:
     """Enumerated over five slots: lost or ignored, state, noise taken, with the covariance of each course by itself."""
     mu_e, mu_d = 0.7, 0.6
     p_d, p_r, p_i = 1.0 - mu_e, mu_e * mu_d, mu_e * (1.0 - mu_d)
-    taken = NoiseTaken(STABLE, NoiseLaw(given), mu_d, mu_e, (1.0, 1.0))
+    taken = NoiseTaken(STABLE, NoiseDistribution(given), mu_d, mu_e, (1.0, 1.0))
     found, A, Q = taken.covariances(5), STABLE.A, STABLE.Q
     total = np.zeros((2, 2))
     for course in words((0, 1, 2), repeat=4):
@@ -157,12 +157,12 @@ def test_the_error_of_taking_noise_is_that_of_all_courses(given: Any) -> None:
 
 def test_limits_of_taking_noise() -> None:
     """Unbounded where the process is unstable; that of smart if no noise is taken; beyond double precision all slots are inf."""
-    unstable = NoiseTaken(UNSTABLE, NoiseLaw(PACKETS), 0.6, 0.7, (1.0, 1.0))
+    unstable = NoiseTaken(UNSTABLE, NoiseDistribution(PACKETS), 0.6, 0.7, (1.0, 1.0))
     assert np.isinf(unstable.limit).all()
     found = unstable.covariances(1200)
     assert np.isfinite(found[1000]).all()
     assert np.isinf(found[-1]).all()
-    never = NoiseTaken(STABLE, NoiseLaw(PACKETS), 0.6, 0.7, (1.0, 0.0))
+    never = NoiseTaken(STABLE, NoiseDistribution(PACKETS), 0.6, 0.7, (1.0, 0.0))
     assert np.array_equal(never.limit, limit(STABLE, Outcomes.eavesdropper(0.7, 0.6, 1.0, 0.0)))
     assert Plain.closed_forms == {}
     make = Noise.closed_forms["naive"]
@@ -229,7 +229,7 @@ def enumerated(z: np.ndarray, gamma: np.ndarray, mu_d: float, given: Any) -> tup
     return mean, spread
 
 
-@LAWS
+@DISTRIBUTIONS
 def test_the_bayesian_eavesdropper_is_the_posterior_over_all_words(given: Any) -> None:
     """Six slots, eight trials: x̂ and P to 1e-8 of an enumeration of all words of types, with losses."""
     batch = Batch(6, 8)
@@ -246,7 +246,7 @@ def test_the_bayesian_eavesdropper_is_the_posterior_over_all_words(given: Any) -
             np.testing.assert_allclose(belief.P[:, :, r], P, rtol=1e-8, atol=1e-10)
 
 
-@LAWS
+@DISTRIBUTIONS
 def test_kernels_agree_on_mixtures_of_states_and_noise(given: Any) -> None:
     """The kernel in use and numpy's, to the bit."""
     batch = Batch(30, 5)
@@ -255,7 +255,7 @@ def test_kernels_agree_on_mixtures_of_states_and_noise(given: Any) -> None:
     one = spy("bayesian", given, batch, 0.4)
     assert isinstance(one, Bayesian)
     beliefs, _ = one.follow(range(30), one.prior(), gamma, z)
-    leaks = Leaks(STABLE, NoiseLaw(given)).block(range(30))
+    leaks = Leaks(STABLE, NoiseDistribution(given)).block(range(30))
     exact, before = np.zeros((30, STABLE.n)), one.prior().memory
     found = reference.follow_mixture(STABLE.A, cholesky(STABLE.Q), leaks, exact, before, gamma, z, 0.4, 12, True)
     assert np.array_equal(beliefs.x_hat, found[0])
@@ -263,7 +263,7 @@ def test_kernels_agree_on_mixtures_of_states_and_noise(given: Any) -> None:
     assert np.array_equal(beliefs.action, found[2])
 
 
-@LAWS
+@DISTRIBUTIONS
 @pytest.mark.parametrize("name", mostly_long(["likelihood", "power-test"], ["likelihood"]))
 def test_detectors_decide_by_the_ratio_of_densities(name: str, given: Any) -> None:
     """The power test by the density of states at any time, `likelihood` by that of a state after its own estimate."""

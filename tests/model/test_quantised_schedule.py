@@ -150,15 +150,15 @@ def test_expectations_are_those_of_all_courses(process: Process, threshold: floa
 
 
 @pytest.mark.parametrize("threshold", [1.0, 1.5, 2.0, 4.25])
-def test_limits_and_the_law_of_the_chain(threshold: float) -> None:
+def test_limits_and_the_distribution_of_the_chain(threshold: float) -> None:
     """The limit is the expectation after many slots; the encrypted fraction is that of the chain; growing steps are unbounded."""
     error = QuantisationError.of(4, 6.0)
     chain = encrypted_schedule(threshold, 0.9, (0.5, 0.2))
     assert np.allclose((chain.reset + chain.carried).sum(1), 1.0)
     assert np.allclose(chain.limit(STABLE, error), chain.covariances(STABLE, 2000, error)[-1], rtol=1e-9)
     whole, part = int(threshold), threshold % 1.0
-    of_law = chain.law[-1] + (chain.law[whole - 1] * (1.0 - part) if part else 0.0)
-    assert encrypted_fraction(threshold, 0.7) == pytest.approx(of_law)
+    of_chain = chain.stationary[-1] + (chain.stationary[whole - 1] * (1.0 - part) if part else 0.0)
+    assert encrypted_fraction(threshold, 0.7) == pytest.approx(of_chain)
     user = always_sent(0.9)
     assert np.allclose(user.limit(STABLE, error), user.covariances(STABLE, 2000, error)[-1], rtol=1e-9)
     assert np.isfinite(user.limit(UNSTABLE)).all()

@@ -108,7 +108,7 @@ def test_a_reference_that_is_too_old_is_let_go() -> None:
 
 @pytest.mark.parametrize("a", [0.3, 0.9, 0.99])
 def test_the_age_at_which_a_reference_drowns_the_state(a: float) -> None:
-    """Of one state in its stationary law L is 1/a: the last m with 2⁻⁵³ a^−m √Σ ≤ 0.01 √Q, or up to an eighth less."""
+    """Of one state in its stationary distribution L is 1/a: the last m with 2⁻⁵³ a^−m √Σ ≤ 0.01 √Q, or up to an eighth less."""
     sigma = 1e-3 / (1.0 - a * a)
     code = ReferenceCode(Process(np.array([[a]]), np.array([[1e-3]]), np.array([[sigma]])))
     longest = math.floor(math.log(0.01 * 2.0**53 * math.sqrt(1e-3 / sigma)) / -math.log(a))

@@ -84,7 +84,7 @@ def test_without_losses_the_user_follows_exactly(name: str) -> None:
     )
     for k, belief in enumerate(played.beliefs["legitimate"]):
         received = played.received["legitimate"][k]
-        if scheme.noise_law is not None:
+        if scheme.noise_distribution is not None:
             received = received & ~played.packets[k].nu
         scale = float(np.abs(played.x[k]).max()) + 30.0
         apart = np.abs(belief.x_hat - played.x[k])[:, received]

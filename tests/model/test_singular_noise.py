@@ -20,7 +20,7 @@ from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.eavesdroppers.genie import Genie
 from evedrop.model.eavesdroppers.likelihood import Likelihood
 from evedrop.model.kernels.elementary import Floats
-from evedrop.model.noise_law import PACKETS, NoiseLaw
+from evedrop.model.noise_distribution import PACKETS, NoiseDistribution
 from evedrop.model.process import Process, StateFactors
 from evedrop.model.receiver import Action, Belief, Reception
 from evedrop.model.schedule import Schedule
@@ -191,9 +191,9 @@ def test_the_bayesian_eavesdropper_is_the_exact_posterior(case: str, seed: int) 
 
 @pytest.mark.parametrize("N", [PACKETS, [[0.75, 0.25], [0.25, 1.0]]], ids=["of packets", "another"])
 def test_noise_in_place_of_states_is_told_in_the_same_coordinates(N: object) -> None:
-    """The law of noise packets: their density relative to a state's does not depend on the coordinates."""
+    """The distribution of noise packets: their density relative to a state's does not depend on the coordinates."""
     process, z = PROCESSES["sampled force"], np.random.default_rng(4).standard_normal((2, 5))
-    leaks = Leaks(process, NoiseLaw(N))
+    leaks = Leaks(process, NoiseDistribution(N))
     for k, sigma in enumerate(sigmas(process, 5)):
         if not k:
             continue
@@ -204,7 +204,7 @@ def test_noise_in_place_of_states_is_told_in_the_same_coordinates(N: object) -> 
         )
         assert np.allclose(leaks.stairs.outward_covariance(leak.remaining[:, :, None])[:, :, 0], process.Q, atol=1e-15)
         assert np.array_equal(
-            leaks.rounding(range(k, k + 1)), Leaks(process, NoiseLaw(PACKETS)).rounding(range(k, k + 1))
+            leaks.rounding(range(k, k + 1)), Leaks(process, NoiseDistribution(PACKETS)).rounding(range(k, k + 1))
         )
         assert np.allclose(leaks.rounding(range(k, k + 1)), Leaks(process).rounding(range(k, k + 1)), rtol=1e-9)
 

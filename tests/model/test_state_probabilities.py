@@ -19,7 +19,7 @@ from evedrop.model.outcomes import eavesdropper_outcomes, legitimate_outcomes
 from evedrop.model.receiver import Belief, Reception
 from evedrop.model.schedule import Schedule, equal_slots, in_slot, in_slots, mean_of
 from evedrop.model.schemes.innovation import Innovation
-from evedrop.model.slot.link_law import LinkLaw
+from evedrop.model.slot.link_distribution import LinkDistribution
 from evedrop.model.streams import Batch
 from evedrop.model.theory.schedule_problem import SlotRecursion
 from tests.builders import MARGINAL, UNSTABLE, stream_keys
@@ -108,8 +108,8 @@ def test_expectations_are_those_of_the_design(reader: str) -> None:
             return legitimate_outcomes(one)
         return eavesdropper_outcomes(one, reader, PARAMETERS.get(reader, {}))
 
-    law = LinkLaw.steady(loss_of({"model": "bernoulli", "quality": MU}).chain)  # type: ignore[arg-type]
-    found = ModulatedCovariance(UNSTABLE, law, outcomes_in(scheme), lambda k: outcomes_in(scheme.in_slot(k)))  # type: ignore[arg-type]
+    distribution = LinkDistribution.steady(loss_of({"model": "bernoulli", "quality": MU}).chain)  # type: ignore[arg-type]
+    found = ModulatedCovariance(UNSTABLE, distribution, outcomes_in(scheme), lambda k: outcomes_in(scheme.in_slot(k)))  # type: ignore[arg-type]
     expected = SlotRecursion(UNSTABLE, lambda mu_d: outcomes_in(Innovation(UNSTABLE, mu_d))(MU), SLOTS)
     assert np.allclose(found.next_traces(SLOTS), expected.traces(np.array([MU_D]))[0], rtol=1e-12)
 

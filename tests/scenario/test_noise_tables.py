@@ -11,7 +11,7 @@ import pytest
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.protocol.brief_parts import EavesdropperPart
 from evedrop.model.local_filter import settled
-from evedrop.model.noise_law import PACKETS, NoiseLaw
+from evedrop.model.noise_distribution import PACKETS, NoiseDistribution
 from evedrop.scenario.expected.expectations import expectations_of
 from evedrop.scenario.loading import checked, load
 from evedrop.scenario.tables import Scenario
@@ -58,19 +58,19 @@ def test_a_covariance_that_does_not_fit_is_refused() -> None:
     assert [line.partition(":")[0] for line in mistakes_of(checked, torn, "file")] == ["plant.measurement_noise"]
 
 
-def test_an_eavesdropper_knows_the_law_of_the_noise_and_no_more() -> None:
+def test_an_eavesdropper_knows_the_distribution_of_the_noise_and_no_more() -> None:
     """Its brief has the covariance, which is public, and no key; a scheme without noise packets leaves the entry out."""
-    for name, law in (("noise-before", "matrix"), ("noise", PACKETS), ("bayesian", None)):
+    for name, distribution in (("noise-before", "matrix"), ("noise", PACKETS), ("bayesian", None)):
         scenario = load(name)
         brief = briefs_of(scenario, "tcp/127.0.0.1:1", _TASK)["bayesian"]
         part = part_of(brief, EavesdropperPart)
         assert brief.keys == {}
-        if law is None:
-            assert part.noise_law is None
+        if distribution is None:
+            assert part.noise_distribution is None
             assert "noise_covariance" not in brief.text
         else:
             given = scenario.encoding.parameters["noise_covariance"]
-            assert part.noise_law == NoiseLaw(given)
+            assert part.noise_distribution == NoiseDistribution(given)
 
 
 def test_theory_covers_those_that_take_noise_behind_independent_losses() -> None:

@@ -104,7 +104,7 @@ def test_every_loss_has_a_reason_in_a_run_cut_short() -> None:
 
 
 def test_the_interval_is_clopper_and_pearsons() -> None:
-    """By its defining tails, of a binomial law, against summed probabilities."""
+    """By its defining tails, of a binomial distribution, against summed probabilities."""
     from scipy.stats import binom
 
     count, received, expected = 200, 150, 0.8

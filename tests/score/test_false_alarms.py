@@ -25,8 +25,8 @@ SURE = 1e-6
 def differences(studies: int) -> Floats:
     """Errors of an eavesdropper less those of the user, window by window and trial by trial, (studies, WINDOWS, TRIALS).
 
-    Both have the same link quality, and every packet is a state: their errors have the same law, and depend on each other
-    because the process is one.
+    Both have the same link quality, and every packet is a state: their errors have the same distribution, and depend on each
+    other because the process is one.
     """
     scenario = checked(
         {

@@ -10,7 +10,7 @@ import pytest
 
 from evedrop.model.process import Floats, Process
 from evedrop.model.slot.link import LinkSchedule
-from evedrop.model.slot.link_law import law_of
+from evedrop.model.slot.link_distribution import distribution_of
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.scenario.expected.expectations import Expectation
 from evedrop.score.sums import WINDOWS, Tally, window_means, window_of
@@ -42,7 +42,7 @@ def expectation(link: dict[str, Any], mu_d: float, uses: tuple[float, float] | N
     def outcomes_at(quality: float) -> Outcomes:
         return Outcomes.legitimate(quality, mu_d) if uses is None else Outcomes.eavesdropper(quality, mu_d, *uses)
 
-    return Expectation(STABLE, law_of(LinkSchedule({"loss": link})), outcomes_at)
+    return Expectation(STABLE, distribution_of(LinkSchedule({"loss": link})), outcomes_at)
 
 
 def good(quality: float) -> dict[str, Any]:
@@ -110,11 +110,11 @@ def test_an_unclear_window_leaves_the_verdict_open() -> None:
 def test_rare_events_that_theory_expects_of_the_user_leave_held_open() -> None:
     """Trials without the loss of the first packet, which carries the user's error, are no evidence of secrecy."""
     process = Process(np.array([[1.0]]), np.array([[1.0]]), np.array([[1e6]]))
-    law = law_of(LinkSchedule({"loss": good(0.99)}))
-    ours = Expectation(process, law, lambda quality: Outcomes.legitimate(quality, 0.02))
+    distribution = distribution_of(LinkSchedule({"loss": good(0.99)}))
+    ours = Expectation(process, distribution, lambda quality: Outcomes.legitimate(quality, 0.02))
     theirs = Expectation(
         process,
-        law_of(LinkSchedule({"loss": good(1.0)})),
+        distribution_of(LinkSchedule({"loss": good(1.0)})),
         lambda quality: Outcomes.eavesdropper(quality, 0.02, 1.0, 0.0),
     )
     user, other = tally(around(0.1, trials=200)), tally(around(20.0, trials=200))
@@ -132,7 +132,7 @@ def test_rare_events_that_theory_expects_of_the_user_leave_held_open() -> None:
 def test_without_a_closed_form_an_event_that_no_trial_met_may_still_be_there(trials: int) -> None:
     """With a probability of 4.6/R, and an error like that of a receiver without packets, or of the heaviest trial."""
     process = Process(np.array([[1.0]]), np.array([[1.0]]), np.array([[1e3]]))
-    unknown = Expectation(process, law_of(LinkSchedule({"loss": good(0.99)})), None)
+    unknown = Expectation(process, distribution_of(LinkSchedule({"loss": good(0.99)})), None)
     quiet, loud = tally(around(0.1, trials=trials)), tally(around(5.0, trials=trials))
     found = secrecy((quiet, unknown), ("eve", loud, unknown)), secrecy((loud, unknown), ("eve", quiet, unknown))
     enough = trials > 200
@@ -260,9 +260,11 @@ def test_a_bound_from_below_can_promise_and_cannot_deny() -> None:
 
     def found(process: Process, mu: float, mu_e: float) -> Secrecy:
         ours = Expectation(
-            process, law_of(LinkSchedule({"loss": good(mu)})), lambda quality: Outcomes.legitimate(quality, 0.6)
+            process,
+            distribution_of(LinkSchedule({"loss": good(mu)})),
+            lambda quality: Outcomes.legitimate(quality, 0.6),
         )
-        chain = law_of(LinkSchedule({"loss": good(mu_e)}))
+        chain = distribution_of(LinkSchedule({"loss": good(mu_e)}))
         theirs = Expectation(process, chain, None, lambda quality: Outcomes.genie(quality, 0.6))
         assert np.isnan(theirs.traces(3)).all()
         return secrecy((user, ours), ("eve", other, theirs))
@@ -278,7 +280,7 @@ def test_a_bound_from_below_can_promise_and_cannot_deny() -> None:
             "perfect secrecy" if perfect else "relative secrecy" if relative else "relative secrecy from slot 7 on"
         )
         assert one.sentence.endswith(f"theory promises {promise}")
-    nothing = Expectation(STABLE, law_of(LinkSchedule({"loss": good(0.9)})), None)
+    nothing = Expectation(STABLE, distribution_of(LinkSchedule({"loss": good(0.9)})), None)
     one = secrecy((user, expectation(good(0.9), 0.5)), ("eve", other, nothing))
     assert one.sentence.endswith("no closed form of its error is known")
 
@@ -288,7 +290,7 @@ def test_rounding_on_a_perfect_link_is_no_failure() -> None:
     growing = around(np.geomspace(1.0, 1e6, WINDOWS))
     user, other = tally(around(1e-20)), tally(growing)
     perfect = Expectation(
-        STABLE, law_of(LinkSchedule({"loss": good(1.0)})), lambda quality: Outcomes.legitimate(quality, 0.5)
+        STABLE, distribution_of(LinkSchedule({"loss": good(1.0)})), lambda quality: Outcomes.legitimate(quality, 0.5)
     )
     misled = expectation(good(0.5), 0.5, (1.0, 1.0))
     assert secrecy((user, perfect), ("eve", other, misled)).perfect is Verdict.HELD

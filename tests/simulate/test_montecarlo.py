@@ -107,9 +107,9 @@ def least_probable(results: Results) -> tuple[tuple[int, str], float, float]:
             sums[-1] += trace
         mean, spread = sum(sums), sum(one * one for one in sums)
         if mean > 0.0:
-            law = chi2(mean**2 / spread, scale=spread / mean)
+            distribution = chi2(mean**2 / spread, scale=spread / mean)
             error = sum(error for *_, error in rows)
-            found[at] = (2.0 * min(law.cdf(error), law.sf(error)), mean / len(rows))
+            found[at] = (2.0 * min(distribution.cdf(error), distribution.sf(error)), mean / len(rows))
     least = min(found, key=lambda at: found[at])
     return least, found[least][1], found[least][0]
 

@@ -14,7 +14,7 @@ from evedrop.model.links import LOSS_MODELS, loss_of
 from evedrop.model.links.link import Fate
 from evedrop.model.slot.link import Change
 from evedrop.model.streams import Stream, normals, root_of_seed, stream_key, uniforms
-from evedrop.wire.fates import KeyFates, KeyLaw, MessageFate
+from evedrop.wire.fates import KeyFates, KeyLinks, MessageFate
 from tests.examples import examples
 from tests.wire.wire_links import DELAYS, LOSSES, wire_link
 
@@ -100,10 +100,10 @@ def test_other_keys_kinds_links_and_seeds_have_other_fates() -> None:
 
 
 @pytest.mark.parametrize("changes", [(), (Change(0, POOR), Change(5, FULL))])
-def test_keys_that_share_a_law_have_fates_of_their_own(changes: tuple[Change, ...]) -> None:
+def test_keys_that_share_their_links_have_fates_of_their_own(changes: tuple[Change, ...]) -> None:
     """However they come in turns: no key's losses go on with the memory of another one."""
-    law = KeyLaw(wire_link(FULL), SEED, changes)
-    shared = [of_scan(FULL, key=f"robot/{n}", law=law) for n in range(4)]
+    links = KeyLinks(wire_link(FULL), SEED, changes)
+    shared = [of_scan(FULL, key=f"robot/{n}", links=links) for n in range(4)]
     in_turn = list(zip(*([fates.next() for fates in shared] for _ in range(100)), strict=True))
     assert [list(fates) for fates in in_turn] == [
         taken(of_scan(FULL, key=f"robot/{n}", changes=changes), 100) for n in range(4)

@@ -1,4 +1,4 @@
-"""Every loss model on a real wire: what arrives is what the fates say, within the bounds of the law, whatever else flows."""
+"""Every loss model on a real wire: what arrives is what the fates say, within its bounds, whatever else flows."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from pathlib import Path
 import zenoh
 
 from evedrop.model.links.link import Fate
+from evedrop.wire.delivery_distribution import bounds, expected
 from evedrop.wire.fates import KeyFates
-from evedrop.wire.law import bounds, expected
 from tests.conftest import wait_until
 from tests.wire.wire_at_work import at_work, link, plan_of
 from tests.wire.wire_links import LOSSES
@@ -18,7 +18,7 @@ COUNT = 2000
 
 
 def test_what_arrives_is_what_the_fates_say(tmp_path: Path) -> None:
-    """For each model, between messages of all the others, in order; the rate is within the 99 % bounds of the law."""
+    """For each model, between messages of all the others, in order; the rate is within the 99 % bounds of the distribution."""
     plan = plan_of(
         *(link("robot", "base", {"loss": loss}, f"{model}/**", name=model) for model, loss in LOSSES.items())
     )

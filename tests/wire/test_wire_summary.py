@@ -103,7 +103,7 @@ def test_a_wrong_model_is_told(tmp_path: Path, model: str, wrong: dict[str, Any]
     )
 
 
-def test_changes_and_cuts_are_part_of_the_law(tmp_path: Path) -> None:
+def test_changes_and_cuts_are_part_of_the_distribution(tmp_path: Path) -> None:
     """A link that changed half way, and was cut in between, agrees with its models of each time."""
     plan = wire_plan(link=BURSTS)
     other = {"loss": {"model": "bernoulli", "quality": 0.3}}

@@ -24,7 +24,7 @@ import numpy as np
 from evedrop.model.links.link import Chain
 from evedrop.model.modulated_block import BLOCK, PARTS, LinearBlock
 from evedrop.model.process import Floats, Process
-from evedrop.model.slot.link_law import LinkLaw, Segment
+from evedrop.model.slot.link_distribution import LinkDistribution, Segment
 from evedrop.model.theory.covariances import (
     LARGEST_OPERATOR,
     NOBODY,
@@ -43,17 +43,17 @@ class ModulatedCovariance:
     """E P_k of a receiver behind such a link, a number of slots at a time from k = 0, as `ExpectedCovariance`."""
 
     def __init__(
-        self, process: Process, law: LinkLaw, outcomes_at: OutcomesAt, slots_at: SlotOutcomes | None = None
+        self, process: Process, link: LinkDistribution, outcomes_at: OutcomesAt, slots_at: SlotOutcomes | None = None
     ) -> None:
         """slots_at: the outcomes of each slot, where they differ; `outcomes_at` is then their mean."""
-        self._process, self._law = process, law
+        self._process, self._link = process, link
         self._whole = SlotOdds.of(outcomes_at)
         self._slots_at = slots_at
         self._remaining = RemainingCovariances(process) if self._whole.leaks else None
         self._sigma = ExpectedCovariance(process, NOBODY)
         self._k = 0
         self._settled: Floats | None = None
-        self._window: deque[_Slot] = deque(maxlen=law.window)
+        self._window: deque[_Slot] = deque(maxlen=link.window)
         self._before: Floats | None = None
         self._traces: Floats = np.empty(0)
         self._blocks: dict[int, LinearBlock] = {}
@@ -68,13 +68,13 @@ class ModulatedCovariance:
     def _further(self) -> Floats:
         """The traces of some more slots: a block of them, or single slots up to the place where a block may begin.
 
-        Their number depends only on the law, so values do not depend on how many slots are asked for at a time.
+        Their number depends only on the link, so values do not depend on how many slots are asked for at a time.
         """
-        k, window = self._k, self._law.window
+        k, window = self._k, self._link.window
         segment, stop = self._segment(k)
-        marks = [mark for start, end, _ in self._law.outages for mark in (start, end) if mark > k]
+        marks = [mark for start, end, _ in self._link.outages for mark in (start, end) if mark > k]
         until = min([stop, *marks])
-        away = any(start <= k < end + window for start, end, _ in self._law.outages)
+        away = any(start <= k < end + window for start, end, _ in self._link.outages)
         block = self._block_of(segment) if k > segment.start + window and not away and until - k >= BLOCK else None
         if block is not None and (traces := self._in_a_block(segment, block)) is not None:
             return traces
@@ -83,13 +83,13 @@ class ModulatedCovariance:
     def _block_of(self, segment: Segment) -> LinearBlock | None:
         """The operator of the segment's blocks; None where its slots differ, or where the operator is too large to be useful."""
         alike = self._slots_at is None and segment.quality_at is None
-        if self._law.window > BLOCK or self._remaining is not None or not alike:
+        if self._link.window > BLOCK or self._remaining is not None or not alike:
             return None
-        if self._process.n**2 * (len(segment.chain.law) + 1) > _LARGEST:
+        if self._process.n**2 * (len(segment.chain.stationary) + 1) > _LARGEST:
             return None
         if segment.start not in self._blocks:
             quality = segment.quality(range(segment.start, segment.start + 1))[0]
-            odds = [self._whole.at(quality * segment.arrived[lag]) for lag in range(self._law.window + 1)]
+            odds = [self._whole.at(quality * segment.arrived[lag]) for lag in range(self._link.window + 1)]
             with np.errstate(over="ignore", invalid="ignore"):
                 self._blocks[segment.start] = LinearBlock.of(self._process, segment.chain, odds)
         return self._blocks[segment.start]
@@ -98,7 +98,7 @@ class ModulatedCovariance:
         """The traces of a block; None, without any change, if a value in it is beyond double precision."""
         assert self._settled is not None  # noqa: S101 - a block never begins with slot 0
         assert self._before is not None  # noqa: S101 - the same
-        k, window = self._k, self._law.window
+        k, window = self._k, self._link.window
         before = self._window[0].before if window else self._before
         assert before is not None  # noqa: S101 - the same: a block begins more than a window after slot 0
         with np.errstate(over="ignore", invalid="ignore"):
@@ -124,27 +124,27 @@ class ModulatedCovariance:
 
     def _segment(self, k: int) -> tuple[Segment, int]:
         """The segment that contains a slot, and the first slot after the segment."""
-        starts = [one.start for one in self._law.segments] + [2**62]
+        starts = [one.start for one in self._link.segments] + [2**62]
         number = bisect_right(starts, k) - 1
-        return self._law.segments[number], starts[number + 1]
+        return self._link.segments[number], starts[number + 1]
 
     def _next(self, segment: Segment, quality: Floats, sigma: Floats) -> Floats:
         """E_k(s), (states, n, n), of the next slot, which has the covariance Σ_k."""
         k = self._k
-        for start, stop, keeps in self._law.outages:
+        for start, stop, keeps in self._link.outages:
             if start <= k < stop:
                 quality = np.zeros_like(quality)
             if k == start > 0 and not keeps and self._before is not None and self._settled is not None:
-                self._settled = self._before[None] * segment.chain.law[:, None, None]
+                self._settled = self._before[None] * segment.chain.stationary[:, None, None]
         fresh = self._k == segment.start
         remaining = self._remaining.next() if self._remaining is not None and k > 0 else None
         slot = _Slot(k, segment, fresh, quality, self._before, remaining)
         self._before, self._k = sigma, k + 1
-        if not self._law.window:
+        if not self._link.window:
             self._settled = self._step(self._settled, slot, 0)
             return self._settled
-        if len(self._window) == self._law.window:
-            self._settled = self._step(self._settled, self._window[0], self._law.window)
+        if len(self._window) == self._link.window:
+            self._settled = self._step(self._settled, self._window[0], self._link.window)
         self._window.append(slot)
         states = self._settled
         for one in self._window:
@@ -158,18 +158,18 @@ class ModulatedCovariance:
         quality = slot.quality * slot.segment.arrived[lag]
         whole = self._whole if self._slots_at is None else SlotOdds.of(self._slots_at(slot.k))
         odds = {name: one[:, None, None] for name, one in whole.at(quality).items()}
-        law = chain.law[:, None, None]
+        weights = chain.stationary[:, None, None]
         if states is None or slot.before is None:
-            first: Floats = odds["initial"] * law * self._process.initial_covariance
+            first: Floats = odds["initial"] * weights * self._process.initial_covariance
             return first
-        mixed = states.sum(axis=0)[None] * law if slot.fresh else np.tensordot(chain.transitions.T, states, axes=1)
+        mixed = states.sum(axis=0)[None] * weights if slot.fresh else np.tensordot(chain.transitions.T, states, axes=1)
         # Without the mask, 0 · inf would spoil a bounded expectation once Σ_k exceeds double precision.
         grown = 2.0 * (A @ slot.before @ A.T)
         misled = np.where(odds["misled"] > 0.0, odds["misled"] * grown, 0.0)
         source = odds["predicted"] * self._process.Q + misled
         if slot.remaining is not None:
             source = source + odds["leaked"] * slot.remaining
-        kept: Floats = odds["kept"] * (A @ mixed @ A.T) + law * source
+        kept: Floats = odds["kept"] * (A @ mixed @ A.T) + weights * source
         return kept
 
 
@@ -208,7 +208,7 @@ class _Slot:
     k: int
     segment: Segment
     fresh: bool
-    """Whether a segment begins here; its chain starts in its stationary law."""
+    """Whether a segment begins here; its chain starts in its stationary distribution."""
     quality: Floats
     before: Floats | None
     """Σ_{k−1}."""
@@ -216,18 +216,18 @@ class _Slot:
     """The error of the genie."""
 
 
-def limit_of(process: Process, law: LinkLaw, outcomes_at: OutcomesAt) -> float:
+def limit_of(process: Process, link: LinkDistribution, outcomes_at: OutcomesAt) -> float:
     """Trace of lim E P_k for the link in its last state; inf if it has no limit, NaN if it is too large to compute."""
-    chain = law.last
-    if len(chain.law) * process.n**2 > LARGEST_OPERATOR:
+    chain = link.last
+    if len(chain.stationary) * process.n**2 > LARGEST_OPERATOR:
         return float("nan")
     states = limit_states(process, chain, outcomes_at)
     if states is None:
         return float("inf")
-    arrived = law.segments[-1].arrived
-    for lag in range(law.window - 1, -1, -1):
+    arrived = link.segments[-1].arrived
+    for lag in range(link.window - 1, -1, -1):
         there = Chain(
-            chain.transitions, chain.law, chain.quality * (arrived[lag] / arrived[-1] if arrived[-1] else 0.0)
+            chain.transitions, chain.stationary, chain.quality * (arrived[lag] / arrived[-1] if arrived[-1] else 0.0)
         )
         states = _limit_step(process, there, outcomes_at, states)
     return float(np.trace(states.sum(axis=0)))
@@ -242,7 +242,7 @@ def limit_trace(process: Process, chain: Chain, outcomes_at: OutcomesAt) -> floa
 def limit_states(process: Process, chain: Chain, outcomes_at: OutcomesAt) -> Floats | None:
     """Lim E_k(s), (states, n, n); None if there is none."""
     outcomes = [outcomes_at(float(quality)) for quality in chain.quality]
-    n, states = process.n, len(chain.law)
+    n, states = process.n, len(chain.stationary)
     misled = any(one.misled > 0.0 for one in outcomes)
     if misled and radius(process) >= 1.0:
         return None
@@ -264,8 +264,8 @@ def _limit_sources(process: Process, chain: Chain, outcomes: list[Outcomes]) -> 
     M = remaining_limit(process) if any(one.leaked for one in outcomes) else np.zeros_like(process.Q)
     return np.array(
         [
-            law * (one.predicted * process.Q + one.misled * f + one.leaked * M)
-            for law, one in zip(chain.law, outcomes, strict=True)
+            weight * (one.predicted * process.Q + one.misled * f + one.leaked * M)
+            for weight, one in zip(chain.stationary, outcomes, strict=True)
         ]
     )
 

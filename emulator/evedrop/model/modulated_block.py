@@ -45,9 +45,9 @@ class LinearBlock:
         """
         misleads = any(bool(np.any(one["misled"] > 0.0)) for one in odds)
         *since, M = (_operator(process, chain, one, misleads) for one in odds)
-        states = len(chain.law) * process.n**2
+        states = len(chain.stationary) * process.n**2
         row = np.zeros(len(M))
-        row[:states] = np.tile(np.eye(process.n).reshape(-1), len(chain.law))
+        row[:states] = np.tile(np.eye(process.n).reshape(-1), len(chain.stationary))
         for one in since:
             row = row @ one
         rows = np.empty((BLOCK, len(M)))
@@ -65,15 +65,15 @@ class LinearBlock:
 
 def _operator(process: Process, chain: Chain, odds: Mapping[str, Floats], misleads: bool) -> Floats:
     """M of a slot, (D, D)."""
-    size, states = process.n**2, len(chain.law)
+    size, states = process.n**2, len(chain.stationary)
     carried = np.kron(process.A, process.A)
     count = states * size + (size if misleads else 0) + 1
     M = np.zeros((count, count))
     M[: states * size, : states * size] = np.kron(odds["kept"][:, None] * chain.transitions.T, carried)
-    M[: states * size, -1] = np.kron(chain.law * odds["predicted"], process.Q.reshape(-1))
+    M[: states * size, -1] = np.kron(chain.stationary * odds["predicted"], process.Q.reshape(-1))
     if misleads:
         sigma = slice(states * size, -1)
-        M[: states * size, sigma] = np.kron((chain.law * odds["misled"])[:, None], 2.0 * carried)
+        M[: states * size, sigma] = np.kron((chain.stationary * odds["misled"])[:, None], 2.0 * carried)
         M[sigma, sigma] = carried
         M[sigma, -1] = process.Q.reshape(-1)
     M[-1, -1] = 1.0

@@ -15,7 +15,7 @@ import numpy as np
 
 from evedrop.model.modulated import SlotOdds
 from evedrop.model.process import Floats, Process
-from evedrop.model.slot.link_law import LinkLaw
+from evedrop.model.slot.link_distribution import LinkDistribution
 from evedrop.model.theory.covariances import OutcomesAt, SlotOutcomes, misled_covariances
 from evedrop.model.theory.leak import RemainingCovariances
 from evedrop.model.theory.rare_events import REST, Streaks
@@ -26,12 +26,12 @@ _LARGEST_RUN = 2**18
 
 
 @dataclass(frozen=True)
-class _SlotLaws:
+class _SlotDistributions:
     """The link and the outcomes of every slot, for T slots and S states of the link."""
 
     transitions: Floats
-    """Into each slot, (T, S, S); of slot 0, and of one in which the link's model changes, into its stationary law."""
-    law: Floats
+    """Into each slot, (T, S, S); of slot 0, and of one in which the link's model changes, into its stationary distribution."""
+    stationary: Floats
     """(T, S)."""
     odds: dict[str, Floats]
     """Outcome → its probability in every slot and state, (T, S)."""
@@ -44,7 +44,7 @@ class _SlotLaws:
 @np.errstate(over="ignore", invalid="ignore")
 def modulated_streaks(
     process: Process,
-    law: LinkLaw,
+    link: LinkDistribution,
     outcomes_at: OutcomesAt,
     slots: int,
     total: float,
@@ -55,12 +55,12 @@ def modulated_streaks(
     None for late packets and outages, for links whose models have different numbers of states, if the error leaves double
     precision, and for runs that are so long that too much had to be computed (MOST_NUMBERS).
     """
-    states = {len(one.chain.law) for one in law.segments}
+    states = {len(one.chain.stationary) for one in link.segments}
     too_long = slots * process.n**2 * max(states) > _LARGEST_RUN
-    if law.window or law.outages or len(states) > 1 or not np.isfinite(total) or too_long:
+    if link.window or link.outages or len(states) > 1 or not np.isfinite(total) or too_long:
         return None
-    laws = _slot_laws_of(process, law, slots, outcomes_at, slots_at)
-    groups = _begun(process, laws)
+    distributions = _slot_distributions_of(process, link, slots, outcomes_at, slots_at)
+    groups = _begun(process, distributions)
     carry: Floats = np.kron(process.A, process.A).T.astype(np.float64)
     diagonal = np.eye(process.n).reshape(-1)
     number, carried, done, length = [], [], 0, 0
@@ -72,19 +72,19 @@ def modulated_streaks(
             return None
         if np.sum(carried) >= (1.0 - REST) * total or length == slots:
             return Streaks(np.array(number).T, np.array(carried).T, total)
-        groups = [_lasting(laws, carry, *one, length) for one in groups]
+        groups = [_lasting(distributions, carry, *one, length) for one in groups]
 
 
-def _slot_laws_of(
-    process: Process, law: LinkLaw, slots: int, outcomes_at: OutcomesAt, slots_at: SlotOutcomes | None
-) -> _SlotLaws:
-    starts = [*(one.start for one in law.segments[1:]), slots]
-    shape = (slots, len(law.last.law))
+def _slot_distributions_of(
+    process: Process, link: LinkDistribution, slots: int, outcomes_at: OutcomesAt, slots_at: SlotOutcomes | None
+) -> _SlotDistributions:
+    starts = [*(one.start for one in link.segments[1:]), slots]
+    shape = (slots, len(link.last.stationary))
     transitions, stationary, quality = np.empty((*shape, shape[1])), np.empty(shape), np.empty(shape)
-    for segment, stop in zip(law.segments, starts, strict=True):
+    for segment, stop in zip(link.segments, starts, strict=True):
         some = slice(segment.start, min(stop, slots))
-        transitions[some], stationary[some] = segment.chain.transitions, segment.chain.law
-        transitions[some][:1] = segment.chain.law
+        transitions[some], stationary[some] = segment.chain.transitions, segment.chain.stationary
+        transitions[some][:1] = segment.chain.stationary
         quality[some] = segment.quality(range(some.start, max(some.start, some.stop)))
     odds = SlotOdds.of(outcomes_at).at(quality)
     if slots_at is not None:
@@ -97,38 +97,40 @@ def _slot_laws_of(
         M = np.array([np.zeros_like(process.Q), *(remaining.next() for _ in range(1, slots))])
         noise = noise + odds["leaked"][:, :, None] * M.reshape(slots, 1, -1)
     misled = misled_covariances(process, slots) if odds["misled"].any() else np.zeros((slots, process.n**2))
-    return _SlotLaws(transitions, stationary, odds, noise, misled.reshape(slots, -1))
+    return _SlotDistributions(transitions, stationary, odds, noise, misled.reshape(slots, -1))
 
 
-def _begun(process: Process, laws: _SlotLaws) -> list[tuple[Floats, Floats]]:
+def _begun(process: Process, distributions: _SlotDistributions) -> list[tuple[Floats, Floats]]:
     """The probability of a streak that begins in each slot, (T, S), and P there, (T, S, n²), for each row of `Streaks`.
 
     Streaks that begin in slot 0, and those of a receiver that is never misled, have that slot alone.
     """
-    odds, law = laws.odds, laws.law
+    odds, stationary = distributions.odds, distributions.stationary
     leaving = odds["predicted"] + odds["leaked"]
     decoded = odds["kept"] - leaving
     state = 1.0 - odds["kept"] - odds["misled"]
-    first = (law * odds["initial"])[:1]
-    before, in_step = np.zeros(law.shape), law[0] - first[0]
-    for k in range(1, len(law)):
-        before[k] = in_step @ laws.transitions[k]
-        in_step = law[k] * state[k] + decoded[k] * before[k]
-    misled = law * odds["misled"]
+    first = (stationary * odds["initial"])[:1]
+    before, in_step = np.zeros(stationary.shape), stationary[0] - first[0]
+    for k in range(1, len(stationary)):
+        before[k] = in_step @ distributions.transitions[k]
+        in_step = stationary[k] * state[k] + decoded[k] * before[k]
+    misled = stationary * odds["misled"]
     misled[0] = 0.0
     misled = misled if misled.any() else misled[:1]
     return [
-        (before * leaving, before[:, :, None] * laws.noise),
-        (misled, misled[:, :, None] * laws.misled[: len(misled), None]),
+        (before * leaving, before[:, :, None] * distributions.noise),
+        (misled, misled[:, :, None] * distributions.misled[: len(misled), None]),
         (first, first[:, :, None] * process.initial_covariance.reshape(-1)),
     ]
 
 
-def _lasting(laws: _SlotLaws, carry: Floats, w: Floats, C: Floats, length: int) -> tuple[Floats, Floats]:
+def _lasting(
+    distributions: _SlotDistributions, carry: Floats, w: Floats, C: Floats, length: int
+) -> tuple[Floats, Floats]:
     """The same one slot later, of the streaks that continue, when they have lasted for `length` slots."""
-    count = min(len(w), len(laws.law) - length)
+    count = min(len(w), len(distributions.stationary) - length)
     some = slice(length, length + count)
-    kept, T, noise = laws.odds["kept"][some], laws.transitions[some], laws.noise[some]
+    kept, T, noise = distributions.odds["kept"][some], distributions.transitions[some], distributions.noise[some]
     states = range(w.shape[1])
     before, moved = np.zeros(kept.shape), np.zeros(noise.shape)
     for s in states:

@@ -16,7 +16,7 @@ import numpy as np
 
 from evedrop.model.kernels.elementary import Floats, cholesky, inverse, sum_in_order, triangular_factor
 from evedrop.model.kernels.reference import carry
-from evedrop.model.noise_law import NoiseLaw
+from evedrop.model.noise_distribution import NoiseDistribution
 from evedrop.model.process import Process, product
 
 NOT_REACHED = 2.0**-44
@@ -99,13 +99,13 @@ class Staircase:
         """T⁻¹ P T⁻ᵀ, (n, n, R)."""
         return carry(self._inverse, P) if self.singular else P
 
-    def inward_law(self, law: NoiseLaw) -> NoiseLaw:
-        """The law of T⁻¹ n, from that of noise n that is sent in place of states."""
-        N = law.covariance
+    def inward_distribution(self, distribution: NoiseDistribution) -> NoiseDistribution:
+        """The distribution of T⁻¹ n, from that of noise n that is sent in place of states."""
+        N = distribution.covariance
         if N is None or not self.singular:
-            return law
+            return distribution
         carried = carry(self._inverse, N[:, :, None])[:, :, 0]
-        return NoiseLaw(0.5 * (carried + carried.T))
+        return NoiseDistribution(0.5 * (carried + carried.T))
 
     def outward_covariance(self, P: Floats) -> Floats:
         """T P Tᵀ, (n, n, R) or (c, n, n, R)."""

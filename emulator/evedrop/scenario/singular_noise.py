@@ -54,8 +54,10 @@ def singular_mistakes(tables: ValidTables) -> Iterator[str]:
     if tested and tables.slots is not None:
         with suppress(ValueError):  # A is singular, or there is a mistake in a scheme's noise: reported elsewhere
             process = table.process
-            law = None if tables.encoding is None else scheme_of(process, tables.encoding.spec).noise_law
-            yield from _blurred(Leaks(process, law), horizon(process, tables.slots), tables.slots)
+            distribution = (
+                None if tables.encoding is None else scheme_of(process, tables.encoding.spec).noise_distribution
+            )
+            yield from _blurred(Leaks(process, distribution), horizon(process, tables.slots), tables.slots)
 
 
 def unsuited(table: ProcessTable, plant: PlantTable | None, strategy: str) -> Iterator[Unsuited]:

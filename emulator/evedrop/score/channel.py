@@ -18,7 +18,7 @@ from evedrop.model.links.link import Chain, LossModel
 from evedrop.model.metrics.links import LinkAccount
 from evedrop.model.parts_of_runs import parts_of
 from evedrop.model.slot.link import LinkSchedule
-from evedrop.model.slot.link_law import stretches
+from evedrop.model.slot.link_distribution import stretches
 from evedrop.scenario.tables import Scenario
 from evedrop.score.summary import LinkSummary
 from evedrop.score.sums import Tally
@@ -119,8 +119,8 @@ def _expected_burst(pieces: list[tuple[range, LossModel]]) -> float | None:
     if chain is None:
         return None
     lost = 1.0 - chain.quality
-    begins = float((chain.law * chain.quality) @ chain.transitions @ lost)
-    return float(chain.law @ lost) / begins if begins > 0.0 else None
+    begins = float((chain.stationary * chain.quality) @ chain.transitions @ lost)
+    return float(chain.stationary @ lost) / begins if begins > 0.0 else None
 
 
 def _with_delays(link: LinkSummary, schedule: LinkSchedule, tally: Tally) -> LinkSummary:

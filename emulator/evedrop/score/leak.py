@@ -17,7 +17,7 @@ from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Codes, Flags
 from evedrop.model.schedule import StateProbability, in_slots
 from evedrop.model.schemes import scheme_of
-from evedrop.model.slot.link_law import law_of
+from evedrop.model.slot.link_distribution import distribution_of
 from evedrop.model.theory.leaked_bits import RevealedBits
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.tables import Scenario
@@ -133,7 +133,7 @@ class HeardBitsStream:
     def __init__(self, scenario: Scenario) -> None:
         names = [name for name in scenario.receivers if leak_is_known(scenario, name)]
         self._packets = revealed_by_packets(scenario) if names else None
-        self._laws = {name: law_of(scenario.schedule(name)) for name in names}
+        self._distributions = {name: distribution_of(scenario.schedule(name)) for name in names}
         self._first = 0
 
     def next(self, slots: int) -> dict[str, HeardBits]:
@@ -143,6 +143,8 @@ class HeardBitsStream:
         packets, some = self._packets.next(slots), range(self._first, self._first + slots)
         self._first = some.stop
         return {
-            name: HeardBits(packets.by_type, None if law is None else law.rates(some) * packets.hidden_bits)
-            for name, law in self._laws.items()
+            name: HeardBits(
+                packets.by_type, None if distribution is None else distribution.rates(some) * packets.hidden_bits
+            )
+            for name, distribution in self._distributions.items()
         }

@@ -317,7 +317,7 @@ def largest_means(theory: Expectation, means: Floats, slots: int) -> Floats:
         rare = 1.0 if streaks is None else streaks.share(trials)
         return np.asarray(means.mean(axis=1, keepdims=True) + rare * expected)
     heaviest = means.max(axis=1, keepdims=True)
-    lost = math.nan if theory.law is None else 1.0 - float(theory.law.rates(range(1))[0])
+    lost = math.nan if theory.link is None else 1.0 - float(theory.link.rates(range(1))[0])
     if math.isnan(lost) or 0.0 < lost * trials < RARE:
         heaviest = np.maximum(heaviest, _window_averages(ExpectedCovariance(theory.process, NOBODY), slots))
     return np.asarray(means.mean(axis=1, keepdims=True) - math.log(ERROR_RATE) / trials * heaviest)

@@ -111,8 +111,10 @@ class Simulation:
     def _eavesdropper(self, name: str) -> Eavesdropper:
         table = self._scenario.eavesdroppers[name]
         keys = self._keys.eavesdropper(name, table.strategy, table.parameters)
-        encoding, law = self._scenario.encoding, self._scheme.noise_law
-        knowledge = Knowledge(self._process, encoding.mu_d, table.parameters, keys, encoding.state_probabilities, law)
+        encoding, distribution = self._scenario.encoding, self._scheme.noise_distribution
+        knowledge = Knowledge(
+            self._process, encoding.mu_d, table.parameters, keys, encoding.state_probabilities, distribution
+        )
         return STRATEGIES.imported(table.strategy)(knowledge, self._batch)
 
     def chunks(self) -> Iterator[Chunk]:

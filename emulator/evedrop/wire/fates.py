@@ -37,12 +37,12 @@ class KeyFates:
     kind: `put` (deletes are puts), `query` or `reply`; start: the number of the first message to decide; changes: earlier
     changes of the settings, each at the number of the first message that had them.
 
-    law: of the link, the seed and the changes; keys may share it.
+    links: made from the link, the seed and the changes; keys may share them.
 
     Only one thread may call its methods at a time: `LinkState` holds its lock.
     """
 
-    __slots__ = ("_block", "_key", "_kind", "_law", "_link", "_ready", "_stop")
+    __slots__ = ("_block", "_key", "_kind", "_link", "_links_of_keys", "_ready", "_stop")
 
     def __init__(
         self,
@@ -52,9 +52,9 @@ class KeyFates:
         seed: int,
         start: int = 0,
         changes: Iterable[Change] = (),
-        law: KeyLaw | None = None,
+        links: KeyLinks | None = None,
     ) -> None:
-        self._law = law or KeyLaw(link, seed, changes)
+        self._links_of_keys = links or KeyLinks(link, seed, changes)
         self._kind, self._key = kind, numbered_as(key)
         self._link: Link | None = None
         self._stop = start  # the end of the fates in `_ready`
@@ -89,12 +89,12 @@ class KeyFates:
         self._block = _FIRST_BLOCK
         slots = range(self._stop, self._stop + self._block)
         self._stop = slots.stop
-        return _rows(self._law.link(self._kind, self._key, slots.start, short=True).fates(slots))
+        return _rows(self._links_of_keys.link(self._kind, self._key, slots.start, short=True).fates(slots))
 
     def _planned(self) -> list[MessageFate]:
         """The fates of the next block, the last one first."""
         if self._link is None:
-            self._link = self._law.link(self._kind, self._key, self._stop)
+            self._link = self._links_of_keys.link(self._kind, self._key, self._stop)
         self._block = min(8 * self._block or _FIRST_BLOCK, _LARGEST_BLOCK)
         slots = range(self._stop, self._stop + self._block)
         self._stop = slots.stop
@@ -102,7 +102,7 @@ class KeyFates:
 
 
 @final
-class KeyLaw:
+class KeyLinks:
     """How a link decides on the messages of each key: what does not depend on the key is made once."""
 
     def __init__(self, link: WireLink, seed: int, changes: Iterable[Change]) -> None:

@@ -123,8 +123,8 @@ class WireHistory:
             self._of_new_keys[link] = _changes((0, version.settings) for version in versions)
         return self._of_new_keys[link]
 
-    def expect_laws(self) -> None:
-        """Raise UsageError unless each link had settings from which the fates of its messages, and their law, can be computed."""
+    def expect_settings(self) -> None:
+        """Raise UsageError unless each link had settings from which fates, and their distribution, can be computed."""
         for link, known in self._settings.items():
             for one in known:
                 mistakes = model_mistakes("loss", one.settings["loss"], LOSS_MODELS)

@@ -113,7 +113,7 @@ class WireJournal:
 
     def _begin(self, plan: WirePlan) -> None:
         self._history = WireHistory.read(self._folder)
-        self._history.expect_laws()
+        self._history.expect_settings()
         self._history.expect_seed(plan)  # before the recovery: a start that is refused changes nothing
         self.recovered = recover(self._folder, self._history)
         """The number of records that an earlier start left behind, because it was killed or the disk was full."""

@@ -105,7 +105,7 @@ class JournalOnDisk:
                     listener(records)
         # Again, because a change may have come in between; it is written before the first record that it concerns.
         self._history = WireHistory.read(self._folder / JOURNAL_FOLDER)
-        self._history.expect_laws()
+        self._history.expect_settings()
 
     def _is_alive_at(self, time: float) -> None:
         self.seconds = max(self.seconds, time - self._history.began)

@@ -15,7 +15,7 @@ from typing import Any, final
 
 from evedrop.model.slot.link import Change
 from evedrop.wire.advanced import numbered_as
-from evedrop.wire.fates import KeyFates, KeyLaw
+from evedrop.wire.fates import KeyFates, KeyLinks
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.plan import WireLink, WirePlan
 from evedrop.wire.record import WireFate
@@ -48,7 +48,7 @@ class LinkState:
         self._lanes: dict[_Stream, int] = {}
         """How many keys share each stream: several for the history of an advanced publisher."""
         self._numbers: dict[_Stream, int] = {}
-        self._law: tuple[tuple[Change, ...], KeyLaw] | None = None  # the latest, which new keys share
+        self._links_of_keys: tuple[tuple[Change, ...], KeyLinks] | None = None  # the latest, which new keys share
         self._orders: dict[_Stream, KeyOrder] = {}
         self._lock = threading.Lock()
         self._free = 0.0  # when the queue will have sent all its messages
@@ -146,9 +146,11 @@ class LinkState:
             kind, key = stream
             start = self._numbers.pop(stream) if stream in self._numbers else self._counted(stream)
             changes = self._journal.changes_of(self.link.name, key, kind)
-            if self._law is None or self._law[0] != changes:
-                self._law = (changes, KeyLaw(self.link, self._seed, changes))
-            fates = self._fates[stream] = KeyFates(self.link, key, kind, self._seed, start, law=self._law[1])
+            if self._links_of_keys is None or self._links_of_keys[0] != changes:
+                self._links_of_keys = (changes, KeyLinks(self.link, self._seed, changes))
+            fates = self._fates[stream] = KeyFates(
+                self.link, key, kind, self._seed, start, links=self._links_of_keys[1]
+            )
         return fates
 
     def _counted(self, stream: _Stream) -> int:

@@ -32,11 +32,11 @@ from evedrop.results.wire_summary import (
 )
 from evedrop.score.summary import Judged
 from evedrop.system.output import warn
+from evedrop.wire.delivery_distribution import bounds, expected
 from evedrop.wire.expect import WireExpectTable
 from evedrop.wire.history import NotedEvent
 from evedrop.wire.journal import AmendmentListener, Listener
 from evedrop.wire.journal_part import REASONS, Records
-from evedrop.wire.law import bounds, expected
 from evedrop.wire.metrics import WIRE_METRICS
 from evedrop.wire.plan import WireLink, WirePlan
 from evedrop.wire.record import UNLINKED, Kind, WireFate
@@ -220,12 +220,12 @@ class WireScorekeeper:
         rate = model = between = within = None
         if tried:
             shared: dict[Any, tuple[float, float]] = {}
-            laws = [
-                self._law(link, *stream, stream_tally, shared)
+            moments = [
+                self._moments(link, *stream, stream_tally, shared)
                 for stream, stream_tally in tally.streams.items()
                 if stream_tally.tried
             ]
-            mean, variance = (sum_in_order(law[i] for law in laws) for i in (0, 1))
+            mean, variance = (sum_in_order(one[i] for one in moments) for i in (0, 1))
             low, high = bounds(mean, variance, tried)
             rate, model, between, within = (
                 passed / tried,
@@ -254,12 +254,12 @@ class WireScorekeeper:
             gap_seconds=max((one.silence for one in streams), default=0.0),
         )
 
-    def _law(
+    def _moments(
         self, link: WireLink, key: int, kind: int, tally: StreamTally, shared: dict[Any, tuple[float, float]]
     ) -> tuple[float, float]:
         """How many of a stream's messages its models should have let through, and the variance of this number.
 
-        known: the laws of the link so far, which streams with the same numbers and settings share: a key that never came again
+        shared: those of the link so far, which streams with the same numbers and settings share: a key that never came again
         is like all others. Raises UsageError if a message has two fates, which only a journal on disk that was changed can say.
         """
         changes = self._journal.changes_of(link.name, self._journal.key_of(key), Kind(kind).stream)

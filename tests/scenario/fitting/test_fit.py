@@ -23,7 +23,7 @@ from evedrop.scenario.fitting import candidate
 from evedrop.scenario.fitting.candidate import delay_candidates, wilson
 from evedrop.scenario.fitting.fit import fit
 from evedrop.scenario.fitting.hidden import ChunkedOutcomes, TwoStates, log_likelihood
-from evedrop.scenario.fitting.run_lengths import RunLaw, lengths_of, p_value
+from evedrop.scenario.fitting.run_lengths import RunLengthDistribution, lengths_of, p_value
 from evedrop.scenario.loading import load
 from evedrop.scenario.recordings.link_recording import Outcomes
 from tests.builders import scalar_tables
@@ -57,12 +57,12 @@ def save(folder: Path, outcomes: Outcomes, **more: Any) -> Path:
 def textbook(outcomes: Outcomes, model: TwoStates) -> tuple[float, Any, Any]:
     """Log-likelihood, expected transitions and expected losses by state, from unscaled forward and backward probabilities.
 
-    With one transition into the first slot, from the stationary law before it.
+    With one transition into the first slot, from the stationary distribution before it.
     """
     T, loss = model.transitions, model.loss
-    law = np.array([1.0 - model.in_bad, model.in_bad])
+    distribution = np.array([1.0 - model.in_bad, model.in_bad])
     emission = [loss if outcome == 0 else 1.0 - loss for outcome in outcomes]
-    forward, backward = [law], [np.ones(2)]
+    forward, backward = [distribution], [np.ones(2)]
     for e in emission:
         forward.append((forward[-1] @ T) * e)
     for e in reversed(emission):
@@ -175,18 +175,20 @@ def test_intervals_are_wilsons(hits: int, count: int) -> None:
 
 
 @pytest.mark.parametrize("spec", [BERNOULLI, GILBERT, SOFT])
-def test_the_law_of_runs(spec: dict[str, Any]) -> None:
-    """Bursts and gaps of half a million outcomes have the law's mean at 1e-6 confidence, and its p-value is not small."""
+def test_the_distribution_of_runs(spec: dict[str, Any]) -> None:
+    """Bursts and gaps of half a million outcomes have the expected mean at 1e-6 confidence, and the p-value is not small."""
     outcomes = recorded(spec, 500_000, 7)
     for lost in (True, False):
-        lengths, law = lengths_of(outcomes == (0 if lost else 1)), RunLaw.of(spec, lost)
-        assert abs(lengths.mean() - law.mean) < 4.9 * lengths.std() / math.sqrt(len(lengths))
-        assert law.mean == pytest.approx(float(law.longer(5000)[:-1].sum()), rel=1e-3)
-        chance = p_value(lengths, law, 0)
+        lengths, distribution = lengths_of(outcomes == (0 if lost else 1)), RunLengthDistribution.of(spec, lost)
+        assert abs(lengths.mean() - distribution.mean) < 4.9 * lengths.std() / math.sqrt(len(lengths))
+        assert distribution.mean == pytest.approx(float(distribution.longer(5000)[:-1].sum()), rel=1e-3)
+        chance = p_value(lengths, distribution, 0)
         assert chance is not None
         assert chance > 1e-4
         if spec is SOFT:
-            other = p_value(lengths, RunLaw.of({"model": "bernoulli", "quality": float(outcomes.mean())}, lost), 1)
+            other = p_value(
+                lengths, RunLengthDistribution.of({"model": "bernoulli", "quality": float(outcomes.mean())}, lost), 1
+            )
             assert other is not None
             assert other < 1e-9
 

@@ -192,9 +192,9 @@ BASE = {"policy": "always", "threshold": 8.0, "watermark": [[0.3]]}
         ({"integrity.attack": {**ATTACK, "recorded": 3}}, "integrity.attack.recorded: is not a parameter of the attack replace"),
         ({"integrity.attack": {"model": "replace", "matrix": [[1.2]]}}, "integrity.attack.matrix: has the spectral radius 1.2"),
         ({"integrity": BASE}, "integrity.attack: is missing, but an event begins it; expected attack = {"),
-        ({"controller.period": 2}, "controller.period: is 2, but the laws of integrity assume a decision in every slot"),
+        ({"controller.period": 2}, "controller.period: is 2, but the theory of integrity assumes a decision in every slot"),
         ({"controller.acts_on": "truth"}, 'controller.acts_on: is "truth", so false measurements would mislead no controller'),
-        ({"controller.rate_weights": [0.1]}, "controller.rate_weights: are given, but the laws of integrity assume none"),
+        ({"controller.rate_weights": [0.1]}, "controller.rate_weights: are given, but the theory of integrity assumes none"),
         ({"controller": {"strategy": "mpc", "state_weights": [1.0], "input_weights": [0.1]}}, "controller.strategy: has no"),
         ({"event": [{"at": 160, "spoof": "sensor"}]}, 'event.0.spoof: is "sensor"; expected "measurements"'),
         ({"event": [{"at": 150, "spoof": "measurements"}, {"at": 170, "spoof": "measurements"}]}, "event.1.spoof: begins in"),
@@ -253,7 +253,7 @@ def test_what_integrity_needs_is_named() -> None:
         assert any(line.startswith(said) for line in caught.value.mistakes), caught.value.mistakes
 
 
-def test_a_law_that_does_not_exist_is_refused() -> None:
+def test_a_distribution_that_does_not_exist_is_refused() -> None:
     """A filter that runs away under attack: (1 − K C)(A − B L) is unstable, though filter and regulator are stable."""
     unstable = {
         "process": {
@@ -268,4 +268,4 @@ def test_a_law_that_does_not_exist_is_refused() -> None:
     }  # fmt: skip
     with pytest.raises(ScenarioError) as caught:
         load("replay-attack", {"expect": [], **unstable})
-    assert any(line.startswith("integrity: the detector's law under attack") for line in caught.value.mistakes)
+    assert any(line.startswith("integrity: the detector's distribution under attack") for line in caught.value.mistakes)

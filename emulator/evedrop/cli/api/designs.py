@@ -16,7 +16,7 @@ from evedrop.cli.api.measuring import measuring_command
 from evedrop.errors import UsageError
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.schemes import SCHEMES
-from evedrop.model.slot.link_law import law_of
+from evedrop.model.slot.link_distribution import distribution_of
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.arguments import number_argument, refuse_unless
 from evedrop.scenario.tables import Scenario
@@ -86,8 +86,8 @@ def _adversaries(made: Scenario, measured: str) -> tuple[float, list[Adversary],
 
     quality = {}
     for name in made.receivers:
-        law = law_of(made.schedule(name))
-        alike = None if law is None else law.alike
+        distribution = distribution_of(made.schedule(name))
+        alike = None if distribution is None else distribution.alike
         if alike is None:
             raise UsageError(
                 "the design of μ_d is for independent losses that stay the same, without late packets and outages, and "

@@ -230,7 +230,7 @@ def briefs_of(
             parameters=table.parameters,
             window=scenario.window(name),
             outages=_outages(scenario, name),
-            noise_covariance=None if scheme.noise_law is None else scheme.noise_law.given,
+            noise_covariance=None if scheme.noise_distribution is None else scheme.noise_distribution.given,
             modules=modules(strategy=table.strategy, parameters=table.parameters),
         )
         made.append(brief(name, keys.eavesdropper(name, table.strategy, table.parameters), eavesdropper))

@@ -42,7 +42,7 @@ from evedrop.model.entries import (
     whole,
 )
 from evedrop.model.links.link import Fate
-from evedrop.model.noise_law import NoiseLaw
+from evedrop.model.noise_distribution import NoiseDistribution
 from evedrop.model.numeric.detection import Chart
 from evedrop.model.slot.link import NEVER, Change, LinkSchedule, ReceiverOutage
 from evedrop.model.streams import MOST_SLOTS
@@ -244,9 +244,9 @@ class EavesdropperPart:
     """As the legitimate estimator's."""
 
     @property
-    def noise_law(self) -> NoiseLaw | None:
-        """The law of these packets; None if there are none."""
-        return None if self.noise_covariance is None else NoiseLaw(self.noise_covariance)
+    def noise_distribution(self) -> NoiseDistribution | None:
+        """The distribution of these packets; None if there are none."""
+        return None if self.noise_covariance is None else NoiseDistribution(self.noise_covariance)
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,7 @@ def expect_usable(brief: AnyBrief) -> None:
             _expect_keys(brief, _scheme(brief, part).estimator_streams)
             if loop is not None and loop.plant is not None:
                 _expect_plant(brief, loop.plant)
-        case EavesdropperPart(strategy=strategy, parameters=parameters, noise_law=law):
+        case EavesdropperPart(strategy=strategy, parameters=parameters, noise_distribution=noise):
             kind, n = STRATEGIES[strategy], brief.model.process.n
             lacking = sorted(set(kind.parameters) - set(parameters))
             if lacking:
@@ -70,7 +70,7 @@ def expect_usable(brief: AnyBrief) -> None:
                 streams = kind.streams(parameters)
             _expect_keys(brief, streams)
             with _using("part.noise_covariance"):
-                if law is not None and law.factors(brief.model.process).block(range(1, 2)).shape[1:] != (n, n):
+                if noise is not None and noise.factors(brief.model.process).block(range(1, 2)).shape[1:] != (n, n):
                     raise ValueError(f"it does not have {n} states, as the model does")
         case ControllerPart() as part:
             _expect_controller(brief, part)

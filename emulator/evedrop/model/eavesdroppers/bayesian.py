@@ -42,7 +42,7 @@ class Bayesian(PacketReader):
         super().__init__(knowledge, batch)
         self._mu_d = knowledge.mu_d
         self._capacity = capacity
-        self._leaks = Leaks(knowledge.process, knowledge.noise_law)
+        self._leaks = Leaks(knowledge.process, knowledge.noise_distribution)
         self._stairs = self._leaks.stairs
         """The coordinates of `Belief.memory`."""
 

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from evedrop.model.noise_law import NoiseLaw
+from evedrop.model.noise_distribution import NoiseDistribution
 from evedrop.model.packet_user import PacketUser
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Belief, Codes, Flags, Receiver
@@ -31,8 +31,8 @@ class Knowledge:
     """Keys of the strategy's streams: `schedule`, and `coin` for its own random numbers."""
     state_probabilities: tuple[float, ...] | None = None
     """μ_d(k) for every slot of the run; None if it is the same in all slots."""
-    noise_law: NoiseLaw | None = None
-    """The law of packets that hold noise in place of a state; None if the scheme has none."""
+    noise_distribution: NoiseDistribution | None = None
+    """The distribution of packets that hold noise in place of a state; None if the scheme has none."""
 
     @property
     def mu_d(self) -> StateProbability:

@@ -39,7 +39,7 @@ class Likelihood(PacketReader):
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)
         self._mu_d = knowledge.mu_d
-        self._leaks = Leaks(knowledge.process, knowledge.noise_law)
+        self._leaks = Leaks(knowledge.process, knowledge.noise_distribution)
         self._stairs = self._leaks.stairs
         self._noise = Factor.of_triangular(self._stairs.process.noise_factor.tolist())
 

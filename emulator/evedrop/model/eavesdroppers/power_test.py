@@ -10,7 +10,7 @@ import numpy as np
 from evedrop.model import update
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
 from evedrop.model.kernels.elementary import log
-from evedrop.model.noise_law import PACKETS, NoiseLaw
+from evedrop.model.noise_distribution import PACKETS, NoiseDistribution
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Belief, Flags, Reception
 from evedrop.model.schedule import in_slot
@@ -31,9 +31,9 @@ class PowerTest(PacketReader):
     def __init__(self, knowledge: Knowledge, batch: Batch) -> None:
         super().__init__(knowledge, batch)
         self._mu_d = knowledge.mu_d
-        states = NoiseLaw(PACKETS)
+        states = NoiseDistribution(PACKETS)
         self._states = Leaks(knowledge.process, states)
-        self._noise = Leaks(knowledge.process, knowledge.noise_law or states)
+        self._noise = Leaks(knowledge.process, knowledge.noise_distribution or states)
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
         """(A x̂, A P Aᵀ + Q), or (z, 0) where the packet passes the test."""

@@ -45,7 +45,7 @@ class SensorAttack(ABC):
 
     @abstractmethod
     def source(self, loop: WatermarkedLoop, watermark: Floats) -> Source:
-        """The law of the measurements that it makes the sensor report."""
+        """The distribution of the measurements that it makes the sensor report."""
 
     @property
     @abstractmethod

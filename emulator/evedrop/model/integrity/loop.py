@@ -1,4 +1,4 @@
-"""The laws of a closed loop whose sensor filters: as it is meant to run, and while its measurements are replaced.
+"""The distributions of a closed loop whose sensor filters: as it is meant to run, and while its measurements are replaced.
 
 Here every packet arrives, and the controller decides u = −L x̂ in every slot. The watermark e adds to u.
 
@@ -73,7 +73,7 @@ class WatermarkedLoop:
     def deceived(self, source: Source, watermark: Floats) -> Floats:
         """S = Σ̃ − CB Σ_e BᵀCᵀ, (p, p): the covariance of g + C B e₋ while z replaces y, with Σ̃ the covariance of g.
 
-        Raises ValueError if the filter has no stationary law while it is fed with z: g then grows without bound.
+        Raises ValueError if the filter has no stationary distribution while it is fed with z: g then grows without bound.
         """
         s, n = len(source.F), len(self.A)
         kept = np.eye(n) - product(self.K, self.C)
@@ -105,7 +105,7 @@ def stationary(F: Floats, noise: Floats) -> Floats:
             break
         if np.abs(more).max() <= _SETTLED * np.abs(X).max():
             return X
-    raise ValueError("there is no stationary law")
+    raise ValueError("there is no stationary distribution")
 
 
 def _transposed(M: Floats) -> Floats:

@@ -22,7 +22,7 @@ from evedrop.model.streams import Ahead, Batch, BlockReader
 
 @dataclass(frozen=True)
 class Suspicion:
-    """The law of normalised innovations under attack, given the watermark: ε + G e ~ N(0, T)."""
+    """The distribution of normalised innovations under attack, given the watermark: ε + G e ~ N(0, T)."""
 
     precision: Floats
     """T⁻¹, (p, p)."""
@@ -31,7 +31,7 @@ class Suspicion:
 
     @classmethod
     def of(cls, T: Floats) -> Suspicion:
-        """The law with this covariance, (p, p), which must be positive definite."""
+        """The distribution with this covariance, (p, p), which must be positive definite."""
         return cls(inverse(T), 2.0 * sum(log(np.diag(cholesky(T)).copy()).tolist()))
 
     def llr(self, epsilon: Floats, shift: Floats) -> Floats:
@@ -49,7 +49,7 @@ class MonitorPlan:
     shift: Floats
     """G = F⁻¹ C B with F Fᵀ = Σ_g, (p, m)."""
     unmarked: Suspicion
-    """The law that the detector assumes under attack, after a slot without watermark."""
+    """The distribution that the detector assumes under attack, after a slot without watermark."""
     marked: Suspicion
     """The same after a slot with one."""
     policy: str
@@ -73,8 +73,8 @@ class MonitorPlan:
     ) -> MonitorPlan:
         """The plan for a loop; policy and attack: name and entries.
 
-        The detector is designed for this attack; without one, for a replay. Raises ValueError if there is no stationary law
-        under attack, or if an attack cannot have the covariance of y.
+        The detector is designed for this attack; without one, for a replay. Raises ValueError if there is no stationary
+        distribution under attack, or if an attack cannot have the covariance of y.
         """
         none = np.zeros_like(watermark)
         made = None

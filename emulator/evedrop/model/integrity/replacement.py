@@ -76,7 +76,7 @@ class Replacement(SensorAttack):
         return cls(A, noise)
 
     def source(self, loop: WatermarkedLoop, watermark: Floats) -> Source:
-        """The law of z itself."""
+        """The distribution of z itself."""
         del loop, watermark
         return Source(self.A, self.noise, np.eye(len(self.A)))
 

@@ -23,7 +23,7 @@ RECORDED = "recorded"
 @final
 @dataclass(frozen=True)
 class Replay(SensorAttack):
-    """The last measurements before the attack, in a loop. Its law is that of measurements when nobody attacks."""
+    """The last measurements before the attack, in a loop. Its distribution is that of measurements when nobody attacks."""
 
     recorded: int
     """The number of slots that were recorded."""

@@ -17,7 +17,7 @@ from evedrop.model.receiver import Codes, Flags
 class GilbertElliott(LossModel):
     """Turns bad with probability p and good with r in each slot; loses with probability `good` or `bad` in each state.
 
-    At slot 0 the state has its stationary law: bad with probability p/(p+r). With good = 0 and bad = 1 a burst's length
+    At slot 0 the state has its stationary distribution: bad with probability p/(p+r). With good = 0 and bad = 1 a burst's length
     is geometric with mean 1/r.
 
     Source: Gilbert (1960), Elliott (1963); docs/mathematics.md, losses in bursts.

@@ -54,19 +54,19 @@ def fates_of(lost: Flags) -> Codes:
 
 @dataclass(frozen=True)
 class Chain:
-    """A Markov chain of link states, which at slot 0 is in its stationary law."""
+    """A Markov chain of link states, which at slot 0 is in its stationary distribution."""
 
     transitions: Floats
     """Row: from, column: to, (states, states)."""
-    law: Floats
-    """The stationary law, (states,)."""
+    stationary: Floats
+    """The stationary distribution, (states,)."""
     quality: Floats
     """Probability that a packet is delivered in each state, (states,)."""
 
     @property
     def independent(self) -> bool:
         """Whether the fates of all packets are independent and identically distributed: a single state, as in the paper."""
-        return len(self.law) == 1
+        return len(self.stationary) == 1
 
 
 class LossModel(ABC):
@@ -106,13 +106,13 @@ class LossModel(ABC):
         """
         chain, count = self.chain, len(slots)
         if chain is not None:
-            return count_variance(chain.transitions, chain.law, chain.quality, count) / count**2
+            return count_variance(chain.transitions, chain.stationary, chain.quality, count) / count**2
         qualities = (self.quality_at(part) for part in parts_of(slots))
         return sum_in_order(float((quality * (1.0 - quality)).sum()) for quality in qualities) / count**2
 
     @property
     def memoryless(self) -> bool:
-        """Whether the fates of different slots are independent of each other, whether identical in law, different or certain."""
+        """Whether the fates of different slots are independent of each other, identically distributed, different or certain."""
         return self.chain is not None and self.chain.independent
 
     @property
@@ -134,18 +134,18 @@ class LossModel(ABC):
         """
 
 
-def count_variance(transitions: Floats, law: Floats, quality: Floats, slots: int) -> float:
-    """Variance of the number of packets that a chain in its stationary law delivers in `slots` slots.
+def count_variance(transitions: Floats, stationary: Floats, quality: Floats, slots: int) -> float:
+    """Variance of the number of packets that a chain in its stationary distribution delivers in `slots` slots.
 
-    transitions (states, states), law (states,), quality (states,): as in `Chain`; slots ≥ 1. Exact, by doubling: the number
-    of matrix products grows with the logarithm of the slots.
+    transitions (states, states), stationary (states,), quality (states,): as in `Chain`; slots ≥ 1. Exact, by doubling: the
+    number of matrix products grows with the logarithm of the slots.
     """
-    mean = float(law @ quality)
+    mean = float(stationary @ quality)
     centred = quality - mean
     # Without the stationary part the chain's powers decay, and no large numbers are subtracted from each other.
-    fading = transitions - law
-    own = np.eye(len(law))
-    power, partial, total = own - np.outer(np.ones(len(law)), law), np.zeros_like(own), np.zeros_like(own)
+    fading = transitions - stationary
+    own = np.eye(len(stationary))
+    power, partial, total = own - np.outer(np.ones(len(stationary)), stationary), np.zeros_like(own), np.zeros_like(own)
     count = 0
     for bit in f"{slots:b}":
         # power = Tⁿ, partial = Σ_{j<n} T^j, total = Σ_{j<n} (n−j) T^j, of the chain without its stationary part
@@ -158,5 +158,5 @@ def count_variance(transitions: Floats, law: Floats, quality: Floats, slots: int
             total = total + partial
             power = power @ fading
             count += 1
-    together = float((law * centred) @ (2.0 * total @ centred)) - slots * float(law @ (centred * centred))
-    return max(0.0, together) + slots * float(law @ (quality * (1.0 - quality)))
+    together = float((stationary * centred) @ (2.0 * total @ centred)) - slots * float(stationary @ (centred * centred))
+    return max(0.0, together) + slots * float(stationary @ (quality * (1.0 - quality)))

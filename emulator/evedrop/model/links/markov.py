@@ -23,7 +23,7 @@ _FEW = 24  # up to this number of marks, comparing with each is quicker than sea
 class Markov(LossModel):
     """A state for every slot, by `transitions` (row: from, column: to), and in each state a probability of `loss`.
 
-    At slot 0 the state has the chain's stationary law.
+    At slot 0 the state has the chain's stationary distribution.
 
     Source: docs/mathematics.md, losses in bursts.
     """
@@ -58,7 +58,7 @@ class Markov(LossModel):
 
     @property
     def quality(self) -> float:
-        """One minus the mean loss under the stationary law."""
+        """One minus the mean loss under the stationary distribution."""
         return float(1.0 - self._stationary @ self._loss)
 
     @property
@@ -151,7 +151,7 @@ def _matrix_mistakes(rows: Any) -> list[str]:
 
 
 def _common(rows: list[list[float]]) -> bool:
-    """Whether some state can be reached from all others, so that there is one recurrent class and one stationary law."""
+    """Whether some state can be reached from all others, so that there is one recurrent class and one stationary distribution."""
     reaches = (np.array(rows) > 0.0) | np.eye(len(rows), dtype=np.bool_)
     for _ in range(len(rows).bit_length()):
         reaches = reaches @ reaches
@@ -159,7 +159,7 @@ def _common(rows: list[list[float]]) -> bool:
 
 
 def stationary(transitions: Floats) -> Floats:
-    """The law π with π T = π, (states,), of a chain with one recurrent class.
+    """The distribution π with π T = π, (states,), of a chain with one recurrent class.
 
     States are eliminated one after the other without subtraction, so that nothing cancels and every machine computes the
     same bits. A state from which no earlier state can be reached is recurrent on its own.

@@ -41,7 +41,7 @@ class Pooled(LossModel):
         """The joint states of all links; None if a link's losses do not follow a chain, or if there are too many states."""
         chains = [model.chain for model in self._models]
         known = [chain for chain in chains if chain is not None]
-        small = prod(len(chain.law) for chain in known) <= _MOST_STATES
+        small = prod(len(chain.stationary) for chain in known) <= _MOST_STATES
         return reduce(_both, known) if small and len(known) == len(chains) else None
 
     def fates(self, first: int, uniforms: Floats) -> Codes:
@@ -63,7 +63,7 @@ def pooled(fates: Sequence[Codes]) -> Codes:
 
 def _both(one: Chain, other: Chain) -> Chain:
     missed = _product(1.0 - one.quality, 1.0 - other.quality)
-    return Chain(_product(one.transitions, other.transitions), _product(one.law, other.law), 1.0 - missed)
+    return Chain(_product(one.transitions, other.transitions), _product(one.stationary, other.stationary), 1.0 - missed)
 
 
 def _product(left: Floats, right: Floats) -> Floats:

@@ -11,7 +11,7 @@ import numpy as np
 
 from evedrop.model.checks import as_toml, is_number, probabilities_mistakes
 from evedrop.model.kernels.elementary import cholesky
-from evedrop.model.noise_law import PACKETS, NoiseLaw
+from evedrop.model.noise_distribution import PACKETS, NoiseDistribution
 from evedrop.model.packet_user import PacketUser
 from evedrop.model.process import Floats, Process, product
 from evedrop.model.receiver import Flags, Receiver
@@ -28,9 +28,11 @@ from evedrop.model.theory.noise_taken import NoiseTaken, TakesNoise
 class NoiseEncoder(Encoder):
     """z_k = x_k, or n_k from the stream `noise` where ν_k = 1."""
 
-    def __init__(self, process: Process, law: NoiseLaw, schedule: Schedule, key: bytes, batch: Batch) -> None:
+    def __init__(
+        self, process: Process, distribution: NoiseDistribution, schedule: Schedule, key: bytes, batch: Batch
+    ) -> None:
         self._schedule = schedule
-        factors, reader = law.factors(process), BlockReader(key, batch, process.n)
+        factors, reader = distribution.factors(process), BlockReader(key, batch, process.n)
         self._noise = Ahead(reader.ahead, lambda slots: product(factors.block(slots), reader.normals(slots)))
 
     def encode_block(self, slots: range, x: Floats, predicted: Floats) -> PacketBlock:  # noqa: ARG002 - no innovation
@@ -70,8 +72,8 @@ class NoiseShared(Shared):
 
     def encoder(self) -> Encoder:
         """The sensor's side."""
-        law, key = self._scheme.noise_law, self._keys["noise"]
-        return NoiseEncoder(self._scheme.process, law, self._schedule, key, self._batch)
+        distribution, key = self._scheme.noise_distribution, self._keys["noise"]
+        return NoiseEncoder(self._scheme.process, distribution, self._schedule, key, self._batch)
 
     def estimator(self) -> Receiver:
         """The legitimate estimator's side."""
@@ -82,7 +84,9 @@ def _takes_noise(scheme: Noise, conditions: ReceiverConditions) -> TakesNoise | 
     received, uses = conditions.received, conditions.uses
     if received is None or uses is None:
         return None
-    return TakesNoise(NoiseTaken(scheme.process, scheme.noise_law, scheme.mu_d, received, uses), conditions.slots)
+    return TakesNoise(
+        NoiseTaken(scheme.process, scheme.noise_distribution, scheme.mu_d, received, uses), conditions.slots
+    )
 
 
 class Noise(Scheme):
@@ -107,12 +111,12 @@ class Noise(Scheme):
             super().__init__(process, tuple(map(float, state_probability)))
         else:
             super().__init__(process, state_probability)
-        self._law = NoiseLaw(noise_covariance)
+        self._distribution = NoiseDistribution(noise_covariance)
 
     @property
-    def noise_law(self) -> NoiseLaw:
+    def noise_distribution(self) -> NoiseDistribution:
         """N(0, N_k)."""
-        return self._law
+        return self._distribution
 
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.model.block_methods import complete, needed
-from evedrop.model.noise_law import NoiseLaw
+from evedrop.model.noise_distribution import NoiseDistribution
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Flags, Receiver
 from evedrop.model.schedule import StateProbability, in_slot, mean_of
@@ -266,8 +266,8 @@ class Scheme(ABC):
         return []
 
     @property
-    def noise_law(self) -> NoiseLaw | None:
-        """The public law of packets that hold noise in place of a state; None if there are none."""
+    def noise_distribution(self) -> NoiseDistribution | None:
+        """The public distribution of packets that hold noise in place of a state; None if there are none."""
         return None
 
     @property

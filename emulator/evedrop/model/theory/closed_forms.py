@@ -107,7 +107,7 @@ class SensorChain:
     """
 
     start: Floats
-    """Law of the state in slot 0, (S,)."""
+    """Distribution of the state in slot 0, (S,)."""
     reset: Floats
     """P ← 0, (S, S)."""
     carried: Floats
@@ -119,17 +119,17 @@ class SensorChain:
         quantisation: the error that a reset leaves, if it is not 0.
         """
         found = np.empty((slots, process.n, process.n))
-        law = self.start
-        E = np.zeros((len(law), process.n, process.n))
+        distribution = self.start
+        E = np.zeros((len(distribution), process.n, process.n))
         left = None if quantisation is None else quantisation.covariances(process, slots)
         with np.errstate(over="ignore", invalid="ignore"):
             for k in range(slots):
                 source = process.Q if k else process.initial_covariance
-                grown = process.A @ E @ process.A.T + law[:, None, None] * source
+                grown = process.A @ E @ process.A.T + distribution[:, None, None] * source
                 E = np.tensordot(self.carried.T, grown, axes=1)
                 if left is not None:
-                    E = E + (law @ self.reset)[:, None, None] * left[k]
-                law = law @ (self.reset + self.carried)
+                    E = E + (distribution @ self.reset)[:, None, None] * left[k]
+                distribution = distribution @ (self.reset + self.carried)
                 found[k] = E.sum(axis=0)
                 if not np.isfinite(found[k]).all():
                     found[k:] = np.inf
@@ -149,8 +149,10 @@ class SensorChain:
         if not np.isfinite(left).all():
             return np.full((n, n), np.inf)
         operator = np.kron(self.carried.T, np.kron(process.A, process.A))
-        law = self.law
-        noise = np.kron(self.carried.T @ law, process.Q.reshape(-1)) + np.kron(self.reset.T @ law, left.reshape(-1))
+        stationary = self.stationary
+        noise = np.kron(self.carried.T @ stationary, process.Q.reshape(-1)) + np.kron(
+            self.reset.T @ stationary, left.reshape(-1)
+        )
         solution = np.linalg.solve(np.eye(len(operator)) - operator, noise)
         total: Floats = solution.reshape(states, n, n).sum(axis=0)
         return total
@@ -171,12 +173,12 @@ class SensorChain:
         return rho > 1.0 and kept < 1.0 - 1e-12 and kept * rho**4 >= 1.0 - 1e-12
 
     @property
-    def law(self) -> Floats:
-        """Stationary law of the state, (S,)."""
+    def stationary(self) -> Floats:
+        """Stationary distribution of the state, (S,)."""
         states = len(self.start)
         balance = np.vstack([(self.reset + self.carried).T - np.eye(states), np.ones(states)])
-        law: Floats = np.linalg.lstsq(balance, np.append(np.zeros(states), 1.0), rcond=None)[0]
-        return law
+        stationary: Floats = np.linalg.lstsq(balance, np.append(np.zeros(states), 1.0), rcond=None)[0]
+        return stationary
 
 
 def scheduled(threshold: int, received: float, acknowledged: tuple[float, float]) -> SensorChain:

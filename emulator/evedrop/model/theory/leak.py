@@ -19,7 +19,7 @@ import numpy as np
 from evedrop.model.kernels.current import kernels
 from evedrop.model.kernels.elementary import cholesky
 from evedrop.model.kernels.leak import Leak
-from evedrop.model.noise_law import PACKETS, NoiseLaw
+from evedrop.model.noise_distribution import PACKETS, NoiseDistribution
 from evedrop.model.process import MARGINAL, Floats, Process, StateFactors, product
 from evedrop.model.staircase import Staircase
 from evedrop.model.streams import Ahead
@@ -108,17 +108,17 @@ def _squared(L: Floats) -> Floats:
 class Leaks:
     """The leak of every slot k ≥ 1; reading slots in order computes each once, and many at a time.
 
-    law: of noise that is sent in place of innovations, and leaks nothing: L_k is then the factor of its covariance, and M_k is Q.
-    Raises ValueError as `Staircase` does.
+    distribution: of noise that is sent in place of innovations, and leaks nothing: L_k is then the factor of its covariance, and
+    M_k is Q. Raises ValueError as `Staircase` does.
     """
 
-    def __init__(self, process: Process, law: NoiseLaw | None = None) -> None:
+    def __init__(self, process: Process, distribution: NoiseDistribution | None = None) -> None:
         self.stairs = Staircase(process)
         """The coordinates of all leaks: where Q is singular they are not those of x."""
         process = self.stairs.process
         self._states = StateFactors(process)
-        self._alone = None if law is None else self.stairs.inward_law(law).factors(process)
-        self._sizes = None if law is None else NoiseLaw(PACKETS).factors(process)
+        self._alone = None if distribution is None else self.stairs.inward_distribution(distribution).factors(process)
+        self._sizes = None if distribution is None else NoiseDistribution(PACKETS).factors(process)
         self._noise = process.noise_factor
         count = max(1, min(_SLOTS_AT_ONCE, _NUMBERS_AT_ONCE // (4 * process.n * process.n)))
         self._factors = Ahead(lambda slots: range(slots.start, max(slots.stop, slots.start + count)), self._computed)

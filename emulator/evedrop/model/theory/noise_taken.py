@@ -12,7 +12,7 @@ from typing import final
 
 import numpy as np
 
-from evedrop.model.noise_law import NoiseLaw
+from evedrop.model.noise_distribution import NoiseDistribution
 from evedrop.model.process import Floats, Process
 from evedrop.model.schedule import StateProbability, in_slot, mean_of
 from evedrop.model.theory.closed_form import ClosedForm
@@ -33,7 +33,7 @@ class NoiseTaken:
     """E P_k = p_d (A E P_{k−1} Aᵀ + Q) + p_i (Σ_k + N_k): noise that is used as the state leaves the error x_k − n_k."""
 
     process: Process
-    law: NoiseLaw
+    distribution: NoiseDistribution
     mu_d: StateProbability
     mu_e: float
     """Quality of the receiver's link."""
@@ -47,7 +47,7 @@ class NoiseTaken:
 
     def covariances(self, slots: int) -> Floats:
         """E P_k for k = 0 … slots−1, (slots, n, n); inf from where it overflows."""
-        A, N = self.process.A, self.law.covariance
+        A, N = self.process.A, self.distribution.covariance
         sigma = state_covariances(self.process, slots)
         found = np.empty_like(sigma)
         with np.errstate(over="ignore", invalid="ignore"):
@@ -66,7 +66,7 @@ class NoiseTaken:
     @property
     def limit(self) -> Floats:
         """The limit of E P_k with the mean of μ_d, (n, n); all inf for ρ ≥ 1, if noise is ever used."""
-        one, N = self.outcomes, self.law.covariance
+        one, N = self.outcomes, self.distribution.covariance
         if one.misled == 0.0:
             return limit(self.process, one)
         if radius(self.process) >= 1.0:

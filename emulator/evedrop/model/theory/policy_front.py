@@ -52,7 +52,7 @@ def policy_chains(send: NDArray[np.bool_], mu: float, mu_e: float) -> tuple[Sens
 
 @dataclass(frozen=True)
 class PolicyMetrics(JsonFields):
-    """The metrics of one policy in the limit: exact, by the stationary law of its chain."""
+    """The metrics of one policy in the limit: exact, by the stationary distribution of its chain."""
 
     user: float
     """Trace of the user's expected error covariance; inf if it is unbounded."""
@@ -162,7 +162,7 @@ def scheduled_metrics(process: Process, links: ScheduledLinks, threshold: int) -
 
 def _metrics(process: Process, user: SensorChain, eve: SensorChain, sends: Floats | NDArray[np.bool_]) -> PolicyMetrics:
     ours, theirs = (float(np.trace(chain.limit(process))) for chain in (user, eve))
-    return PolicyMetrics(ours, theirs, float(user.law @ sends))
+    return PolicyMetrics(ours, theirs, float(user.stationary @ sends))
 
 
 def front(

@@ -56,7 +56,7 @@ class EavesdropperSetup:
         scheme = made(self.scheme_of, problem, self.scheme)
         of_slots = scheme.mu_d if isinstance(scheme.mu_d, tuple) else None
         mu_d, keys = scheme.state_probability, NamedKeys.of(streams)
-        knowledge = Knowledge(problem.process, mu_d, self.parameters, keys, of_slots, scheme.noise_law)
+        knowledge = Knowledge(problem.process, mu_d, self.parameters, keys, of_slots, scheme.noise_distribution)
         with calling(f"{self.kind.__name__}(knowledge, batch)", self.kind):
             return self.kind(knowledge, problem.batch)
 

@@ -103,8 +103,10 @@ class LossChecks:
             raise Broken("settles or memoryless is neither True nor False")
         if chain is not None and not isinstance(chain, Chain):
             raise Broken(f"chain is {type(chain).__name__}; expected a Chain, or None")
-        if chain is not None and not np.allclose(chain.law @ chain.transitions, chain.law):
-            raise Broken("chain.law is not the stationary law of chain.transitions; correct them, or return None")
+        if chain is not None and not np.allclose(chain.stationary @ chain.transitions, chain.stationary):
+            raise Broken(
+                "chain.stationary is not the stationary distribution of chain.transitions; correct them, or return None"
+            )
 
     def twice(self, problem: Problem) -> None:
         """Two that take turns do the same as one alone."""
@@ -181,7 +183,7 @@ class DelayChecks:
             ("a trial by itself", self.alone),
             ("slots in pieces", self.pieces),
         ]
-        return judged((exact, small()), ([("the delays it says", self.law)], large()))
+        return judged((exact, small()), ([("the delays it says", self.says)], large()))
 
     def _delays(self, problem: Problem, bounds: tuple[int, ...] = ()) -> Floats:
         reader, parts = BlockReader(key("delay"), problem.batch, 1), []
@@ -225,7 +227,7 @@ class DelayChecks:
         once = self._delays(problem)
         self._same(once, self._delays(problem, (1, 4)), problem, "{0!r} in one call and {1!r} in several", _PIECES)
 
-    def law(self, problem: Problem) -> None:
+    def says(self, problem: Problem) -> None:
         """The fraction of packets in time is the stated one."""
         delays = self._delays(problem)
         for lag in range(4):

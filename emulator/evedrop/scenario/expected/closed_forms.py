@@ -11,7 +11,7 @@ from evedrop.model.acknowledgements import FORGING, heed_rule_of, rates_of
 from evedrop.model.outcomes import uses_of
 from evedrop.model.process import Floats
 from evedrop.model.schemes import SCHEMES, scheme_of
-from evedrop.model.slot.link_law import law_of
+from evedrop.model.slot.link_distribution import distribution_of
 from evedrop.model.theory.closed_form import ClosedForm, Hijack, ReceiverConditions
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.tables import Scenario
@@ -117,7 +117,7 @@ def _split(scenario: Scenario, receiver: str) -> Split:
 def _independent(scenario: Scenario, receiver: str) -> bool:
     """Whether a link loses packets independently, and neither delays nor changes; colluding links count as one."""
     schedule = scenario.schedule(receiver)
-    law = law_of(schedule)
-    if law is None or law.alike is None or schedule.correlation is not None or schedule.outages or schedule.changes:
+    link = distribution_of(schedule)
+    if link is None or link.alike is None or schedule.correlation is not None or schedule.outages or schedule.changes:
         return False
     return set(schedule.settings) == {"loss"} and scenario.link(receiver).model.chain is not None

@@ -29,7 +29,7 @@ def warnings_of(scenario: Scenario) -> list[str]:
     found = []
     process, mu_d = scenario.process.process, scenario.encoding.mu_d
     expectation = expectations_of(scenario)[LEGITIMATE]
-    alike = None if expectation.law is None else expectation.law.alike
+    alike = None if expectation.link is None else expectation.link.alike
     mu = 0.0 if alike is None else float(alike.quality[0])
     bound = stability_bound(process, mu)
     if alike is None:

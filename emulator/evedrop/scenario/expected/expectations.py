@@ -18,7 +18,7 @@ from evedrop.model.process import Floats, Process
 from evedrop.model.schedule import in_slot
 from evedrop.model.schemes import scheme_of
 from evedrop.model.schemes.scheme import Scheme
-from evedrop.model.slot.link_law import LinkLaw, law_of
+from evedrop.model.slot.link_distribution import LinkDistribution, distribution_of
 from evedrop.model.theory import covariances as theory
 from evedrop.model.theory.closed_form import ClosedForm
 from evedrop.model.theory.covariances import ExpectedCovariance, Outcomes, OutcomesAt, SlotOutcomes
@@ -66,7 +66,7 @@ class Expectation:
     """One receiver's expected actual error covariance, by the chain that its link's losses follow."""
 
     process: Process
-    law: LinkLaw | None
+    link: LinkDistribution | None
     """None: theory does not cover the link."""
     outcomes_at: OutcomesAt | None
     """Maps a link's quality to the frequencies of the receiver's actions; None if these are unknown."""
@@ -91,26 +91,26 @@ class Expectation:
         return self.closed is not None or self._known is not None
 
     @property
-    def _known(self) -> tuple[LinkLaw, OutcomesAt] | None:
-        return None if self.law is None or self.outcomes_at is None else (self.law, self.outcomes_at)
+    def _known(self) -> tuple[LinkDistribution, OutcomesAt] | None:
+        return None if self.link is None or self.outcomes_at is None else (self.link, self.outcomes_at)
 
     @property
     def _outcomes(self) -> Outcomes | None:
         """The outcomes behind a link whose losses are independent, as in the paper."""
         if self._known is None or self.slots_at is not None:
             return None
-        law, outcomes_at = self._known
-        alike = law.alike
+        link, outcomes_at = self._known
+        alike = link.alike
         return None if alike is None else outcomes_at(float(alike.quality[0]))
 
     @property
     def bound(self) -> Expectation | None:
         """A lower bound on the receiver's error, if theory knows only that."""
         if self.closed_bound is not None:
-            return Expectation(self.process, self.law, None, closed=self.closed_bound)
-        if self.known or self.law is None or self.bound_at is None:
+            return Expectation(self.process, self.link, None, closed=self.closed_bound)
+        if self.known or self.link is None or self.bound_at is None:
             return None
-        return Expectation(self.process, self.law, self.bound_at, slots_at=self.bound_slots_at)
+        return Expectation(self.process, self.link, self.bound_at, slots_at=self.bound_slots_at)
 
     @property
     def has_limit(self) -> bool:
@@ -189,8 +189,8 @@ class Expectation:
             return False
         if self._outcomes is not None:
             return theory.has_infinite_variance(self.process, self._outcomes)
-        law, outcomes_at = self._known
-        return theory.has_infinite_variance(self.process, modulated.tail_outcomes(law.last, outcomes_at))
+        link, outcomes_at = self._known
+        return theory.has_infinite_variance(self.process, modulated.tail_outcomes(link.last, outcomes_at))
 
 
 def outcomes_of(scenario: Scenario, receiver: str) -> OutcomesAt | None:
@@ -227,7 +227,7 @@ def expectations_of(scenario: Scenario) -> dict[str, Expectation]:
         bound = closed is not None and closed.bound
         found[name] = Expectation(
             scenario.process.process,
-            law_of(scenario.schedule(name)),
+            distribution_of(scenario.schedule(name)),
             outcomes_of(scenario, name),
             bound_of(scenario, name),
             closed=None if bound else closed,

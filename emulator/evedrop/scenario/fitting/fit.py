@@ -14,7 +14,7 @@ from evedrop.model.checks import toml_of
 from evedrop.model.process import Floats
 from evedrop.scenario.fitting import candidate
 from evedrop.scenario.fitting.candidate import Candidate, delay_candidates, wilson
-from evedrop.scenario.fitting.run_lengths import RunLaw, lengths_of, p_value
+from evedrop.scenario.fitting.run_lengths import RunLengthDistribution, lengths_of, p_value
 from evedrop.scenario.recordings.link_recording import DELAY, LinkRecording, Outcomes
 
 FEWEST = 100
@@ -167,12 +167,12 @@ def _check(name: str, outcomes: Outcomes) -> None:
 
 def _runs(outcomes: Outcomes, chosen: Candidate, lost: bool) -> RunLengths:
     lengths = lengths_of(outcomes == 0 if lost else outcomes == 1)
-    law = RunLaw.of(chosen.spec, lost)
+    distribution = RunLengthDistribution.of(chosen.spec, lost)
     return RunLengths(
         len(lengths),
         float(lengths.mean()) if len(lengths) else None,
-        law.mean,
-        p_value(lengths, law, 3 if chosen.parameters == 4 else 1),
+        distribution.mean,
+        p_value(lengths, distribution, 3 if chosen.parameters == 4 else 1),
     )
 
 

@@ -58,11 +58,11 @@ class TwoStates:
 
     def log_likelihood_of_states(self, bad: Flags) -> float:
         """The log-likelihood of a recording that shows the states themselves, (packets,)."""
-        law = np.array([1.0 - self.in_bad, self.in_bad])
+        start = np.array([1.0 - self.in_bad, self.in_bad])
         at = bad.astype(np.intp)
         counts = np.bincount(2 * at[:-1] + at[1:], minlength=4).reshape(2, 2)
         seen = counts > 0
-        return float((counts[seen] * np.log(self.transitions[seen])).sum() + np.log(law[at[0]]))
+        return float((counts[seen] * np.log(self.transitions[seen])).sum() + np.log(start[at[0]]))
 
 
 def most_likely(outcomes: Outcomes, starts: Iterable[TwoStates]) -> tuple[TwoStates, float]:
@@ -78,7 +78,7 @@ def most_likely(outcomes: Outcomes, starts: Iterable[TwoStates]) -> tuple[TwoSta
 
 
 def log_likelihood(outcomes: Outcomes, model: TwoStates) -> float:
-    """The log-likelihood of a recording under a model that starts in its stationary law."""
+    """The log-likelihood of a recording under a model that starts in its stationary distribution."""
     return ChunkedOutcomes(outcomes).step(model)[1]
 
 

@@ -27,29 +27,29 @@ def lengths_of(within: Flags) -> NDArray[np.intp]:
 
 
 @dataclass(frozen=True)
-class RunLaw:
-    """The law of the runs of one outcome, for a chain with these transitions (states, states) and stationary law (states,)."""
+class RunLengthDistribution:
+    """How long the runs of one outcome are: for a chain with transitions (states, states), stationary distribution (states,)."""
 
     transitions: Floats
-    law: Floats
+    stationary: Floats
     chance: Floats
     """Probability of the outcome in each state, (states,)."""
 
     @classmethod
-    def of(cls, spec: Mapping[str, Any], lost: bool) -> RunLaw:
-        """The law of the bursts (lost) or gaps of a fitted loss model."""
+    def of(cls, spec: Mapping[str, Any], lost: bool) -> RunLengthDistribution:
+        """The distribution of the bursts (lost) or gaps of a fitted loss model."""
         if spec["model"] == "bernoulli":
-            T, law, loss = np.ones((1, 1)), np.ones(1), np.array([1.0 - spec["quality"]])
+            T, stationary, loss = np.ones((1, 1)), np.ones(1), np.array([1.0 - spec["quality"]])
         else:
             p, r = spec["p"], spec["r"]
-            T, law = np.array([[1.0 - p, p], [r, 1.0 - r]]), np.array([r, p]) / (p + r)
+            T, stationary = np.array([[1.0 - p, p], [r, 1.0 - r]]), np.array([r, p]) / (p + r)
             loss = np.array([spec.get("good", 0.0), spec.get("bad", 1.0)])
-        return cls(T, law, loss if lost else 1.0 - loss)
+        return cls(T, stationary, loss if lost else 1.0 - loss)
 
     @property
     def _opening(self) -> Floats:
         """The states in which a run begins, (states,)."""
-        opening: Floats = ((self.law * (1.0 - self.chance)) @ self.transitions) * self.chance
+        opening: Floats = ((self.stationary * (1.0 - self.chance)) @ self.transitions) * self.chance
         opening /= opening.sum()
         return opening
 
@@ -57,7 +57,9 @@ class RunLaw:
     def mean(self) -> float:
         """Mean length."""
         stay = self.transitions * self.chance
-        return float(self._opening @ np.linalg.solve(np.eye(len(self.law)) - stay, np.ones(len(self.law))))
+        return float(
+            self._opening @ np.linalg.solve(np.eye(len(self.stationary)) - stay, np.ones(len(self.stationary)))
+        )
 
     def longer(self, most: int) -> Floats:
         """P(length > l) for l = 0 … most, (most + 1,)."""
@@ -69,14 +71,14 @@ class RunLaw:
         return np.array(found)
 
 
-def p_value(lengths: NDArray[np.intp], law: RunLaw, parameters: int) -> float | None:
-    """Probability of runs at least as unlikely under the law, by Pearson's test. None for too few runs.
+def p_value(lengths: NDArray[np.intp], distribution: RunLengthDistribution, parameters: int) -> float | None:
+    """Probability of runs at least as unlikely under the distribution, by Pearson's test. None for too few runs.
 
-    parameters: the number of parameters of the law that were estimated from the recording.
+    parameters: the number of parameters of the distribution that were estimated from the recording.
     """
     if len(lengths) < _FEWEST:
         return None
-    longer = law.longer(int(lengths.max()) + 1)
+    longer = distribution.longer(int(lengths.max()) + 1)
     least = max(_LEAST_EXPECTED, len(lengths) / _BINS)
     bounds, left = [0], float(longer[0])
     for length in range(1, len(longer)):

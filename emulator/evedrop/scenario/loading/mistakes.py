@@ -15,7 +15,7 @@ from evedrop.model.outcomes import eavesdropper_outcomes, legitimate_outcomes
 from evedrop.model.process import Process
 from evedrop.model.schemes import scheme_of
 from evedrop.model.slot.link import LinkSchedule
-from evedrop.model.slot.link_law import law_of
+from evedrop.model.slot.link_distribution import distribution_of
 from evedrop.model.theory.horizon import horizon
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.across import (
@@ -128,7 +128,7 @@ def _no_theory(name: str, tables: ValidTables, sound: bool) -> str | None:
         link = receiver.link
         if LEGITIMATE not in scheme.closed_forms and legitimate_outcomes(scheme) is None:
             return f"no closed form is known for the scheme {tables.encoding.scheme}"
-    if law_of(LinkSchedule(link.settings(1.0), receiver.window)) is None:
+    if distribution_of(LinkSchedule(link.settings(1.0), receiver.window)) is None:
         return f"no theory covers {name}'s link"
     if tables.scenario is None or not sound:
         return None

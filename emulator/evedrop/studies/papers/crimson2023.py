@@ -13,7 +13,7 @@ import numpy as np
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.local_filter import LocalFilter, settled
-from evedrop.model.noise_law import PACKETS
+from evedrop.model.noise_distribution import PACKETS
 from evedrop.model.numeric.shiryaev import ShiryaevTest
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process, Trajectory
@@ -151,7 +151,7 @@ def mean_errors(noise_covariance: object, trials: int, slots: int) -> dict[str, 
     scheme = Noise(network, 1.0 - NOISE, noise_covariance)
     trajectory, local = Trajectory(truth, keys["process"], batch), LocalFilter(truth, PLANT, keys["measurement"], batch)
     encoder = scheme.encoder(keys, batch)
-    knowledge = Knowledge(network, scheme.state_probability, {}, {}, None, scheme.noise_law)
+    knowledge = Knowledge(network, scheme.state_probability, {}, {}, None, scheme.noise_distribution)
     receivers: dict[str, Receiver] = {"user": scheme.estimator(keys, batch)}
     receivers |= {name: STRATEGIES[name](knowledge, batch) for name in ("naive", "power-test", "bayesian")}
     spec = {"model": "bernoulli", "quality": 1.0 - LOSSES}

@@ -38,7 +38,7 @@ _THEIR_SLOTS = 200_000
 _RUN_SLOTS = 50_000
 """The slots of one of their runs in the search for a policy; they averaged several runs."""
 _START = 50
-"""Slots that are not counted: the law of the covariances has then forgotten the start."""
+"""Slots that are not counted: the distribution of the covariances has then forgotten the start."""
 _SIDE_BY_SIDE = 2500
 """Trials that are simulated at once."""
 

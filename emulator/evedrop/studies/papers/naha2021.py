@@ -66,8 +66,8 @@ class Naha2021(Paper):
 
 _NOT_PUBLIC: Mapping[str, str] = {
     "the numbers of their figures and tables": "the numbers were not available to us; the closed forms are compared above",
-    "the CUSUM with the law of the innovation given all earlier measurements": "neither its program nor its numbers are public; "
-    "the detector here has the stationary law",
+    "the CUSUM with the innovation's distribution given earlier measurements": "neither its program nor its numbers are public; "
+    "the detector here has the stationary distribution",
     "the optimal thresholds of the parsimonious policy": "neither their values nor the program that found them are public",
 }
 

@@ -85,7 +85,7 @@ class Integrity(Application):
 
     @classmethod
     def objections(cls, loop: ControlledPlant, table: Table) -> list[str]:
-        """A loop whose law is not known, a watermark that does not fit it, and an attack that is impossible in it."""
+        """A loop whose distribution is not known, a watermark that does not fit it, and an attack that is impossible in it."""
         return list(_objections(loop, _own(table)))
 
     @classmethod
@@ -99,12 +99,12 @@ class Integrity(Application):
     @classmethod
     def tally(cls, loop: ControlledPlant, table: Table, trials: int) -> ApplicationTally:
         """A tally over no slots yet."""
-        own, law = _own(table), loop_of(loop.assignment)
+        own, watermarked = _own(table), loop_of(loop.assignment)
         policy, covariance = POLICIES[own.policy].of(own.parameters), own.covariance(loop.plant.inputs)
         spans = _spans(loop, own)
-        theory = _theory(law, own, covariance)
+        theory = _theory(watermarked, own, covariance)
         return IntegrityTally(
-            IntegrityCase(loop.plant, law, policy, theory, spans[0][0] if spans else None, loop.slots), trials
+            IntegrityCase(loop.plant, watermarked, policy, theory, spans[0][0] if spans else None, loop.slots), trials
         )
 
     @classmethod
@@ -155,14 +155,16 @@ class Integrity(Application):
         return IntegrityFeed(POLICIES[own.policy].of(own.parameters))
 
 
-def _theory(law: WatermarkedLoop, table: IntegrityTable, covariance: Floats) -> WatermarkTheory:
+def _theory(watermarked: WatermarkedLoop, table: IntegrityTable, covariance: Floats) -> WatermarkTheory:
     """The closed forms against the attack; against a replay if the table has no attack."""
     described = table.described_attack
     if described is None:
-        return WatermarkTheory.of(law, Replay(1), covariance)
+        return WatermarkTheory.of(watermarked, Replay(1), covariance)
     rests = POLICIES[table.policy].rests
-    attack = SENSOR_ATTACKS[described[0]].of(described[1], law, np.zeros_like(covariance) if rests else covariance)
-    return WatermarkTheory.of(law, attack, covariance)
+    attack = SENSOR_ATTACKS[described[0]].of(
+        described[1], watermarked, np.zeros_like(covariance) if rests else covariance
+    )
+    return WatermarkTheory.of(watermarked, attack, covariance)
 
 
 def _spans(loop: ControlledPlant, table: IntegrityTable) -> Sequence[tuple[int, int]]:
@@ -180,14 +182,14 @@ def _objections(loop: ControlledPlant, table: IntegrityTable) -> Iterator[str]:
         )
         return
     if loop.strategy is not Lqr:
-        yield 'controller.strategy: has no fixed gain, which the laws of integrity need; expected strategy = "lqr"'
+        yield 'controller.strategy: has no fixed gain, which the theory of integrity needs; expected strategy = "lqr"'
         return
     if loop.on_truth:
         yield 'controller.acts_on: is "truth", so false measurements would mislead no controller; expected acts_on = "estimate"'
     if loop.period != 1:
-        yield f"controller.period: is {loop.period}, but the laws of integrity assume a decision in every slot; expected 1"
+        yield f"controller.period: is {loop.period}, but the theory of integrity assumes a decision in every slot; expected 1"
     if assignment.rate_weights.any():
-        yield "controller.rate_weights: are given, but the laws of integrity assume none; remove the line"
+        yield "controller.rate_weights: are given, but the theory of integrity assumes none; remove the line"
     if table.watermark is not None and len(table.watermark) != m:
         yield f"integrity.watermark: is {len(table.watermark)} × {len(table.watermark)}; expected {m} × {m}, as there are inputs"
         return
@@ -195,25 +197,25 @@ def _objections(loop: ControlledPlant, table: IntegrityTable) -> Iterator[str]:
     if described is None and loop.spoofed:
         yield 'integrity.attack: is missing, but an event begins it; expected attack = { model = "replay", recorded = 100 }'
         return
-    law = loop_of(assignment)
+    watermarked = loop_of(assignment)
     if described is not None:
         name, given = described
-        found = SENSOR_ATTACKS[name].objections(given, law, _spans(loop, table)[0][0])
+        found = SENSOR_ATTACKS[name].objections(given, watermarked, _spans(loop, table)[0][0])
         yield from (f"integrity.attack.{entry}: {what}" for entry, what in found)
         if found:
             return
-    yield from _law_mistakes(law, table, m)
+    yield from _theory_mistakes(watermarked, table, m)
 
 
-def _law_mistakes(law: WatermarkedLoop, table: IntegrityTable, inputs: int) -> Iterator[str]:
+def _theory_mistakes(watermarked: WatermarkedLoop, table: IntegrityTable, inputs: int) -> Iterator[str]:
     covariance = table.covariance(inputs)
     try:
         for one in (covariance, np.zeros_like(covariance)):
-            _theory(law, table, one)
+            _theory(watermarked, table, one)
     except ValueError as error:
         yield (
-            f"integrity: the detector's law under attack cannot be computed, because {error}; expected another attack, or "
-            "controller weights with which (1 − K C)(A − B L) is stable"
+            f"integrity: the detector's distribution under attack cannot be computed, because {error}; expected another "
+            "attack, or controller weights with which (1 − K C)(A − B L) is stable"
         )
 
 

@@ -42,7 +42,7 @@ class Segment:
 
 
 @dataclass(frozen=True)
-class LinkLaw:
+class LinkDistribution:
     """A link's segments, and the outages of its receiver."""
 
     segments: tuple[Segment, ...]
@@ -50,8 +50,8 @@ class LinkLaw:
     """First slot, first slot after the outage, and whether the receiver keeps its state."""
 
     @classmethod
-    def steady(cls, chain: Chain) -> LinkLaw:
-        """The law of a link that only loses packets, by a chain."""
+    def steady(cls, chain: Chain) -> LinkDistribution:
+        """The distribution of a link that only loses packets, by a chain."""
         return cls((Segment(0, chain, 1.0, np.ones(1)),))
 
     @property
@@ -68,7 +68,7 @@ class LinkLaw:
             if some:
                 rate = np.zeros(len(some))
                 # State by state, so that the bits do not depend on how many slots are asked for at a time.
-                for quality, odds in zip(segment.quality(some).T, segment.chain.law.tolist(), strict=True):
+                for quality, odds in zip(segment.quality(some).T, segment.chain.stationary.tolist(), strict=True):
                     rate += quality * odds
                 found[some.start - slots.start : some.stop - slots.start] = segment.arrived[0] * rate
         for start, stop, _ in self.outages:
@@ -81,17 +81,17 @@ class LinkLaw:
         segment = self.segments[-1]
         gone = any(stop > _FAR for _, stop, _ in self.outages)
         quality = segment.quality(range(_FAR, _FAR + 1))[0] * (0.0 if gone else segment.arrived[-1])
-        return Chain(segment.chain.transitions, segment.chain.law, quality)
+        return Chain(segment.chain.transitions, segment.chain.stationary, quality)
 
     @property
     def alike(self) -> Chain | None:
-        """A single state, if the fates of all packets are independent and identical in law and none is late, as in the paper."""
+        """A single state, if all fates are independent and identically distributed and no packet is late, as in the paper."""
         one = len(self.segments) == 1 and not self.outages and self.window == 0
         return self.last if one and self.segments[0].quality_at is None and self.segments[0].chain.independent else None
 
 
-def law_of(schedule: LinkSchedule) -> LinkLaw | None:
-    """The law of a link, from everything that is known of it in advance; None if theory does not cover it.
+def distribution_of(schedule: LinkSchedule) -> LinkDistribution | None:
+    """The distribution of a link, from everything that is known of it in advance; None if theory does not cover it.
 
     It does not cover losses with a memory that is not a chain, losses that never settle, queues, delays that are not
     independent draws, and receivers that are away while packets are under way.
@@ -108,7 +108,7 @@ def law_of(schedule: LinkSchedule) -> LinkLaw | None:
     if not late:
         segments = [replace(one, arrived=one.arrived[-1:]) for one in segments]
     outages = tuple((one.start, one.stop, getattr(one, "keeps_state", True)) for one in schedule.outages)
-    return LinkLaw(tuple(segments), outages)
+    return LinkDistribution(tuple(segments), outages)
 
 
 def stretches(schedule: LinkSchedule) -> list[tuple[int, Mapping[str, Any], bool]]:

@@ -102,9 +102,9 @@ def _variance_of_chain(chain: Chain, parts: Sequence[_Part]) -> float:
     w is the row Σ passes_i E[(γ_i − mean); state at the present message] over the messages i so far, so that the covariance of
     all of them with the message is w · (quality − mean). Its entries sum to 0; so the chain's stationary part can be left out.
     """
-    mean = float(chain.law @ chain.quality)
+    mean = float(chain.stationary @ chain.quality)
     centred = chain.quality - mean
-    fading = chain.transitions - chain.law
+    fading = chain.transitions - chain.stationary
     sums: dict[int, tuple[Floats, Floats]] = {}
     w, at, total = np.zeros(len(centred)), parts[0].slots.start, 0.0
     for part in parts:
@@ -113,9 +113,9 @@ def _variance_of_chain(chain: Chain, parts: Sequence[_Part]) -> float:
             sums[count] = _power_and_sum(fading, count)
         power, partial = sums[count]
         w = w @ np.linalg.matrix_power(fading, part.slots.start - at)
-        own = passes**2 * count_variance(chain.transitions, chain.law, chain.quality, count)
+        own = passes**2 * count_variance(chain.transitions, chain.stationary, chain.quality, count)
         total += own + passes * (1.0 - passes) * count * mean + 2.0 * passes * float(w @ partial @ centred)
-        w = w @ power + passes * ((chain.law * centred) @ partial @ fading)
+        w = w @ power + passes * ((chain.stationary * centred) @ partial @ fading)
         at = part.slots.stop
     return total
 

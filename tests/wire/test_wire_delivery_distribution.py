@@ -1,4 +1,4 @@
-"""The law of a link's deliveries: against measured fates for every model, and against sums over all pairs of messages."""
+"""How many messages a link delivers: against measured fates for every model, and against sums over all pairs of messages."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import pytest
 from evedrop.model.links import loss_of
 from evedrop.model.links.link import Fate
 from evedrop.model.slot.link import Change
+from evedrop.wire.delivery_distribution import bounds, expected
 from evedrop.wire.fates import KeyFates
-from evedrop.wire.law import bounds, expected
 from tests.wire.wire_links import LOSSES, wire_link
 
 SEED = 5
@@ -23,7 +23,7 @@ RANGES = (range(100), range(150, 151), range(160, 700), range(800, 2000))
 
 @pytest.mark.parametrize("model", LOSSES)
 def test_measured_deliveries(model: str) -> None:
-    """The deliveries of all keys together are within the 99 % bounds, and scatter as the law says; for every model."""
+    """The deliveries of all keys together are within the 99 % bounds, and scatter as the distribution says; for every model."""
     settings = {"loss": LOSSES[model], "corrupt": 0.05}
     changes = [Change(900, {"loss": LOSSES[model], "corrupt": 0.3}), Change(1400, POOR)]
     codes = np.empty((KEYS, 2000), np.uint8)
@@ -52,7 +52,7 @@ def test_variance_of_a_chain_with_gaps(model: str) -> None:
     ranges = (range(3, 10), range(17, 18), range(30, 50))
     taken = [n for some in ranges for n in some]
     passes = [0.95 if n < 40 else 0.5 if n < 45 else 1.0 for n in taken]
-    mean = float(chain.law @ chain.quality)
+    mean = float(chain.stationary @ chain.quality)
     total = 0.0
     for i, p in zip(taken, passes, strict=True):
         for j, q in zip(taken, passes, strict=True):
@@ -60,7 +60,7 @@ def test_variance_of_a_chain_with_gaps(model: str) -> None:
                 total += p * mean * (1.0 - p * mean)
             else:
                 ahead = np.linalg.matrix_power(chain.transitions, abs(i - j))
-                both = float((chain.law * chain.quality) @ ahead @ chain.quality)
+                both = float((chain.stationary * chain.quality) @ ahead @ chain.quality)
                 total += p * q * (both - mean * mean)
     found = expected(settings, changes, ranges)
     assert found[0] == pytest.approx(mean * sum(passes), rel=1e-12)
@@ -109,7 +109,7 @@ def test_many_messages() -> None:
 
 
 def test_bounds() -> None:
-    """They hold 99 % of a normal law, stay within the possible counts, and meet where nothing is random."""
+    """They hold 99 % of a normal distribution, stay within the possible counts, and meet where nothing is random."""
     assert bounds(500.0, 100.0, 1000) == pytest.approx((500 - 26.258, 500 + 26.258), abs=1e-3)
     assert bounds(0.2, 0.2, 1000)[0] == 0.0
     assert bounds(999.8, 0.2, 1000)[1] == 1000.0

@@ -1,4 +1,4 @@
-"""The law of packets that hold noise in place of a state. It is public; only the slots of the noise are secret.
+"""The distribution of packets that hold noise in place of a state. It is public; only the slots of the noise are secret.
 
 Source: docs/mathematics.md, noise packets.
 """
@@ -20,7 +20,7 @@ PACKETS = "packets"
 
 @final
 @dataclass(frozen=True)
-class NoiseLaw:
+class NoiseDistribution:
     """n_k ~ N(0, N_k), independent from slot to slot and of the process. given: `noise_covariance` as a scenario has it."""
 
     given: Any

@@ -1,4 +1,4 @@
-"""Theory behind links that change, delay packets or lose their receivers: against the law of the last packet's age."""
+"""Theory behind links that change, delay packets or lose their receivers: against the distribution of the last packet's age."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from evedrop.model.links.link import Fate
 from evedrop.model.modulated import ModulatedCovariance, limit_of
 from evedrop.model.process import Process
 from evedrop.model.slot.link import NEVER, Change, LinkSchedule, ReceiverOutage
-from evedrop.model.slot.link_law import law_of
+from evedrop.model.slot.link_distribution import distribution_of
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.scenario.expected.expectations import Expectation
 from evedrop.scenario.timeline import Away
@@ -43,7 +43,7 @@ def aged(quality: Callable[[int], float], there: Callable[[int], float], window:
 
 def traces(schedule: LinkSchedule) -> np.ndarray:
     """What theory says."""
-    return Expectation(WALK, law_of(schedule), Outcomes.plain).traces(SLOTS)
+    return Expectation(WALK, distribution_of(schedule), Outcomes.plain).traces(SLOTS)
 
 
 PLAIN: dict[str, Any] = {"loss": {"model": "bernoulli", "quality": 0.6}}
@@ -63,10 +63,10 @@ def test_late_packets(delay: dict[str, Any], window: int) -> None:
     there = [0.2 + 0.8 * (model.arrived(lag) or 0.0) for lag in range(window + 1)]
     expected = aged(lambda _: 0.6 * 0.9, lambda lag: there[lag], window)
     np.testing.assert_allclose(traces(schedule), expected, rtol=1e-12)
-    law = law_of(schedule)
-    assert law is not None
-    settled = Expectation(WALK, law, Outcomes.plain).traces(900)[-1]
-    assert limit_of(WALK, law, Outcomes.plain) == pytest.approx(settled, rel=1e-9)
+    link = distribution_of(schedule)
+    assert link is not None
+    settled = Expectation(WALK, link, Outcomes.plain).traces(900)[-1]
+    assert limit_of(WALK, link, Outcomes.plain) == pytest.approx(settled, rel=1e-9)
 
 
 def test_links_that_change() -> None:
@@ -114,7 +114,7 @@ def test_a_receiver_that_goes_away(start: int, stop: int, keeps: bool) -> None:
 
 
 def test_a_chain_with_delays_is_a_chain_of_two_ends() -> None:
-    """Bursts whose states are alike are not bursts, also with late packets; and a new chain begins in its own law."""
+    """Bursts whose states are alike are not bursts, also with late packets; and a new chain begins in its own link."""
     alike = {"loss": {"model": "gilbert-elliott", "p": 0.1, "r": 0.3, "good": 0.4, "bad": 0.4}}
     delay = {"delay": {"model": "normal", "mean": 1.5, "standard_deviation": 1.0}}
     np.testing.assert_allclose(
@@ -127,9 +127,9 @@ def test_a_chain_with_delays_is_a_chain_of_two_ends() -> None:
 def test_slots_may_be_asked_for_in_any_pieces() -> None:
     """The same numbers."""
     schedule = LinkSchedule({**PLAIN, "delay": DELAYS[1]}, 3, (Change(17, {**PLAIN, "delay": DELAYS[0]}),))
-    law = law_of(schedule)
-    assert law is not None
-    stream = ModulatedCovariance(WALK, law, Outcomes.plain)
+    link = distribution_of(schedule)
+    assert link is not None
+    stream = ModulatedCovariance(WALK, link, Outcomes.plain)
     parts = [stream.next_traces(count) for count in (1, 16, 1, 1, 20, 21)]
     assert np.array_equal(np.concatenate(parts), traces(schedule))
 
@@ -147,6 +147,6 @@ def test_slots_may_be_asked_for_in_any_pieces() -> None:
 )
 def test_what_theory_does_not_know(schedule: LinkSchedule) -> None:
     """There is no number then."""
-    assert law_of(schedule) is None
+    assert distribution_of(schedule) is None
     assert np.isnan(traces(schedule)).all()
     assert math.isnan(Expectation(WALK, None, Outcomes.plain).limit)
