@@ -1,4 +1,4 @@
-"""What certificates and a second router cost: live runs in clear, with certificates, and with two routers, in turn.
+"""What certificates and a second router cost: live runs without certificates, with them, and with two routers, in turn.
 
 python benchmarks/connections.py [--quick]
 """
@@ -14,7 +14,7 @@ from live_run import rate
 from evedrop.system.ports import free_port
 
 WAYS: dict[str, Callable[[], tuple[str, ...]]] = {
-    "in clear": lambda: (),
+    "unencrypted": lambda: (),
     "with certificates": lambda: ("--listen", f"tls/127.0.0.1:{free_port()}"),
     "two routers, with certificates": lambda: ("--set", "network.routers=2"),
 }
@@ -28,7 +28,7 @@ def main(quick: bool) -> None:
             for name, options in WAYS.items():
                 rates_of[name].append(rate("eavesdroppers", "--slots", str(slots), "--trials", str(trials), *options()))
         for name, rates in rates_of.items():
-            ratio = statistics.median(a / b for a, b in zip(rates, rates_of["in clear"], strict=True))
+            ratio = statistics.median(a / b for a, b in zip(rates, rates_of["unencrypted"], strict=True))
             print(f"{trials:>5} trials, {name}: {statistics.median(rates):>8,.0f} slots/s; ratio {ratio:.2f}")
 
 

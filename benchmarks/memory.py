@@ -79,8 +79,8 @@ class Looks:
             for slots, sizes in zip(self.slots, self.megabytes, strict=True)
             if len(sizes) == all_there
         ]
-        before = [sizes for share, sizes in looks if 0.25 <= share < 0.5]
-        after = [sizes for share, sizes in looks if share >= 0.75]
+        before = [sizes for fraction, sizes in looks if 0.25 <= fraction < 0.5]
+        after = [sizes for fraction, sizes in looks if fraction >= 0.75]
         return (before, after) if before and after else None
 
     @property

@@ -70,7 +70,7 @@ class MeasuredRun:
     """Processor seconds of all processes, a second."""
     busiest: str
     """The kind of process that used most of it."""
-    share: float
+    fraction: float
     """The part of a core that one such process used."""
 
     @property
@@ -127,7 +127,7 @@ def _measure(trials: int, receivers: int, shards: int, slots: int) -> MeasuredRu
         megabytes=max(resident for _, resident, _ in looks),
         cores=sum(map(sum, used.values())) / (end - begin),
         busiest=busiest,
-        share=max(used[busiest]) / (end - begin),
+        fraction=max(used[busiest]) / (end - begin),
     )
 
 
@@ -258,7 +258,8 @@ def main(quick: bool, picture: Path | None) -> None:
         runs.append(run)
         print(
             f"{run.trials:>6} {run.receivers:>10} {run.shards:>7} {run.slots:>8,} {run.slots_per_second:>9,.0f} "
-            f"{run.rate:>13,.0f} {run.cost:>9.3f} {run.cores:>11.2f}  {run.busiest:<11} {run.share:.2f} {run.megabytes:>9,.0f}",
+            f"{run.rate:>13,.0f} {run.cost:>9.3f} {run.cores:>11.2f}  {run.busiest:<11} {run.fraction:.2f} "
+            f"{run.megabytes:>9,.0f}",
             flush=True,
         )
     growth(runs)

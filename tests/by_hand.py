@@ -39,7 +39,7 @@ class ByHand:
     entered: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Process → the words before its command line, such as those that enter a network namespace."""
     insecure: bool = False
-    """Whether it may be in clear although others could listen."""
+    """Whether it may be unencrypted although others could listen."""
     relay: str | None = None
     """Where the second router listens, if there is one."""
     paused: bool = False

@@ -31,17 +31,17 @@ def test_the_budget_is_met_exactly(scenario: Path) -> None:
     """The energy of the threshold found is the budget, and so is that of a run, within five standard errors."""
     changes = {"energy": {"packet": 3.0, "bit": 0.5, "encryption": 4.0}}
     design = design_budget(scenario, 10.0, changes=changes)
-    assert design.in_clear == 3.0 + 0.5 * 11
-    assert design.encrypted == design.in_clear + 4.0
+    assert design.unencrypted == 3.0 + 0.5 * 11
+    assert design.encrypted == design.unencrypted + 4.0
     assert design.best.energy == pytest.approx(10.0)
     assert 1.0 < design.best.threshold < 2.0
     made = load(scenario, {**changes, "encoding.threshold": design.best.threshold, "slots": 200})
     simulation = Simulation(made, range(200))
     for _ in simulation.chunks():
         pass
-    shares = simulation.packets.encrypted / 200
+    fractions = simulation.packets.encrypted / 200
     expected = (199 * design.best.encrypted_fraction + 1.0) / 200  # slot 0 is encrypted
-    assert abs(shares.mean() - expected) < 5.0 * shares.std() / 200**0.5
+    assert abs(fractions.mean() - expected) < 5.0 * fractions.std() / 200**0.5
 
 
 def test_errors_are_those_of_runs(scenario: Path, tmp_path: Path) -> None:
@@ -66,7 +66,7 @@ def test_the_table_has_the_threshold(evedrop: Evedrop, scenario: Path, budget: f
     assert done.out.splitlines()[-1].startswith("threshold = ")
     found = json.loads(evedrop("design", str(scenario), "--budget", str(budget), "--json").out)
     assert found["best"]["threshold"] == pytest.approx(threshold)
-    assert set(found) == {"budget", "in_clear", "encrypted", "user", "best", "others"}
+    assert set(found) == {"budget", "unencrypted", "encrypted", "user", "best", "others"}
 
 
 def test_what_has_no_limit_is_unbounded(evedrop: Evedrop, scenario: Path) -> None:
@@ -85,7 +85,7 @@ def test_what_has_no_limit_is_unbounded(evedrop: Evedrop, scenario: Path) -> Non
 @pytest.mark.parametrize(
     ("budget", "changes", "why"),
     [
-        (1.0, {}, r"no threshold up to \d+ meets the budget 1: packets in clear cost 1 .* such as 1.5"),
+        (1.0, {}, r"no threshold up to \d+ meets the budget 1: unencrypted packets cost 1 .* such as 1.5"),
         (0.2, {}, "no threshold"),
         (1.5, {"acknowledgements.link.quality": 0.0}, "no acknowledgement arrives, so nothing less than 2 is enough"),
         (float("nan"), {}, "expected a finite number"),

@@ -66,7 +66,7 @@ def test_without_a_mount_namespace_no_disk_breaks(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("key", KEYS)
 def test_the_fates_of_a_wire_are_those_of_its_model(key: str, tmp_path: Path) -> None:
-    """Decided in one go, they are those that the wire decides block by block; in the share of the link."""
+    """Decided in one go, they are those that the wire decides block by block; as often as the link says."""
     path = tmp_path / "robot.toml"
     path.write_text(wires.FILE)
     link = next(each for each in load_wire(path).links if each.name == key)

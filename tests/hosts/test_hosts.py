@@ -123,7 +123,7 @@ def test_hosts_of_their_own_change_nothing_and_show_nothing(tmp_path: Path) -> N
         assert readable(tmp_path / "capture", run) == (0, set())
 
 
-def test_in_clear_everything_can_be_read(tmp_path: Path) -> None:
+def test_unencrypted_everything_can_be_read(tmp_path: Path) -> None:
     """With --insecure the same capture has the payloads in it: so it would have shown them."""
     scenario = on_hosts(slots=100)
     with apart(tmp_path, scenario, "tcp") as (network, run), captured(network, "router", tmp_path / "capture"):

@@ -73,10 +73,10 @@ TWO_CLEAR = ("--set", "network.routers=2", "--listen", "tcp/127.0.0.2:{port}", "
         (TWO, True),
         pytest.param(TWO_CLEAR, False, marks=pytest.mark.long),
     ],
-    ids=["tls", "tls, router last", "tls by name", "in clear", "two routers", "two routers in clear"],
+    ids=["tls", "tls, router last", "tls by name", "unencrypted", "two routers", "two routers unencrypted"],
 )
 def test_started_by_hand_it_is_the_same_run(options: tuple[str, ...], backwards: bool, evedrop: Evedrop) -> None:
-    """In whatever order, from two folders that stand for hosts, in clear or not: the digests of the trials in memory."""
+    """In whatever order, from two folders that stand for hosts, encrypted or not: the digests of the trials in memory."""
     port = str(free_port())
     briefs = written(evedrop, *(option.format(port=port) for option in options), "--results", "results")
     hosts = [evedrop.folder / "one", evedrop.folder / "two"]

@@ -49,7 +49,7 @@ def test_addresses_at_which_no_router_can_be_reached_are_refused(listen: str, co
     ],
 )
 def test_a_router_is_known_by_its_names(listen: str, connect: str | None, names: tuple[str, ...]) -> None:
-    """What is connected to, then what is listened on; in clear on loopback alone, unless the user says otherwise."""
+    """What is connected to, then what is listened on; unencrypted on loopback alone, unless the user says otherwise."""
     found = router_endpoint(listen, connect)
     assert found.names == names
     assert (str(found.listen), str(found.connect)) == (listen, connect or listen)

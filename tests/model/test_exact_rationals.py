@@ -273,10 +273,10 @@ def test_readers_of_references(model: Model, received: float, heard: float, unhe
 @settings(deadline=None, max_examples=examples(20))
 @given(models(most_states=2, highest=0.9), st.integers(1, 3), st.floats(0.05, 1.0), probabilities, st.booleans())
 def test_schedules_by_holding_time(
-    model: Model, threshold: int, received: float, share: float, encrypted: bool
+    model: Model, threshold: int, received: float, fraction: float, encrypted: bool
 ) -> None:
     """Every slot, and the limit: where all packets arrive, slots repeat with a period, and it is their mean."""
-    acknowledged = (share * received, 0.5 * (1.0 - received))
+    acknowledged = (fraction * received, 0.5 * (1.0 - received))
     chain = (encrypted_schedule if encrypted else scheduled)(threshold, received, acknowledged)
     carried, all_ways = exact(chain.carried), exact(chain.carried + chain.reset)
     distribution = [Fraction(float(one)) for one in chain.start]

@@ -17,7 +17,7 @@ from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.process import Process
 from evedrop.model.reference_code import ReferenceCode
 from evedrop.model.schemes import scheme_of
-from evedrop.model.schemes.threshold_code import forged_share
+from evedrop.model.schemes.threshold_code import forged_fraction
 from evedrop.model.streams import Batch
 from evedrop.model.theory.closed_forms import reference_covariances, reference_limit
 from evedrop.model.theory.covariances import Outcomes, expected_covariances
@@ -80,9 +80,9 @@ def test_the_threshold_policy_follows_its_belief() -> None:
     """B ← c after an acknowledged state, c + b(1 − c) after an acknowledged code, else the same; the state is sent iff b > θ."""
     rng = np.random.default_rng(3)
     gamma, acks = rng.random((2, 40, 30)) < 0.7
-    c = forged_share(0.8, 0.2)
+    c = forged_fraction(0.8, 0.2)
     assert c == pytest.approx(0.2 * 0.2 / (0.8 * 0.8 + 0.2 * 0.2))
-    assert forged_share(0.0, 0.0) == 0.0
+    assert forged_fraction(0.0, 0.0) == 0.0
     packets = played_over(STABLE, THRESHOLD, gamma, gamma, acks).packets
     for r in range(30):
         b, t = 0.0, -1
@@ -193,7 +193,7 @@ def test_a_limit_that_is_too_large_is_not_computed() -> None:
         assert reference_limit(process, 0.8, (0.72, 0.02)) == pytest.approx(limit, nan_ok=True)
 
 
-def test_without_states_in_clear_the_bound_is_the_expectation() -> None:
+def test_without_unencrypted_states_the_bound_is_the_expectation() -> None:
     """α = 0 and L = A: the recursion of state-secrecy codes."""
     found = reference_covariances(UNSTABLE, 0.9, (0.6, 0.1), 5, 0.0, lambda _: UNSTABLE.A)
     assert np.array_equal(found, reference_covariances(UNSTABLE, 0.9, (0.6, 0.1), 5))

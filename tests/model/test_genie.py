@@ -148,12 +148,12 @@ def test_known_values() -> None:
 
 @settings(deadline=None, max_examples=examples(150))
 @given(systems(0.9), st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.floats(0.0, 0.999))
-def test_nobody_without_the_secret_does_better(process: Process, mu: float, share: float, mu_d: float) -> None:
+def test_nobody_without_the_secret_does_better(process: Process, mu: float, fraction: float, mu_d: float) -> None:
     """For μ_e ≤ μ and μ_d < 1 the genie is at no k better than the legitimate estimator, as matrices.
 
     It is never worse than smart, and unbounded exactly when smart is.
     """
-    mu_e = mu * share
+    mu_e = mu * fraction
     ours = expected_covariances(process, Outcomes.legitimate(mu, mu_d), 40)
     genie = expected_covariances(process, Outcomes.genie(mu_e, mu_d), 40)
     smart = expected_covariances(process, Outcomes.eavesdropper(mu_e, mu_d, 1.0, 0.0), 40)

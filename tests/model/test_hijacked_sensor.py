@@ -50,23 +50,23 @@ def test_as_many_are_heeded_as_before(alpha: float, overheard: float) -> None:
     if heed_rule is None:
         assert alpha == 1.0 or overheard == 0.0
         return
-    shares = [heed_rule.share_of(missed) for missed in (0, heed_rule.patience, heed_rule.patience + 1)]
-    assert shares == sorted(shares, reverse=True)
-    assert 0.0 <= heed_rule.share <= 1.0
-    assert shares[2] == 0.0
+    fractions = [heed_rule.fraction_of(missed) for missed in (0, heed_rule.patience, heed_rule.patience + 1)]
+    assert fractions == sorted(fractions, reverse=True)
+    assert 0.0 <= heed_rule.fraction <= 1.0
+    assert fractions[2] == 0.0
     left = (1.0 - overheard) ** heed_rule.patience
     if left > 1e-9:
-        assert 1.0 - left + heed_rule.share * overheard * left == pytest.approx(alpha, abs=1e-9)
+        assert 1.0 - left + heed_rule.fraction * overheard * left == pytest.approx(alpha, abs=1e-9)
 
 
 def test_what_it_heeds_of_some_links() -> None:
-    """α ≤ μ_e: a share of what was heard. Else all after few misses; with a deaf eavesdropper or without losses, no choice."""
+    """α ≤ μ_e: a fraction of what was heard. Else all after few misses; with a deaf eavesdropper or without losses, no choice."""
     cases = {(0.6, 0.9): (0, 0.6 / 0.9), (0.6, 1.0): (0, 0.6), (0.95, 0.9): (1, 0.05 / 0.09), (0.9, 0.5): (3, 0.4)}
-    for (alpha, overheard), (patience, share) in cases.items():
+    for (alpha, overheard), (patience, fraction) in cases.items():
         heed_rule = HeedRule.of(alpha, overheard)
         assert heed_rule is not None
         assert heed_rule.patience == patience
-        assert heed_rule.share == pytest.approx(share)
+        assert heed_rule.fraction == pytest.approx(fraction)
     assert HeedRule.of(0.0, 0.5) == HeedRule(0, 0.0)
     assert HeedRule.of(1.0, 0.5) is HeedRule.of(0.5, 0.0) is None
     assert heed_rule_of("critical", 0.5, 0.5) is None
@@ -90,7 +90,7 @@ def test_acknowledgements_are_heeded_by_misses(alpha: float, overheard: float) -
         HeedRule.of(alpha, overheard),
     )
     assert heed_rule is not None
-    missed, at_share = np.zeros(300, int), []
+    missed, at_fraction = np.zeros(300, int), []
     for k in range(60):
         arrived = channel.arrived(k, sent[k], gamma[k] & sent[k], gamma_e[k] & sent[k])
         assert np.array_equal(arrived, channel.arrived(k, sent[k], gamma[k] & sent[k], gamma_e[k] & sent[k]))
@@ -98,8 +98,8 @@ def test_acknowledgements_are_heeded_by_misses(alpha: float, overheard: float) -
         due = gamma[k] & sent[k]
         assert arrived[due & (missed < heed_rule.patience)].all()
         assert not arrived[~due | (missed > heed_rule.patience)].any()
-        at_share += arrived[due & (missed == heed_rule.patience)].tolist()
-    assert abs(np.mean(at_share) - heed_rule.share) < 5.0 * np.sqrt(0.25 / len(at_share))
+        at_fraction += arrived[due & (missed == heed_rule.patience)].tolist()
+    assert abs(np.mean(at_fraction) - heed_rule.fraction) < 5.0 * np.sqrt(0.25 / len(at_fraction))
 
 
 def test_without_lost_acknowledgements_it_is_the_honest_sensor() -> None:

@@ -48,7 +48,7 @@ def holding_times(played: Played, link: np.ndarray, r: int) -> list[float]:
 
 @pytest.mark.parametrize("threshold", [1, 2, 4])
 def test_packets_go_by_the_holding_time(threshold: int) -> None:
-    """Sent, or encrypted, exactly from `threshold` slots after the last acknowledged one; in clear it is the state."""
+    """Sent, or encrypted, exactly from `threshold` slots after the last acknowledged one; unencrypted it is the state."""
     rng = np.random.default_rng(1)
     events = tuple(rng.random((3, 30, 60)) < 0.7)
     mask = Mask(STABLE, stream_key(ROOT, "mask"), Batch(30, 60))
@@ -72,7 +72,7 @@ def test_packets_go_by_the_holding_time(threshold: int) -> None:
 
 @pytest.mark.parametrize("name", READERS)
 def test_what_is_received_in_a_way_one_can_read_is_the_state(name: str) -> None:
-    """The user reads every packet, the eavesdropper every one in clear; it leaves encrypted ones alone."""
+    """The user reads every packet, the eavesdropper every unencrypted one; it leaves encrypted ones alone."""
     rng = np.random.default_rng(2)
     events = tuple(rng.random((3, 30, 60)) < 0.7)
     played = played_over(name, UNSTABLE, 3, events)
@@ -140,7 +140,7 @@ def test_long_silences_keep_an_eavesdropper_out_of_an_unstable_process() -> None
 
 
 def test_blocked_acknowledgements_mistune_one_and_open_the_other() -> None:
-    """Blocked, `scheduled` sends in every slot, in clear; `encrypted-schedule` encrypts every packet."""
+    """Blocked, `scheduled` sends in every slot, unencrypted; `encrypted-schedule` encrypts every packet."""
     gamma = coins(0.8, 20, 100)
     blocked = np.zeros_like(gamma)
     opened = played_over("scheduled", STABLE, 5, (gamma, gamma, blocked))

@@ -62,7 +62,7 @@ def test_chain_gives_the_limit_of_the_expectation() -> None:
 
 @pytest.mark.parametrize("case", chain.CASES)
 def test_simulated_occupation_is_the_limiting_distribution(case: tuple[float, float]) -> None:
-    """Link and schedule of the emulator spend in each step and word the stated share of slots, at five errors."""
+    """Link and schedule of the emulator spend in each step and word the stated fraction of slots, at five errors."""
     found = chain.simulate(*case, trials=400, slots=1500, progress=lambda _: None)
     for (mean, error), expected in (
         (found.steps, step_probabilities(*case, chain.STEPS)),

@@ -105,7 +105,7 @@ def test_independent_losses_have_the_streaks_of_the_closed_form(outcomes: Outcom
     assert found is not None
     assert closed is not None
     for trials in (1, 30, 1000):
-        assert found.share(trials) == pytest.approx(closed.share(trials), rel=1e-6, abs=1e-8)
+        assert found.fraction(trials) == pytest.approx(closed.fraction(trials), rel=1e-6, abs=1e-8)
     assert found.trials_for(0.01) == closed.trials_for(0.01)
 
 
@@ -130,8 +130,8 @@ def test_bursts_make_rare_events_rarer_and_larger() -> None:
     at, process = AT["legitimate"](0.6), Process(np.eye(1), np.eye(1), np.eye(1))
     long = Chain(np.array([[0.99, 0.01], [0.09, 0.91]]), np.array([0.9, 0.1]), np.array([1.0, 0.0]))
     alike = replace(STEADY, quality=np.array([0.9]))
-    shares = [found_in(LinkDistribution.steady(chain), at, 100, process).share(20) for chain in (long, alike)]
-    assert shares[0] > 5.0 * shares[1] > 0.0
+    fractions = [found_in(LinkDistribution.steady(chain), at, 100, process).fraction(20) for chain in (long, alike)]
+    assert fractions[0] > 5.0 * fractions[1] > 0.0
 
 
 def test_what_is_not_computed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -187,8 +187,8 @@ def test_losses_of_states_are_looked_up_in_either_way() -> None:
     small = {"model": "markov", "transitions": [[0.6, 0.4], [0.3, 0.7]], "loss": [0.0, 1.0]}
     many = 8
     # Every state has many copies, which differ only in how likely each copy is; the loss of a copy is that of its state.
-    share = np.arange(1.0, many + 1) / np.arange(1.0, many + 1).sum()
-    copies = np.kron(np.array(small["transitions"]), np.ones((many, 1)) * share)
+    fraction = np.arange(1.0, many + 1) / np.arange(1.0, many + 1).sum()
+    copies = np.kron(np.array(small["transitions"]), np.ones((many, 1)) * fraction)
     large = {"model": "markov", "transitions": copies.tolist(), "loss": np.repeat([0.0, 1.0], many).tolist()}
     numbers = np.random.default_rng(4).random((200, 2, 50))
     assert LOSS_MODELS["markov"].mistakes({name: large[name] for name in ("transitions", "loss")}) == []

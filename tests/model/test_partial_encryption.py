@@ -1,4 +1,4 @@
-"""Partial encryption: its packets, its user, the exact reader of the packets in clear, and the theory of that reader."""
+"""Partial encryption: its packets, its user, the exact reader of the unencrypted packets, and the theory of that reader."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from evedrop.model.outcomes import eavesdropper_outcomes
 from evedrop.model.process import Floats, Process, Trajectory
 from evedrop.model.receiver import Action, Belief, Receiver, Reception
 from evedrop.model.schemes import scheme_of
-from evedrop.model.schemes.partial_encryption import INNOVATION_IN_CLEAR, PartialEncryption
+from evedrop.model.schemes.partial_encryption import UNENCRYPTED_INNOVATION, PartialEncryption
 from evedrop.model.schemes.scheme import Packet
 from evedrop.model.streams import Batch
 from evedrop.model.theory.clear_states import ClearStatesForm
@@ -40,7 +40,7 @@ def scheme(process: Process, encrypted: list[int], mu_d: float) -> PartialEncryp
 
 
 def reader_of(process: Process, batch: Batch) -> Receiver:
-    """The reader of the packets in clear."""
+    """The reader of the unencrypted packets."""
     return READERS[READER](Knowledge(process, 1.0, {}, {}), batch)
 
 
@@ -63,11 +63,11 @@ def beliefs(
 
 
 def test_packets_show_what_is_not_encrypted() -> None:
-    """States in clear and innovations as they are; the header names the encrypted ones; slot 0 is a state."""
+    """Unencrypted states and innovations as they are; the header names the encrypted ones; slot 0 is a state."""
     batch = Batch(40, 30)
     for k, x, predicted, packet in sent(scheme(DRIFTING, [0, 2], 0.5), batch):
         assert packet.header is not None
-        np.testing.assert_array_equal(packet.header[0], np.where(packet.nu, INNOVATION_IN_CLEAR, 0b101))
+        np.testing.assert_array_equal(packet.header[0], np.where(packet.nu, UNENCRYPTED_INNOVATION, 0b101))
         np.testing.assert_array_equal(packet.z[1], np.where(packet.nu, x[1] - predicted[1], x[1]))
         np.testing.assert_array_equal(packet.z[:, packet.nu], (x - predicted)[:, packet.nu])
         assert not np.isclose(packet.z[::2, ~packet.nu], x[::2, ~packet.nu], atol=1e-6).any()
@@ -123,7 +123,7 @@ def test_the_reader_is_the_textbook_filter(process: Process, encrypted: list[int
 
 
 def test_the_reader_says_what_it_did() -> None:
-    """The state where all is in clear, or there is no header; nothing used where all is encrypted; a betrayed state is known."""
+    """The state where all is unencrypted or without a header; nothing used where all is encrypted; a betrayed state is known."""
     batch = Batch(3, 4)
     reader = reader_of(MARGINAL, batch)
     gamma, z = np.array([True, True, True, False]), np.ones((2, 4))
@@ -200,7 +200,7 @@ def form(
 @settings(deadline=None, max_examples=examples(25))
 @given(models(lowest=0.5), st.sampled_from([0.0, 1.0]), st.integers(0, 7))
 def test_what_theory_knows_in_exact_fractions(model: Model, mu_d: float, bits: int) -> None:
-    """Schur complements of the states in clear, for noise of any condition."""
+    """Schur complements of the unencrypted states, for noise of any condition."""
     n = model.process.n
     hidden = [i for i in range(n) if bits >> i & 1]
     clear = [i for i in range(n) if i not in hidden]

@@ -113,8 +113,8 @@ def test_packets_go_by_the_holding_time_and_a_coin(threshold: float) -> None:
         assert (eve.action[gamma[k] & encrypted] == Action.DISCARDED).all()
         held = np.where(gamma[k], 1, held + 1)
     if early:
-        share = 1.0 - threshold % 1.0
-        assert abs(np.mean(early) - share) < 4.0 * np.sqrt(share * (1.0 - share) / len(early))
+        fraction = 1.0 - threshold % 1.0
+        assert abs(np.mean(early) - fraction) < 4.0 * np.sqrt(fraction * (1.0 - fraction) / len(early))
 
 
 @pytest.mark.parametrize("process", [pytest.param(STABLE, marks=pytest.mark.long), UNSTABLE])
@@ -134,19 +134,19 @@ def test_expectations_are_those_of_all_courses(process: Process, threshold: floa
             process, slots, error
         ),
     }
-    encrypted_share = []
+    encrypted_fractions = []
     for k in range(slots):
         encrypted = (held >= np.ceil(threshold)) | ((held >= np.floor(threshold)) & coin[k])
-        encrypted_share.append(float(chances @ encrypted))
+        encrypted_fractions.append(float(chances @ encrypted))
         for name, heard in (("user", gamma[k]), ("eve", gamma_e[k] & ~encrypted)):
             grown = process.A @ P[name] @ process.A.T + process.Q if k else process.initial_covariance
             P[name] = np.where(heard[:, None, None], R[k], grown)
             assert np.allclose(np.tensordot(chances, P[name], axes=1), found[name][k], rtol=1e-9)
         held = np.where(gamma[k] & link[k], 1, held + 1)
-    assert encrypted_share[0] == pytest.approx(1.0)
+    assert encrypted_fractions[0] == pytest.approx(1.0)
     # Once as many slots as the threshold have passed, the chain is as good as stationary.
     if threshold < 3.0:
-        assert encrypted_share[-1] == pytest.approx(encrypted_fraction(threshold, MU * ARRIVES), abs=1e-9)
+        assert encrypted_fractions[-1] == pytest.approx(encrypted_fraction(threshold, MU * ARRIVES), abs=1e-9)
 
 
 @pytest.mark.parametrize("threshold", [1.0, 1.5, 2.0, 4.25])

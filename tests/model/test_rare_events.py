@@ -92,53 +92,53 @@ def test_streaks_do_not_depend_on_the_parts_of_a_run(monkeypatch: pytest.MonkeyP
 
 @pytest.mark.parametrize("outcomes", [LEGITIMATE, MISLED, SMART], ids=["legitimate", "misled", "smart"])
 def test_streaks_of_a_long_run_carry_the_whole_expectation(outcomes: Outcomes) -> None:
-    """Over several blocks of powers, all but the share that is left out is carried; the numbers fall with the length."""
+    """Over several blocks of powers, all but the fraction that is left out is carried; the numbers fall with the length."""
     found = found_in(STABLE, outcomes, 3000)
     assert found.total == pytest.approx(float(expected_traces(STABLE, outcomes, 3000).sum()), rel=1e-12)
     assert found.carried.sum() == pytest.approx(found.total, rel=2e-9)
     assert np.all(np.diff(found.number) <= 0.0)
 
 
-def test_share_is_of_streaks_that_too_few_trials_meet() -> None:
-    """The share falls with the trials, and `trials_for` gives the number at which it reaches a level."""
+def test_the_fraction_is_of_streaks_that_too_few_trials_meet() -> None:
+    """The fraction falls with the trials, and `trials_for` gives the number at which it reaches a level."""
     found = found_in(PLANE, SMART, 200)
-    shares = [found.share(trials) for trials in (1, 10, 100, 10_000, 10**9)]
-    assert shares == sorted(shares, reverse=True)
-    assert shares[0] > 0.1
-    assert shares[-1] < 0.001
+    fractions = [found.fraction(trials) for trials in (1, 10, 100, 10_000, 10**9)]
+    assert fractions == sorted(fractions, reverse=True)
+    assert fractions[0] > 0.1
+    assert fractions[-1] < 0.001
     for level in (0.2, 0.05, 0.001):
         trials = int(found.trials_for(level))
-        assert found.share(trials) <= level < found.share(trials - 20)
+        assert found.fraction(trials) <= level < found.fraction(trials - 20)
 
 
-def test_a_small_share_is_not_rounded_away() -> None:
-    """A share above 1e-9 is told as it is; less than that is what `streaks` leaves out, and counts as nothing."""
+def test_a_small_fraction_is_not_rounded_away() -> None:
+    """A fraction above 1e-9 is told as it is; less than that is what `streaks` leaves out, and counts as nothing."""
     number = np.array([[1.0, 1e-6], [0.0, 0.0], [0.0, 0.0]])
-    for rare, share in ((5e-4, 5e-4), (2e-9, 2e-9), (5e-10, 0.0)):
+    for rare, fraction in ((5e-4, 5e-4), (2e-9, 2e-9), (5e-10, 0.0)):
         carried = np.array([[1.0 - rare, rare], [0.0, 0.0], [0.0, 0.0]])
-        assert Streaks(number, carried, 1.0).share(100) == pytest.approx(share, rel=1e-6)
+        assert Streaks(number, carried, 1.0).fraction(100) == pytest.approx(fraction, rel=1e-6)
 
 
-def test_share_of_an_initial_covariance_that_no_trial_misses_packets_of() -> None:
+def test_the_fraction_of_an_initial_covariance_that_no_trial_misses_packets_of() -> None:
     """A first packet that one trial in a thousand loses carries nearly all of the error if nothing else does."""
     process = Process(np.array([[0.5]]), np.array([[1e-9]]), np.array([[1.0]]))
     found = found_in(process, Outcomes.plain(0.999), 50)
-    assert found.share(19_000) > 0.99
-    assert found.share(20_001) < 0.01
+    assert found.fraction(19_000) > 0.99
+    assert found.fraction(20_001) < 0.01
     assert found.trials_for(0.05) == 20_000.0
 
 
 def test_a_receiver_without_error_has_no_rare_events() -> None:
     """A perfect link has no error that anything could carry."""
     found = found_in(STABLE, Outcomes.plain(1.0), 20)
-    assert (found.total, found.share(1), found.trials_for(0.05)) == (0.0, 0.0, 1.0)
+    assert (found.total, found.fraction(1), found.trials_for(0.05)) == (0.0, 0.0, 1.0)
 
 
 def test_a_number_of_trials_beyond_double_precision_is_infinite() -> None:
     """A start that grows faster than its streak dies out is carried by a streak that no number of trials meets."""
     process = Process(np.array([[1e3]]), np.array([[1.0]]), np.array([[1.0]]))
     found = found_in(process, Outcomes.plain(1.0 - 1e-5), 70)
-    assert found.share(10**9) > 0.99
+    assert found.fraction(10**9) > 0.99
     assert found.trials_for(0.05) == math.inf
 
 

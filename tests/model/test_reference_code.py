@@ -146,11 +146,11 @@ def test_an_almost_singular_process_is_carried_by_itself() -> None:
 @pytest.mark.parametrize("name", ["acknowledged", "random-code", "threshold-code"])
 def test_a_singular_process_is_warned_of(name: str) -> None:
     """By every scheme with such a code, and by no other."""
-    singular, regular = (Process(np.diag([1.1, last]), np.eye(2), np.eye(2)) for last in (0.0, 0.5))
+    singular, nonsingular = (Process(np.diag([1.1, last]), np.eye(2), np.eye(2)) for last in (0.0, 0.5))
     parameters = dict(SCHEMES[name].parameters)
     (warning,) = scheme_of(singular, {"scheme": name, **parameters}).warnings()
     assert warning.startswith("process.A is singular to double precision (max |A| · max |A⁻¹| exceeds 9e13)")
-    assert scheme_of(regular, {"scheme": name, **parameters}).warnings() == []
+    assert scheme_of(nonsingular, {"scheme": name, **parameters}).warnings() == []
     assert scheme_of(singular, {"scheme": "open-loop"}).warnings() == []
 
 

@@ -307,9 +307,9 @@ def test_how_often_the_last_state_is_certain() -> None:
         np.array([[5.625e-3, 1.25e-2], [1.25e-2, 5e-2]]),
         singular_noise=True,
     )
-    regular = Process(singular.A, np.diag(np.diag(singular.Q)), singular.initial_covariance)
+    nonsingular = Process(singular.A, np.diag(np.diag(singular.Q)), singular.initial_covariance)
     certain: list[float] = []
-    for process in (singular, regular):
+    for process in (singular, nonsingular):
         batch, random = Batch(21, 600), np.random.default_rng(1)
         eve, belief = Bayesian(Knowledge(process, 0.3, {}, {}), batch), None
         L = np.linalg.cholesky(process.initial_covariance)

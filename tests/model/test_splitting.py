@@ -43,14 +43,14 @@ def test_trials_are_copied_in_proportion(populations: int, size: int, seed: int)
     of = SplitPopulations(populations, size)
     for _ in range(3):
         importance = rng.lognormal(sigma=3.0, size=(populations, size))
-        before, share = of.means(importance), of.weigh(importance)
+        before, fraction = of.means(importance), of.weigh(importance)
         product = importance * of.weight
         copied = of.split(rng.random(populations))
         count = np.bincount(copied, minlength=populations * size).reshape(populations, size)
         average = size * product / product.sum(axis=1, keepdims=True)
         assert np.all((count >= np.floor(average - 1e-9)) & (count <= np.ceil(average + 1e-9)))
         assert np.allclose(of.means(importance.reshape(-1)[copied].reshape(importance.shape)), before)
-        assert np.all((share > 0.999 / size) & (share <= 1.0 + 1e-12))
+        assert np.all((fraction > 0.999 / size) & (fraction <= 1.0 + 1e-12))
 
 
 def test_equal_trials_count_alike() -> None:

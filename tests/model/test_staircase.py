@@ -72,10 +72,10 @@ def test_what_double_precision_cannot_decide_is_refused() -> None:
         Staircase(process_of([[1.0, 2.0**-30], [0.0, 1.0]], [[1.0], [1.0]]))
     clear = Staircase(process_of([[1.0, 2.0**-30], [0.0, 1.0]], [[0.0], [1.0]]))
     assert (clear.unreached, clear.later) == (0, 1), "a small entry must not be taken for the rounding of a difference"
-    regular = Staircase(Process(np.eye(2), np.eye(2), np.eye(2), singular_noise=True))
-    assert (regular.singular, regular.later) == (False, 0)
-    assert not Leaks(regular.process).rounding(range(1, 4)).any()
-    assert regular.outside(np.ones((2, 1))).shape == (0, 1)
+    nonsingular = Staircase(Process(np.eye(2), np.eye(2), np.eye(2), singular_noise=True))
+    assert (nonsingular.singular, nonsingular.later) == (False, 0)
+    assert not Leaks(nonsingular.process).rounding(range(1, 4)).any()
+    assert nonsingular.outside(np.ones((2, 1))).shape == (0, 1)
 
 
 def test_a_range_within_rounding_of_all_states_is_seen() -> None:
@@ -93,7 +93,7 @@ def test_a_range_within_rounding_of_all_states_is_seen() -> None:
 
 
 def test_the_part_of_a_noise_outside_the_range_is_measured() -> None:
-    """0 for the range of Q itself, and the share of a matrix that is outside this range."""
+    """0 for the range of Q itself, and the fraction of a matrix that is outside this range."""
     stairs = Staircase(PROCESSES["sampled force"])
     G = PROCESSES["sampled force"].noise_factor[:, :1]
     assert stairs.outside(G).max() < 1e-15

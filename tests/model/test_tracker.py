@@ -144,7 +144,7 @@ def test_it_is_the_exact_posterior(process: Process, learns_at: int) -> None:
 def test_its_room_is_enough_for_as_many_packets_as_the_documents_say(process: Process, lossless: bool) -> None:
     """Exact up to the fifth packet by default, and up to the sixth with room for 16; beyond that 2 % off at most.
 
-    40 trials without a leak; distances from the exact mean are shares of the start's size.
+    40 trials without a leak; distances from the exact mean are fractions of the start's size.
     """
     gamma, words = np.ones((6, 40), bool) if lossless else coins(0.7, 6, 40), Words(process, 6)
     scale = float(np.sqrt(np.trace(process.initial_covariance + process.Q)))

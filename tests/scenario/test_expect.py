@@ -109,7 +109,7 @@ def test_without_eavesdroppers_there_is_nobody_to_be_secret_from() -> None:
     ("quantile", "least"), [(0.9, 10), (0.1, 10), (0.5, 2), (0.99, 100), (0.95, 20), (0.999, 1000)]
 )
 def test_a_quantile_needs_a_trial_beyond_it(quantile: float, least: int) -> None:
-    """The least number of trials is 1 over the share of trials beyond the quantile."""
+    """The least number of trials is 1 over the fraction of trials beyond the quantile."""
     expectation = {"metric": ERROR, "below": 1.0, "quantile": quantile}
     assert expecting(expectation, trials=least).trials == least
     (said,) = mistakes_of(expecting, expectation, trials=least - 1)

@@ -119,7 +119,7 @@ def test_a_plants_noise_that_is_no_covariance_is_the_only_mistake(noise: list[li
     assert line.startswith("plant.noise: ")
 
 
-REGULAR: dict[str, Any] = {
+NONSINGULAR: dict[str, Any] = {
     "process__Q": [[2.5e-5 + 1e-9, 5e-4], [5e-4, 1e-2 + 1e-9]],
     "process__singular_noise": None,
 }
@@ -130,13 +130,13 @@ TRACKER: dict[str, Any] = {"eavesdroppers": {"eve": {**EVE["eve"], "strategy": "
 @pytest.mark.parametrize(
     ("refused", "strategy", "more"),
     [
-        (WRONG["a track of its own"][0], "smart", REGULAR),
+        (WRONG["a track of its own"][0], "smart", NONSINGULAR),
         (
             {**WRONG["singular twice"][0], "eavesdroppers": {"eve": {**EVE["eve"], "strategy": "genie"}}},
             "smart",
-            REGULAR,
+            NONSINGULAR,
         ),
-        ({**WRONG["another noise"][0], "eavesdroppers": EVE}, "genie", REGULAR),
+        ({**WRONG["another noise"][0], "eavesdroppers": EVE}, "genie", NONSINGULAR),
         (TRACKER, "smart", SETTLED),
     ],
 )

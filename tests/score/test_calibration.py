@@ -23,7 +23,7 @@ from evedrop.scenario.tables import Scenario
 from evedrop.score.rare_events import z_of_error
 from evedrop.score.run_tally import RunTally
 from evedrop.score.scorekeeper import verdicts
-from evedrop.score.summary import RARE_SHARE, RareEvents
+from evedrop.score.summary import RARE_FRACTION, RareEvents
 from evedrop.score.verdict import Verdict
 from evedrop.simulate.simulation import Mode
 from evedrop.simulate.trials import carry_out, tasks_of
@@ -87,7 +87,7 @@ def tally_of(scenario: Scenario) -> RunTally:
 def rare_events(expected: Expectation, slots: int, trials: int) -> RareEvents | None:
     """The rare events of a study of so many trials."""
     streaks = expected.streaks(slots)
-    return None if streaks is None else RareEvents(streaks.share(trials), streaks.trials_for(RARE_SHARE))
+    return None if streaks is None else RareEvents(streaks.fraction(trials), streaks.trials_for(RARE_FRACTION))
 
 
 def z_scores(one: Documented) -> dict[str, list[float | None]]:
@@ -130,8 +130,8 @@ def test_z_is_calibrated_at_the_sizes_of_the_documents(capsys: pytest.CaptureFix
 def row(scores: list[float | None]) -> str:
     """How many studies, in how many of them the z-score is given, and how often it is beyond 1.96 and 3, below and above."""
     z = np.array([score for score in scores if score is not None])
-    shares = [np.mean(z < -1.96), np.mean(z > 1.96), np.mean(z < -3.0), np.mean(z > 3.0)] if len(z) else []
-    shown = [f"{100 * share:.1f} %" for share in shares] or ["–"] * 4
+    fractions = [np.mean(z < -1.96), np.mean(z > 1.96), np.mean(z < -3.0), np.mean(z > 3.0)] if len(z) else []
+    shown = [f"{100 * fraction:.1f} %" for fraction in fractions] or ["–"] * 4
     return " | ".join([f"{len(scores)}", f"{len(z)}", *shown])
 
 

@@ -43,9 +43,9 @@ def test_probabilities_are_not_too_small(process: Process) -> None:
     own.add_actions(action)
     probability = own.probability(errors(process, action, 2))
     for level in (0.5, 0.1, 0.01, 0.001):
-        share = float((probability < level).mean())
-        assert share <= level + 4.5 * np.sqrt(level * (1.0 - level) / TRIALS), level
-        assert share > 0.3 * level or level < 0.1
+        fraction = float((probability < level).mean())
+        assert fraction <= level + 4.5 * np.sqrt(level * (1.0 - level) / TRIALS), level
+        assert fraction > 0.3 * level or level < 0.1
 
 
 def test_the_expectation_is_the_mean_of_many_trials_with_the_same_events() -> None:

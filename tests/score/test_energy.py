@@ -35,7 +35,7 @@ def test_the_three_measures_by_hand() -> None:
 
 
 def test_a_measure_of_nothing_is_said_to_be_none() -> None:
-    """A reference that neither buys nor sells gives no shares."""
+    """A reference that neither buys nor sells gives no fractions."""
     found = difference(np.array([1.0, 1.0]), np.array([0.0, 0.0]))
     assert np.isinf(found.net)
     assert np.isinf(found.summed)

@@ -58,7 +58,7 @@ def test_other_schemes_reveal_states_or_nothing(tmp_path: Path, scheme: str, cle
 
 
 def test_a_schedule_of_probabilities_leaks_slot_by_slot() -> None:
-    """Where μ_d differs from slot to slot, so do the shares of states and innovations."""
+    """Where μ_d differs from slot to slot, so do the fractions of states and innovations."""
     chances = [1.0, 0.2, 0.9, 0.0]
     encoding = {"scheme": "innovation", "state_probability": chances}
     scenario = load("eavesdroppers", {"slots": 4, "encoding": encoding, "expect": []})

@@ -29,7 +29,7 @@ from evedrop.scenario.expected.expectations import expectations_of
 from evedrop.scenario.loading import load
 from evedrop.scenario.tables import Scenario
 from evedrop.score.scorekeeper import RunOutcome
-from evedrop.score.summary import RARE_SHARE, Summary
+from evedrop.score.summary import RARE_FRACTION, Summary
 from evedrop.score.sums import Tally
 from evedrop.simulate.montecarlo import Merger, Plan
 from evedrop.simulate.simulation import Mode
@@ -86,11 +86,11 @@ def test_standard_errors_are_those_of_the_trials_means(recorded: Results, receiv
         assert peer[name] == pytest.approx(means.mean(), rel=1e-12), name
         assert peer["standard_errors"][name] == pytest.approx(textbook(means), rel=1e-9), name
     z = textbook_z(expected["mean_squared_error"], peer["expected_trace_covariance"])
-    if peer["rare_events"]["share"] > RARE_SHARE:
+    if peer["rare_events"]["fraction"] > RARE_FRACTION:
         assert peer["z"] == {"mean_squared_error": None}
     else:
         assert peer["z"] == {"mean_squared_error": pytest.approx(z, rel=1e-6)}
-    assert (receiver == "naive") == (peer["rare_events"]["share"] <= RARE_SHARE)
+    assert (receiver == "naive") == (peer["rare_events"]["fraction"] <= RARE_FRACTION)
 
 
 def test_late_packets_count_in_the_trials_too() -> None:
@@ -316,14 +316,14 @@ def test_the_report_says_where_rare_events_carry_the_error(capsys: pytest.Captur
     )
     rare = few.peers["legitimate"].rare_events
     assert rare is not None
-    assert rare.share > 0.9
+    assert rare.fraction > 0.9
     assert rare.trials == 20_000
     said = (
         "more than 99 % of its expected error is carried by events that are expected fewer than 20 times in 40 trials"
     )
     assert said in report_of(few, capsys)
     assert many.peers["legitimate"].rare_events is not None
-    assert many.peers["legitimate"].rare_events.share < RARE_SHARE
+    assert many.peers["legitimate"].rare_events.fraction < RARE_FRACTION
     for summary in (many, one):
         assert "is carried by events" not in report_of(summary, capsys)
 
@@ -372,8 +372,8 @@ def test_rare_events_are_those_of_theory(recorded: Results) -> None:
         streaks = expected.streaks(300)
         assert streaks is not None
         assert recorded.summary["peers"][name]["rare_events"] == {
-            "share": streaks.share(7),
-            "trials": streaks.trials_for(RARE_SHARE),
+            "fraction": streaks.fraction(7),
+            "trials": streaks.trials_for(RARE_FRACTION),
         }
 
 

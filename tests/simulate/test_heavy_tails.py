@@ -70,7 +70,7 @@ def misses(test: SignTestOf, samples: Floats, truth: float) -> tuple[float, floa
 
 
 HIGHEST = 0.01 + 4.5 * math.sqrt(0.01 * 0.99 / TRIES)
-"""Of TRIES tests at 1 %, the share that may be wrong, at 4.5 standard errors."""
+"""Of TRIES tests at 1 %, the fraction that may be wrong, at 4.5 standard errors."""
 
 
 @pytest.mark.parametrize("count", mostly_long([2, 10, 60, 500], [10]))

@@ -171,7 +171,7 @@ def test_a_cell_is_a_study_of_its_own(everything: Everything, tmp_path: Path) ->
 
 
 def test_all_schemes_have_the_same_trials_and_losses(everything: Everything) -> None:
-    """An eavesdropper that reads what any scheme sends in clear has the error that it has against `plain`."""
+    """An eavesdropper that reads what any scheme sends unencrypted has the error that it has against `plain`."""
     found, _ = everything
     user = found.schemes["plain"].legitimate.mean
     assert found.schemes["cipher"].legitimate.mean == pytest.approx(user, rel=1e-9)

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from evedrop.errors import ScenarioError, UsageError
-from evedrop.model.metrics.text import share_text
+from evedrop.model.metrics.text import fraction_text
 from evedrop.model.schemes import SCHEMES
 from evedrop.scenario.loading import load
 from evedrop.studies.matchups import adversaries_of, matchups_of
@@ -226,6 +226,6 @@ def test_rare_events_are_said_below_the_table(evedrop: Evedrop) -> None:
     found = json.loads((evedrop.folder / "found" / "compare.json").read_text())
     for scheme, one in found["schemes"].items():
         rare = [cell["eavesdropper"]["rare_events"] for cell in one["against"].values() if "eavesdropper" in cell]
-        share = max(each["share"] for each in rare)
-        assert share > 0.1
-        assert f"{scheme} up to {share_text(share)}" in line
+        fraction = max(each["fraction"] for each in rare)
+        assert fraction > 0.1
+        assert f"{scheme} up to {fraction_text(fraction)}" in line

@@ -98,9 +98,9 @@ def test_the_command_prints_the_table_and_json(evedrop: Evedrop) -> None:
     mean = found["more_than_plain"]["net_energy"]["mean"]
     (line,) = (line for line in shown.out.splitlines() if "net energy: innovation less plain" in line)
     assert f" {mean:.3g} Wh" in line
-    share = found["differences"]["scheme_from_plain"]["summed"]["mean"]
+    fraction = found["differences"]["scheme_from_plain"]["summed"]["mean"]
     (line,) = (line for line in shown.out.splitlines() if "summed: innovation from plain" in line)
-    assert f" {100.0 * share:.3g} %" in line
+    assert f" {100.0 * fraction:.3g} %" in line
     for words, said in (
         (("cost", "vehicle"), "there is no household with a controller; try the scenario microgrid"),
         (("cost", "microgrid", "--trials", "1"), "--trials 1: expected 2 or more"),

@@ -141,7 +141,7 @@ def test_a_point_is_a_study_of_its_own(swept: tuple[pa.Table, Path], tmp_path: P
             for metric, error in peer["standard_errors"].items():
                 assert row[f"{metric}_standard_error"] == error
             assert row["mean_squared_error_z"] == peer["z"]["mean_squared_error"]
-            assert {"share": row["rare_share"], "trials": row["rare_trials"]} == peer["rare_events"]
+            assert {"fraction": row["rare_fraction"], "trials": row["rare_trials"]} == peer["rare_events"]
             for level, value in peer["error_quantiles"].items():
                 assert row[f"error_quantile_{level}"] == value
             verdict = alone["secrecy"].get(name, {})

@@ -1,4 +1,4 @@
-"""What the view of a wire says about its messages: lines of events, states of lanes, and shares of losses."""
+"""What the view of a wire says about its messages: lines of events, states of lanes, and fractions of losses."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from evedrop.wire.graph import loss_of
-from evedrop.wire.lane_states import LaneState, legend, share_of, state_of
+from evedrop.wire.lane_states import LaneState, legend, loss_state_of, state_of
 from evedrop.wire.notices import CutWatcher, LinkWatcher
 from evedrop.wire.record import WireFate
 from evedrop.wire.step_counts import DELIVERED, OUTCOMES, WireSteps
@@ -64,7 +64,7 @@ def test_pairs_of_sides_are_cut_when_all_their_links_are() -> None:
     [(0, 0, "silent"), (7, 0, "0 % lost"), (7, 7, "100 % lost"), (1000, 213, "21 % lost"), (1000, 13, "1.3 % lost"),
      (100_000, 7, "0.007 % lost"), (1000, 999, "99.9 % lost")],
 )  # fmt: skip
-def test_shares_are_rounded_but_never_to_nothing_or_all(heard: int, lost: int, text: str) -> None:
+def test_fractions_are_rounded_but_never_to_nothing_or_all(heard: int, lost: int, text: str) -> None:
     """A link that lost one message of many has not lost 0 %."""
     counts = np.zeros(len(OUTCOMES), np.int64)
     counts[DELIVERED], counts[OUTCOMES.index(WireFate.LOST)] = heard - lost, lost
@@ -81,14 +81,14 @@ def test_a_lane_tells_how_much_was_lost() -> None:
         assert state_of(counts[0, 0]) is state, (delivered, lost, underway)
 
 
-def test_the_share_of_a_link_counts_every_message() -> None:
-    """For whatever reason it was not delivered; a silent link has no share."""
+def test_the_fraction_of_a_link_counts_every_message() -> None:
+    """For whatever reason it was not delivered; a silent link has no fraction."""
     for stretch, state in (
         ({}, LaneState.QUIET), ({WireFate.DELIVERED: 3}, LaneState.DELIVERED),
         ({WireFate.DELIVERED: 3, WireFate.REFUSED: 2}, LaneState.SOME),
         ({WireFate.DELIVERED: 2, WireFate.CUT: 1, WireFate.LOST: 1}, LaneState.MOST),
     ):  # fmt: skip
-        assert share_of(steps_of(stretch).counts[0, 0]) is state
+        assert loss_state_of(steps_of(stretch).counts[0, 0]) is state
 
 
 def test_the_main_reason_decides_on_a_lane() -> None:

@@ -83,8 +83,8 @@ def test_a_silence_takes_little() -> None:
     assert steps[-1].first == 8_639_999
 
 
-@pytest.mark.parametrize("share", [0.5, 0.99])
-def test_quantiles_of_delays_are_right_within_three_per_cent(share: float) -> None:
+@pytest.mark.parametrize("fraction", [0.5, 0.99])
+def test_quantiles_of_delays_are_right_within_three_per_cent(fraction: float) -> None:
     """Over all orders of magnitude; a delay of 0 is 0, and no delivered message gives NaN."""
     rng = np.random.default_rng(5)
     rows = np.zeros(20_000, RECORD)
@@ -94,11 +94,11 @@ def test_quantiles_of_delays_are_right_within_three_per_cent(share: float) -> No
     rows["fate"][rows["link"] == 2] = WireFate.LOST
     rows["delay"][rows["link"] == 3] = rng.normal(0.02, 0.005, 5000)
     delays = counted([rows], 4)[0].delays[0]
-    shown = quantile(delays, share)
+    shown = quantile(delays, fraction)
     assert shown[1] == 0.0
     assert np.isnan(shown[[2, 4]]).all()
     for link in (0, 3):
-        expected = np.quantile(rows["delay"][rows["link"] == link], share)
+        expected = np.quantile(rows["delay"][rows["link"] == link], fraction)
         np.testing.assert_allclose(shown[link], expected, rtol=0.04)
 
 

@@ -126,7 +126,9 @@ def test_rates_and_delays_are_those_of_the_messages(rows: NDArray[Any], rrd: Pat
             if not len(there):
                 assert np.isnan([delay[link], delay[3 + link]]).all()
             elif link < 2:
-                expected = [1e3 * np.quantile(there["delay"], share, method="inverted_cdf") for share in (0.99, 0.5)]
+                expected = [
+                    1e3 * np.quantile(there["delay"], fraction, method="inverted_cdf") for fraction in (0.99, 0.5)
+                ]
                 np.testing.assert_allclose([delay[3 + link], delay[link]], expected, rtol=0.04)
 
 

@@ -16,8 +16,8 @@ def print_budget(design: BudgetDesign) -> None:
     """Print the thresholds as a table, the one for the budget among them."""
     console = terminal()
     console.print(
-        f"a packet in clear costs {design.in_clear:g}, an encrypted one {design.encrypted:g}; errors are traces in the limit; "
-        f"the user's is {finite_text(design.user)}"
+        f"an unencrypted packet costs {design.unencrypted:g}, an encrypted one {design.encrypted:g}; errors are traces in the "
+        f"limit; the user's is {finite_text(design.user)}"
     )
     names = list(design.best.eavesdroppers)
     errors = [f"error of {name}" for name in names]

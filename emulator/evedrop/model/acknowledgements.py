@@ -63,30 +63,30 @@ class HeedRule(NamedTuple):
 
     patience: int
     """Those of packets after fewer misses than this are heeded, those after more are not."""
-    share: float
-    """The share that is heeded of those after exactly this many misses."""
+    fraction: float
+    """The fraction that is heeded of those after exactly this many misses."""
 
     @classmethod
     def of(cls, quality: float, overheard: float) -> HeedRule | None:
-        """The rule that heeds a share `quality` of all, if the eavesdropper hears packets with the probability `overheard`.
+        """The rule that heeds a fraction `quality` of all, if the eavesdropper hears packets with the probability `overheard`.
 
-        1 − (1−μ_e)^J (1 − μ_e a) = α, with the patience J and the share a. None if there is no choice: where no acknowledgement
-        is lost, and where nothing is overheard.
+        1 − (1−μ_e)^J (1 − μ_e a) = α, with the patience J and the fraction a. None if there is no choice: where no
+        acknowledgement is lost, and where nothing is overheard.
 
         Source: after Lu, Quevedo, Gupta, Dey (2020); docs/mathematics.md, the hijacked sensor.
         """
         if quality >= 1.0 or 1.0 - overheard == 1.0:
             return None
         patience = 0 if overheard >= 1.0 else max(0, int(math.log1p(-quality) / math.log1p(-overheard)) - 1)
-        # From here on only elementary operations, so that the share has the same bits on every machine.
+        # From here on only elementary operations, so that the fraction has the same bits on every machine.
         while _power(1.0 - overheard, patience + 1) > 1.0 - quality:
             patience += 1
         left = _power(1.0 - overheard, patience)
         return cls(patience, min(max((quality - (1.0 - left)) / (overheard * left), 0.0), 1.0))
 
-    def share_of(self, missed: int) -> float:
-        """The share that is heeded after this many misses."""
-        return 1.0 if missed < self.patience else self.share if missed == self.patience else 0.0
+    def fraction_of(self, missed: int) -> float:
+        """The fraction that is heeded after this many misses."""
+        return 1.0 if missed < self.patience else self.fraction if missed == self.patience else 0.0
 
 
 def _power(base: float, exponent: int) -> float:
@@ -149,8 +149,8 @@ class AckChannel:
         # The first of two words is that of a reader of one.
         reader = BlockReader(key, batch, 2)
         self._heed_rule = heed_rule_of(attack, quality, overheard)
-        share = 0.0 if self._heed_rule is None else self._heed_rule.share
-        words, limits = [0, 1, 0], np.array([quality, flip, share])[:, None]
+        fraction = 0.0 if self._heed_rule is None else self._heed_rule.fraction
+        words, limits = [0, 1, 0], np.array([quality, flip, fraction])[:, None]
         self._drawn = Ahead(reader.ahead, lambda slots: reader.uniforms(slots)[:, words] < limits)
         self._missed: NDArray[np.int64] = np.zeros(batch.trials, np.int64)
         self._counted = -1
@@ -212,8 +212,10 @@ def rates_of(attack: str, mu: float, mu_e: float, quality: float = 1.0, flip: fl
     chances = np.where(gamma, mu, 1.0 - mu) * np.where(gamma_e, mu_e, 1.0 - mu_e) * np.where(flips, flip, 1.0 - flip)
     heed_rule, heeded = heed_rule_of(attack, quality, mu_e), np.full(8, quality)
     if heed_rule is not None:
-        share = heed_rule.share_of(0)
-        heeded = np.where(gamma_e, share, max(0.0, quality - mu_e * share) / max(1.0 - mu_e, np.finfo(float).tiny))
+        fraction = heed_rule.fraction_of(0)
+        heeded = np.where(
+            gamma_e, fraction, max(0.0, quality - mu_e * fraction) / max(1.0 - mu_e, np.finfo(float).tiny)
+        )
     arrives = heeded * chances * ATTACKS[attack](gamma, gamma_e, flips)
 
     def split(heard: Flags) -> tuple[float, float]:

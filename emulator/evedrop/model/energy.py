@@ -32,7 +32,7 @@ class EnergyModel:
     """Energy of encrypting a packet, in addition."""
 
     def sent(self, scheme: _Bits) -> float:
-        """Energy of a packet of a scheme that is sent in clear."""
+        """Energy of a packet of a scheme that is sent unencrypted."""
         return self.packet + self.bit * scheme.packet_bits
 
     def spent(self, scheme: _Bits, sent: _Count, encrypted: _Count) -> _Count:

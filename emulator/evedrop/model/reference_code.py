@@ -13,7 +13,7 @@ import numpy as np
 from evedrop.model.kernels.current import kernels
 from evedrop.model.kernels.elementary import cholesky
 from evedrop.model.process import Floats, Process, StateFactors, product
-from evedrop.model.staircase import is_regular
+from evedrop.model.staircase import is_nonsingular
 from evedrop.model.theory.horizon import TOLERANCE, UNIT_ROUNDOFF
 
 NONE = -1
@@ -37,7 +37,7 @@ class ReferenceCode:
 
     def __init__(self, process: Process, open_loop: bool = False, ages_kept: int = _OLDEST_KEPT) -> None:
         self._process, self._ages_kept = process, ages_kept
-        self.decorrelates = not open_loop and is_regular(process.A)
+        self.decorrelates = not open_loop and is_nonsingular(process.A)
         """Whether packets are independent of the state that they are sent for: L is not A."""
         self._states = StateFactors(process)
         self._kept = max(2, _NUMBERS_KEPT // (_SLOTS_AT_ONCE * process.n * process.n))
@@ -148,12 +148,12 @@ class _Watch:
 
 def singular_warnings(process: Process) -> list[str]:
     """The consequences of a singular A, for which there is no L with independent packets."""
-    if is_regular(process.A):
+    if is_nonsingular(process.A):
         return []
     return [
         "process.A is singular to double precision (max |A| · max |A⁻¹| exceeds 9e13), so no code makes packets independent of "
         "the state: references are carried by L = A, as in the scheme open-loop, and an eavesdropper that lost the reference "
-        "learns the decaying modes from every packet; a regular A prevents that"
+        "learns the decaying modes from every packet; a nonsingular A prevents that"
     ]
 
 

@@ -15,7 +15,7 @@ _FOLLOWED = 32  # critical slots whose consequences are computed each by itself
 
 
 def reference_floor(process: Process, received: float, acknowledged: tuple[float, float], slots: int) -> Floats:
-    """A lower bound on tr E P_k for k = 0 … slots−1, (slots,), for regular A; inf from where it overflows.
+    """A lower bound on tr E P_k for k = 0 … slots−1, (slots,), for nonsingular A; inf from where it overflows.
 
     Arguments as for `reference_covariances`. With c the probability of a critical slot, acknowledged and not heard,
 

@@ -27,7 +27,7 @@ ROUNDING = 2.0**-50
 """The standard deviation of the rounding of a packet, relative to the numbers that it is computed from."""
 _BY_CHANCE = 1e-6
 _STANDARD_DEVIATIONS = 40.0  # from the range, in standard deviations of rounding, at which a packet is outside of it
-_REGULAR = 0.01 * 2.0**53  # a condition number of A up to which its inverse has correct digits
+_NONSINGULAR = 0.01 * 2.0**53  # a condition number of A up to which its inverse has correct digits
 _CHECKED_ONE_BY_ONE = 64  # slots; later ones whose number is a power of two, and the last
 
 _Vector = list[float]
@@ -42,7 +42,7 @@ class _Basis(NamedTuple):
 
 @final
 class Staircase:
-    """The coordinates s of a process, x = T s; those of a process with regular Q are x itself.
+    """The coordinates s of a process, x = T s; those of a process with nonsingular Q are x itself.
 
     Raises ValueError if double precision cannot decide which directions noise reaches, or if A and Q are both singular.
     """
@@ -59,7 +59,7 @@ class Staircase:
         """The number of states that the noise of one slot does not reach, those included."""
         if not self.singular:
             return
-        if not is_regular(process.A):
+        if not is_nonsingular(process.A):
             raise ValueError(
                 "A is singular to double precision, and so is Q: a packet then shows part of w without noise"
             )
@@ -163,13 +163,13 @@ def is_singular(process: Process) -> bool:
     return process.singular_noise and bool(np.any(np.diag(process.noise_factor) == 0.0))
 
 
-def is_regular(A: Floats) -> bool:
+def is_nonsingular(A: Floats) -> bool:
     """Whether A⁻¹ has correct digits in double precision."""
     try:
         size = float(np.abs(A).max()) * float(np.abs(inverse(A)).max())
     except ValueError:
         return False
-    return size <= _REGULAR
+    return size <= _NONSINGULAR
 
 
 def _reached(process: Process, scale: _Vector) -> _Basis:

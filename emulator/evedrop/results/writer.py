@@ -49,8 +49,8 @@ from evedrop.score.sums import SlotSums
 
 _ROUND_SECONDS = 3.0  # the longest time between rounds, which a killed writer loses
 _ROUND_BYTES = (32 * 2**10, 4 * 2**20)  # the most that is held back, at the start of a run and later
-_ROUND_SHARE = 8  # at most this fraction (one in 8) of the bytes on disk is held back
-_METRICS_SHARE = 50  # after metrics took some time, none are computed for 50 times as long
+_ROUND_ONE_IN = 8  # at most one in 8 of the bytes on disk is held back
+_METRICS_PAUSE = 50  # after metrics took some time, none are computed for 50 times as long
 
 __all__ = [
     "DIGESTS", "JOURNAL", "NULLABLE", "SLOTS", "ResultsWriter", "plain", "seen_actions", "write_summary",
@@ -162,7 +162,7 @@ class ResultsWriter:
         self._at = at
         began = time.monotonic()
         least, most = _ROUND_BYTES
-        if began < self._round_due and self._bytes < min(most, max(least, self._on_disk // _ROUND_SHARE)):
+        if began < self._round_due and self._bytes < min(most, max(least, self._on_disk // _ROUND_ONE_IN)):
             return
         first = not self._metrics_before
         due = first or began >= self._metrics_due
@@ -180,7 +180,7 @@ class ResultsWriter:
         if due and not first:  # the first metrics import the theory, so their time says nothing about the next
             self.write_metrics(metrics())
             now = time.monotonic()
-            self._metrics_due = now + max(_ROUND_SECONDS, _METRICS_SHARE * (now - began))
+            self._metrics_due = now + max(_ROUND_SECONDS, _METRICS_PAUSE * (now - began))
 
     def write_rows(self, at: str) -> None:
         """Write all rows to disk now. Raises OSError as `checkpoint` does."""

@@ -61,7 +61,7 @@ def singular_mistakes(tables: ValidTables) -> Iterator[str]:
 
 
 def unsuited(table: ProcessTable, plant: PlantTable | None, strategy: str) -> Iterator[Unsuited]:
-    """The reasons why a strategy cannot work with this process and plant; none for a Q that must be regular."""
+    """The reasons why a strategy cannot work with this process and plant; none for a Q that must be nonsingular."""
     kind = STRATEGIES.get(strategy)
     if kind is None or not table.singular_noise:
         return

@@ -94,7 +94,7 @@ class LoopTally:
         self.other_error = 0.0
         """Sum of squared errors of the estimator that is not in the loop."""
         self.of_trials: Floats = np.zeros((4, trials))
-        """The slots of each trial, and its shares of the three totals above, in their order."""
+        """The slots of each trial, and its fractions of the three totals above, in their order."""
         self.applications: dict[str, ApplicationTally] = {}
         """Application → its totals, for those that the scenario uses."""
 

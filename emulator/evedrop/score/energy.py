@@ -18,14 +18,14 @@ _HOUR = 3600.0
 
 @dataclass(frozen=True)
 class EnergyDifference:
-    """The difference of a run's grid power from another run's, as shares of the other's, per trial (…)."""
+    """The difference of a run's grid power from another run's, as fractions of the other's, per trial (…)."""
 
     net: Floats
     """The difference of net energy: |Σ P − Σ P′| / |Σ P′|."""
     total: Floats
     """The relative difference of the energy through the meter in both directions: |Σ |P| − Σ |P′|| / Σ |P′|."""
     summed: Floats
-    """The sum of the differences of single slots: Σ |P − P′| / Σ |P′|. At least as large as both others, as shares of Σ |P′|."""
+    """The sum of the differences of single slots: Σ |P − P′| / Σ |P′|. At least as large as both others, divided by Σ |P′|."""
 
 
 @final
@@ -75,7 +75,7 @@ class Meter:
 
     @property
     def difference(self) -> EnergyDifference:
-        """The three measures. A share of a sum that is 0 is infinite, or NaN if both sums are 0."""
+        """The three measures. A fraction of a sum that is 0 is infinite, or NaN if both sums are 0."""
         net, other_net = self.bought - self.sold, self.other_bought - self.other_sold
         total, other_total = self.bought + self.sold, self.other_bought + self.other_sold
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,4 +1,4 @@
-"""What the packets that an eavesdropper received reveal without the secret: states in clear, and bits of other packets.
+"""What the packets that an eavesdropper received reveal without the secret: unencrypted states, and bits of other packets.
 
 Source: docs/mathematics.md, leak in bits.
 """
@@ -46,7 +46,7 @@ class HeardBits(NamedTuple):
 
 @final
 class LeakTally:
-    """The bits, and the states in clear, that R trials received, summed over slots from slot 0 on."""
+    """The bits, and the unencrypted states, that R trials received, summed over slots from slot 0 on."""
 
     def __init__(self, trials: int) -> None:
         self._bits, self._clear = np.zeros(trials), np.zeros(trials)

@@ -10,7 +10,7 @@ import numpy as np
 from evedrop.model.metrics.standard_error import mean_skewness, z_of
 from evedrop.model.process import Floats
 from evedrop.scenario.expected.expectations import Expectation
-from evedrop.score.summary import RARE_SHARE, RareEvents
+from evedrop.score.summary import RARE_FRACTION, RareEvents
 from evedrop.score.sums import Tally
 
 _LARGEST_SKEWNESS = 0.3
@@ -20,7 +20,7 @@ _LARGEST_SKEWNESS = 0.3
 def rare_events_of(expected: Expectation, tally: Tally) -> RareEvents | None:
     """The rare events of a receiver over the slots so far; None if they are unknown."""
     streaks = expected.streaks(tally.done) if tally.alike else None
-    return None if streaks is None else RareEvents(streaks.share(tally.trials), streaks.trials_for(RARE_SHARE))
+    return None if streaks is None else RareEvents(streaks.fraction(tally.trials), streaks.trials_for(RARE_FRACTION))
 
 
 def z_of_error(
@@ -29,9 +29,9 @@ def z_of_error(
     """The z-score of a mean error over slots 0 … slots−1, from the mean error of every trial, (R,), and theory's.
 
     rare: the receiver's rare events, None if they are unknown: then the trials must not be skewed too much. None where rare
-    events carry more than RARE_SHARE of the expectation, where the variance is infinite, and as from `z_of`.
+    events carry more than RARE_FRACTION of the expectation, where the variance is infinite, and as from `z_of`.
     """
-    if theory is None or expected.infinite_variance or (rare is not None and rare.share > RARE_SHARE):
+    if theory is None or expected.infinite_variance or (rare is not None and rare.fraction > RARE_FRACTION):
         return None
     if rare is None and of_trials is not None and abs(mean_skewness(of_trials)) > _LARGEST_SKEWNESS:
         return None

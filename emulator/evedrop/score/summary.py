@@ -38,18 +38,18 @@ MODES: Mapping[str, str] = {
     "error-coordinates": " --error-coordinates",
 }
 """The mode of a run → the option of `evedrop montecarlo` that chooses it, after a space."""
-RARE_SHARE = 0.1
-"""The share of an expected error that rare events may carry without being reported; beyond it, a mean error has no z-score."""
+RARE_FRACTION = 0.1
+"""The fraction of an expected error that rare events may carry without being reported; beyond it, a mean error has no z-score."""
 
 
 @dataclass(frozen=True)
 class RareEvents:
     """The events that carry a receiver's expected error, but that too few trials meet."""
 
-    share: float
-    """The share of the expected error that comes from events that are expected fewer than 20 times in all trials."""
+    fraction: float
+    """The fraction of the expected error that comes from events that are expected fewer than 20 times in all trials."""
     trials: float
-    """The number of trials for which this share would be RARE_SHARE."""
+    """The number of trials for which this fraction would be RARE_FRACTION."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class RareEstimate:
     splits: int
     """After how many slots trials were copied."""
     counting: float
-    """The least share of trials that counted in a slot, in the mean over populations."""
+    """The least fraction of trials that counted in a slot, in the mean over populations."""
     doubt: str | None
     slots: Mapping[str, Sequence[float]]
     """`mean_error` and `standard_error` of every slot; empty if they are not to be trusted."""

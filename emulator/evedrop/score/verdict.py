@@ -21,7 +21,7 @@ from evedrop.model.theory.rare_events import RARE
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.expected.expectations import Expectation, ExpectedTraceStream
 from evedrop.score.rare_events import rare_events_of
-from evedrop.score.summary import RARE_SHARE, LeakSummary, SecrecySummary
+from evedrop.score.summary import RARE_FRACTION, LeakSummary, SecrecySummary
 from evedrop.score.sums import WINDOWS, Tally, window_bounds, window_means, window_of
 
 ERROR_RATE = 0.01
@@ -314,7 +314,7 @@ def largest_means(theory: Expectation, means: Floats, slots: int) -> Floats:
         if not theory.of_model:
             return expected
         streaks = theory.streaks(slots)
-        rare = 1.0 if streaks is None else streaks.share(trials)
+        rare = 1.0 if streaks is None else streaks.fraction(trials)
         return np.asarray(means.mean(axis=1, keepdims=True) + rare * expected)
     heaviest = means.max(axis=1, keepdims=True)
     lost = math.nan if theory.link is None else 1.0 - float(theory.link.rates(range(1))[0])
@@ -339,7 +339,7 @@ def _missing(name: str, tally: Tally, theory: Expectation) -> str:
         return f": no closed form bounds the error of {name} in events that none of them met"
     rare = rare_events_of(theory, tally)
     ways = "montecarlo --rare estimates its mean"
-    if rare is not None and rare.share > RARE_SHARE and math.isfinite(rare.trials):
+    if rare is not None and rare.fraction > RARE_FRACTION and math.isfinite(rare.trials):
         ways = f"{count_text(rare.trials)} trials would contain them, and {ways}"
     return f": theory expects a larger error of {name}, which rare events carry; {ways}"
 

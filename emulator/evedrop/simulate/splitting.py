@@ -44,7 +44,7 @@ class SplitMeans:
     splits: tuple[int, ...]
     """The slots after which trials were copied."""
     counting: float
-    """The least share of trials that counted in a slot, in the mean over populations."""
+    """The least fraction of trials that counted in a slot, in the mean over populations."""
 
     @property
     def of_populations(self) -> Floats:
@@ -130,12 +130,12 @@ class Splitter:
             simulation = self._simulation(range(first, first + count * size), lineage)
             for k, error, important in self._slots(simulation, start):
                 errors[:, k] = populations.means(error.reshape(count, size))
-                share = populations.weigh((important + self._floor[k]).reshape(count, size)).mean()
-                counting[k], start = share, k + 1
+                fraction = populations.weigh((important + self._floor[k]).reshape(count, size)).mean()
+                counting[k], start = fraction, k + 1
                 self._on_progress(count * size)
                 if self._stopped():
                     break
-                if k + 1 < slots and (share < _SPLIT_BELOW if splits is None else k in splits):
+                if k + 1 < slots and (fraction < _SPLIT_BELOW if splits is None else k in splits):
                     ancestors = populations.split(uniforms.uniforms(range(k, k + 1))[0, 0])
                     lineage = lineage.split(k + 1, ancestors)
                     done.append(k)

@@ -47,7 +47,7 @@ from evedrop.simulate.trials import BatchResult, tasks_of
 from evedrop.studies.matchups import Group, Matchups
 from evedrop.system.signals import stop_on_signals
 
-_WRITE_SECONDS, _WRITE_SHARE = (
+_WRITE_SECONDS, _WRITE_PAUSE = (
     3.0,
     50.0,
 )  # from one compare.json to the next, and as a multiple of the time to write one
@@ -90,7 +90,7 @@ def compare_all(matchups: Matchups, folder: Path, on_event: OnEvent, plan: Plan,
                         break
                     played.append((group, merger))
                     began = time.monotonic()
-                    if began - written > max(_WRITE_SECONDS, _WRITE_SHARE * took):
+                    if began - written > max(_WRITE_SECONDS, _WRITE_PAUSE * took):
                         _write_found(folder, _comparison(matchups, played))
                         written = time.monotonic()
                         took = written - began

@@ -61,7 +61,7 @@ class SecrecyCost:
     more_than_plain: Mapping[str, MeanEstimate]
     """`net_energy` and `total_energy`: that with the scheme less that with `plain`, in Wh."""
     differences: Mapping[str, Mapping[str, MeanEstimate]]
-    """`scheme_from_plain`, `scheme_from_truth`, `plain_from_truth` → measure → the difference, as a share."""
+    """`scheme_from_plain`, `scheme_from_truth`, `plain_from_truth` → measure → the difference, as a fraction."""
 
 
 def secrecy_cost(

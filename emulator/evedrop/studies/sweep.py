@@ -214,7 +214,7 @@ def _rows(point: Point, scenario: Scenario, summary: Summary) -> Iterator[dict[s
             **{z_column(name): peer.z.get(name) for name, one in all_metrics().items() if one.expected is not None},
             **{f"error_quantile_{level}": value for level, value in (peer.error_quantiles or {}).items()},
             "infinite_variance": peer.infinite_variance,
-            "rare_share": None if peer.rare_events is None else peer.rare_events.share,
+            "rare_fraction": None if peer.rare_events is None else peer.rare_events.fraction,
             "rare_trials": None if peer.rare_events is None else peer.rare_events.trials,
             **{
                 column: value

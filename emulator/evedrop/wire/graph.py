@@ -14,7 +14,7 @@ import rerun.blueprint as rrb
 
 from evedrop.show.view.drawn_graph import LETTER, LINE, DrawnGraph
 from evedrop.show.view.palette import DROPPED_TEXT, TRUTH, TRUTH_CURVE
-from evedrop.wire.lane_states import LaneState, share_of
+from evedrop.wire.lane_states import LaneState, loss_state_of
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.step_counts import DELIVERED, Counts
 
@@ -55,13 +55,13 @@ class WireGraph:
         for counts in recent:
             labels += [*self._sides, *(f"{link.name}: {loss_of(counts[at])}" for at, link in enumerate(self._links))]
             colours += [TRUTH] * len(self._sides)
-            states = [share_of(counts[at]) for at in range(len(self._links))]
+            states = [loss_state_of(counts[at]) for at in range(len(self._links))]
             colours += [_TEXTS.get(state, state.colour) for state in states]
         return self._drawn.columns(labels, colours)
 
 
 def loss_of(counts: Counts) -> str:
-    """The share of messages that were not delivered, as a text; counts: (outcomes,)."""
+    """The fraction of messages that were not delivered, as a text; counts: (outcomes,)."""
     heard = int(counts.sum())
     if not heard:
         return "silent"

@@ -52,10 +52,10 @@ def state_of(counts: Counts) -> LaneState:
         return LaneState.CUT
     if reason is WireFate.OVERFLOW:
         return LaneState.FULL
-    return share_of(ended) if reason.emulated else LaneState.OWN
+    return loss_state_of(ended) if reason.emulated else LaneState.OWN
 
 
-def share_of(counts: Counts) -> LaneState:
+def loss_state_of(counts: Counts) -> LaneState:
     """How much of a link's messages was lost, for whatever reason; counts as for `state_of`."""
     heard, delivered = int(counts.sum()), int(counts[DELIVERED])
     if not heard:

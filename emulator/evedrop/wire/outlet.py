@@ -34,7 +34,7 @@ LONG_SECONDS: Final = 2e-4
 LAST_SECONDS: Final = 2.0
 """Seconds that the sides have to take what waits when the wire ends."""
 _ALONE_SECONDS = 1.0  # that a message may take past the queue if no third side waits with it
-_SHARE, _MOST_SECONDS = 0.1, 0.05  # of the time, and seconds at a time, for which a side may let others wait
+_FRACTION, _MOST_SECONDS = 0.1, 0.05  # of the time, and seconds at a time, for which a side may let others wait
 _SLOW_SECONDS = 10.0  # for which a slow side has no messages past the queue; each time twice as long
 _TICK = 0.05  # of the patience, which counts ticks: a process that was suspended has not waited
 _SLOW = 2.0**24  # bytes that a side takes in a second at least, or it counts as stopped
@@ -127,7 +127,7 @@ class SideOutlet:
         now = time.monotonic()
         with self._lock:
             if not alone:
-                self._waited = max(0.0, self._waited - _SHARE * (now - self._noted)) + seconds
+                self._waited = max(0.0, self._waited - _FRACTION * (now - self._noted)) + seconds
                 self._noted = now
             if not self._is_slow and (seconds > _ALONE_SECONDS if alone else self._waited > _MOST_SECONDS):
                 self._is_slow = True

@@ -275,8 +275,11 @@ class WireScorekeeper:
                     )
             mean, variance = expected(link.settings, changes, ranges)
             if tally.scattered:  # a sample of a known range: the range varies as a whole, and the sample within it
-                share = tally.tried / sum(map(len, ranges))
-                mean, variance = mean * share, variance * share**2 + mean * share * (1.0 - mean * share / tally.tried)
+                fraction = tally.tried / sum(map(len, ranges))
+                mean, variance = (
+                    mean * fraction,
+                    variance * fraction**2 + mean * fraction * (1.0 - mean * fraction / tally.tried),
+                )
             shared[name] = (mean, variance)
         return shared[name]
 

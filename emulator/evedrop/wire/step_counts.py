@@ -127,9 +127,9 @@ class StepCounter:
         return closed
 
 
-def quantile(delays: Counts, share: float) -> NDArray[np.float64]:
-    """The delay in seconds that a share of the messages does not exceed, by buckets (…, buckets); NaN without a message."""
+def quantile(delays: Counts, fraction: float) -> NDArray[np.float64]:
+    """The delay in seconds that a fraction of the messages does not exceed, by buckets (…, buckets); NaN without a message."""
     total = delays.cumsum(-1)
-    bucket = (total >= np.maximum(share * total[..., -1:], 1e-9)).argmax(-1)
+    bucket = (total >= np.maximum(fraction * total[..., -1:], 1e-9)).argmax(-1)
     middle = _SHORTEST * 10.0 ** ((bucket - 0.5) / _PER_DECADE)
     return np.where(total[..., -1] == 0, np.nan, np.where(bucket == 0, 0.0, middle))

@@ -169,7 +169,7 @@ def test_results_are_short_when_printed_and_a_table_in_a_notebook(results: RunRe
 
 def test_a_table_in_a_notebook_has_the_cautions_of_the_terminal(results: RunResults) -> None:
     """An incomplete run says so first; a mean that rare events carry is doubted."""
-    rare = {"share": 0.5, "trials": 1e6}
+    rare = {"fraction": 0.5, "trials": 1e6}
     changed = json.loads(json.dumps(results.summary))
     changed["ended"] = "a process died"
     changed["peers"]["smart"]["rare_events"] = rare

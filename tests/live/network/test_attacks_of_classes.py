@@ -205,14 +205,14 @@ def test_what_a_class_says_of_itself_is_checked(evedrop: Evedrop) -> None:
 
 
 FACTS = {"parameters": {}, "pools_links": False, "takes": True, "own_outcomes": True}
-SHARES = {"predicted": 0.5, "state": 0.5, "misled": 0.0, "decoded": 0.0, "leaked": 0.0, "initial": 0.5}
+FRACTIONS = {"predicted": 0.5, "state": 0.5, "misled": 0.0, "decoded": 0.0, "leaked": 0.0, "initial": 0.5}
 LIES: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "mistakes": ("none", lambda kind: kind.mistakes({})),
     "streams": ([7], lambda kind: kind.streams({})),
     "betrayed": (-1, lambda kind: kind.betrayed({})),
     "follows_gamma": ("yes", lambda kind: kind.follows_gamma({})),
     "use_probabilities": ([0.5, 1.5], lambda kind: kind.use_probabilities({})),
-    "outcomes_at": ({**SHARES, "state": 0.7}, lambda kind: kind.outcomes({}, 0.5)(0.5)),
+    "outcomes_at": ({**FRACTIONS, "state": 0.7}, lambda kind: kind.outcomes({}, 0.5)(0.5)),
 }
 
 
@@ -220,7 +220,7 @@ def said_by(lies: dict[str, Any]) -> Any:
     """The remote class of a class that gives these answers, right or wrong."""
     calls = RemoteCalls()
     truth = {"mistakes": [], "streams": [], "betrayed": None, "follows_gamma": True, "use_probabilities": [1.0, 1.0]}
-    said = {**truth, "outcomes": True, "outcomes_at": SHARES, **lies}
+    said = {**truth, "outcomes": True, "outcomes_at": FRACTIONS, **lies}
     given: dict[str, list[Any]] = {
         "class": ["STRATEGIES"],
         "outcomes": ["STRATEGIES", {}, 0.5],

@@ -36,7 +36,7 @@ ONCE = {"timeout_ms": 0, "exit_on_failure": True}
 
 @pytest.fixture(scope="module", params=["tcp", "tls"])
 def stage(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    """A router and a relay for all tests of this file, in clear and with certificates."""
+    """A router and a relay for all tests of this file, without certificates and with them."""
     scenario = small_network(slots=100_000, network={"routers": 2})
     with bench_of(scenario, tmp_path_factory.mktemp("linked"), request.param) as one:
         yield one

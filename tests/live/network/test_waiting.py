@@ -85,7 +85,7 @@ def test_a_connection_that_ends_before_there_is_a_certificate_is_no_refusal(tmp_
 
 @pytest.mark.parametrize("error", [ssl.SSLEOFError, ssl.SSLZeroReturnError, ConnectionResetError, BrokenPipeError])
 @pytest.mark.parametrize("secure", [True, False])
-def test_a_connection_that_ends_is_a_refusal_only_in_clear(error: type[OSError], secure: bool) -> None:
+def test_a_connection_that_ends_is_a_refusal_only_unencrypted(error: type[OSError], secure: bool) -> None:
     """With each of the errors by which versions of Python and of OpenSSL report it."""
     clock = TestClock()
     failures = Failures(clock, secure)

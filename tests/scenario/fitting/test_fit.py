@@ -96,7 +96,7 @@ def test_a_step_is_the_textbooks(p: float, r: float, good: float, bad: float, ou
 
 
 def test_steps_climb() -> None:
-    """The likelihood never falls by more than the first outcome's share, which the step neglects."""
+    """The likelihood never falls by more than the first outcome's fraction, which the step neglects."""
     chunks, model, before = ChunkedOutcomes(recorded(SOFT, 5000)), TwoStates(0.3, 0.4, 0.2, 0.5), -math.inf
     for _ in range(60):
         model, likelihood = chunks.step(model)

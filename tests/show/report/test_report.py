@@ -128,7 +128,7 @@ def test_a_page_has_cautions_events_and_outages_and_does_not_depend_on_the_order
 ) -> None:
     """A mean that rare events carry is doubted; an event and an outage have a row each; a failure has its command."""
     summary = json.loads((study / "summary.json").read_text())
-    summary["peers"]["smart"]["rare_events"] = {"share": 0.5, "trials": 1e6}
+    summary["peers"]["smart"]["rare_events"] = {"fraction": 0.5, "trials": 1e6}
     summary["events"] = [{"slot": 1234, "event": "the link of smart is cut", "by": "scenario"}]
     summary["outages"] = [{"process": "smart", "slot": 7, "until": None, "seconds": 1.0, "shard": None}]
     (tmp_path / "summary.json").write_text(json.dumps(summary))
@@ -305,7 +305,7 @@ def test_means_and_counts_do_not_depend_on_the_pieces(lengths: list[int], most: 
     assert counts.commonest.tolist() == [int(tally.argmax()) for tally in tallies]
     assert counts.highest.tolist() == [int(codes[group].max()) for group in groups]
     if count:
-        assert counts.shares == [float(share) for share in np.bincount(codes, minlength=3) / count]
+        assert counts.fractions == [float(fraction) for fraction in np.bincount(codes, minlength=3) / count]
 
 
 def test_a_lane_has_a_pixel_for_every_slot_or_the_worst_of_several() -> None:

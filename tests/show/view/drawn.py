@@ -27,7 +27,7 @@ def skipped_without_driver() -> Iterator[None]:
 
 
 def filled(png: bytes) -> float:
-    """Share of the pixels inside a panel that are not its most frequent colour."""
+    """Fraction of the pixels inside a panel that are not its most frequent colour."""
     pixels = np.asarray(matplotlib.image.imread(io.BytesIO(png)))[:, :, :3]
     inside = (pixels[40:, :, :] * 255).astype(np.int64) @ np.array([65536, 256, 1])
     return float(np.mean(inside != np.bincount(inside.ravel()).argmax()))
@@ -37,8 +37,8 @@ def panels_are_filled(rrd: Path, panels: int) -> None:
     """Assert that a recording has this many panels, and that each draws something and complains of nothing."""
     with skipped_without_driver(), opened(rrd, (1600, 950)) as viewer:
         views = viewer.state().views
-        shares = {str(view.name): filled(viewer.take(view.view_id)) for view in views}
+        fractions = {str(view.name): filled(viewer.take(view.view_id)) for view in views}
         complaints = [view.reports for view in views if view.reports]
-    assert len(shares) == panels
-    assert min(shares.values()) > 0.004, shares
+    assert len(fractions) == panels
+    assert min(fractions.values()) > 0.004, fractions
     assert complaints == []

@@ -85,13 +85,13 @@ def test_the_sun_is_a_days_with_clouds() -> None:
     assert depths.max() > 0.75
 
 
-def test_clouds_leave_a_share() -> None:
+def test_clouds_leave_a_fraction() -> None:
     """Of a clear sky's power, between their depth and all of it, but for the flicker; the same for a seed."""
-    share = sun.share_left(sun.Clouds(), Draws(11, "clouds"))
-    assert share.shape == (86_400,)
-    assert 0.2 < share.min() < 0.6
-    assert 1.0 < share.max() < 1.2
-    assert np.array_equal(share, sun.share_left(sun.Clouds(), Draws(11, "clouds")))
+    fraction = sun.fraction_left(sun.Clouds(), Draws(11, "clouds"))
+    assert fraction.shape == (86_400,)
+    assert 0.2 < fraction.min() < 0.6
+    assert 1.0 < fraction.max() < 1.2
+    assert np.array_equal(fraction, sun.fraction_left(sun.Clouds(), Draws(11, "clouds")))
 
 
 def test_appliances_follow_the_profile() -> None:

@@ -82,7 +82,7 @@ def test_who_knows_the_level_knows_the_load(sun: int | None) -> None:
 
 
 def test_what_is_not_known_is_taken_for_load() -> None:
-    """A sun that the neighbour has no idea of makes the load less by as much; an error of the level, by its share."""
+    """A sun that the neighbour has no idea of makes the load less by as much; an error of the level, by its fraction."""
     d = np.tile([1.5, 0.5], (SLOTS, 1))
     nothing = np.zeros((SLOTS, 2, 1))
     straight = replace(GIVEN, process=Process(np.eye(2), GIVEN.process.Q, GIVEN.process.Q))

@@ -87,7 +87,7 @@ def verdict(theirs: float, ours: float, **more: Any) -> NumberVerdict:
 
 
 def test_a_number_agrees_within_the_largest_of_its_tolerances() -> None:
-    """A share of theirs, an absolute bound, or standard errors of the difference."""
+    """A fraction of theirs, an absolute bound, or standard errors of the difference."""
     agrees, differs, erratum = NumberVerdict.AGREES, NumberVerdict.DIFFERS, NumberVerdict.ERRATUM
     assert verdict(-2.0, -2.03, relative=0.02) is agrees
     assert verdict(-2.0, -2.05, relative=0.02) is differs

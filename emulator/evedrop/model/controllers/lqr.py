@@ -38,17 +38,17 @@ def riccati(assignment: Assignment) -> tuple[Floats, Floats]:
     weight_u, weight_r = np.diag(assignment.input_weights), np.diag(assignment.rate_weights)
     both = weight_u + weight_r
     # With v = u − (W_u + W_r)⁻¹ W_r u′ instead of u the weights have no products of inputs and states.
-    share = product(inverse(both), weight_r)
+    part = product(inverse(both), weight_r)
     F = np.zeros((n + m, n + m))
-    F[:n, :n], F[:n, n:], F[n:, n:] = A, product(B, share), share
+    F[:n, :n], F[:n, n:], F[n:, n:] = A, product(B, part), part
     G_u = np.vstack([B, np.eye(m)])
     H = np.zeros((n + m, n + m))
     H[:n, :n] = np.diag(assignment.state_weights)
-    H[n:, n:] = weight_r - product(weight_r, share)
+    H[n:, n:] = weight_r - product(weight_r, part)
     P = _riccati(F, product(product(G_u, inverse(both)), _transposed(G_u)), H)
     carried = product(_transposed(G_u), P)
     K = product(inverse(both + product(carried, G_u)), product(carried, F))
-    K[:, n:] -= share
+    K[:, n:] -= part
     return K, P
 
 

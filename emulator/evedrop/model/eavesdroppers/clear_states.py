@@ -1,4 +1,4 @@
-"""The eavesdropper that reads what partial encryption leaves in clear: a Kalman filter without measurement noise."""
+"""The eavesdropper that reads what partial encryption leaves unencrypted: a Kalman filter without measurement noise."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from evedrop.model.kernels.current import kernels
 from evedrop.model.process import Floats, product
 from evedrop.model.receiver import Action, Belief, Flags, Reception
 from evedrop.model.reference_code import initial_factor
-from evedrop.model.schemes.partial_encryption import INNOVATION_IN_CLEAR
+from evedrop.model.schemes.partial_encryption import UNENCRYPTED_INNOVATION
 
 _NEGLIGIBLE = (
     1e-75  # of the noise: the square of such a standard deviation is lost in rounding, and its own square in underflow
@@ -18,10 +18,10 @@ _NEGLIGIBLE = (
 
 
 class ClearStates(PacketReader):
-    """Reads the states in clear, and innovations, as the header says; exact MMSE without the pads.
+    """Reads the unencrypted states, and innovations, as the header says; exact MMSE without the pads.
 
-    `Belief.memory` is a factor X of P = X Xᵀ, (n, n, R). A state in clear is a measurement without noise; the rows of X are made
-    triangular, those in clear first, so no difference of covariances is taken.
+    `Belief.memory` is a factor X of P = X Xᵀ, (n, n, R). An unencrypted state is a measurement without noise; the rows of X are
+    made triangular, the unencrypted ones first, so no difference of covariances is taken.
 
     Source: docs/mathematics.md, partial encryption.
     """
@@ -41,9 +41,9 @@ class ClearStates(PacketReader):
         return super().knowing(k, x, belief)._replace(memory=(np.zeros_like(belief.P),))
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
-        """Predicted; with the innovation added; or conditioned on the states in clear. Without a header all of them are."""
+        """Predicted; with the innovation added; or conditioned on the unencrypted states. Without a header all of them are."""
         header = np.zeros(self.trials, np.int64) if heard.header is None else heard.header[0]
-        innovation = heard.gamma & (header == INNOVATION_IN_CLEAR)
+        innovation = heard.gamma & (header == UNENCRYPTED_INNOVATION)
         x_hat, X = self._predicted(k, belief, innovation)
         x_hat = np.where(innovation, x_hat + heard.z, x_hat)
         action = np.where(innovation, np.uint8(Action.INNOVATION), np.uint8(Action.LOST))
@@ -70,7 +70,7 @@ class ClearStates(PacketReader):
 
 
 def _read(x_hat: Floats, X: Floats, hidden: Flags, z: Floats) -> tuple[Floats, Floats]:
-    """x̂ (n, R) and the factor (n, n, R) once the states in clear have been read from z (n, R)."""
+    """x̂ (n, R) and the factor (n, n, R) once the unencrypted states have been read from z (n, R)."""
     order = np.argsort(hidden, kind="stable")
     clear = int((~hidden).sum())
     L = kernels.triangular_factors(X[order].transpose(2, 0, 1).copy())

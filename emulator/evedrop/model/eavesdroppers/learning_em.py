@@ -135,8 +135,8 @@ class LearningEm(Learner):
             scale = np.where((posterior.packets == 0.0) & gamma, scale_of(gamma[None], z[None]), scale)
             theta = self.known.start(NARROW[0] * scale)
         elif not self.known.everything:
-            share = np.where(gamma, 1.0 - 1.0 / (age + 1.0), 1.0)
-            moments = moments.faded(share).added(theta.A, z, gamma.astype(np.float64), after.last)
+            fraction = np.where(gamma, 1.0 - 1.0 / (age + 1.0), 1.0)
+            moments = moments.faded(fraction).added(theta.A, z, gamma.astype(np.float64), after.last)
             moments, theta = moments.most_likely(theta, scale, self.known.names)
         return Learned(after.posterior, theta, moments, scale), after.state
 

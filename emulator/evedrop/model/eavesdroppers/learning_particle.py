@@ -113,8 +113,8 @@ class LearningParticle(Learner):
         many, packet = self._wide(gamma), self._wide(z)
         after = advanced(k, self.known, theta, posterior, many, packet)
         if k and not self.known.everything:
-            share = np.where(many, 1.0 - 1.0 / (k + 2.0), 1.0)
-            moments = moments.faded(share).added(theta.A, packet, many.astype(np.float64), after.last)
+            fraction = np.where(many, 1.0 - 1.0 / (k + 2.0), 1.0)
+            moments = moments.faded(fraction).added(theta.A, packet, many.astype(np.float64), after.last)
         weight = weight + after.evidence
         most = self._narrow(weight).max(axis=0)
         weight = weight - self._wide(most)
@@ -172,8 +172,8 @@ class LearningParticle(Learner):
     def _mean(self, portion: Floats, values: Floats) -> Floats:
         """The mean over particles of values (…, N R), (…, R)."""
         total = np.zeros((*values.shape[:-1], self.trials))
-        for p, share in enumerate(portion):
-            total += share * values[..., p * self.trials : (p + 1) * self.trials]
+        for p, fraction in enumerate(portion):
+            total += fraction * values[..., p * self.trials : (p + 1) * self.trials]
         return total
 
     def _believed(self, cloud: Cloud, action: Codes, scale: Floats, largest: Floats) -> Belief:

@@ -16,7 +16,7 @@ from evedrop.model.remote_calls import RemoteCalls
 from evedrop.model.theory.covariances import Outcomes, OutcomesAt
 
 _ROUNDING = 1e-9
-_SHARES = ("predicted", "state", "misled", "decoded", "leaked")
+_FRACTIONS = ("predicted", "state", "misled", "decoded", "leaked")
 """The entries of `Outcomes` that sum to 1."""
 
 
@@ -115,13 +115,13 @@ class _RemoteEavesdropper(Eavesdropper):
 
         def at(mu_e: float) -> Outcomes:
             found = cls._ask("outcomes_at", dict(parameters), mu_d, float(mu_e))
-            names = [*_SHARES, "initial"]
+            names = [*_FRACTIONS, "initial"]
             if not isinstance(found, dict) or sorted(found) != sorted(names):
                 raise _wrong("outcomes()", found, f"the probabilities {', '.join(names)}")
             if not all(_is_probability(value) for value in found.values()):
                 raise _wrong("outcomes()", found, "probabilities")
-            if abs(sum_in_order(found[name] for name in _SHARES) - 1.0) > _ROUNDING:
-                raise _wrong("outcomes()", found, f"{', '.join(_SHARES)} that sum to 1")
+            if abs(sum_in_order(found[name] for name in _FRACTIONS) - 1.0) > _ROUNDING:
+                raise _wrong("outcomes()", found, f"{', '.join(_FRACTIONS)} that sum to 1")
             return Outcomes(**found)
 
         return at

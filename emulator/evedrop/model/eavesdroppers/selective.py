@@ -1,4 +1,4 @@
-"""The selective eavesdropper: uses packets sent in clear, and ignores those that are encrypted according to the header."""
+"""The selective eavesdropper: uses packets sent unencrypted, and ignores those that are encrypted according to the header."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Selective(PacketReader):
     )
 
     def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
-        """A x̂ and A P Aᵀ + Q, or z and 0 where a packet is in clear."""
+        """A x̂ and A P Aᵀ + Q, or z and 0 where a packet is unencrypted."""
         # The codes 0 and 1 of `Action` are γ itself: the state where a packet arrives.
         action = heard.gamma.astype(np.uint8)
         if heard.header is not None:

@@ -227,7 +227,7 @@ def triangular_factor(rows: Rows) -> Rows:
 
 
 def inverse(M: Floats) -> Floats:
-    """Inverse of a regular matrix (n, n), by elimination with row pivots.
+    """Inverse of a nonsingular matrix (n, n), by elimination with row pivots.
 
     Raises ValueError where a pivot is 0.
     """

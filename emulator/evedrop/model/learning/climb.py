@@ -45,7 +45,7 @@ def climbed(known: Known, first: int, gamma: Flags, z: Floats, so_far: Parameter
     every = start._replace(mu_d=np.ones_like(scale))
     _, moments, _ = _passed(known, every, first, gamma, z, scale)
     regression = moments.most_likely(every, scale, known.names)[1]._replace(mu_d=start.mu_d)
-    starts = [regression, *(known.start(share * scale) for share in NARROW), *([so_far] if so_far else [])]
+    starts = [regression, *(known.start(fraction * scale) for fraction in NARROW), *([so_far] if so_far else [])]
     several, trials = len(starts), len(scale)
     theta = Parameters(*(np.concatenate(parts, axis=-1) for parts in zip(*starts, strict=True)))
     gamma, z, scales = (np.concatenate([part] * several, axis=-1) for part in (gamma, z, scale))

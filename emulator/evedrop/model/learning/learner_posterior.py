@@ -97,9 +97,9 @@ def advanced(k: int, known: Known, theta: Parameters, posterior: LearnerPosterio
 def _corrected(sigma: Factors, packets: Floats, gamma: Flags, z: Floats) -> Factors:
     """Σ_k, drawn towards z zᵀ by the packets so far (R,): both types have this covariance. The first packet gives its scale."""
     n, first = len(z), gamma & (packets == 0.0)
-    share = np.where(gamma & ~first, 1.0 / (packets + n + 1.0), 0.0)
+    fraction = np.where(gamma & ~first, 1.0 / (packets + n + 1.0), 0.0)
     rows = [[*row, value] for row, value in zip(sigma.unit(), z, strict=True)]
-    drawn = orthogonalised(rows, [*(sigma.diagonal * (1.0 - share)), share])
+    drawn = orthogonalised(rows, [*(sigma.diagonal * (1.0 - fraction)), fraction])
     return Factors(np.where(first, 0.0, drawn.lower), np.where(first, scale_of(gamma[None], z[None]), drawn.diagonal))
 
 
@@ -121,5 +121,5 @@ def bounded(x_hat: Floats, P: Floats, largest: Floats) -> tuple[Floats, Floats]:
     """
     bound = np.where(largest > 0.0, _FARTHEST * largest, 1e100)
     standard_deviation = np.sqrt(np.stack([P[i, i] for i in range(len(P))]))
-    share = np.where(standard_deviation > bound, bound / np.maximum(standard_deviation, bound), 1.0)
-    return np.clip(x_hat, -bound, bound), P * (share[:, None] * share[None])
+    fraction = np.where(standard_deviation > bound, bound / np.maximum(standard_deviation, bound), 1.0)
+    return np.clip(x_hat, -bound, bound), P * (fraction[:, None] * fraction[None])

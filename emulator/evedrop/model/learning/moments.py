@@ -18,7 +18,7 @@ from evedrop.model.kernels.mixtures import summed
 from evedrop.model.learning.posterior import Parameters, Transition
 
 RIDGE = 1e-3
-"""Weight of the imagined transition that makes the regression regular."""
+"""Weight of the imagined transition that makes the regression nonsingular."""
 _LEAST = 1e-9  # least D in the factors of Q, over the variance of the first packets
 _LARGEST = 1e6  # largest entry of A
 
@@ -64,24 +64,24 @@ class Moments(NamedTuple):
         """The factors of Σ r E x_{k−1} x_{k−1}ᵀ."""
         return Factors(self.lower, self.diagonal)
 
-    def faded(self, share: Floats) -> Moments:
-        """The same with `share` (R,) of every weight."""
-        return Moments(self.lower, *(part * share for part in self[1:]))
+    def faded(self, fraction: Floats) -> Moments:
+        """The same with `fraction` (R,) of every weight."""
+        return Moments(self.lower, *(part * fraction for part in self[1:]))
 
     def added(self, A: Floats, z: Floats, heard: Floats, last: Transition) -> Moments:
         """These and the transition to a slot whose packets are z (n, R), 0 where none was heard (R,); A (n, n, R)."""
         rows, weights = [list(row) for row in self.information.unit()], list(self.diagonal)
         cross, square = self.cross, self.square
-        for c in np.flatnonzero(last.share.any(axis=1)):
-            share, before = last.share[c], last.before[:, c]
+        for c in np.flatnonzero(last.fraction.any(axis=1)):
+            fraction, before = last.fraction[c], last.before[:, c]
             spread = Factors(last.spread.lower[:, c], last.spread.diagonal[:, c])
             away, carried = z - applied(A, before), multiplied(A, covariance(spread))
-            cross = cross + share * (away[:, None] * before[None] - carried)
-            square = square + share * (away[:, None] * away[None] + outer(carried, A))
+            cross = cross + fraction * (away[:, None] * before[None] - carried)
+            square = square + fraction * (away[:, None] * away[None] + outer(carried, A))
             for row, value, unit in zip(rows, before, spread.unit(), strict=True):
                 row += [value, *unit]
-            weights += [share, *(share * D for D in spread.diagonal)]
-        state = summed(last.share)
+            weights += [fraction, *(fraction * D for D in spread.diagonal)]
+        state = summed(last.fraction)
         return Moments(
             *orthogonalised(rows, weights),
             cross,

@@ -45,7 +45,7 @@ class Parameters(NamedTuple):
 class Transition(NamedTuple):
     """The knowledge of x_{k−1} if the packet of slot k is the state x_k, for each component of slot k − 1."""
 
-    share: Floats
+    fraction: Floats
     """Probability of the component and that the packet is the state, (C, R)."""
     before: Floats
     """Mean of x_{k−1}, (n, C, R)."""
@@ -105,7 +105,7 @@ def weighed(theta: Parameters, sigma: Factors, of: Mixture, gamma: Flags, z: Flo
     ratios = np.where(gamma, of.weight * _likely(away, predicted, alone, sigma), 0.0)
     ratio = summed(ratios)
     state = _state_probability(theta.mu_d, ratio, gamma)
-    share = np.divide(ratios, ratio, out=np.zeros(ratios.shape), where=ratio > 0.0) * state
+    fraction = np.divide(ratios, ratio, out=np.zeros(ratios.shape), where=ratio > 0.0) * state
     before = of.mean + _entries(gain, _whitened(predicted, away))
     mean = np.where(gamma, mean + _entries(told, _whitened(sigma, z))[:, None, :], mean)
     after = Mixture(
@@ -114,7 +114,7 @@ def weighed(theta: Parameters, sigma: Factors, of: Mixture, gamma: Flags, z: Flo
     after = after._replace(diagonal=np.minimum(after.diagonal, _LARGEST * _LARGEST))
     density = log(np.maximum(theta.mu_d * ratio + (1.0 - theta.mu_d), _LEAST)) - 0.5 * (alone + _log_determinant(sigma))
     mixture = opened(pruned(after), state, z, capacity)
-    return Weighed(mixture, sigma, np.where(gamma, density, 0.0), state, Transition(share, before, spread))
+    return Weighed(mixture, sigma, np.where(gamma, density, 0.0), state, Transition(fraction, before, spread))
 
 
 def _leak(theta: Parameters, sigma: Factors) -> tuple[Factors, list[list[Floats]], Factors]:

@@ -27,9 +27,9 @@ def count_text(number: float) -> str:
     return f"{number:,.0f}" if number < _LARGE_COUNT else _scientific(number, 1)
 
 
-def share_text(share: float) -> str:
-    """A share as a percentage of two digits; one that is nearly everything is more than 99 %."""
-    return f"{100 * share:.2g} %" if share < _NEARLY_ALL else "more than 99 %"
+def fraction_text(fraction: float) -> str:
+    """A fraction as a percentage of two digits; one that is nearly everything is more than 99 %."""
+    return f"{100 * fraction:.2g} %" if fraction < _NEARLY_ALL else "more than 99 %"
 
 
 def estimate(value: float | None, error: float | None, how: str = ".4g") -> ShownNumber:

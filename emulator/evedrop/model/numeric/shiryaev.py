@@ -41,7 +41,7 @@ class ShiryaevTest:
     hazard: float
     """κ: the probability that the change happens in a slot, if it has not happened before."""
     risk: float
-    """h: of all alarms, the share of false ones is at most this, if the change happens as κ says."""
+    """h: of all alarms, the fraction of false ones is at most this, if the change happens as κ says."""
 
     def __post_init__(self) -> None:
         """Check the numbers."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from evedrop.model.process import Floats
 
-_KEPT = 0.99  # the share of trials below the value to which larger ones are cut in the floor of the importance
+_KEPT = 0.99  # the fraction of trials below the value to which larger ones are cut in the floor of the importance
 _LEAST = 1e-3
 
 
@@ -44,11 +44,11 @@ class SplitPopulations:
         return np.asarray((quantity * self.weight).mean(axis=1), np.float64)
 
     def weigh(self, importance: Floats) -> Floats:
-        """Take the importance G of the slot's trials; the share of them that would count in a split, 1/N … 1, (P,)."""
+        """Take the importance G of the slot's trials; the fraction of them that would count in a split, 1/N … 1, (P,)."""
         self._importance = importance
         product = importance * self.weight
-        share = product / product.max(axis=1, keepdims=True)
-        found: Floats = share.sum(axis=1) ** 2 / (share * share).sum(axis=1) / share.shape[1]
+        fraction = product / product.max(axis=1, keepdims=True)
+        found: Floats = fraction.sum(axis=1) ** 2 / (fraction * fraction).sum(axis=1) / fraction.shape[1]
         return found
 
     def split(self, uniforms: Floats) -> NDArray[np.intp]:

@@ -1,4 +1,4 @@
-"""Encryption scheduling: packets in clear while the user keeps up, encrypted when it has fallen behind."""
+"""Encryption scheduling: unencrypted packets while the user keeps up, encrypted when it has fallen behind."""
 
 from __future__ import annotations
 
@@ -44,12 +44,12 @@ class EncryptedScheduleEncoder(Encoder):
         return Packet(z, np.zeros(x.shape[1], np.bool_), encrypted.astype(np.int64)[None])
 
     def acknowledged(self, k: int, acknowledged: Flags) -> None:
-        """Send in clear again where slot k is acknowledged."""
+        """Send unencrypted again where slot k is acknowledged."""
         self._held.acknowledged(k, acknowledged)
 
 
 def selective_form(scheme: Scheme, threshold: float, conditions: ReceiverConditions) -> ChainForm | None:
-    """That of a receiver that uses the packets in clear; None if the chain, with a state for each holding time, is too long."""
+    """That of a reader of the unencrypted packets; None if the chain, with a state for each holding time, is too long."""
     received, acknowledged = conditions.received, conditions.acknowledged
     if received is None or acknowledged is None or conditions.hijack is not None or threshold > LARGEST_OPERATOR:
         return None
@@ -76,7 +76,7 @@ class EncryptedSchedule(Scheme):
     secret_streams = ("mask",)
     estimator_streams = ("mask",)
     needs_acknowledgements = True
-    header = ("1 if encrypted, 0 if in clear",)
+    header = ("1 if encrypted, 0 if unencrypted",)
     secret_words = (0, 1)
 
     def __init__(self, process: Process, threshold: int) -> None:

@@ -16,7 +16,7 @@ from evedrop.model.process import Floats, Process, StateFactors, product
 from evedrop.model.receiver import Belief, Beliefs, Codes, Flags, Receiver
 from evedrop.model.schedule import Schedule, StateProbability
 from evedrop.model.schemes.scheme import Encoder, PacketBlock, Scheme, Shared
-from evedrop.model.staircase import is_regular
+from evedrop.model.staircase import is_nonsingular
 from evedrop.model.streams import Ahead, Batch, BlockReader
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.model.theory.leaked_bits import LeakedBits, RevealedBits
@@ -134,7 +134,7 @@ class Innovation(Scheme):
 
     def revealed_bits(self) -> RevealedBits | None:
         """The state, or what an innovation leaks; None if A is singular, for an innovation then shows a part of w itself."""
-        if not is_regular(self.process.A):
+        if not is_nonsingular(self.process.A):
             return None
         return RevealedBits(math.inf, LeakedBits(self.process))
 

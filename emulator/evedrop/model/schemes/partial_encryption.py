@@ -1,4 +1,4 @@
-"""Partial encryption: some states of every state packet under a pad, as by `cipher`, the others and all innovations in clear."""
+"""Partial encryption: some states of a state packet under a pad, as by `cipher`, the others and all innovations unencrypted."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from evedrop.model.streams import Batch
 from evedrop.model.theory.clear_states import ClearStatesForm
 from evedrop.model.theory.covariances import Outcomes, radius
 
-INNOVATION_IN_CLEAR = -1
+UNENCRYPTED_INNOVATION = -1
 """The header of an innovation; that of a state packet has bit i for each encrypted state i."""
 _LAST = 62  # the last bit of a header that is not negative
 _WORD_BITS = 64
@@ -32,7 +32,7 @@ def hidden_states(encrypted: Sequence[int], n: int) -> Flags:
 
 @final
 class PartialEncryptionEncoder(Encoder):
-    """z_k = x_k with some states masked, or w_{k−1} in clear; the header says which."""
+    """z_k = x_k with some states masked, or w_{k−1} unencrypted; the header says which."""
 
     def __init__(self, schedule: Schedule, mask: Mask, hidden: Flags) -> None:
         self._schedule, self._mask, self._hidden = schedule, mask, hidden
@@ -42,7 +42,7 @@ class PartialEncryptionEncoder(Encoder):
         """The packet of slot k."""
         nu = self._schedule.at(k)
         state = np.where(self._hidden[:, None], self._mask.hide(k, x), x) if self._hidden.any() else x
-        header = np.where(nu, INNOVATION_IN_CLEAR, np.int64(self._header))
+        header = np.where(nu, UNENCRYPTED_INNOVATION, np.int64(self._header))
         return Packet(np.where(nu, x - predicted, state), nu, header[None])
 
 
@@ -69,7 +69,7 @@ class PartialEncryptionEstimator(Receiver):
 
 
 class PartialEncryption(Scheme):
-    """Encrypts some states of the state packets, which have probability μ_d = `state_probability`; innovations are in clear.
+    """Encrypts some states of the state packets, which have probability μ_d = `state_probability`; innovations are unencrypted.
 
     For a sensor that can encrypt only few numbers. With μ_d = 0 only the packet of slot 0 is encrypted: an eavesdropper that
     reads everything else has the error A^k e_0, which grows without bound if A is unstable.
@@ -149,6 +149,6 @@ class PartialEncryption(Scheme):
         return ClearStatesForm(self.process, self._hidden, self.state_probability, received, slots)
 
     def error_floor(self, slots: int) -> tuple[Floats, bool]:
-        """The error of a receiver that hears everything in clear, and knows every innovation where there are any, (slots,)."""
+        """The error of a receiver that hears all that is unencrypted, and knows every innovation if there are any, (slots,)."""
         form = ClearStatesForm(self.process, self._hidden, self.state_probability, None, slots)
         return form.traces, form.limit == np.inf

@@ -54,7 +54,7 @@ class QuantisedScheduleEncoder(Encoder):
         return Packet(z, np.zeros(x.shape[1], np.bool_), encrypted.astype(np.int64)[None])
 
     def acknowledged(self, k: int, acknowledged: Flags) -> None:
-        """Send in clear again where slot k is acknowledged."""
+        """Send unencrypted again where slot k is acknowledged."""
         self._held.acknowledged(k, acknowledged)
 
 
@@ -97,8 +97,8 @@ def _selective_form(scheme: QuantisedSchedule, conditions: ReceiverConditions) -
 class QuantisedSchedule(Scheme):
     """Quantises the state with subtractive dither, and encrypts as `encrypted-schedule` does, from a threshold θ on.
 
-    θ need not be whole: at a holding time of ⌊θ⌋ a coin decides, so that any energy budget between that of packets in clear
-    and that of a cipher is met exactly. The dither is public: a packet in clear is shown as the number that is read from it.
+    θ need not be whole: at a holding time of ⌊θ⌋ a coin decides, so that any energy budget between that of unencrypted packets
+    and that of a cipher is met exactly. The dither is public: an unencrypted packet is shown as the number that is read from it.
 
     Source: Huang, Ding, Leong, Quevedo, Shi (2021); docs/mathematics.md, quantised packets.
     """
@@ -111,7 +111,7 @@ class QuantisedSchedule(Scheme):
     estimator_streams = ("dither", "mask")
     needs_acknowledgements = True
     reads_packets = True
-    header = ("1 if encrypted, 0 if in clear",)
+    header = ("1 if encrypted, 0 if unencrypted",)
     secret_words = (0, 1)
 
     def __init__(self, process: Process, threshold: float, bits: int, standard_deviations: float) -> None:

@@ -84,7 +84,7 @@ class RandomCode(Scheme):
         """None: the information in a packet depends on the acknowledgements before it."""
 
     def lost_reference(self, received: float, acknowledged: tuple[float, float]) -> LostReference:  # noqa: ARG002 - only states count
-        """A state in clear ends the growth: ρ²(1 − αμ) a slot."""
+        """An unencrypted state ends the growth: ρ²(1 − αμ) a slot."""
         growth = growth_by_coin(self.process, self._alpha, received)
         square = radius(self.process) ** 2
         least = (square - 1.0) / square if square > 1.0 else 0.0

@@ -46,7 +46,7 @@ class Packet(NamedTuple):
     nu: Flags
     """ν_k, (R,): true for an innovation, or for noise in its place. Never sent; the sensor's own record."""
     header: NDArray[np.int64] | None = None
-    """Sent in clear with z, (h, R); None for a scheme without a header."""
+    """Sent unencrypted with z, (h, R); None for a scheme without a header."""
     sent: Flags | None = None
     """Whether a packet is sent, (R,); None for a scheme that sends in every slot."""
 

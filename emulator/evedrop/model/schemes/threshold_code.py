@@ -20,7 +20,7 @@ from evedrop.model.streams import Batch
 from evedrop.model.theory.lost_reference import LostReference, growth_by_phases, most_coded
 
 
-def forged_share(mu: float, flip: float) -> float:
+def forged_fraction(mu: float, flip: float) -> float:
     """P(γ = 0 | an acknowledgement arrives), where each slot's is flipped with probability p; 0 if none ever arrives.
 
     Source: docs/mathematics.md, flipped acknowledgements.
@@ -45,7 +45,7 @@ class ThresholdCodeEncoder(MixedEncoder):
         return flags
 
     def acknowledged(self, k: int, acknowledged: Flags) -> None:
-        """An acknowledgement of a state makes b the share of forged ones; that of a coded packet adds to b."""
+        """An acknowledgement of a state makes b the fraction of forged ones; that of a coded packet adds to b."""
         super().acknowledged(k, acknowledged)
         after = self._forged + np.where(self._sent_plain, 0.0, self._belief * (1.0 - self._forged))
         self._belief = np.where(acknowledged, after, self._belief)
@@ -67,7 +67,7 @@ class ThresholdCode(Scheme):
 
     def __init__(self, process: Process, lost_belief: float, assumed_quality: float, assumed_flip: float) -> None:
         super().__init__(process)
-        self._threshold, self._forged = lost_belief, forged_share(assumed_quality, assumed_flip)
+        self._threshold, self._forged = lost_belief, forged_fraction(assumed_quality, assumed_flip)
 
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -28,7 +28,7 @@ _RANK = 1e-9  # relative: a smaller singular value is taken for 0
 @final
 @dataclass(frozen=True)
 class ClearStatesForm(ClosedForm):
-    """The expected error covariance of a receiver that reads the states in clear, slot by slot, without a closed formula.
+    """The expected error covariance of a receiver that reads the unencrypted states, slot by slot, without a closed formula.
 
     Behind a perfect link, with packets that are all states (μ_d = 1) or, after slot 0, all innovations (μ_d = 0), it is the same
     in every trial. Otherwise it is that of a receiver that hears more than any: all packets, and with 0 < μ_d < 1 both types in
@@ -102,7 +102,7 @@ class ClearStatesForm(ClosedForm):
         return found
 
     def _read(self, X: Floats) -> Floats:
-        """A factor of the covariance once the states in clear have been read, (n, n), from one of it before, (n, m)."""
+        """A factor of the covariance once the unencrypted states have been read, (n, n), from one of it before, (n, m)."""
         order = np.argsort(self.hidden, kind="stable")
         clear = int((~self.hidden).sum())
         L = kernels.triangular_factors(X[order][None].copy())[0]

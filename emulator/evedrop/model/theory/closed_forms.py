@@ -216,7 +216,7 @@ def hijacked_schedule(threshold: int, mu: float, mu_e: float, heed_rule: HeedRul
         for user, served in product((True, False), repeat=2):
             now = 0 if served else min(missed + 1, counts - 1)
             chance = (mu if user else 1.0 - mu) * (mu_e if served else 1.0 - mu_e)
-            heeded = heed_rule.share_of(now) if user else 0.0
+            heeded = heed_rule.fraction_of(now) if user else 0.0
             for after, odds in ((now, heeded), (top * counts + now, 1.0 - heeded)):
                 reset[before, after] += chance * odds * hears(user, served)
                 carried[before, after] += chance * odds * (1.0 - hears(user, served))
@@ -226,7 +226,7 @@ def hijacked_schedule(threshold: int, mu: float, mu_e: float, heed_rule: HeedRul
 def encrypted_schedule(threshold: float, received: float, acknowledged: tuple[float, float]) -> SensorChain:
     """The chain for the selective eavesdropper of `encrypted-schedule`; arguments as for `scheduled`, states up to ⌈θ⌉.
 
-    The threshold θ need not be whole: at a holding time of ⌊θ⌋ a packet is then in clear with probability θ − ⌊θ⌋.
+    The threshold θ need not be whole: at a holding time of ⌊θ⌋ a packet is then unencrypted with probability θ − ⌊θ⌋.
 
     Source: docs/mathematics.md, schedules by holding time and quantised packets.
     """

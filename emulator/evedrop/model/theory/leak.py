@@ -136,7 +136,7 @@ class Leaks:
         return self._factors.of(slots)
 
     def rounding(self, slots: range) -> Floats:
-        """The variance of the rounding of packets, (c, n), in the coordinates of leaks; 0 if Q is regular."""
+        """The variance of the rounding of packets, (c, n), in the coordinates of leaks; 0 if Q is nonsingular."""
         n = len(self._noise)
         if not self.stairs.singular:
             return np.zeros((len(slots), n))

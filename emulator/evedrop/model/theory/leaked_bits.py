@@ -30,7 +30,7 @@ _AS_GOOD_AS_INFINITE = (
 
 @final
 class LeakedBits:
-    """The bits that an innovation packet reveals, a number of slots at a time from k = 0; 0 in slot 0. A must be regular.
+    """The bits that an innovation packet reveals, a number of slots at a time from k = 0; 0 in slot 0. A must be nonsingular.
 
     Also valid in slots beyond the horizon, where Σ_k exceeds double precision. Values do not depend on how many slots are asked
     for at a time.

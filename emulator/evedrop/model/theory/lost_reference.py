@@ -1,4 +1,4 @@
-"""The error of a receiver that lacks the reference of later packets, and the states in clear that end its growth.
+"""The error of a receiver that lacks the reference of later packets, and the unencrypted states that end its growth.
 
 Source: docs/mathematics.md, flipped acknowledgements.
 """
@@ -18,13 +18,13 @@ class LostReference(NamedTuple):
     """The growth of the expected error of a receiver that lacks the reference."""
 
     growth: float
-    """The factor from slot to slot, or from one phase of states in clear to the next; from 1 on the error has no bound."""
+    """The factor from slot to slot, or from one phase of unencrypted states to the next; from 1 on the error has no bound."""
     remedy: str
     """What must be changed for a factor below 1, in words that follow "unless"."""
 
 
 def growth_by_coin(process: Process, plain: float, received: float) -> float:
-    """The factor for each slot: ρ² times the probability of not receiving a state in clear.
+    """The factor for each slot: ρ² times the probability of not receiving an unencrypted state.
 
     plain: the probability α that a packet contains the state; received: that it arrives.
     """
@@ -32,7 +32,7 @@ def growth_by_coin(process: Process, plain: float, received: float) -> float:
 
 
 def growth_by_phases(process: Process, coded: float, received: float, acknowledged: tuple[float, float]) -> float:
-    """The factor from one phase of states in clear, which ends with an acknowledgement, to the next; inf if it is unbounded.
+    """The factor from one phase of unencrypted states, which ends with an acknowledgement, to the next; inf if it is unbounded.
 
     coded: the acknowledged coded packets between two phases. acknowledged: the probabilities that a packet is acknowledged and
     was heard by the receiver, and that it is acknowledged and was not heard.

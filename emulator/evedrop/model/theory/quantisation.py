@@ -17,9 +17,9 @@ from evedrop.model.theory.covariances import NOBODY, limit, state_covariances
 @final
 @dataclass(frozen=True)
 class QuantisationError:
-    """White noise of covariance R_k = share · diag(Σ_k): the steps grow with the standard deviations of the states."""
+    """White noise of covariance R_k = fraction · diag(Σ_k): the steps grow with the standard deviations of the states."""
 
-    share: float
+    fraction: float
 
     @classmethod
     def of(cls, bits: int, standard_deviations: float) -> QuantisationError:
@@ -36,5 +36,5 @@ class QuantisationError:
         return self._of(limit(process, NOBODY))
 
     def _of(self, sigma: Floats) -> Floats:
-        found: Floats = np.where(np.eye(sigma.shape[-1], dtype=np.bool_), self.share * sigma, 0.0)
+        found: Floats = np.where(np.eye(sigma.shape[-1], dtype=np.bool_), self.fraction * sigma, 0.0)
         return found

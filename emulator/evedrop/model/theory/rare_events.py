@@ -1,4 +1,4 @@
-"""The share of an expected error that is due to rare events, and how many trials it takes to see them, behind independent losses.
+"""The fraction of an expected error that is due to rare events, and the trials needed to see them, behind independent losses.
 
 A *streak* begins where the error leaves 0, where an innovation misleads the receiver, or in slot 0 if its packet was not
 used; it lasts until a state, or the next misleading innovation, replaces the error. Long streaks are rare, and may
@@ -32,7 +32,7 @@ LARGEST_RUN = 2**22
 RARE = 20
 """Events that are expected less often than this in all trials are rare: their number, and with it a mean, is too uncertain."""
 REST = 1e-9
-"""The share of the expectation that is left out, in the longest streaks."""
+"""The fraction of the expectation that is left out, in the longest streaks."""
 
 
 @final
@@ -47,20 +47,20 @@ class Streaks:
     total: float
     """Σ_k tr E P_k."""
 
-    def share(self, trials: int) -> float:
-        """The share of the expectation in slots that fewer than RARE streaks of all trials are expected to reach, 0 … 1."""
+    def fraction(self, trials: int) -> float:
+        """The fraction of the expectation in slots that fewer than RARE streaks of all trials are expected to reach, 0 … 1."""
         if self.total == 0.0:
             return 0.0
         met = float(self.carried[self.number * trials >= RARE].sum()) / self.total
         return 1.0 - met if met < 1.0 - REST else 0.0
 
-    def trials_for(self, share: float) -> float:
-        """The number of trials for which this share is left in such slots; inf if it exceeds double precision. share > 1e-9."""
+    def trials_for(self, fraction: float) -> float:
+        """The number of trials for which this fraction is left in such slots; inf beyond double precision. fraction > 1e-9."""
         if self.total == 0.0:
             return 1.0
         order = np.argsort(-self.number, axis=None, kind="stable")
         met = np.cumsum(self.carried.reshape(-1)[order])
-        last = int(np.searchsorted(met, (1.0 - share) * self.total))
+        last = int(np.searchsorted(met, (1.0 - fraction) * self.total))
         number = float(self.number.reshape(-1)[order[min(last, len(order) - 1)]])
         return max(1.0, float(np.ceil(RARE / number))) if number > 0.0 else math.inf
 

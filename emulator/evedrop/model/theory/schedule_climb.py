@@ -99,12 +99,12 @@ def _repaired(problem: ScheduleProblem, mu_d: Floats) -> Floats:
         way = 1.0 - mu_d
     low, high = 0.0, 1.0
     for _ in range(_REFINEMENTS):
-        shares = np.linspace(low, high, _POINTS)
-        keeps = np.isfinite(problem.sums(mu_d + shares[:, None] * way))
+        fractions = np.linspace(low, high, _POINTS)
+        keeps = np.isfinite(problem.sums(mu_d + fractions[:, None] * way))
         first = int(np.argmax(keeps))  # the last one keeps it: the whole way, or the end of the step before
         if first == 0:
-            high = float(shares[0])
+            high = float(fractions[0])
             break
-        low, high = float(shares[first - 1]), float(shares[first])
+        low, high = float(fractions[first - 1]), float(fractions[first])
     found: Floats = mu_d + high * way
     return found

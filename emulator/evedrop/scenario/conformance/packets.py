@@ -162,7 +162,7 @@ def _expect_columns(slots: range, packet: Packet | PacketBlock, scheme: Scheme, 
         raise Broken(f"{where}: {subject} {there}, and the scheme's `header` names {len(scheme.header)} numbers")
     if packet.header is not None:
         shape = (*rows, len(scheme.header), trials)
-        expect_array(f"{where}: {name}.header", packet.header, np.int64, shape, f"{axes}numbers in clear, R trials")
+        expect_array(f"{where}: {name}.header", packet.header, np.int64, shape, f"{axes}unencrypted numbers, R trials")
     if (packet.sent is None) == scheme.may_be_silent:
         raise Broken(
             f"{where}: {name}.sent and `may_be_silent` = {scheme.may_be_silent} do not agree; expected both or none"

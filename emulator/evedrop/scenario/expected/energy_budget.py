@@ -38,8 +38,8 @@ class BudgetDesign(JsonFields):
     """The threshold for a budget, between others."""
 
     budget: float
-    in_clear: float
-    """Energy of a packet in clear."""
+    unencrypted: float
+    """Energy of an unencrypted packet."""
     encrypted: float
     """Energy of an encrypted packet."""
     user: float
@@ -82,16 +82,18 @@ def budget_of(scenario: Scenario, budget: float) -> BudgetDesign:
         )
     scheme = scheme_of(scenario.process.process, scenario.encoding.spec)
     model, arrives = scenario.energy_model, sum(acknowledged)
-    in_clear, encrypted = model.spent(scheme, 1.0, 0.0), model.spent(scheme, 1.0, 1.0)
+    unencrypted, encrypted = model.spent(scheme, 1.0, 0.0), model.spent(scheme, 1.0, 1.0)
     threshold = 1.0
     if budget < encrypted:
-        threshold = math.inf if budget <= in_clear else threshold_for((budget - in_clear) / model.encryption, arrives)
+        threshold = (
+            math.inf if budget <= unencrypted else threshold_for((budget - unencrypted) / model.encryption, arrives)
+        )
     most = LARGEST_OPERATOR // scenario.process.process.n**2
     if not threshold <= most:
         raise UsageError(
-            f"no threshold up to {most} meets the budget {budget:g}: packets in clear cost {in_clear:g} in a slot and encrypted "
-            f"ones {encrypted:g}, and {100.0 * encrypted_fraction(most, arrives):.2g} % are encrypted then; give more, such as "
-            f"{in_clear + 0.5 * (encrypted - in_clear):g}"
+            f"no threshold up to {most} meets the budget {budget:g}: unencrypted packets cost {unencrypted:g} in a slot and "
+            f"encrypted ones {encrypted:g}, and {100.0 * encrypted_fraction(most, arrives):.2g} % are encrypted then; give more, "
+            f"such as {unencrypted + 0.5 * (encrypted - unencrypted):g}"
             + ("" if arrives else f"; no acknowledgement arrives, so nothing less than {encrypted:g} is enough")
         )
 
@@ -105,7 +107,7 @@ def budget_of(scenario: Scenario, budget: float) -> BudgetDesign:
         return ThresholdMetrics(one, fraction, model.spent(scheme, 1.0, fraction), errors)
 
     others = tuple(metrics(float(whole)) for whole in range(1, _SHOWN + 1))
-    return BudgetDesign(budget, in_clear, encrypted, user.limit, metrics(threshold), others, left_out)
+    return BudgetDesign(budget, unencrypted, encrypted, user.limit, metrics(threshold), others, left_out)
 
 
 def _with(scenario: Scenario, threshold: float) -> Scenario:

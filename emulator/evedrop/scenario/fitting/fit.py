@@ -178,10 +178,10 @@ def _runs(outcomes: Outcomes, chosen: Candidate, lost: bool) -> RunLengths:
 
 def lines(found: Fit) -> list[str]:
     """The fit as printed lines."""
-    share = 100.0 * found.lost / found.count
+    fraction = 100.0 * found.lost / found.count
     mean = "none of them ended" if found.bursts.mean is None else f"{found.bursts.mean:.4g} slots on average"
     return [
-        f"{found.trace}: {found.count} outcomes, {found.lost} lost ({share:.4g} %), {found.bursts.count} bursts, {mean}",
+        f"{found.trace}: {found.count} outcomes, {found.lost} lost ({fraction:.4g} %), {found.bursts.count} bursts, {mean}",
         *model_lines(found),
         found.toml,
     ]

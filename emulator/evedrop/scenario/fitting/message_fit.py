@@ -100,8 +100,8 @@ def message_lines(found: MessageFit) -> list[str]:
     """The fit as printed lines."""
     fit = found.fit
     mean = "none of them ended" if fit.bursts.mean is None else f"{fit.bursts.mean:.4g} messages on average"
-    share = 100.0 * fit.lost / fit.count
-    told = [f"{fit.trace}: {fit.count} messages, {fit.lost} lost ({share:.4g} %), {fit.bursts.count} bursts, {mean}"]
+    fraction = 100.0 * fit.lost / fit.count
+    told = [f"{fit.trace}: {fit.count} messages, {fit.lost} lost ({fraction:.4g} %), {fit.bursts.count} bursts, {mean}"]
     told += [f"  {sentence}" for sentence in (*_counted(found), *found.recording.notes)]
     told += [*model_lines(fit), "# for a wire file:", found.wire_toml]
     link = found.scenario_link

@@ -9,11 +9,11 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 
 from evedrop.model.metrics import columns, shown_metric, unloadable_metrics
-from evedrop.model.metrics.text import count_text, estimate, number_text, share_text
+from evedrop.model.metrics.text import count_text, estimate, fraction_text, number_text
 from evedrop.model.theory.rare_events import RARE
 from evedrop.scenario.application import applications_in
 from evedrop.score.summary import (
-    RARE_SHARE,
+    RARE_FRACTION,
     ControllerSummary,
     DirectionSummary,
     Judged,
@@ -204,13 +204,14 @@ def _rare_lines(summary: Summary) -> Iterator[str]:
     """A line for each receiver whose expected error is carried by events that too few of the trials contain."""
     for name, peer in summary.peers.items():
         rare = peer.rare_events
-        if rare is not None and rare.share > RARE_SHARE and summary.trials > 1:
+        if rare is not None and rare.fraction > RARE_FRACTION and summary.trials > 1:
             split = peer.rare_estimate is not None
             enough = f"{count_text(rare.trials)} trials" if math.isfinite(rare.trials) else "no number of trials"
             yield (
-                f"{name}: {share_text(rare.share)} of its expected error is carried by {rare_events_words(summary.trials)}, so "
-                f"its mean over the trials is uncertain, probably too small{'' if split else ', and has no z'}; {enough} would "
-                f"leave {share_text(RARE_SHARE)}" + ("" if split else "; montecarlo --rare estimates it by splitting")
+                f"{name}: {fraction_text(rare.fraction)} of its expected error is carried by "
+                f"{rare_events_words(summary.trials)}, so its mean over the trials is uncertain, probably too small"
+                f"{'' if split else ', and has no z'}; {enough} would leave {fraction_text(RARE_FRACTION)}"
+                + ("" if split else "; montecarlo --rare estimates it by splitting")
             )
 
 

@@ -10,8 +10,8 @@ from itertools import groupby
 from typing import TYPE_CHECKING
 
 from evedrop.model.metrics.shown_number import ShownNumber
-from evedrop.model.metrics.text import estimate, number_text, share_text
-from evedrop.score.summary import RARE_SHARE
+from evedrop.model.metrics.text import estimate, fraction_text, number_text
+from evedrop.score.summary import RARE_FRACTION
 from evedrop.score.verdict import MARKS, SecrecyKept
 from evedrop.show.report.closing import rare_events_words
 from evedrop.show.report.text_table import TextTable
@@ -111,8 +111,8 @@ def verdict(cell: Cell) -> str:
     return "–" if cell.verdict is None else f"{MARKS[cell.verdict]} {WORDS[cell.verdict]}"
 
 
-def _rare_share(of: SimulatedError | None) -> float:
-    return 0.0 if of is None or of.rare_events is None or of.infinite_variance else of.rare_events.share
+def _rare_fraction(of: SimulatedError | None) -> float:
+    return 0.0 if of is None or of.rare_events is None or of.infinite_variance else of.rare_events.fraction
 
 
 def _left_out(found: Comparison) -> Iterator[str]:
@@ -131,10 +131,10 @@ def _undefined(found: Comparison) -> Iterator[str]:
 
 def _remarks(found: Comparison) -> Iterator[str]:
     yield (
-        "sent: the share of slots with a packet; bits, energy: what the sensor sends, headers included, and spends in a "
+        "sent: the fraction of slots with a packet; bits, energy: what the sensor sends, headers included, and spends in a "
         "slot on average; secret: the most bits that a slot uses, + bits that a trial uses once; "
-        "clear: the share of slots whose packet is the state itself; leak: the bits about the path of states that another packet "
-        "reveals without the secret"
+        "clear: the fraction of slots whose packet is the state itself; leak: the bits about the path of states that another "
+        "packet reveals without the secret"
     )
     measured = [cell.eavesdropper for one in found.schemes.values() for cell in one.cells.values()]
     if any(one is not None and one.infinite_variance for one in measured):
@@ -142,11 +142,13 @@ def _remarks(found: Comparison) -> Iterator[str]:
             "med: the variance over trials is infinite, so the mean says nothing; this is the median trial, which lies far "
             "below the expectation of theory"
         )
-    shares = {
-        name: max((_rare_share(cell.eavesdropper) for cell in one.cells.values()), default=0.0)
+    fractions = {
+        name: max((_rare_fraction(cell.eavesdropper) for cell in one.cells.values()), default=0.0)
         for name, one in found.schemes.items()
     }
-    rare = [f"{name} up to {share_text(share)}" for name, share in shares.items() if share > RARE_SHARE]
+    rare = [
+        f"{name} up to {fraction_text(fraction)}" for name, fraction in fractions.items() if fraction > RARE_FRACTION
+    ]
     if rare:
         yield (
             f"{rare_events_words(found.trials)} carry a part of expected errors, whose means and standard errors are then "

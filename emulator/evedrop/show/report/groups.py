@@ -63,8 +63,8 @@ class GroupCounts(_Groups):
         self._counts += np.bincount(cells, minlength=self._counts.size).reshape(self._counts.shape)
 
     @property
-    def shares(self) -> list[float]:
-        """The share of each code among all codes so far; there must be at least one."""
+    def fractions(self) -> list[float]:
+        """The fraction of each code among all codes so far; there must be at least one."""
         return [int(total) / self.taken for total in self._counts.sum(0)]
 
     @property

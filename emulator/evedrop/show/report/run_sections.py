@@ -88,12 +88,12 @@ def _lost_track(of: RunSource) -> Iterator[Markup]:
     for name, one in of.trial.items():
         table.add(
             name,
-            *(f"{share:.1%}" for share in one.track.shares),
+            *(f"{fraction:.1%}" for fraction in one.track.fractions),
             f"{one.lost.count:,}",
             f"slots {_where(one.lost.spans[0])}" if one.lost.count else "–",
         )
-    yield made("table", table, "Shares of the slots, and spans in which the receiver lost track")
-    used = {code for lanes in of.trial.values() for code, share in enumerate(lanes.outcome.shares) if share}
+    yield made("table", table, "Fractions of the slots, and spans in which the receiver lost track")
+    used = {code for lanes in of.trial.values() for code, fraction in enumerate(lanes.outcome.fractions) if fraction}
     yield made("legend", "Upper lanes:", KNOWLEDGE.legend())
     yield made("legend", "Lower lanes, packets:", EAVESDROPPER.legend(used))
     for name, one in of.trial.items():
@@ -108,10 +108,10 @@ def _lanes(name: str, one: RecordedTrial) -> Iterator[Markup]:
     """The two lanes of a receiver, and its longest spans."""
     spans = one.lost.spans
     yield made("heading", name)
-    label = f"{name}: in track in {one.track.shares[Track.IN_TRACK]:.1%} of the slots 0 to {one.last:,}"
+    label = f"{name}: in track in {one.track.fractions[Track.IN_TRACK]:.1%} of the slots 0 to {one.last:,}"
     yield lane_picture(KNOWLEDGE, one.track.highest, label)
     counted = ", ".join(
-        f"{share:.1%} {word}" for word, share in zip(OUTCOMES, one.outcome.shares, strict=True) if share
+        f"{fraction:.1%} {word}" for word, fraction in zip(OUTCOMES, one.outcome.fractions, strict=True) if fraction
     )
     yield lane_picture(EAVESDROPPER, one.outcome.commonest, f"{name}: packets by what became of them: {counted}")
     if spans:
@@ -155,8 +155,8 @@ def _links(of: RunSource) -> Iterator[Markup]:
         yield made(
             "table",
             table,
-            "Packets, the share that the loss model let through, and the share by the model, which should lie in the 99.9 % "
-            "confidence interval of the packets observed",
+            "Packets, the fraction that the loss model let through, and the fraction by the model, which should lie in the "
+            "99.9 % confidence interval of the packets observed",
         )
 
 

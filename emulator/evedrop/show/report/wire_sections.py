@@ -83,7 +83,7 @@ def _links(of: WireSource) -> Iterator[Markup]:
     yield made(
         "table",
         wire_table(of.summary),
-        "Messages; the share that the models let through, and what they predict; whether it is within their bounds of 99 %; "
+        "Messages; the fraction that the models let through, and what they predict; whether it is within their bounds of 99 %; "
         "the median delay; the most messages in a row that did not arrive",
     )
     table = TextTable.headed(["link", "from", "to", "keys"], ["99 % bounds"], ["loss model"])

@@ -91,4 +91,4 @@ class ErrorDistance:
 
 
 _DECADES = 9
-_NOTHING = 1e-3  # the share of √(tr Q), the distance of one step, below which a distance is only that of rounding
+_NOTHING = 1e-3  # the fraction of √(tr Q), the distance of one step, below which a distance is only that of rounding

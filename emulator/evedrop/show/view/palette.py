@@ -49,7 +49,7 @@ WIRE_LANES: tuple[Colour, ...] = (STATE, DECODED, DISCARDED, MISLED, DROPPED, SI
 DROPPED_TEXT: Colour = (230, 78, 44)
 """`DROPPED` for letters on the background of the theme, which need to be brighter than a lane."""
 WIRE_TEXTS: tuple[Colour, ...] = (STATE, MISLED, DROPPED_TEXT, TRUTH_CURVE, TRUTH)
-"""The links of a wire's graph by the share that they lost, those without messages, and the sides."""
+"""The links of a wire's graph by the fraction that they lost, those without messages, and the sides."""
 
 IN_TRACK_TEXT: Colour = (80, 255, 180)
 """`DECODED` for letters on the background of the theme."""
@@ -91,10 +91,10 @@ def colour(i: int) -> Colour:
     return RECEIVERS[i % len(RECEIVERS)]
 
 
-def dim(of: Colour, share: float) -> Colour:
-    """The same colour at a share of its brightness."""
+def dim(of: Colour, fraction: float) -> Colour:
+    """The same colour at a fraction of its brightness."""
     r, g, b = of
-    return int(r * share), int(g * share), int(b * share)
+    return int(r * fraction), int(g * fraction), int(b * fraction)
 
 
 def hexadecimal(of: Colour) -> str:

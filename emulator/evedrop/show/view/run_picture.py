@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 _WIDTH = 8.4
 _LAST = 300  # slots of lanes and plane unless told otherwise
-_MARGIN = 0.25  # around the truth in the plane, as a share of its extent
+_MARGIN = 0.25  # around the truth in the plane, as a fraction of its extent
 _LINES, _DOTS = ("-", "-.", ":"), (".", "x", "+")
 """Of the first receivers with different colours, of the next ones, whose colours are the same, and so on."""
 _HEIGHTS: Mapping[str, Callable[[int], float]] = {
@@ -92,10 +92,10 @@ def _errors(axes: Axes, rows: pa.Table, receivers: list[str], slots: range | Non
         if (found["trials"] > 1).any():
             many = True
             with np.errstate(all="ignore"):
-                share = np.exp(
+                fraction = np.exp(
                     2.0 * found["standard_error"] / error
                 )  # symmetric on the logarithmic axis, and never below 0
-            edges = (np.maximum(edge, floor) for edge in (error / share, error * share))
+            edges = (np.maximum(edge, floor) for edge in (error / fraction, error * fraction))
             axes.fill_between(found["slot"], *edges, color=ink, alpha=0.25, linewidth=0)
     axis = ErrorAxis.of(heights, floor)
     if axis is not None:  # otherwise the axis has nothing to show, and no logarithms

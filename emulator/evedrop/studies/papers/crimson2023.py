@@ -178,7 +178,7 @@ def _detector(trials: int) -> Iterator[PublishedNumber]:
     held = false[0] - 4.0 * false[1] <= DETECTOR.risk
     yield PublishedNumber.stated(
         "detector",
-        f"share of false alarms, {rates}",
+        f"fraction of false alarms, {rates}",
         f"at most {DETECTOR.risk:g}",
         false[0],
         NumberVerdict.FORMULA if held else NumberVerdict.DIFFERS,
@@ -193,7 +193,7 @@ def _detector(trials: int) -> Iterator[PublishedNumber]:
 
 
 def detection(test: ShiryaevTest, trials: int) -> tuple[tuple[float, float], tuple[float, float]]:
-    """The share of false alarms, and the mean number of slots from the change to a true alarm, with standard errors.
+    """The fraction of false alarms, and the mean number of slots from the change to a true alarm, with standard errors.
 
     The change comes in slot k with probability κ(1−κ)^k.
     """

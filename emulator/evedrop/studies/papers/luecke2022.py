@@ -20,7 +20,7 @@ from evedrop.model.reference_code import ReferenceCode
 from evedrop.model.schemes.mixed_packets import MixedEncoder
 from evedrop.model.schemes.random_code import RandomCode, RandomCodeEncoder
 from evedrop.model.schemes.scheme import Scheme
-from evedrop.model.schemes.threshold_code import ThresholdCode, ThresholdCodeEncoder, forged_share
+from evedrop.model.schemes.threshold_code import ThresholdCode, ThresholdCodeEncoder, forged_fraction
 from evedrop.model.slot.link import link_of
 from evedrop.model.streams import Batch, root_of_seed, stream_key
 from evedrop.studies.papers.deliveries import deliveries
@@ -64,7 +64,7 @@ class TransmissionPolicy:
         """The sensor's side."""
         if self.alpha is not None:
             return RandomCodeEncoder(code, n, batch, key, self.alpha)
-        return ThresholdCodeEncoder(code, n, batch.trials, float(self.theta or 0.0), forged_share(MU, FLIP))
+        return ThresholdCodeEncoder(code, n, batch.trials, float(self.theta or 0.0), forged_fraction(MU, FLIP))
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ FULL, QUICK = _Size((2000, 1000), 100, 250), _Size((200, 100), 4, 500)
 
 @final
 class Luecke2022(Paper):
-    """Coded states, and states in clear by a random or a threshold policy; numbers of the public program."""
+    """Coded states, and unencrypted states by a random or a threshold policy; numbers of the public program."""
 
     title = "Coding for Secrecy in Remote State Estimation With an Adversary"
     authors = "M. Lücke, J. Lu, D. E. Quevedo"
@@ -159,7 +159,7 @@ def _by_quantiles(one: _Published, runs: Floats) -> Iterator[PublishedNumber]:
         low, middle, high = np.quantile(means, [0.05, 0.5, 0.95])
         reason = (
             f"the expectation has no bound: while the {name} lacks the reference, its expected error grows {factor:.3g}-fold "
-            f"{'a slot' if one.policy.theta is None else 'from one phase of states in clear to the next'}; the means of runs "
+            f"{'a slot' if one.policy.theta is None else 'from one phase of unencrypted states to the next'}; the means of runs "
             f"of {_RUN_SLOTS:,} slots go from {low:.3g} to {high:.3g} (5 and 95 %), with the median {middle:.3g}"
         )
         verdict = NumberVerdict.NOT_COMPARABLE

@@ -119,12 +119,12 @@ def _detection(level: float, trials: int) -> Iterator[PublishedNumber]:
 
 def _without_watermark(trials: int) -> PublishedNumber:
     slots = 501
-    share, error = _mean(np.isfinite(_run(0.0, slots, min(trials, 1000), 1, _always(_LOW)).first_alarms(_LOW)) * 1.0)
+    fraction, error = _mean(np.isfinite(_run(0.0, slots, min(trials, 1000), 1, _always(_LOW)).first_alarms(_LOW)) * 1.0)
     theory = _theory(0.0)
-    said = f"{_WORDS}0: h/D for h = 8 is {_LOW / theory.divergence:.0f} slots; the share detected within 500"
+    said = f"{_WORDS}0: h/D for h = 8 is {_LOW / theory.divergence:.0f} slots; the fraction detected within 500"
     return PublishedNumber.stated(
-        "delay", said, None, share, NumberVerdict.NOT_COMPARABLE,
-        "h/D is far beyond the 500 slots of the run, so the share that it predicts is too small to compare", error,
+        "delay", said, None, fraction, NumberVerdict.NOT_COMPARABLE,
+        "h/D is far beyond the 500 slots of the run, so the fraction that it predicts is too small to compare", error,
     )  # fmt: skip
 
 
@@ -154,8 +154,8 @@ def _parsimonious(trials: int) -> PublishedNumber:
     """The slots with a watermark when nobody attacks."""
     policy = "parsimonious", {"watch_from": 0.05, "alarm_from": 0.999, "attack_rate": 1e-3}
     run = _run(0.3, 500, min(trials, 1000), None, policy)
-    share, error = _mean((run.watermark[:, 0] != 0.0).mean(axis=0))
+    fraction, error = _mean((run.watermark[:, 0] != 0.0).mean(axis=0))
     return PublishedNumber.stated(
-        "parsimonious", "θ₁ = 0.05, θ₂ = 0.999, an attack in 1000 slots, Σ_e = 0.3, none: slots with a watermark", None, share,
-        NumberVerdict.NOT_COMPARABLE, "their thresholds are not public, and no closed form is known for this share", error,
+        "parsimonious", "θ₁ = 0.05, θ₂ = 0.999, an attack in 1000 slots, Σ_e = 0.3, none: slots with a watermark", None, fraction,
+        NumberVerdict.NOT_COMPARABLE, "their thresholds are not public, and no closed form is known for this fraction", error,
     )  # fmt: skip

@@ -81,7 +81,7 @@ class PublishedNumber:
     ) -> Self:
         """Compare two numbers. They agree if they differ by no more than any of the tolerances given.
 
-        relative: as a share of theirs; absolute: in units of the number; errors: in standard errors of the difference.
+        relative: as a fraction of theirs; absolute: in units of the number; errors: in standard errors of the difference.
         their_error: the standard error of theirs, 0 if it is exact. erratum: the reason, where a larger difference is known to be
         the paper's mistake. printed: False if theirs is our evaluation of the paper's formula.
 

@@ -1,4 +1,4 @@
-"""Heights of rows and lanes, as shares of a small window of 720 pixels. Larger windows have room to spare."""
+"""Heights of rows and lanes, as fractions of a small window of 720 pixels. Larger windows have room to spare."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FIXED_HEIGHT = TITLE_HEIGHT + LEGEND_HEIGHT
 
 
 def lanes_height(count: int) -> float:
-    """The share that a view of `count` lanes needs; eight lanes fit, and more can be reached by scrolling."""
+    """The fraction that a view of `count` lanes needs; eight lanes fit, and more can be reached by scrolling."""
     return min(_MOST, (_HEAD + _LANE * count) / _PIXELS)
 
 

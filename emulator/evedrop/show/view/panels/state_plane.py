@@ -248,8 +248,10 @@ def borders(truth: Points, points: Points, low: Points, high: Points) -> Points:
     towards = points.astype(np.float64) - truth
     with np.errstate(all="ignore"):
         room = np.where(towards > 0.0, high - edge - truth, low + edge - truth) / towards
-    share = np.clip(np.nan_to_num(np.where(towards == 0.0, np.inf, room), nan=0.0).min(axis=1, initial=1.0), 0.0, 1.0)
-    moved = truth + share[:, None] * towards
+    fraction = np.clip(
+        np.nan_to_num(np.where(towards == 0.0, np.inf, room), nan=0.0).min(axis=1, initial=1.0), 0.0, 1.0
+    )
+    moved = truth + fraction[:, None] * towards
     return _shown(np.where(inside(points, low, high)[:, None], points, moved))
 
 

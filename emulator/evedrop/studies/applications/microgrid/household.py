@@ -78,10 +78,10 @@ class Household(Application):
             f"the house buys {_kwh(summary, 'bought')} kWh and sells {_kwh(summary, 'sold')} kWh; a "
             f"controller that sees the truth, {_kwh(seen, 'bought')} and {_kwh(seen, 'sold')} kWh"
         ]
-        shares = [summary[f"{name}_difference"] for name in ("net", "total", "summed")]
-        if None not in shares:
+        fractions = [summary[f"{name}_difference"] for name in ("net", "total", "summed")]
+        if None not in fractions:
             errors = [cls.standard_error(summary, (f"{name}_difference",)) for name in ("net", "total", "summed")]
-            net, total, summed = (_per_cent(*one) for one in zip(shares, errors, strict=True))
+            net, total, summed = (_per_cent(*one) for one in zip(fractions, errors, strict=True))
             lines.append(
                 f"grid power differs from that controller's by {net} in net energy, {total} in total, "
                 f"{summed} summed slot by slot"
@@ -167,8 +167,8 @@ def _house(table: Table) -> HouseholdTable:
     return table
 
 
-def _per_cent(share: float, error: float | None) -> str:
-    return estimate(100.0 * share, None if error is None else 100.0 * error, ".2g") + " %"
+def _per_cent(fraction: float, error: float | None) -> str:
+    return estimate(100.0 * fraction, None if error is None else 100.0 * error, ".2g") + " %"
 
 
 def _kwh(summary: Summary, way: str) -> str:

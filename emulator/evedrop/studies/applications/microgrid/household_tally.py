@@ -218,7 +218,7 @@ class PerfectLoop:
 
 
 _BELIEVED = 0.9
-"""The share of a guess that the copy of the controller is told. A controller that compensates the load at once leaves no
+"""The fraction of a guess that the copy of the controller is told. A controller that compensates the load at once leaves no
 trace in the level, and a copy that is told all of a wrong guess would confirm that guess forever."""
 
 

@@ -43,10 +43,10 @@ def area(score: Floats, truth: Flags) -> float:
 
 
 def detection_rate(score: Floats, truth: Flags, false_alarms: float) -> float:
-    """Share of active windows that are detected if the share `false_alarms` of the quiet ones is taken for active.
+    """Fraction of active windows that are detected if the fraction `false_alarms` of the quiet ones is taken for active.
 
     A coin decides between windows with equal scores at the threshold, so that a receiver without knowledge detects the
-    share `false_alarms`. NaN without both kinds of windows.
+    fraction `false_alarms`. NaN without both kinds of windows.
     """
     on, off = score[truth], np.sort(score[~truth])[::-1]
     if not len(on) or not len(off):
@@ -54,5 +54,5 @@ def detection_rate(score: Floats, truth: Flags, false_alarms: float) -> float:
     allowed = false_alarms * len(off)
     threshold = off[min(int(allowed), len(off) - 1)]
     above, alike = int(np.sum(off > threshold)), int(np.sum(off == threshold))
-    share = min(1.0, (allowed - above) / alike)
-    return float(np.mean(on > threshold) + share * np.mean(on == threshold))
+    fraction = min(1.0, (allowed - above) / alike)
+    return float(np.mean(on > threshold) + fraction * np.mean(on == threshold))

@@ -35,7 +35,7 @@ class Roof:
 
 @dataclass(frozen=True)
 class Clouds:
-    """Spells in seconds, means of exponential times; depth is the remaining share of the clear sky's power."""
+    """Spells in seconds, means of exponential times; depth is the remaining fraction of the clear sky's power."""
 
     clear: float = 900.0
     cloudy: float = 240.0
@@ -66,8 +66,8 @@ def clear_sky(roof: Roof, date: str) -> Floats:
     return every_second
 
 
-def share_left(clouds: Clouds, draws: Draws) -> Floats:
-    """Share of the clear sky's power that clouds leave, every second, (86 400,): at least 0."""
+def fraction_left(clouds: Clouds, draws: Draws) -> Floats:
+    """Fraction of the clear sky's power that clouds leave, every second, (86 400,): at least 0."""
     spells = np.ones(SECONDS)
     k = 0.0
     while k < SECONDS:
@@ -77,15 +77,15 @@ def share_left(clouds: Clouds, draws: Draws) -> Floats:
         k += length
     forget = 1.0 / clouds.edge
     steady = np.sqrt(2.0 / clouds.flicker_time) * clouds.flicker * draws.normals(SECONDS)
-    share = np.empty(SECONDS)
+    fraction = np.empty(SECONDS)
     edge, flicker = 1.0, 0.0
     for k, (target, kick) in enumerate(zip(spells.tolist(), steady.tolist(), strict=True)):
         edge += forget * (target - edge)
         flicker += kick - flicker / clouds.flicker_time
-        share[k] = edge + flicker
-    return np.clip(share, 0.0, None)
+        fraction[k] = edge + flicker
+    return np.clip(fraction, 0.0, None)
 
 
 def solar_power(roof: Roof, clouds: Clouds, date: str, seed: int) -> Floats:
     """Power in kW of every second of a day, (86 400,). Needs pvlib, of the extra `data`."""
-    return clear_sky(roof, date) * share_left(clouds, Draws(seed, "clouds"))
+    return clear_sky(roof, date) * fraction_left(clouds, Draws(seed, "clouds"))

@@ -23,7 +23,7 @@ def draw(path: Path, table: pa.Table, key: str) -> None:
     house = mine[peers[0]]
     numbers = all(isinstance(row[key], (int, float)) for row in house)
     x = [float(row[key]) if numbers else float(i) for i, row in enumerate(house)]
-    with panels(path, 3, 12.6, 3.9) as (energies, shares, told):
+    with panels(path, 3, 12.6, 3.9) as (energies, fractions, told):
         for name, colour, mark in (("bought", BLUE, "o"), ("sold", GREEN, "s")):
             bars = _bars(house, f"{name}_energy")
             energies.errorbar(
@@ -36,11 +36,11 @@ def draw(path: Path, table: pa.Table, key: str) -> None:
             found = [row[f"{name}_difference"] for row in house]
             percent = [float("nan") if one is None or one <= 0.0 else 100.0 * one for one in found]
             bars = [100.0 * one for one in _bars(house, f"{name}_difference")]
-            shares.errorbar(x, percent, bars, fmt=f"{mark}-", color=colour, label=name)
-        shares.axhline(_LIMIT, color=GREY, linewidth=0.9, linestyle=":", label=f"the paper: {_LIMIT} %")
-        shares.set_yscale("log")
-        shares.set_ylabel("difference of grid power (%)")
-        shares.set_title("(b) from a controller that sees the truth")
+            fractions.errorbar(x, percent, bars, fmt=f"{mark}-", color=colour, label=name)
+        fractions.axhline(_LIMIT, color=GREY, linewidth=0.9, linestyle=":", label=f"the paper: {_LIMIT} %")
+        fractions.set_yscale("log")
+        fractions.set_ylabel("difference of grid power (%)")
+        fractions.set_title("(b) from a controller that sees the truth")
         for peer, colour, mark in zip(peers, _COLOURS * len(peers), _MARKS * len(peers), strict=False):
             areas = [float("nan") if row["activity_area"] is None else row["activity_area"] for row in mine[peer]]
             told.errorbar(x, areas, _bars(mine[peer], "activity_area"), fmt=f"{mark}-", color=colour, label=peer)
@@ -48,9 +48,9 @@ def draw(path: Path, table: pa.Table, key: str) -> None:
         told.set_ylim(0.4, 1.02)
         told.set_ylabel("area under the curve")
         told.set_title("(c) who can tell when somebody is at it")
-        for axes in (energies, shares, told):
+        for axes in (energies, fractions, told):
             axes.set_xlabel(key)
-            axes.set_xlim(shares.get_xlim())
+            axes.set_xlim(fractions.get_xlim())
             if not numbers:
                 axes.set_xticks(x, [str(row[key]) for row in house])
             axes.legend()
