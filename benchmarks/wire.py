@@ -34,12 +34,11 @@ from evedrop.live.network.control_file import read_control
 from evedrop.live.network.operator import ask
 from evedrop.live.protocol.requests import StatusRequest
 from evedrop.live.protocol.wire_status import WireStatus
-from evedrop.wire.delivery_distribution import bounds, expected
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.journal_part import Records
 from evedrop.wire.plan import Side, WireLink, WirePlan
-from evedrop.wire.record import WireFate
+from evedrop.wire.records import Records, WireFate
 from evedrop.wire.relay import WireRelay
+from evedrop.wire.scorekeeper import bounds, expected
 from evedrop.wire.side import SideSession
 
 _ANYWHERE = ("tcp/127.0.0.1:0",)

@@ -21,10 +21,9 @@ from evedrop.scenario.loading import load, parse, shipped, value_of
 from evedrop.scenario.plugins import named_in
 from evedrop.scenario.recordings.disturbance_file import read_disturbances
 from evedrop.scenario.recordings.link_recording import LinkRecording
-from evedrop.wire.check import key_lines, warnings_of_wire, wire_lines
-from evedrop.wire.delivery_distribution import expected
-from evedrop.wire.fates import KeyFates
-from evedrop.wire.file import example_wire, load_wire, resolved_wire, wire_of
+from evedrop.wire.file import example_wire, key_lines, load_wire, resolved_wire, warnings_of_wire, wire_lines, wire_of
+from evedrop.wire.link_state import KeyFates
+from evedrop.wire.scorekeeper import expected
 from evedrop.wire.timeline import moments
 from tests.fuzz.mutation import words_of
 from tests.fuzz.reader import Reader, as_json, as_toml, cells, parquet_of, raw, tried

@@ -16,7 +16,7 @@ from evedrop import montecarlo
 from evedrop.model.kernels.elementary import sum_in_order
 from evedrop.scenario.expected.estimates import warnings_of
 from evedrop.scenario.loading import load, shipped
-from evedrop.wire.delivery_distribution import expected
+from evedrop.wire.scorekeeper import expected
 from tests.examples import mostly_long
 
 PLAIN = builtins.sum

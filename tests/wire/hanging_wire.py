@@ -12,8 +12,8 @@ from evedrop.__main__ import program
 from evedrop.wire import side
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.publications import PublicationRelay
+from evedrop.wire.recording import WireView
 from evedrop.wire.side import SideSession
-from evedrop.wire.view import WireView
 from evedrop.wire.watchdog import Watchdog
 
 SOON = 1.0

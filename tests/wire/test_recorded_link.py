@@ -13,12 +13,12 @@ import pytest
 
 from evedrop.errors import TraceError, UsageError
 from evedrop.scenario.fitting.message_fit import fit_messages
-from evedrop.wire.fates import KeyFates
 from evedrop.wire.file import resolved_wire, wire_of
 from evedrop.wire.journal import WireJournal
+from evedrop.wire.link_state import KeyFates
 from evedrop.wire.plan import WirePlan
-from evedrop.wire.record import AGAIN, Kind, WireFate
 from evedrop.wire.recorded_link import journal_recording
+from evedrop.wire.records import AGAIN, Kind, WireFate
 from tests.conftest import Evedrop
 
 SETTINGS = {

@@ -14,11 +14,10 @@ import pytest
 from evedrop import wire
 from evedrop.show.report.wire import wire_outcome
 from evedrop.system.ports import free_port
-from evedrop.wire import bypasses as bypasses_module
-from evedrop.wire.bypasses import Bypasses
-from evedrop.wire.check import wire_lines
-from evedrop.wire.few_lines import MOST
-from evedrop.wire.file import resolved_wire, wire_of
+from evedrop.wire import neighbours as bypasses_module
+from evedrop.wire.departures import MOST
+from evedrop.wire.file import resolved_wire, wire_lines, wire_of
+from evedrop.wire.neighbours import Bypasses
 from evedrop.wire.plan import Side
 from evedrop.wire.running import ExpectationFailed
 from tests.conftest import wait_until

@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 
 from evedrop.cli.main import main
-from evedrop.wire.check import key_lines, warnings_of_wire, wire_lines
-from evedrop.wire.file import example_wire, wire_of
+from evedrop.wire.file import example_wire, key_lines, warnings_of_wire, wire_lines, wire_of
 from evedrop.wire.plan import WirePlan
 
 

@@ -6,9 +6,9 @@ import time
 from typing import Any
 
 from evedrop.live.network.clock import SystemClock
-from evedrop.wire.conductor import WireConductor
 from evedrop.wire.file import wire_of
 from evedrop.wire.plan import WirePlan
+from evedrop.wire.steering import WireConductor
 from evedrop.wire.timeline import Moment
 from tests.clock import TestClock
 from tests.conftest import wait_until

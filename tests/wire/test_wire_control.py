@@ -17,9 +17,8 @@ from evedrop.live.protocol.envelope import enclosed
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.requests import OperatorRequest
 from evedrop.names import RECORDER
-from evedrop.wire.conductor import WireConductor
-from evedrop.wire.control import WireControl
 from evedrop.wire.scorekeeper import WireScorekeeper
+from evedrop.wire.steering import WireConductor, WireControl
 from tests.conftest import LIMIT, wait_until
 from tests.wire.wire_at_work import LOSSY, WireAtWork, at_work, both_ways, program
 

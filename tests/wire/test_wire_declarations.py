@@ -15,7 +15,7 @@ import pytest
 import zenoh
 
 from evedrop.wire.plan import Side
-from evedrop.wire.record import WireFate
+from evedrop.wire.records import WireFate
 from tests.conftest import wait_until
 from tests.wire.wire_at_work import ANYWHERE, WireAtWork, at_work, both_ways, link, plan_of
 

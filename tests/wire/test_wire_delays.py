@@ -14,10 +14,10 @@ from zenoh.ext import CacheConfig, HistoryConfig, MissDetectionConfig, RecoveryC
 from zenoh.ext import declare_advanced_publisher as advanced_publisher
 from zenoh.ext import declare_advanced_subscriber as advanced_subscriber
 
-from evedrop.wire.conductor import WireConductor
-from evedrop.wire.journal_reader import journal_tables
+from evedrop.wire.journal import journal_tables
 from evedrop.wire.plan import WireEvent
-from evedrop.wire.record import AGAIN, Kind, WireFate
+from evedrop.wire.records import AGAIN, Kind, WireFate
+from evedrop.wire.steering import WireConductor
 from tests.conftest import wait_until
 from tests.wire.test_wire_publications import reader, ready
 from tests.wire.wire_at_work import LOSSY, PERFECT, at_work, both_ways, is_declared, link, plan_of

@@ -11,8 +11,8 @@ import pytest
 from evedrop.model.links import loss_of
 from evedrop.model.links.link import Fate
 from evedrop.model.slot.link import Change
-from evedrop.wire.delivery_distribution import bounds, expected
-from evedrop.wire.fates import KeyFates
+from evedrop.wire.link_state import KeyFates
+from evedrop.wire.scorekeeper import bounds, expected
 from tests.wire.wire_links import LOSSES, wire_link
 
 SEED = 5

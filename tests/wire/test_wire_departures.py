@@ -13,9 +13,7 @@ import pytest
 import zenoh
 
 from evedrop import wire
-from evedrop.wire.backlog import Backlog
-from evedrop.wire.departures import MANY, MOST_GONE, Departures
-from evedrop.wire.few_lines import MOST
+from evedrop.wire.departures import MANY, MOST, MOST_GONE, Backlog, Departures
 from evedrop.wire.publications import PublicationRelay
 from evedrop.wire.watchdog import Duty
 from tests.clock import TestClock

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from evedrop.wire.expect import WireExpectTable, expectation_mistakes
 from evedrop.wire.file import wire_of
 from evedrop.wire.plan import WirePlan
+from evedrop.wire.tables import WireExpectTable, expectation_mistakes
 from tests.builders import mistakes_of
 
 

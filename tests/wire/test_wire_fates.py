@@ -14,7 +14,7 @@ from evedrop.model.links import LOSS_MODELS, loss_of
 from evedrop.model.links.link import Fate
 from evedrop.model.slot.link import Change
 from evedrop.model.streams import Stream, normals, root_of_seed, stream_key, uniforms
-from evedrop.wire.fates import KeyFates, KeyLinks, MessageFate
+from evedrop.wire.link_state import KeyFates, KeyLinks, MessageFate
 from tests.examples import examples
 from tests.wire.wire_links import DELAYS, LOSSES, wire_link
 

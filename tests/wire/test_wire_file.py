@@ -10,10 +10,9 @@ from typing import Any
 import pytest
 
 from evedrop.errors import ScenarioError, UsageError
-from evedrop.wire.endpoints import place_of
 from evedrop.wire.file import load_wire, resolved_wire, wire_of
 from evedrop.wire.plan import Side, SideTls, WireEvent
-from evedrop.wire.units import in_seconds
+from evedrop.wire.tables import in_seconds, place_of
 from tests.builders import mistakes_of
 
 EXAMPLE = Path(str(resources.files("evedrop.wire"))) / "examples" / "robot.toml"

@@ -12,7 +12,7 @@ from evedrop import wire
 from evedrop.errors import RunError
 from evedrop.results.wire_summary import WireSummary
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.record import Kind, WireFate
+from evedrop.wire.records import Kind, WireFate
 from evedrop.wire.running import RunningWire
 from tests.conftest import wait_until
 from tests.examples import mostly_long

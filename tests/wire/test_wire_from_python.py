@@ -17,9 +17,9 @@ import zenoh
 from evedrop import wire
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.journal_on_disk import scorekeeper_on_disk
-from evedrop.wire.record import AGAIN, Kind, WireFate
+from evedrop.wire.on_disk import scorekeeper_on_disk
 from evedrop.wire.recorded_link import journal_recording
+from evedrop.wire.records import AGAIN, Kind, WireFate
 from evedrop.wire.running import ExpectationFailed, RunningWire
 from evedrop.wire.scorekeeper import WireScorekeeper
 from tests.conftest import wait_until

@@ -19,7 +19,7 @@ from evedrop.errors import Interrupted, RunError
 from evedrop.system.signals import stop_or_leave_on_signals
 from evedrop.wire.file import load_wire
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.journal_on_disk import summary_of_wire
+from evedrop.wire.on_disk import summary_of_wire
 from evedrop.wire.watchdog import Duty, Watchdog
 from tests.conftest import LIMIT, wait_until
 from tests.examples import mostly_long

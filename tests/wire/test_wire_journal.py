@@ -20,11 +20,23 @@ import pytest
 from evedrop.errors import UsageError
 from evedrop.model.slot.link import NEVER
 from evedrop.wire import journal as journal_module
-from evedrop.wire.journal import WireJournal
-from evedrop.wire.journal_part import STORED, JournalPart, Records, Words, records_in, records_of, table_of
-from evedrop.wire.journal_reader import journal_tables, part_names, unfinished_table
-from evedrop.wire.lanes import LinkState
-from evedrop.wire.record import AGAIN, HELD, RECORD, UNLINKED, Kind, WireFate
+from evedrop.wire.journal import WireJournal, journal_tables, part_names, unfinished_table
+from evedrop.wire.link_state import LinkState
+from evedrop.wire.records import (
+    AGAIN,
+    HELD,
+    RECORD,
+    STORED,
+    UNLINKED,
+    JournalPart,
+    Kind,
+    Records,
+    WireFate,
+    Words,
+    records_in,
+    records_of,
+    table_of,
+)
 from tests.conftest import LIMIT, wait_until
 from tests.examples import mostly_long
 from tests.wire.wire_plans import wire_plan
@@ -313,9 +325,9 @@ import mmap, os, random, signal, sys, time
 from pathlib import Path
 import numpy as np
 import pyarrow as pa
-from evedrop.wire.record import HELD, Kind
+from evedrop.wire.records import HELD, Kind
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.journal_reader import journal_tables
+from evedrop.wire.journal import journal_tables
 from tests.wire.wire_plans import wire_plan
 
 folder, chance = Path(sys.argv[1]), random.Random(5)
@@ -375,9 +387,9 @@ ON_SMALL_DISK = """
 import subprocess, sys, time
 from pathlib import Path
 import pyarrow as pa
-from evedrop.wire.record import Kind
+from evedrop.wire.records import Kind
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.journal_reader import journal_tables
+from evedrop.wire.journal import journal_tables
 from tests.wire.wire_plans import wire_plan
 
 def fill(name):

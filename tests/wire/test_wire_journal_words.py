@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from evedrop.wire.journal_part import Words
-from evedrop.wire.journal_words import JournalWords, words_in
+from evedrop.wire.journal import JournalWords, words_in
+from evedrop.wire.records import Words
 
 KEYS, SOURCES, LINKS = ["scan", "örtlich/🤖", 'a "b"\n\\'], ["b1", "ﬀ"], ["up", "down"]
 
@@ -58,7 +58,7 @@ def test_a_key_that_two_threads_name_at_once_is_admitted_once(tmp_path: Path) ->
 
 def test_words_of_any_length_and_number_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The file grows with them, and ends with the last one when it is closed."""
-    monkeypatch.setattr("evedrop.wire.journal_words._ROOM", mmap.ALLOCATIONGRANULARITY)
+    monkeypatch.setattr("evedrop.wire.journal._ROOM", mmap.ALLOCATIONGRANULARITY)
     words = JournalWords(tmp_path, 1, lambda _: None)
     keys = {words.key_code(key): key for n in range(300) for key in (f"key/{n}", f"{n}/{'ö' * 40 * n}")}
     keys[words.key_code("last")] = "last"  # after which the file has room for more
@@ -80,7 +80,7 @@ def test_a_word_for_which_the_disk_has_no_room_has_its_code_all_the_same(
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patched:
-        patched.setattr("evedrop.wire.journal_words.mapped_end", full)
+        patched.setattr("evedrop.wire.journal.mapped_end", full)
         assert [words.key_code(key) for key in ("a", "b", "a")] == [1, 2, 1]
     assert [error.errno for error in missed] == [28, 28]
     assert words.key_code("c") == 3

@@ -20,10 +20,9 @@ from evedrop.system.files import is_locked
 from evedrop.wire import journal as journal_module
 from evedrop.wire.file import resolved_wire
 from evedrop.wire.history import WireHistory
-from evedrop.wire.journal import WireJournal
-from evedrop.wire.journal_on_disk import summary_of_wire
-from evedrop.wire.journal_recovery import recover
-from evedrop.wire.record import HELD, Kind, WireFate
+from evedrop.wire.journal import WireJournal, recover
+from evedrop.wire.on_disk import summary_of_wire
+from evedrop.wire.records import HELD, Kind, WireFate
 from evedrop.wire.run import _begin_results, run_wire
 from tests.pages import checked
 from tests.wire.wire_at_work import LOSSY, both_ways

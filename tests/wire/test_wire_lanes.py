@@ -12,10 +12,9 @@ from typing import Any
 
 import pytest
 
-from evedrop.wire.fates import KeyFates
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.lanes import Decision, LinkState
-from evedrop.wire.record import WireFate
+from evedrop.wire.link_state import Decision, KeyFates, LinkState
+from evedrop.wire.records import WireFate
 from tests.wire.wire_at_work import DEAD, LOSSY, PERFECT, both_ways, link, plan_of
 
 LARGEST = 100
@@ -159,7 +158,7 @@ def test_an_ordered_link_delays_a_message_as_long_as_the_one_before(
 ) -> None:
     """The losses, and the delays of messages that no earlier one holds up, are those of the same link without an order."""
     now = [100.0]
-    monkeypatch.setattr("evedrop.wire.lanes.time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr("evedrop.wire.link_state.time", SimpleNamespace(monotonic=lambda: now[0]))
     settings = {**LOSSY, "delay": {"model": "normal", "mean": 0.05, "standard_deviation": 0.02}}
     plan = plan_of(link("robot", "base", settings, ordered=True), link("base", "robot"))
     fates = KeyFates(plan.links[0], "scan", "put", plan.seed)
@@ -178,7 +177,7 @@ def test_an_ordered_link_delays_a_message_as_long_as_the_one_before(
 def test_an_order_is_kept_until_its_last_message_is_due(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Although the key is forgotten, and used again, meanwhile."""
     now = [100.0]
-    monkeypatch.setattr("evedrop.wire.lanes.time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr("evedrop.wire.link_state.time", SimpleNamespace(monotonic=lambda: now[0]))
     plan = plan_of(link("robot", "base", {**PERFECT, "delay": {"model": "constant", "value": 5.0}}, ordered=True))
     with WireJournal(tmp_path, plan) as journal:
         state = LinkState(plan.links[0], plan, journal)

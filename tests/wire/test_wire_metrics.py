@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from evedrop.results.wire_summary import WireLinkSummary
-from evedrop.wire.metrics import WIRE_METRICS
+from evedrop.wire.tallies import WIRE_METRICS
 
 DELAYS: Any = SimpleNamespace(delay_quantile=lambda quantile: quantile)
 """The tally of messages whose delay has the quantile q at q seconds."""

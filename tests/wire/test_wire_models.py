@@ -8,8 +8,8 @@ from pathlib import Path
 import zenoh
 
 from evedrop.model.links.link import Fate
-from evedrop.wire.delivery_distribution import bounds, expected
-from evedrop.wire.fates import KeyFates
+from evedrop.wire.link_state import KeyFates
+from evedrop.wire.scorekeeper import bounds, expected
 from tests.conftest import wait_until
 from tests.wire.wire_at_work import at_work, link, plan_of
 from tests.wire.wire_links import LOSSES

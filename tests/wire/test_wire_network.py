@@ -21,10 +21,10 @@ from evedrop.results.reading import Results
 from evedrop.scenario.loading import checked, load
 from evedrop.scenario.tables import Scenario
 from evedrop.simulate.montecarlo import Plan
-from evedrop.wire.fates import KeyFates
 from evedrop.wire.file import wire_of
-from evedrop.wire.network import over_wire
+from evedrop.wire.link_state import KeyFates
 from evedrop.wire.plan import WirePlan
+from evedrop.wire.scenario_network import over_wire
 from evedrop.wire.timeline import moments
 from tests.builders import MARGINAL, listener, process_table, scenario_of
 from tests.conftest import wait_until

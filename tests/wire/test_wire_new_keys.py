@@ -11,13 +11,11 @@ import pyarrow as pa
 import pytest
 import zenoh
 
-from evedrop.wire.journal_on_disk import scorekeeper_on_disk
-from evedrop.wire.journal_reader import journal_tables
-from evedrop.wire.key_limit import KeyLimit
+from evedrop.wire.journal import KeyLimit, journal_tables
+from evedrop.wire.on_disk import scorekeeper_on_disk
 from evedrop.wire.plan import WirePlan
-from evedrop.wire.publications import PublicationRelay
-from evedrop.wire.publishers import Publishers
-from evedrop.wire.record import Kind, WireFate
+from evedrop.wire.publications import PublicationRelay, Publishers
+from evedrop.wire.records import Kind, WireFate
 from evedrop.wire.scorekeeper import WireScorekeeper
 from tests.conftest import LIMIT, wait_until
 from tests.wire.test_wire_publications import reader, ready
@@ -31,7 +29,7 @@ def declared(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The keys for which publishers are declared now; a key is frequent after 3 messages, and there is room for 8 keys."""
     monkeypatch.setattr("evedrop.wire.publications.OFTEN", 3)
     monkeypatch.setattr("evedrop.wire.publications.READY_KEYS", 8)
-    monkeypatch.setattr("evedrop.wire.publishers.MOST_PUBLISHERS", 2)
+    monkeypatch.setattr("evedrop.wire.publications.MOST_PUBLISHERS", 2)
     keys: list[str] = []
     declare, release = Publishers.declare, Publishers.release
 
@@ -53,7 +51,7 @@ def declared(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 @pytest.fixture
 def few_keys(monkeypatch: pytest.MonkeyPatch) -> None:
     """The programs of a side may use five keys."""
-    monkeypatch.setattr("evedrop.wire.key_limit.MOST_KEYS", 5)
+    monkeypatch.setattr("evedrop.wire.journal.MOST_KEYS", 5)
 
 
 @pytest.fixture
@@ -115,7 +113,7 @@ def test_publishers_are_declared_for_frequent_keys_only(tmp_path: Path, declared
 
 def test_a_publisher_that_cannot_be_declared_takes_no_place(monkeypatch: pytest.MonkeyPatch) -> None:
     """Zenoh raises an error for it; the next one finds its place."""
-    monkeypatch.setattr("evedrop.wire.publishers.MOST_PUBLISHERS", 1)
+    monkeypatch.setattr("evedrop.wire.publications.MOST_PUBLISHERS", 1)
     sample = SimpleNamespace(key_expr="scan", priority=zenoh.Priority.DATA, express=False)
 
     def refuse(*_: object, **__: object) -> None:
@@ -135,7 +133,7 @@ def test_a_key_that_is_in_use_is_not_forgotten_for_new_ones(
 ) -> None:
     """Otherwise its fates would be computed again from its first message on, each time."""
     forgotten: list[str] = []
-    monkeypatch.setattr("evedrop.wire.lanes.LinkState.forget", lambda _self, _kind, key: forgotten.append(key))
+    monkeypatch.setattr("evedrop.wire.link_state.LinkState.forget", lambda _self, _kind, key: forgotten.append(key))
     with at_work(both_ways(), tmp_path) as wire, wire.program("robot") as sender:
         for n in range(100):
             sender.put("scan", b"", congestion_control=BLOCK)
@@ -185,7 +183,7 @@ def test_the_keys_of_earlier_starts_keep_their_places(tmp_path: Path) -> None:
 
 def test_long_keys_need_more_room(monkeypatch: pytest.MonkeyPatch) -> None:
     """The characters of the keys are limited, too; a shorter key may still fit."""
-    monkeypatch.setattr("evedrop.wire.key_limit.MOST_CHARACTERS", 100)
+    monkeypatch.setattr("evedrop.wire.journal.MOST_CHARACTERS", 100)
     told: list[str] = []
     plan = both_ways()
     limit = KeyLimit(plan.links, [("robot-base", "a" * 40, "put"), ("robot-base", "a" * 40, "query")], told.append)

@@ -5,11 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evedrop.wire.graph import loss_of
-from evedrop.wire.lane_states import LaneState, legend, loss_state_of, state_of
-from evedrop.wire.notices import CutWatcher, LinkWatcher
-from evedrop.wire.record import WireFate
-from evedrop.wire.step_counts import DELIVERED, OUTCOMES, WireSteps
+from evedrop.wire.panels import loss_of
+from evedrop.wire.records import WireFate
+from evedrop.wire.time_steps import (
+    DELIVERED,
+    OUTCOMES,
+    CutWatcher,
+    LaneState,
+    LinkWatcher,
+    WireSteps,
+    legend,
+    loss_state_of,
+    state_of,
+)
 from tests.wire.wire_rows import plan_of, robot_plan
 
 

@@ -12,9 +12,8 @@ from typing import Any
 import pytest
 
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.journal_part import records_in
 from evedrop.wire.outlet import SideOutlet
-from evedrop.wire.record import HELD, Kind, WireFate
+from evedrop.wire.records import HELD, Kind, WireFate, records_in
 from tests.conftest import LIMIT, wait_until
 from tests.wire.wire_at_work import both_ways
 

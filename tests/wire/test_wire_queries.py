@@ -12,8 +12,8 @@ from zenoh.ext import CacheConfig, MissDetectionConfig, RecoveryConfig
 from zenoh.ext import declare_advanced_publisher as advanced_publisher
 from zenoh.ext import declare_advanced_subscriber as advanced_subscriber
 
-from evedrop.wire.advanced import LOST_HISTORY_SECONDS
-from evedrop.wire.record import Kind, WireFate
+from evedrop.wire.plan import LOST_HISTORY_SECONDS
+from evedrop.wire.records import Kind, WireFate
 from tests.conftest import wait_until
 from tests.wire.wire_at_work import DEAD, PERFECT, WireAtWork, at_work, both_ways, is_declared, link, plan_of
 

@@ -17,12 +17,12 @@ from PIL import Image
 from evedrop.cli.main import main
 from evedrop.errors import UsageError
 from evedrop.results.wire_folder import WIRE_FILE
-from evedrop.wire import replay
+from evedrop.wire import recording
 from evedrop.wire.file import resolved_wire
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.lane_states import LaneState
-from evedrop.wire.record import UNLINKED, Kind, WireFate
-from evedrop.wire.replay import PICTURE_SIZE, replay_wire
+from evedrop.wire.recording import PICTURE_SIZE, replay_wire
+from evedrop.wire.records import UNLINKED, Kind, WireFate
+from evedrop.wire.time_steps import LaneState
 from tests.conftest import LIMIT
 from tests.privileged import CannotRun, skip
 from tests.wire.wire_recordings import CUT, RATES, SECONDS, shown, texts
@@ -71,7 +71,7 @@ def test_a_view_on_a_full_disk_ends(
 ) -> None:
     """Rerun may never return from such a disk."""
     ended = threading.Event()
-    monkeypatch.setattr(replay, "_WRITE_SECONDS", 0.2)
+    monkeypatch.setattr(recording, "_WRITE_SECONDS", 0.2)
     monkeypatch.setattr(rr.RecordingStream, call, lambda *_, **__: ended.wait(LIMIT))
     assert main(["view", str(folder), "--picture", str(folder / "w.png")]) == UsageError.exit_status
     assert "the recording is incomplete: " in capfd.readouterr().err

@@ -16,9 +16,9 @@ from evedrop.live.network.control_file import read_control
 from evedrop.live.network.operator import ask
 from evedrop.live.protocol.requests import StatusRequest
 from evedrop.live.protocol.wire_status import WireStatus
-from evedrop.wire.fates import KeyFates
 from evedrop.wire.file import load_wire
-from evedrop.wire.journal_reader import journal_tables
+from evedrop.wire.journal import journal_tables
+from evedrop.wire.link_state import KeyFates
 from evedrop.wire.run import continuation, run_wire
 from tests.conftest import Evedrop, Live, wait_until
 from tests.wire.wire_at_work import program

@@ -20,10 +20,9 @@ from xxhash import xxh3_128_hexdigest
 from zenoh import ext
 
 from evedrop.cli import main as cli
-from evedrop.wire import ros2, ros2_entities
+from evedrop.wire import ros2
 from evedrop.wire.file import load_wire
-from evedrop.wire.ros2 import Entity, Qos, SourceReader, read_token, reply_seconds, service_key
-from evedrop.wire.ros2_entities import EntityLog
+from evedrop.wire.ros2 import Entity, EntityLog, Qos, SourceReader, read_token, reply_seconds, service_key
 
 HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 NODE = "@ros2_lv/0/aac3178e146ba6f1fc6e6a4085e77f21/0/0/NN/%/%/listener"
@@ -240,7 +239,7 @@ def test_a_log_that_cannot_be_written_is_reported_once(tmp_path: Path, capsys: p
 
 def test_a_log_does_not_grow_without_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A program that declares ever new tokens fills no disk."""
-    monkeypatch.setattr(ros2_entities, "MOST_ENTITIES", 2)
+    monkeypatch.setattr(ros2, "MOST_ENTITIES", 2)
     log = EntityLog(tmp_path)
     for n in range(4):
         log.add("robot", f"{NODE}{n}")

@@ -12,10 +12,9 @@ from typing import Any
 import pytest
 import zenoh
 
-from evedrop.wire.fates import KeyFates
 from evedrop.wire.file import load_wire
-from evedrop.wire.journal import WireJournal
-from evedrop.wire.journal_reader import journal_tables
+from evedrop.wire.journal import WireJournal, journal_tables
+from evedrop.wire.link_state import KeyFates
 from evedrop.wire.plan import Side, WireLink, WirePlan
 from evedrop.wire.relay import WireRelay
 from tests.conftest import LIMIT, wait_until

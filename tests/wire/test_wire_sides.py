@@ -16,7 +16,7 @@ from evedrop.live.launch.authority import Authority
 from evedrop.system.lacks import lack_of
 from evedrop.system.ports import free_port
 from evedrop.wire.plan import Side, SideTls
-from evedrop.wire.record import WireFate
+from evedrop.wire.records import WireFate
 from evedrop.wire.side import PROBES, SideSession, side_config
 from tests.conftest import wait_until
 from tests.wire.test_wire_publications import reader, ready

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from evedrop.wire.record import RECORD, UNLINKED, WireFate
-from evedrop.wire.step_counts import DELIVERED, OUTCOMES, StepCounter, WireSteps, quantile
+from evedrop.wire.records import RECORD, UNLINKED, WireFate
+from evedrop.wire.time_steps import DELIVERED, OUTCOMES, StepCounter, WireSteps, quantile
 from tests.examples import examples
 from tests.wire.wire_rows import START, robot_plan, traffic
 

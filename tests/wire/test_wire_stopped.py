@@ -22,10 +22,10 @@ from evedrop.live.network.operator import ask
 from evedrop.live.protocol.requests import StatusRequest
 from evedrop.live.protocol.wire_status import WireStatus
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.journal_on_disk import scorekeeper_on_disk
+from evedrop.wire.on_disk import scorekeeper_on_disk
 from evedrop.wire.outlet import SideOutlet
-from evedrop.wire.publishers import Message
-from evedrop.wire.record import WireFate
+from evedrop.wire.publications import Message
+from evedrop.wire.records import WireFate
 from evedrop.wire.relay import WireRelay
 from evedrop.wire.scorekeeper import WireScorekeeper
 from evedrop.wire.side import ZenohConfig, side_config
@@ -223,7 +223,7 @@ CROWDED = """
 import sys, threading
 from pathlib import Path
 import zenoh
-from evedrop.wire.publishers import Message
+from evedrop.wire.publications import Message
 from tests.conftest import LIMIT, wait_until
 from tests.wire.wire_at_work import at_work, link, plan_of
 

@@ -17,17 +17,15 @@ from evedrop.results.wire_folder import WIRE_FILE
 from evedrop.results.wire_summary import WireLinkSummary, WireSummary
 from evedrop.show.report.wire import WITHOUT_MODEL, wire_failures, wire_sentences, wire_table
 from evedrop.show.report.writing import write_report
-from evedrop.wire.closing import closing_lines
-from evedrop.wire.expect import WireExpectTable
-from evedrop.wire.fates import KeyFates
 from evedrop.wire.file import resolved_wire, wire_of
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.journal_on_disk import scorekeeper_on_disk
-from evedrop.wire.metrics import WIRE_METRICS
+from evedrop.wire.link_state import KeyFates
+from evedrop.wire.on_disk import closing_lines, scorekeeper_on_disk
 from evedrop.wire.plan import Side, WirePlan
-from evedrop.wire.record import AGAIN, UNLINKED, Kind, WireFate
+from evedrop.wire.records import AGAIN, UNLINKED, Kind, WireFate
 from evedrop.wire.scorekeeper import WireScorekeeper
-from evedrop.wire.tallies import LinkTally
+from evedrop.wire.tables import WireExpectTable
+from evedrop.wire.tallies import WIRE_METRICS, LinkTally
 from tests.pages import checked
 from tests.wire.wire_links import LOSSES
 from tests.wire.wire_plans import wire_plan

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evedrop.wire.journal_part import Records
-from evedrop.wire.record import RECORD, WireFate
+from evedrop.wire.records import RECORD, Records, WireFate
 from evedrop.wire.tallies import LinkTally, StreamTally
 from tests.examples import examples
 

@@ -15,13 +15,11 @@ from numpy.typing import NDArray
 from evedrop.cli.main import main
 from evedrop.errors import UsageError
 from evedrop.show.view import recording
-from evedrop.wire.live_view import live_view
 from evedrop.wire.panels import Pace
 from evedrop.wire.plan import WireEvent
-from evedrop.wire.record import WireFate
-from evedrop.wire.replay import replay_wire
-from evedrop.wire.run import run_wire
-from evedrop.wire.view import WireView
+from evedrop.wire.recording import WireView, replay_wire
+from evedrop.wire.records import WireFate
+from evedrop.wire.run import live_view, run_wire
 from tests.conftest import LIMIT, wait_until
 from tests.wire.wire_at_work import LOSSY, both_ways, sending
 from tests.wire.wire_recordings import CUT, RATES, SECONDS, shown, texts

@@ -13,9 +13,8 @@ import numpy as np
 import zenoh
 
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.journal_part import Records
 from evedrop.wire.plan import Side, WireLink, WirePlan
-from evedrop.wire.record import RECORD, WireFate
+from evedrop.wire.records import RECORD, Records, WireFate
 from evedrop.wire.relay import WireRelay
 from tests.conftest import LIMIT, wait_until
 

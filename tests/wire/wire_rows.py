@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from evedrop.model.slot.link import NEVER, Link, LinkSchedule, streams_of
 from evedrop.model.streams import Batch, root_of_seed, stream_key
 from evedrop.wire.plan import Side, WireLink, WirePlan
-from evedrop.wire.record import RECORD, WireFate
+from evedrop.wire.records import RECORD, WireFate
 
 START = 1_800_000_000.0
 """When the wires of these tests start, in seconds since 1970."""

@@ -135,7 +135,7 @@ def _of_wire(options: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
     if wrong := next((name for name, equals, side in sides if not (name and equals and side)), None):
         raise UsageError(f"--wire-side {wrong}: expected PROCESS=SIDE, such as --wire-side sensor=robot")
     from evedrop.wire.file import load_wire
-    from evedrop.wire.network import over_wire
+    from evedrop.wire.scenario_network import over_wire
 
     return over_wire(scenario, load_wire(options.wire), options.wire_key, {name: side for name, _, side in sides})
 

@@ -4,7 +4,11 @@ A Zenoh program that cannot pass on a message with `BLOCK` for 5 seconds ends it
 in the same way. Zenoh does not tell a wire why a connection ended. So the wire says what it knows: which program it was, how much
 waited at its side, and whether it came back, which a program that has ended does not do.
 
-Source: docs/wire.md, what Zenoh drops by itself.
+Zenoh does not tell how full a channel is, either. So the messages are counted when somebody asks: those that are taken from then
+on until the channel is empty. Messages that come meanwhile count, too. Programs that connect again and again must not fill the
+history, so each matter has a limited number of lines.
+
+Source: docs/wire.md, what Zenoh drops by itself, and what programs need.
 """
 
 from __future__ import annotations
@@ -12,14 +16,111 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import Final, final
+from typing import Any, Final, final
 
 import zenoh
 
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
-from evedrop.wire.backlog import Backlog
-from evedrop.wire.few_lines import FewLines
 from evedrop.wire.side import SideSession
+from evedrop.wire.watchdog import Duty
+
+MOST: Final = 20
+"""The lines that are told one by one."""
+
+
+@final
+class FewLines:
+    """Tells lines; beyond `MOST`, only that there were more. Threads may call its methods at the same time."""
+
+    def __init__(self, tell: Callable[[str], None], what: str) -> None:
+        """tell: for each line; what: the matter, in the plural, such as "ways past the wire"."""
+        self._tell, self._what = tell, what
+        self._told = 0
+        self._lock = threading.Lock()
+
+    @property
+    def is_full(self) -> bool:
+        """Whether further lines are not told."""
+        return self._told > MOST
+
+    def add(self, line: str) -> None:
+        """Tell a line."""
+        with self._lock:
+            self._told += 1
+            at = self._told
+        if at <= MOST:
+            self._tell(line)
+        elif at == MOST + 1:
+            self._tell(f"there were more than {MOST} {self._what}; further ones are not listed")
+
+
+@final
+class _Count:
+    """A count that has begun."""
+
+    __slots__ = ("answer", "taken")
+
+    def __init__(self, answer: Callable[[int], None]) -> None:
+        self.answer = answer
+        self.taken = 0
+
+
+@final
+class Backlog:
+    """The messages that a thread has not taken yet. `ask` may be called by any thread."""
+
+    def __init__(self, handler: Any, most: int) -> None:
+        """handler: of a subscriber with a channel; most: the messages that the channel has room for."""
+        self._handler, self._most = handler, most
+        self._counts: list[_Count] = []
+        self._is_empty = False
+        self._lock = threading.Lock()
+
+    def ask(self, answer: Callable[[int], None]) -> None:
+        """Let `answer` have the number of messages that wait now: at once if there is none, or else when they are taken."""
+        with self._lock:
+            if not self._is_empty:
+                self._counts.append(_Count(answer))
+                return
+        answer(0)
+
+    def take_all(self, take: Callable[[zenoh.Sample], None], duty: Duty) -> None:
+        """Take all messages until the subscription ends, with the thread that calls this. duty: has each in hand."""
+        look, wait, counts = self._handler.try_recv, self._handler.recv, self._counts
+        while True:
+            try:
+                sample = look()
+                if sample is None:
+                    self._note_empty()
+                    sample = wait()
+                    self._is_empty = False
+            except zenoh.ZError:  # it has ended, and all is taken
+                break
+            duty.in_hand = sample
+            take(sample)
+            duty.in_hand = None
+            if counts:
+                self._count()
+        self._note_empty()
+
+    def _count(self) -> None:
+        """Count a message that was taken."""
+        with self._lock:
+            for count in self._counts:
+                count.taken += 1
+            full = [count for count in self._counts if count.taken >= self._most]
+            self._counts[:] = [count for count in self._counts if count.taken < self._most]
+        for count in full:
+            count.answer(count.taken)
+
+    def _note_empty(self) -> None:
+        with self._lock:
+            self._is_empty = True
+            counts = [*self._counts]
+            self._counts.clear()
+        for count in counts:
+            count.answer(count.taken)
+
 
 MANY: Final = 4096
 """Messages that wait at a side when a program is named at once: half of what may wait. Few wait when a program simply ends."""

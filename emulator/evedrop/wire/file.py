@@ -1,29 +1,52 @@
-"""Wire files: read, checked, and written again; mistakes are reported together.
+"""Wire files: read, checked, explained, and written again.
 
-Source: docs/wire.md, the file.
+Mistakes are reported together. Some only show when tables are compared: names, endpoints, events. Any of these tables may be
+malformed. An explanation has the links in order, which of them each key takes, and entries that are probably mistakes.
+
+Source: docs/wire.md, the file, and which link a key takes.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from importlib import resources
+from itertools import permutations
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import zenoh
 from pydantic import ValidationError
 
 from evedrop.errors import ScenarioError, UsageError
+from evedrop.model.checks import as_toml
 from evedrop.scenario.input_files import locate_recordings, read_recordings
+from evedrop.scenario.link_table import CHANGEABLE, OTHER_MODEL, unchangeable
 from evedrop.scenario.loading import set_entry, tables_in
 from evedrop.scenario.loading.line_numbers import with_line_numbers
 from evedrop.scenario.sentences import sentences
 from evedrop.scenario.toml_text import toml_text
 from evedrop.scenario.values import unusable
+from evedrop.scenario.words import listed
 from evedrop.system.files import Unreadable, shown, text_of
-from evedrop.wire.across import link_names, mistakes_across, unknown
+from evedrop.system.hints import near
 from evedrop.wire.plan import Side, SideTls, WireEvent, WireLink, WirePlan
-from evedrop.wire.tables import SideTable, TlsTable, WireEventTable, WireFile, WireLinkTable, changed_settings
+from evedrop.wire.tables import (
+    ENCRYPTED,
+    NOTHING_LOST,
+    EndpointPlace,
+    SideTable,
+    TlsTable,
+    WireEventTable,
+    WireFile,
+    WireLinkTable,
+    WireSettingsTable,
+    changed_settings,
+    expectation_mistakes,
+    key_expression_mistake,
+    place_of,
+)
 
 _MOST_BYTES = 2**28
 
@@ -192,3 +215,274 @@ def _event_table(event: WireEvent) -> dict[str, Any]:
         table["partition"] = list(event.partition)
     given = {"cut": event.cut, "link": event.link, "set": event.settings, "note": event.note}
     return table | {name: value for name, value in given.items() if value is not None}
+
+
+Tables = Sequence[Mapping[str, Any]]
+LinkNow = tuple[Mapping[str, Any], bool]
+"""A link's settings, and whether its losses are tied to another link's."""
+
+
+def mistakes_across(tables: Mapping[str, Any]) -> Iterator[str]:
+    """Mistakes across the tables of a wire file."""
+    side = tables.get("side")
+    sides: Mapping[str, Any] = side if isinstance(side, Mapping) else {}
+    links, events = _tables(tables.get("link")), _tables(tables.get("event"))
+    yield from _endpoint_mistakes(sides)
+    if sides:
+        yield from _side_mistakes(sides, links)
+    yield from _name_mistakes(links)
+    yield from _correlation_mistakes(links)
+    names = link_names(links)
+    yield from expectation_mistakes(_tables(tables.get("expect")), names)
+    for i, event in enumerate(events):
+        settings_of = partial(_settings_of, dict(zip(names, links, strict=True)))
+        yield from (f"event.{i}.{line}" for line in event_mistakes(event, [*sides], names, settings_of))
+
+
+def link_names(links: Tables) -> list[str]:
+    """The name of each link: that in its table, or FROM-TO, or FROM-TO-2 and so on where that is taken."""
+    taken = {str(link["name"]) for link in links if link.get("name") is not None}
+    names = []
+    for link in links:
+        name = link.get("name")
+        if name is None:
+            plain = f"{link.get('from')}-{link.get('to')}"
+            numbered = (f"{plain}-{number}" for number in range(2, 2 * len(links) + 2))
+            name = next(one for one in (plain, *numbered) if one not in taken)
+            taken.add(name)
+        names.append(str(name))
+    return names
+
+
+def change_mistakes(settings: Mapping[str, Any], correlated: bool, changes: Mapping[str, Any]) -> Iterator[str]:
+    """Mistakes in changed entries of a link with these settings. correlated: whether its losses are tied to another link's."""
+    yield from unchangeable(changes)
+    try:
+        made = changed_settings(settings, {entry: changes[entry] for entry in changes if entry in CHANGEABLE}, settings)
+    except ValidationError as error:
+        yield from sentences(error, WireSettingsTable)
+        return
+    if correlated and made.get("loss", settings["loss"])["model"] != settings["loss"]["model"]:
+        yield OTHER_MODEL
+
+
+def _settings_of(links: Mapping[str, Mapping[str, Any]], name: str) -> LinkNow | None:
+    """The settings of a link of the file at the start; None if the link's table has mistakes, which are reported elsewhere."""
+    try:
+        return WireLinkTable.model_validate(links[name]).wire_settings(), links[name].get("correlation") is not None
+    except ValidationError:
+        return None
+
+
+def _tables(found: Any) -> Tables:
+    """The entries of a list of tables; a malformed one is empty."""
+    return [one if isinstance(one, Mapping) else {} for one in found] if isinstance(found, list) else []
+
+
+def _endpoint_mistakes(sides: Mapping[str, Any]) -> Iterator[str]:
+    """Two sides, or one side twice, at one place."""
+    listens, connects = _places(sides, "listen"), _places(sides, "connect")
+    round_and_round = "so that messages would go round"
+    for i, one in enumerate(listens):
+        if (other := _overlapping(one, listens[:i])) is not None:
+            same = "the same place" if one.endpoint == other.endpoint else f"the same place as {other.endpoint}"
+            yield f"{one.said}, {same} at which side {other.side} listens; expected another port"
+    for i, one in enumerate(connects):
+        if (other := _overlapping(one, listens)) is not None:
+            where = f"where side {other.side} of this wire listens, {round_and_round}"
+            yield f"{one.said}, {where}; expected a router outside of the wire"
+        if (other := _overlapping(one, connects[:i])) is not None:
+            why = "" if one.side == other.side else f", {round_and_round}"
+            yield f"{one.said}, the router to which side {other.side} connects{why}; expected another router"
+
+
+class _Placed(NamedTuple):
+    """A well-formed endpoint of a side."""
+
+    path: str
+    side: str
+    endpoint: str
+    place: EndpointPlace
+
+    @property
+    def said(self) -> str:
+        """The beginning of a message about it."""
+        return f"{self.path}: is {as_toml(self.endpoint)}"
+
+
+def _overlapping(one: _Placed, others: Sequence[_Placed]) -> _Placed | None:
+    return next((other for other in others if one.place.overlaps(other.place)), None)
+
+
+def _places(sides: Mapping[str, Any], entry: str) -> list[_Placed]:
+    found = []
+    for name, side in sides.items():
+        given = side.get(entry) if isinstance(side, Mapping) else None
+        several = {f".{i}": one for i, one in enumerate(given)} if isinstance(given, list) else {"": given}
+        for number, endpoint in several.items():
+            if isinstance(endpoint, str) and (place := place_of(endpoint)) is not None:
+                found.append(_Placed(f"side.{name}.{entry}{number}", name, endpoint, place))
+    return found
+
+
+def unknown(name: object, known: Sequence[str], what: str) -> str:
+    """The end of a message about a name that nothing has. what: `side` or `link`."""
+    choice = f"expected {listed(known)}" if known else f"the file has no {what}"
+    return f"is {as_toml(name)}; {choice}{near(name, known)}"
+
+
+def _side_mistakes(sides: Mapping[str, Any], links: Tables) -> Iterator[str]:
+    for i, link in enumerate(links):
+        for entry in ("from", "to"):
+            if isinstance(link.get(entry), str) and link[entry] not in sides:
+                yield f"link.{i}.{entry}: {unknown(link[entry], [*sides], 'side')}"
+        if isinstance(link.get("to"), str) and link["to"] == link.get("from") and link["to"] in sides:
+            yield f"link.{i}.to: is {as_toml(link['to'])}, where the link begins; expected another side"
+
+
+def _name_mistakes(links: Tables) -> Iterator[str]:
+    first: dict[str, int] = {}
+    for i, link in enumerate(links):
+        if isinstance(name := link.get("name"), str) and first.setdefault(name, i) != i:
+            yield f"link.{i}.name: is {as_toml(name)}, the name of link.{first[name]}; expected a name of its own"
+
+
+def _correlation_mistakes(links: Tables) -> Iterator[str]:
+    names = link_names(links)
+    for i, (name, link) in enumerate(zip(names, links, strict=True)):
+        tie = link.get("correlation")
+        other = tie.get("with") if isinstance(tie, Mapping) else None
+        if not isinstance(other, str):
+            continue
+        path = f"link.{i}.correlation.with"
+        others = [one for one in names if one != name]
+        if other not in others:
+            yield f"{path}: {unknown(other, others, 'other link')}"
+            continue
+        theirs = links[names.index(other)]
+        if theirs.get("correlation") is not None:
+            yield f"{path}: is {other}, whose own losses are tied to another link's; expected a link without correlation"
+        elif (there := _model(theirs)) != (here := _model(link)):
+            yield f"{path}: is {other}, but the loss models differ ({there} there and {here} here); expected the same model"
+
+
+def _model(link: Mapping[str, Any]) -> object:
+    loss = link.get("loss")
+    return loss.get("model") if isinstance(loss, Mapping) else "bernoulli"
+
+
+def event_mistakes(
+    event: Mapping[str, Any], sides: Sequence[str], links: Sequence[str], settings_of: Callable[[str], LinkNow | None]
+) -> Iterator[str]:
+    """Mistakes in an event that only show with the sides and links of the wire, given by their names.
+
+    settings_of: the settings of a link, and whether its losses are tied to another link's; None for a link with mistakes.
+    """
+    partition = event.get("partition")
+    if isinstance(partition, list) and sides:
+        for i, name in enumerate(partition):
+            if isinstance(name, str) and name not in sides:
+                yield f"partition.{i}: {unknown(name, sides, 'side')}"
+        if len(partition) == 2 and partition[0] == partition[1]:
+            yield f"partition: is {as_toml(partition)}; expected two different sides"
+    for entry in ("cut", "link"):
+        if isinstance(event.get(entry), str) and event[entry] not in links:
+            yield f"{entry}: {unknown(event[entry], links, 'link')}"
+    if (
+        isinstance(event.get("set"), Mapping)
+        and event.get("link") in links
+        and (now := settings_of(event["link"])) is not None
+    ):
+        yield from (f"set.{line}" for line in change_mistakes(*now, event["set"]))
+
+
+def wire_lines(plan: WirePlan) -> Iterator[str]:
+    """The sides, and the links in the order in which they are tried."""
+    width = max(len(name) for name in (*plan.sides, *(link.name for link in plan.links)))
+    for side in plan.sides.values():
+        where = [*side.listen, *(f"connects to {one}" for one in side.connect)]
+        yield f"side  {side.name:<{width}}  {', '.join(where)}{_guards(side)}"
+    for link in plan.links:
+        tap = " (tap)" if link.tap else ""
+        yield f"link  {link.name:<{width}}  {link.source} → {link.target}{tap}  {link.keys}  {_effects(link)}"
+    for expression in plan.lossless:
+        yield f"never lost  {expression}"
+
+
+def key_lines(plan: WirePlan, keys: Sequence[str]) -> Iterator[str]:
+    """Which link each key takes, in each direction that has a link. Raises UsageError for all keys that Zenoh refuses."""
+    wrong = [f"key {as_toml(key)}{why}" for key in keys if (why := key_expression_mistake(key)) is not None]
+    if wrong:
+        raise UsageError("\n".join(wrong))
+    ways = [way for way in permutations(plan.sides, 2) if any((link.source, link.target) == way for link in plan.links)]
+    for key in keys:
+        expression = zenoh.KeyExpr(key)
+        yield f"key  {key}{'  (never lost)' if plan.is_lossless(expression) else ''}"
+        taken = {way: plan.link_of(*way, expression) for way in ways}
+        for (source, target), link in taken.items():
+            yield f"  {source} → {target}  {'no link takes it' if link is None else _taken(link, expression)}"
+        if "@" in key and not any(taken.values()):
+            yield "  wildcards do not match the parts of a key that begin with @: name them in a link's keys"
+
+
+def warnings_of_wire(plan: WirePlan) -> Iterator[str]:
+    """What is allowed, and probably a mistake."""
+    for i, link in enumerate(plan.links):
+        for before in plan.links[:i]:
+            same = (before.source, before.target) == (link.source, link.target)
+            if same and before.expression.includes(link.expression):
+                yield f"link {link.name} takes no key: {before.name}, which comes first, takes all of them; move {link.name} up"
+                break
+    for side in plan.sides.values():
+        if not any(side.name in (link.source, link.target) for link in plan.links):
+            yield f"side {side.name} has no link: nothing crosses to it or from it"
+        yield from _openness(side)
+    ways = {(link.source, link.target) for link in plan.links if not link.tap}
+    for source, target in sorted(ways):
+        if (target, source) not in ways:
+            yield f"no link leads from {target} back to {source}: queries from {source} get no replies"
+
+
+def _taken(link: WireLink, key: zenoh.KeyExpr) -> str:
+    """The link that takes a key, and what is special about that."""
+    notes = ["a copy of publications, no queries"] if link.tap else []
+    if not link.takes_all(key):
+        notes.append("which takes only some of these keys")
+    return f"{link.name} ({'; '.join(notes)})" if notes else link.name
+
+
+def _effects(link: WireLink) -> str:
+    """The settings of a link, without those that do nothing."""
+    settings: Mapping[str, Any] = link.settings
+    told = [f"{name} = {as_toml(value)}" for name, value in settings.items() if (name, value) != ("loss", NOTHING_LOST)]
+    if link.ordered:
+        told.append("in order")
+    if link.correlation is not None:
+        told.append(f"losses tied to {link.correlation[0]} with strength {link.correlation[1]}")
+    return ", ".join(told) or "no faults"
+
+
+def _guards(side: Side) -> str:
+    """Who may use a side, if not every client that can reach it."""
+    said = [] if side.users is None else [f"users {', '.join(side.users)}"]
+    if side.tls is not None and side.tls.authority is not None:
+        said.append("certificates required")
+    if side.keys != ("**",):
+        said.append(f"only {', '.join(side.keys)}")
+    if side.peers:
+        said.append("mode peer allowed")
+    return f"  ({'; '.join(said)})" if said else ""
+
+
+def _openness(side: Side) -> Iterator[str]:
+    """A warning for each endpoint that other machines can reach without proving who they are."""
+    for endpoint in side.listen:
+        place = place_of(endpoint)
+        if place is None or place.loopback:
+            continue
+        lacking = [] if place.protocol in ENCRYPTED else ["encryption (tls)"]
+        if side.users is None and (side.tls is None or side.tls.authority is None):
+            lacking.append("users or an authority")
+        if lacking:
+            without = " and without ".join(lacking)
+            yield f"side {side.name} listens on {endpoint}, which other machines may reach, without {without}"

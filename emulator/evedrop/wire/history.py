@@ -22,8 +22,7 @@ from evedrop.model.links import LOSS_MODELS
 from evedrop.model.slot.link import NEVER, Change
 from evedrop.scenario.table import model_mistakes
 from evedrop.system.files import write_all
-from evedrop.wire.advanced import numbered_as
-from evedrop.wire.plan import WirePlan
+from evedrop.wire.plan import WirePlan, numbered_as
 
 Numbered = tuple[str, str, str]
 """Link, key as in `numbered_as`, and kind: the messages that share these are numbered from 0."""

@@ -1,49 +1,70 @@
 """The journal of a wire: a record for each message and link, on disk as soon as it is made, and Parquet files made from it.
 
 `record` writes into memory that is mapped from a file, so the record survives the end of the process. A thread hands the records
-to listeners ten times a second, and makes a Parquet file from every file of records that is full.
+to listeners ten times a second, and makes a Parquet file from every file of records that is full. The folder is locked for this
+process, and a file in it says when the wire was last alive. What an earlier start left behind, because it was killed or the disk
+was full, is recovered. `journal_tables` reads the journal, of a wire that runs or was killed, too.
 
-Source: docs/wire.md, the journal.
+Records have codes for keys and senders. A line of the file `NNN.words` has a code and its text, so the records of a wire that
+was killed can be read. The end of the file is mapped into memory, as records are: a call of the system for each word costs many
+times as much, above all since other threads run meanwhile. Until it is closed, zeros follow the last line. Since a wire keeps
+the records of a key until it ends, there is a limit on the keys that programs use: one for each side, so that programs of one
+side cannot use up the keys of others.
+
+Source: docs/wire.md, the journal, a wire that starts again, and many keys.
 """
 
 from __future__ import annotations
 
 import contextlib
 import itertools
+import json
 import math
+import mmap
+import os
+import re
 import shutil
 import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, final
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
 
 from evedrop.errors import UsageError
-from evedrop.model.slot.link import Change
+from evedrop.model.slot.link import NEVER, Change
+from evedrop.results.folder import make_private
 from evedrop.results.wire_summary import JournalState
+from evedrop.system.files import try_lock
 from evedrop.system.output import warn
 from evedrop.system.threads import wait_for_thread
 from evedrop.wire.history import NotedEvent, Numbered, WireHistory, highest
-from evedrop.wire.journal_part import (
+from evedrop.wire.plan import WireLink, WirePlan, numbered_as
+from evedrop.wire.records import (
+    HELD,
+    PARQUET,
+    RECORD,
     STORED,
+    UNLINKED,
     JournalPart,
+    Kind,
     Records,
+    WireFate,
+    Words,
     amend_parquet,
+    mapped_end,
+    next_numbers,
+    records_in,
     records_of,
     table_of,
     write_parquet,
 )
-from evedrop.wire.journal_place import JournalPlace
-from evedrop.wire.journal_reader import JOURNAL_FOLDER, parquet_path
-from evedrop.wire.journal_recovery import recover
-from evedrop.wire.journal_words import JournalWords
-from evedrop.wire.key_limit import KeyLimit
-from evedrop.wire.plan import WirePlan
-from evedrop.wire.record import HELD, RECORD, WireFate, next_numbers
 
 PART_ROWS = 2**17
 """Records in a file: at 70 000 messages a second it is full after two seconds."""
@@ -398,3 +419,375 @@ class WireJournal:
                 raise
             for i, fate in enumerate(fates.values()):
                 self._hear(self.amendment_listeners, before[i : i + 1], fate)
+
+
+_ROOM = 2**18  # bytes of the file that are mapped at once, unless a word is longer
+
+
+@final
+class JournalWords:
+    """The keys and senders of one start of a wire. Threads may call its methods at the same time."""
+
+    def __init__(
+        self,
+        unfinished: Path,
+        start: int,
+        miss: Callable[[OSError], None],
+        admits: Callable[[str, str], bool] = lambda _key, _side: True,
+    ) -> None:
+        """unfinished: the folder of the file; miss: called when the disk has no room for a word.
+
+        admits: whether there is room for a new key of a side, as `KeyLimit`. Raises OSError.
+        """
+        self._file = os.open(_path(unfinished, start), os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600)
+        self._size = os.fstat(self._file).st_size
+        self._map: mmap.mmap | None = None
+        self._start = self._end = 0  # of the bytes of the file that are mapped
+        self._miss, self._admits = miss, admits
+        self._naming, self._admitting = threading.Lock(), threading.Lock()
+        self._codes: dict[str, dict[str, int]] = {"key": {"": 0}, "source": {"": 0}}
+        self._texts: dict[str, list[str]] = {"key": [""], "source": [""]}
+
+    def key_code(self, key: str, side: str = "") -> int:
+        """The code of a key that a program of a side uses; 0 if the key is new and the limit is reached."""
+        code = self._codes["key"].get(key)
+        if code:
+            return code
+        with self._admitting:  # another thread may ask for the same key, whose place counts once
+            if code := self._codes["key"].get(key):
+                return code
+            return self._new_code("key", key) if self._admits(key, side) else 0
+
+    def source_code(self, source: str) -> int:
+        """The code of a sender; 0 for "", a sender that is not known."""
+        return self._codes["source"].get(source) or self._new_code("source", source)
+
+    def key_of(self, code: int) -> str:
+        """The key that has a code."""
+        return self._texts["key"][code]
+
+    @property
+    def key_codes(self) -> Mapping[str, int]:
+        """Key → code."""
+        return self._codes["key"]
+
+    def words(self, links: list[str]) -> Words:
+        """All codes so far and what they stand for. links: the names of the links, in the order of their codes."""
+        return Words(links, dict(enumerate(self._texts["key"])), dict(enumerate(self._texts["source"])))
+
+    def close(self) -> None:
+        """Close the file."""
+        self._unmap()
+        os.close(self._file)
+
+    def _new_code(self, what: str, text: str) -> int:
+        with self._naming:
+            codes, texts = self._codes[what], self._texts[what]
+            code = codes.get(text)
+            if code is None:
+                code = len(texts)
+                texts.append(text)
+                self._write(f'["{what}", {code}, {json.dumps(text)}]\n'.encode())
+                codes[text] = code  # last, because other threads read it without the lock
+            return code
+
+    def _write(self, line: bytes) -> None:
+        size = self._size + len(line)
+        if size > self._end:
+            try:
+                self._make_room(len(line))
+            except OSError as error:
+                self._miss(error)
+                return
+        assert self._map is not None  # noqa: S101 - it ends at `_end`
+        self._map[self._size - self._start : size - self._start] = line
+        self._size = size
+
+    def _make_room(self, least: int) -> None:
+        """Map the rest of the file, and room for some bytes at least. Raises OSError if the disk is full."""
+        start = self._size - self._size % mmap.ALLOCATIONGRANULARITY
+        length = max(_ROOM, self._size - start + least)
+        made = mapped_end(self._file, start, length)
+        if self._map is not None:
+            self._map.close()
+        self._map, self._start, self._end = made, start, start + length
+
+    def _unmap(self) -> None:
+        """Let the file end with its last line."""
+        if self._map is not None:
+            self._map.close()
+            self._map, self._start, self._end = None, 0, 0
+            os.ftruncate(self._file, self._size)
+
+
+def words_in(unfinished: Path, start: int, links: list[str]) -> Words:
+    """The words of a start that has not ended, from its file."""
+    words = Words(links, {}, {})
+    with contextlib.suppress(FileNotFoundError):
+        for line in _path(unfinished, start).read_bytes().splitlines():
+            with contextlib.suppress(ValueError, TypeError, OverflowError, RecursionError):  # the last line may be torn
+                what, code, text = json.loads(line)
+                (words.keys if what == "key" else words.sources)[int(code)] = (
+                    str(text).encode("utf-8", "replace").decode()
+                )
+    return words
+
+
+def _path(unfinished: Path, start: int) -> Path:
+    return unfinished / f"{start:03d}.words"
+
+
+MOST_KEYS = 2**18
+"""The keys that a wire keeps for the programs of a side; each takes some 1 kB."""
+MOST_CHARACTERS = 2**25
+"""The characters of these keys."""
+
+
+@final
+class KeyLimit:
+    """The keys of a wire that are new, counted for each side. Threads may call its methods at the same time."""
+
+    def __init__(self, links: Iterable[WireLink], earlier: Iterable[Numbered], tell: Callable[[str], None]) -> None:
+        """earlier: the streams that earlier starts numbered; their keys count, too. tell: for warnings.
+
+        The stream of `KEY/@adv/…` counts as a key until one of these comes, for there is no telling how many there were.
+        """
+        self._tell = tell
+        self._used: dict[str, tuple[int, int]] = {}  # side → keys, characters
+        self._full: set[str] = set()
+        self._earlier: set[str] = set()
+        self._lock = threading.Lock()
+        sources = {link.name: link.source for link in links}
+        for link, key, _ in earlier:
+            if key not in self._earlier:
+                self._earlier.add(key)
+                self._take(key, sources.get(link, ""))
+
+    def admits(self, key: str, side: str) -> bool:
+        """Whether there is room for a new key that a program of a side uses; then it has its place from now on."""
+        with self._lock:
+            if key in self._earlier:
+                return True
+            if (numbered := numbered_as(key)) in self._earlier:  # the first such key has the place of its stream
+                self._earlier.remove(numbered)
+                return True
+            keys, characters = self._used.get(side, (0, 0))
+            if keys < MOST_KEYS and characters + len(key) <= MOST_CHARACTERS:
+                self._take(key, side)
+                return True
+            if side in self._full:
+                return False
+            self._full.add(side)
+        self._tell(
+            f"programs at the side {side} have used {keys:,} keys of {characters:,} characters, and the wire keeps no more of "
+            "them; messages with new keys are dropped as too_many_keys; let these programs use fewer keys"
+        )
+        return False
+
+    def _take(self, key: str, side: str) -> None:
+        keys, characters = self._used.get(side, (0, 0))
+        self._used[side] = (keys + 1, characters + len(key))
+
+
+@final
+class JournalPlace:
+    """A journal's folder, which this process alone writes to until it calls `close`."""
+
+    def __init__(self, journal: Path, tell: Callable[[str], None]) -> None:
+        """Make the folder, and lock it. tell: for what the user must know.
+
+        Raises UsageError if another wire uses the folder, and OSError if it cannot be written.
+        """
+        self._journal, self._tell = journal, tell
+        self.incomplete_since: float | None = None
+        """When something could not be written for the first time, in seconds since 1970; None: the disk always had room."""
+        self.removed: Path | None = None
+        """This folder, or the one inside it, if it was removed or moved since the wire began, as of the last `poll`."""
+        self.unfinished = journal / UNFINISHED
+        """The folder inside it for records that are not yet in a Parquet file."""
+        make_private(self.unfinished)
+        self._lock = locked(journal)
+        self._alive: int | None = None
+
+    def begin(self) -> None:
+        """Begin to note that the wire is alive, once an earlier start has been recovered. Raises OSError."""
+        self._alive = os.open(self.unfinished / "alive", os.O_WRONLY | os.O_CREAT, 0o600)
+        self.beat()
+
+    def beat(self) -> None:
+        """Note that the wire is alive now. Raises OSError."""
+        assert self._alive is not None  # noqa: S101 - it has begun
+        os.pwrite(self._alive, struct.pack("<d", time.time()), 0)
+
+    def poll(self) -> None:
+        """Check whether the folder is still there, and report at once if it is not."""
+        if self.removed is not None:
+            return
+        self.removed = self._missing()
+        if self.removed is not None:
+            self.incomplete_since = self.incomplete_since or time.time()
+            self._tell(
+                f"{self.removed} was removed or moved while the wire runs, so the wire no longer has a journal; it goes on; end "
+                "it, and start it again"
+            )
+
+    def miss(self, error: OSError) -> None:
+        """Note that something could not be written, and tell so the first time."""
+        self.poll()
+        if self.incomplete_since is None:
+            self.incomplete_since = time.time()
+            at = time.strftime("%H:%M:%S", time.localtime(self.incomplete_since))
+            self._tell(
+                f"the journal is incomplete from {at} on, because {self._journal} cannot be written ({error.strerror}); the wire "
+                "goes on; make room"
+            )
+
+    def _missing(self) -> Path | None:
+        """The folder, or the one inside it, that was removed, moved or replaced."""
+        try:
+            if not os.path.samestat(os.fstat(self._lock), os.stat(self._journal)):
+                return self._journal
+            return self.unfinished if self._alive is not None and os.fstat(self._alive).st_nlink == 0 else None
+        except (FileNotFoundError, NotADirectoryError):
+            return self._journal
+        except OSError:  # a disk that does not answer may answer later
+            return None
+
+    def close(self) -> None:
+        """Let another wire use the folder."""
+        for descriptor in (self._alive, self._lock):
+            if descriptor is not None:
+                os.close(descriptor)
+
+
+def locked(folder: Path) -> int:
+    """The descriptor of a folder that this process alone may use until it closes it. Raises UsageError if another one does."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    if not try_lock(descriptor):
+        os.close(descriptor)
+        raise UsageError(f"another wire writes to {folder.parent}; end it, or give another folder")
+    return descriptor
+
+
+def recover(journal: Path, history: WireHistory) -> int:
+    """Make Parquet files from all that an earlier start left behind, and end that start; returns the number of such records.
+
+    Raises OSError if the disk is full, and UsageError if a file is damaged; then nothing is lost.
+    """
+    place = journal / UNFINISHED
+    recovered, alive = 0, last_beat(place)
+    names = [name for name in part_names(journal) if int(name.partition("-")[0]) == history.start]
+    if not history.ended:
+        counts = dict(history.counts)
+        for name in names:
+            path = parquet_path(journal, name)
+            try:
+                if not path.exists():
+                    table = unfinished_table(place / f"{name}.rows", history.links, killed=True)
+                    recovered += table.num_rows
+                    write_parquet(path, table)
+                _count_table(counts, path)
+            except (pa.ArrowException, KeyError) as error:
+                raise damaged(journal, name, error) from error
+        history.end(counts, alive)
+    for path in (*journal.glob("*.new"), *place.iterdir()):
+        path.unlink()
+    return recovered
+
+
+def _count_table(counts: dict[Numbered, int], path: Path) -> None:
+    table = pq.read_table(path, columns=["link", "key", "kind", "n"], filters=pc.field("n").is_valid())
+    for row in table.group_by(["link", "key", "kind"]).aggregate([("n", "max")]).to_pylist():
+        if row["link"] is None:
+            continue
+        if row["key"] is None or row["kind"] is None:
+            raise pa.ArrowInvalid("a message with a number has no key or no kind")
+        highest(counts, (row["link"], row["key"], Kind[row["kind"].upper()].stream), row["n_max"] + 1)
+
+
+JOURNAL_FOLDER = "journal"
+"""The folder inside a wire's folder that contains its journal."""
+_LATEST = 1e15  # seconds
+UNFINISHED = "unfinished"
+"""The folder inside it for records that are not yet in a Parquet file."""
+
+
+def journal_tables(folder: Path | str, start: int | None = None, killed: bool = False) -> Iterator[pa.Table]:
+    """The journal of a wire's folder in the order of its rows, a table for each part.
+
+    The wire may still run, or may have been killed. A journal without messages is one empty table.
+
+    start: only the rows of this start of the wire, from 1; None: the rows of all starts. killed: as for `records_in`.
+
+    Raises UsageError if there is no journal, or a part cannot be read.
+    """
+    journal = Path(folder) / JOURNAL_FOLDER
+    if not journal.is_dir():
+        raise UsageError(
+            f"{folder} is not the folder of a wire: it has no folder {JOURNAL_FOLDER}; give the results folder of a wire"
+        )
+    links = WireHistory.read(journal).links
+    names = [name for name in part_names(journal) if start in {None, _start_of(name)}]
+    if not names:
+        yield PARQUET.empty_table()
+    for name in names:
+        try:
+            yield _table(journal, name, links, killed)
+        except (OSError, pa.ArrowException) as error:
+            raise damaged(journal, name, error) from error
+
+
+def _table(journal: Path, name: str, links: dict[int, list[str]], killed: bool) -> pa.Table:
+    path = journal / UNFINISHED / f"{name}.rows"
+    with contextlib.suppress(FileNotFoundError):  # a running wire may just have made the Parquet file
+        if not parquet_path(journal, name).exists():
+            return unfinished_table(path, links, killed)
+    return pq.read_table(parquet_path(journal, name), schema=PARQUET)
+
+
+def _start_of(name: str) -> int:
+    """The number of the start that made a part."""
+    return int(name.partition("-")[0])
+
+
+def damaged(journal: Path, name: str, why: object) -> UsageError:
+    """The error about a part that cannot be read."""
+    return UsageError(
+        f"part {name} of the journal in {journal} cannot be read ({why}); remove its file, or give another folder"
+    )
+
+
+def unfinished_table(path: Path, links: Mapping[int, list[str]], killed: bool) -> pa.Table:
+    """The records that are not yet in a Parquet file, as a table. Raises OSError, and UsageError if they are damaged.
+
+    links: as in `WireHistory`; killed: as for `records_in`.
+    """
+    start = _start_of(path.stem)
+    words, records = words_in(path.parent, start, links.get(start, [])), records_in(path, killed)
+    wrong = ~np.isin(records["fate"], [*WireFate]) | ((records["kind"] & 0x7F) > max(Kind)) | (records["n"] >= NEVER)
+    wrong |= (records["link"] != UNLINKED) & (records["link"] >= len(words.links))
+    for name in ("time", "delay"):
+        wrong |= ~(np.abs(records[name]) < _LATEST)  # not a number, too
+    if wrong.any():
+        raise damaged(path.parents[1], path.stem, f"record {int(wrong.argmax())} is not one of this wire")
+    return table_of(records, words)
+
+
+def part_names(journal: Path) -> list[str]:
+    """The names of all parts of a journal, such as 001-0002 for the second part of the first start, in order."""
+    found = {path.stem for path in (*journal.glob("*.parquet"), *(journal / UNFINISHED).glob("*.rows"))}
+    parts = [name for name in found if re.fullmatch(r"\d{3,}-\d{4,}", name)]  # a user may keep files of others there
+    return sorted(parts, key=lambda name: [int(number) for number in name.split("-")])
+
+
+def parquet_path(journal: Path, name: str) -> Path:
+    """The Parquet file of a part."""
+    return journal / f"{name}.parquet"
+
+
+def last_beat(unfinished: Path) -> float:
+    """The latest time that a wire noted while it ran; 0 if it noted none."""
+    with contextlib.suppress(OSError, struct.error):
+        beat: float = struct.unpack("<d", (unfinished / "alive").read_bytes())[0]
+        return beat
+    return 0.0

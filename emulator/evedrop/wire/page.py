@@ -11,7 +11,7 @@ from evedrop.results.reading import results_of_this_version
 from evedrop.show.report.kinds import wire_page
 from evedrop.show.report.wire_sections import WireSource
 from evedrop.show.report.writing import write_page
-from evedrop.wire.journal_on_disk import summary_of_wire
+from evedrop.wire.on_disk import summary_of_wire
 
 
 def write_wire_report(folder: Path) -> Path:

@@ -1,6 +1,10 @@
-"""The content of a wire file: sides, links between them, events. Made by `evedrop.wire.file` and read by everything else.
+"""The content of a wire file: sides, links between them with the keys that they take, events.
 
-Source: docs/wire.md, the file.
+Made by `evedrop.wire.file` and read by everything else. Zenoh's advanced publishers have keys of their own for the messages on
+KEY: KEY/@adv/… for their history, heartbeats and recovery. After `@adv` come the Zenoh id of a session, and numbers of its own,
+which differ from run to run.
+
+Source: docs/wire.md, the file, and what comes late.
 """
 
 from __future__ import annotations
@@ -8,12 +12,27 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Final
 
 import zenoh
 
-from evedrop.wire.advanced import published_key
-from evedrop.wire.expect import WireExpectTable
+from evedrop.wire.tables import WireExpectTable
+
+_MARK = "/@adv"
+_HISTORY = f"{_MARK}/"
+LOST_HISTORY_SECONDS: Final = 0.5
+"""How long the asker of a history waits for a lost question or answer: an advanced subscriber holds back new messages."""
+
+
+def published_key(key: str) -> str | None:
+    """KEY, if a key is `KEY/@adv/…`; None for all other keys."""
+    return key.partition(_HISTORY)[0] if _HISTORY in key else None
+
+
+def numbered_as(key: str) -> str:
+    """The key with which messages share their numbers and random streams: `KEY/@adv` for `KEY/@adv/…`, or else their own."""
+    published = published_key(key)
+    return key if published is None else f"{published}{_MARK}"
 
 
 @dataclass(frozen=True)

@@ -19,15 +19,13 @@ from typing import Any, final
 import zenoh
 
 from evedrop.system.threads import wait_for_thread
-from evedrop.wire.advanced import LOST_HISTORY_SECONDS, published_key
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.lanes import Decision, Lane, LinkState
+from evedrop.wire.link_state import Decision, Lane, LinkState, Scheduler
 from evedrop.wire.outlet import SideOutlet, waiting_bytes
-from evedrop.wire.plan import WirePlan
+from evedrop.wire.plan import LOST_HISTORY_SECONDS, WirePlan, published_key
 from evedrop.wire.publications import READY_KEYS
-from evedrop.wire.record import AGAIN, HELD, UNLINKED, Kind, WireFate
+from evedrop.wire.records import AGAIN, HELD, UNLINKED, Kind, WireFate
 from evedrop.wire.ros2 import SourceReader, reply_seconds
-from evedrop.wire.scheduler import Scheduler
 from evedrop.wire.side import SideSession, expressions_of
 from evedrop.wire.watchdog import Duty
 

@@ -20,13 +20,11 @@ from numpy.typing import NDArray
 from evedrop.errors import TraceError, UsageError
 from evedrop.scenario.recordings.message_numbers import MessageArrivals, MessageSeries, joined, series_of
 from evedrop.scenario.recordings.message_recording import MessageRecording, check_parts
-from evedrop.wire.advanced import numbered_as
 from evedrop.wire.file import load_wire
 from evedrop.wire.history import WireHistory
-from evedrop.wire.journal_part import REASONS
-from evedrop.wire.journal_reader import JOURNAL_FOLDER, journal_tables
-from evedrop.wire.plan import WireLink
-from evedrop.wire.record import Kind, WireFate
+from evedrop.wire.journal import JOURNAL_FOLDER, journal_tables
+from evedrop.wire.plan import WireLink, numbered_as
+from evedrop.wire.records import REASONS, Kind, WireFate
 
 _COLUMNS = ["time", "link", "key", "source", "sequence", "reason", "delay", "n", "kind", "again"]
 _MOST_SHOWN = 10  # links or keys that a message lists

@@ -18,19 +18,16 @@ import zenoh
 from evedrop.live.network.zenoh_log import LOGGED
 from evedrop.system.output import warn
 from evedrop.system.threads import wait_for_thread
-from evedrop.wire.bypasses import Bypasses
 from evedrop.wire.departures import Departures
 from evedrop.wire.journal import WireJournal
-from evedrop.wire.lanes import LinkState
+from evedrop.wire.link_state import LinkState
 from evedrop.wire.liveliness import LivelinessRelay
-from evedrop.wire.neighbours import Neighbours
+from evedrop.wire.neighbours import Bypasses, Neighbours
 from evedrop.wire.outlet import LAST_SECONDS, SideOutlet
 from evedrop.wire.plan import WirePlan
-from evedrop.wire.publications import PublicationRelay
-from evedrop.wire.publishers import Publishers
+from evedrop.wire.publications import PublicationRelay, Publishers
 from evedrop.wire.queries import QueryRelay
-from evedrop.wire.ros2 import service_key
-from evedrop.wire.ros2_entities import EntityLog
+from evedrop.wire.ros2 import EntityLog, service_key
 from evedrop.wire.side import SideSession
 from evedrop.wire.timeline import Moment
 from evedrop.wire.watchdog import Duty

@@ -1,21 +1,26 @@
 """Reads the metadata of rmw_zenoh, which carries ROS 2 over Zenoh: who sent a message, and who offers a service.
 
 A wire passes ROS 2 on as it passes on everything else. It reads this to name publishers in its journal, to offer the services of
-one side on the others, and to wait long enough for their replies.
+one side on the others, and to wait long enough for their replies. A file beside the journal has the names behind its gids: every
+entity of ROS 2 that the wire has seen.
 
-Source: docs/ros2.md, what the wire reads.
+Source: docs/ros2.md, what the wire reads, and the journal.
 """
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from struct import Struct
 from typing import Final, final
 
 import zenoh
 from xxhash import xxh3_128_intdigest
+
+from evedrop.system.output import warn
 
 _ATTACHMENT = Struct("<q8xB16s")
 """Sequence number, time (skipped), length of the gid, gid."""
@@ -181,3 +186,36 @@ def reply_seconds(key: str, seconds: float) -> float:
     if not key.rpartition("/")[2].startswith(_HASHES):
         return seconds
     return max(seconds, RESULT_SECONDS if _RESULT in key else SERVICE_SECONDS)
+
+
+ENTITIES: Final = "ros2.jsonl"
+"""The file inside a wire's folder that has a line for each entity: side, gid, kind, node, topic, type and QoS."""
+MOST_ENTITIES = 65_536
+"""The most lines that one start of a wire writes."""
+
+
+@final
+class EntityLog:
+    """Writes down each entity of ROS 2 once, as its liveliness token describes it, when its token first appears.
+
+    A file that cannot be written ends the log with a warning; the wire continues.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path: Path | None = folder / ENTITIES
+        self._known: set[tuple[str, str]] = set()
+
+    def add(self, side: str, token: str) -> None:
+        """Note a token of a program at a side; a token that is not of rmw_zenoh is ignored."""
+        if self._path is None or (side, token) in self._known or len(self._known) >= MOST_ENTITIES:
+            return
+        entity = read_token(token)
+        if entity is None:
+            return
+        self._known.add((side, token))
+        try:
+            with self._path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps({"side": side, **asdict(entity)}) + "\n")
+        except OSError as error:
+            warn(f"{self._path} lacks entities of ROS 2 from now on ({error.strerror}); the wire and its journal go on")
+            self._path = None

@@ -1,14 +1,18 @@
-"""`evedrop wire`: opens a wire, carries out its events, and ends it in order.
+"""`evedrop wire`: opens a wire, carries out its events, shows it while it runs, and ends it in order.
 
-Source: docs/wire.md.
+It is shown in a window, on a page for browsers, or only in a file. Neither Rerun nor the viewer is loaded before a view is asked
+for.
+
+Source: docs/wire.md, and its section about the view.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from evedrop.errors import Interrupted, RunError
 from evedrop.live.network.control_file import remove_control
@@ -17,21 +21,22 @@ from evedrop.results.wire_folder import WIRE_FILE
 from evedrop.results.wire_summary import WIRE_SUMMARY_FILE
 from evedrop.scenario.wire_table import PUT
 from evedrop.show.report.wire import wire_failures
+from evedrop.show.view.viewer import Viewer, choose
 from evedrop.system.environment import check_zenoh_runtime
 from evedrop.system.output import warn
 from evedrop.system.signals import stop_or_leave_on_signals
-from evedrop.wire.closing import closing_lines
-from evedrop.wire.conductor import WireConductor
-from evedrop.wire.control import WireControl
 from evedrop.wire.file import resolved_wire
 from evedrop.wire.history import Numbered
-from evedrop.wire.journal import WireJournal
-from evedrop.wire.journal_reader import JOURNAL_FOLDER
-from evedrop.wire.live_view import live_view
+from evedrop.wire.journal import JOURNAL_FOLDER, WireJournal
+from evedrop.wire.on_disk import closing_lines
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.relay import WireRelay
 from evedrop.wire.scorekeeper import WireScorekeeper
+from evedrop.wire.steering import WireConductor, WireControl
 from evedrop.wire.watchdog import ANSWER_SECONDS, WORK_SECONDS, Duty, Watchdog, end_at_once
+
+if TYPE_CHECKING:
+    from evedrop.wire.recording import WireView
 
 
 def run_wire(
@@ -156,3 +161,39 @@ def _begin_results(out: Path, plan: WirePlan) -> None:
         write_private(out / WIRE_FILE, resolved_wire(plan))
     except OSError as error:
         warn(f"wire.toml cannot be written ({error}); the wire goes on")
+
+
+@contextmanager
+def live_view(plan: WirePlan, out: Path, mode: str, say: Callable[[str], None]) -> Iterator[WireView | None]:
+    """A view of a wire that starts now, for the time of a `with` block; None for "off".
+
+    mode: as `evedrop run --view`, or the name of a file that ends in .rrd: the recording is written there, and nothing is shown.
+    out: the wire's folder. say: for the line with the address of the page.
+
+    Raises UsageError for any other mode, and if a viewer cannot be started.
+    """
+    to_file = mode.endswith(".rrd")
+    shown = "off" if to_file else choose(mode)
+    if shown == "off" and not to_file:
+        yield None
+        return
+    from evedrop.wire.recording import WireView  # noqa: PLC0415 - loads Rerun
+
+    path = Path(mode) if to_file else out.absolute() / "recording.rrd"
+    viewer = Viewer.start(shown, out / "logs", path)
+    try:
+        if viewer is not None and viewer.address is not None:
+            say(f"the wire is shown at {viewer.address}, to anybody who has this address")
+        if viewer is not None and viewer.warning is not None:
+            warn(viewer.warning)
+        view = WireView(path, plan, out.resolve().name, time.time())
+        try:
+            yield view
+        finally:
+            view.close()
+            if view.failure is not None:
+                warn(view.failure)
+    finally:
+        if viewer is not None:
+            viewer.complete()
+            viewer.stop()

@@ -35,8 +35,8 @@ from evedrop.score.summary import failed
 from evedrop.show.report.wire import wire_failures
 from evedrop.system.processes import kill, wait_for
 from evedrop.wire.file import load_wire, resolved_wire, wire_of
-from evedrop.wire.journal_on_disk import scorekeeper_on_disk
-from evedrop.wire.journal_reader import journal_tables
+from evedrop.wire.journal import journal_tables
+from evedrop.wire.on_disk import scorekeeper_on_disk
 from evedrop.wire.plan import WirePlan
 
 if TYPE_CHECKING:

@@ -1,13 +1,16 @@
 """The tables of a wire file: their entries, and the checks of each table by itself.
 
-Source: docs/wire.md, the file.
+Lengths of time, sizes and rates are numbers in seconds, bytes and bytes per second, or texts with a unit. An endpoint says where
+a side listens. `[[expect]]` is a condition on what a link delivered, how long it held messages back, and its longest gaps.
+
+Source: docs/wire.md, the file, units, sides and expectations.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from typing import Annotated, Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, NamedTuple
 
 import zenoh
 from pydantic import AfterValidator, BeforeValidator, Field
@@ -18,9 +21,221 @@ from evedrop.model.delays import DELAY_MODELS
 from evedrop.scenario.link_table import CorrelationTable, LinkTable
 from evedrop.scenario.table import NAME, Found, Table, expected
 from evedrop.scenario.words import listed
-from evedrop.wire.endpoints import ENCRYPTED, FREE, checked_endpoint
-from evedrop.wire.expect import WireExpectTable
-from evedrop.wire.units import Rate, Seconds, Size, in_seconds
+from evedrop.system.hints import near
+from evedrop.wire.tallies import WIRE_METRICS
+
+_TIMES = {"us": 1e-6, "µs": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
+_SIZES = {"B": 1, "kB": 10**3, "MB": 10**6, "GB": 10**9, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30}
+_BITS = {"bit/s": 1 / 8, "kbit/s": 1e3 / 8, "Mbit/s": 1e6 / 8, "Gbit/s": 1e9 / 8}
+_RATES = {**{f"{unit}/s": float(size) for unit, size in _SIZES.items()}, **_BITS}
+_WITH_UNIT = re.compile(r"(\d+(?:\.\d+)?(?:[eE][+-]?\d+)?)\s*(\S+)")
+LONGEST_SECONDS = 1e6
+LARGEST_BYTES = 2**40
+
+
+def in_unit(text: str, units: Mapping[str, float]) -> float | None:
+    """The number in a text such as "20 ms", in the base unit; None if it is not a number with one of the units."""
+    found = _WITH_UNIT.fullmatch(text.strip())
+    if found is None or found[2] not in units:
+        return None
+    number = float(found[1]) * units[found[2]]
+    return round(number, 12)  # 20 ms are the number that 0.02 is
+
+
+def in_seconds(text: str) -> float | None:
+    """The seconds in a text such as "20 ms"; None if it is not a length of time."""
+    return in_unit(text, _TIMES)
+
+
+def seconds_of(text: str) -> float | None:
+    """The seconds in a text such as "20 ms" or "0.02", up to `LONGEST_SECONDS`; None if it is neither."""
+    found = in_seconds(text if text.strip()[-1:].isalpha() else f"{text} s")
+    return found if found is not None and found <= LONGEST_SECONDS else None
+
+
+def _seconds(value: Any) -> Any:
+    return _read(value, _TIMES, 'seconds, or a text such as "20 ms"')
+
+
+def _rate(value: Any) -> Any:
+    return _read(value, _RATES, 'bytes per second, or a text such as "2 MB/s"')
+
+
+def _size(value: Any) -> Any:
+    number = _read(value, _SIZES, 'bytes, or a text such as "256 kB"')
+    return int(number) if isinstance(number, float) and number.is_integer() else number
+
+
+def _read(value: Any, units: Mapping[str, float], what: str) -> Any:
+    if not isinstance(value, str):
+        return value
+    number = in_unit(value, units)
+    if number is None:
+        raise expected(f"{what}; the units are {', '.join(units)}")
+    return number
+
+
+Seconds = Annotated[float, Field(strict=True, ge=0.0, le=LONGEST_SECONDS), BeforeValidator(_seconds)]
+Rate = Annotated[float, Field(strict=True, ge=1.0, le=float(LARGEST_BYTES)), BeforeValidator(_rate)]
+"""Bytes per second."""
+Size = Annotated[int, Field(strict=True, ge=0, le=LARGEST_BYTES), BeforeValidator(_size)]
+"""Bytes."""
+
+
+RELIABLE = ("tcp", "tls", "quic", "ws", "unixsock-stream")
+"""The protocols on which nothing is lost; one that loses by itself would hide what the wire loses."""
+ENCRYPTED = frozenset({"tls", "quic"})
+FREE = "tcp/127.0.0.1:0"
+"""Any free port of the loopback interface."""
+_ENDPOINT = re.compile(r"([a-z0-9-]+)/([^?#]+)(?:[?#].*)?")
+_HOST_AND_PORT = re.compile(r"(\[[0-9a-fA-F:.%a-z]+\]|[^:\[\]/]+):(\d{1,5})")
+_EVERY_HOST = frozenset({"0.0.0.0", "[::]"})  # noqa: S104 - recognised, not bound
+_LOOPBACK = re.compile(r"127\.\d+\.\d+\.\d+|\[::1\]|localhost")
+
+
+class EndpointPlace(NamedTuple):
+    """Where an endpoint is."""
+
+    protocol: str
+    host: str
+    """The host, or the path of a socket."""
+    port: int | None
+    """None for a socket in the file system."""
+
+    @property
+    def loopback(self) -> bool:
+        """Whether only programs on this machine can reach it."""
+        return self.port is None or _LOOPBACK.fullmatch(self.host) is not None
+
+    def overlaps(self, other: EndpointPlace) -> bool:
+        """Whether a program that listens on one keeps others from listening on the other."""
+        if (self.port is None) != (other.port is None) or (self.protocol == "quic") != (other.protocol == "quic"):
+            return False
+        if self.port is None:
+            return self.host == other.host
+        same = self.host == other.host or bool({self.host, other.host} & _EVERY_HOST)
+        return self.port == other.port != 0 and same
+
+
+def place_of(endpoint: str) -> EndpointPlace | None:
+    """The place of an endpoint; None if it is malformed."""
+    found = _ENDPOINT.fullmatch(endpoint)
+    if found is None or found[1] not in RELIABLE:
+        return None
+    if found[1] == "unixsock-stream":
+        return EndpointPlace(found[1], found[2], None)
+    address = _HOST_AND_PORT.fullmatch(found[2])
+    if address is None or int(address[2]) > 65_535:
+        return None
+    host = "127.0.0.1" if address[1] == "localhost" else address[1]
+    return EndpointPlace(found[1], host, int(address[2]))
+
+
+def checked_endpoint(endpoint: str) -> str:
+    """The endpoint, if its form is right; otherwise raises the error of a check."""
+    if endpoint.startswith("udp/"):
+        raise expected(f"{listed(RELIABLE)} in place of udp, which would lose messages of its own")
+    if place_of(endpoint) is None:
+        raise expected(f"PROTOCOL/HOST:PORT with the protocol {listed(RELIABLE)}, such as tcp/127.0.0.1:7448")
+    return endpoint
+
+
+_BOUNDS = ("below", "above")
+
+
+def _bound(value: Any) -> Any:
+    seconds = in_seconds(value) if isinstance(value, str) else None
+    if isinstance(value, str) and seconds is None:
+        raise expected('a number, or a length of time such as "20 ms"')
+    return value if seconds is None else seconds
+
+
+def _metric(text: str) -> str:
+    _, dot, metric = text.rpartition(".")
+    if not dot or metric not in WIRE_METRICS:
+        names = [f"LINK.{one}" for one in WIRE_METRICS]
+        raise expected(listed(names), near(metric, WIRE_METRICS))
+    return text
+
+
+Bound = Annotated[float, Field(strict=True, ge=0.0, allow_inf_nan=False), BeforeValidator(_bound)]
+
+
+class WireExpectTable(Table):
+    """`[[expect]]` of a wire file: a metric of a link with its bounds, or a link whose losses must agree with its model."""
+
+    metric: Annotated[
+        str | None, AfterValidator(lambda text: text and _metric(text)), Field(examples=["scan.delivery"])
+    ] = None
+    below: Annotated[Bound | None, Field(examples=[0.9])] = None
+    above: Annotated[Bound | None, Field(examples=[0.5])] = None
+    quantile: Annotated[float | None, Field(strict=True, gt=0.0, lt=1.0, examples=[0.99])] = None
+    link: Annotated[str | None, Field(strict=True, examples=["scan"])] = None
+
+    @classmethod
+    def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
+        """Mistakes unless there is a metric with a bound, or a link alone."""
+        given = [name for name, value in table.items() if value is not None]
+        if "link" in given:
+            others = [name for name in given if name in {"metric", "quantile", *_BOUNDS}]
+            return [
+                (name, 'is set, but a table with link has no other entries; expected link = "scan" alone')
+                for name in others
+            ]
+        if "metric" not in given:
+            return [("metric", 'is missing; expected metric = "scan.delivery" with below or above, or link = "scan"')]
+        found = []
+        if not set(given) & set(_BOUNDS):
+            found.append(("below", "is missing, and so is above; add one of them, or both"))
+        metric = WIRE_METRICS.get(str(table["metric"]).rpartition(".")[2])
+        if (metric is not None and metric.has_quantile) == ("quantile" not in given):
+            names = [one.name for one in WIRE_METRICS.values() if one.has_quantile]
+            said = (
+                f"is missing; a {listed(names)} needs one"
+                if "quantile" not in given
+                else f"is set, but only a {listed(names)} has quantiles"
+            )
+            found.append(
+                ("quantile", f"{said}; expected quantile = 0.99 with {listed([f'LINK.{one}' for one in names])}")
+            )
+        return found
+
+    @property
+    def subject(self) -> str:
+        """The name of the link."""
+        return self.link if self.link is not None else str(self.metric).rpartition(".")[0]
+
+    @property
+    def wanted(self) -> str:
+        """The value that is expected."""
+        if self.link is not None:
+            return "within the 99 % bounds of its model"
+        bounds = [(name, getattr(self, name)) for name in _BOUNDS]
+        return " and ".join(f"{name} {value:.10g}" for name, value in bounds if value is not None)
+
+    @property
+    def text(self) -> str:
+        """The expectation as a part of a sentence."""
+        if self.link is not None:
+            return f"link {self.link} {self.wanted}"
+        quantile = "" if self.quantile is None else f"{self.quantile:.10g} quantile of "
+        return f"{quantile}{self.metric} {self.wanted}"
+
+    def holds(self, found: float) -> bool:
+        """Whether a metric meets the expectation."""
+        return (self.below is None or found < self.below) and (self.above is None or found > self.above)
+
+
+def expectation_mistakes(expectations: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Iterator[str]:
+    """Mistakes in the names of links, of tables that may be malformed."""
+    for i, table in enumerate(expectations):
+        for entry in ("metric", "link"):
+            text = table.get(entry)
+            link = text.rpartition(".")[0] if isinstance(text, str) and entry == "metric" else text
+            if isinstance(link, str) and link and link not in names:
+                choice = f"expected a metric or the name of {listed(names)}" if names else "the file has no link"
+                yield f"expect.{i}.{entry}: is {as_toml(text)}, but there is no link {link}; {choice}{near(link, names)}"
+
 
 DEFAULT_QUEUE = 256_000
 """Bytes that may wait before a link of limited rate."""

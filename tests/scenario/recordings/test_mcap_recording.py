@@ -20,8 +20,8 @@ from evedrop.model.links import loss_of
 from evedrop.model.links.link import Fate
 from evedrop.scenario.fitting.message_fit import fit_messages
 from evedrop.scenario.recordings.mcap_recording import mcap_recording
-from evedrop.wire.fates import KeyFates
 from evedrop.wire.file import wire_of
+from evedrop.wire.link_state import KeyFates
 from tests.conftest import Evedrop
 from tests.scenario.recordings.recorded_messages import BURSTS, Recorded, heard, lossy, trimmed, write
 

@@ -158,9 +158,8 @@ def _view_wire(options: argparse.Namespace) -> int:
     from evedrop.show.view.picture import picture_apart
     from evedrop.show.view.viewer import WebAddress, open_run
     from evedrop.system.signals import raise_on_signals
-    from evedrop.wire.closing import closing_lines
-    from evedrop.wire.journal_on_disk import summary_of_wire
-    from evedrop.wire.replay import PICTURE_SIZE, replay_wire
+    from evedrop.wire.on_disk import closing_lines, summary_of_wire
+    from evedrop.wire.recording import PICTURE_SIZE, replay_wire
 
     _check_names(options)
     if options.slot is not None:

@@ -28,7 +28,7 @@ def wire(options: argparse.Namespace) -> int:
         raise UsageError(
             f"wire {options.file} {options.keys[0]}: keys are for --check, which says which link a key takes"
         )
-    from evedrop.wire.check import key_lines, warnings_of_wire, wire_lines
+    from evedrop.wire.file import key_lines, warnings_of_wire, wire_lines
 
     seconds = None if options.seconds is None else _seconds(options.seconds)
     plan = load_wire(options.file, changes_of(options))
@@ -66,7 +66,7 @@ def _hush(line: str) -> None:
 
 def _seconds(text: str) -> float:
     """The length of time of `--for`. Raises UsageError."""
-    from evedrop.wire.units import seconds_of
+    from evedrop.wire.tables import seconds_of
 
     found = seconds_of(text)
     if found is None or found == 0.0:

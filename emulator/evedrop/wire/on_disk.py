@@ -1,28 +1,34 @@
-"""The journal of a wire that runs in another process, or was killed, read from the disk: for its metrics so far.
+"""What a wire's folder says of a wire that runs in another process, has ended or was killed: its summary so far.
 
-Source: docs/wire.md, from Python.
+The closing report has the summary as a table, and sentences below it, as text.
+
+Source: docs/wire.md, from Python, and the summary.
 """
 
 from __future__ import annotations
 
+import io
+import shutil
 from pathlib import Path
 from typing import final
 
 import pyarrow as pa
 import zenoh
+from rich.console import Console
 
 from evedrop.errors import UsageError
 from evedrop.model.checks import as_toml
 from evedrop.model.slot.link import Change
 from evedrop.results.wire_folder import WIRE_FILE
 from evedrop.results.wire_summary import WIRE_SUMMARY_FILE, JournalState, WireSummary
+from evedrop.show.report.wire import wire_sentences, wire_table
+from evedrop.show.terminal_tables import rich_table
 from evedrop.system.files import is_locked
 from evedrop.wire.file import load_wire
 from evedrop.wire.history import NotedEvent, WireHistory
-from evedrop.wire.journal import AmendmentListener, Listener
-from evedrop.wire.journal_part import records_of
-from evedrop.wire.journal_reader import JOURNAL_FOLDER, UNFINISHED, journal_tables, last_beat
+from evedrop.wire.journal import JOURNAL_FOLDER, UNFINISHED, AmendmentListener, Listener, journal_tables, last_beat
 from evedrop.wire.plan import WirePlan
+from evedrop.wire.records import records_of
 from evedrop.wire.scorekeeper import WireScorekeeper
 
 
@@ -114,3 +120,11 @@ class JournalOnDisk:
 def _words(column: pa.ChunkedArray) -> list[str]:
     """The words that a dictionary column may contain."""
     return [word for chunk in column.chunks for word in chunk.dictionary.to_pylist()]
+
+
+def closing_lines(summary: WireSummary) -> list[str]:
+    """The table of the links, and the sentences."""
+    text = io.StringIO()
+    console = Console(file=text, force_terminal=False, width=max(100, shutil.get_terminal_size().columns))
+    console.print(rich_table(wire_table(summary)))
+    return [*(line.rstrip() for line in text.getvalue().splitlines()), *wire_sentences(summary)]
