@@ -32,8 +32,7 @@ from wire_peers import Carried, Traffic, carry, session_to
 from evedrop.errors import UsageError
 from evedrop.live.network.control_file import read_control
 from evedrop.live.network.operator import ask
-from evedrop.live.protocol.requests import StatusRequest
-from evedrop.live.protocol.wire_status import WireStatus
+from evedrop.live.protocol.requests import StatusRequest, WireStatus
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.plan import Side, WireLink, WirePlan
 from evedrop.wire.records import Records, WireFate

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from typing import final
 
-from evedrop.live.network.process_session import ProcessSession
-from evedrop.live.network.resending import GapDetector, ReplayBuffer
-from evedrop.live.protocol.brief import AnyBrief
-from evedrop.live.protocol.brief_closed_loop import EstimatorLoopPart, SensorLoopPart
-from evedrop.live.protocol.closed_loop import known, read_decided
+from evedrop.live.network.process_session import GapDetector, ProcessSession, ReplayBuffer
+from evedrop.live.protocol.brief import AnyBrief, EstimatorLoopPart, SensorLoopPart
 from evedrop.live.protocol.codec import Reader
+from evedrop.live.protocol.telemetry import known, read_decided
 from evedrop.model.input_aware import InputAwareEstimator
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Belief, Flags, Receiver

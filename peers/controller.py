@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from evedrop.live.network.process_session import ProcessSession
+from evedrop.live.network.process_session import GapDetector, ProcessSession
 from evedrop.live.network.reporting import DecisionReporter
-from evedrop.live.network.resending import GapDetector
 from evedrop.live.network.session import Session
-from evedrop.live.protocol.brief import AnyBrief, Brief
-from evedrop.live.protocol.brief_closed_loop import decoded
-from evedrop.live.protocol.brief_parts import ControllerPart
-from evedrop.live.protocol.closed_loop import decided, read_known
+from evedrop.live.protocol.brief import AnyBrief, Brief, ControllerPart, decoded
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import EndRun
+from evedrop.live.protocol.telemetry import decided, read_known
 from evedrop.model.slot.controller import ControllerCore
 from evedrop.names import CONTROLLER
 from evedrop.peers.closed_loop import kept_decisive

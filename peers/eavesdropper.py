@@ -6,8 +6,7 @@ from collections.abc import Callable
 
 from evedrop.live.network.process_session import ProcessSession
 from evedrop.live.network.session import Session
-from evedrop.live.protocol.brief import AnyBrief, Brief
-from evedrop.live.protocol.brief_parts import EavesdropperPart
+from evedrop.live.protocol.brief import AnyBrief, Brief, EavesdropperPart
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.peers.receiver_loop import follow

@@ -10,17 +10,13 @@ from typing import final
 
 import numpy as np
 
-from evedrop.live.network.pending import Pending, most_slots
-from evedrop.live.network.process_session import ProcessSession
+from evedrop.live.network.process_session import GapDetector, Pending, ProcessSession, most_slots
 from evedrop.live.network.reporting import BeliefReporter
-from evedrop.live.network.resending import GapDetector
 from evedrop.live.network.session import Session
-from evedrop.live.protocol.brief import AnyBrief, Brief
-from evedrop.live.protocol.brief_parts import ReceiverPart
+from evedrop.live.protocol.brief import AnyBrief, Brief, ReceiverPart
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import EndRun
-from evedrop.live.protocol.packet_blocks import read_deliveries
-from evedrop.live.protocol.packets import acknowledgement, is_barrier, read_acknowledgement
+from evedrop.live.protocol.packets import acknowledgement, is_barrier, read_acknowledgement, read_deliveries
 from evedrop.live.protocol.telemetry import leaving
 from evedrop.model.receiver import Belief, Flags, Receiver
 from evedrop.model.slot.receiver import ReceiverCore

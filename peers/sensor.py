@@ -10,16 +10,11 @@ from typing import final
 
 from evedrop.errors import RunError
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
-from evedrop.live.network.mailbox import Mailbox
-from evedrop.live.network.pending import most_slots
-from evedrop.live.network.process_session import ProcessSession
+from evedrop.live.network.process_session import GapDetector, Mailbox, ProcessSession, ReplayBuffer, most_slots
 from evedrop.live.network.program import ProgramStates
 from evedrop.live.network.reporting import TruthReporter
-from evedrop.live.network.resending import GapDetector, ReplayBuffer
 from evedrop.live.network.session import Session
-from evedrop.live.protocol.brief import AnyBrief, Brief
-from evedrop.live.protocol.brief_closed_loop import decoded
-from evedrop.live.protocol.brief_parts import ProgramEntry, SensorPart
+from evedrop.live.protocol.brief import AnyBrief, Brief, ProgramEntry, SensorPart, decoded
 from evedrop.live.protocol.codec import Reader, read_progress
 from evedrop.live.protocol.commands import EndRun, Go, Hold, Start
 from evedrop.live.protocol.packets import barrier, read_acknowledgement, resend, uplink

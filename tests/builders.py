@@ -12,8 +12,7 @@ import pytest
 import tomli_w
 
 from evedrop.errors import DisturbanceError, ScenarioError
-from evedrop.live.protocol.brief import AnyBrief
-from evedrop.live.protocol.brief_parts import Part
+from evedrop.live.protocol.brief import AnyBrief, Part
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Belief, Beliefs
 from evedrop.model.streams import root_of_seed, stream_key

@@ -17,8 +17,7 @@ from typing import IO, Any
 from evedrop import montecarlo
 from evedrop.live.launch.briefs import write_briefs
 from evedrop.live.launch.ports import endpoints_at
-from evedrop.live.launch.preloading import process_starter
-from evedrop.live.launch.starter import StartedProcess, Starter
+from evedrop.live.launch.starter import StartedProcess, Starter, process_starter
 from evedrop.live.network.endpoint import Endpoint
 from evedrop.live.protocol.brief import read_brief
 from evedrop.names import RECORDER

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import IO, Any, Protocol
 from unittest.mock import patch
 
-from evedrop.live.launch.preloading import OF_OTHERS, OF_RECORDERS, OF_SUMMARIES, ForkServer, fork_servers
+from evedrop.live.launch.starter import OF_OTHERS, OF_RECORDERS, OF_SUMMARIES, ForkServer, fork_servers
 
 _MODULES = (
     *OF_OTHERS,

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, NoReturn
 from evedrop import __main__ as command
 from evedrop.cli.progress_line import ProgressLine
 from evedrop.fork_server import serve
-from evedrop.live.launch import preloading
+from evedrop.live.launch import starter
 from evedrop.scenario.progress_events import Held
 
 if TYPE_CHECKING:
@@ -110,5 +110,5 @@ program = command.program
 if __name__ == "__main__":
     limited_program()
 else:
-    preloading.start_servers = forked_servers
+    starter.start_servers = forked_servers
     command.program = program_with_path

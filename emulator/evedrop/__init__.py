@@ -25,7 +25,7 @@ if TYPE_CHECKING:
         run,
         sweep,
     )
-    from evedrop.live.launch.preloading import preloaded
+    from evedrop.live.launch.starter import preloaded
     from evedrop.scenario.loading import Scenario
     from evedrop.wire.running import wire  # the package `wire`, which can be called: see there
 

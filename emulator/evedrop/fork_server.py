@@ -1,6 +1,6 @@
 """A fork server: a bare process from which the processes of a run are forked, so that modules are imported only once.
 
-It knows no scenario, no seed and no brief. For each process the launcher (`evedrop.live.launch.preloading`) sends the words
+It knows no scenario, no seed and no brief. For each process the launcher (`evedrop.live.launch.starter`) sends the words
 of its command, its environment, folder, umask and standard files; a fork then runs that command as a new interpreter would.
 The launcher gets each process's id and, when it ends, its status. This process ends when the launcher does. A server for
 roles that need further modules is a fork of this one that has imported those, too.

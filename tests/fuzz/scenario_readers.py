@@ -13,7 +13,7 @@ import pyarrow as pa
 import tomli_w
 
 from evedrop.errors import RunError
-from evedrop.live.protocol.brief_parts import ProgramEntry
+from evedrop.live.protocol.brief import ProgramEntry
 from evedrop.live.protocol.state_message import read_state
 from evedrop.scenario.expected.estimates import warnings_of
 from evedrop.scenario.fitting.process_fit import fit_process

@@ -7,12 +7,11 @@ from dataclasses import dataclass, field
 from queue import SimpleQueue
 from typing import Any, Self
 
-from evedrop.live.network.resending import ReplayBuffer
+from evedrop.live.network.process_session import ReplayBuffer
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.codec import Reader
-from evedrop.live.protocol.commands import Bounds, ControlCommand, read_command
+from evedrop.live.protocol.commands import Bounds, ControlCommand, StatusReporter, read_command
 from evedrop.live.protocol.keys import RunKeys
-from evedrop.live.protocol.process_status import StatusReporter
 from tests.conftest import LIMIT
 
 

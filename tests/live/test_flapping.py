@@ -16,8 +16,8 @@ import zenoh
 
 from evedrop.live.network.session import client_config
 from evedrop.live.protocol.brief import read_brief
+from evedrop.live.protocol.codec import enclosed
 from evedrop.live.protocol.commands import EndRun
-from evedrop.live.protocol.envelope import enclosed
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.scenario.loading import load
 from evedrop.scenario.tables import Scenario

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evedrop.live.launch.gathered_tables import Gathered, Journals, Recorded, Statistics
+from evedrop.live.launch.gathering import Gathered, Journals, Recorded, Statistics
 from evedrop.model.links.link import REASONS
 from evedrop.results.writer import ResultsWriter
 from evedrop.score.slots import ReceiverSlots, Slots

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from evedrop.live.launch.host_messages import (
+from evedrop.live.launch.other_hosts import (
     Greeting,
     HostMessage,
     LauncherHeartbeat,

@@ -16,8 +16,7 @@ from typing import IO, Any
 
 import pytest
 
-from evedrop.live.launch.host_messages import LogText, ProcessEnded, SendSignal, StartProcess, answer_in
-from evedrop.live.launch.host_program import HostProcesses
+from evedrop.live.launch.other_hosts import HostProcesses, LogText, ProcessEnded, SendSignal, StartProcess, answer_in
 from evedrop.live.launch.starter import FORK_SERVER_LOST, StartedProcess
 from evedrop.live.protocol.brief import brief_from
 from evedrop.live.protocol.last_word import Cause, LastWord

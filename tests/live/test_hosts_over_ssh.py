@@ -22,9 +22,8 @@ from typing import Any
 import pytest
 
 from evedrop.errors import ScenarioError
-from evedrop.live.launch.host_messages import LauncherHeartbeat, StartProcess, greeting_in, line_of, order_in
 from evedrop.live.launch.hosts_file import load_hosts
-from evedrop.live.launch.ssh_starter import ssh_command
+from evedrop.live.launch.other_hosts import LauncherHeartbeat, StartProcess, greeting_in, line_of, order_in, ssh_command
 from evedrop.scenario.loading import load
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.scenario.tables import NetworkTable

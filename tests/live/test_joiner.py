@@ -9,9 +9,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from evedrop.live.protocol.closed_loop import Decisions
 from evedrop.live.protocol.codec import Reader
-from evedrop.live.protocol.telemetry import Extent, Journal, Report, Truth
+from evedrop.live.protocol.telemetry import Decisions, Extent, Journal, Report, Truth
 from evedrop.live.recorder.joiner import Joiner
 from evedrop.model.digest import Blocks
 from evedrop.model.links.link import REASONS

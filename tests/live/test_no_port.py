@@ -20,10 +20,9 @@ import pytest
 
 from evedrop.errors import Interrupted, RunError
 from evedrop.live.launch.ports import RouterEndpoints, endpoints_at
-from evedrop.live.launch.preloading import process_starter
 from evedrop.live.launch.private_folder import private_folder, socket_folder
 from evedrop.live.launch.process_set import launch_one
-from evedrop.live.launch.starter import StartedProcess, Starter
+from evedrop.live.launch.starter import StartedProcess, Starter, process_starter
 from evedrop.live.network.endpoint import Endpoint, SocketEndpoint, endpoint_in
 from evedrop.live.protocol.launcher_events import RouterListens
 from evedrop.scenario.progress_events import silent

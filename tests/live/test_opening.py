@@ -13,8 +13,8 @@ import zenoh
 
 from evedrop.cli.main import main
 from evedrop.errors import RunError, UsageError
+from evedrop.live.network.connecting import open_session
 from evedrop.live.network.control_file import Control
-from evedrop.live.network.opening import open_session
 from evedrop.names import OPERATOR
 from evedrop.system.environment import check_zenoh_runtime
 from tests.conftest import LIMIT

@@ -17,8 +17,14 @@ import pytest
 from evedrop import preloaded
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.launch.ports import loopback_endpoints
-from evedrop.live.launch.preloading import fork_servers, process_starter
-from evedrop.live.launch.starter import FORK_SERVER_LOST, StartedProcess, Starter, start_process
+from evedrop.live.launch.starter import (
+    FORK_SERVER_LOST,
+    StartedProcess,
+    Starter,
+    fork_servers,
+    process_starter,
+    start_process,
+)
 from evedrop.names import KERNELS_VARIABLE
 from evedrop.system.environment import own_environment
 from tests.conftest import LIMIT, wait_until

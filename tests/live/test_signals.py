@@ -53,7 +53,7 @@ def test_a_signal_may_come_while_the_lock_of_the_event_is_held() -> None:
 def test_a_launcher_that_is_gone_is_known_without_waiting() -> None:
     """The other end of standard input is looked at, open with something to read in it, then closed."""
     code = (
-        "from evedrop.live.network.launcher_watchdog import launcher_is_gone\n"
+        "from evedrop.live.network.launcher_pipe import launcher_is_gone\n"
         "print(launcher_is_gone(), flush=True)\ninput()\nprint(launcher_is_gone(), flush=True)\n"
         "while not launcher_is_gone():\n    pass\nprint('gone')\n"
     )

@@ -14,20 +14,20 @@ from typing import Any
 import pytest
 
 from evedrop.errors import RunError, UsageError
-from evedrop.live.launch.host_messages import (
+from evedrop.live.launch.hosts_file import HostTable
+from evedrop.live.launch.other_hosts import (
     MOST_NOISE,
     Greeting,
     LauncherHeartbeat,
     Order,
     ProcessEnded,
+    SshHost,
     StartProcess,
     answer_in,
     line_of,
     order_in,
     own_version,
 )
-from evedrop.live.launch.hosts_file import HostTable
-from evedrop.live.launch.ssh_starter import SshHost
 from evedrop.live.launch.starter import CONNECTION_LOST, FORK_SERVER_LOST
 from evedrop.live.protocol.last_word import last_word_file, read_last_word
 from evedrop.system.environment import own_environment
@@ -142,7 +142,7 @@ def test_a_host_is_told_that_the_launcher_lives(connect: Connect, tmp_path: Path
 
 def test_an_ssh_that_takes_nothing_is_ended(connect: Connect, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A suspended one would keep the launcher waiting for room in the pipe, deaf to Ctrl-C."""
-    monkeypatch.setattr("evedrop.live.launch.ssh_starter._SEND_SECONDS", 0.2)
+    monkeypatch.setattr("evedrop.live.launch.other_hosts._SEND_SECONDS", 0.2)
     host = connect(GREETING)
     ready(host)
     os.kill(host._ssh.pid, signal.SIGSTOP)

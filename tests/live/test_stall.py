@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import pytest
 
 from evedrop.errors import Silence
+from evedrop.live.protocol.commands import ProcessStatus
 from evedrop.live.protocol.keys import RunKeys
-from evedrop.live.protocol.process_status import ProcessStatus
 from evedrop.live.recorder.stall import Stall, patience_of, silent_of
 from tests.clock import TestClock
 

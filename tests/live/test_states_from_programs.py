@@ -16,9 +16,9 @@ import zenoh
 
 from evedrop.cli.api import montecarlo, run
 from evedrop.errors import RunError
-from evedrop.live.launch.preloading import preloaded
+from evedrop.live.launch.starter import preloaded
 from evedrop.live.network.program import ProgramStates
-from evedrop.live.protocol.brief_parts import ProgramEntry
+from evedrop.live.protocol.brief import ProgramEntry
 from evedrop.results.diff import difference
 from evedrop.results.reading import Results
 from evedrop.scenario.recordings.disturbance_file import table_text

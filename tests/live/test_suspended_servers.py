@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from evedrop.errors import Interrupted
-from evedrop.live.launch.preloading import ForkServer, PreloadedStarter, fork_servers
-from evedrop.live.launch.starter import FORK_SERVER_LOST
+from evedrop.live.launch.starter import FORK_SERVER_LOST, ForkServer, PreloadedStarter, fork_servers
 from evedrop.system.environment import own_environment
 from tests.conftest import LIMIT, Evedrop, Live, cause_of, wait_until
 from tests.examples import mostly_long
@@ -155,7 +154,7 @@ def test_a_fork_server_that_starts_nothing_is_given_up(tmp_path: Path, monkeypat
     """After a time in which the slowest machine makes all imports."""
     with fork_servers(["evedrop.cli.main"]) as servers:
         suspended(servers[0], tmp_path)
-        monkeypatch.setattr("evedrop.live.launch.preloading._START_SECONDS", 0.5)
+        monkeypatch.setattr("evedrop.live.launch.starter._START_SECONDS", 0.5)
         with (tmp_path / "log").open("wb") as log, pytest.raises(OSError, match="did not respond"):
             servers[0].start("sensor", tmp_path / "no.json", log, own_environment())
 

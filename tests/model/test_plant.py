@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from evedrop.live.protocol.brief_closed_loop import AssignmentEntry, PlantEntry
+from evedrop.live.protocol.brief import AssignmentEntry, PlantEntry
 from evedrop.model.controllers import CONTROLLERS, Assignment
 from evedrop.model.controllers.lqr import Lqr, gain, held
 from evedrop.model.input_aware import InputAwareEstimator, Offset

@@ -15,12 +15,11 @@ import pytest
 
 from evedrop.errors import EvedropError, Gap, MalformedMessage
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
+from evedrop.live.network.process_session import ReplayBuffer
 from evedrop.live.network.reporting import is_due
-from evedrop.live.network.resending import ReplayBuffer
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
-from evedrop.live.protocol.brief import AnyBrief, Flow
-from evedrop.live.protocol.brief_parts import LegitimatePart, SensorPart
+from evedrop.live.protocol.brief import AnyBrief, Flow, LegitimatePart, SensorPart
 from evedrop.live.protocol.commands import EndRun, Start
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.model.digest import Blocks, Digests

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
-from evedrop.live.protocol.brief_parts import EavesdropperPart
+from evedrop.live.protocol.brief import EavesdropperPart
 from evedrop.model.local_filter import settled
 from evedrop.model.noise_distribution import PACKETS, NoiseDistribution
 from evedrop.scenario.expected.expectations import expectations_of

@@ -11,7 +11,7 @@ import pytest
 from evedrop import montecarlo, run
 from evedrop.errors import ScenarioError, UsageError
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
-from evedrop.live.protocol.brief_parts import RouterPart, SensorPart
+from evedrop.live.protocol.brief import RouterPart, SensorPart
 from evedrop.model.acknowledgements import OVERHEARING
 from evedrop.model.numeric.detection import Chart
 from evedrop.model.schemes import scheme_of

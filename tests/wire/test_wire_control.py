@@ -13,7 +13,7 @@ import zenoh
 from evedrop.cli.main import main
 from evedrop.live.network.control_file import read_control
 from evedrop.live.network.operator import ask
-from evedrop.live.protocol.envelope import enclosed
+from evedrop.live.protocol.codec import enclosed
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.requests import OperatorRequest
 from evedrop.names import RECORDER

@@ -14,8 +14,7 @@ import pytest
 
 from evedrop.live.network.control_file import read_control
 from evedrop.live.network.operator import ask
-from evedrop.live.protocol.requests import StatusRequest
-from evedrop.live.protocol.wire_status import WireStatus
+from evedrop.live.protocol.requests import StatusRequest, WireStatus
 from evedrop.wire.file import load_wire
 from evedrop.wire.journal import journal_tables
 from evedrop.wire.link_state import KeyFates

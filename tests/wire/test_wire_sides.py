@@ -12,7 +12,7 @@ import pytest
 import zenoh
 
 from evedrop.errors import UsageError
-from evedrop.live.launch.authority import Authority
+from evedrop.live.network.certificates import Authority
 from evedrop.system.lacks import lack_of
 from evedrop.system.ports import free_port
 from evedrop.wire.plan import Side, SideTls

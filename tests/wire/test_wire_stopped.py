@@ -19,8 +19,7 @@ import zenoh
 
 from evedrop.live.network.control_file import read_control
 from evedrop.live.network.operator import ask
-from evedrop.live.protocol.requests import StatusRequest
-from evedrop.live.protocol.wire_status import WireStatus
+from evedrop.live.protocol.requests import StatusRequest, WireStatus
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.on_disk import scorekeeper_on_disk
 from evedrop.wire.outlet import SideOutlet

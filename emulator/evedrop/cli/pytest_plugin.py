@@ -119,7 +119,7 @@ class ScenarioItem(pytest.Item):
 
     def _imports_once(self) -> None:
         """Let the live runs of all scenarios share their imports."""
-        from evedrop.live.launch.preloading import preloaded  # needed only to run a scenario
+        from evedrop.live.launch.starter import preloaded  # needed only to run a scenario
 
         if _PRELOADED not in self.config.stash and not self.config.option.evedrop_in_memory:
             stack = self.config.stash[_PRELOADED] = ExitStack()

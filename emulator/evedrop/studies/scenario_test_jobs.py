@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import final
 
 from evedrop.errors import Interrupted
-from evedrop.live.network.launcher_watchdog import when_launcher_is_gone
+from evedrop.live.network.launcher_pipe import when_launcher_is_gone
 from evedrop.studies.scenario_tests import Finding, Manner, Outcome, carry_out
 from evedrop.system.processes import SUSPENDED_SECONDS, SuspensionWatch, continue_when_parent_dies, kill, wait_for
 from evedrop.system.signals import stop_on_signals

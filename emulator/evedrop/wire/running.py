@@ -26,8 +26,7 @@ from evedrop.errors import EvedropError, RunError, UsageError
 from evedrop.live.network.control_file import no_run, read_control
 from evedrop.live.network.operator import Answer, ask
 from evedrop.live.network.zenoh_log import MARK
-from evedrop.live.protocol.requests import LinkRequest, OperatorRequest, StatusRequest
-from evedrop.live.protocol.wire_status import WireStatus
+from evedrop.live.protocol.requests import LinkRequest, OperatorRequest, StatusRequest, WireStatus
 from evedrop.results.folder import claimed, default_folder, write_private
 from evedrop.results.wire_summary import WIRE_SUMMARY_FILE, WireSummary
 from evedrop.scenario.words import listed

@@ -19,7 +19,7 @@ from typing import Any, Self, final
 import zenoh
 
 from evedrop.errors import UsageError
-from evedrop.live.network.opening import open_session
+from evedrop.live.network.connecting import open_session
 from evedrop.system.ports import free_port
 from evedrop.wire.plan import Side, SideTls, WireLink
 from evedrop.wire.watchdog import ANSWER_SECONDS, Duty

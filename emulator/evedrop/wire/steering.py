@@ -20,18 +20,16 @@ from typing import Any, Self, final
 import zenoh
 
 from evedrop.errors import ScenarioError
-from evedrop.live.network.access import Grant, access_control
+from evedrop.live.network.access import Grant, access_control, users_file
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
+from evedrop.live.network.connecting import open_session
+from evedrop.live.network.connection import Question, Questions
 from evedrop.live.network.control_file import Control, remove_control
-from evedrop.live.network.declared import Question, Questions
-from evedrop.live.network.opening import open_session
 from evedrop.live.network.operator import Answer, Order
-from evedrop.live.network.router_users import users_file
 from evedrop.live.network.session import listening_config
-from evedrop.live.protocol.envelope import Dropped
+from evedrop.live.protocol.codec import Dropped
 from evedrop.live.protocol.keys import RunKeys, ZenohConfig
-from evedrop.live.protocol.requests import LinkRequest, OperatorRequest, StatusRequest
-from evedrop.live.protocol.wire_status import WireLinkStatus, WireStatus
+from evedrop.live.protocol.requests import LinkRequest, OperatorRequest, StatusRequest, WireLinkStatus, WireStatus
 from evedrop.names import OPERATOR, RECORDER
 from evedrop.system.output import warn
 from evedrop.system.ports import free_port

@@ -99,10 +99,10 @@ if LAUNCHES or (CONFUSED and "evedrop.fork_server" in sys.orig_argv):
         {
             "evedrop.cli.progress_line": _telling,
             "evedrop.live.protocol.brief": _wired,
-            "evedrop.live.launch.ssh_starter": _heard,
+            "evedrop.live.launch.other_hosts": _heard,
         }
         if LAUNCHES
-        else {"evedrop.live.network.declared": _confused}
+        else {"evedrop.live.network.connection": _confused}
     )
 
     class _Finder:

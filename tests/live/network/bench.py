@@ -20,7 +20,7 @@ from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.launch.ports import loopback_endpoints
 from evedrop.live.network.session import client_config
 from evedrop.live.protocol.brief import AnyBrief, Flow, brief_from
-from evedrop.live.protocol.envelope import enclosed, payload_of
+from evedrop.live.protocol.codec import enclosed, payload_of
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.scenario.tables import Scenario
 from evedrop.system.ports import free_port

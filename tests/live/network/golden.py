@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 
 from evedrop.live.network import operator
-from evedrop.live.protocol import closed_loop as loop_wire
+from evedrop.live.protocol import codec, commands, packets, telemetry
 from evedrop.live.protocol import codec as wire
-from evedrop.live.protocol import commands, envelope, packets, telemetry
-from evedrop.live.protocol.process_status import ProcessStatus, read_process_status
-from evedrop.live.protocol.requests import REQUESTS, read_request
-from evedrop.live.protocol.status import RunStatus
+from evedrop.live.protocol import telemetry as loop_wire
+from evedrop.live.protocol.commands import ProcessStatus, read_process_status
+from evedrop.live.protocol.requests import REQUESTS, RunStatus, read_request
 from evedrop.model.digest import Blocks
 from evedrop.model.entries import read
 from evedrop.model.flag_bits import packed_flags
@@ -142,10 +141,10 @@ def decode_over(raw: bytes) -> dict[str, Any]:
 
 def decode_envelope(key: str, raw: bytes) -> dict[str, Any]:
     """As a reader of that key, and as a reader of no other."""
-    assert envelope.payload_of(key + "n", raw) is None
-    payload = envelope.payload_of(key, raw)
+    assert codec.payload_of(key + "n", raw) is None
+    payload = codec.payload_of(key, raw)
     assert payload is not None
-    return {"key": envelope.named_in(raw), "message": {"k": wire.Reader(KEY, payload).integer("k")}}
+    return {"key": codec.named_in(raw), "message": {"k": wire.Reader(KEY, payload).integer("k")}}
 
 
 def decode_decided(shape: dict[str, Any], value: dict[str, Any], raw: bytes) -> dict[str, Any]:
@@ -360,7 +359,7 @@ CODECS: dict[str, tuple[Encode, Decode]] = {
         lambda _shape, _value, raw: decode_over(raw),
     ),
     "envelope": (
-        lambda _shape, value: envelope.enclosed(value["key"], wire.pack(value["message"])),
+        lambda _shape, value: codec.enclosed(value["key"], wire.pack(value["message"])),
         lambda _shape, value, raw: decode_envelope(value["key"], raw),
     ),
     "process-status": (

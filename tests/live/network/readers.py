@@ -9,12 +9,11 @@ import msgpack
 import numpy as np
 
 from evedrop.live.network import operator
-from evedrop.live.protocol import closed_loop as loop_wire
 from evedrop.live.protocol import codec as wire
-from evedrop.live.protocol import commands, packets, process_status, telemetry
+from evedrop.live.protocol import commands, packets, telemetry
+from evedrop.live.protocol import telemetry as loop_wire
 from evedrop.live.protocol.codec import Reader
-from evedrop.live.protocol.requests import StepRequest, read_request
-from evedrop.live.protocol.status import LinkStatus, RunStatus
+from evedrop.live.protocol.requests import LinkStatus, RunStatus, StepRequest, read_request
 from evedrop.model.digest import Blocks
 from evedrop.model.links.link import REASONS
 from evedrop.model.receiver import Belief, Reception
@@ -63,7 +62,7 @@ READERS: Mapping[str, tuple[str, Callable[[bytes], Any]]] = {
     "report": _on("telemetry/eve", lambda m: telemetry.read_report(m, K, EXTENT, BLOCKS, WINDOW)),
     "decisions": _on("telemetry/controller", lambda m: loop_wire.read_decisions(m, K, EXTENT, BLOCKS, PERIOD)),
     "journal": _on("journal", lambda m: telemetry.read_journal(m, K, {"legitimate": 0, "eve": WINDOW}, EXTENT)),
-    "process-status": _on("telemetry/eve", lambda m: process_status.read_process_status(m, SLOTS)),
+    "process-status": _on("telemetry/eve", lambda m: commands.read_process_status(m, SLOTS)),
     "refusal": _on("telemetry/eve", lambda m: wire.read_refusal(m, "eve")),
 }
 """What is read → the key it comes on, and its reader, of the bytes within the envelope. A reader gives values or raises
@@ -111,7 +110,7 @@ EXAMPLES: Mapping[str, bytes] = {
                                {0: np.ones(TRIALS)}).pack(),
     "decisions": loop_wire.Decisions(K, 4, np.ones(1), _digests).pack(),
     "journal": telemetry.Journal(K, 2, _accounts()).pack(),
-    "process-status": process_status.ProcessStatus(K, ("evedrop/r1/uplink",)).pack(),
+    "process-status": commands.ProcessStatus(K, ("evedrop/r1/uplink",)).pack(),
     "refusal": wire.refusal("evedrop/r1/downlink/eve", "no k"),
 }  # fmt: skip
 """A message that each reader takes, to begin with."""

@@ -21,8 +21,8 @@ import zenoh
 from evedrop.live.network.access import Grant, access_control, grants
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
+from evedrop.live.protocol.codec import enclosed
 from evedrop.live.protocol.commands import EndRun, Unknown
-from evedrop.live.protocol.envelope import enclosed
 from tests.conftest import LIMIT, wait_until
 from tests.live.network.bench import Bench, Ear, bench_of, connect, small_network
 

@@ -11,7 +11,7 @@ import zenoh
 from evedrop.cli.main import main
 from evedrop.live.network.control_file import Control, remove_control
 from evedrop.live.network.operator import Answer
-from evedrop.live.protocol.envelope import enclosed
+from evedrop.live.protocol.codec import enclosed
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.names import RECORDER
 from evedrop.system.ports import free_port

@@ -19,17 +19,15 @@ from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from evedrop.errors import BriefError, RunError, UsageError
-from evedrop.live.launch.authority import Authority
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.launch.ports import endpoints_at
-from evedrop.live.network.certificates import check_identity
+from evedrop.live.network.certificates import Authority, check_identity
 from evedrop.live.network.connecting import RouterAddress, connected
 from evedrop.live.network.control_file import Control, read_control
 from evedrop.live.network.session import client_config, router_address_of
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets
-from evedrop.live.protocol.brief import AnyBrief, read_brief
-from evedrop.live.protocol.brief_parts import Identity, RecorderPart
+from evedrop.live.protocol.brief import AnyBrief, Identity, RecorderPart, read_brief
 from evedrop.system.ports import free_port
 from tests.conftest import wait_until
 from tests.live.network.bench import Bench, Ear, bench_of, connect, small_network

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from evedrop.live.network.container_heartbeat import VARIABLE, HeartbeatFile
+from evedrop.live.network.connection import VARIABLE, HeartbeatFile
 from tests.conftest import wait_until
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from queue import SimpleQueue
 
-from evedrop.live.network.delayed_sender import DelayedSender
+from evedrop.live.network.router import DelayedSender
 
 
 def test_messages_go_out_when_they_are_due_and_in_order() -> None:

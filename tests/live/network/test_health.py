@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from evedrop.cli import main as cli
-from evedrop.live.network.health import is_there
+from evedrop.live.network.operator import is_there
 from tests.live.network.bench import Bench, bench_of, small_network
 
 EVE = "eve"
@@ -18,7 +18,7 @@ EVE = "eve"
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Who is not let in gives up soon."""
-    monkeypatch.setattr("evedrop.live.network.health._CONNECT_SECONDS", 0.3)
+    monkeypatch.setattr("evedrop.live.network.operator._CONNECT_SECONDS", 0.3)
 
 
 @pytest.mark.usefixtures("impatient")

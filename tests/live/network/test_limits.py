@@ -10,14 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evedrop.errors import MalformedMessage
-from evedrop.live.network.mailbox import Mailbox, allowance
-from evedrop.live.protocol import closed_loop as loop_wire
+from evedrop.live.network.process_session import Mailbox, allowance
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
-from evedrop.live.protocol.commands import Again
-from evedrop.live.protocol.envelope import head_of
-from evedrop.live.protocol.message_limits import Sizes
-from evedrop.live.protocol.process_status import ProcessStatus
+from evedrop.live.protocol import telemetry as loop_wire
+from evedrop.live.protocol.codec import head_of
+from evedrop.live.protocol.commands import Again, ProcessStatus
+from evedrop.live.protocol.keys import Sizes
 from evedrop.model.digest import BLOCK_SLOTS
 from evedrop.model.links.link import REASONS
 from evedrop.model.receiver import Belief, Reception

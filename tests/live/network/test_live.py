@@ -22,8 +22,8 @@ from evedrop import montecarlo
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets
 from evedrop.live.protocol.brief import AnyBrief, read_brief
+from evedrop.live.protocol.codec import enclosed
 from evedrop.live.protocol.commands import EndRun
-from evedrop.live.protocol.envelope import enclosed
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.model.streams import stream_key
 from evedrop.names import RECORDER

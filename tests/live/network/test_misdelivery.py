@@ -15,15 +15,14 @@ import zenoh
 
 from evedrop.errors import MalformedMessage
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
+from evedrop.live.network.access import users_file
+from evedrop.live.network.connection import Question, SubscriptionClosedError
 from evedrop.live.network.control_file import Control
-from evedrop.live.network.declared import Question, SubscriptionClosedError
 from evedrop.live.network.operator import Answer, ask
-from evedrop.live.network.router_users import users_file
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import AnyBrief
-from evedrop.live.protocol.codec import Reader, progress
+from evedrop.live.protocol.codec import Reader, enclosed, head_of, named_in, progress
 from evedrop.live.protocol.commands import EndRun, Start
-from evedrop.live.protocol.envelope import enclosed, head_of, named_in
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.requests import StatusRequest
 from evedrop.system.ports import free_port

@@ -15,9 +15,8 @@ import zenoh
 
 from evedrop.live.network.control_file import Control
 from evedrop.live.network.operator import Answer, ask
-from evedrop.live.protocol.brief import AnyBrief
-from evedrop.live.protocol.brief_parts import RecorderPart
-from evedrop.live.protocol.envelope import enclosed, payload_of
+from evedrop.live.protocol.brief import AnyBrief, RecorderPart
+from evedrop.live.protocol.codec import enclosed, payload_of
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.live.protocol.requests import PauseRequest, StatusRequest, StepRequest
 from tests.builders import part_of

@@ -11,8 +11,7 @@ import pytest
 
 from evedrop.errors import MalformedMessage
 from evedrop.live.network.access import grants
-from evedrop.live.protocol.brief import read_brief
-from evedrop.live.protocol.brief_closed_loop import Wiring
+from evedrop.live.protocol.brief import Wiring, read_brief
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.model.digest import BlockDigests, RunDigest
 from evedrop.model.kernels.elementary import normal_quantile

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evedrop.errors import Gap
-from evedrop.live.network.resending import GapDetector, ReplayBuffer
+from evedrop.live.network.process_session import GapDetector, ReplayBuffer
 from evedrop.live.protocol.codec import Reader
 from tests.clock import TestClock
 

@@ -22,8 +22,7 @@ from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.network.router import RouterLoop
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets, telemetry
-from evedrop.live.protocol.brief import Brief, Flow
-from evedrop.live.protocol.brief_parts import RouterPart
+from evedrop.live.protocol.brief import Brief, Flow, RouterPart
 from evedrop.live.protocol.commands import EndRun
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.model.process import Floats

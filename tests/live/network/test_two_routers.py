@@ -15,14 +15,13 @@ import zenoh
 from evedrop.errors import UsageError
 from evedrop.live.launch.ports import endpoints_at, loopback_endpoints
 from evedrop.live.network.access import Grant, access_control, at_relay, at_router, grants
-from evedrop.live.network.health import is_there
+from evedrop.live.network.operator import is_there
 from evedrop.live.network.session import client_config
 from evedrop.live.protocol import codec as wire
 from evedrop.live.protocol import packets
-from evedrop.live.protocol.brief import AnyBrief
-from evedrop.live.protocol.brief_parts import RelayPart, RouterPart
+from evedrop.live.protocol.brief import AnyBrief, RelayPart, RouterPart
+from evedrop.live.protocol.codec import enclosed
 from evedrop.live.protocol.commands import EndRun, Unknown
-from evedrop.live.protocol.envelope import enclosed
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.names import RELAY
 from tests.builders import part_of
@@ -119,7 +118,7 @@ def test_each_router_is_asked_for_itself(stage: Bench, monkeypatch: pytest.Monke
     """Each answers for itself with its own credentials, and the relay for those at its site."""
     assert is_there(stage.briefs["router"])
     assert is_there(stage.briefs["relay"])
-    monkeypatch.setattr("evedrop.live.network.health._CONNECT_SECONDS", 0.3)
+    monkeypatch.setattr("evedrop.live.network.operator._CONNECT_SECONDS", 0.3)
     assert not is_there(replace(stage.briefs["relay"], password="of another run"))  # noqa: S106 - that is the point
 
 

@@ -8,11 +8,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-from evedrop.live.network.router_users import users_file
+from evedrop.live.network.access import users_file
 
 KILLED = """
 import os, signal
-from evedrop.live.network.router_users import users_file
+from evedrop.live.network.access import users_file
 with users_file({"legitimate": "secret"}) as users:
     print(users.read_text(), flush=True)
     os.kill(os.getpid(), signal.SIGKILL)

@@ -8,8 +8,7 @@ from typing import Any
 
 from evedrop.errors import BriefError
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
-from evedrop.live.protocol.brief import AnyBrief, Brief, Flow, Model, read_brief
-from evedrop.live.protocol.brief_parts import EavesdropperPart
+from evedrop.live.protocol.brief import AnyBrief, Brief, EavesdropperPart, Flow, Model, read_brief
 from evedrop.live.protocol.brief_use import expect_usable
 from evedrop.scenario.loading import load
 from evedrop.scenario.tables import Scenario

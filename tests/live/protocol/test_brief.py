@@ -15,8 +15,7 @@ import pytest
 from evedrop.errors import BriefError
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.launch.ports import endpoints_at
-from evedrop.live.protocol.brief import has_part, read_brief
-from evedrop.live.protocol.brief_parts import EavesdropperPart, RecorderPart, RouterPart, SensorPart
+from evedrop.live.protocol.brief import EavesdropperPart, RecorderPart, RouterPart, SensorPart, has_part, read_brief
 from evedrop.scenario.stream_keys import StreamKeys
 from tests.conftest import Evedrop
 from tests.examples import mostly_long

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from evedrop.errors import MalformedMessage
-from evedrop.live.protocol.keys import RunKeys, reader_of, writer_of
-from evedrop.live.protocol.message_limits import low_pass
+from evedrop.live.protocol.keys import RunKeys, low_pass, reader_of, writer_of
 from tests.live.network.readers import EXAMPLES, READERS, TRIALS, fields_of
 from tests.live.protocol.made_briefs import BRIEFS, refusal
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgpack
 import pytest
 
-from evedrop.live.protocol.envelope import Dropped, enclosed, head_of, named_in, payload_of
+from evedrop.live.protocol.codec import Dropped, enclosed, head_of, named_in, payload_of
 
 KEY, OTHER = "evedrop/r1/downlink/eve", "evedrop/r1/control/eve"
 

@@ -12,8 +12,16 @@ from hypothesis import strategies as st
 
 from evedrop.errors import Gap, MalformedMessage
 from evedrop.live.protocol.codec import Reader, pack
-from evedrop.live.protocol.packet_blocks import read_deliveries, read_uplinks
-from evedrop.live.protocol.packets import delivery, packed_header, read_delivery, read_extras, read_uplink, uplink
+from evedrop.live.protocol.packets import (
+    delivery,
+    packed_header,
+    read_deliveries,
+    read_delivery,
+    read_extras,
+    read_uplink,
+    read_uplinks,
+    uplink,
+)
 from evedrop.model.flag_bits import packed_flags
 from evedrop.model.receiver import Reception
 from evedrop.model.slot.transit import Late

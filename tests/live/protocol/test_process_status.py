@@ -8,7 +8,7 @@ import pytest
 
 from evedrop.errors import MalformedMessage
 from evedrop.live.protocol.codec import Reader
-from evedrop.live.protocol.process_status import ProcessStatus, StatusReporter, is_process_status, read_process_status
+from evedrop.live.protocol.commands import ProcessStatus, StatusReporter, is_process_status, read_process_status
 
 KEY = "evedrop/r1/telemetry/eve"
 

@@ -12,9 +12,7 @@ import numpy as np
 import pytest
 
 from evedrop.errors import BriefError
-from evedrop.live.protocol.brief import AnyBrief, read_brief
-from evedrop.live.protocol.brief_closed_loop import decoded, encoded
-from evedrop.live.protocol.brief_parts import ProgramEntry, SensorPart
+from evedrop.live.protocol.brief import AnyBrief, ProgramEntry, SensorPart, decoded, encoded, read_brief
 from evedrop.live.protocol.brief_use import expect_usable
 from evedrop.live.protocol.state_message import MOST_BYTES, read_state
 from evedrop.scenario.loading import checked

@@ -10,8 +10,7 @@ import pytest
 from evedrop.errors import MalformedMessage
 from evedrop.live.network.operator import Answer, read_answer
 from evedrop.live.protocol.codec import pack
-from evedrop.live.protocol.status import LinkStatus, RunStatus, status_of_shards
-from evedrop.live.protocol.wire_status import WireLinkStatus, WireStatus
+from evedrop.live.protocol.requests import LinkStatus, RunStatus, WireLinkStatus, WireStatus, status_of_shards
 from evedrop.scenario.progress_events import RunEvent
 
 KEY = "evedrop/r1/control/recorder"

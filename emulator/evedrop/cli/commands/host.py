@@ -9,7 +9,7 @@ from evedrop.cli.command import Command
 
 def host(options: argparse.Namespace) -> int:
     """Start processes of a run for a launcher on another host."""
-    from evedrop.live.launch.host_program import serve_launcher
+    from evedrop.live.launch.other_hosts import serve_launcher
 
     del options
     serve_launcher()

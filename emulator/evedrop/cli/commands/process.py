@@ -19,8 +19,7 @@ from evedrop.cli.options import argument, changes_of, entries, loaded, scenario,
 from evedrop.errors import BriefError, EvedropError, UsageError
 
 if TYPE_CHECKING:
-    from evedrop.live.protocol.brief import AnyBrief, Brief
-    from evedrop.live.protocol.brief_parts import RecorderPart
+    from evedrop.live.protocol.brief import AnyBrief, Brief, RecorderPart
 
 
 _BY_HAND = ("results", "listen", "connect", "relay", "relay_connect", "wait", "insecure", "paused")
@@ -74,8 +73,7 @@ def _compose(options: argparse.Namespace) -> int:
 
 def process(options: argparse.Namespace) -> int:
     """Run one process of a run."""
-    from evedrop.live.protocol.brief import read_brief
-    from evedrop.live.protocol.brief_parts import ImportingPart, RecorderPart, RoutingPart
+    from evedrop.live.protocol.brief import ImportingPart, RecorderPart, RoutingPart, read_brief
     from evedrop.scenario.plugins import look_in
     from evedrop.system.processes import continue_when_parent_dies
 
@@ -110,8 +108,7 @@ def process(options: argparse.Namespace) -> int:
 
 def _play(brief: AnyBrief, serve: str | None) -> int:
     """Run the process of a brief; returns its exit status. serve: where a recorder shows the run to browsers."""
-    from evedrop.live.protocol.brief import has_part
-    from evedrop.live.protocol.brief_parts import RecorderPart
+    from evedrop.live.protocol.brief import RecorderPart, has_part
     from evedrop.live.protocol.brief_use import classes_known, expect_usable
 
     if brief.identity is not None:
@@ -133,7 +130,7 @@ def _play(brief: AnyBrief, serve: str | None) -> int:
 
 def _listens(brief: AnyBrief) -> bool:
     """Whether strangers may connect to the process: to a router, or a sensor that takes states from programs."""
-    from evedrop.live.protocol.brief_parts import RoutingPart, SensorPart
+    from evedrop.live.protocol.brief import RoutingPart, SensorPart
 
     part = brief.part
     program = part.program if isinstance(part, SensorPart) else None
@@ -142,7 +139,7 @@ def _listens(brief: AnyBrief) -> bool:
 
 def _take_part(brief: AnyBrief) -> None:
     """Run the process of a brief that is not the recorder's."""
-    from evedrop.live.protocol import brief_parts as parts
+    from evedrop.live.protocol import brief as parts
     from evedrop.live.protocol.brief import has_part
 
     if has_part(brief, parts.RouterPart):
@@ -195,7 +192,7 @@ def _report(folder: Path, status: int, how: str) -> None:
 
 def health(options: argparse.Namespace) -> int:
     """Print whether the process of a brief is on the network."""
-    from evedrop.live.network.health import is_there
+    from evedrop.live.network.operator import is_there
     from evedrop.live.protocol.brief import read_brief
 
     brief = read_brief(options.brief)

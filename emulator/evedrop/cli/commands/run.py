@@ -32,7 +32,7 @@ def demo(options: argparse.Namespace) -> int:
 
 def run(options: argparse.Namespace) -> int:
     """Run a scenario live."""
-    from evedrop.live.launch.preloading import process_starter
+    from evedrop.live.launch.starter import process_starter
 
     with process_starter():  # the servers make their imports while the scenario is read
         ended = _run(options)

@@ -79,8 +79,7 @@ def step(options: argparse.Namespace) -> int:
 def status(options: argparse.Namespace) -> int:
     """Print the run's status."""
     from evedrop.live.network.control_file import read_controls
-    from evedrop.live.protocol.requests import StatusRequest
-    from evedrop.live.protocol.status import RunStatus, status_of_shards
+    from evedrop.live.protocol.requests import RunStatus, StatusRequest, status_of_shards
 
     answers = [
         _answer(options.run, control, StatusRequest(), "status", _PATIENCE).status

@@ -1,4 +1,9 @@
-"""Makes the briefs of a scenario's processes: the knowledge and the keys of each process."""
+"""Makes the briefs of a scenario's processes: the knowledge and the keys of each process.
+
+In a closed loop, that includes the knowledge of each process about plant, inputs and disturbances.
+
+Source: docs/protocol.md, the brief.
+"""
 
 from __future__ import annotations
 
@@ -6,32 +11,42 @@ import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 from evedrop.errors import NoAnswer, UsageError
-from evedrop.live.launch.closed_loop_briefs import LoopBriefs
 from evedrop.live.launch.ports import RouterEndpoints, Routers, endpoints_at, identities_of
-from evedrop.live.protocol.brief import AnyBrief, Brief, Flow, Model
-from evedrop.live.protocol.brief_closed_loop import encoded
-from evedrop.live.protocol.brief_parts import (
+from evedrop.live.protocol.brief import (
+    AnyBrief,
+    AssignmentEntry,
+    Brief,
+    ControllerPart,
     EavesdropperPart,
+    EstimatorLoopPart,
+    Flow,
     LegitimatePart,
     LinkEntry,
+    Model,
+    MonitorEntry,
     Part,
+    PlantEntry,
     ProgramEntry,
     RecorderPart,
     RelayPart,
     RouterPart,
+    SensorLoopPart,
     SensorPart,
+    SensorPlantEntry,
+    Wiring,
+    encoded,
 )
-from evedrop.live.protocol.message_limits import Sizes
+from evedrop.live.protocol.keys import Sizes
 from evedrop.model.eavesdroppers import REMOTE_CALLS, STRATEGIES
 from evedrop.model.schemes import scheme_of
 from evedrop.model.slot.account import COUNTED_BURSTS
 from evedrop.names import ACKNOWLEDGEMENTS, CONTROLLER, LEGITIMATE, OPERATOR, RECORDER, RELAY, ROUTER, SENSOR
 from evedrop.results.folder import new_folder
 from evedrop.scenario.controlled import monitor_of
-from evedrop.scenario.input_files import states_of
+from evedrop.scenario.input_files import disturbances_of, states_of
 from evedrop.scenario.plugins import named_in
 from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.stream_keys import StreamKeys
@@ -292,3 +307,49 @@ def write_briefs(
         return [brief.write(folder) for brief in made.values()]
     except OSError as error:
         raise UsageError(f"{folder} cannot be written ({error.strerror}); give another --out") from error
+
+
+@final
+class LoopBriefs:
+    """A closed loop's parts of a scenario's briefs; each is None if the scenario lacks the plant or controller for it."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._scenario = scenario
+        self._disturbances = encoded(disturbances_of(scenario))
+        table, driven = scenario.controller, scenario.driven
+        self.wiring = None if table is None else Wiring(table.acts_on, scenario.legitimate.knows_input)
+        """The controller's connections, for the router."""
+        self.of_sensor = None if table is None else SensorLoopPart(table.period, table.acts_on)
+        """For the sensor: the slots in which it waits for inputs, and whether it sends the state to the controller."""
+        self.plant = None if driven is None else SensorPlantEntry.of(driven, disturbances=self._disturbances)
+        """The plant with its disturbances, for the sensor."""
+        plan = monitor_of(scenario)
+        self.monitor = None if plan is None else MonitorEntry.of(plan)
+        """Watermark, detector and attack, for the sensor."""
+
+    def sensor_keys(self, keys: StreamKeys) -> dict[str, bytes]:
+        """Stream → key, for the sensor's own streams, without those of the secret."""
+        driven = self._scenario.driven
+        measures = driven is not None and driven.output_matrix is not None
+        monitors = {} if self.monitor is None else {"watermark": keys.watermark, "spoofing": keys.spoofing}
+        return {"process": keys.process, **({"measurement": keys.measurement} if measures else {}), **monitors}
+
+    @property
+    def of_legitimate(self) -> EstimatorLoopPart | None:
+        """For the legitimate estimator: when it sends its estimate, and the plant if it knows the inputs; None if neither."""
+        wiring, loop, driven = self.wiring, self.of_sensor, self._scenario.driven
+        if wiring is None or loop is None or (wiring.on_truth and not wiring.knows_input):
+            return None
+        plant = PlantEntry.of(driven) if wiring.knows_input and driven is not None else None
+        return EstimatorLoopPart(loop.period, loop.acts_on, plant)
+
+    @property
+    def of_controller(self) -> ControllerPart | None:
+        """The controller's part: its strategy, assignment, plant and disturbances."""
+        scenario = self._scenario
+        assignment, table, driven = scenario.assignment, scenario.controller, scenario.driven
+        if assignment is None or table is None or driven is None:
+            return None
+        return ControllerPart(
+            table.strategy, AssignmentEntry.of(assignment), table.acts_on, PlantEntry.of(driven), self._disturbances
+        )

@@ -23,8 +23,7 @@ from evedrop.live.launch.starter import (
     end_all,
     start_process,
 )
-from evedrop.live.protocol.brief import AnyBrief
-from evedrop.live.protocol.brief_parts import ReceiverPart, RoutingPart
+from evedrop.live.protocol.brief import AnyBrief, ReceiverPart, RoutingPart
 from evedrop.live.protocol.last_word import Cause, LastWord, last_word_file, read_last_word
 from evedrop.live.protocol.launcher_events import (
     Alive,

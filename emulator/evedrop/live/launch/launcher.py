@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 from evedrop.errors import UsageError
 from evedrop.live.launch.ports import loopback_endpoints, warn_if_exposed
-from evedrop.live.launch.preloading import process_starter
 from evedrop.live.launch.process_set import FinishedRun, launch_one
+from evedrop.live.launch.starter import process_starter
 from evedrop.scenario.progress_events import OnEvent
 from evedrop.scenario.tables import Scenario
 from evedrop.show.view.viewer import choose
@@ -87,7 +87,7 @@ def _on_hosts(
     paused: bool,
 ) -> FinishedRun:
     """Run a scenario as `launch` does, with processes on other hosts."""
-    from evedrop.live.launch.ssh_starter import ssh_starter  # noqa: PLC0415 - not needed on one machine
+    from evedrop.live.launch.other_hosts import ssh_starter  # noqa: PLC0415 - not needed on one machine
 
     if scenario.shards > 1:
         raise UsageError(

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from evedrop.errors import UsageError
 from evedrop.live.network.endpoint import AnyEndpoint, Endpoint, SocketEndpoint
-from evedrop.live.protocol.brief_parts import Identity
+from evedrop.live.protocol.brief import Identity
 from evedrop.names import RELAY, ROUTER, SENSOR
 from evedrop.system.output import warn
 from evedrop.system.ports import free_port
@@ -217,7 +217,7 @@ def identities_of(run: str, endpoints: RouterEndpoints, users: tuple[str, ...]) 
     """Process name, or operator → its certificate; empty if the router listens without TLS."""
     if not endpoints.router.secure:
         return {}
-    from evedrop.live.launch.authority import Authority  # noqa: PLC0415 - saves most runs 50 ms
+    from evedrop.live.network.certificates import Authority  # noqa: PLC0415 - saves most runs 50 ms
 
     authority = Authority(run)
     return {

@@ -1,19 +1,36 @@
-"""Starts the process of a brief; tests pass a starter that starts none."""
+"""Starts the processes of a run: each by an interpreter of its own, or all by fork servers.
+
+A fork server is a bare process that has already imported the modules (`evedrop.fork_server`). Tests pass a starter that starts
+none.
+
+Source: docs/architecture.md, why it is built this way.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import json
+import os
+import select
 import signal
+import socket
 import subprocess
 import sys
 import threading
+import time
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Protocol
+from queue import Empty, SimpleQueue
+from typing import IO, Protocol, final
 
+from evedrop.errors import Interrupted
 from evedrop.names import RECORDER, RELAY, ROUTER
-from evedrop.system.processes import kill, wait_for
+from evedrop.system.environment import SINGLE_THREADED, own_environment
+from evedrop.system.processes import KILLED_SECONDS, KillableProcess, kill, wait_for
 from evedrop.system.signals import SHOW_STACKS, held_back
 
 TELLING = frozenset({RECORDER, ROUTER, RELAY})
@@ -142,3 +159,332 @@ def end_all(processes: Collection[StartedProcess]) -> None:
     for process in processes:
         if process.stdin is not None:
             process.stdin.close()
+
+
+_MOST_BYTES = 4096
+_POLL_SECONDS = 0.25
+_REPORT_SECONDS = 5.0
+"""For a fork server to report the end of a process: a suspended one never does. Only the launcher's own time counts."""
+_START_SECONDS = 120.0
+"""For a fork server to make its imports and start a process."""
+_GONE = (errno.ESRCH, "its fork server has ended")
+_SILENT = (errno.ETIMEDOUT, f"its fork server did not respond within {_START_SECONDS:.0f} s")
+_EVERY_ROLE = (
+    "evedrop.cli.commands.process",
+    "evedrop.cli.main",
+    "evedrop.live.protocol.brief_use",
+    "evedrop.scenario.plugins",
+    "evedrop.system.signals",
+)
+OF_OTHERS = (*_EVERY_ROLE, "evedrop.peers.eavesdropper", "evedrop.peers.legitimate")
+"""What the processes of most roles import; not the modules of sensor and router, which have no place in an eavesdropper."""
+OF_RECORDERS = ("evedrop.live.recorder.recorder",)
+"""What a recorder imports in addition."""
+OF_SUMMARIES = ("scipy.special",)
+"""What it imports once it makes a summary, which takes an eighth of a second."""
+
+
+@final
+class Fork(ReportedProcess):
+    """A process that a fork server has started, and whose end it reports."""
+
+    def __init__(self, pid: int, handle: int) -> None:
+        """handle: a file descriptor that refers to the process; once it has ended, its id may be another process's."""
+        super().__init__(pid)
+        self._handle: int | None = handle
+
+    def _close(self) -> None:
+        if self._handle is not None:
+            os.close(self._handle)
+        self._handle = None
+
+    @property
+    def over(self) -> bool:
+        """Whether it has ended, reported or not: the system says so."""
+        with self._lock:
+            if self._handle is None:
+                return True
+            system = select.poll()
+            system.register(self._handle, select.POLLIN)
+            return bool(system.poll(0))
+
+    def send_signal(self, sig: int) -> None:
+        """Send a signal to it, if it still runs."""
+        with self._lock, suppress(ProcessLookupError):
+            if self._handle is not None:
+                signal.pidfd_send_signal(self._handle, sig)
+
+
+def start_servers(channels: Sequence[socket.socket], modules: Sequence[Sequence[str]]) -> KillableProcess:
+    """Start the first of some fork servers, each of which takes requests from its end of a channel. Raises OSError.
+
+    modules: what each imports in addition to those before it. Each server after the first is forked from the one before.
+    """
+    words = [[str(channel.fileno()), *names] for channel, names in zip(channels, modules, strict=True)]
+    with held_back():
+        return subprocess.Popen(
+            [sys.executable, "-P", "-m", "evedrop.fork_server", json.dumps(words)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+            env={**own_environment(), **SINGLE_THREADED},
+            pass_fds=[channel.fileno() for channel in channels],
+        )
+
+
+@final
+class ForkServer:
+    """The launcher's side of a fork server for some roles: starts processes, and learns how they end.
+
+    A server that does not report the end of a process is given up: its processes are killed.
+
+    channel: whose other end the server has.
+    """
+
+    def __init__(self, channel: socket.socket) -> None:
+        channel.settimeout(_POLL_SECONDS)
+        self._channel = channel
+        self._forks: dict[int, Fork] = {}
+        self._asking = threading.Lock()
+        self._begun: SimpleQueue[Fork | OSError] = SimpleQueue()
+        """The process that was asked for, or why it could not be started."""
+        self._follower = threading.Thread(target=self._follow, name="fork server", daemon=True)
+        self._follower.start()
+
+    @property
+    def alive(self) -> bool:
+        """Whether it can still start processes."""
+        return self._follower.is_alive()
+
+    def close(self) -> None:
+        """End the fork server, as soon as it has made its imports; its forks have ended before."""
+        self._give_up()
+        self._follower.join(KILLED_SECONDS)  # it reads the end of the channel at once
+        self._channel.close()
+
+    def _give_up(self) -> None:
+        """Close the channel: the server ends, if it is not suspended, and `_follow` ends its processes."""
+        with suppress(OSError):  # it is closed
+            self._channel.shutdown(socket.SHUT_RDWR)
+
+    def start(
+        self,
+        role: str,
+        brief: Path,
+        log: IO[bytes],
+        environment: Mapping[str, str],
+        stop: threading.Event | None = None,
+    ) -> StartedProcess:
+        """Start `evedrop ROLE BRIEF`, whose files only this user may read. Raises OSError, Interrupted once `stop` is set."""
+        read_stdin, write_stdin = os.pipe()
+        read_stdout, write_stdout = os.pipe() if role in TELLING else (None, None)
+        stdin = os.fdopen(write_stdin, "wb")
+        stdout = None if read_stdout is None else os.fdopen(read_stdout, "rb")
+        files = (read_stdin, log.fileno() if write_stdout is None else write_stdout, log.fileno())
+        try:
+            process = self.fork([role, str(brief)], files, environment, _folder(), 0o077, stop)
+        except BaseException:
+            stdin.close()
+            if stdout is not None:
+                stdout.close()
+            raise
+        finally:
+            os.close(read_stdin)
+            if write_stdout is not None:
+                os.close(write_stdout)
+        process.stdin, process.stdout = stdin, stdout
+        return process
+
+    def fork(
+        self,
+        words: Sequence[str],
+        files: tuple[int, int, int],
+        environment: Mapping[str, str],
+        folder: str | None,
+        umask: int,
+        stop: threading.Event | None = None,
+    ) -> Fork:
+        """Run `evedrop WORDS` in a fork of the server, with these standard files, in this folder.
+
+        Raises OSError if that is impossible or takes `_START_SECONDS`, Interrupted if `stop` is set before the process runs.
+        """
+        request = {"words": [*words], "environment": dict(environment), "folder": folder, "umask": umask}
+        with self._asking:
+            try:
+                socket.send_fds(self._channel, [json.dumps(request).encode()], files)
+            except (ConnectionError, TimeoutError):
+                raise OSError(*_GONE) from None
+            begun = self._answer(stop)
+        if isinstance(begun, OSError):
+            raise begun
+        return begun
+
+    def _answer(self, stop: threading.Event | None) -> Fork | OSError:
+        """The answer to a request. A server that does not answer in time is given up, for a late answer would confuse."""
+        deadline = time.monotonic() + _START_SECONDS
+        while time.monotonic() < deadline:
+            with suppress(Empty):
+                return self._begun.get(timeout=_POLL_SECONDS)
+            if stop is not None and stop.is_set():
+                self._give_up()
+                raise Interrupted
+        self._give_up()
+        return OSError(*_SILENT)
+
+    def _follow(self) -> None:
+        """Read the reports of the fork server until it ends or is given up, and end the processes that it leaves behind."""
+        try:
+            while (report := self._next_report()) is not None:
+                self._take(*report)
+        finally:
+            for fork in self._forks.values():
+                fork.kill()
+                fork.ended(FORK_SERVER_LOST)
+            self._begun.put(OSError(*_GONE))
+
+    def _next_report(self) -> tuple[dict[str, int], list[int]] | None:
+        """The server's next report, and the files that came with it; None if it has ended, or hangs."""
+        unreported = 0.0
+        while unreported < _REPORT_SECONDS:
+            try:
+                report, handles, _, _ = socket.recv_fds(self._channel, _MOST_BYTES, 1)
+            except TimeoutError:
+                # Not by the clock: this process may have been suspended, too.
+                unreported = unreported + _POLL_SECONDS if any(fork.over for fork in self._forks.values()) else 0.0
+            except OSError:
+                return None
+            else:
+                return (json.loads(report), handles) if report else None
+        return None
+
+    def _take(self, report: dict[str, int], handles: list[int]) -> None:
+        if "error" in report:
+            self._begun.put(OSError(report["error"], os.strerror(report["error"])))
+        elif "status" in report:
+            self._forks.pop(report["pid"]).ended(report["status"])
+        else:
+            fork = self._forks[report["pid"]] = Fork(report["pid"], *handles)
+            self._begun.put(fork)
+
+
+@contextmanager
+def fork_servers(*modules: Sequence[str]) -> Iterator[tuple[ForkServer, ...]]:
+    """Fork servers, each of which imports these modules and those of the servers before it. Raises OSError."""
+    with ExitStack() as stack:
+        pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in modules]
+        for ours, _ in pairs:  # also if no process, or no thread, can be started
+            stack.callback(ours.close)
+        with ExitStack() as theirs:
+            for _, end in pairs:
+                theirs.enter_context(end)
+            process = start_servers([end for _, end in pairs], modules)
+        stack.callback(kill, process)  # it may be in the middle of its imports, or suspended
+        servers = tuple(ForkServer(ours) for ours, _ in pairs)
+        for server in servers:
+            stack.callback(server.close)
+        yield servers
+
+
+@final
+class PreloadedStarter:
+    """Starts a recorder from the last of some fork servers, and all others, which need fewer modules, from the first.
+
+    stop: once it is set, no fork server is waited for.
+    """
+
+    def __init__(self, servers: Sequence[ForkServer], stop: threading.Event | None = None) -> None:
+        self._servers, self._stop = servers, stop
+
+    def until(self, stop: threading.Event) -> PreloadedStarter:
+        """The same for a run that ends once this is set."""
+        return PreloadedStarter(self._servers, stop)
+
+    def __call__(self, role: str, brief: Path, log: IO[bytes], environment: Mapping[str, str]) -> StartedProcess:
+        """Start `evedrop ROLE BRIEF`. Raises OSError, and Interrupted if it is stopped before."""
+        server = self._servers[-1 if role == RECORDER else 0]
+        return server.start(role, brief, log, environment, self._stop)
+
+
+@final
+@dataclass(frozen=True)
+class _Kept:
+    """The fork servers of a `preloaded` block, and the environment in which their interpreters were started."""
+
+    servers: tuple[ForkServer, ...]
+    starter: Starter
+    environment: Mapping[str, str]
+
+    @property
+    def usable(self) -> bool:
+        """Whether the servers live, and interpreters that were started now would be no different."""
+        return all(server.alive for server in self.servers) and self.environment == _inherited()
+
+
+_kept: list[_Kept] = []
+"""What is kept for the `preloaded` blocks that this process is in."""
+
+
+@contextmanager
+def process_starter(stop: threading.Event | None = None) -> Iterator[Starter]:
+    """The fastest way to start processes on this system, until the block ends. Raises OSError.
+
+    stop: once it is set, the starter waits for nothing, and raises Interrupted. Outside a `preloaded` block, a summary's own
+    imports are not made in advance, so that one run starts as early as it can.
+    """
+    with ExitStack() as stack:
+        usable = bool(_kept) and _kept[-1].usable
+        starter = _kept[-1].starter if usable else stack.enter_context(_kept_servers(OF_OTHERS, OF_RECORDERS))
+        if stop is not None and isinstance(starter, PreloadedStarter):
+            starter = starter.until(stop)
+        yield starter
+
+
+@contextmanager
+def preloaded() -> Iterator[Starter]:
+    """Make the imports of live runs once for all runs in the block, which then start and end faster.
+
+    Two more processes wait meanwhile. Raises OSError if they cannot be started.
+
+    >>> with preloaded():                                                               # doctest: +SKIP
+    ...     found = [run("eavesdroppers", slots=1000, seed=seed) for seed in range(10)]
+    """
+    with _kept_servers(OF_OTHERS, (*OF_RECORDERS, *OF_SUMMARIES)) as starter:
+        yield starter
+
+
+@contextmanager
+def preloaded_without_recorder() -> Iterator[Starter]:
+    """The same on a host that carries only other processes of a run: the imports of a recorder are not made. Raises OSError."""
+    with _kept_servers(OF_OTHERS) as starter:
+        yield starter
+
+
+@contextmanager
+def _kept_servers(*modules: Sequence[str]) -> Iterator[Starter]:
+    """Fork servers that import these modules, for all runs in the block. Raises OSError."""
+    try:
+        os.close(os.pidfd_open(os.getpid()))
+    except (AttributeError, OSError):  # not Linux, or a sandbox that forbids it
+        yield start_process
+        return
+    with fork_servers(*modules) as servers:
+        starter = PreloadedStarter(servers)
+        kept = _Kept(servers, starter, _inherited())
+        _kept.append(kept)
+        try:
+            yield starter
+        finally:
+            _kept.remove(kept)
+
+
+def _inherited() -> dict[str, str]:
+    """What a server's interpreter may have read from the environment; where temporary files are, a fork asks for itself."""
+    return {name: value for name, value in own_environment().items() if name not in {"TMPDIR", "TEMP", "TMP"}}
+
+
+def _folder() -> str | None:
+    """The current folder; None if it has been removed."""
+    with suppress(OSError):
+        return os.getcwd()
+    return None

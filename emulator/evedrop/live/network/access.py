@@ -1,6 +1,7 @@
 """The keys that each process may use: one table, from which the router's access control is made. All else is denied.
 
-Readers name every key they read: exact rules do not cover a wildcard subscription, so it receives nothing.
+Readers name every key they read: exact rules do not cover a wildcard subscription, so it receives nothing. Router and relay write
+the passwords of the users they let in, and leave after those users.
 
 With two linked routers, the table also says which process connects to which, and which keys cross between them:
 
@@ -13,10 +14,14 @@ Source: docs/protocol.md, keys and two routers.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
-from evedrop.live.protocol.brief_closed_loop import Wiring
+from evedrop.live.protocol.brief import Wiring
 from evedrop.live.protocol.keys import RunKeys, ZenohConfig
 from evedrop.names import CONTROLLER, LEGITIMATE, OPERATOR, RECORDER, RELAY, ROUTER, SENSOR
 
@@ -200,3 +205,29 @@ def _crossing(table: list[Grant]) -> tuple[tuple[str, ...], tuple[str, ...]]:
         if writers & _NEAR and readers - _NEAR:
             from_router.append(key)
     return tuple(to_router), tuple(from_router)
+
+
+_FAREWELL_SECONDS = 10.0
+
+
+@contextmanager
+def users_file(users: Mapping[str, str]) -> Iterator[Path]:
+    """The file of users and passwords that Zenoh reads once, when the session opens.
+
+    It has no name in any folder, so nothing of it is left however the process ends: the path is that of an open file.
+    """
+    with tempfile.TemporaryFile("w", encoding="utf-8") as file:
+        file.writelines(f"{user}:{password}\n" for user, password in users.items())
+        file.flush()
+        file.seek(0)  # where a path of an open file shares its position
+        yield Path(f"/dev/fd/{file.fileno()}")
+
+
+def until_all_left(present: Mapping[str, bool], linked: Callable[[], bool] = lambda: False) -> None:
+    """Wait until no process is present and no other router is linked, for a few seconds at most.
+
+    Two routers that close their link at the same time fail in Zenoh 1.10, so one must leave first.
+    """
+    deadline = time.monotonic() + _FAREWELL_SECONDS
+    while (any(present.values()) or linked()) and time.monotonic() < deadline:
+        time.sleep(0.005)

@@ -1,6 +1,9 @@
-"""Connecting to the router: a process waits for a router that is not there yet, but reports lasting errors at once.
+"""Opening a Zenoh session: with the router of a run, as such a router, which listens where the brief says, or otherwise.
 
-Zenoh alone cannot tell these apart: for any error it only reports, after its time limit, that it could not connect.
+A process waits for a router that is not there yet, but reports lasting errors at once. Zenoh alone cannot tell these apart: for
+any error it only reports, after its time limit, that it could not connect. Zenoh panics if it cannot start a thread or read
+`ZENOH_RUNTIME`: no handler of errors but that of `BaseException` sees this. So every command and process opens its sessions
+here, and each says in a sentence why Zenoh cannot begin.
 """
 
 from __future__ import annotations
@@ -18,10 +21,28 @@ import zenoh
 
 from evedrop.errors import BriefError, RunError
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
-from evedrop.live.network.endpoint import AnyEndpoint, Endpoint, endpoint_in
-from evedrop.live.network.opening import open_session
-from evedrop.live.protocol.brief_parts import Identity
+from evedrop.live.network.endpoint import AnyEndpoint, Endpoint, SocketEndpoint, endpoint_in
+from evedrop.live.protocol.brief import Identity
 from evedrop.live.protocol.keys import ZenohConfig
+from evedrop.system.environment import check_zenoh_runtime
+from evedrop.system.lacks import lack_of
+
+
+def open_session(config: zenoh.Config) -> zenoh.Session:
+    """Open a session.
+
+    Raises zenoh.ZError, UsageError if `ZENOH_RUNTIME` is malformed, and RunError if the machine lacks threads or memory.
+    """
+    check_zenoh_runtime()
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError:
+        raise
+    except BaseException as error:
+        if (lack := lack_of(error)) is None:
+            raise
+        raise RunError(lack) from error
+
 
 _WAITING_SECONDS = 3.0  # how often a process says that it still waits for its router
 _AGAIN_SECONDS = 0.02, 0.25  # between attempts, the first and the longest
@@ -288,3 +309,36 @@ def _maker_at(endpoint: Endpoint) -> str:
             return maker_of(shown.getpeercert(binary_form=True) or b"")
     except (OSError, ValueError):
         return "an unknown authority"
+
+
+def listening(listen: str, identity: Identity | None, config: ZenohConfig) -> zenoh.Session:
+    """Open a router's session. Raises BriefError if it cannot listen at the address in its brief."""
+    endpoint = endpoint_of(listen, identity)
+    try:
+        endpoint.try_to_listen()
+        return open_session(zenoh.Config.from_json5(json.dumps(config)))
+    except (OSError, zenoh.ZError) as error:
+        raise _cannot_listen(endpoint, error) from error
+
+
+def _cannot_listen(endpoint: AnyEndpoint, error: OSError | zenoh.ZError) -> BriefError:
+    """The error of a router that cannot listen, with the remedy."""
+    why = (error.strerror or error) if isinstance(error, OSError) else error
+    if isinstance(endpoint, SocketEndpoint):
+        return BriefError(
+            f"the router cannot listen at {endpoint} ({why}); set TMPDIR to a folder where sockets can be made, or run again "
+            "with --listen tls/127.0.0.1:PORT"
+        )
+    if isinstance(error, socket.gaierror):
+        return BriefError(
+            f"the host of {endpoint} is not known here ({why}); write it into /etc/hosts, or write the "
+            f"briefs again with --listen {endpoint.protocol}/0.0.0.0:{endpoint.port} and --connect"
+        )
+    if isinstance(error, zenoh.ZError):
+        return BriefError(
+            f"the router cannot listen at {endpoint} ({why}); write the briefs again with another --listen"
+        )
+    return BriefError(
+        f"the router cannot listen at {endpoint} ({why}); end the program that does, or write the briefs "
+        f"again with another --listen {endpoint.protocol}/HOST:PORT, of the host that the router is started on"
+    )

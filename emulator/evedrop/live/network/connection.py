@@ -2,24 +2,238 @@
 
 Zenoh would reconnect a session by itself, but then may deliver one key's messages to another key's subscriber
 (docs/upstream.md). So a session that has lost its router is closed and another one is opened, which holds nothing that
-could be out of date.
+could be out of date. The process keeps one object for each publisher, subscription or other entity that it declares: it reads a
+subscription without a break while another subscriber replaces the subscription's own.
+
+A process that has had no connection for too long ends itself: the recorder cannot tell it to end. While it is on its network it
+touches a file whose age is a cheap health check, if the environment names one, as the image of docs/containers.md does.
 
 Source: docs/protocol.md, lost connections.
 """
 
 from __future__ import annotations
 
+import os
+import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
+from pathlib import Path
 from queue import SimpleQueue
-from typing import TypeVar, final
+from typing import Protocol, TypeVar, final
 
 import zenoh
+from zenoh.handlers import FifoChannel
 
-from evedrop.errors import EvedropError
-from evedrop.live.network.declared import Declared, Subscription, Watch
+from evedrop.errors import EvedropError, RunError
+from evedrop.live.protocol.brief import AnyBrief
+from evedrop.live.protocol.codec import Dropped, head_of
+from evedrop.live.protocol.commands import StatusReporter
+from evedrop.live.protocol.last_word import Cause, LastWord
+from evedrop.system.output import say
+
+
+class Declared(Protocol):
+    """An object that is declared on every session of a process."""
+
+    def declare(self, session: zenoh.Session) -> None:
+        """Declare it on this session; the previous session is closed."""
+
+
+class SubscriptionClosedError(Exception):
+    """The process has closed its connection: nothing will arrive any more."""
+
+
+@final
+class Subscription:
+    """A subscription to one exact key, read in order with `recv`."""
+
+    def __init__(self, key: str, dropped: Dropped, status: StatusReporter, room: int) -> None:
+        """status: of the process, which records there that it waits; room: how many messages it holds."""
+        self._room = room
+        self._key, self._head, self._dropped, self._status = key, head_of(key), dropped, status
+        self._waits = (key,)
+        self._subscribers: SimpleQueue[zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]] | None] = SimpleQueue()
+        self._subscriber: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]] | None = None
+
+    def declare(self, session: zenoh.Session) -> None:
+        """Subscribe; messages that arrived on earlier sessions are read first."""
+        self._subscribers.put(session.declare_subscriber(self._key, FifoChannel(self._room)))
+
+    def close(self) -> None:
+        """End the subscription: there will be no other session."""
+        self._subscribers.put(None)
+
+    def recv(self) -> bytes:
+        """The next message. Raises SubscriptionClosedError once the connection is closed for good."""
+        self._status.waits = self._waits
+        payload = self._received()
+        self._status.waits = ()
+        return payload
+
+    def take(self, most: int) -> list[bytes]:
+        """Wait for the next message; then it, and those that have arrived after it, up to `most` in all.
+
+        Raises SubscriptionClosedError as `recv` does.
+        """
+        found = [self.recv()]
+        while len(found) < most and self._subscriber is not None:
+            try:
+                sample = self._subscriber.try_recv()
+            except zenoh.ZError:  # as for `recv`, which continues with the next session
+                break
+            if sample is None:
+                break
+            payload = self._dropped.contents(self._key, self._head, sample.payload.to_bytes())
+            if payload is not None:
+                found.append(payload)
+        return found
+
+    def _received(self) -> bytes:
+        while True:
+            if self._subscriber is None:
+                self._subscriber = self._subscribers.get()
+                if self._subscriber is None:
+                    raise SubscriptionClosedError(self._key)
+            try:
+                message = self._subscriber.recv().payload.to_bytes()
+            except zenoh.ZError:  # its session is closed, and all messages that had arrived are read
+                self._subscriber = None
+                continue
+            payload = self._dropped.contents(self._key, self._head, message)
+            if payload is not None:
+                return payload
+
+    def __iter__(self) -> Iterator[bytes]:
+        with suppress(SubscriptionClosedError):
+            while True:
+                yield self.recv()
+
+
+@final
+class CallbackSubscription:
+    """A subscription to one exact key; a thread of Zenoh's hands its messages on."""
+
+    def __init__(self, key: str, dropped: Dropped, receive: Callable[[bytes], None]) -> None:
+        self._key, self._head, self._dropped, self._receive = key, head_of(key), dropped, receive
+
+    def declare(self, session: zenoh.Session) -> None:
+        """Subscribe."""
+        session.declare_subscriber(self._key, self._take)
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        payload = self._dropped.contents(self._key, self._head, sample.payload.to_bytes())
+        if payload is not None:
+            self._receive(payload)
+
+
+@final
+class Publisher:
+    """A publisher for one exact key. Messages put without a connection are lost, and sent again in a later round."""
+
+    def __init__(self, key: str) -> None:
+        self.key, self._head = key, head_of(key)
+        self._session: zenoh.Session | None = None
+        self._publisher: zenoh.Publisher | None = None
+
+    def declare(self, session: zenoh.Session) -> None:
+        """Publish on this session from now on."""
+        self._publisher = session.declare_publisher(
+            self.key, congestion_control=zenoh.CongestionControl.BLOCK, reliability=zenoh.Reliability.RELIABLE
+        )
+        self._session = session
+
+    def __call__(self, payload: bytes) -> None:
+        """Put a message."""
+        publisher, session = self._publisher, self._session
+        if publisher is None or session is None:
+            return
+        try:
+            publisher.put(self._head + payload)
+        except zenoh.ZError:
+            if not session.is_closed():
+                raise
+
+    @property
+    def matched(self) -> bool:
+        """Whether the key has a reader."""
+        publisher, session = self._publisher, self._session
+        if publisher is None or session is None or session.is_closed():
+            return False
+        with suppress(zenoh.ZError):
+            return bool(publisher.matching_status.matching)  # type: ignore[attr-defined]  # the stub says bool
+        return False
+
+
+@final
+class Question:
+    """A question from another process, to be answered once."""
+
+    def __init__(self, key: str, query: zenoh.Query, payload: bytes) -> None:
+        self._key, self._query = key, query
+        self.payload = payload
+
+    def answer(self, payload: bytes) -> None:
+        """Send the answer, if the asking process is still connected."""
+        with suppress(zenoh.ZError):
+            self._query.reply(self._key, head_of(self._key) + payload)
+        self._query.drop()
+
+
+@final
+class Questions:
+    """A key at which this process answers questions; a thread of Zenoh's hands each question on."""
+
+    def __init__(self, key: str, dropped: Dropped, receive: Callable[[Question], None]) -> None:
+        self._key, self._head, self._dropped, self._receive = key, head_of(key), dropped, receive
+
+    def declare(self, session: zenoh.Session) -> None:
+        """Accept questions on this session."""
+        session.declare_queryable(self._key, self._take)
+
+    def _take(self, query: zenoh.Query) -> None:
+        message = b"" if query.payload is None else query.payload.to_bytes()
+        payload = self._dropped.contents(self._key, self._head, message)
+        if payload is None:
+            query.drop()
+        else:
+            self._receive(Question(self._key, query, payload))
+
+
+@final
+class Watch:
+    """Whether a process is on the network. Calls `changed` at every change, on a thread of Zenoh's or of the connection's."""
+
+    def __init__(self, key: str, changed: Callable[[bool], None]) -> None:
+        self._key, self._changed = key, changed
+        self._lock = threading.Lock()
+        self._session = 0
+        """Number of the session that it listens to: messages of an earlier session are out of date."""
+        self._there = False
+
+    def declare(self, session: zenoh.Session) -> None:
+        """Watch on this session, beginning with the present state."""
+        with self._lock:
+            self._session += 1
+            number = self._session
+        session.liveliness().declare_subscriber(
+            self._key, lambda sample: self._note(number, sample.kind == zenoh.SampleKind.PUT), history=True
+        )
+
+    def lose(self) -> None:
+        """Handle the loss of the connection: the process counts as absent."""
+        with self._lock:
+            self._session += 1
+            number = self._session
+        self._note(number, there=False)
+
+    def _note(self, number: int, there: bool) -> None:
+        with self._lock:
+            if number == self._session and there != self._there:
+                self._there = there
+                self._changed(there)
+
 
 _AGAIN_SECONDS = 0.02, 0.25  # between attempts, the first and the longest
 _ANSWER_SECONDS = 1.0
@@ -177,3 +391,79 @@ def _close(session: zenoh.Session) -> None:
     """Close a session. If its router is stopped, Zenoh gives up after ten seconds; the session is of no use then either."""
     with suppress(zenoh.ZError):
         session.close()
+
+
+@final
+class ConnectionWatchdog:
+    """Ends its process after `flow.longest_outage` without a connection."""
+
+    def __init__(self, brief: AnyBrief) -> None:
+        self._brief = brief
+        self._lock = threading.Lock()
+        self._timer: threading.Timer | None = None
+        self._released = False
+
+    def changed(self, connected: bool) -> None:
+        """Handle the loss or the return of the connection."""
+        self._set(lost=not connected)
+
+    def release(self) -> None:
+        """Stop watching: the process closes its connection itself."""
+        self._released = True
+        self._set(lost=False)
+
+    def _set(self, lost: bool) -> None:
+        with self._lock:
+            if self._timer is not None:
+                self._timer.cancel()
+            self._timer = None
+            if lost and not self._released:
+                self._timer = threading.Timer(self._brief.flow.longest_outage, self._give_up)
+                self._timer.daemon = True
+                self._timer.start()
+
+    def _give_up(self) -> None:
+        sentence = (
+            f"{self._brief.process} has had no connection with the router at {self._brief.router} for "
+            f"{self._brief.flow.longest_outage:g} s; check that the router runs and can be reached"
+        )
+        say(sentence)
+        sys.stderr.flush()
+        LastWord(Cause.NO_CONNECTION, sentence).leave(self._brief.last_word)
+        os._exit(RunError.exit_status)
+
+
+VARIABLE = "EVEDROP_HEARTBEAT"
+_BEAT_SECONDS = 2.0
+
+
+@final
+class HeartbeatFile:
+    """Touches the file that the environment names, if it names one, until `stop`."""
+
+    def __init__(self, connected: Callable[[], bool], seconds: float = _BEAT_SECONDS) -> None:
+        """connected: whether the process is on its network; seconds: between two checks."""
+        self._connected = connected
+        self._seconds = seconds
+        self._over = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Start to touch the file. Does nothing if already started."""
+        path = os.environ.get(VARIABLE)
+        if path and self._thread is None:
+            self._thread = threading.Thread(target=self._keep, args=(Path(path),), name="heartbeat", daemon=True)
+            self._thread.start()
+
+    def stop(self) -> None:
+        """Stop touching the file and checking the connection."""
+        self._over.set()
+        if self._thread is not None:
+            self._thread.join(_BEAT_SECONDS)
+
+    def _keep(self, path: Path) -> None:
+        while not self._over.is_set():
+            if self._connected():
+                with suppress(OSError):  # the process then counts as unhealthy, but continues
+                    path.touch()
+            self._over.wait(self._seconds)

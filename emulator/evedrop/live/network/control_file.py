@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from evedrop.errors import UsageError
-from evedrop.live.protocol.brief_parts import Identity
+from evedrop.live.protocol.brief import Identity
 from evedrop.system.files import Unreadable, is_folder, is_there, text_of
 
 _NAME = "control.json"

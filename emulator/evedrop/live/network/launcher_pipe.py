@@ -1,14 +1,17 @@
-"""Sends events to the launcher: that a router listens, and the recorder's events, including its heartbeat.
+"""A process and its launcher: the events that it sends there, and whether the launcher is gone.
 
-The launcher gives up on a recorder that is silent for half a minute. So the heartbeat has its own thread: it continues
-while the recorder imports, computes or writes, however long that takes on a busy machine.
+The events are that a router listens, and the recorder's, including its heartbeat. The launcher gives up on a recorder that is
+silent for half a minute. So the heartbeat has its own thread: it continues while the recorder imports, computes or writes,
+however long that takes on a busy machine.
 """
 
 from __future__ import annotations
 
 import os
+import select
 import sys
 import threading
+from collections.abc import Callable
 from contextlib import suppress
 from types import TracebackType
 from typing import Self, TextIO, cast, final
@@ -70,3 +73,28 @@ class Heartbeat:
     def _beat(self) -> None:
         while not self._over.wait(self._seconds):
             emit(Alive())
+
+
+def when_launcher_is_gone(then: Callable[[], None], said: Callable[[bytes], None] = lambda _: None) -> None:
+    """Call `then`, on a thread of its own, when standard input closes: the launcher holds its other end.
+
+    said: gets every line that the launcher writes.
+    """
+
+    def wait() -> None:
+        # Not sys.stdin: a thread that waits in its lock makes the interpreter abort at exit.
+        rest = b""
+        while read := os.read(0, 4096):
+            *lines, rest = (rest + read).split(b"\n")
+            for line in lines:
+                said(line)
+        then()
+
+    threading.Thread(target=wait, name="launcher-watchdog", daemon=True).start()
+
+
+def launcher_is_gone() -> bool:
+    """Whether the other end of standard input, a pipe, is closed; asks the system, so it does not depend on a thread."""
+    poll = select.poll()
+    poll.register(0, 0)
+    return bool(poll.poll(0))

@@ -1,4 +1,6 @@
-"""How the operator asks a run or wire in progress, and how it answers: by a Zenoh query.
+"""What is asked of a run in progress from outside: the operator's requests, by Zenoh queries to the recorder, and its health.
+
+Whether a process is on the network now is asked of the router: only the router's view counts for other processes.
 
 Source: docs/protocol.md, request and answer.
 """
@@ -13,16 +15,15 @@ from typing import final
 import zenoh
 
 from evedrop.errors import MalformedMessage
+from evedrop.live.network.connecting import open_session
+from evedrop.live.network.connection import Question
 from evedrop.live.network.control_file import Control
-from evedrop.live.network.declared import Question
-from evedrop.live.network.opening import open_session
+from evedrop.live.network.endpoint import endpoint_in
 from evedrop.live.network.session import client_config
-from evedrop.live.protocol.codec import Reader, pack
-from evedrop.live.protocol.envelope import enclosed, payload_of
+from evedrop.live.protocol.brief import AnyBrief, RelayPart, RoutingPart
+from evedrop.live.protocol.codec import Reader, enclosed, pack, payload_of
 from evedrop.live.protocol.keys import RunKeys
-from evedrop.live.protocol.requests import OperatorRequest, read_request
-from evedrop.live.protocol.status import RunStatus
-from evedrop.live.protocol.wire_status import WireStatus
+from evedrop.live.protocol.requests import OperatorRequest, RunStatus, WireStatus, read_request
 from evedrop.model.entries import expect, read, table_of
 from evedrop.names import OPERATOR, RECORDER
 
@@ -111,3 +112,28 @@ def ask(control: Control, request: OperatorRequest, patience: float) -> Answer |
             if answer is not None:
                 return read_answer(key, answer)
     return None
+
+
+_CONNECT_SECONDS = 3.0
+_ANSWER_SECONDS = 3.0
+
+
+def is_there(brief: AnyBrief) -> bool:
+    """Whether the router sees the process of a brief: connected, ready, and not lost since.
+
+    Asks with the credentials of the process itself, which may ask for no other process.
+    """
+    zenoh.init_log_from_env_or("off")
+    config = client_config(brief)
+    config["connect"]["timeout_ms"] = int(_CONNECT_SECONDS * 1000)
+    if isinstance(brief.part, RoutingPart):
+        # The router asks itself. It may listen on every address, which its certificate does not name.
+        listens = brief.part.listen if isinstance(brief.part, RelayPart) else brief.router
+        config["connect"]["endpoints"] = [str(endpoint_in(listens).nearby)]
+        config["transport"]["link"].get("tls", {})["verify_name_on_connect"] = False
+    try:
+        with open_session(zenoh.Config.from_json5(json.dumps(config))) as session:
+            answers = session.liveliness().get(RunKeys(brief.run).alive(brief.process), timeout=_ANSWER_SECONDS)
+            return any(answer.ok is not None for answer in answers)
+    except zenoh.ZError:
+        return False

@@ -1,15 +1,29 @@
-"""The part of a session that the work of a process uses; tests pass one in memory."""
+"""The part of a session that the work of a process uses: messages to take, and messages to send. Tests pass one in memory.
+
+A mailbox holds at most as many bytes from each sender as a run can have in flight. All messages of a key that have arrived and
+are not handled yet are taken at once. Messages that may be lost with a connection are kept, and sent again when the conductor
+asks for them. They are not acknowledged one by one: the sensor is never further than the window ahead of the slots that the
+recorder has written, so messages older than a window are no longer needed and are forgotten.
+
+Source: docs/protocol.md, lost connections.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+import threading
+from collections import deque
+from collections.abc import Callable, Collection, Iterator, Mapping
+from queue import SimpleQueue
 from types import TracebackType
-from typing import Protocol, Self
+from typing import Protocol, Self, final
 
-from evedrop.live.network.resending import ReplayBuffer
-from evedrop.live.protocol.commands import ControlCommand
-from evedrop.live.protocol.keys import RunKeys
-from evedrop.live.protocol.process_status import StatusReporter
+from evedrop.errors import Gap, MalformedMessage
+from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
+from evedrop.live.protocol.brief import AnyBrief
+from evedrop.live.protocol.codec import Reader
+from evedrop.live.protocol.commands import ControlCommand, StatusReporter
+from evedrop.live.protocol.keys import RunKeys, writer_of
+from evedrop.live.protocol.packets import is_barrier, is_resend
 
 
 class Received(Protocol):
@@ -68,3 +82,182 @@ class ProcessSession(Protocol):
 
     def commanded(self, receivers: Collection[str] | None = None) -> ControlCommand | None:
         """The next command, or None."""
+
+
+_MOST_SLOTS = 64
+_BLOCK_BYTES = 1 << 18  # of the numbers of a block, so that it stays in the processor's cache
+
+
+def most_slots(brief: AnyBrief) -> int:
+    """How many slots a process of a run handles at once at most."""
+    return max(1, min(_MOST_SLOTS, _BLOCK_BYTES // (8 * len(brief.model.A) * brief.trials)))
+
+
+@final
+class Pending:
+    """Reads packets, or deliveries, and the barriers between them from a subscription, as many messages ahead as have arrived."""
+
+    def __init__(self, subscription: Received, key: str, most: int) -> None:
+        """most: how many messages to read ahead."""
+        self._subscription, self._key, self._most = subscription, key, most
+        self._messages: deque[Reader] = deque()
+
+    def peek(self) -> Reader:
+        """The next message, which stays the next until it is taken or dropped; waits for it if need be."""
+        if not self._messages:
+            self._messages.extend(Reader(self._key, payload) for payload in self._subscription.take(self._most))
+        return self._messages[0]
+
+    def drop(self) -> None:
+        """Remove the next message, which `peek` has returned."""
+        self._messages.popleft()
+
+    def take_messages(self, first: int, most: int) -> list[Reader]:
+        """Take the packets of slots `first`, `first` + 1, … without a gap or a barrier, as many as have arrived, up to `most`.
+
+        The next message must be the packet of slot `first`.
+        """
+        found = [self._messages.popleft()]
+        while len(found) < most and self._messages:
+            message = self._messages[0]
+            if message.fields.get("k") != first + len(found) or is_barrier(message) or is_resend(message):
+                break
+            found.append(self._messages.popleft())
+        return found
+
+    def __iter__(self) -> Iterator[Reader]:
+        """All messages that still come, until the connection is closed."""
+        while self._messages:
+            yield self._messages.popleft()
+        for payload in self._subscription:
+            yield Reader(self._key, payload)
+
+
+_OVERHEAD_BYTES = 200  # of a message in memory, besides its payload
+_ROUNDS = 4  # of resending all kept messages, before the first one is read
+
+
+def allowance(largest: int, window: int, batch: int) -> int:
+    """How many unread bytes of one sender may wait: reports of a window and two batches, in some rounds, and a reserve."""
+    return _ROUNDS * (window // batch + 3) * (largest + _OVERHEAD_BYTES) + 2**20
+
+
+@final
+class Mailbox:
+    """A queue of messages by sender; filled by threads of Zenoh's, read by one."""
+
+    def __init__(self, keys: Mapping[str, str], most: int, clock: Clock = SYSTEM_CLOCK) -> None:
+        """keys: sender → the key on which it sends; most: how many bytes of one sender may wait."""
+        self._keys, self._most, self._clock = keys, most, clock
+        self._queue: SimpleQueue[tuple[str, bytes | bool]] = SimpleQueue()
+        self._waiting = dict.fromkeys(keys, 0)
+        self._lock = threading.Lock()
+        self._flooded: tuple[str, bytes] | None = None
+
+    def put(self, sender: str, item: bytes | bool) -> None:
+        """Put a message, or whether the sender is present. If a sender sends too much, its further messages are dropped."""
+        if isinstance(item, bytes):
+            with self._lock:
+                waiting = self._waiting[sender] + len(item) + _OVERHEAD_BYTES
+                if waiting > self._most:
+                    self._flooded = self._flooded or (sender, item)
+                    return
+                self._waiting[sender] = waiting
+        self._queue.put((sender, item))
+
+    def __len__(self) -> int:
+        """How many messages wait."""
+        return self._queue.qsize()
+
+    def get(self, timeout: float | None = None) -> tuple[str, bytes | bool]:
+        """Wait for the next message. Raises Empty after `timeout` seconds, MalformedMessage if a sender has sent too much."""
+        if self._flooded is not None:
+            flooding, last = self._flooded
+            key = self._keys[flooding]
+            raise MalformedMessage(
+                key,
+                f"more than {self._most} unread bytes",
+                "no more than the window of the run",
+                last,
+                writer_of(key),
+            )
+        sender, item = self._clock.next(self._queue, timeout)
+        if isinstance(item, bytes):
+            with self._lock:
+                self._waiting[sender] -= len(item) + _OVERHEAD_BYTES
+        return sender, item
+
+
+@final
+class ReplayBuffer:
+    """A publisher that keeps the messages sent through it; thread-safe.
+
+    span: messages older than this many slots are forgotten; None: only `forget` forgets.
+    head: makes the message that precedes the resent ones, from (round, first slot that is not done, first slot that is
+    resent).
+    back: how many slots before the first that is not done are resent, too.
+    """
+
+    def __init__(
+        self,
+        put: Callable[[bytes], None],
+        span: int | None = None,
+        head: Callable[[int, int, int], bytes] | None = None,
+        back: int = 0,
+    ) -> None:
+        self._put, self._span, self._head, self._back = put, span, head, back
+        self._messages: deque[tuple[int, bytes]] = deque()
+        self._forgotten = 0
+        self._lock = threading.Lock()
+
+    def __call__(self, k: int, payload: bytes) -> None:
+        """Send a message that belongs to slot k, and keep it."""
+        with self._lock:
+            self._messages.append((k, payload))
+            self._put(payload)
+        if self._span is not None:
+            self.forget(k - self._span)
+
+    def forget(self, k: int) -> None:
+        """Forget messages of slots below k, which are done, except the `back` slots before k."""
+        with self._lock:
+            self._forgotten = max(self._forgotten, k)
+            while self._messages and self._messages[0][0] < k - self._back:
+                self._messages.popleft()
+
+    def again(self, number: int, k: int) -> None:
+        """Send the messages of slots from k on, which are not done, again; the last message in any case."""
+        with self._lock:
+            k = max(k, self._forgotten)  # a late request must not announce slots that are forgotten
+            first = max(0, k - self._back)
+            if self._head is not None:
+                self._put(self._head(number, k, first))
+            for place, (slot, payload) in enumerate(self._messages, 1):
+                if slot >= first or place == len(self._messages):
+                    self._put(payload)
+
+
+@final
+class GapDetector:
+    """Handles messages of slots that are not due: ignores earlier slots, and for later ones waits for the missing slot."""
+
+    def __init__(self, key: str, patience: float, clock: Clock = SYSTEM_CLOCK) -> None:
+        """patience: for how many seconds later slots may arrive while the due one does not."""
+        self._key, self._patience, self._clock = key, patience, clock
+        self._slot, self._since = -1, 0.0
+
+    def take_message(self, receive: Callable[[], Reader], due: int) -> Reader:
+        """Wait for the message of slot `due`. Raises Gap as `missed` does."""
+        while (found := (message := receive()).integer("k")) != due:
+            self.missed(due, found)
+        return message
+
+    def missed(self, due: int, found: int) -> None:
+        """Slot `found` arrived when `due` was expected. Raises Gap if slot `due` has been missing for too long."""
+        now = self._clock.monotonic()
+        if found < due:
+            return
+        if self._slot != due:
+            self._slot, self._since = due, now
+        elif now - self._since > self._patience:
+            raise Gap(self._key, due, found)

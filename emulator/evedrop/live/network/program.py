@@ -15,8 +15,8 @@ import zenoh
 
 from evedrop.errors import BriefError, RunError
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
-from evedrop.live.network.opening import open_session
-from evedrop.live.protocol.brief_parts import ProgramEntry
+from evedrop.live.network.connecting import open_session
+from evedrop.live.protocol.brief import ProgramEntry
 from evedrop.live.protocol.keys import ZenohConfig
 from evedrop.live.protocol.state_message import MOST_BYTES, read_state
 from evedrop.model.process import Floats

@@ -5,12 +5,10 @@ Source: docs/protocol.md, two routers.
 
 from __future__ import annotations
 
-from evedrop.live.network.access import access_control, at_relay, grants
+from evedrop.live.network.access import access_control, at_relay, grants, until_all_left, users_file
 from evedrop.live.network.connecting import connected
-from evedrop.live.network.router_users import until_all_left, users_file
 from evedrop.live.network.session import ATTEMPT, Session, client_config, router_address_of, router_config
-from evedrop.live.protocol.brief import Brief
-from evedrop.live.protocol.brief_parts import RelayPart
+from evedrop.live.protocol.brief import Brief, RelayPart
 from evedrop.live.protocol.commands import EndRun
 from evedrop.live.protocol.keys import ZenohConfig
 

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.live.protocol.brief import AnyBrief
-from evedrop.live.protocol.closed_loop import Decisions
 from evedrop.live.protocol.codec import progress
-from evedrop.live.protocol.telemetry import Report, Truth
+from evedrop.live.protocol.telemetry import Decisions, Report, Truth
 from evedrop.model.block_sums import BlockSums
 from evedrop.model.digest import BlockDigests, Blocks, Digests, InputLog
 from evedrop.model.kernels.current import kernels

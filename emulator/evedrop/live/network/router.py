@@ -7,34 +7,37 @@
 A receiver that is present gets one delivery in every slot, with everything that arrives in the slot. At a barrier on the
 uplink the router journals all slots before it and waits until the conductor lets it continue; links change nowhere else. When
 packets are sent again, the router routes them again, with the same fates, as a restarted router would.
+
+Some of the conductor's commands are carried out at a barrier, others end any waiting. In real time, deliveries may be delayed by
+a fraction of a slot: they are sent when they are due, in order, while the router continues. Delays of whole slots are emulated
+time, the same in every run.
+
+Source: docs/protocol.md, control and lost connections.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import heapq
+import itertools
+import threading
+import time
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from queue import SimpleQueue
 from typing import final
 
 import numpy as np
 
-from evedrop.errors import NotRegistered
-from evedrop.live.network.access import access_control, at_router, grants
-from evedrop.live.network.delayed_sender import DelayedSender
-from evedrop.live.network.pending import Pending, most_slots
-from evedrop.live.network.process_session import ProcessSession
-from evedrop.live.network.resending import GapDetector
-from evedrop.live.network.router_commands import Commands, ReplayRequested
-from evedrop.live.network.router_users import until_all_left, users_file
+from evedrop.errors import EvedropError, NotRegistered
+from evedrop.live.network.access import access_control, at_router, grants, until_all_left, users_file
+from evedrop.live.network.process_session import GapDetector, Pending, ProcessSession, most_slots
 from evedrop.live.network.session import Session, router_config
-from evedrop.live.protocol.brief import AnyBrief, Brief
-from evedrop.live.protocol.brief_closed_loop import Wiring
-from evedrop.live.protocol.brief_parts import RouterPart
+from evedrop.live.protocol.brief import AnyBrief, Brief, RouterPart, Wiring
 from evedrop.live.protocol.codec import Reader
-from evedrop.live.protocol.commands import Go, LinkChange
+from evedrop.live.protocol.commands import Again, ControlCommand, EndRun, Go, LinkChange
 from evedrop.live.protocol.keys import ZenohConfig
-from evedrop.live.protocol.packet_blocks import Uplinked, read_uplinks
 from evedrop.live.protocol.packets import (
+    Uplinked,
     acknowledgement,
     barrier,
     delivery,
@@ -43,6 +46,7 @@ from evedrop.live.protocol.packets import (
     packed_header,
     read_acknowledgement,
     read_resend,
+    read_uplinks,
 )
 from evedrop.live.protocol.telemetry import Journal
 from evedrop.model.acknowledgements import AckChannel, AckChannelSpec
@@ -398,3 +402,135 @@ class RouterLoop:
 def _opened(brief: Brief[RouterPart], access: ZenohConfig) -> Session:
     with users_file(brief.part.users) as users:
         return Session(brief, router_config(brief, str(users), access, brief.router), brief.router)
+
+
+class ReplayRequested(Exception):
+    """The conductor asks for packets again: the message that the router waits for may have been lost."""
+
+
+@final
+class Commands:
+    """Reads the session's commands on a thread of its own.
+
+    knock: wakes the thread that waits for packets when the run has ended.
+    waiting: queues that get a None when waiting for their next item may be in vain.
+    """
+
+    def __init__(
+        self,
+        session: ProcessSession,
+        receivers: Collection[str],
+        knock: Callable[[], None],
+        waiting: Iterable[SimpleQueue[bytes | None]],
+        patience: float,
+    ) -> None:
+        """receivers: those that a command may name.
+
+        patience: how many seconds to wait for the conductor's command for a round that the sensor has announced.
+        """
+        self._session, self._receivers, self._knock, self._waiting = session, receivers, knock, tuple(waiting)
+        self._patience = patience
+        self._orders: SimpleQueue[tuple[int, ControlCommand] | None] = SimpleQueue()
+        self._changed = threading.Condition()
+        self._asked = Again(0, 0)
+        self._heeded = 0
+        self._ended = False
+        self._failure: EvedropError | None = None
+        threading.Thread(target=self._listen, name="commands", daemon=True).start()
+
+    def _listen(self) -> None:
+        try:
+            while not self._ended:
+                self._sort(self._session.command(self._receivers))
+        except EvedropError as error:  # the working thread raises it
+            self._failure = error
+        with self._changed:
+            self._changed.notify()
+        self._wake()
+        self._knock()
+
+    def _sort(self, command: ControlCommand) -> None:
+        match command:
+            case Again():
+                with self._changed:
+                    self._asked = command
+                    self._changed.notify()
+                self._wake()
+            case EndRun():
+                self._ended = True
+            case _:
+                self._orders.put((self._asked.round, command))
+
+    def _wake(self) -> None:
+        self._orders.put(None)
+        for queue in self._waiting:
+            queue.put(None)
+
+    def over(self) -> bool:
+        """Whether the conductor has ended the run. Raises MalformedMessage if it sent a malformed command."""
+        if self._failure is not None:
+            raise self._failure
+        return self._ended
+
+    def check(self) -> None:
+        """Raise ReplayRequested if the conductor has ended the run, or asked for packets since the last request obeyed."""
+        if self.over() or self._asked.round != self._heeded:
+            raise ReplayRequested
+
+    def next(self) -> ControlCommand:
+        """The next command of the current round; those of earlier rounds are skipped. Raises ReplayRequested as `check` does."""
+        while True:
+            with self._session.status.waiting(self._session.keys.control(ROUTER)):
+                order = self._orders.get()
+            self.check()
+            if order is not None and order[0] == self._heeded:
+                return order[1]
+
+    def resend_of(self, number: int) -> Again | None:
+        """Wait for the conductor's command for this round; None if the conductor has asked for a later one.
+
+        Also None if it has ended the run meanwhile, or if no such command arrives within the patience.
+        """
+        with self._changed:
+            # Sensor and router are told at the same time: if the command does not arrive, the round does not exist.
+            if not self._changed.wait_for(lambda: self.over() or self._asked.round >= number, self._patience):
+                return None
+            if self._ended or self._asked.round > number:
+                return None
+            self._heeded = number
+            return self._asked
+
+
+Put = Callable[[bytes], None]
+
+
+@final
+class DelayedSender:
+    """Sends messages when they are due, on a daemon thread of its own: a run ends only when all have arrived."""
+
+    def __init__(self) -> None:
+        self._due: list[tuple[float, int, Put, bytes]] = []
+        self._numbers = itertools.count()
+        self._changed = threading.Condition()
+        threading.Thread(target=self._go_round, name="delayed-sender", daemon=True).start()
+
+    def round(self, put: Put) -> Callable[[bytes, float], None]:
+        """A publisher that sends each message the given seconds later, but never before the previous message."""
+        last = 0.0
+
+        def send(payload: bytes, seconds: float) -> None:
+            nonlocal last
+            last = max(last, time.monotonic() + seconds)
+            with self._changed:
+                heapq.heappush(self._due, (last, next(self._numbers), put, payload))
+                self._changed.notify()
+
+        return send
+
+    def _go_round(self) -> None:
+        while True:
+            with self._changed:
+                while not self._due or (wait := self._due[0][0] - time.monotonic()) > 0.0:
+                    self._changed.wait(wait if self._due else None)
+                _, _, put, payload = heapq.heappop(self._due)
+            put(payload)

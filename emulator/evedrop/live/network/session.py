@@ -25,27 +25,35 @@ import zenoh
 
 from evedrop.errors import Gap, MalformedMessage, MissingProcesses, RunError
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
-from evedrop.live.network.connecting import Credentials, RouterAddress, WaitReporter, connected
-from evedrop.live.network.connection import Connection
-from evedrop.live.network.connection_watchdog import ConnectionWatchdog
-from evedrop.live.network.container_heartbeat import HeartbeatFile
-from evedrop.live.network.declared import CallbackSubscription, Publisher, Question, Questions, Subscription, Watch
-from evedrop.live.network.launcher_pipe import emit
-from evedrop.live.network.launcher_watchdog import when_launcher_is_gone
-from evedrop.live.network.listening import listening
-from evedrop.live.network.mailbox import allowance
-from evedrop.live.network.opening import open_session
-from evedrop.live.network.resending import ReplayBuffer
+from evedrop.live.network.connecting import Credentials, RouterAddress, WaitReporter, connected, listening, open_session
+from evedrop.live.network.connection import (
+    CallbackSubscription,
+    Connection,
+    ConnectionWatchdog,
+    HeartbeatFile,
+    Publisher,
+    Question,
+    Questions,
+    Subscription,
+    Watch,
+)
+from evedrop.live.network.launcher_pipe import emit, when_launcher_is_gone
+from evedrop.live.network.process_session import ReplayBuffer, allowance
 from evedrop.live.network.zenoh_log import LOGGED
-from evedrop.live.protocol.brief import AnyBrief, Brief
-from evedrop.live.protocol.brief_parts import Identity, RouterPart, RoutingPart
-from evedrop.live.protocol.codec import Reader, end_report, refusal
-from evedrop.live.protocol.commands import Abandon, Again, Bounds, ControlCommand, EndRun, ReportStatus, read_command
-from evedrop.live.protocol.envelope import Dropped
-from evedrop.live.protocol.keys import RunKeys, ZenohConfig, reader_of
+from evedrop.live.protocol.brief import AnyBrief, Brief, Identity, RouterPart, RoutingPart
+from evedrop.live.protocol.codec import Dropped, Reader, end_report, refusal
+from evedrop.live.protocol.commands import (
+    Abandon,
+    Again,
+    Bounds,
+    ControlCommand,
+    EndRun,
+    ReportStatus,
+    StatusReporter,
+    read_command,
+)
+from evedrop.live.protocol.keys import RunKeys, ZenohConfig, low_pass, reader_of
 from evedrop.live.protocol.launcher_events import RouterListens
-from evedrop.live.protocol.message_limits import low_pass
-from evedrop.live.protocol.process_status import StatusReporter
 from evedrop.names import RECORDER, ROUTER
 
 READY_SECONDS = 30.0

@@ -11,14 +11,17 @@ from contextlib import contextmanager
 import numpy as np
 
 from evedrop.errors import BriefError, NotRegistered
-from evedrop.live.protocol.brief import WRITE_AGAIN, AnyBrief
-from evedrop.live.protocol.brief_closed_loop import MonitorEntry, PlantEntry, decoded
-from evedrop.live.protocol.brief_parts import (
+from evedrop.live.protocol.brief import (
+    WRITE_AGAIN,
+    AnyBrief,
     ControllerPart,
     EavesdropperPart,
     LegitimatePart,
+    MonitorEntry,
+    PlantEntry,
     RouterPart,
     SensorPart,
+    decoded,
 )
 from evedrop.model.acknowledgements import ATTACKS
 from evedrop.model.controllers import CONTROLLERS

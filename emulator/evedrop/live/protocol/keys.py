@@ -1,13 +1,19 @@
-"""The keys of a run: the reader of each, and the only process that may write it.
+"""The keys of a run: the reader of each, the only process that may write it, and how large a message on it may be.
 
-Source: docs/protocol.md, keys.
+A router drops larger messages, and no process accepts them.
+
+Source: docs/protocol.md, keys and limits.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from evedrop.model.digest import BLOCK_SLOTS, DIGEST_BYTES
+from evedrop.model.links.link import REASONS
+from evedrop.model.slot.account import COUNTED_BURSTS
 from evedrop.names import CONTROLLER, LEGITIMATE, OPERATOR, RECORDER, ROUTER, SENSOR
 
 KINDS = ("uplink", "downlink", "ack", "estimate", "state", "input", "telemetry", "journal", "progress", "control")
@@ -115,3 +121,75 @@ def writer_of(key: str) -> str:
 
 ZenohConfig = dict[str, Any]
 """A JSON object whose entries Zenoh defines."""
+
+
+_FRAME_BYTES = 4096
+"""Room for the other parts of a message: its key, field names, and additions of later versions."""
+_COMMAND_BYTES = 32 * 2**20  # changes of links contain their settings, such as recorded losses
+_QUESTION_BYTES = 2**20
+_NAME_BYTES = 128  # of a key in a list
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """The dimensions that determine the sizes of a run's messages."""
+
+    n: int
+    trials: int
+    recorded: int
+    batch: int
+    """The largest number of slots in a report."""
+    window: int
+    """The longest window of the receivers, in slots."""
+    receivers: int
+    header: int = 0
+    inputs: int = 0
+    period: int = 1
+    """Slots between decisions."""
+    monitored: bool = False
+    """Whether there are a watermark and a detector."""
+
+    @property
+    def of_kinds(self) -> dict[str, int]:
+        """Kind of key, the part after the run's name → bytes of its largest message."""
+        n, R, c = self.n, self.trials, self.batch
+        mask, state = (R + 7) // 8, 8 * n * R
+        packet = state + 8 * self.header * R + mask + _NAME_BYTES
+        # Blocks of the digest that end in a report: one may have begun before it, and the last may be short.
+        blocks = c // BLOCK_SLOTS + 2
+        digests, sums = blocks * DIGEST_BYTES * R, blocks * 8 * R
+        report = c * (state + 5 * R + 8 * n * n * self.recorded + 16) + digests + sums
+        monitored = 8 * (self.inputs + 1) * R if self.monitored else 0
+        truth = c * (2 * state + 8 * self.inputs * R + 4 * mask + monitored)
+        leaving = state + 8 * n * n * R
+        decisions = 8 * (c + self.period) + digests + self.period // BLOCK_SLOTS * DIGEST_BYTES * R
+        waits = _NAME_BYTES * (self.receivers + 1)
+        link = c * (mask + 4 * (len(REASONS) + 1) + 2 * R) + 4 * (COUNTED_BURSTS + self.window + 2) + _FRAME_BYTES
+        kinds = {
+            "uplink": packet + state,
+            "downlink": packet * (1 + 2 * (self.window + 1)) + state,
+            "ack": mask,
+            "estimate": state,
+            "state": state,
+            "input": 8 * self.inputs * R + mask,
+            "telemetry": max(report, truth, leaving, decisions, waits),
+            "journal": max(self.receivers * link, waits),
+            "progress": 0,
+            "control": _COMMAND_BYTES,
+        }
+        return {kind: kinds[kind] + _FRAME_BYTES for kind in KINDS}
+
+
+def low_pass(run: str, kinds: Mapping[str, int]) -> list[ZenohConfig]:
+    """The `low_pass_filter` section of a router's Zenoh configuration, which drops larger messages; kinds: `Sizes.of_kinds`."""
+
+    def rule(name: str, keys: list[str], size: int, messages: list[str]) -> ZenohConfig:
+        return {"id": name, "flows": ["ingress"], "messages": messages, "key_exprs": keys, "size_limit": size}
+
+    under = {kind: [f"evedrop/{run}/{kind}", f"evedrop/{run}/{kind}/**"] for kind in kinds}
+    asked = [f"evedrop/{run}/control/recorder"]
+    return [
+        *(rule(kind, under[kind], size, ["put", "delete"]) for kind, size in kinds.items()),
+        rule("question", asked, _QUESTION_BYTES, ["query"]),
+        rule("answer", asked, _COMMAND_BYTES, ["reply"]),
+    ]

@@ -1,15 +1,17 @@
-"""The operator's requests to a run or wire in progress, a class for each.
+"""The operator's requests to a run or wire in progress, a class for each, and the status that it gets in answer.
 
-Source: docs/protocol.md, request.
+Source: docs/protocol.md, request and answer.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Self
 
 from evedrop.live.protocol.codec import Reader, pack
+from evedrop.model.entries import SLOT, entry, flag, listed, maybe, named, not_negative, read, table_of, text
+from evedrop.scenario.progress_events import RunEvent
 
 
 @dataclass(frozen=True)
@@ -105,3 +107,116 @@ def read_request(key: str, payload: bytes) -> OperatorRequest:
     if do not in REQUESTS:
         raise message.malformed(f"do = {do!r}", f"one of {', '.join(REQUESTS)}")
     return REQUESTS[do].read(message)
+
+
+@dataclass(frozen=True)
+class LinkStatus:
+    """The packets of a link so far."""
+
+    offered: int = field(metadata=entry(SLOT))
+    delivered: int = field(metadata=entry(SLOT))
+    fraction: float | None = field(metadata=entry(maybe(not_negative)))
+    """The fraction of the offered packets that was delivered; None if none was offered."""
+
+    @classmethod
+    def of(cls, offered: int, delivered: int) -> Self:
+        """The status of a link with these packets."""
+        return cls(offered, delivered, delivered / offered if offered else None)
+
+    def __str__(self) -> str:
+        fraction = "–" if self.fraction is None else f"{self.fraction:.4f}"
+        return f"{self.delivered} of {self.offered} packets delivered, {fraction}"
+
+
+def _links(found: Mapping[str, Any]) -> dict[str, LinkStatus]:
+    return {name: read(LinkStatus, one) for name, one in found.items()}
+
+
+def _events(found: Sequence[Mapping[str, Any]]) -> list[RunEvent]:
+    return [read(RunEvent, one) for one in found]
+
+
+@dataclass(frozen=True)
+class RunStatus:
+    """The state of a run in progress."""
+
+    slot: int = field(metadata=entry(SLOT))
+    """The first slot that is not scored."""
+    slots: int = field(metadata=entry(SLOT))
+    """The number of slots of the run."""
+    slots_per_second: float = field(metadata=entry(not_negative))
+    state: str = field(metadata=entry(text))
+    """`running`, `held` or `paused`."""
+    processes: Mapping[str, bool] = field(metadata=entry(named(flag)))
+    """Process → whether it is on the network."""
+    links: Mapping[str, LinkStatus] = field(metadata=entry(named(table_of(LinkStatus)), _links))
+    """Receiver → its link."""
+    events: Sequence[RunEvent] = field(metadata=entry(listed(table_of(RunEvent)), _events))
+
+    @property
+    def lines(self) -> Iterator[str]:
+        """The status as lines of text."""
+        state = self.state if self.state == "running" else f"{self.state} before slot {self.slot}"
+        yield f"slot {self.slot} of {self.slots}, {self.slots_per_second:,.0f} slots/s, {state}"
+        there = ", ".join(name for name, is_there in self.processes.items() if is_there)
+        missing = ", ".join(name for name, is_there in self.processes.items() if not is_there)
+        yield f"processes: {there}" + (f"; not on the network: {missing}" if missing else "")
+        yield from (f"link {name}: {link}" for name, link in self.links.items())
+        yield from (f"event at slot {one.slot}: {one.event} (by the {one.by})" for one in self.events)
+
+
+def status_of_shards(statuses: Sequence[RunStatus]) -> RunStatus:
+    """The status of a run in shards: the slowest one's slot; processes present if they are in all shards; and all packets."""
+    slowest = min(statuses, key=lambda status: status.slot)
+    processes = {name: all(one.processes[name] for one in statuses) for name in slowest.processes}
+    links = {
+        name: LinkStatus.of(
+            *(sum(getattr(one.links[name], what) for one in statuses) for what in ("offered", "delivered"))
+        )
+        for name in slowest.links
+    }
+    return replace(slowest, processes=processes, links=links)
+
+
+@dataclass(frozen=True)
+class WireLinkStatus:
+    """The messages of a wire's link so far."""
+
+    heard: int = field(metadata=entry(SLOT))
+    delivered: int = field(metadata=entry(SLOT))
+    cut: bool = field(metadata=entry(flag))
+    """Whether nothing passes now."""
+
+    def __str__(self) -> str:
+        fraction = f"{self.delivered / self.heard:.4f}" if self.heard else "–"
+        return f"{self.delivered} of {self.heard} messages delivered, {fraction}" + (", cut" if self.cut else "")
+
+
+def _wire_links(found: Mapping[str, Any]) -> dict[str, WireLinkStatus]:
+    return {name: read(WireLinkStatus, one) for name, one in found.items()}
+
+
+@dataclass(frozen=True)
+class WireStatus:
+    """The state of a wire."""
+
+    seconds: float = field(metadata=entry(not_negative))
+    """Since it began."""
+    sides: Mapping[str, Sequence[str]] = field(metadata=entry(named(listed(text))))
+    """Side → the endpoints at which programs connect."""
+    links: Mapping[str, WireLinkStatus] = field(metadata=entry(named(table_of(WireLinkStatus)), _wire_links))
+    events: Sequence[str] = field(metadata=entry(listed(text)))
+    """The events so far, a line each."""
+    journal: str = field(metadata=entry(text))
+    """Whether the journal is complete, in words."""
+    bypasses: Sequence[str] = field(metadata=entry(listed(text)))
+    """The ways past the wire that it noticed, a line each."""
+
+    @property
+    def lines(self) -> Iterator[str]:
+        """The status as lines of text."""
+        yield f"{self.seconds:.1f} s, journal {self.journal}"
+        yield from (f"side {name}: {', '.join(endpoints)}" for name, endpoints in self.sides.items())
+        yield from (f"link {name}: {link}" for name, link in self.links.items())
+        yield from (f"event at {event}" for event in self.events)
+        yield from (f"no verdict: {bypass}" for bypass in self.bypasses)

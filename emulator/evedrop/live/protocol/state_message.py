@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from evedrop.live.protocol.brief_parts import ProgramEntry
+from evedrop.live.protocol.brief import ProgramEntry
 from evedrop.model.checks import is_number
 from evedrop.model.given_states import LARGEST, deviations
 from evedrop.model.process import Floats

@@ -10,8 +10,8 @@ from typing import NoReturn, final
 
 from evedrop.errors import Interrupted, RunError
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
-from evedrop.live.network.declared import Question
-from evedrop.live.network.mailbox import Mailbox
+from evedrop.live.network.connection import Question
+from evedrop.live.network.process_session import Mailbox
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.codec import Reader, is_over, progress, read_over
 from evedrop.live.protocol.commands import Abandon, ControlCommand, EndRun, Start

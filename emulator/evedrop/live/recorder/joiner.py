@@ -1,4 +1,9 @@
-"""Joins the reports of all processes into slots: a slot is complete when every process has reported it."""
+"""Joins the reports of all processes into slots: a slot is complete when every process has reported it.
+
+On behalf of an absent receiver the recorder reports by itself, so that every slot of every receiver is accounted for.
+
+Source: docs/results.md, summary.json.
+"""
 
 from __future__ import annotations
 
@@ -10,15 +15,29 @@ from typing import Any, Generic, TypeVar, final
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.live.protocol.closed_loop import read_decisions
+from evedrop.live.network.reporting import BeliefReporter
+from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.codec import Reader
-from evedrop.live.protocol.telemetry import Extent, Journal, Report, Truth, read_journal, read_report, read_truth
+from evedrop.live.protocol.telemetry import (
+    Extent,
+    Journal,
+    Report,
+    Truth,
+    read_decisions,
+    read_journal,
+    read_report,
+    read_truth,
+)
 from evedrop.model.digest import Blocks, DigestLog
 from evedrop.model.integrity.monitor import MonitoredSlots
 from evedrop.model.links.link import REASONS
 from evedrop.model.process import Floats
+from evedrop.model.receiver import Belief, prior
 from evedrop.model.slot.account import Account
+from evedrop.model.slot.receiver import Absence
 from evedrop.names import CONTROLLER, ROUTER, SENSOR
+from evedrop.scenario.tables import Scenario
+from evedrop.scenario.timeline import Away
 from evedrop.score.slots import InputSlots, ReceiverSlots, Slots, all_set
 
 Message = TypeVar("Message")
@@ -209,3 +228,36 @@ def _rows(parts: list[tuple[Message, slice]], arrays: list[NDArray[Any]]) -> NDA
     """The rows of the parts' arrays, one after the other."""
     chosen = [array[rows] for array, (_, rows) in zip(arrays, parts, strict=True)]
     return chosen[0] if len(chosen) == 1 else np.concatenate(chosen)
+
+
+@final
+class AbsenceReporter:
+    """Reports the beliefs of a receiver that is away, computed from its belief when it left.
+
+    brief: of the recorder; put: takes the reports as if they were the receiver's own.
+    """
+
+    def __init__(
+        self, brief: AnyBrief, scenario: Scenario, receiver: str, away: Away, left: Belief, put: Callable[[bytes], None]
+    ) -> None:
+        process = scenario.process.process
+        fresh = prior(process, scenario.trials, away.start)
+        self._absence = Absence(process, left if away.keeps_state else fresh)
+        cuts, late = scenario.outage_bounds(receiver), scenario.window(receiver) > 0
+        self._reporter = BeliefReporter(brief, lambda _, payload: put(payload), lambda *_: None, cuts, away.start, late)
+        self.next = away.start
+        """The first slot that has not been reported."""
+        self._stop = min(away.stop, scenario.slots)
+
+    @property
+    def over(self) -> bool:
+        """Whether all slots of the outage are reported."""
+        return self.next == self._stop
+
+    def follow(self, end: int) -> None:
+        """Report the slots of the outage below `end`."""
+        slots = range(self.next, min(end, self._stop))
+        if slots:
+            self._reporter.add_slots(slots, self._absence.take_slots(slots))
+            self.next = slots.stop
+        self._reporter.flush(self.next)

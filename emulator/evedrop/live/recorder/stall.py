@@ -15,8 +15,8 @@ from typing import final
 
 from evedrop.errors import Silence
 from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
+from evedrop.live.protocol.commands import ProcessStatus
 from evedrop.live.protocol.keys import writer_of
-from evedrop.live.protocol.process_status import ProcessStatus
 from evedrop.names import RECORDER
 
 LEAST_SECONDS = 5.0

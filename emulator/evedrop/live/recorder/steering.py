@@ -1,7 +1,8 @@
 """Steers a run: when it is held and every process has reported all earlier slots, carries out due events, and lets it continue.
 
-So an event takes effect exactly between two slots, whether it is the scenario's or the operator's. While the sensor holds,
-only packets delayed by links are under way.
+So an event takes effect exactly between two slots, whether it is the scenario's or the operator's. While the sensor holds, only
+packets delayed by links are under way. Some requests of the operator await an answer: steps, in which a held run continues for
+some slots, and the status of the run.
 
 Source: docs/control.md.
 """
@@ -19,14 +20,16 @@ from evedrop.live.network.operator import Order
 from evedrop.live.network.session import READY_SECONDS
 from evedrop.live.protocol.commands import Go, Hold, LinkChange
 from evedrop.live.protocol.launcher_events import ProcessRequest
-from evedrop.live.protocol.requests import LinkRequest, PauseRequest, ResumeRequest, StepRequest
+from evedrop.live.protocol.requests import LinkRequest, LinkStatus, PauseRequest, ResumeRequest, RunStatus, StepRequest
 from evedrop.live.recorder.conductor import Conductor
+from evedrop.model.metrics.links import LinkAccount
 from evedrop.model.slot.link import Change
 from evedrop.names import ROUTER, SENSOR, ProcessAction
 from evedrop.scenario.events.event import Act
 from evedrop.scenario.loading.file import with_event
 from evedrop.scenario.progress_events import Held, OnEvent, RunEvent
 from evedrop.scenario.tables import Scenario
+from evedrop.score.run_tally import RunTally
 
 
 @dataclass(frozen=True)
@@ -282,3 +285,19 @@ class Steering:
         self._go()
         if self._asked:
             self._conductor.send_to(SENSOR, Hold())
+
+
+def status_of(
+    scenario: Scenario, done: int, rate: float, steering: Steering, conductor: Conductor, run_tally: RunTally
+) -> RunStatus:
+    """The status of a run; done: how many slots are scored; rate: slots per second."""
+    accounts = {name: LinkAccount.of(tally) for name, tally in run_tally.tallies.items()}
+    return RunStatus(
+        slot=done,
+        slots=scenario.slots,
+        slots_per_second=0.0 if steering.paused else rate,
+        state="paused" if steering.paused else "running" if steering.at is None else "held",
+        processes=conductor.processes,
+        links={name: LinkStatus.of(one.offered, one.delivered) for name, one in accounts.items()},
+        events=steering.events,
+    )

@@ -1,7 +1,10 @@
-"""Starts processes of a run on other hosts, over ssh: one connection for each host, with the system's `ssh`.
+"""Processes of a run on other hosts, over ssh: the launcher's side, the program that starts them there, and their messages.
 
-Each host gets the briefs of its own processes and no others, over the connection. When the connection closes, however that
-happens, the processes there end.
+There is one connection for each host, with the system's `ssh`. Each host gets the briefs of its own processes and no others,
+over the connection. Each message is one JSON object on a line: the entries of its class, and its kind. The program on the host
+gets its orders on standard input. It knows only the briefs of the processes that it starts; they are in a folder that only this
+user can read, until the processes have read them. When the connection closes, however that happens, it ends all processes and
+removes the folder.
 
 Source: docs/hosts.md, how it works.
 """
@@ -10,43 +13,190 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import importlib.metadata
 import itertools
+import json
 import os
 import select
 import shlex
 import shutil
 import signal
 import subprocess
+import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import IO, final
+from typing import IO, Any, ClassVar, TypeVar, final
 
 from evedrop.errors import Interrupted, RunError, UsageError
-from evedrop.live.launch.host_messages import (
-    MOST_NOISE,
-    Answer,
-    LauncherHeartbeat,
-    LogText,
-    Order,
-    SendSignal,
-    StartProcess,
-    answer_in,
-    greeting_in,
-    line_of,
-    own_version,
-)
 from evedrop.live.launch.hosts_file import HostsPlan, HostTable
-from evedrop.live.launch.starter import CONNECTION_LOST, FORK_SERVER_LOST, ReportedProcess, StartedProcess, Starter
-from evedrop.live.protocol.brief import read_brief
-from evedrop.live.protocol.brief_parts import ImportingPart
-from evedrop.live.protocol.last_word import Cause, LastWord
+from evedrop.live.launch.private_folder import private_folder
+from evedrop.live.launch.starter import (
+    CONNECTION_LOST,
+    FORK_SERVER_LOST,
+    ReportedProcess,
+    StartedProcess,
+    Starter,
+    end_all,
+    preloaded_without_recorder,
+)
+from evedrop.live.protocol.brief import AnyBrief, ImportingPart, ReceiverPart, brief_from, read_brief
+from evedrop.live.protocol.last_word import Cause, LastWord, last_word_file, read_last_word
+from evedrop.model.entries import (
+    SLOT,
+    anything,
+    entry,
+    expect,
+    inner,
+    named,
+    not_negative,
+    plain,
+    read,
+    table,
+    table_of,
+    text,
+    whole,
+)
 from evedrop.system.environment import own_environment
-from evedrop.system.processes import kill, signalled_when_parent_dies, wait_for
+from evedrop.system.processes import continue_when_parent_dies, kill, signalled_when_parent_dies, wait_for
+from evedrop.system.signals import raise_on_signals
+
+MOST_NOISE = 200
+"""The most lines that the login shell of a host may print before the program begins."""
+_KIND = "kind"
+_NUMBER = entry(SLOT)
+
+
+@dataclass(frozen=True)
+class HostMessage:
+    """The base class of all messages."""
+
+    kind: ClassVar[str]
+
+
+@dataclass(frozen=True)
+class StartProcess(HostMessage):
+    """To the host: start a process."""
+
+    kind = "start"
+    number: int = field(metadata=_NUMBER)
+    """Distinguishes it from all other processes of the run."""
+    brief: AnyBrief = field(repr=False, metadata=entry(anything, brief_from))
+    environment: Mapping[str, str] = field(metadata=entry(named(text)))
+    """Variables in addition to those of the host."""
+
+
+@dataclass(frozen=True)
+class SendSignal(HostMessage):
+    """To the host: send a signal to a process."""
+
+    kind = "signal"
+    number: int = field(metadata=_NUMBER)
+    signal: int = field(metadata=entry(whole(1, 64)))
+
+
+@dataclass(frozen=True)
+class LauncherHeartbeat(HostMessage):
+    """To the host: the launcher is still there."""
+
+    kind = "heartbeat"
+    silence: float = field(metadata=entry(not_negative))
+    """Seconds after which the host may consider a silent launcher gone."""
+
+
+@dataclass(frozen=True)
+class Greeting(HostMessage):
+    """To the launcher, before all else: the program runs."""
+
+    kind = "greeting"
+    evedrop: str = field(metadata=entry(text))
+    """Its version."""
+
+
+@dataclass(frozen=True)
+class LogText(HostMessage):
+    """To the launcher: what a process has written to its log."""
+
+    kind = "log"
+    number: int = field(metadata=_NUMBER)
+    written: str = field(metadata=entry(text))
+
+
+@dataclass(frozen=True)
+class ProcessEnded(HostMessage):
+    """To the launcher: a process has ended."""
+
+    kind = "ended"
+    number: int = field(metadata=_NUMBER)
+    status: int = field(metadata=entry(whole(-64, FORK_SERVER_LOST)))
+    """Negative: the signal that ended it. `FORK_SERVER_LOST`: it ended with its fork server."""
+    last_word: LastWord | None = field(default=None, metadata=inner(LastWord, left_out=True))
+    """Why it ended, if it could tell."""
+
+
+Order = StartProcess | SendSignal | LauncherHeartbeat
+"""What a launcher sends."""
+Answer = LogText | ProcessEnded
+"""What a host sends after its greeting."""
+_ORDERS: tuple[type[Order], ...] = (StartProcess, SendSignal, LauncherHeartbeat)
+_ANSWERS: tuple[type[Answer], ...] = (LogText, ProcessEnded)
+M = TypeVar("M", bound=HostMessage)
+
+
+def line_of(message: HostMessage) -> bytes:
+    """A message as a line."""
+    return json.dumps({_KIND: message.kind, **plain(message)}, default=plain).encode() + b"\n"
+
+
+def order_in(line: bytes) -> Order:
+    """The order of a line. Raises ValueError if it is not one."""
+    return _message_in(line, _ORDERS)
+
+
+def answer_in(line: bytes) -> Answer:
+    """The answer of a line. Raises ValueError if it is not one."""
+    return _message_in(line, _ANSWERS)
+
+
+def greeting_in(line: bytes) -> Greeting:
+    """The greeting of a line, of any version of the program. Raises ValueError if it is not one."""
+    found = _object_in(line)
+    expect(table({"evedrop": text}, strict=False), "", found)
+    return Greeting(found["evedrop"])
+
+
+def _message_in(line: bytes, kinds: Collection[type[M]]) -> M:
+    found = _object_in(line)
+    name = found.pop(_KIND, None)
+    kind = next((kind for kind in kinds if kind.kind == name), None)
+    if kind is None:
+        raise _no_message(line)
+    expect(table_of(kind), kind.kind, found)
+    return read(kind, found)
+
+
+def _object_in(line: bytes) -> dict[str, Any]:
+    try:
+        found = json.loads(line)
+    except (ValueError, RecursionError) as error:
+        raise _no_message(line) from error
+    if not isinstance(found, dict):
+        raise _no_message(line)
+    return found
+
+
+def _no_message(line: bytes) -> ValueError:
+    return ValueError(f"{line[:80]!r} is not a message")
+
+
+def own_version() -> str:
+    """The version of Evedrop, which must be the same on all hosts."""
+    return importlib.metadata.version("evedrop")
+
 
 ANSWER_SECONDS = 60.0
 """How long a host may take to connect and to start Python."""
@@ -345,3 +495,139 @@ def ssh_starter(plan: HostsPlan, here: Starter, stop: threading.Event, longest_o
         for host in hosts.values():
             host.wait_until_ready(deadline, stop)
         yield SshStarter(plan, hosts, here)
+
+
+_LAST_LINES_SECONDS = 1.0  # for the last lines of a process that has ended, whose own children may hold its log open
+
+
+def serve_launcher() -> None:
+    """Carry out the launcher's orders until it closes standard input.
+
+    Raises UsageError if no launcher gives orders, RunError for one that is malformed; all processes are then ended.
+    """
+    if sys.stdin is None or sys.stdin.isatty():
+        raise UsageError("`evedrop host` is started by `evedrop run SCENARIO --hosts FILE`, over ssh; use that command")
+    continue_when_parent_dies()  # if suspended, once the connection, whose process on this host is the parent, is closed
+    os.umask(0o077)
+    answers = os.fdopen(os.dup(1), "wb", buffering=0)
+    os.dup2(2, 1)  # so that nothing else can write between the messages
+    with raise_on_signals(), private_folder() as private, preloaded_without_recorder() as start:
+        host, silence = HostProcesses(private, start, answers.write), _Silence()
+        try:
+            host.answer(Greeting(own_version()))
+            for line in sys.stdin.buffer:
+                try:
+                    order = order_in(line)
+                    silence.heard(order)
+                    host.obey(order)
+                except ValueError as error:
+                    raise RunError(
+                        f"the launcher gave an order that cannot be carried out ({error}); use the same version of Evedrop "
+                        "on all hosts"
+                    ) from error
+        finally:
+            host.end()
+
+
+@final
+class _Silence:
+    """Ends this program when the launcher has been silent for long: its host may be gone, and the connection seem open."""
+
+    def __init__(self) -> None:
+        self._timer: threading.Timer | None = None
+        self._seconds = 0.0
+
+    def heard(self, order: Order) -> None:
+        """Note that an order came. A heartbeat says how long the launcher may be silent from now on."""
+        if isinstance(order, LauncherHeartbeat):
+            self._seconds = order.silence
+        if self._timer is not None:
+            self._timer.cancel()
+        if self._seconds:
+            self._timer = threading.Timer(self._seconds, os.kill, (os.getpid(), signal.SIGTERM))
+            self._timer.daemon = True
+            self._timer.start()
+
+
+@final
+class HostProcesses:
+    """The processes of a launcher on this host.
+
+    private: the folder for their files; send: writes bytes to the launcher.
+    """
+
+    def __init__(self, private: Path, start: Starter, send: Any) -> None:
+        self._private, self._start, self._send = private, start, send
+        self._sending = threading.Lock()
+        self._ending = False
+        self._processes: dict[int, StartedProcess] = {}
+
+    def answer(self, message: Greeting | Answer) -> None:
+        """Send a message to the launcher; harmless if it is gone."""
+        with self._sending, contextlib.suppress(OSError):
+            left = memoryview(line_of(message))
+            while left:
+                left = left[self._send(left) :]
+
+    def obey(self, order: Order) -> None:
+        """Start a process, or send a signal to one. Raises ValueError if the name of a process cannot be that of a file."""
+        if isinstance(order, StartProcess):
+            self._begin(order)
+        elif isinstance(order, SendSignal) and (process := self._processes.get(order.number)) is not None:
+            with contextlib.suppress(ProcessLookupError):
+                process.send_signal(order.signal)
+
+    def end(self) -> None:
+        """End all processes. The launcher learns of it by the end of the connection: no process there failed by itself."""
+        self._ending = True
+        end_all(self._processes.values())
+
+    def _begin(self, order: StartProcess) -> None:
+        number, brief = order.number, self._kept_here(order.brief)
+        if Path(brief.process).name != brief.process:
+            raise ValueError(f"{brief.process} is not the name of a process")
+        environment = {**own_environment(), **order.environment}
+        if "TMPDIR" in order.environment:
+            environment["TMPDIR"] = str(self._private)
+        read, write = os.pipe()
+        try:
+            with os.fdopen(write, "wb") as log:
+                path = brief.write(self._private)
+                last_word_file(self._private, brief.process).unlink(missing_ok=True)
+                self._processes[number] = self._start(brief.role, path, log, environment)
+        except OSError as error:
+            os.close(read)
+            self.answer(LogText(number, f"evedrop: {brief.process} cannot be started ({error})\n"))
+            gone = error.errno in (errno.ESRCH, errno.ETIMEDOUT)  # its fork server, whose host is to blame
+            self.answer(ProcessEnded(number, FORK_SERVER_LOST if gone else 1))
+            return
+        events = self._processes[number].stdout
+        if events is not None:
+            events.close()  # the launcher waits for no router on another host
+        threading.Thread(target=self._follow, args=(number, brief.process, read), daemon=True).start()
+
+    def _kept_here(self, brief: AnyBrief) -> AnyBrief:
+        """The same brief with the files of the process in the private folder of this host."""
+        if brief.last_word is not None:
+            brief = replace(brief, last_word=str(last_word_file(self._private, brief.process)))
+        if not isinstance(brief.part, ReceiverPart) or brief.part.state_file is None:
+            return brief
+        state_file = str((self._private / f"{brief.process}.state").absolute())
+        return replace(brief, part=replace(brief.part, state_file=state_file))
+
+    def _follow(self, number: int, name: str, log: int) -> None:
+        """Send what a process writes to its log, and how it ended."""
+        reader = threading.Thread(target=self._read, args=(number, log), daemon=True)
+        reader.start()
+        process = self._processes[number]
+        status = process.wait()  # without a limit: nobody waits for this thread
+        if process.stdin is not None:
+            process.stdin.close()
+        reader.join(_LAST_LINES_SECONDS)
+        if not self._ending:
+            self.answer(ProcessEnded(number, status, read_last_word(last_word_file(self._private, name))))
+
+    def _read(self, number: int, log: int) -> None:
+        with os.fdopen(log, "rb", buffering=0) as lines:
+            while text := lines.read(65536):
+                self.answer(LogText(number, text.decode("utf-8", "replace")))
