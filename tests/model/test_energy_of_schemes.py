@@ -10,7 +10,7 @@ from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.plain import Plain
 from evedrop.model.schemes.scheme import PacketBlock
 from evedrop.model.streams import Batch
-from evedrop.simulate.packet_tally import PacketTally
+from evedrop.simulate.chunk import PacketTally
 from tests.model.slot_loop import coins, play
 
 PROCESS = Process(np.eye(2), np.eye(2), np.eye(2))

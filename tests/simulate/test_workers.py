@@ -280,7 +280,7 @@ def test_a_worker_is_given_no_tokens(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_was_merged_before_a_fault_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A fault after the first batch: the tables have its trials, the summary says how the study ended."""
     from evedrop.cli.api import montecarlo
-    from evedrop.simulate import sharing
+    from evedrop.simulate import montecarlo as sharing
 
     def failing(tasks: list[Any], *_: object) -> object:
         yield 0, tasks[0].carry_out(lambda _: None, lambda: False)

@@ -1,12 +1,11 @@
 """Exact mode: the same cores as in a live run, without messages between them.
 
-Slots are simulated a chunk at a time. Where something flows back to the sensor, the parts that it depends on are simulated one
-slot at a time, and all others follow a chunk at a time.
+A receiver with its link does the work of a live run's router, receiver process and absence reporter.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -21,28 +20,28 @@ from evedrop.model.integrity.monitor import Monitor
 from evedrop.model.kernels.current import kernels
 from evedrop.model.numeric.detection import CusumBatch
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Belief, Flags, Receiver
+from evedrop.model.receiver import Belief, Flags, Receiver, prior
 from evedrop.model.schemes.scheme import Scheme, Shared
 from evedrop.model.slot.controller import ControllerCore
 from evedrop.model.slot.link_core import LinkCore
 from evedrop.model.slot.plant import PlantCore
-from evedrop.model.slot.receiver import FollowedSlots
+from evedrop.model.slot.receiver import Absence, FollowedSlots, ReceiverCore
 from evedrop.model.slot.sensor import SensorCore, Sent
+from evedrop.model.slot.transit import Arrivals
 from evedrop.model.streams import Batch
 from evedrop.names import CONTROLLER, LEGITIMATE
 from evedrop.scenario.controlled import monitor_of
 from evedrop.scenario.input_files import disturbances_of, states_of
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.scenario.tables import Scenario
+from evedrop.scenario.timeline import Away
 from evedrop.score.acknowledging import ack_channel_of, chart_of
 from evedrop.score.closed_loop_tally import SolveTimes
 from evedrop.score.filtering import local_filter_of
 from evedrop.score.slots import InputSlots, ReceiverSlots, Slots
 from evedrop.score.sums import squared_errors
-from evedrop.simulate.chunk import Chunk, ReceiverChunk
+from evedrop.simulate.chunk import Chunk, PacketTally, ReceiverChunk
 from evedrop.simulate.guarded_classes import Guard
-from evedrop.simulate.linked_receiver import LinkedReceiver
-from evedrop.simulate.packet_tally import PacketTally
 
 
 @dataclass(frozen=True)
@@ -244,3 +243,40 @@ class _ControlLoop:
         digests = self._log.add(k, self._u, self._failed)
         if digests is not None:
             self._digests.update([digests])
+
+
+@final
+class LinkedReceiver:
+    """A receiver that follows the slots from 0 on, and may be away in some of them."""
+
+    def __init__(self, receiver: Receiver, window: int, outages: Sequence[Away]) -> None:
+        self._receiver, self._window = receiver, window
+        self._outages = {away.start: away for away in outages}
+        self._away: Away | None = None
+        self._absence: Absence
+        self._core = ReceiverCore(receiver, window)
+
+    @property
+    def belief(self) -> Belief:
+        """Its belief after the last slot in which it was present, or that it passed."""
+        return self._core.belief
+
+    def take_slots(self, slots: range, arrivals: Arrivals) -> FollowedSlots:
+        """The beliefs after consecutive slots, at least one. The receiver is present in all of them, or away in all."""
+        k = slots.start
+        if k in self._outages:
+            self._leave(self._outages[k])
+        if self._away is not None and k < self._away.stop:
+            if self._away.keeps_state:
+                self._core.miss(slots)
+            late = np.zeros((2, len(slots), self._receiver.trials), np.uint16) if self._window else None
+            return FollowedSlots(self._absence.take_slots(slots), late)
+        if self._away is not None and not self._away.keeps_state:
+            self._core = ReceiverCore(self._receiver, self._window, k)
+        self._away = None
+        return self._core.take_slots(slots, arrivals)
+
+    def _leave(self, away: Away) -> None:
+        process, trials = self._receiver.process, self._receiver.trials
+        left = self._core.belief if away.keeps_state else prior(process, trials, away.start)
+        self._away, self._absence = away, Absence(process, left)

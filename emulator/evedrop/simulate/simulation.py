@@ -33,10 +33,9 @@ from evedrop.scenario.plugins import look_in
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.scenario.tables import Scenario
 from evedrop.score.closed_loop_tally import SolveTimes
-from evedrop.simulate.chunk import Chunk, ReceiverChunk
+from evedrop.simulate.chunk import Chunk, PacketTally, ReceiverChunk
 from evedrop.simulate.exact import ExactSimulation, Roles
 from evedrop.simulate.guarded_classes import Guard
-from evedrop.simulate.packet_tally import PacketTally
 
 _CHUNK_NUMBERS = 64  # slots of a chunk times states: with 2000 trials side by side, a megabyte for each array
 

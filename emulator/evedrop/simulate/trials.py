@@ -24,9 +24,8 @@ from evedrop.score.run_tally import RunTally
 from evedrop.score.scorekeeper import Scorekeeper
 from evedrop.score.slots import Slots
 from evedrop.score.sums import SlotSums, slot_sums
-from evedrop.simulate.chunk import Chunk
+from evedrop.simulate.chunk import Chunk, PacketTally
 from evedrop.simulate.kept_tasks import KeptTasks
-from evedrop.simulate.packet_tally import PacketTally
 from evedrop.simulate.simulation import Mode, Simulation
 from evedrop.simulate.tasks import OnProgress, Stopped, Task
 

@@ -39,9 +39,9 @@ from evedrop.score.leak import revealed_by_packets
 from evedrop.score.rare_events import rare_events_of, z_of_error
 from evedrop.score.scorekeeper import verdicts
 from evedrop.score.sums import Tally, trial_means
+from evedrop.simulate.chunk import PacketTally
 from evedrop.simulate.kept_tasks import kept_tasks, study_of
 from evedrop.simulate.montecarlo import Merger, Plan, progress_counter
-from evedrop.simulate.packet_tally import PacketTally
 from evedrop.simulate.simulation import Mode
 from evedrop.simulate.trials import BatchResult, tasks_of
 from evedrop.studies.matchups import Group, Matchups
