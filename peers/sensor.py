@@ -9,7 +9,6 @@ from queue import Empty
 from typing import final
 
 from evedrop.errors import RunError
-from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.network.process_session import GapDetector, Mailbox, ProcessSession, ReplayBuffer, most_slots
 from evedrop.live.network.program import ProgramStates
 from evedrop.live.network.reporting import TruthReporter
@@ -33,6 +32,7 @@ from evedrop.names import RECORDER, SENSOR
 from evedrop.peers.closed_loop import Steered
 from evedrop.scenario.conformance.checked import checked_encoder
 from evedrop.scenario.conformance.problems import Problem
+from evedrop.system.waiting import SYSTEM_CLOCK, Clock
 
 _PROGRESS_BYTES = 16 * 2**20  # for one follower: far more than are ever under way
 _SETTLE_SECONDS = 2.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from evedrop.live.network.clock import SystemClock
+from evedrop.system.waiting import SystemClock
 from evedrop.wire.file import wire_of
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.steering import WireConductor

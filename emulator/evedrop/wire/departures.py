@@ -20,7 +20,7 @@ from typing import Any, Final, final
 
 import zenoh
 
-from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
+from evedrop.system.waiting import SYSTEM_CLOCK, Clock
 from evedrop.wire.side import SideSession
 from evedrop.wire.watchdog import Duty
 

@@ -43,7 +43,7 @@ from evedrop.results.folder import make_private
 from evedrop.results.wire_summary import JournalState
 from evedrop.system.files import try_lock
 from evedrop.system.output import warn
-from evedrop.system.threads import wait_for_thread
+from evedrop.system.waiting import wait_for_thread
 from evedrop.wire.history import NotedEvent, Numbered, WireHistory, highest
 from evedrop.wire.plan import WireLink, WirePlan, numbered_as
 from evedrop.wire.records import (

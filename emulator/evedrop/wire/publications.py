@@ -17,7 +17,7 @@ from typing import Any, final
 
 import zenoh
 
-from evedrop.system.threads import wait_for_thread
+from evedrop.system.waiting import wait_for_thread
 from evedrop.wire.departures import Backlog
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.link_state import Lane, LinkState

@@ -17,7 +17,7 @@ import zenoh
 
 from evedrop.live.network.zenoh_log import LOGGED
 from evedrop.system.output import warn
-from evedrop.system.threads import wait_for_thread
+from evedrop.system.waiting import wait_for_thread
 from evedrop.wire.departures import Departures
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.link_state import LinkState

@@ -21,7 +21,6 @@ import zenoh
 
 from evedrop.errors import ScenarioError
 from evedrop.live.network.access import Grant, access_control, users_file
-from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.network.connecting import open_session
 from evedrop.live.network.connection import Question, Questions
 from evedrop.live.network.control_file import Control, remove_control
@@ -33,7 +32,7 @@ from evedrop.live.protocol.requests import LinkRequest, OperatorRequest, StatusR
 from evedrop.names import OPERATOR, RECORDER
 from evedrop.system.output import warn
 from evedrop.system.ports import free_port
-from evedrop.system.threads import wait_for_thread
+from evedrop.system.waiting import SYSTEM_CLOCK, Clock, wait_for_thread
 from evedrop.wire.journal import WireJournal
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.relay import WireRelay

@@ -36,7 +36,7 @@ from evedrop.scenario.progress_events import (
 )
 from evedrop.scenario.tables import Scenario
 from evedrop.show.view.viewer import Viewer
-from evedrop.system.threads import wait_for_thread
+from evedrop.system.waiting import wait_for_thread
 
 _POLL_SECONDS = 0.25
 

@@ -20,12 +20,12 @@ from typing import Protocol, final
 import zenoh
 
 from evedrop.errors import BriefError, RunError
-from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.network.endpoint import AnyEndpoint, Endpoint, SocketEndpoint, endpoint_in
 from evedrop.live.protocol.brief import Identity
 from evedrop.live.protocol.keys import ZenohConfig
 from evedrop.system.environment import check_zenoh_runtime
 from evedrop.system.lacks import lack_of
+from evedrop.system.waiting import SYSTEM_CLOCK, Clock
 
 
 def open_session(config: zenoh.Config) -> zenoh.Session:

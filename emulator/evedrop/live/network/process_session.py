@@ -18,12 +18,12 @@ from types import TracebackType
 from typing import Protocol, Self, final
 
 from evedrop.errors import Gap, MalformedMessage
-from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import ControlCommand, StatusReporter
 from evedrop.live.protocol.keys import RunKeys, writer_of
 from evedrop.live.protocol.packets import is_barrier, is_resend
+from evedrop.system.waiting import SYSTEM_CLOCK, Clock
 
 
 class Received(Protocol):

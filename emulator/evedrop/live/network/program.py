@@ -14,12 +14,12 @@ from typing import Self, final
 import zenoh
 
 from evedrop.errors import BriefError, RunError
-from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.network.connecting import open_session
 from evedrop.live.protocol.brief import ProgramEntry
 from evedrop.live.protocol.keys import ZenohConfig
 from evedrop.live.protocol.state_message import MOST_BYTES, read_state
 from evedrop.model.process import Floats
+from evedrop.system.waiting import SYSTEM_CLOCK, Clock
 
 LEAST_SECONDS = 5.0
 """The least time for which a program may be silent, as for a process of the run."""

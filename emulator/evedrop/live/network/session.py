@@ -24,7 +24,6 @@ from typing import Self, final
 import zenoh
 
 from evedrop.errors import Gap, MalformedMessage, MissingProcesses, RunError
-from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.network.connecting import Credentials, RouterAddress, WaitReporter, connected, listening, open_session
 from evedrop.live.network.connection import (
     CallbackSubscription,
@@ -55,6 +54,7 @@ from evedrop.live.protocol.commands import (
 from evedrop.live.protocol.keys import RunKeys, ZenohConfig, low_pass, reader_of
 from evedrop.live.protocol.launcher_events import RouterListens
 from evedrop.names import RECORDER, ROUTER
+from evedrop.system.waiting import SYSTEM_CLOCK, Clock
 
 READY_SECONDS = 30.0
 _POLL_SECONDS = 0.004

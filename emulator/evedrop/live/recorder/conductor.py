@@ -9,7 +9,6 @@ from queue import Empty, SimpleQueue
 from typing import NoReturn, final
 
 from evedrop.errors import Interrupted, RunError
-from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.network.connection import Question
 from evedrop.live.network.process_session import Mailbox
 from evedrop.live.network.session import Session
@@ -17,6 +16,7 @@ from evedrop.live.protocol.codec import Reader, is_over, progress, read_over
 from evedrop.live.protocol.commands import Abandon, ControlCommand, EndRun, Start
 from evedrop.names import RECORDER, RELAY, ROUTER, SENSOR
 from evedrop.system.signals import AFTERTHOUGHT_SECONDS
+from evedrop.system.waiting import SYSTEM_CLOCK, Clock
 
 _ABANDON_SECONDS = 2.0  # for processes to leave when told to
 _POLL_SECONDS = 0.05  # how soon a signal is noticed

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from typing import final
 
-from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.protocol.brief import Flow
 from evedrop.live.protocol.commands import Again
 from evedrop.live.recorder.conductor import Conductor
@@ -19,6 +18,7 @@ from evedrop.live.recorder.stall import patience_of
 from evedrop.live.recorder.steering import Steering
 from evedrop.names import RECORDER, RELAY, ROUTER
 from evedrop.scenario.progress_events import ConnectionOutage, OnEvent
+from evedrop.system.waiting import SYSTEM_CLOCK, Clock
 
 _SOON_SECONDS = 0.5  # after which a round without effect is repeated; the wait doubles each time
 _IDLE_SECONDS = 10.0  # for which a run may stand still without a known reason before a round is tried

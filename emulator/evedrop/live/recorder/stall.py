@@ -14,10 +14,10 @@ from collections.abc import Callable, Collection, Mapping
 from typing import final
 
 from evedrop.errors import Silence
-from evedrop.live.network.clock import SYSTEM_CLOCK, Clock
 from evedrop.live.protocol.commands import ProcessStatus
 from evedrop.live.protocol.keys import writer_of
 from evedrop.names import RECORDER
+from evedrop.system.waiting import SYSTEM_CLOCK, Clock
 
 LEAST_SECONDS = 5.0
 """The least of these: a busy machine may not let a process work for some seconds."""
