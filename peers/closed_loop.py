@@ -8,7 +8,7 @@ from evedrop.live.network.process_session import GapDetector, ProcessSession, Re
 from evedrop.live.protocol.brief import AnyBrief, EstimatorLoopPart, SensorLoopPart
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.telemetry import known, read_decided
-from evedrop.model.input_aware import InputAwareEstimator
+from evedrop.model.plant import InputAwareEstimator
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Belief, Flags, Receiver
 

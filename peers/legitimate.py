@@ -8,7 +8,7 @@ from functools import partial
 from evedrop.live.network.process_session import ProcessSession
 from evedrop.live.network.session import Session
 from evedrop.live.protocol.brief import AnyBrief, Brief, LegitimatePart
-from evedrop.model.input_aware import InputAwareEstimator
+from evedrop.model.plant import InputAwareEstimator
 from evedrop.model.schemes import scheme_of
 from evedrop.peers.closed_loop import Consultation
 from evedrop.peers.receiver_loop import follow

@@ -18,16 +18,14 @@ from evedrop.live.protocol.codec import Reader, read_progress
 from evedrop.live.protocol.commands import EndRun, Go, Hold, Start
 from evedrop.live.protocol.packets import barrier, read_acknowledgement, resend, uplink
 from evedrop.live.protocol.telemetry import held
-from evedrop.model.given_states import GivenStates, recorded
+from evedrop.model.detection import CusumBatch
 from evedrop.model.integrity.monitor import Monitor
 from evedrop.model.local_filter import LocalFilter
-from evedrop.model.numeric.detection import CusumBatch
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags
 from evedrop.model.schemes import scheme_of
 from evedrop.model.schemes.scheme import Scheme
-from evedrop.model.slot.plant import PlantCore
-from evedrop.model.slot.sensor import SensorCore, Sent
+from evedrop.model.slot.sensor_core import GivenStates, PlantCore, SensorCore, Sent, recorded
 from evedrop.names import RECORDER, SENSOR
 from evedrop.peers.closed_loop import Steered
 from evedrop.scenario.conformance.checked import checked_encoder

@@ -13,13 +13,12 @@ from evedrop.cli.command import Command
 from evedrop.errors import EvedropError, UsageError
 from evedrop.model import update
 from evedrop.model.checks import probability_mistakes
-from evedrop.model.delays.constant import ConstantDelay
-from evedrop.model.delays.delay import DelayModel
+from evedrop.model.delays import ConstantDelay, DelayModel
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge, PacketReader, PacketTaker
-from evedrop.model.eavesdroppers.naive import Naive
+from evedrop.model.eavesdroppers.fixed_rules import Naive
 from evedrop.model.kernels import elementary
 from evedrop.model.links.bernoulli import Bernoulli
-from evedrop.model.links.link import Chain, Fate, LossModel, fates_of
+from evedrop.model.links.loss_model import Chain, Fate, LossModel, fates_of
 from evedrop.model.metrics.metric import MeanMetric, Metric, MetricColumn, MetricTally, ScoredSlots
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Action, Belief, Beliefs, Codes, Flags, Receiver, Reception, prior, trace_of
@@ -27,7 +26,7 @@ from evedrop.model.schemes.innovation import Innovation
 from evedrop.model.schemes.plain import Plain, PlainEncoder, PlainEstimator
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, PacketBlock, Scheme, Shared
 from evedrop.model.streams import Batch, BlockReader
-from evedrop.model.theory.closed_form import ClosedForm, ReceiverConditions
+from evedrop.model.theory.closed_forms import ClosedForm, ReceiverConditions
 from evedrop.model.theory.covariances import Outcomes, OutcomesAt
 from evedrop.names import ProcessAction
 from evedrop.system.later import imported_later

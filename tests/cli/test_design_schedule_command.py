@@ -10,7 +10,7 @@ import pytest
 
 from evedrop.cli.api import design_schedule
 from evedrop.model.theory.covariances import Outcomes
-from evedrop.model.theory.schedule_problem import SlotRecursion
+from evedrop.model.theory.schedules import SlotRecursion
 from evedrop.scenario.loading import load
 from tests.builders import UNSTABLE
 from tests.conftest import Evedrop

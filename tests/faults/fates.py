@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from evedrop.model.links.link import Fate
+from evedrop.model.links.loss_model import Fate
 from evedrop.model.slot.link import Fates
 from evedrop.scenario.tables import Scenario
 from evedrop.simulate.simulation import Simulation

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evedrop.live.launch.gathering import Gathered, Journals, Recorded, Statistics
-from evedrop.model.links.link import REASONS
+from evedrop.model.links.loss_model import REASONS
 from evedrop.results.writer import ResultsWriter
 from evedrop.score.slots import ReceiverSlots, Slots
 from evedrop.score.sums import slot_sums, squared_errors

@@ -13,8 +13,8 @@ from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.telemetry import Decisions, Extent, Journal, Report, Truth
 from evedrop.live.recorder.joiner import Joiner
 from evedrop.model.digest import Blocks
-from evedrop.model.links.link import REASONS
-from evedrop.model.slot.account import COUNTED_BURSTS, Account
+from evedrop.model.links.loss_model import REASONS
+from evedrop.model.slot.link import COUNTED_BURSTS, Account
 from evedrop.score.slots import ReceiverSlots, Slots
 from tests.builders import mirrored
 

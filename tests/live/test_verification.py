@@ -15,11 +15,10 @@ from evedrop.errors import Contradiction, MalformedMessage
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.telemetry import Extent, Journal, Report, read_journal, read_report
 from evedrop.live.recorder.verification import Verifier
-from evedrop.model.block_sums import BlockSums
-from evedrop.model.digest import BlockDigests, Blocks
-from evedrop.model.links.link import REASONS
+from evedrop.model.digest import BlockDigests, Blocks, BlockSums
+from evedrop.model.links.loss_model import REASONS
 from evedrop.model.receiver import Belief
-from evedrop.model.slot.account import COUNTED_BURSTS, Account
+from evedrop.model.slot.link import COUNTED_BURSTS, Account
 from evedrop.score.slots import ReceiverSlots, Slots
 from tests.builders import mirrored, one_slot
 

@@ -8,8 +8,7 @@ import numpy as np
 
 from evedrop.model.process import Process
 from evedrop.model.receiver import Flags, Reception
-from evedrop.model.reference import ReferenceReceiver
-from evedrop.model.reference_code import ReferenceCode
+from evedrop.model.reference_code import ReferenceCode, ReferenceReceiver
 from evedrop.model.schemes.mixed_packets import MixedEncoder
 
 

@@ -9,9 +9,8 @@ from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.process import Process
 from evedrop.model.receiver import Action, Reception
-from evedrop.model.reference import ReferenceReceiver
-from evedrop.model.schemes.acknowledged import Acknowledged
-from evedrop.model.schemes.open_loop import OpenLoop
+from evedrop.model.reference_code import ReferenceReceiver
+from evedrop.model.schemes.acknowledged import Acknowledged, OpenLoop
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.streams import Batch
 from tests.builders import DRIFTING, UNSTABLE

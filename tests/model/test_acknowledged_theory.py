@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from evedrop.model.process import Process
-from evedrop.model.reference_floor import reference_floor
-from evedrop.model.schemes.acknowledged import Acknowledged
-from evedrop.model.schemes.open_loop import OpenLoop
+from evedrop.model.reference_form import reference_floor
+from evedrop.model.schemes.acknowledged import Acknowledged, OpenLoop
 from evedrop.model.theory.closed_forms import reference_covariances
 from evedrop.model.theory.covariances import expected_covariances
 from evedrop.scenario.expected.expectations import expectations_of

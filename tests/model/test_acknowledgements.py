@@ -12,9 +12,9 @@ from scipy.optimize import brentq
 from scipy.stats import binomtest
 
 from evedrop.model.acknowledgements import ATTACKS, AckChannel, rates_of
+from evedrop.model.detection import Chart, CusumBatch, chart_for
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
-from evedrop.model.numeric.detection import Chart, CusumBatch, chart_for
 from evedrop.model.schemes.acknowledged import Acknowledged
 from evedrop.model.streams import Batch, stream_key
 from evedrop.model.theory.closed_forms import reference_covariances

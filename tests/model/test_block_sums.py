@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evedrop.model.block_sums import BlockSums, added_in_order
+from evedrop.model.digest import BlockSums, added_in_order
 
 SLOTS, CUTS = 700, (300, 310)
 STARTS = [0, 256, 300, 310, 512]

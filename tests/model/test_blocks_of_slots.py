@@ -13,8 +13,7 @@ from evedrop.model import update
 from evedrop.model.digest import BlockDigests
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
-from evedrop.model.eavesdroppers.naive import Naive
-from evedrop.model.eavesdroppers.suspicious import Suspicious
+from evedrop.model.eavesdroppers.fixed_rules import Naive, Suspicious
 from evedrop.model.process import Floats, Process, Trajectory
 from evedrop.model.receiver import Action, Belief, Beliefs, Flags, Receiver, Reception
 from evedrop.model.schemes import SCHEMES, scheme_of

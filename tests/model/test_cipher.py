@@ -10,7 +10,7 @@ from scipy import stats
 
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
-from evedrop.model.numeric.masking import Mask
+from evedrop.model.number_codes import Mask
 from evedrop.model.process import Process
 from evedrop.model.schemes.cipher import Cipher
 from evedrop.model.streams import Batch, Stream, stream_key

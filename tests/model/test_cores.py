@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop.model.links.link import Fate
+from evedrop.model.detection import Chart, CusumBatch
+from evedrop.model.links.loss_model import Fate
 from evedrop.model.local_filter import LocalFilter
-from evedrop.model.numeric.detection import Chart, CusumBatch
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Receiver
@@ -20,11 +20,9 @@ from evedrop.model.schemes.innovation import InnovationEncoder, SharedSecret
 from evedrop.model.schemes.plain import PlainEncoder
 from evedrop.model.schemes.scheme import Packet, PacketBlock
 from evedrop.model.slot.link import Change, LinkSchedule, ReceiverOutage, streams_of
-from evedrop.model.slot.link_core import LinkCore
-from evedrop.model.slot.plant import PlantCore
-from evedrop.model.slot.receiver import FollowedSlots, ReceiverCore
-from evedrop.model.slot.sensor import SensorCore, Sent
-from evedrop.model.slot.transit import Arrivals
+from evedrop.model.slot.link_core import Arrivals, LinkCore
+from evedrop.model.slot.receiver_core import FollowedSlots, ReceiverCore
+from evedrop.model.slot.sensor_core import PlantCore, SensorCore, Sent
 from evedrop.model.streams import Batch, stream_key
 from tests.builders import MARGINAL, stream_keys
 from tests.model.slot_loop import ROOT, keys_of

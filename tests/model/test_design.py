@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from evedrop.errors import UsageError
 from evedrop.model.process import Process
-from evedrop.model.theory.adversary import Adversary, adversary_bound
 from evedrop.model.theory.covariances import Outcomes, limit_trace, stability_bound
 from evedrop.model.theory.design import (
     best_difference,
@@ -19,6 +18,7 @@ from evedrop.model.theory.design import (
     perfect_secrecy,
     relative_secrecy,
 )
+from evedrop.model.theory.ratio import Adversary, adversary_bound
 from tests.builders import MICROGRID, UNSTABLE
 from tests.examples import examples, mostly_long
 

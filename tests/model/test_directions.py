@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from evedrop.model.process import Process
-from evedrop.model.theory.clear_states import ClearStatesForm
-from evedrop.model.theory.covariances import NOBODY, Outcomes, expected_covariances
-from evedrop.model.theory.directions import growth
+from evedrop.model.theory.closed_forms import ClearStatesForm
+from evedrop.model.theory.covariances import NOBODY, Outcomes, expected_covariances, growth
 
 TURNED, _ = np.linalg.qr(np.random.default_rng(3).standard_normal((4, 4)))
 MIXED = Process(TURNED @ np.diag([1.3, 1.1, 1.0, 0.6]) @ TURNED.T, np.eye(4), np.eye(4))

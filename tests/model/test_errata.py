@@ -6,7 +6,6 @@ import pytest
 from evedrop.model.process import Floats, Process, Trajectory, mistakes_of
 from evedrop.model.schemes.innovation import Innovation
 from evedrop.model.streams import Batch
-from evedrop.model.theory.adversary import Adversary
 from evedrop.model.theory.covariances import (
     Outcomes,
     expected_covariances,
@@ -15,6 +14,7 @@ from evedrop.model.theory.covariances import (
     state_covariances,
 )
 from evedrop.model.theory.design import best_difference, design, relative_secrecy
+from evedrop.model.theory.ratio import Adversary
 from evedrop.studies.papers import microgrid
 from tests.builders import stream_keys
 

@@ -17,7 +17,7 @@ from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.process import Process
 from evedrop.model.reference_code import ReferenceCode
 from evedrop.model.schemes import scheme_of
-from evedrop.model.schemes.threshold_code import forged_fraction
+from evedrop.model.schemes.mixed_packets import forged_fraction
 from evedrop.model.streams import Batch
 from evedrop.model.theory.closed_forms import reference_covariances, reference_limit
 from evedrop.model.theory.covariances import Outcomes, expected_covariances

@@ -12,7 +12,7 @@ import pytest
 from evedrop.model.acknowledgements import HeedRule
 from evedrop.model.process import Process
 from evedrop.model.schemes import SCHEMES, scheme_of
-from evedrop.model.theory.closed_form import ClosedForm, Hijack, ReceiverConditions
+from evedrop.model.theory.closed_forms import ClosedForm, Hijack, ReceiverConditions
 from evedrop.model.theory.covariances import LARGEST_OPERATOR
 
 STABLE = Process(np.array([[0.9, 0.3], [0.0, 0.8]]), np.eye(2), np.eye(2))

@@ -8,9 +8,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evedrop.model.given_states import GivenStates, deviations, recorded
 from evedrop.model.process import product
-from evedrop.model.slot.plant import PlantCore
+from evedrop.model.slot.sensor_core import GivenStates, PlantCore, deviations, recorded
 from evedrop.model.streams import Batch
 from tests.builders import MARGINAL
 

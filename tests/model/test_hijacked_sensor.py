@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from evedrop.model.acknowledgements import AckChannel, HeedRule, heed_rule_of, rates_of
 from evedrop.model.process import Process
 from evedrop.model.streams import Batch, stream_key
-from evedrop.model.theory.closed_form import Hears
-from evedrop.model.theory.closed_forms import hijacked_schedule, scheduled
+from evedrop.model.theory.closed_forms import Hears, hijacked_schedule, scheduled
 from evedrop.scenario.expected.expectations import expectations_of
 from evedrop.scenario.loading import checked
 from evedrop.score.acknowledging import chart_of

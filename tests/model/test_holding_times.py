@@ -7,12 +7,12 @@ import pytest
 
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
-from evedrop.model.numeric.masking import Mask
+from evedrop.model.number_codes import Mask
 from evedrop.model.process import Process
 from evedrop.model.receiver import Action
 from evedrop.model.schemes import scheme_of
 from evedrop.model.schemes.encrypted_schedule import EncryptedSchedule
-from evedrop.model.schemes.scheduled import Scheduled
+from evedrop.model.schemes.silent import Scheduled
 from evedrop.model.streams import Batch, stream_key
 from evedrop.model.theory import closed_forms
 from evedrop.model.theory.covariances import limit

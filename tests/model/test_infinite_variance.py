@@ -7,8 +7,7 @@ import pytest
 
 from evedrop.model.process import Process
 from evedrop.model.reference_form import ReferenceForm
-from evedrop.model.theory.chain_form import ChainForm
-from evedrop.model.theory.closed_forms import SensorChain, always_sent, encrypted_schedule, scheduled
+from evedrop.model.theory.closed_forms import ChainForm, SensorChain, always_sent, encrypted_schedule, scheduled
 
 
 def process_of(a: float) -> Process:

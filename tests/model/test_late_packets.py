@@ -12,15 +12,14 @@ from hypothesis import strategies as st
 
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
-from evedrop.model.links.link import Fate
+from evedrop.model.links.loss_model import Fate
 from evedrop.model.process import Process, Trajectory
 from evedrop.model.receiver import Action, Belief, Receiver, Reception, prior
 from evedrop.model.schemes.encrypted_schedule import EncryptedSchedule
 from evedrop.model.schemes.innovation import Innovation
-from evedrop.model.slot.account import COUNTED_BURSTS, Accountant
-from evedrop.model.slot.link import Fates, Link, LinkSchedule, streams_of
-from evedrop.model.slot.receiver import Absence, ReceiverCore
-from evedrop.model.slot.transit import Arrival, Arrivals, Late, Transit
+from evedrop.model.slot.link import COUNTED_BURSTS, Accountant, Fates, Link, LinkSchedule, streams_of
+from evedrop.model.slot.link_core import Arrival, Arrivals, Late, Transit
+from evedrop.model.slot.receiver_core import Absence, ReceiverCore
 from evedrop.model.streams import Batch
 from tests.builders import stream_keys
 from tests.examples import examples

@@ -11,10 +11,9 @@ import pytest
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.bayesian import Bayesian
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
+from evedrop.model.eavesdroppers.learner import CAPACITY, RIDGE, divided, factored
 from evedrop.model.eavesdroppers.learning_em import LearningEm, climbing_slots
 from evedrop.model.kernels.factored import Factor, Factors, covariance
-from evedrop.model.learning.learner_posterior import CAPACITY
-from evedrop.model.learning.moments import RIDGE, divided, factored
 from evedrop.model.process import Floats, Process, Trajectory
 from evedrop.model.receiver import Belief, Receiver, Reception
 from evedrop.model.schemes.cipher import Cipher

@@ -10,14 +10,11 @@ import pytest
 
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.bayesian import Bayesian
-from evedrop.model.eavesdroppers.delegate import Delegate
+from evedrop.model.eavesdroppers.delegates import Delegate
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
-from evedrop.model.eavesdroppers.learning_particle import LearningParticle
+from evedrop.model.eavesdroppers.learner import CAPACITY, Moments, known
+from evedrop.model.eavesdroppers.learning_particle import LearningParticle, drawn, lattice, numbers_of
 from evedrop.model.kernels.factored import Factors, covariance
-from evedrop.model.learning.draws import drawn, lattice, numbers_of
-from evedrop.model.learning.known import known
-from evedrop.model.learning.learner_posterior import CAPACITY
-from evedrop.model.learning.moments import Moments
 from evedrop.model.process import Process
 from evedrop.model.receiver import Reception
 from evedrop.model.streams import Batch

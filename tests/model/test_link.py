@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evedrop.model.delays import DELAY_MODELS, delay_of
-from evedrop.model.links.link import Fate
+from evedrop.model.links.loss_model import Fate
 from evedrop.model.slot.link import NEVER, Change, Fates, Link, LinkSchedule, ReceiverOutage, streams_of
 from evedrop.model.streams import Batch, Stream, normals, root_of_seed, stream_key, uniforms
 from tests.examples import examples

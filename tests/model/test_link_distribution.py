@@ -11,7 +11,7 @@ import pytest
 
 from evedrop.model.delays import delay_of
 from evedrop.model.links import loss_of
-from evedrop.model.links.link import Fate
+from evedrop.model.links.loss_model import Fate
 from evedrop.model.modulated import ModulatedCovariance, limit_of
 from evedrop.model.process import Process
 from evedrop.model.slot.link import NEVER, Change, LinkSchedule, ReceiverOutage

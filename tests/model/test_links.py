@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from evedrop.model.links import LOSS_MODELS, pooled_spec, single_specs
-from evedrop.model.links.link import Fate
-from evedrop.model.slot.account import Accountant
-from evedrop.model.slot.link import Fates, link_of
+from evedrop.model.links.loss_model import Fate
+from evedrop.model.slot.link import Accountant, Fates, link_of
 from evedrop.model.streams import Batch, Stream, root_of_seed, stream_key, uniforms
 
 KEY = stream_key(root_of_seed(8), "link/eve")

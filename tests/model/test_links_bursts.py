@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from evedrop.model.links import LOSS_MODELS, loss_of
-from evedrop.model.links.link import Fate
+from evedrop.model.links.loss_model import Fate
 from evedrop.model.links.markov import stationary
 from evedrop.model.process import Floats
 from evedrop.model.slot.link import link_of

@@ -13,9 +13,8 @@ from scipy import stats
 from scipy.integrate import quad
 
 from evedrop.model.links import loss_of
-from evedrop.model.links.distance import Distance
-from evedrop.model.links.fading import delivery_probability
-from evedrop.model.links.link import Fate
+from evedrop.model.links.distance import Distance, delivery_probability
+from evedrop.model.links.loss_model import Fate
 from evedrop.model.links.way import Way
 from evedrop.model.streams import Stream, root_of_seed, stream_key, uniforms
 from tests.examples import examples

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from evedrop.model.links import LOSS_MODELS, loss_of
-from evedrop.model.links.link import Fate
+from evedrop.model.links.loss_model import Fate
 from evedrop.model.streams import Stream, root_of_seed, stream_key, uniforms
 
 KEY = stream_key(root_of_seed(77), "link/eve")

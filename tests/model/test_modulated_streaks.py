@@ -9,10 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evedrop.model import modulated_streaks as module
-from evedrop.model.links.link import Chain
-from evedrop.model.modulated import ModulatedCovariance
-from evedrop.model.modulated_streaks import modulated_streaks
+from evedrop.model import modulated as module
+from evedrop.model.links.loss_model import Chain
+from evedrop.model.modulated import ModulatedCovariance, modulated_streaks
 from evedrop.model.process import Floats, Process
 from evedrop.model.slot.link_distribution import LinkDistribution, Segment
 from evedrop.model.theory.covariances import NOBODY, Outcomes, OutcomesAt, expected_traces

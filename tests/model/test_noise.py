@@ -15,17 +15,16 @@ from evedrop.model.eavesdroppers.bayesian import Bayesian
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.kernels import reference
 from evedrop.model.kernels.elementary import cholesky
-from evedrop.model.noise_distribution import PACKETS, NoiseDistribution
 from evedrop.model.outcomes import uses_of
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Action, Receiver, Reception
+from evedrop.model.schedule import PACKETS, NoiseDistribution
 from evedrop.model.schemes.noise import Noise
 from evedrop.model.schemes.plain import Plain
 from evedrop.model.streams import Batch
-from evedrop.model.theory.closed_form import ReceiverConditions
+from evedrop.model.theory.closed_forms import NoiseTaken, ReceiverConditions, TakesNoise
 from evedrop.model.theory.covariances import NOBODY, Outcomes, expected_covariances, limit, state_covariances
 from evedrop.model.theory.leak import Leaks
-from evedrop.model.theory.noise_taken import NoiseTaken, TakesNoise
 from tests.builders import UNSTABLE
 from tests.examples import mostly_long
 from tests.model.slot_loop import STABLE, Played, coins, keys_of, play

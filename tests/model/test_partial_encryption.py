@@ -20,7 +20,7 @@ from evedrop.model.schemes import scheme_of
 from evedrop.model.schemes.partial_encryption import UNENCRYPTED_INNOVATION, PartialEncryption
 from evedrop.model.schemes.scheme import Packet
 from evedrop.model.streams import Batch
-from evedrop.model.theory.clear_states import ClearStatesForm
+from evedrop.model.theory.closed_forms import ClearStatesForm
 from evedrop.model.theory.covariances import Outcomes, expected_traces, state_covariances
 from tests.builders import DRIFTING, MARGINAL, MICROGRID, UNSTABLE, stream_keys
 from tests.examples import examples

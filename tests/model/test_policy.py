@@ -11,11 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evedrop.model.process import Process
-from evedrop.model.theory.policy import best_policy, held_traces, least_weight
-from evedrop.model.theory.policy_front import (
+from evedrop.model.theory.policies import (
     PolicyMetrics,
     ScheduledLinks,
+    best_policy,
     front,
+    held_traces,
+    least_weight,
     policy_metrics,
     scheduled_metrics,
 )

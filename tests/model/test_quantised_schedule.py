@@ -12,12 +12,13 @@ from scipy import stats
 
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
-from evedrop.model.numeric.quantiser import DitheredQuantiser, LevelPad
+from evedrop.model.number_codes import DitheredQuantiser, LevelPad
 from evedrop.model.process import Process
 from evedrop.model.receiver import Action
-from evedrop.model.schemes.quantised_schedule import QuantisedSchedule
+from evedrop.model.schemes.encrypted_schedule import QuantisedSchedule
 from evedrop.model.streams import Batch, Stream, stream_key
 from evedrop.model.theory.closed_forms import (
+    QuantisationError,
     SensorChain,
     always_sent,
     encrypted_fraction,
@@ -25,7 +26,6 @@ from evedrop.model.theory.closed_forms import (
     threshold_for,
 )
 from evedrop.model.theory.covariances import state_covariances
-from evedrop.model.theory.quantisation import QuantisationError
 from tests.builders import DRIFTING, UNSTABLE
 from tests.model.slot_loop import ROOT, STABLE, coins, play
 

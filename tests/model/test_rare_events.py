@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from evedrop.model import parts_of_runs
+from evedrop.model import process as parts_of_runs
 from evedrop.model.process import Floats, Process
 from evedrop.model.theory import rare_events
 from evedrop.model.theory.covariances import NOBODY, Outcomes, expected_traces

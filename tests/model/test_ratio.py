@@ -10,9 +10,8 @@ import pytest
 
 from evedrop.errors import UsageError
 from evedrop.model.process import Process
-from evedrop.model.theory.adversary import Adversary
 from evedrop.model.theory.design import design
-from evedrop.model.theory.ratio import cheapest, large_enough, largest_ratio
+from evedrop.model.theory.ratio import Adversary, cheapest, large_enough, largest_ratio
 from tests.builders import MICROGRID, UNSTABLE
 from tests.examples import mostly_long
 

@@ -11,8 +11,7 @@ import pytest
 from evedrop.model.process import Process
 from evedrop.model.reference_code import ReferenceCode
 from evedrop.model.schemes import SCHEMES, scheme_of
-from evedrop.model.schemes.acknowledged import Acknowledged
-from evedrop.model.schemes.open_loop import OpenLoop
+from evedrop.model.schemes.acknowledged import Acknowledged, OpenLoop
 from evedrop.model.schemes.scheme import Scheme
 from tests.builders import DRIFTING, UNSTABLE
 from tests.model.acknowledged_runs import MIXED, SINGULAR, carried, exact_sigmas, played_over

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from evedrop.errors import NoAnswer, NotRegistered
-from evedrop.model.remote_calls import RemoteCalls
+from evedrop.model.eavesdroppers.remote_class import RemoteCalls
 
 HEAD = "import os, signal, time\nfrom pathlib import Path\nfrom evedrop.extend import Naive\n\n\nclass Mine(Naive):\n"
 

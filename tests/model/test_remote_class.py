@@ -8,9 +8,8 @@ from typing import Any
 import pytest
 
 from evedrop.errors import NoAnswer, NotRegistered
-from evedrop.model.eavesdroppers.naive import Naive
-from evedrop.model.eavesdroppers.remote_class import RemoteClasses
-from evedrop.model.remote_calls import RemoteCalls
+from evedrop.model.eavesdroppers.fixed_rules import Naive
+from evedrop.model.eavesdroppers.remote_class import RemoteCalls, RemoteClasses
 from evedrop.model.theory.covariances import Outcomes
 
 NAME, REGISTRY = "mine:Eve", "STRATEGIES"

@@ -13,11 +13,10 @@ from scipy.optimize import differential_evolution
 
 from evedrop.errors import UsageError
 from evedrop.model.process import Process
-from evedrop.model.theory import schedule_climb
-from evedrop.model.theory.adversary import Adversary
+from evedrop.model.theory import schedules
 from evedrop.model.theory.covariances import Outcomes, expected_traces, misled_covariances
-from evedrop.model.theory.schedule_problem import ScheduleProblem, SlotRecursion
-from evedrop.model.theory.schedules import BestSchedule, ScheduleDesign, best_schedule
+from evedrop.model.theory.ratio import Adversary
+from evedrop.model.theory.schedules import BestSchedule, ScheduleDesign, ScheduleProblem, SlotRecursion, best_schedule
 from tests.builders import DRIFTING, UNSTABLE
 from tests.model.slot_loop import STABLE
 
@@ -232,7 +231,7 @@ def test_where_no_states_exceed_the_bound_all_slots_have_as_few_as_keep_it() -> 
     problem = problem_of(SETTLED, "smart", 16, 0.005)
     nothing = np.array([1.0] + [0.0] * 15)
     assert not math.isfinite(problem.sum_of(nothing))
-    mu_d = schedule_climb._repaired(problem, nothing)
+    mu_d = schedules._repaired(problem, nothing)
     assert len({*mu_d[1:]}) == 1
     assert problem.user.traces(mu_d[None]).max() == pytest.approx(0.005, rel=1e-9)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evedrop.model.numeric.shiryaev import ShiryaevTest
+from evedrop.model.detection import ShiryaevTest
 
 TEST = ShiryaevTest(normal=0.2, raised=0.6, hazard=0.1, risk=0.05)
 

@@ -18,12 +18,11 @@ import pytest
 from evedrop.model.eavesdroppers.bayesian import Bayesian
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.eavesdroppers.genie import Genie
-from evedrop.model.eavesdroppers.likelihood import Likelihood
+from evedrop.model.eavesdroppers.type_tests import Likelihood
 from evedrop.model.kernels.elementary import Floats
-from evedrop.model.noise_distribution import PACKETS, NoiseDistribution
 from evedrop.model.process import Process, StateFactors
 from evedrop.model.receiver import Action, Belief, Reception
-from evedrop.model.schedule import Schedule
+from evedrop.model.schedule import PACKETS, NoiseDistribution, Schedule
 from evedrop.model.streams import Batch
 from evedrop.model.theory.covariances import Outcomes, expected_traces, limit_trace
 from evedrop.model.theory.leak import Leaks, RemainingCovariances, remaining_limit

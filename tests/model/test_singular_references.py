@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from evedrop.model.receiver import Reception
-from evedrop.model.reference import ReferenceReceiver
-from evedrop.model.reference_code import NONE
+from evedrop.model.reference_code import NONE, ReferenceReceiver
 from tests.model.rationals import Matrix, combined, exact, inverted, times, transposed
 from tests.model.singular_processes import PROCESSES, sigmas
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evedrop.model.numeric.splitting import SplitPopulations, importance_floor
 from evedrop.model.process import Floats
+from evedrop.model.splitting import SplitPopulations, importance_floor
 from evedrop.model.streams import OWN, Batch, BlockReader, Lineage, stream_key
 
 KEY = stream_key(b"any", "splitting")

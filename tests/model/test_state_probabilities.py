@@ -21,7 +21,7 @@ from evedrop.model.schedule import Schedule, equal_slots, in_slot, in_slots, mea
 from evedrop.model.schemes.innovation import Innovation
 from evedrop.model.slot.link_distribution import LinkDistribution
 from evedrop.model.streams import Batch
-from evedrop.model.theory.schedule_problem import SlotRecursion
+from evedrop.model.theory.schedules import SlotRecursion
 from tests.builders import MARGINAL, UNSTABLE, stream_keys
 
 MU_D = (1.0, 0.0, 0.0, 0.3, 0.3, 0.9, 1.0, 0.2)

@@ -8,7 +8,7 @@ from scipy import stats
 
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
-from evedrop.model.schemes.withholding import Withholding
+from evedrop.model.schemes.silent import Withholding
 from evedrop.model.streams import Batch
 from evedrop.model.theory.covariances import expected_covariances, limit, lyapunov
 from tests.builders import DRIFTING, UNSTABLE

@@ -23,8 +23,8 @@ from evedrop.live.protocol.brief import AnyBrief, Flow, LegitimatePart, SensorPa
 from evedrop.live.protocol.commands import EndRun, Start
 from evedrop.live.protocol.keys import RunKeys
 from evedrop.model.digest import Blocks, Digests
-from evedrop.model.flag_bits import packed_flags
 from evedrop.model.process import Process
+from evedrop.model.receiver import packed_flags
 from evedrop.peers.eavesdropper import eavesdrop
 from evedrop.peers.legitimate import estimate
 from evedrop.peers.sensor import Window, sense

@@ -11,7 +11,7 @@ import pytest
 from pydantic import BaseModel
 
 from evedrop.cli.api import montecarlo
-from evedrop.model.packet_words import ACTIONS
+from evedrop.model.receiver import ACTIONS
 from evedrop.results import growing_tables as growing
 from evedrop.results.growing_tables import BATCH_BYTES, UNFINISHED, TableStream, Unfinished, finish
 from evedrop.results.reading import Results

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from evedrop.model.links.link import Fate
+from evedrop.model.links.loss_model import Fate
 from evedrop.model.slot.link import NEVER
 from evedrop.scenario.loading import checked
 from evedrop.scenario.tables import Scenario

@@ -11,7 +11,7 @@ import pytest
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.protocol.brief import EavesdropperPart
 from evedrop.model.local_filter import settled
-from evedrop.model.noise_distribution import PACKETS, NoiseDistribution
+from evedrop.model.schedule import PACKETS, NoiseDistribution
 from evedrop.scenario.expected.expectations import expectations_of
 from evedrop.scenario.loading import checked, load
 from evedrop.scenario.tables import Scenario

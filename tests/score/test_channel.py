@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop.model.slot.account import Accountant
-from evedrop.model.slot.link import Link
+from evedrop.model.slot.link import Accountant, Link
 from evedrop.model.streams import Batch
 from evedrop.scenario.loading import checked
 from evedrop.scenario.stream_keys import StreamKeys

@@ -19,8 +19,8 @@ from scipy.stats import t as student
 
 from evedrop.cli.api import montecarlo, run
 from evedrop.cli.report import closing_table, print_summary
+from evedrop.model.metrics.built_in import UsedFraction
 from evedrop.model.metrics.metric import MeanMetric, ScoredSlots, TallyMetric
-from evedrop.model.metrics.packets import UsedFraction
 from evedrop.model.metrics.standard_error import ratio_error, standard_error, z_of
 from evedrop.model.metrics.text import estimate
 from evedrop.model.process import Floats

@@ -13,7 +13,7 @@ from evedrop.errors import ScenarioError, UsageError
 from evedrop.live.launch.briefs import RecorderTask, briefs_of
 from evedrop.live.protocol.brief import RouterPart, SensorPart
 from evedrop.model.acknowledgements import OVERHEARING
-from evedrop.model.numeric.detection import Chart
+from evedrop.model.detection import Chart
 from evedrop.model.schemes import scheme_of
 from evedrop.scenario.expected.expectations import expectations_of
 from evedrop.scenario.loading import checked

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from evedrop.model.links import loss_of
-from evedrop.model.links.link import Fate
+from evedrop.model.links.loss_model import Fate
 from evedrop.model.slot.link import Change
 from evedrop.wire.link_state import KeyFates
 from evedrop.wire.scorekeeper import bounds, expected

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from evedrop.model.delays import DELAY_MODELS, delay_of
 from evedrop.model.links import LOSS_MODELS, loss_of
-from evedrop.model.links.link import Fate
+from evedrop.model.links.loss_model import Fate
 from evedrop.model.slot.link import Change
 from evedrop.model.streams import Stream, normals, root_of_seed, stream_key, uniforms
 from evedrop.wire.link_state import KeyFates, KeyLinks, MessageFate

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import zenoh
 
-from evedrop.model.links.link import Fate
+from evedrop.model.links.loss_model import Fate
 from evedrop.wire.link_state import KeyFates
 from evedrop.wire.scorekeeper import bounds, expected
 from tests.conftest import wait_until

@@ -15,7 +15,7 @@ import zenoh
 from evedrop.cli.api import montecarlo, run
 from evedrop.cli.main import main
 from evedrop.errors import ScenarioError, UsageError
-from evedrop.model.links.link import Fate
+from evedrop.model.links.loss_model import Fate
 from evedrop.results.diff import difference
 from evedrop.results.reading import Results
 from evedrop.scenario.loading import checked, load

@@ -12,7 +12,7 @@ from evedrop.show.report.text_table import TextTable
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from evedrop.model.theory.policy_front import Front, PolicyMetrics
+    from evedrop.model.theory.policies import Front, PolicyMetrics
     from evedrop.scenario.expected.policies import PolicyDesign
 
 _METRICS = ("user's error", "its error", "sent")

@@ -1,6 +1,6 @@
-"""Which acknowledgements reach the sensor: over a lossy channel, and past a jammer that also hears the packets.
+"""What the sensor learns from acknowledgements, over a lossy channel and past a jammer that also hears the packets.
 
-Source: docs/mathematics.md, attacks on acknowledgements.
+From them follows the holding time: the time since the legitimate estimator last had the state, as far as the sensor knows.
 """
 
 from __future__ import annotations
@@ -222,3 +222,28 @@ def rates_of(attack: str, mu: float, mu_e: float, quality: float = 1.0, flip: fl
         return float(arrives[heard].sum()), float(arrives[~heard].sum())
 
     return AcknowledgementRates(float(arrives.sum()), split(gamma), split(gamma_e))
+
+
+_NEVER = -(2**62)
+
+
+@final
+class HoldingTime:
+    """h_k = k − t with the last acknowledged slot t, for every trial; infinite before the first acknowledgement.
+
+    Acknowledgements that are blocked or lost make h too large, never too small.
+
+    Source: docs/mathematics.md, schedules by holding time.
+    """
+
+    def __init__(self, trials: int) -> None:
+        self._slot: NDArray[np.int64] = np.full(trials, _NEVER, np.int64)
+
+    def reached(self, k: int, threshold: int) -> Flags:
+        """Whether h_k ≥ threshold, (R,)."""
+        flags: Flags = k - self._slot >= threshold
+        return flags
+
+    def acknowledged(self, k: int, acknowledged: Flags) -> None:
+        """Add the acknowledgements (R,) of slot k; slots may come in any order."""
+        self._slot = np.where(acknowledged, np.maximum(self._slot, k), self._slot)

@@ -1,14 +1,6 @@
-"""Digests of what a receiver received and believed: equal digests mean that two runs agree to the last bit.
+"""Digests of what a receiver received and believed, and sums over slots: their bits do not depend on where blocks begin.
 
-For each trial and each aligned block of 256 slots, the digest is XXH3-128 over, slot by slot, γ (1 byte), x̂ (n) and the upper
-triangle of P (row by row) as little-endian float64; for a controller, whether its decision failed (1 byte) and u (m). A block
-also ends where an outage of the receiver begins or ends, since another process may continue. A receiver's digest is SHA-256
-over its block digests, ordered by trial, then block. A block is named by its first slot.
-
-P differs from its transpose by rounding only, so the lower triangle says nothing new: `asymmetry` of `evedrop.model.receiver`
-finds what differs by more.
-
-Source: docs/results.md, digests.
+Equal digests mean that two runs agree to the last bit.
 """
 
 from __future__ import annotations
@@ -229,3 +221,43 @@ class RunDigest:
     def hexadecimal(self) -> str:
         """The digest so far."""
         return self._hash.hexdigest()
+
+
+_FEW_TRIALS = 64  # up to this number, numpy adds a slot at a time more slowly than it accumulates all slots
+
+
+def added_in_order(total: Floats, numbers: Floats) -> Floats:
+    """A total of every trial, (R,), and the numbers of some slots, (c, R): their sum, (R,), one slot added after the other."""
+    if numbers.shape[1] < _FEW_TRIALS:
+        return np.asarray(np.add.accumulate(np.concatenate([total[None], numbers]), axis=0)[-1])
+    total = total.copy()
+    for row in numbers:
+        total += row
+    return total
+
+
+@final
+class BlockSums:
+    """The sum of a number of every trial over each block of slots, the blocks of a receiver's digests.
+
+    A process that begins with a block, after an outage, continues where another one ended. cuts: as in `block_starts`.
+    """
+
+    def __init__(self, trials: int, slots: int, cuts: Iterable[int] = ()) -> None:
+        self._blocks = Blocks(slots, cuts)
+        self.unfinished: Floats = np.zeros(trials)
+        """The sum over the slots so far of the block that has not ended, (R,)."""
+
+    def add(self, slots: range, numbers: Floats) -> dict[int, Floats]:
+        """Add consecutive slots, (c, R); returns the sums (R,) of the blocks that end with one of them, by first slot."""
+        found: dict[int, Floats] = {}
+        k = slots.start
+        while k < slots.stop:
+            stop = min(slots.stop, self._blocks.end(k))
+            rows = numbers[k - slots.start : stop - slots.start]
+            self.unfinished = added_in_order(self.unfinished, rows)
+            if stop == self._blocks.end(k):
+                found[self._blocks.start(k)] = self.unfinished
+                self.unfinished = np.zeros_like(self.unfinished)
+            k = stop
+        return found

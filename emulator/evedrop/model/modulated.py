@@ -1,28 +1,20 @@
 """Expected covariances behind a link whose quality follows a Markov chain or changes with time, or that delays packets.
 
-For each link state s, E_k(s) = E[P_k; state s in slot k], and with q(s) its quality and T the transitions
-
-    E_k(s) = kept(q(s)) A (Σ_r T(r, s) E_{k−1}(r)) Aᵀ + π(s) (p_d(q(s)) Q + p_i(q(s)) f_k + p_l(q(s)) M_k),
-
-because the state in slot k alone decides the fate of its packet. The sum over s is E P_k. Where packets may be late by up
-to W slots, the same recursion runs from slot k − W, up to which everything is settled, to slot k, with q(s) times the
-probability that a packet of each slot has arrived by slot k: a late packet counts as if it had been in time.
-
-Source: docs/mathematics.md, losses in bursts and late packets.
+A block of equal slots behind a chain is computed at once: the recursion as one linear operator. Streaks behind such a link are
+computed for a genie and with a μ_d for each slot, too.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import final
 
 import numpy as np
 
-from evedrop.model.links.link import Chain
-from evedrop.model.modulated_block import BLOCK, PARTS, LinearBlock
+from evedrop.model.links.loss_model import Chain
 from evedrop.model.process import Floats, Process
 from evedrop.model.slot.link_distribution import LinkDistribution, Segment
 from evedrop.model.theory.covariances import (
@@ -33,9 +25,11 @@ from evedrop.model.theory.covariances import (
     OutcomesAt,
     SlotOutcomes,
     lyapunov,
+    misled_covariances,
     radius,
 )
 from evedrop.model.theory.leak import RemainingCovariances, remaining_limit
+from evedrop.model.theory.rare_events import REST, Streaks
 
 
 @final
@@ -290,3 +284,185 @@ def tail_outcomes(chain: Chain, outcomes_at: OutcomesAt) -> Outcomes:
     rate = min(1.0, float(np.max(np.abs(np.linalg.eigvals(keeps)))))
     misled = max(one.misled for one in outcomes)
     return Outcomes(predicted=rate, state=max(0.0, 1.0 - rate - misled), misled=misled, decoded=0.0, initial=1.0)
+
+
+BLOCK = 128
+"""Slots in a block, a power of 2."""
+PARTS = ("kept", "predicted", "misled", "leaked", "initial")
+"""The outcomes of a slot that the recursion needs."""
+
+
+@final
+@dataclass(frozen=True)
+class LinearBlock:
+    """The operator of a block of slots."""
+
+    traces: Floats
+    """t M^j for j = 1 … BLOCK, (BLOCK, D)."""
+    last: Floats
+    """M^BLOCK, (D, D)."""
+    misleads: bool
+    """Whether v contains Σ: only where an error may grow with it, because Σ may exceed double precision."""
+
+    @classmethod
+    def of(cls, process: Process, chain: Chain, odds: Sequence[Mapping[str, Floats]]) -> LinearBlock:
+        """The block of a chain; leaks are not supported.
+
+        odds: lag → the probabilities of the outcomes in the chain's states, (S,) each, of a slot this number of slots ago;
+        the last lag is that of settled slots.
+        """
+        misleads = any(bool(np.any(one["misled"] > 0.0)) for one in odds)
+        *since, M = (_operator(process, chain, one, misleads) for one in odds)
+        states = len(chain.stationary) * process.n**2
+        row = np.zeros(len(M))
+        row[:states] = np.tile(np.eye(process.n).reshape(-1), len(chain.stationary))
+        for one in since:
+            row = row @ one
+        rows = np.empty((BLOCK, len(M)))
+        for j in range(BLOCK):
+            rows[j] = row = row @ M
+        return cls(rows, np.linalg.matrix_power(M, BLOCK), misleads)
+
+    def ahead(self, states: Floats, sigma: Floats) -> tuple[Floats, Floats]:
+        """Traces of the slots of a block, (BLOCK,), and E after it, (S, n, n), from E and Σ of the slot before it."""
+        parts = [states.reshape(-1), *([sigma.reshape(-1)] if self.misleads else []), np.ones(1)]
+        v = np.concatenate(parts)
+        after = self.last[: states.size] @ v
+        return self.traces @ v, after.reshape(states.shape)
+
+
+def _operator(process: Process, chain: Chain, odds: Mapping[str, Floats], misleads: bool) -> Floats:
+    """M of a slot, (D, D)."""
+    size, states = process.n**2, len(chain.stationary)
+    carried = np.kron(process.A, process.A)
+    count = states * size + (size if misleads else 0) + 1
+    M = np.zeros((count, count))
+    M[: states * size, : states * size] = np.kron(odds["kept"][:, None] * chain.transitions.T, carried)
+    M[: states * size, -1] = np.kron(chain.stationary * odds["predicted"], process.Q.reshape(-1))
+    if misleads:
+        sigma = slice(states * size, -1)
+        M[: states * size, sigma] = np.kron((chain.stationary * odds["misled"])[:, None], 2.0 * carried)
+        M[sigma, sigma] = carried
+        M[sigma, -1] = process.Q.reshape(-1)
+    M[-1, -1] = 1.0
+    return M
+
+
+MOST_NUMBERS = 2**24
+"""The most entries of covariances that are computed for all lengths of streaks, which takes half a second."""
+_LARGEST_RUN = 2**18
+
+
+@dataclass(frozen=True)
+class _SlotDistributions:
+    """The link and the outcomes of every slot, for T slots and S states of the link."""
+
+    transitions: Floats
+    """Into each slot, (T, S, S); of slot 0, and of one in which the link's model changes, into its stationary distribution."""
+    stationary: Floats
+    """(T, S)."""
+    odds: dict[str, Floats]
+    """Outcome → its probability in every slot and state, (T, S)."""
+    noise: Floats
+    """p_d Q + p_l M_k of every slot and state, (T, S, n²)."""
+    misled: Floats
+    """f_k, (T, n²)."""
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def modulated_streaks(
+    process: Process,
+    link: LinkDistribution,
+    outcomes_at: OutcomesAt,
+    slots: int,
+    total: float,
+    slots_at: SlotOutcomes | None = None,
+) -> Streaks | None:
+    """The streaks of a receiver in slots 0 … slots−1; total: Σ_k tr E P_k.
+
+    None for late packets and outages, for links whose models have different numbers of states, if the error leaves double
+    precision, and for runs that are so long that too much had to be computed (MOST_NUMBERS).
+    """
+    states = {len(one.chain.stationary) for one in link.segments}
+    too_long = slots * process.n**2 * max(states) > _LARGEST_RUN
+    if link.window or link.outages or len(states) > 1 or not np.isfinite(total) or too_long:
+        return None
+    distributions = _slot_distributions_of(process, link, slots, outcomes_at, slots_at)
+    groups = _begun(process, distributions)
+    carry: Floats = np.kron(process.A, process.A).T.astype(np.float64)
+    diagonal = np.eye(process.n).reshape(-1)
+    number, carried, done, length = [], [], 0, 0
+    while True:
+        number.append([float(w.sum()) for w, _ in groups])
+        carried.append([float((C @ diagonal).sum()) for _, C in groups])
+        length, done = length + 1, done + sum(C.size for _, C in groups)
+        if done > MOST_NUMBERS:
+            return None
+        if np.sum(carried) >= (1.0 - REST) * total or length == slots:
+            return Streaks(np.array(number).T, np.array(carried).T, total)
+        groups = [_lasting(distributions, carry, *one, length) for one in groups]
+
+
+def _slot_distributions_of(
+    process: Process, link: LinkDistribution, slots: int, outcomes_at: OutcomesAt, slots_at: SlotOutcomes | None
+) -> _SlotDistributions:
+    starts = [*(one.start for one in link.segments[1:]), slots]
+    shape = (slots, len(link.last.stationary))
+    transitions, stationary, quality = np.empty((*shape, shape[1])), np.empty(shape), np.empty(shape)
+    for segment, stop in zip(link.segments, starts, strict=True):
+        some = slice(segment.start, min(stop, slots))
+        transitions[some], stationary[some] = segment.chain.transitions, segment.chain.stationary
+        transitions[some][:1] = segment.chain.stationary
+        quality[some] = segment.quality(range(some.start, max(some.start, some.stop)))
+    odds = SlotOdds.of(outcomes_at).at(quality)
+    if slots_at is not None:
+        for k in range(slots):
+            for name, one in SlotOdds.of(slots_at(k)).at(quality[k]).items():
+                odds[name][k] = one
+    noise = odds["predicted"][:, :, None] * process.Q.reshape(-1)
+    if odds["leaked"].any():
+        remaining = RemainingCovariances(process)
+        M = np.array([np.zeros_like(process.Q), *(remaining.next() for _ in range(1, slots))])
+        noise = noise + odds["leaked"][:, :, None] * M.reshape(slots, 1, -1)
+    misled = misled_covariances(process, slots) if odds["misled"].any() else np.zeros((slots, process.n**2))
+    return _SlotDistributions(transitions, stationary, odds, noise, misled.reshape(slots, -1))
+
+
+def _begun(process: Process, distributions: _SlotDistributions) -> list[tuple[Floats, Floats]]:
+    """The probability of a streak that begins in each slot, (T, S), and P there, (T, S, n²), for each row of `Streaks`.
+
+    Streaks that begin in slot 0, and those of a receiver that is never misled, have that slot alone.
+    """
+    odds, stationary = distributions.odds, distributions.stationary
+    leaving = odds["predicted"] + odds["leaked"]
+    decoded = odds["kept"] - leaving
+    state = 1.0 - odds["kept"] - odds["misled"]
+    first = (stationary * odds["initial"])[:1]
+    before, in_step = np.zeros(stationary.shape), stationary[0] - first[0]
+    for k in range(1, len(stationary)):
+        before[k] = in_step @ distributions.transitions[k]
+        in_step = stationary[k] * state[k] + decoded[k] * before[k]
+    misled = stationary * odds["misled"]
+    misled[0] = 0.0
+    misled = misled if misled.any() else misled[:1]
+    return [
+        (before * leaving, before[:, :, None] * distributions.noise),
+        (misled, misled[:, :, None] * distributions.misled[: len(misled), None]),
+        (first, first[:, :, None] * process.initial_covariance.reshape(-1)),
+    ]
+
+
+def _lasting(
+    distributions: _SlotDistributions, carry: Floats, w: Floats, C: Floats, length: int
+) -> tuple[Floats, Floats]:
+    """The same one slot later, of the streaks that continue, when they have lasted for `length` slots."""
+    count = min(len(w), len(distributions.stationary) - length)
+    some = slice(length, length + count)
+    kept, T, noise = distributions.odds["kept"][some], distributions.transitions[some], distributions.noise[some]
+    states = range(w.shape[1])
+    before, moved = np.zeros(kept.shape), np.zeros(noise.shape)
+    for s in states:
+        for r in states:
+            before[:, s] += T[:, r, s] * w[:count, r]
+            moved[:, s] += T[:, r, s, None] * C[:count, r]
+    return before * kept, (moved @ carry) * kept[:, :, None] + before[:, :, None] * noise

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from evedrop.model.eavesdroppers import READERS, STRATEGIES
-from evedrop.model.eavesdroppers.constant import ConstantEstimate
 from evedrop.model.eavesdroppers.eavesdropper import PacketTaker
+from evedrop.model.eavesdroppers.fixed_rules import ConstantEstimate
 from evedrop.model.schemes.innovation import Innovation
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.theory.covariances import Outcomes, OutcomesAt

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from evedrop.model import update
-from evedrop.model.block_methods import complete, needed, outdated
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Belief, Beliefs, Codes, Flags, Receiver, Reception
+from evedrop.model.receiver import Belief, Beliefs, Codes, Flags, Receiver, Reception, complete, needed, outdated
 
 
 def _use_one(uses_block: Callable[..., Flags | None]) -> Callable[..., Flags | None]:

@@ -8,6 +8,7 @@ Source: docs/mathematics.md, model.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -285,3 +286,13 @@ def _reachable(A: Floats, Q: Floats) -> int:
 def _range(M: Floats) -> Floats:
     u, s, _ = np.linalg.svd(M)
     return u[:, : int(np.sum(s > 1e-12 * max(s[0], 1e-300)))]
+
+
+SLOTS_AT_ONCE = 2**14
+"""The most slots in a part."""
+
+
+def parts_of(slots: range) -> Iterator[range]:
+    """Consecutive slots in parts, in order; none if there are no slots."""
+    for first in range(slots.start, slots.stop, SLOTS_AT_ONCE):
+        yield range(first, min(slots.stop, first + SLOTS_AT_ONCE))

@@ -1,18 +1,55 @@
-"""The base of every receiver: its belief, its action in a slot, and the prediction between packets."""
+"""The base of every receiver: its belief, its action in a slot, and the prediction between packets.
+
+Actions and the types of packets have words, for the tables of results and for recordings. Flags of trials can be packed to bit
+masks. A receiver's class may have methods that take many slots at once; a subclass that changes the method for one slot must not
+inherit them.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.model.block_methods import complete, needed
 from evedrop.model.kernels.current import kernels
 from evedrop.model.process import Floats, Process
+
+Written = TypeVar("Written", bound=Callable[..., Any])
+
+
+def complete(kind: type, base: type, block: str, single: str, of_one: Callable[[Any], Any], *others: str) -> None:
+    """Give a class the method of a pair that it does not write; block, single: the names of the two.
+
+    A class that changes `single`, or one of `others`, after it inherited `block` has the `block` of `base`, which calls `single`
+    for each slot. A class that writes `block` alone, and inherits no `single`, has that of a block of one: of_one makes it.
+    """
+    if outdated(kind, block, single, *others):
+        setattr(kind, block, getattr(base, block))
+    elif getattr(kind, single) is getattr(base, single) and getattr(kind, block) is not getattr(base, block):
+        setattr(kind, single, of_one(getattr(kind, block)))
+
+
+def needed(method: Written) -> Written:
+    """A method for a single slot that a class must have: abstract, unless the class writes the one for blocks of slots.
+
+    Type checkers, which do not know of `complete`, take it for an ordinary method.
+    """
+    setattr(method, "__isabstractmethod__", True)  # noqa: B010 - mypy refuses the assignment
+    return method
+
+
+def outdated(kind: type, block: str, *single: str) -> bool:
+    """Whether a class changes what happens in a single slot after it inherited the method for blocks of slots.
+
+    block: the name of that method; single: the names of the methods for a single slot.
+    """
+    newest = next(one for one in kind.__mro__ if vars(one).keys() & {block, *single})
+    return block not in vars(newest)
+
 
 Flags = NDArray[np.bool_]
 Codes = NDArray[np.uint8]
@@ -187,3 +224,38 @@ class Receiver(ABC):
             belief = self.step(k, belief, Reception(gamma[row], z[row]))
             found.put(row, belief)
         return found, belief
+
+
+STATE = "state"
+INNOVATION = "innovation"
+NOTHING = "nothing"
+"""In tables: the sensor sent no packet."""
+SILENT = "silent"
+"""The same in recordings and pictures, whose lanes have one word for each slot."""
+DROPPED = "dropped"
+DISCARDED = "discarded"
+MISLED = "misled"
+"""The receiver used an innovation as the state."""
+
+TYPES = (STATE, INNOVATION, NOTHING)
+"""What the sensor sent. The index of a word of a packet is ν."""
+ACTIONS = (DROPPED, STATE, INNOVATION, DISCARDED, MISLED)
+"""A receiver's actions as the recorder knows them. The index of a word is its `Action`, except for the last one."""
+ACTION_OF: Mapping[str, Action] = {
+    DROPPED: Action.LOST,
+    STATE: Action.STATE,
+    INNOVATION: Action.INNOVATION,
+    DISCARDED: Action.DISCARDED,
+    MISLED: Action.STATE,
+}
+"""The word of an action → the action as the receiver knows it."""
+
+
+def packed_flags(flags: Flags) -> NDArray[np.uint8]:
+    """Flags (…, R) as bit masks (…, ⌈R/8⌉), trial 0 in the lowest bit of the first byte."""
+    return np.packbits(flags, axis=-1, bitorder="little")
+
+
+def flags_of(masks: NDArray[np.uint8], trials: int) -> Flags:
+    """The flags (…, R) of bit masks (…, ⌈R/8⌉)."""
+    return np.unpackbits(masks, axis=-1, count=trials, bitorder="little").view(np.bool_)

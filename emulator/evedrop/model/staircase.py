@@ -16,8 +16,8 @@ import numpy as np
 
 from evedrop.model.kernels.elementary import Floats, cholesky, inverse, sum_in_order, triangular_factor
 from evedrop.model.kernels.reference import carry
-from evedrop.model.noise_distribution import NoiseDistribution
 from evedrop.model.process import Process, product
+from evedrop.model.schedule import NoiseDistribution
 
 NOT_REACHED = 2.0**-44
 """The largest rest of a direction that is already reached, relative to the numbers it was computed from."""

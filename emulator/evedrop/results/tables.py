@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from evedrop.model.digest import DIGEST_BYTES
 from evedrop.model.integrity.monitor import MonitoredSlots
-from evedrop.model.links.link import REASONS
+from evedrop.model.links.loss_model import REASONS
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats
 from evedrop.score.histogram import LEVELS

@@ -18,12 +18,10 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from evedrop.model.digest import Digests
-from evedrop.model.flag_bits import packed_flags
-from evedrop.model.links.link import REASONS
-from evedrop.model.packet_words import ACTIONS, MISLED, NOTHING, TYPES
+from evedrop.model.links.loss_model import REASONS
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Action, Codes, Flags
+from evedrop.model.receiver import ACTIONS, MISLED, NOTHING, TYPES, Action, Codes, Flags, packed_flags
 from evedrop.names import CONTROLLER
 from evedrop.results.folder import HeldFolder
 from evedrop.results.growing_tables import BATCH_BYTES, UNFINISHED, TableStream, Unfinished, finish, write_metrics

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from evedrop.model.kernels.elementary import log
-from evedrop.model.links.link import Fate
+from evedrop.model.links.loss_model import Fate
 from evedrop.model.process import Floats
 from evedrop.model.slot.link import NEVER
 from evedrop.model.streams import Stream, root_of_seed, stream_key, uniforms

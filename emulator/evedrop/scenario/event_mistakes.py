@@ -11,7 +11,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from evedrop.model.links.link import Fate
+from evedrop.model.links.loss_model import Fate
 from evedrop.model.registry import place_of
 from evedrop.scenario.events.event import Act, EventKind, Surroundings
 from evedrop.scenario.link_table import CHANGEABLE, OTHER_MODEL, LinkTable, changed_link, unchangeable

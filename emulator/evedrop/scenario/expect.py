@@ -15,7 +15,7 @@ from pydantic import AfterValidator, Field
 
 from evedrop.model.checks import is_number
 from evedrop.model.metrics import expectable_metrics, metrics_of, unloadable_metrics
-from evedrop.model.metrics.links import LINK_METRICS
+from evedrop.model.metrics.built_in import LINK_METRICS
 from evedrop.scenario.application import APPLICATIONS, Application
 from evedrop.scenario.table import Found, Number, Table, expected, one_of
 from evedrop.scenario.words import as_toml, listed

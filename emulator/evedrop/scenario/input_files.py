@@ -13,13 +13,11 @@ import numpy as np
 
 from evedrop.errors import DisturbanceError, TraceError, UsageError
 from evedrop.model.checks import is_number
-from evedrop.model.delays import DELAY_MODELS
-from evedrop.model.delays.delay import DelayModel
-from evedrop.model.delays.trace import MOST_DELAYS
-from evedrop.model.given_states import deviations
+from evedrop.model.delays import DELAY_MODELS, MOST_DELAYS, DelayModel
 from evedrop.model.links import LOSS_MODELS
-from evedrop.model.links.link import LossModel
+from evedrop.model.links.loss_model import LossModel
 from evedrop.model.process import Floats
+from evedrop.model.slot.sensor_core import deviations
 from evedrop.scenario.recordings.disturbance_file import found_file, read_disturbances
 from evedrop.scenario.recordings.link_recording import LinkRecording
 from evedrop.scenario.tables import Scenario

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.links import LOSS_MODELS, loss_of, pooled_spec
-from evedrop.model.links.link import LossModel
+from evedrop.model.links.loss_model import LossModel
 from evedrop.scenario.table import Found, Probability, Table, model_mistakes
 from evedrop.scenario.words import as_toml, listed
 from evedrop.system.hints import near

@@ -189,7 +189,7 @@ class Scenario(Table):
     def read(cls, tables: Mapping[str, Any]) -> Self:
         """The scenario that tables describe. From now on modules are found in its folder of modules. Raises ValidationError.
 
-        This process imports such modules only for schemes and links: see `evedrop.model.remote_calls` for eavesdroppers.
+        This process imports such modules only for schemes and links: see `evedrop.model.eavesdroppers` for eavesdroppers.
         """
         folder = tables.get("modules")
         if isinstance(folder, str) and Path(folder).is_dir():

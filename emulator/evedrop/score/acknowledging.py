@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.model.acknowledgements import AckChannelSpec, rates_of
+from evedrop.model.detection import Chart, chart_for
 from evedrop.model.metrics.standard_error import standard_error
-from evedrop.model.numeric.detection import Chart, chart_for
 from evedrop.model.receiver import Flags
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.tables import Scenario

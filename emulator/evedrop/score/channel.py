@@ -14,9 +14,9 @@ import numpy as np
 from evedrop.model.delays import delay_of
 from evedrop.model.kernels.elementary import sum_in_order
 from evedrop.model.links import loss_of
-from evedrop.model.links.link import Chain, LossModel
-from evedrop.model.metrics.links import LinkAccount
-from evedrop.model.parts_of_runs import parts_of
+from evedrop.model.links.loss_model import Chain, LossModel
+from evedrop.model.metrics.built_in import LinkAccount
+from evedrop.model.process import parts_of
 from evedrop.model.slot.link import LinkSchedule
 from evedrop.model.slot.link_distribution import stretches
 from evedrop.scenario.tables import Scenario

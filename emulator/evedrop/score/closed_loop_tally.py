@@ -12,9 +12,8 @@ from typing import final
 
 import numpy as np
 
-from evedrop.model.input_aware import Offset
 from evedrop.model.metrics.standard_error import standard_error
-from evedrop.model.plant import Plant
+from evedrop.model.plant import Offset, Plant
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Codes
 from evedrop.names import LEGITIMATE

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from evedrop.model.links.link import REASONS
+from evedrop.model.links.loss_model import REASONS
 from evedrop.scenario.application import APPLICATIONS, Summary
 from evedrop.scenario.expect import ExpectTable, direction_metric, link_metric
 from evedrop.scenario.tables import Scenario

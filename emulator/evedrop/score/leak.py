@@ -11,7 +11,7 @@ from typing import NamedTuple, final
 
 import numpy as np
 
-from evedrop.model.block_sums import added_in_order
+from evedrop.model.digest import added_in_order
 from evedrop.model.metrics.standard_error import standard_error, z_of
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Codes, Flags

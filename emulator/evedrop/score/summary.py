@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from evedrop.errors import UnknownName
 from evedrop.model.entries import plain
 from evedrop.model.metrics import METRICS
-from evedrop.model.metrics.links import LinkAccount
+from evedrop.model.metrics.built_in import LinkAccount
 from evedrop.model.metrics.text import estimate
 from evedrop.scenario import application
 from evedrop.scenario.progress_events import ConnectionOutage, RunEvent

@@ -10,14 +10,14 @@ from typing import final
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.model.block_sums import BlockSums, added_in_order
+from evedrop.model.digest import BlockSums, added_in_order
 from evedrop.model.kernels.current import kernels
 from evedrop.model.metrics import metric
 from evedrop.model.metrics.metric import ReceiverTally, TallyMetric, TrialTally
 from evedrop.model.metrics.standard_error import standard_error
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Codes, Flags
-from evedrop.model.slot.account import COUNTED_BURSTS, Account
+from evedrop.model.slot.link import COUNTED_BURSTS, Account
 from evedrop.score.conditional import ConditionalError
 from evedrop.score.leak import LeakTally
 from evedrop.score.watched_tally import WatchedSlots, WatchedTally

@@ -14,8 +14,7 @@ import numpy as np
 
 from evedrop.model.metrics.standard_error import ratio_error, skewed_test, student_test
 from evedrop.model.metrics.text import count_text, estimate
-from evedrop.model.parts_of_runs import parts_of
-from evedrop.model.process import Floats
+from evedrop.model.process import Floats, parts_of
 from evedrop.model.theory.covariances import NOBODY, ExpectedCovariance
 from evedrop.model.theory.rare_events import RARE
 from evedrop.names import LEGITIMATE

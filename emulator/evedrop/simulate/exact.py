@@ -13,21 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.model.acknowledgements import AckChannel
+from evedrop.model.detection import CusumBatch
 from evedrop.model.digest import BlockDigests, Digests, InputLog
-from evedrop.model.given_states import GivenStates, recorded
-from evedrop.model.input_aware import InputAwareEstimator
 from evedrop.model.integrity.monitor import Monitor
 from evedrop.model.kernels.current import kernels
-from evedrop.model.numeric.detection import CusumBatch
+from evedrop.model.plant import InputAwareEstimator
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Belief, Flags, Receiver, prior
 from evedrop.model.schemes.scheme import Scheme, Shared
-from evedrop.model.slot.controller import ControllerCore
-from evedrop.model.slot.link_core import LinkCore
-from evedrop.model.slot.plant import PlantCore
-from evedrop.model.slot.receiver import Absence, FollowedSlots, ReceiverCore
-from evedrop.model.slot.sensor import SensorCore, Sent
-from evedrop.model.slot.transit import Arrivals
+from evedrop.model.slot.controller_core import ControllerCore
+from evedrop.model.slot.link_core import Arrivals, LinkCore
+from evedrop.model.slot.receiver_core import Absence, FollowedSlots, ReceiverCore
+from evedrop.model.slot.sensor_core import GivenStates, PlantCore, SensorCore, Sent, recorded
 from evedrop.model.streams import Batch
 from evedrop.names import CONTROLLER, LEGITIMATE
 from evedrop.scenario.controlled import monitor_of

@@ -16,7 +16,7 @@ import numpy as np
 
 from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.links import LOSS_MODELS, single_specs
-from evedrop.model.links.link import Fate
+from evedrop.model.links.loss_model import Fate
 from evedrop.model.receiver import Receiver
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.schemes.scheme import Encoder, Scheme

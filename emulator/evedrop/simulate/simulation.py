@@ -20,8 +20,8 @@ from evedrop.model import update
 from evedrop.model.digest import Digests, block_starts
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge
-from evedrop.model.input_aware import InputAwareEstimator
 from evedrop.model.outcomes import eavesdropper_outcomes
+from evedrop.model.plant import InputAwareEstimator
 from evedrop.model.process import Floats, ProcessNoise, Trajectory
 from evedrop.model.receiver import Codes, Flags, Receiver, trace_of
 from evedrop.model.schemes import scheme_of

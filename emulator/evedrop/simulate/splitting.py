@@ -16,8 +16,8 @@ from typing import final
 import numpy as np
 
 from evedrop.model.metrics.standard_error import standard_error, z_of
-from evedrop.model.numeric.splitting import SplitPopulations, importance_floor
 from evedrop.model.process import Floats
+from evedrop.model.splitting import SplitPopulations, importance_floor
 from evedrop.model.streams import OWN, Batch, BlockReader, Lineage, root_of_seed, stream_key
 from evedrop.scenario.expected.expectations import Expectation, expectations_of
 from evedrop.scenario.tables import Scenario

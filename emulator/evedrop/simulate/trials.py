@@ -16,7 +16,7 @@ import numpy as np
 from evedrop.model.digest import Digests
 from evedrop.model.metrics.metric import ScoredSlots
 from evedrop.model.process import Floats
-from evedrop.model.slot.account import Account, Accountant
+from evedrop.model.slot.link import Account, Accountant
 from evedrop.scenario.expected.expectations import KnownTraces, expected_traces_of
 from evedrop.scenario.tables import Scenario
 from evedrop.score.histogram import SlotHistograms

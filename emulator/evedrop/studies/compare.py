@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from evedrop.errors import Interrupted, RunError, UsageError
-from evedrop.model.metrics.errors import MeanSquaredError
+from evedrop.model.metrics.built_in import MeanSquaredError
 from evedrop.model.metrics.standard_error import standard_error
 from evedrop.model.schemes import scheme_of
 from evedrop.names import LEGITIMATE

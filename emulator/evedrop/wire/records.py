@@ -23,7 +23,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from evedrop.model.links.link import Fate
+from evedrop.model.links.loss_model import Fate
 from evedrop.results.folder import private_replacement
 from evedrop.system.files import write_all
 

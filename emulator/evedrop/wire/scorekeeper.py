@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from evedrop.errors import UsageError
 from evedrop.model.kernels.elementary import sum_in_order
 from evedrop.model.links import loss_of
-from evedrop.model.links.link import Chain, LossModel, count_variance
+from evedrop.model.links.loss_model import Chain, LossModel, count_variance
 from evedrop.model.process import Floats
 from evedrop.model.slot.link import NEVER, Change
 from evedrop.results.folder import replace_private

@@ -15,7 +15,7 @@ from matplotlib.colors import to_hex
 from evedrop import Scenario, montecarlo
 from evedrop.cli.api import ComparisonResults, RunResults, SweepResults, compare, sweep
 from evedrop.errors import UsageError
-from evedrop.model.eavesdroppers.naive import Naive
+from evedrop.model.eavesdroppers.fixed_rules import Naive
 from evedrop.show.report.writing import REPORT
 from evedrop.show.view.palette import DROPPED, colour, hexadecimal
 from evedrop.simulate.montecarlo import Plan

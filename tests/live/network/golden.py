@@ -19,11 +19,9 @@ from evedrop.live.protocol.commands import ProcessStatus, read_process_status
 from evedrop.live.protocol.requests import REQUESTS, RunStatus, read_request
 from evedrop.model.digest import Blocks
 from evedrop.model.entries import read
-from evedrop.model.flag_bits import packed_flags
-from evedrop.model.receiver import Belief, Reception
-from evedrop.model.slot.account import COUNTED_BURSTS, Account
-from evedrop.model.slot.link import Change
-from evedrop.model.slot.transit import Late
+from evedrop.model.receiver import Belief, Reception, packed_flags
+from evedrop.model.slot.link import COUNTED_BURSTS, Account, Change
+from evedrop.model.slot.link_core import Late
 
 TEXT = (Path(__file__).parents[3] / "docs" / "protocol.md").read_text(encoding="utf-8")
 GOLDEN: dict[str, str] = dict(re.findall(r"^```golden ([^\n]+)\n(.*?)^```$", TEXT, re.S | re.M))

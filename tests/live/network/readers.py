@@ -15,11 +15,10 @@ from evedrop.live.protocol import telemetry as loop_wire
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.requests import LinkStatus, RunStatus, StepRequest, read_request
 from evedrop.model.digest import Blocks
-from evedrop.model.links.link import REASONS
+from evedrop.model.links.loss_model import REASONS
 from evedrop.model.receiver import Belief, Reception
-from evedrop.model.slot.account import COUNTED_BURSTS, Account
-from evedrop.model.slot.link import Change
-from evedrop.model.slot.transit import Late
+from evedrop.model.slot.link import COUNTED_BURSTS, Account, Change
+from evedrop.model.slot.link_core import Late
 from evedrop.scenario.progress_events import RunEvent
 
 SLOTS, N, TRIALS, RECORDED, WINDOW, INPUTS, PERIOD = 40, 2, 3, 1, 2, 1, 4

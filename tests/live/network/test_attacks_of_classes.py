@@ -15,9 +15,8 @@ import pytest
 from evedrop.errors import NoAnswer
 from evedrop.model.eavesdroppers import REMOTE_CALLS
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
-from evedrop.model.eavesdroppers.remote_class import RemoteClasses
+from evedrop.model.eavesdroppers.remote_class import RemoteCalls, RemoteClasses
 from evedrop.model.process import Process
-from evedrop.model.remote_calls import RemoteCalls
 from evedrop.model.streams import Batch
 from evedrop.results.reading import Results
 from tests.conftest import Evedrop, Live, wait_until
@@ -45,7 +44,7 @@ SPY = f'''
 import gc, json, os, sys
 from pathlib import Path
 
-from evedrop.model.eavesdroppers.naive import Naive
+from evedrop.model.eavesdroppers.fixed_rules import Naive
 
 SEED = int("{str(SEED)[::-1]}"[::-1])  # so that its own constants are not found
 OURS = {OURS!r}
@@ -193,9 +192,7 @@ def test_what_a_class_says_of_itself_is_checked(evedrop: Evedrop) -> None:
     }
     for body, said in wrong.items():
         REMOTE_CALLS.forget()
-        text = (
-            "import os\nfrom evedrop.model.eavesdroppers.naive import Naive\n\n\nclass Spy(Naive):\n    @classmethod\n"
-        )
+        text = "import os\nfrom evedrop.model.eavesdroppers.fixed_rules import Naive\n\n\nclass Spy(Naive):\n    @classmethod\n"
         (evedrop.folder / "spy.py").write_text(f"{text}    def use_probabilities(cls, parameters):\n        {body}\n")
         done = evedrop("run", "spy.toml", "--view", "off", "--out", "run")
         assert done.status == 2, (body, done.err)

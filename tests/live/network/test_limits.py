@@ -18,11 +18,10 @@ from evedrop.live.protocol.codec import head_of
 from evedrop.live.protocol.commands import Again, ProcessStatus
 from evedrop.live.protocol.keys import Sizes
 from evedrop.model.digest import BLOCK_SLOTS
-from evedrop.model.links.link import REASONS
+from evedrop.model.links.loss_model import REASONS
 from evedrop.model.receiver import Belief, Reception
-from evedrop.model.slot.account import COUNTED_BURSTS, Account
-from evedrop.model.slot.link import Change
-from evedrop.model.slot.transit import Late
+from evedrop.model.slot.link import COUNTED_BURSTS, Account, Change
+from evedrop.model.slot.link_core import Late
 from tests.examples import examples
 
 SIZES = st.builds(

@@ -15,7 +15,7 @@ from evedrop.live.network.router import RouterLoop
 from evedrop.live.protocol import packets, telemetry
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import Again, Go, LinkChange
-from evedrop.model.links.link import REASONS
+from evedrop.model.links.loss_model import REASONS
 from evedrop.model.slot.link import Change
 from tests.conftest import LIMIT, wait_until
 from tests.live.network.test_router import Ear, MemoryBench

@@ -22,11 +22,10 @@ from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.keys import writer_of
 from evedrop.live.recorder.joiner import Joiner
 from evedrop.model.digest import Blocks
-from evedrop.model.flag_bits import packed_flags
-from evedrop.model.links.link import REASONS
-from evedrop.model.receiver import Belief, Reception
-from evedrop.model.slot.account import COUNTED_BURSTS, Account
-from evedrop.model.slot.transit import Late
+from evedrop.model.links.loss_model import REASONS
+from evedrop.model.receiver import Belief, Reception, packed_flags
+from evedrop.model.slot.link import COUNTED_BURSTS, Account
+from evedrop.model.slot.link_core import Late
 from tests.builders import mirrored
 from tests.examples import examples
 from tests.live.network.readers import EXAMPLES, READERS, fields_of

@@ -14,7 +14,7 @@ from evedrop.live.protocol.codec import Reader, pack, read_refusal, refusal
 from evedrop.live.protocol.packets import delivery, packed_header, read_delivery, read_extras, read_uplink, uplink
 from evedrop.live.protocol.telemetry import Extent, Truth, read_truth
 from evedrop.model.receiver import Reception
-from evedrop.model.slot.transit import Late
+from evedrop.model.slot.link_core import Late
 from tests.live.network.readers import EXAMPLES, READERS, TRIALS, fields_of
 
 KEY = "evedrop/r1/telemetry/eve"

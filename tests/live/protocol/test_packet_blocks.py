@@ -22,9 +22,8 @@ from evedrop.live.protocol.packets import (
     read_uplinks,
     uplink,
 )
-from evedrop.model.flag_bits import packed_flags
-from evedrop.model.receiver import Reception
-from evedrop.model.slot.transit import Late
+from evedrop.model.receiver import Reception, packed_flags
+from evedrop.model.slot.link_core import Late
 from tests.examples import examples
 
 UP, DOWN = "evedrop/r/uplink", "evedrop/r/downlink/eve"

@@ -115,10 +115,10 @@ def contents(found: Any) -> Any:
 
 def test_every_kernel_is_here() -> None:
     """A new one needs arguments above."""
-    compiled = pytest.importorskip(
+    in_c = pytest.importorskip(
         "evedrop.model.kernels.compiled", reason="the C kernels are not built", exc_type=ImportError
     )
-    named = {name for name in vars(compiled) if isfunction(getattr(compiled, name)) and not name.startswith("_")}
+    named = {name for name in vars(in_c) if isfunction(getattr(in_c, name)) and not name.startswith("_")}
     assert {name for name in named if not name.startswith("expect")} == FIT.keys()
 
 

@@ -11,8 +11,7 @@ from unittest.mock import patch
 
 import pytest
 
-from evedrop.model import remote_calls
-from evedrop.model.eavesdroppers import REMOTE_CALLS
+from evedrop.model.eavesdroppers import REMOTE_CALLS, remote_class
 from evedrop.scenario.conformance import answering
 from evedrop.scenario.plugins import look_in
 from tests.conftest import Evedrop
@@ -52,7 +51,7 @@ class AnswersHere:
 @pytest.fixture
 def asked_here(imports_forgotten: None) -> Iterator[None]:
     """Classes of anybody's own answer in this process, which takes a hundredth of the time."""
-    with patch.object(remote_calls, "_Child", AnswersHere):
+    with patch.object(remote_class, "_Child", AnswersHere):
         yield
 
 

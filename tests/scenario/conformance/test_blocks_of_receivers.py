@@ -10,7 +10,7 @@ import pytest
 
 from evedrop.model import update
 from evedrop.model.eavesdroppers.eavesdropper import PacketReader, PacketTaker
-from evedrop.model.eavesdroppers.naive import Naive
+from evedrop.model.eavesdroppers.fixed_rules import Naive
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Belief, Beliefs, Codes, Flags, Reception
 from evedrop.model.schemes.plain import PlainEstimator

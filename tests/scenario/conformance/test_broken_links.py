@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evedrop.model.delays.normal import Normal
+from evedrop.model.delays import Normal
 from evedrop.model.links.bernoulli import Bernoulli
-from evedrop.model.links.gilbert_elliott import GilbertElliott
-from evedrop.model.links.link import fates_of
+from evedrop.model.links.loss_model import fates_of
+from evedrop.model.links.markov import GilbertElliott
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes
 from evedrop.scenario.conformance.links import DelayChecks, LossChecks

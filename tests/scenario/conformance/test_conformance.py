@@ -10,8 +10,7 @@ import pytest
 from evedrop.errors import UsageError
 from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.eavesdroppers import STRATEGIES
-from evedrop.model.eavesdroppers.naive import Naive
-from evedrop.model.eavesdroppers.suspicious import Suspicious
+from evedrop.model.eavesdroppers.fixed_rules import Naive, Suspicious
 from evedrop.model.links import LOSS_MODELS
 from evedrop.model.links.bernoulli import Bernoulli
 from evedrop.model.receiver import Flags

@@ -18,7 +18,7 @@ from scipy import stats
 
 from evedrop.errors import TraceError
 from evedrop.model.links import loss_of
-from evedrop.model.links.link import Fate
+from evedrop.model.links.loss_model import Fate
 from evedrop.scenario.fitting import candidate
 from evedrop.scenario.fitting.candidate import delay_candidates, wilson
 from evedrop.scenario.fitting.fit import fit

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from evedrop.errors import UsageError
-from evedrop.model.links.pattern import Pattern
+from evedrop.model.links.trace import Pattern
 from evedrop.scenario.input_files import read_recordings
 from evedrop.scenario.loading import load, parse
 from evedrop.system.files import Limit, Unreadable, contents, lines_of

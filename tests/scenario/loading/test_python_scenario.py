@@ -16,7 +16,7 @@ import pytest
 
 from evedrop import Scenario, montecarlo, sweep
 from evedrop.errors import ScenarioError, UsageError
-from evedrop.model.eavesdroppers.naive import Naive
+from evedrop.model.eavesdroppers.fixed_rules import Naive
 from evedrop.model.schemes.innovation import Innovation
 from evedrop.scenario.entries import ScenarioEntries
 from evedrop.scenario.loading import load, parse, shipped, tables_in

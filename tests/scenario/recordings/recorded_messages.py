@@ -11,7 +11,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from evedrop.model.links import loss_of
-from evedrop.model.links.link import Fate
+from evedrop.model.links.loss_model import Fate
 from evedrop.scenario.recordings.link_recording import Outcomes
 
 BURSTS = {"model": "gilbert-elliott", "p": 0.05, "r": 0.3}

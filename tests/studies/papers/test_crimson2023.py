@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evedrop.model.numeric.shiryaev import ShiryaevTest
+from evedrop.model.detection import ShiryaevTest
 from evedrop.studies.papers.crimson2023 import detection, filter_error, noise_threshold, open_loop
 
 A, Q = np.array([[0.5, 0.1], [0.4, 0.6]]), 0.01 * np.eye(2)

@@ -23,8 +23,8 @@ from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import listed
 
 if TYPE_CHECKING:
-    from evedrop.model.theory.adversary import Adversary
     from evedrop.model.theory.design import Design
+    from evedrop.model.theory.ratio import Adversary
     from evedrop.model.theory.schedules import ScheduleDesign
     from evedrop.scenario.expected.energy_budget import BudgetDesign
     from evedrop.scenario.expected.policies import PolicyDesign
@@ -82,7 +82,7 @@ def _adversaries(made: Scenario, measured: str) -> tuple[float, list[Adversary],
 
     measured: the command that measures what cannot be designed.
     """
-    from evedrop.model.theory.adversary import Adversary  # a run does not need it
+    from evedrop.model.theory.ratio import Adversary  # a run does not need it
 
     quality = {}
     for name in made.receivers:

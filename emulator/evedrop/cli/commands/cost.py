@@ -10,8 +10,7 @@ from evedrop.cli.command import Command
 from evedrop.cli.in_memory import crew, keeping, studied
 from evedrop.cli.options import as_json, entries, scenario
 from evedrop.cli.tables import tables
-from evedrop.model.metrics.shown_number import ShownNumber
-from evedrop.model.metrics.text import number_text
+from evedrop.model.metrics.text import ShownNumber, number_text
 from evedrop.system.output import print_json
 
 if TYPE_CHECKING:

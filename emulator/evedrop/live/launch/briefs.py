@@ -42,7 +42,7 @@ from evedrop.live.protocol.brief import (
 from evedrop.live.protocol.keys import Sizes
 from evedrop.model.eavesdroppers import REMOTE_CALLS, STRATEGIES
 from evedrop.model.schemes import scheme_of
-from evedrop.model.slot.account import COUNTED_BURSTS
+from evedrop.model.slot.link import COUNTED_BURSTS
 from evedrop.names import ACKNOWLEDGEMENTS, CONTROLLER, LEGITIMATE, OPERATOR, RECORDER, RELAY, ROUTER, SENSOR
 from evedrop.results.folder import new_folder
 from evedrop.scenario.controlled import monitor_of

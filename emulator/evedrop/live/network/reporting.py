@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 from evedrop.live.protocol.brief import AnyBrief
 from evedrop.live.protocol.codec import progress
 from evedrop.live.protocol.telemetry import Decisions, Report, Truth
-from evedrop.model.block_sums import BlockSums
-from evedrop.model.digest import BlockDigests, Blocks, Digests, InputLog
+from evedrop.model.digest import BlockDigests, Blocks, BlockSums, Digests, InputLog
 from evedrop.model.kernels.current import kernels
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Beliefs, Flags
-from evedrop.model.slot.sensor import Sent
+from evedrop.model.slot.sensor_core import Sent
 
 
 def is_due(brief: AnyBrief, k: int) -> bool:

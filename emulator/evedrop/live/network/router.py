@@ -50,13 +50,10 @@ from evedrop.live.protocol.packets import (
 )
 from evedrop.live.protocol.telemetry import Journal
 from evedrop.model.acknowledgements import AckChannel, AckChannelSpec
-from evedrop.model.flag_bits import packed_flags
 from evedrop.model.kernels.current import kernels
-from evedrop.model.receiver import Flags
-from evedrop.model.slot.account import COUNTED_BURSTS, Account, Accountant
-from evedrop.model.slot.link import Change, LinkSchedule, streams_of
-from evedrop.model.slot.link_core import LinkCore
-from evedrop.model.slot.transit import Late
+from evedrop.model.receiver import Flags, packed_flags
+from evedrop.model.slot.link import COUNTED_BURSTS, Account, Accountant, Change, LinkSchedule, streams_of
+from evedrop.model.slot.link_core import Late, LinkCore
 from evedrop.names import ACKNOWLEDGEMENTS, LEGITIMATE, ROUTER
 
 

@@ -23,6 +23,7 @@ from evedrop.errors import BriefError
 from evedrop.live.protocol.keys import KINDS
 from evedrop.model.acknowledgements import AckChannelSpec
 from evedrop.model.controllers.controller import Assignment
+from evedrop.model.detection import Chart
 from evedrop.model.entries import (
     LIMITS,
     MATRIX,
@@ -49,11 +50,10 @@ from evedrop.model.entries import (
     whole,
 )
 from evedrop.model.integrity.monitor import MonitorPlan, Suspicion
-from evedrop.model.links.link import Fate
-from evedrop.model.noise_distribution import NoiseDistribution
-from evedrop.model.numeric.detection import Chart
+from evedrop.model.links.loss_model import Fate
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process, mistakes_of
+from evedrop.model.schedule import NoiseDistribution
 from evedrop.model.slot.link import NEVER, Change, LinkSchedule, ReceiverOutage
 from evedrop.model.streams import MOST_SLOTS, Batch
 from evedrop.system.files import Unreadable, opened, why_of

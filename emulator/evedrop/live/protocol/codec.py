@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 
 from evedrop.errors import Gap, MalformedMessage, Refusal
 from evedrop.live.protocol.keys import reader_of, writer_of
-from evedrop.model.flag_bits import flags_of
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Flags
+from evedrop.model.receiver import Flags, flags_of
 
 _LARGEST = 2**62  # the default bound of integers: slots can be added to it without leaving 64 bits
 _SMALL_BYTES = 1 << 16  # objects that msgpack unpacks from this few bytes take some megabytes at most

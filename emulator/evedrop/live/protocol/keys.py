@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from evedrop.model.digest import BLOCK_SLOTS, DIGEST_BYTES
-from evedrop.model.links.link import REASONS
-from evedrop.model.slot.account import COUNTED_BURSTS
+from evedrop.model.links.loss_model import REASONS
+from evedrop.model.slot.link import COUNTED_BURSTS
 from evedrop.names import CONTROLLER, LEGITIMATE, OPERATOR, RECORDER, ROUTER, SENSOR
 
 KINDS = ("uplink", "downlink", "ack", "estimate", "state", "input", "telemetry", "journal", "progress", "control")

@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.live.protocol.codec import Reader, pack
-from evedrop.model.flag_bits import flags_of, packed_flags
 from evedrop.model.kernels.current import kernels
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Flags, Reception
-from evedrop.model.slot.transit import NOTHING, Arrival, Arrivals, Late
+from evedrop.model.receiver import Flags, Reception, flags_of, packed_flags
+from evedrop.model.slot.link_core import NOTHING, Arrival, Arrivals, Late
 
 Headers = NDArray[np.int64]
 

@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 
 from evedrop.live.protocol.codec import Reader, pack, shown
 from evedrop.model.digest import DIGEST_BYTES, Blocks, Digests
-from evedrop.model.flag_bits import packed_flags
-from evedrop.model.links.link import REASONS
+from evedrop.model.links.loss_model import REASONS
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Action, Belief, Codes, Flags, asymmetry
-from evedrop.model.slot.account import COUNTED_BURSTS, Account
+from evedrop.model.receiver import Action, Belief, Codes, Flags, asymmetry, packed_flags
+from evedrop.model.slot.link import COUNTED_BURSTS, Account
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from evedrop.live.protocol.commands import Go, Hold, LinkChange
 from evedrop.live.protocol.launcher_events import ProcessRequest
 from evedrop.live.protocol.requests import LinkRequest, LinkStatus, PauseRequest, ResumeRequest, RunStatus, StepRequest
 from evedrop.live.recorder.conductor import Conductor
-from evedrop.model.metrics.links import LinkAccount
+from evedrop.model.metrics.built_in import LinkAccount
 from evedrop.model.slot.link import Change
 from evedrop.names import ROUTER, SENSOR, ProcessAction
 from evedrop.scenario.events.event import Act

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from evedrop.model.eavesdroppers.colluding import Colluding
+from evedrop.model.eavesdroppers.delegates import Colluding, ReplayInformed
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper
 from evedrop.model.eavesdroppers.readers import GROUP, READERS, REMOTE_CALLS, RESERVED
 from evedrop.model.eavesdroppers.remote_class import RemoteClasses
-from evedrop.model.eavesdroppers.replay_informed import ReplayInformed
 from evedrop.model.registry import Registry
 
 _BUILT_IN: Mapping[str, type[Eavesdropper]] = {

@@ -10,11 +10,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from evedrop.model.noise_distribution import NoiseDistribution
 from evedrop.model.packet_user import PacketUser
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Belief, Codes, Flags, Receiver
-from evedrop.model.schedule import StateProbability
+from evedrop.model.schedule import NoiseDistribution, StateProbability
 from evedrop.model.streams import Batch
 from evedrop.model.theory.covariances import Outcomes, OutcomesAt
 

@@ -1,10 +1,6 @@
 """The eavesdropper that learns by expectation-maximisation: it knows the mechanism, but neither the process nor μ_d.
 
-Until it has kept as many slots as it may, it goes through all of them again whenever their number has doubled: the
-expectation is the Bayesian eavesdropper with estimated parameters, the maximisation a regression of the packets that may be
-states on the states before them. From the first time on, every other packet is one small step of both.
-
-Source: docs/mathematics.md, eavesdroppers that learn.
+It climbs over all slots that it has kept, from several starts at once.
 """
 
 from __future__ import annotations
@@ -18,17 +14,79 @@ from numpy.typing import NDArray
 
 from evedrop.model.checks import as_toml, number_mistakes
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
-from evedrop.model.eavesdroppers.learner import Learner
+from evedrop.model.eavesdroppers.learner import (
+    Known,
+    Learner,
+    LearnerPosterior,
+    Moments,
+    Parameters,
+    advanced,
+    knowing_mistakes,
+    scale_of,
+    unheard,
+)
 from evedrop.model.kernels.factored import covariance
 from evedrop.model.kernels.mixtures import moments as moments_of
-from evedrop.model.learning.climb import NARROW, Learned, climbed
-from evedrop.model.learning.known import knowing_mistakes
-from evedrop.model.learning.learner_posterior import LearnerPosterior, advanced, scale_of, unheard
-from evedrop.model.learning.moments import Moments
-from evedrop.model.learning.posterior import Parameters
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Action, Belief, Codes, Flags, Reception
 from evedrop.model.streams import Batch
+
+PASSES = 8
+"""Passes over the slots that were kept, whenever they are gone through."""
+NARROW = (0.1, 0.01, 1e-4)
+"""The starts' Q, over the variance of the first packets, each with A = I."""
+
+
+class Learned(NamedTuple):
+    """The result of a climb."""
+
+    posterior: LearnerPosterior
+    theta: Parameters
+    moments: Moments
+    scale: Floats
+    """(R,)."""
+
+
+def climbed(known: Known, first: int, gamma: Flags, z: Floats, so_far: Parameters | None) -> Learned:
+    """The most likely parameters for slots from `first` on, gamma (c, R) and z (c, n, R), 0 where nothing was received.
+
+    so_far: the parameters that were found from fewer slots, which are one more start.
+    """
+    scale = scale_of(gamma, z)
+    # The regression that takes every packet for the state: its A has the right direction, and is too small.
+    start = known.start(scale)
+    every = start._replace(mu_d=np.ones_like(scale))
+    _, moments, _ = _passed(known, every, first, gamma, z, scale)
+    regression = moments.most_likely(every, scale, known.names)[1]._replace(mu_d=start.mu_d)
+    starts = [regression, *(known.start(fraction * scale) for fraction in NARROW), *([so_far] if so_far else [])]
+    several, trials = len(starts), len(scale)
+    theta = Parameters(*(np.concatenate(parts, axis=-1) for parts in zip(*starts, strict=True)))
+    gamma, z, scales = (np.concatenate([part] * several, axis=-1) for part in (gamma, z, scale))
+    for _ in range(PASSES):
+        posterior, moments, evidence = _passed(known, theta, first, gamma, z, scales)
+        moments, theta = moments.most_likely(theta, scales, known.names)
+    best = np.argmax(evidence.reshape(several, trials), axis=0) * trials + np.arange(trials)
+    return Learned(
+        LearnerPosterior(*(part[..., best] for part in posterior)),
+        Parameters(*(part[..., best] for part in theta)),
+        Moments(*(part[..., best] for part in moments)),
+        scale,
+    )
+
+
+def _passed(
+    known: Known, theta: Parameters, first: int, gamma: Flags, z: Floats, scale: Floats
+) -> tuple[LearnerPosterior, Moments, Floats]:
+    """The posterior after the slots from `first` on, the moments of their transitions, and the logarithm of their density."""
+    posterior, moments = unheard(known, scale), Moments.imagined(theta.A, scale)
+    evidence = np.zeros(len(scale))
+    for k, (heard, packet) in enumerate(zip(gamma, z, strict=True), first):
+        posterior, _, density, last = advanced(k, known, theta, posterior, heard, packet)
+        evidence = evidence + density
+        if k:
+            moments = moments.added(theta.A, packet, heard.astype(np.float64), last)
+    return posterior, moments, evidence
+
 
 _MOST_KEPT = 4096
 _EACH = 8  # slots for each state before the first climb

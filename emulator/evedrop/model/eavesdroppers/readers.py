@@ -5,23 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from evedrop.model.eavesdroppers.bayesian import Bayesian
-from evedrop.model.eavesdroppers.clear_states import ClearStates
-from evedrop.model.eavesdroppers.constant import ConstantEstimate
+from evedrop.model.eavesdroppers.code_readers import ClearStates, Reference
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper
+from evedrop.model.eavesdroppers.fixed_rules import ConstantEstimate, Naive, Selective, Smart, Suspicious
 from evedrop.model.eavesdroppers.genie import Genie
 from evedrop.model.eavesdroppers.learning_em import LearningEm
 from evedrop.model.eavesdroppers.learning_particle import LearningParticle
-from evedrop.model.eavesdroppers.likelihood import Likelihood
-from evedrop.model.eavesdroppers.naive import Naive
-from evedrop.model.eavesdroppers.power_test import PowerTest
-from evedrop.model.eavesdroppers.reference import Reference
-from evedrop.model.eavesdroppers.remote_class import RemoteClasses
-from evedrop.model.eavesdroppers.selective import Selective
-from evedrop.model.eavesdroppers.smart import Smart
-from evedrop.model.eavesdroppers.suspicious import Suspicious
+from evedrop.model.eavesdroppers.remote_class import RemoteCalls, RemoteClasses
 from evedrop.model.eavesdroppers.tracker import Tracker
+from evedrop.model.eavesdroppers.type_tests import Likelihood, PowerTest
 from evedrop.model.registry import Registry
-from evedrop.model.remote_calls import RemoteCalls
 
 GROUP = "evedrop.eavesdroppers"
 RESERVED = ("strategy", "link", "links", "window")

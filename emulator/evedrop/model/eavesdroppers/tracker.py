@@ -1,27 +1,65 @@
 """The tracker: follows both tracks of `twin-track`, and estimates their mean while it cannot know which is real.
 
-A packet fixes one track and says nothing about the coin. Two uncertainties remain after it: the noise since then, which
-is common to all histories, and the position of the other track, o = other − last, which no noise moves. The next packet
-is on the track of the last one, or on the other; then o changes its sign, and is known as precisely as that noise allows.
-
-Source: docs/mathematics.md, twin track.
+The distribution of their distance says what one track reveals about the other.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge, PacketReader
+from evedrop.model.kernels.current import kernels
 from evedrop.model.kernels.elementary import cholesky, exp, log
-from evedrop.model.kernels.factored import Factor, Factors, covariance, grown, orthogonalised, squared_length
+from evedrop.model.kernels.factored import Factor, Factors, covariance, grown, orthogonalised, solved, squared_length
 from evedrop.model.kernels.mixtures import Mixture, merge, pruned, summed, with_a_place
-from evedrop.model.process import Floats
+from evedrop.model.process import Floats, Process, product
 from evedrop.model.receiver import Action, Belief, Flags, Reception
 from evedrop.model.streams import Batch
-from evedrop.model.twins import Twins
+
+
+@final
+class Apart:
+    """The distance to the twin, given one track of a slot; its numbers depend only on the process."""
+
+    def __init__(self, start: Floats, noise: Floats) -> None:
+        n = len(start)
+        nothing = np.zeros((n, n))
+        joint = kernels.triangular_factors(np.block([[start, noise, nothing], [-start, nothing, start]])[None])[0]
+        self._state = joint[:n, :n].tolist()
+        self._gain = joint[n:, :n]
+        self.factor = Factor.of_triangular(joint[n:, n:].tolist())
+        """R_k, factored."""
+
+    def mean(self, a: Floats) -> Floats:
+        """G L_k⁻¹ a, (n, R), of tracks a (n, R)."""
+        return product(self._gain, solved(self._state, a))
+
+
+@final
+class Twins:
+    """`Apart` of any slot; asking for slots in order is quick."""
+
+    def __init__(self, process: Process) -> None:
+        self._A, self._noise = process.A, process.noise_factor
+        self._first = cholesky(process.initial_covariance), np.zeros((process.n, process.n))
+        self._k = 0
+        self._start, self._late = self._first
+
+    def at(self, k: int) -> Apart:
+        """The distance in slot k."""
+        if k < self._k:
+            self._k, (self._start, self._late) = 0, self._first
+        while self._k < k:
+            self._start = product(self._A, self._start)
+            self._late = kernels.triangular_factors(
+                np.concatenate([product(self._A, self._late), self._noise], axis=1)[None]
+            )[0]
+            self._k += 1
+        return Apart(self._start, self._late)
+
 
 CAPACITY = 8
 """The most histories of either kind in a trial; beyond it the two least probable ones are merged."""

@@ -9,12 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from evedrop.model.integrity.always import AlwaysMarked
-from evedrop.model.integrity.attack import SensorAttack
-from evedrop.model.integrity.parsimonious import Parsimonious
-from evedrop.model.integrity.policy import WatermarkPolicy
-from evedrop.model.integrity.replacement import Replacement
-from evedrop.model.integrity.replay import Replay
+from evedrop.model.integrity.attacks import Replacement, Replay, SensorAttack
+from evedrop.model.integrity.policies import AlwaysMarked, Parsimonious, WatermarkPolicy
 
 SENSOR_ATTACKS: Mapping[str, type[SensorAttack]] = {"replace": Replacement, "replay": Replay}
 POLICIES: Mapping[str, type[WatermarkPolicy]] = {"always": AlwaysMarked, "parsimonious": Parsimonious}

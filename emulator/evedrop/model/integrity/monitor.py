@@ -12,9 +12,9 @@ from typing import Any, final
 import numpy as np
 
 from evedrop.model.integrity import POLICIES, SENSOR_ATTACKS
-from evedrop.model.integrity.attack import SensorAttack
+from evedrop.model.integrity.attacks import SensorAttack
 from evedrop.model.integrity.loop import Source, WatermarkedLoop, spread
-from evedrop.model.integrity.policy import WatermarkPolicy
+from evedrop.model.integrity.policies import WatermarkPolicy
 from evedrop.model.kernels.elementary import cholesky, inverse, log, semidefinite_factor
 from evedrop.model.process import Floats, product
 from evedrop.model.streams import Ahead, Batch, BlockReader

@@ -11,7 +11,7 @@ import numpy as np
 
 from evedrop.model.controllers.controller import Assignment
 from evedrop.model.controllers.lqr import riccati
-from evedrop.model.integrity.attack import SensorAttack
+from evedrop.model.integrity.attacks import SensorAttack
 from evedrop.model.integrity.loop import WatermarkedLoop, spread
 from evedrop.model.integrity.monitor import assumed
 from evedrop.model.kernels.elementary import cholesky, inverse

@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 from evedrop.model.kernels.choice import EXTENSION
 from evedrop.model.kernels.elementary import Floats
-from evedrop.model.kernels.reference import Codes, Flags, Words
-from evedrop.model.kernels.shapes import (
+from evedrop.model.kernels.reference import (
+    Codes,
+    Flags,
+    Words,
     expect,
     expect_bytes,
     expect_counters,

@@ -7,12 +7,10 @@ from typing import Any
 
 from evedrop.model.links.bernoulli import Bernoulli
 from evedrop.model.links.distance import Distance
-from evedrop.model.links.gilbert_elliott import GilbertElliott
-from evedrop.model.links.link import LossModel
-from evedrop.model.links.markov import Markov
-from evedrop.model.links.pattern import Pattern
+from evedrop.model.links.loss_model import LossModel
+from evedrop.model.links.markov import GilbertElliott, Markov
 from evedrop.model.links.pooled import Pooled
-from evedrop.model.links.trace import RecordedLoss
+from evedrop.model.links.trace import Pattern, RecordedLoss
 from evedrop.model.registry import Registry
 
 POOLED = "pooled"

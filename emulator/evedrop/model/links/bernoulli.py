@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from evedrop.model.checks import probability_mistakes
-from evedrop.model.links.link import Chain, LossModel, fates_of
+from evedrop.model.links.loss_model import Chain, LossModel, fates_of
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes
 

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from evedrop.model.links.link import Chain, Fate, LossModel
+from evedrop.model.links.loss_model import Chain, Fate, LossModel
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes
 

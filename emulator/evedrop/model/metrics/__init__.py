@@ -9,10 +9,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from evedrop.errors import NotRegistered
-from evedrop.model.metrics.covariances import ExpectedTraceCovariance, MeanTraceCovariance
-from evedrop.model.metrics.errors import MeanActualTraceCovariance, MeanSquaredError
+from evedrop.model.metrics.built_in import (
+    ExpectedTraceCovariance,
+    MeanActualTraceCovariance,
+    MeanSquaredError,
+    MeanTraceCovariance,
+    ReceivedFraction,
+    UsedFraction,
+)
 from evedrop.model.metrics.metric import Metric, MetricColumn
-from evedrop.model.metrics.packets import ReceivedFraction, UsedFraction
 from evedrop.model.registry import Registry
 from evedrop.names import LEGITIMATE
 

@@ -7,21 +7,17 @@ from typing import Any
 
 from evedrop.model.process import Process
 from evedrop.model.registry import Registry
-from evedrop.model.schemes.acknowledged import Acknowledged
+from evedrop.model.schemes.acknowledged import Acknowledged, OpenLoop
 from evedrop.model.schemes.cipher import Cipher
-from evedrop.model.schemes.encrypted_schedule import EncryptedSchedule
+from evedrop.model.schemes.encrypted_schedule import EncryptedSchedule, QuantisedSchedule
 from evedrop.model.schemes.innovation import Innovation
+from evedrop.model.schemes.mixed_packets import RandomCode, ThresholdCode
 from evedrop.model.schemes.noise import Noise
-from evedrop.model.schemes.open_loop import OpenLoop
 from evedrop.model.schemes.partial_encryption import PartialEncryption
 from evedrop.model.schemes.plain import Plain
-from evedrop.model.schemes.quantised_schedule import QuantisedSchedule
-from evedrop.model.schemes.random_code import RandomCode
-from evedrop.model.schemes.scheduled import Scheduled
 from evedrop.model.schemes.scheme import Scheme
-from evedrop.model.schemes.threshold_code import ThresholdCode
+from evedrop.model.schemes.silent import Scheduled, Withholding
 from evedrop.model.schemes.twin_track import TwinTrack
-from evedrop.model.schemes.withholding import Withholding
 
 _BUILT_IN: Mapping[str, type[Scheme]] = {
     "acknowledged": Acknowledged,

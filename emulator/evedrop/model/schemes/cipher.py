@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from evedrop.model import update
-from evedrop.model.numeric.masking import Mask
+from evedrop.model.number_codes import Mask
 from evedrop.model.process import MARGINAL, Floats, Process
 from evedrop.model.receiver import Belief, Codes, Flags, Receiver, Reception, select
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, PacketBlock, Scheme, Shared

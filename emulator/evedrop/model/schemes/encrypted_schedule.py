@@ -1,24 +1,33 @@
-"""Encryption scheduling: unencrypted packets while the user keeps up, encrypted when it has fallen behind."""
+"""Encryption scheduling: packets are unencrypted while the legitimate estimator keeps up, encrypted when it has fallen behind.
+
+Quantised packets may have a threshold between two whole numbers, so that the schedule meets an energy budget.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
-from evedrop.model.checks import count_mistakes
-from evedrop.model.holding_time import HoldingTime
-from evedrop.model.numeric.masking import Mask
+from evedrop.model import update
+from evedrop.model.acknowledgements import HoldingTime
+from evedrop.model.checks import MOST_SLOTS, count_mistakes, number_mistakes
+from evedrop.model.number_codes import MOST_BITS, DitheredQuantiser, LevelPad, Mask
 from evedrop.model.process import Floats, Process
-from evedrop.model.receiver import Flags, select
-from evedrop.model.schemes.cipher import CipherEstimator
+from evedrop.model.receiver import Belief, Codes, Flags, Receiver, Reception, select
+from evedrop.model.schemes.cipher import CipherEstimator, encrypted_packets
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, PacketBlock, Scheme, Shared
-from evedrop.model.streams import Batch
-from evedrop.model.theory.chain_form import ChainForm
-from evedrop.model.theory.closed_form import ReceiverConditions
-from evedrop.model.theory.closed_forms import encrypted_schedule
+from evedrop.model.streams import Ahead, Batch, BlockReader
+from evedrop.model.theory.closed_forms import (
+    ChainForm,
+    QuantisationError,
+    ReceiverConditions,
+    always_sent,
+    encrypted_schedule,
+)
 from evedrop.model.theory.covariances import LARGEST_OPERATOR, Outcomes
 
 
@@ -105,3 +114,146 @@ class EncryptedSchedule(Scheme):
     def outcomes(self, mu: float) -> Outcomes:
         """A state with every packet."""
         return Outcomes.plain(mu)
+
+
+_WIDEST = 100.0  # standard deviations
+
+
+@final
+class QuantisedScheduleEncoder(Encoder):
+    """Sends the number that is read from the level of x_k; from the threshold on, the middle of the masked level.
+
+    The header tells which.
+
+    At a holding time of ⌊θ⌋ the packet is masked with probability 1 − (θ − ⌊θ⌋), by the stream `threshold`.
+    """
+
+    def __init__(self, threshold: float, batch: Batch, quantiser: DitheredQuantiser, pad: LevelPad, key: bytes) -> None:
+        self._least, self._most = math.floor(threshold), math.ceil(threshold)
+        early = 1.0 - (threshold - self._least)
+        self._held = HoldingTime(batch.trials)
+        self._quantiser, self._pad = quantiser, pad
+        reader = BlockReader(key, batch, 1)
+        self._early = Ahead(reader.ahead, lambda slots: reader.uniforms(slots)[:, 0, :] < early)
+
+    def encode(self, k: int, x: Floats, predicted: Floats) -> Packet:  # noqa: ARG002 - the state alone is sent
+        """The packet of slot k."""
+        encrypted = self._held.reached(k, self._most) | (self._held.reached(k, self._least) & self._early.at(k))
+        levels = self._quantiser.levels(k, x)
+        masked = self._quantiser.centres(k, self._pad.hide(k, levels))
+        z = np.where(encrypted, masked, self._quantiser.read(k, levels))
+        return Packet(z, np.zeros(x.shape[1], np.bool_), encrypted.astype(np.int64)[None])
+
+    def acknowledged(self, k: int, acknowledged: Flags) -> None:
+        """Send unencrypted again where slot k is acknowledged."""
+        self._held.acknowledged(k, acknowledged)
+
+
+@final
+class QuantisedScheduleEstimator(Receiver):
+    """Reads every packet; the value read has the error of the quantiser, of covariance R_k = diag(Δ²)/12."""
+
+    def __init__(self, process: Process, trials: int, quantiser: DitheredQuantiser, pad: LevelPad) -> None:
+        super().__init__(process, trials)
+        self._quantiser, self._pad = quantiser, pad
+
+    def act(self, k: int, gamma: Flags) -> Codes:  # noqa: ARG002 - every slot alike
+        """The state where a packet arrives: the codes 0 and 1 of `Action` are γ itself."""
+        return gamma.astype(np.uint8)
+
+    def step(self, k: int, belief: Belief, heard: Reception) -> Belief:
+        """(A x̂, A P Aᵀ + Q) if lost, otherwise (the value read, R_k)."""
+        action = self.act(k, heard.gamma)
+        encrypted = encrypted_packets(heard)
+        masked = self._quantiser.levels_of(k, np.where(encrypted, heard.z, 0.0))
+        z = np.where(encrypted, self._quantiser.read(k, self._pad.reveal(k, masked)), heard.z)
+        after = update.belief(self.process, k, belief, action, z)
+        steps = self._quantiser.steps(k)
+        error = np.diag(steps * steps / 12.0)
+        return after._replace(P=after.P + np.where(heard.gamma, error[:, :, None], 0.0))
+
+
+def _always_read(scheme: QuantisedSchedule, conditions: ReceiverConditions) -> ChainForm | None:
+    """That of the user, which reads every packet."""
+    received = conditions.received
+    if received is None or conditions.acknowledged is None or scheme.threshold > LARGEST_OPERATOR:
+        return None
+    return ChainForm(scheme.process, conditions.slots, always_sent(received), scheme.quantisation)
+
+
+def _quantised_selective_form(scheme: QuantisedSchedule, conditions: ReceiverConditions) -> ChainForm | None:
+    return selective_form(scheme, scheme.threshold, conditions)
+
+
+class QuantisedSchedule(Scheme):
+    """Quantises the state with subtractive dither, and encrypts as `encrypted-schedule` does, from a threshold θ on.
+
+    θ need not be whole: at a holding time of ⌊θ⌋ a coin decides, so that any energy budget between that of unencrypted packets
+    and that of a cipher is met exactly. The dither is public: an unencrypted packet is shown as the number that is read from it.
+
+    Source: Huang, Ding, Leong, Quevedo, Shi (2021); docs/mathematics.md, quantised packets.
+    """
+
+    best_reader = "selective"
+    closed_forms = MappingProxyType({"legitimate": _always_read, "selective": _quantised_selective_form})
+    meets_energy_budget = True
+    parameters = MappingProxyType({"threshold": 1.5, "bits": 8, "standard_deviations": 6.0})
+    secret_streams = ("dither", "mask", "threshold")
+    estimator_streams = ("dither", "mask")
+    needs_acknowledgements = True
+    reads_packets = True
+    header = ("1 if encrypted, 0 if unencrypted",)
+    secret_words = (0, 1)
+
+    def __init__(self, process: Process, threshold: float, bits: int, standard_deviations: float) -> None:
+        super().__init__(process)
+        self.threshold, self._width, self._standard_deviations = threshold, bits, standard_deviations
+
+    @classmethod
+    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """A threshold below 1, a number of bits that is not whole, or a range that is empty."""
+        return [
+            *number_mistakes(given, "threshold", 1.0, MOST_SLOTS),
+            *count_mistakes(given, "bits", MOST_BITS),
+            *number_mistakes(given, "standard_deviations", 1.0, _WIDEST),
+        ]
+
+    @property
+    def payload_bits(self) -> int:
+        """A level for each state."""
+        return self._width * self.process.n
+
+    @property
+    def header_bits(self) -> int:
+        """One: whether the packet is encrypted."""
+        return 1
+
+    @property
+    def quantisation(self) -> QuantisationError:
+        """The error of the value read."""
+        return QuantisationError.of(self._width, self._standard_deviations)
+
+    def encrypted(self, packets: PacketBlock) -> Flags:
+        """Those whose header says so, (c, R)."""
+        return encrypted_by_header(packets)
+
+    def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
+        """The quantiser and the pads."""
+        quantiser, pad = self._shared_parts(keys, batch)
+        return NoInnovations(
+            self.process,
+            batch.trials,
+            lambda: QuantisedScheduleEncoder(self.threshold, batch, quantiser, pad, keys["threshold"]),
+            lambda: QuantisedScheduleEstimator(self.process, batch.trials, quantiser, pad),
+        )
+
+    def estimator(self, keys: Mapping[str, bytes], batch: Batch) -> Receiver:
+        """The legitimate estimator's side alone, which needs no coin."""
+        return QuantisedScheduleEstimator(self.process, batch.trials, *self._shared_parts(keys, batch))
+
+    def _shared_parts(self, keys: Mapping[str, bytes], batch: Batch) -> tuple[DitheredQuantiser, LevelPad]:
+        quantiser = DitheredQuantiser(self.process, self._width, self._standard_deviations, keys["dither"], batch)
+        return quantiser, LevelPad(self.process.n, self._width, keys["mask"], batch)
+
+    def outcomes(self, mu: float) -> None:
+        """None: a packet that is read leaves the error of the quantiser."""

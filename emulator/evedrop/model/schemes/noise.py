@@ -11,17 +11,15 @@ import numpy as np
 
 from evedrop.model.checks import as_toml, is_number, probabilities_mistakes
 from evedrop.model.kernels.elementary import cholesky
-from evedrop.model.noise_distribution import PACKETS, NoiseDistribution
 from evedrop.model.packet_user import PacketUser
 from evedrop.model.process import Floats, Process, product
 from evedrop.model.receiver import Flags, Receiver
-from evedrop.model.schedule import Schedule
+from evedrop.model.schedule import PACKETS, NoiseDistribution, Schedule
 from evedrop.model.schemes.scheme import Encoder, PacketBlock, Scheme, Shared
 from evedrop.model.streams import Ahead, Batch, BlockReader
-from evedrop.model.theory.closed_form import ReceiverConditions
+from evedrop.model.theory.closed_forms import NoiseTaken, ReceiverConditions, TakesNoise
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.model.theory.leaked_bits import RevealedBits
-from evedrop.model.theory.noise_taken import NoiseTaken, TakesNoise
 
 
 @final

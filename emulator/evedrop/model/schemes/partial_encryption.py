@@ -10,13 +10,13 @@ import numpy as np
 
 from evedrop.model import update
 from evedrop.model.checks import as_toml, probability_mistakes
-from evedrop.model.numeric.masking import Mask
+from evedrop.model.number_codes import Mask
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Action, Belief, Codes, Flags, Receiver, Reception
 from evedrop.model.schedule import Schedule
 from evedrop.model.schemes.scheme import Encoder, NoInnovations, Packet, PacketBlock, Scheme, Shared
 from evedrop.model.streams import Batch
-from evedrop.model.theory.clear_states import ClearStatesForm
+from evedrop.model.theory.closed_forms import ClearStatesForm
 from evedrop.model.theory.covariances import Outcomes, radius
 
 UNENCRYPTED_INNOVATION = -1

@@ -11,17 +11,13 @@ from typing import Any, ClassVar, NamedTuple, final
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.model.block_methods import complete, needed
-from evedrop.model.noise_distribution import NoiseDistribution
 from evedrop.model.process import Floats, Process
-from evedrop.model.receiver import Flags, Receiver
-from evedrop.model.schedule import StateProbability, in_slot, mean_of
+from evedrop.model.receiver import Flags, Receiver, complete, needed
+from evedrop.model.schedule import NoiseDistribution, StateProbability, in_slot, mean_of
 from evedrop.model.streams import Batch
-from evedrop.model.theory.closed_form import ClosedForm, ClosedFormMaker
+from evedrop.model.theory.closed_forms import ClosedForm, ClosedFormMaker, LostReference, QuantisationError
 from evedrop.model.theory.covariances import Outcomes
 from evedrop.model.theory.leaked_bits import RevealedBits
-from evedrop.model.theory.lost_reference import LostReference
-from evedrop.model.theory.quantisation import QuantisationError
 
 _WORD_BITS = 64
 _THEORY = (

@@ -17,8 +17,7 @@ from evedrop.model.integrity.theory import loop_of
 from evedrop.model.local_filter import LocalFilter
 from evedrop.model.process import Floats, product
 from evedrop.model.schemes.plain import PlainEncoder
-from evedrop.model.slot.plant import PlantCore
-from evedrop.model.slot.sensor import SensorCore
+from evedrop.model.slot.sensor_core import PlantCore, SensorCore
 from evedrop.model.streams import Batch, root_of_seed, stream_key
 
 

@@ -1,22 +1,135 @@
-"""Closed forms for schemes that the outcomes of single slots do not determine: bounds, and chains with a memory.
+"""Closed forms of receivers whose slots differ, for schemes that the outcomes of single slots do not determine.
 
-Source: docs/mathematics.md, twin track, acknowledged references, schedules by holding time.
+There are bounds, and chains with a memory: of a receiver whose error follows the sensor's Markov chain, that reads a state from
+a quantised packet, that takes noise packets for states, that reads some states of every state packet, and all innovations, over
+a perfect link, or that lacks the reference of later packets, until a state that is sent unencrypted ends the growth of its
+error.
 """
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import product
+from typing import Any, NamedTuple, final
 
 import numpy as np
 
 from evedrop.model.acknowledgements import HeedRule
-from evedrop.model.process import Floats, Process
-from evedrop.model.theory.closed_form import Hears
-from evedrop.model.theory.covariances import LARGEST_OPERATOR, Outcomes, limit_trace, radius
-from evedrop.model.theory.quantisation import QuantisationError
+from evedrop.model.kernels.current import kernels
+from evedrop.model.kernels.elementary import cholesky
+from evedrop.model.process import MARGINAL, Floats, Process
+from evedrop.model.receiver import Flags
+from evedrop.model.schedule import NoiseDistribution, StateProbability, in_slot, mean_of
+from evedrop.model.theory.covariances import (
+    LARGEST_OPERATOR,
+    NOBODY,
+    Growth,
+    Outcomes,
+    has_infinite_variance,
+    limit,
+    limit_trace,
+    lyapunov,
+    radius,
+    state_covariances,
+    unstable_part,
+)
+
+Hears = Callable[[bool, bool], float]
+"""(whether the user hears a packet, whether the hijacker does) → the probability that a receiver hears it."""
+
+
+class ClosedForm(ABC):
+    """One receiver's expected error covariance over the slots of a run."""
+
+    bound: bool = False
+    """Whether this is only a lower bound, in every slot; its limit is exact."""
+
+    @property
+    @abstractmethod
+    def traces(self) -> Floats:
+        """The traces of all slots, (slots,)."""
+
+    @property
+    @abstractmethod
+    def limit(self) -> float:
+        """Trace of the limit; inf if it is unbounded, NaN if it is too large to compute."""
+
+    @property
+    @abstractmethod
+    def infinite_variance(self) -> bool:
+        """Whether the variance of tr P over trials has no bound (docs/mathematics.md, heavy tails)."""
+
+    @property
+    def growth(self) -> Growth | None:
+        """The directions in which the error grows without bound; None if they are unknown."""
+        return None
+
+
+@dataclass(frozen=True)
+class Hijack:
+    """A hijacked sensor that counts the packets its eavesdropper has missed."""
+
+    mu: float
+    """Quality of the user's link."""
+    mu_e: float
+    """Quality of the link of the eavesdropper that the sensor serves."""
+    heed_rule: HeedRule
+    hears: Hears
+    """For the receiver whose closed form is made."""
+
+
+@dataclass(frozen=True)
+class ReceiverConditions:
+    """What theory knows of a receiver's link and of the acknowledgements, for the makers in `Scheme.closed_forms`."""
+
+    slots: int
+    legitimate: bool
+    """Whether the receiver is the legitimate estimator."""
+    received: float | None
+    """The probability that it receives a packet that is sent; None unless losses are independent and alike in all slots."""
+    uses: tuple[float, float] | None = None
+    """The probabilities that its strategy uses a packet with ν = 0, and with ν = 1; None unless it decides by ν alone."""
+    acknowledged: tuple[float, float] | None = None
+    """The probabilities that a packet is acknowledged and the receiver heard it, and that it is acknowledged and the receiver did
+    not. None: there are no acknowledgements, or their probabilities differ from slot to slot. Else `received` is known."""
+    forged: bool = False
+    """Whether an attacker sends acknowledgements in the user's name."""
+    hijack: Hijack | None = None
+    """The hijacked sensor, if it needs more than the last packet to decide which acknowledgements it heeds."""
+
+
+ClosedFormMaker = Callable[[Any, ReceiverConditions], ClosedForm | None]
+"""(a scheme, a receiver's conditions) → the receiver's closed form; None if there is none under these conditions."""
+
+
+@final
+@dataclass(frozen=True)
+class QuantisationError:
+    """White noise of covariance R_k = fraction · diag(Σ_k): the steps grow with the standard deviations of the states."""
+
+    fraction: float
+
+    @classmethod
+    def of(cls, bits: int, standard_deviations: float) -> QuantisationError:
+        """That of 2^bits steps over so many standard deviations to either side: Δ²/12 each."""
+        return cls(standard_deviations**2 / (3.0 * 4.0**bits))
+
+    def covariances(self, process: Process, slots: int) -> Floats:
+        """R_k for k = 0 … slots−1, (slots, n, n); inf from where Σ_k overflows."""
+        found: Floats = self._of(state_covariances(process, slots))
+        return found
+
+    def limit(self, process: Process) -> Floats:
+        """The limit of R_k, (n, n); its diagonal is inf unless A forgets."""
+        return self._of(limit(process, NOBODY))
+
+    def _of(self, sigma: Floats) -> Floats:
+        found: Floats = np.where(np.eye(sigma.shape[-1], dtype=np.bool_), self.fraction * sigma, 0.0)
+        return found
 
 
 def twin_track_bound(process: Process, slots: int) -> Floats:
@@ -315,3 +428,285 @@ def step_probabilities(mu: float, mu_d: float, steps: int) -> Floats:
     probabilities: Floats = (1.0 - mu) * in_sync * not_the_state ** np.maximum(np.arange(steps) - 1.0, 0.0)
     probabilities[:1] = in_sync
     return probabilities
+
+
+@final
+@dataclass(frozen=True)
+class ChainForm(ClosedForm):
+    """That of a receiver whose error is reset or predicted, as the sensor's behaviour and the link decide."""
+
+    process: Process
+    slots: int
+    chain: SensorChain
+    quantisation: QuantisationError | None = None
+    """The error of a state that is read from a packet; None if there is none."""
+
+    @cached_property
+    def traces(self) -> Floats:
+        """The traces of all slots, (slots,)."""
+        found = self.chain.covariances(self.process, self.slots, self.quantisation)
+        traces: Floats = np.trace(found, axis1=1, axis2=2)
+        return traces
+
+    @cached_property
+    def limit(self) -> float:
+        """Trace of the limit; inf if it is unbounded, NaN if it is too large to compute."""
+        if len(self.chain.start) * self.process.n**2 > LARGEST_OPERATOR:
+            return float("nan")
+        return float(np.trace(self.chain.limit(self.process, self.quantisation)))
+
+    @cached_property
+    def infinite_variance(self) -> bool:
+        """Whether the variance over trials has no bound: not if only the steps of a quantiser grow."""
+        return self.chain.has_infinite_variance(self.process)
+
+
+@final
+@dataclass(frozen=True)
+class NoiseTaken:
+    """E P_k = p_d (A E P_{k−1} Aᵀ + Q) + p_i (Σ_k + N_k): noise that is used as the state leaves the error x_k − n_k."""
+
+    process: Process
+    distribution: NoiseDistribution
+    mu_d: StateProbability
+    mu_e: float
+    """Quality of the receiver's link."""
+    uses: tuple[float, float]
+    """The probabilities that it uses a state, and noise."""
+
+    @property
+    def outcomes(self) -> Outcomes:
+        """Those of a slot, on average over the slots; `misled` is the probability p_i that noise is used."""
+        return Outcomes.eavesdropper(self.mu_e, mean_of(self.mu_d), *self.uses)
+
+    def covariances(self, slots: int) -> Floats:
+        """E P_k for k = 0 … slots−1, (slots, n, n); inf from where it overflows."""
+        A, N = self.process.A, self.distribution.covariance
+        sigma = state_covariances(self.process, slots)
+        found = np.empty_like(sigma)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for k in range(slots):
+                one = Outcomes.eavesdropper(self.mu_e, in_slot(self.mu_d, k), *self.uses)
+                if k == 0:
+                    found[k] = one.initial * self.process.initial_covariance
+                else:
+                    taken = sigma[k] + (sigma[k] if N is None else N)
+                    found[k] = one.kept * (A @ found[k - 1] @ A.T) + one.predicted * self.process.Q + one.misled * taken
+                if not np.isfinite(found[k]).all():
+                    found[k:] = np.inf
+                    break
+        return found
+
+    @property
+    def limit(self) -> Floats:
+        """The limit of E P_k with the mean of μ_d, (n, n); all inf for ρ ≥ 1, if noise is ever used."""
+        one, N = self.outcomes, self.distribution.covariance
+        if one.misled == 0.0:
+            return limit(self.process, one)
+        if radius(self.process) >= 1.0:
+            return np.full_like(self.process.Q, math.inf)
+        sigma = limit(self.process, NOBODY)
+        source = one.predicted * self.process.Q + one.misled * (sigma + (sigma if N is None else N))
+        return lyapunov(replace(self.process, Q=source), one.kept)
+
+
+@final
+@dataclass(frozen=True)
+class TakesNoise(ClosedForm):
+    """That of a receiver that mistakes noise packets for states, behind a link of independent losses."""
+
+    taken: NoiseTaken
+    slots: int
+
+    @cached_property
+    def traces(self) -> Floats:
+        """The traces of all slots, (slots,)."""
+        traces: Floats = np.trace(self.taken.covariances(self.slots), axis1=1, axis2=2)
+        return traces
+
+    @cached_property
+    def limit(self) -> float:
+        """Trace of the limit; inf if it is unbounded."""
+        return float(np.trace(self.taken.limit))
+
+    @property
+    def infinite_variance(self) -> bool:
+        """Whether the variance of tr P over trials has no bound: not where noise is used, which leaves an error like x itself."""
+        return has_infinite_variance(self.taken.process, self.taken.outcomes)
+
+
+_LARGEST = 1e150  # whose square is a double
+_LONGEST = 2_000  # slots in which a bounded error settles, or its limit is unknown
+_SETTLED = 1e-12  # relative change in a slot
+_RANK = 1e-9  # relative: a smaller singular value is taken for 0
+
+
+@final
+@dataclass(frozen=True)
+class ClearStatesForm(ClosedForm):
+    """The expected error covariance of a receiver that reads the unencrypted states, slot by slot, without a closed formula.
+
+    Behind a perfect link, with packets that are all states (μ_d = 1) or, after slot 0, all innovations (μ_d = 0), it is the same
+    in every trial. Otherwise it is that of a receiver that hears more than any: all packets, and with 0 < μ_d < 1 both types in
+    every slot.
+    """
+
+    process: Process
+    hidden: Flags
+    """Whether each state is encrypted, (n,)."""
+    mu_d: float
+    received: float | None
+    """The probability that a packet is received; None if it differs from slot to slot or is unknown."""
+    slots: int
+
+    bound: bool = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "bound", self.received != 1.0 or 0.0 < self.mu_d < 1.0)
+
+    @property
+    def infinite_variance(self) -> bool:
+        """False: the error that theory knows is the same in every trial."""
+        return False
+
+    @cached_property
+    def traces(self) -> Floats:
+        """The traces of all slots, (slots,); inf from where they overflow."""
+        return self._followed(self.slots)
+
+    @cached_property
+    def limit(self) -> float:
+        """Trace of the limit; inf if it is unbounded, NaN if it is not reached in many slots."""
+        if self.growing.shape[1]:
+            return math.inf
+        last, before = self._followed(_LONGEST)[[-1, -2]]
+        return float(last) if abs(last - before) <= _SETTLED * last else math.nan
+
+    @cached_property
+    def growing(self) -> Floats:
+        """An orthonormal basis of the directions in which the error grows without bound, (n, m)."""
+        A, n, clear = self.process.A, self.process.n, np.eye(self.process.n)[~self.hidden]
+        if self.mu_d == 0.0:
+            # After slot 0, e_k = A^k e_0, and e_0 is in the encrypted states.
+            return unstable_part(A, _invariant_hull(A, np.eye(n)[:, self.hidden]), 1.0 + MARGINAL)
+        unseen = _orthogonal_to(_invariant_hull(A.T, clear.T))
+        return unstable_part(A, unseen, 1.0 - MARGINAL if self.mu_d == 1.0 else 1.0 + MARGINAL)
+
+    @property
+    def growth(self) -> Growth:
+        """Where the error grows: exactly in `growing`, or perhaps also elsewhere, but only where the state itself grows."""
+        if self.mu_d == 1.0 and not self.bound:
+            return Growth(self.growing, self.growing)
+        return Growth(self.growing, unstable_part(self.process.A, np.eye(self.process.n), 1.0 - MARGINAL))
+
+    def _followed(self, slots: int) -> Floats:
+        found = np.full(slots, np.inf)
+        A, noise = self.process.A, self.process.noise_factor
+        X = self._read(cholesky(self.process.initial_covariance))
+        for k in range(slots):
+            found[k] = float((X * X).sum())
+            moved = A @ X
+            if not np.abs(moved).max() < _LARGEST:
+                break
+            if self.mu_d == 1.0:
+                moved = np.concatenate([moved, noise], axis=1)
+            after = self._read(moved) if self.mu_d > 0.0 else moved
+            if np.array_equal(after, X):
+                found[k:] = found[k]
+                break
+            X = after
+        return found
+
+    def _read(self, X: Floats) -> Floats:
+        """A factor of the covariance once the unencrypted states have been read, (n, n), from one of it before, (n, m)."""
+        order = np.argsort(self.hidden, kind="stable")
+        clear = int((~self.hidden).sum())
+        L = kernels.triangular_factors(X[order][None].copy())[0]
+        L[:clear] = 0.0
+        L[:, :clear] = 0.0
+        found: Floats = np.empty_like(L)
+        found[order] = L
+        return found
+
+
+def _invariant_hull(A: Floats, columns: Floats) -> Floats:
+    """An orthonormal basis, (n, s), of the smallest invariant subspace of A that contains these columns."""
+    scale = max(1.0, float(np.abs(A).max()))
+    basis = _range(columns)
+    while 0 < basis.shape[1] < len(A):
+        grown = _range(np.hstack([basis, (A / scale) @ basis]))
+        if grown.shape[1] == basis.shape[1]:
+            break
+        basis = grown
+    return basis
+
+
+def _orthogonal_to(basis: Floats) -> Floats:
+    """An orthonormal basis of the orthogonal complement, (n, n − s), of one with s columns."""
+    u, _, _ = np.linalg.svd(basis, full_matrices=True) if basis.shape[1] else (np.eye(len(basis)), None, None)
+    return np.asarray(u[:, basis.shape[1] :])
+
+
+def _range(columns: Floats) -> Floats:
+    if not columns.shape[1]:
+        return columns
+    u, s, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(u[:, s > _RANK * s[0]])
+
+
+_LARGEST_EXPONENT = 700.0  # of a double
+
+
+class LostReference(NamedTuple):
+    """The growth of the expected error of a receiver that lacks the reference."""
+
+    growth: float
+    """The factor from slot to slot, or from one phase of unencrypted states to the next; from 1 on the error has no bound."""
+    remedy: str
+    """What must be changed for a factor below 1, in words that follow "unless"."""
+
+
+def growth_by_coin(process: Process, plain: float, received: float) -> float:
+    """The factor for each slot: ρ² times the probability of not receiving an unencrypted state.
+
+    plain: the probability α that a packet contains the state; received: that it arrives.
+    """
+    return radius(process) ** 2 * (1.0 - plain * received)
+
+
+def growth_by_phases(process: Process, coded: float, received: float, acknowledged: tuple[float, float]) -> float:
+    """The factor from one phase of unencrypted states, which ends with an acknowledgement, to the next; inf if it is unbounded.
+
+    coded: the acknowledged coded packets between two phases. acknowledged: the probabilities that a packet is acknowledged and
+    was heard by the receiver, and that it is acknowledged and was not heard.
+    """
+    between, in_phase = _growths(process, received, acknowledged)
+    if in_phase == 0.0:
+        return 0.0
+    if not (math.isfinite(between) and math.isfinite(in_phase) and math.isfinite(coded)):
+        return math.inf
+    exponent = coded * math.log(between) + math.log(in_phase)
+    return math.exp(exponent) if exponent < _LARGEST_EXPONENT else math.inf
+
+
+def most_coded(process: Process, received: float, acknowledged: tuple[float, float]) -> float:
+    """The most acknowledged coded packets between two phases with a factor below 1; −1 if even none is too many."""
+    between, in_phase = _growths(process, received, acknowledged)
+    if not in_phase < 1.0:
+        return -1.0
+    if in_phase == 0.0 or between <= 1.0:
+        return math.inf
+    return math.ceil(-math.log(in_phase) / math.log(between)) - 1.0
+
+
+def _growths(process: Process, received: float, acknowledged: tuple[float, float]) -> tuple[float, float]:
+    """The factors of the slots up to the acknowledgement of one coded packet, and of a phase whose states are not received."""
+    square, missed = radius(process) ** 2, acknowledged[1]
+    arrives = sum(acknowledged)
+    return _growth_until(square, arrives, 1.0 - arrives), _growth_until(square, missed, 1.0 - received - missed)
+
+
+def _growth_until(square: float, ends: float, goes_on: float) -> float:
+    """The sum over j of square^{j+1} times the probability that the growth ends after j slots; inf if it has no bound."""
+    rest = 1.0 - square * goes_on
+    return square * ends / rest if rest > 0.0 else math.inf

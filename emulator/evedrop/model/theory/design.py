@@ -16,10 +16,20 @@ import numpy as np
 from evedrop.errors import UsageError
 from evedrop.model.process import Process
 from evedrop.model.receiver import Flags
-from evedrop.model.theory.adversary import ATTAINED, Adversary, adversary_bound, points_between, traces_of
 from evedrop.model.theory.covariances import Outcomes, expected_traces, limit_trace, stability_bound
 from evedrop.model.theory.json_values import json_value
-from evedrop.model.theory.ratio import Choice, LargestRatio, cheapest, largest_ratio, ratio_of
+from evedrop.model.theory.ratio import (
+    ATTAINED,
+    Adversary,
+    Choice,
+    LargestRatio,
+    adversary_bound,
+    cheapest,
+    largest_ratio,
+    points_between,
+    ratio_of,
+    traces_of,
+)
 
 Interval = tuple[float, float]
 

@@ -18,9 +18,9 @@ import numpy as np
 
 from evedrop.model.kernels.current import kernels
 from evedrop.model.kernels.elementary import cholesky
-from evedrop.model.kernels.leak import Leak
-from evedrop.model.noise_distribution import PACKETS, NoiseDistribution
+from evedrop.model.kernels.mixtures import Leak
 from evedrop.model.process import MARGINAL, Floats, Process, StateFactors, product
+from evedrop.model.schedule import PACKETS, NoiseDistribution
 from evedrop.model.staircase import Staircase
 from evedrop.model.streams import Ahead
 

@@ -17,15 +17,8 @@ from typing import final
 import numpy as np
 
 from evedrop.model.kernels.elementary import sum_in_order
-from evedrop.model.parts_of_runs import SLOTS_AT_ONCE, parts_of
-from evedrop.model.process import Floats, Process
-from evedrop.model.theory.covariances import (
-    ExpectedCovariance,
-    NoiseCovariances,
-    Outcomes,
-    block_length,
-    powers_of,
-)
+from evedrop.model.process import SLOTS_AT_ONCE, Floats, Process, parts_of
+from evedrop.model.theory.covariances import ExpectedCovariance, NoiseCovariances, Outcomes, block_length, powers_of
 
 LARGEST_RUN = 2**22
 """The most numbers, slots × n², in the covariances of a run for which the streaks of a misled receiver are computed."""

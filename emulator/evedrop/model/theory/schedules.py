@@ -1,24 +1,195 @@
-"""A μ_d for each slot of a short run: the schedule that keeps the user's error low and makes an eavesdropper's large.
+"""A μ_d for each slot of a short run: the schedule that keeps the legitimate error low and makes an eavesdropper's large.
 
-Source: docs/mathematics.md, schedules of μ_d.
+The problem has the errors that a schedule leads to, and what it is to reach. The schedule is found by climbing over all slots at
+once, from several starts.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from operator import itemgetter
+from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.errors import UsageError
 from evedrop.model.process import Floats, Process
-from evedrop.model.theory.covariances import Outcomes, OutcomesAt
+from evedrop.model.theory.covariances import Outcomes, OutcomesAt, misled_covariances
 from evedrop.model.theory.json_values import JsonFields, json_value
-from evedrop.model.theory.schedule_climb import climbed, patterns
-from evedrop.model.theory.schedule_problem import ROUNDING, ScheduleProblem, SlotRecursion
+from evedrop.model.theory.leak import RemainingCovariances
+
+ROUNDING = 1e-12
+"""By how much, relatively, a trace may exceed its bound, or a score another one."""
+
+
+@final
+class SlotRecursion:
+    """E P_k of one receiver for many schedules at once, slot by slot: its map of a slot is affine in μ_d(k).
+
+    E_0 = p_0 Σ0, E_k = kept · A E_{k−1} Aᵀ + p_d Q + p_i f_k + p_l M_k, with probabilities that are affine in μ_d(k).
+
+    Source: docs/mathematics.md, schedules of μ_d.
+    """
+
+    def __init__(self, process: Process, outcomes_at: OutcomesAt, slots: int) -> None:
+        never, always = outcomes_at(0.0), outcomes_at(1.0)
+        self._A, self._Q = process.A, process.Q
+        self._base = _probabilities(never)
+        self._slope = _probabilities(always) - self._base
+        self.initial: Floats = always.initial * process.initial_covariance
+        """E P_0, (n, n): the first packet is always the state."""
+        self._misled = misled_covariances(process, slots)
+        remaining = RemainingCovariances(process) if never.leaked else None
+        self._remaining = np.zeros_like(self._misled)
+        if remaining is not None:
+            for k in range(1, slots):
+                self._remaining[k] = remaining.next()
+
+    def next(self, k: int, E: Floats, mu_d: Floats) -> Floats:
+        """E P_k, (S, n, n), from E P_{k−1}, (S, n, n), with μ_d(k), (S,)."""
+        kept, predicted, misled, leaked = (self._base[:, None] + self._slope[:, None] * mu_d)[:, :, None, None]
+        found: Floats = (
+            kept * (self._A @ E @ self._A.T)
+            + predicted * self._Q
+            + misled * self._misled[k]
+            + leaked * self._remaining[k]
+        )
+        return found
+
+    def traces(self, mu_d: Floats) -> Floats:
+        """Trace of E P_k for k = 0 … N−1 of schedules, (S, N) → (S, N); μ_d(0) is taken as 1."""
+        found = np.empty(mu_d.shape)
+        E = np.broadcast_to(self.initial, (len(mu_d), *self.initial.shape))
+        found[:, 0] = np.trace(self.initial)
+        for k in range(1, mu_d.shape[1]):
+            E = self.next(k, E, mu_d[:, k])
+            found[:, k] = np.trace(E, axis1=1, axis2=2)
+        return found
+
+
+def _probabilities(outcomes: Outcomes) -> Floats:
+    return np.array([outcomes.kept, outcomes.predicted, outcomes.misled, outcomes.leaked])
+
+
+@dataclass(frozen=True)
+class ScheduleProblem:
+    """What a schedule is to reach: the largest Σ_k (1 − weight) tr E Pᵉ_k − weight tr E P_k with tr E P_k ≤ Ω in each slot."""
+
+    user: SlotRecursion
+    eavesdropper: SlotRecursion
+    slots: int
+    max_trace: float
+    """Ω; inf for no bound."""
+    weight: float
+
+    def sums(self, mu_d: Floats) -> Floats:
+        """The sum of each schedule, (S, N) → (S,); −inf for those that violate Ω."""
+        ours, theirs = self.user.traces(mu_d), self.eavesdropper.traces(mu_d)
+        total = ((1.0 - self.weight) * theirs - self.weight * ours).sum(axis=1)
+        return np.where((ours <= self.max_trace * (1.0 + ROUNDING)).all(axis=1), total, -np.inf)
+
+    def sum_of(self, mu_d: Floats) -> float:
+        """The sum of one schedule, (N,)."""
+        return float(self.sums(mu_d[None])[0])
+
+
+_MOST_PATTERNS, _PATTERN_SLOTS = 24, 240  # starts of each kind: as many as a long schedule leaves time for
+_SNAP = 1e-6  # a μ_d nearer than this to 0 or 1 is meant to be it
+
+
+def patterns(slots: int, blocks: list[slice]) -> list[Floats]:
+    """Schedules, (N,), to climb from: states in one block alone, or in all blocks up to one. They need not keep Ω."""
+    found = []
+    count = max(2, min(_MOST_PATTERNS, _PATTERN_SLOTS // slots))
+    for i in np.unique(np.linspace(0, len(blocks) - 1, count).astype(np.int64)).tolist():
+        for first in (i, 0):
+            mu_d = np.zeros(slots)
+            mu_d[0] = mu_d[blocks[first].start : blocks[i].stop] = 1.0
+            found.append(mu_d)
+    return found
+
+
+def climbed(problem: ScheduleProblem, start: Floats, blocks: list[slice]) -> Floats:
+    """A schedule, (N,), that keeps Ω, by a sequential quadratic program over all blocks at once.
+
+    Every trace is affine in the μ_d of a single slot, so that its derivative is the difference between its values at 1 and 0.
+    """
+    from scipy.optimize import minimize  # noqa: PLC0415 - slow to import
+
+    slots = problem.slots
+    bound = problem.max_trace if math.isfinite(problem.max_trace) else 1.0
+    scale = max(abs(float(replace(problem, max_trace=math.inf).sums(np.ones((1, slots)))[0])), 1e-300)
+    member = np.zeros((slots, len(blocks)))
+    for i, one in enumerate(blocks):
+        member[one, i] = 1.0
+
+    def schedule(of: Floats) -> Floats:
+        found: Floats = member @ np.clip(of, 0.0, 1.0)
+        found[0] = 1.0
+        return found
+
+    def derivatives(recursion: SlotRecursion, of: Floats) -> Floats:
+        """Of the trace of each slot by the μ_d of each block, (N, B)."""
+        mu_d = schedule(of)
+        ends = np.repeat(mu_d[None], 2 * (slots - 1), axis=0)
+        index = np.arange(slots - 1)
+        ends[index, index + 1], ends[index + slots - 1, index + 1] = 0.0, 1.0
+        traces = recursion.traces(ends)
+        by_slot = np.vstack([np.zeros(slots), traces[slots - 1 :] - traces[: slots - 1]])
+        found: Floats = by_slot.T @ member
+        return found
+
+    def loss(of: Floats) -> float:
+        ours, theirs = (each.traces(schedule(of)[None])[0] for each in (problem.user, problem.eavesdropper))
+        return float((problem.weight * ours - (1.0 - problem.weight) * theirs).sum()) / scale
+
+    def slope(of: Floats) -> Floats:
+        ours, theirs = (derivatives(each, of) for each in (problem.user, problem.eavesdropper))
+        found: Floats = (problem.weight * ours - (1.0 - problem.weight) * theirs).sum(axis=0) / scale
+        return found
+
+    constraint: Any = {
+        "type": "ineq",
+        "fun": lambda of: 1.0 - problem.user.traces(schedule(of)[None])[0, 1:] / bound,
+        "jac": lambda of: -derivatives(problem.user, of)[1:] / bound,
+    }
+    found = minimize(
+        loss,
+        np.array([start[one.start] for one in blocks]),
+        jac=slope,
+        bounds=[(0.0, 1.0)] * len(blocks),
+        constraints=[constraint] if math.isfinite(problem.max_trace) else [],
+        method="SLSQP",
+        options={"maxiter": 100, "ftol": 1e-10},
+    )
+    mu_d = schedule(np.nan_to_num(found.x, nan=1.0))
+    mu_d[mu_d < _SNAP], mu_d[mu_d > 1.0 - _SNAP] = 0.0, 1.0
+    return _repaired(problem, mu_d)
+
+
+def _repaired(problem: ScheduleProblem, mu_d: Floats) -> Floats:
+    """The nearest schedule, (N,), on the way from one to states alone that keeps Ω: the user's error falls with each μ_d.
+
+    Slots without states keep none, if Ω can be kept so.
+    """
+    way = np.where(mu_d > 0.0, 1.0 - mu_d, 0.0)
+    if not math.isfinite(problem.sum_of(mu_d + way)):
+        way = 1.0 - mu_d
+    low, high = 0.0, 1.0
+    for _ in range(_REFINEMENTS):
+        fractions = np.linspace(low, high, _POINTS)
+        keeps = np.isfinite(problem.sums(mu_d + fractions[:, None] * way))
+        first = int(np.argmax(keeps))  # the last one keeps it: the whole way, or the end of the step before
+        if first == 0:
+            high = float(fractions[0])
+            break
+        low, high = float(fractions[first - 1]), float(fractions[first])
+    found: Floats = mu_d + high * way
+    return found
+
 
 _POINTS, _REFINEMENTS = 33, 8  # the least feasible μ_d of a block is found to 33⁻⁸
 _MESH, _ZOOM, _NARROW = 17, 4.0, 1e-3

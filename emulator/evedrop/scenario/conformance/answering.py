@@ -1,4 +1,4 @@
-"""The process that answers for one eavesdropper's class, so that the class runs nowhere else; see `evedrop.model.remote_calls`.
+"""The process that answers for one eavesdropper's class, so that it runs nowhere else; see `model/eavesdroppers/remote_class.py`.
 
 It is told where modules are, then one question per line, each a list: the name of a class, the question, and arguments.
 Each answer is one line. The process ends when no question comes for some seconds, and when the asking process is gone.

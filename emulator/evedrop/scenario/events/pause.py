@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from evedrop.model.links.link import Fate
+from evedrop.model.links.loss_model import Fate
 from evedrop.names import ProcessAction
 from evedrop.scenario.events.effects import Leave, Return
 from evedrop.scenario.events.event import Act, EventKind, Fault

@@ -12,7 +12,7 @@ from evedrop.model.outcomes import uses_of
 from evedrop.model.process import Floats
 from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.slot.link_distribution import distribution_of
-from evedrop.model.theory.closed_form import ClosedForm, Hijack, ReceiverConditions
+from evedrop.model.theory.closed_forms import ClosedForm, Hijack, ReceiverConditions
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.tables import Scenario
 

@@ -11,18 +11,16 @@ import numpy as np
 
 from evedrop.model import modulated
 from evedrop.model.acknowledgements import FORGING
-from evedrop.model.modulated_streaks import modulated_streaks
+from evedrop.model.modulated import modulated_streaks
 from evedrop.model.outcomes import eavesdropper_outcomes, legitimate_outcomes
-from evedrop.model.parts_of_runs import parts_of
-from evedrop.model.process import Floats, Process
+from evedrop.model.process import Floats, Process, parts_of
 from evedrop.model.schedule import in_slot
 from evedrop.model.schemes import scheme_of
 from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.slot.link_distribution import LinkDistribution, distribution_of
 from evedrop.model.theory import covariances as theory
-from evedrop.model.theory.closed_form import ClosedForm
-from evedrop.model.theory.covariances import ExpectedCovariance, Outcomes, OutcomesAt, SlotOutcomes
-from evedrop.model.theory.directions import Growth, growth
+from evedrop.model.theory.closed_forms import ClosedForm
+from evedrop.model.theory.covariances import ExpectedCovariance, Growth, Outcomes, OutcomesAt, SlotOutcomes, growth
 from evedrop.model.theory.rare_events import Streaks, streaks, total_of
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.expected.closed_forms import ClosedStream, closed_of

@@ -14,8 +14,7 @@ import numpy as np
 from evedrop.errors import UsageError
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.theory.covariances import LARGEST_OPERATOR, stability_bound
-from evedrop.model.theory.policy import held_traces, least_weight
-from evedrop.model.theory.policy_front import Front, ScheduledLinks, front
+from evedrop.model.theory.policies import Front, ScheduledLinks, front, held_traces, least_weight
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.expected.closed_forms import conditions_of, stated_form
 from evedrop.scenario.tables import Scenario

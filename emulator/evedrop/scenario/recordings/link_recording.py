@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evedrop.errors import TraceError
-from evedrop.model.delays.trace import MOST_DELAYS
+from evedrop.model.delays import MOST_DELAYS
 from evedrop.model.links.trace import MOST_OUTCOMES
 from evedrop.system.files import Limit, Unreadable, lines_of, opened, why_of
 

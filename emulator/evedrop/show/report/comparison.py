@@ -9,8 +9,7 @@ from collections.abc import Iterator
 from itertools import groupby
 from typing import TYPE_CHECKING
 
-from evedrop.model.metrics.shown_number import ShownNumber
-from evedrop.model.metrics.text import estimate, fraction_text, number_text
+from evedrop.model.metrics.text import ShownNumber, estimate, fraction_text, number_text
 from evedrop.score.summary import RARE_FRACTION
 from evedrop.score.verdict import MARKS, SecrecyKept
 from evedrop.show.report.closing import rare_events_words

@@ -15,8 +15,8 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from evedrop.errors import UsageError
-from evedrop.model.packet_words import NOTHING, SILENT
 from evedrop.model.process import Floats
+from evedrop.model.receiver import NOTHING, SILENT
 from evedrop.results.reading import Results
 from evedrop.scenario.loading.recorded import recorded_noise
 from evedrop.score.summary import Summary

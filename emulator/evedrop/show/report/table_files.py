@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from evedrop.errors import UsageError
-from evedrop.model.metrics.shown_number import ShownNumber
+from evedrop.model.metrics.text import ShownNumber
 from evedrop.show.report.text_table import TextTable
 
 ERROR, UNIT = "standard error", "unit"

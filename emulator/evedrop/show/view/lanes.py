@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from evedrop.model.packet_words import DISCARDED, DROPPED, INNOVATION, MISLED, SILENT, STATE
-from evedrop.model.receiver import Action, Codes
+from evedrop.model.receiver import DISCARDED, DROPPED, INNOVATION, MISLED, SILENT, STATE, Action, Codes
 from evedrop.score.track import Track
 from evedrop.show.view import palette
 from evedrop.show.view.palette import Colour

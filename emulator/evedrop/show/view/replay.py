@@ -13,9 +13,8 @@ import pyarrow.compute as pc
 
 from evedrop.errors import UsageError
 from evedrop.model.integrity.monitor import MonitoredSlots
-from evedrop.model.packet_words import ACTION_OF, INNOVATION, NOTHING
 from evedrop.model.process import Floats
-from evedrop.model.receiver import Flags
+from evedrop.model.receiver import ACTION_OF, INNOVATION, NOTHING, Flags
 from evedrop.results.reading import Results
 from evedrop.scenario.loading.recorded import recorded
 from evedrop.show.view.scene import PeerSlots, SceneSlots

@@ -14,8 +14,8 @@ import pyarrow.compute as pc
 from matplotlib.patches import Patch
 
 from evedrop.errors import UsageError
-from evedrop.model.packet_words import NOTHING, SILENT
 from evedrop.model.process import Floats
+from evedrop.model.receiver import NOTHING, SILENT
 from evedrop.results.reading import Results
 from evedrop.scenario.arguments import refuse_unless
 from evedrop.scenario.loading.recorded import recorded, recorded_noise

@@ -10,14 +10,14 @@ from typing import final
 
 import numpy as np
 
+from evedrop.model.detection import ShiryaevTest
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.local_filter import LocalFilter, settled
-from evedrop.model.noise_distribution import PACKETS
-from evedrop.model.numeric.shiryaev import ShiryaevTest
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process, Trajectory
 from evedrop.model.receiver import Receiver, Reception
+from evedrop.model.schedule import PACKETS
 from evedrop.model.schemes.noise import Noise
 from evedrop.model.slot.link import link_of
 from evedrop.model.streams import Batch, BlockReader, root_of_seed, stream_key

@@ -15,12 +15,16 @@ import numpy as np
 from evedrop.model.acknowledgements import AckChannel, rates_of
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Reception
-from evedrop.model.reference import ReferenceReceiver
-from evedrop.model.reference_code import ReferenceCode
-from evedrop.model.schemes.mixed_packets import MixedEncoder
-from evedrop.model.schemes.random_code import RandomCode, RandomCodeEncoder
+from evedrop.model.reference_code import ReferenceCode, ReferenceReceiver
+from evedrop.model.schemes.mixed_packets import (
+    MixedEncoder,
+    RandomCode,
+    RandomCodeEncoder,
+    ThresholdCode,
+    ThresholdCodeEncoder,
+    forged_fraction,
+)
 from evedrop.model.schemes.scheme import Scheme
-from evedrop.model.schemes.threshold_code import ThresholdCode, ThresholdCodeEncoder, forged_fraction
 from evedrop.model.slot.link import link_of
 from evedrop.model.streams import Batch, root_of_seed, stream_key
 from evedrop.studies.papers.deliveries import deliveries

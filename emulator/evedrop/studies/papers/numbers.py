@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 
 from evedrop.model.process import Floats
-from evedrop.model.theory.adversary import Adversary, adversary_bound
 from evedrop.model.theory.covariances import Outcomes, expected_traces, stability_bound
 from evedrop.model.theory.design import Against
+from evedrop.model.theory.ratio import Adversary, adversary_bound
 from evedrop.studies.papers import numerical
 from evedrop.studies.papers.reproduction import NumberVerdict, PublishedNumber
 

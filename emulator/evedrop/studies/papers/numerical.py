@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from evedrop.model.process import Process
-from evedrop.model.theory.adversary import Adversary
 from evedrop.model.theory.covariances import Outcomes, limit_trace, stability_bound
 from evedrop.model.theory.design import Against, design
+from evedrop.model.theory.ratio import Adversary
 from evedrop.show.view.figure_style import panels
 
 MU = 0.9

@@ -11,8 +11,7 @@ from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Any, Self, TypeAlias
 
-from evedrop.model.metrics.shown_number import ShownNumber
-from evedrop.model.metrics.text import estimate
+from evedrop.model.metrics.text import ShownNumber, estimate
 
 Value: TypeAlias = float | str | None
 """A number; text for anything else, such as a range; None if there is nothing."""

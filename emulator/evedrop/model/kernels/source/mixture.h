@@ -1,4 +1,4 @@
-/* The Bayesian eavesdropper's slots, WIDTH trials at a time: posterior.py and mixtures.py. */
+/* The Bayesian eavesdropper's slots, WIDTH trials at a time: mixtures.py. */
 
 #include "factored.h"
 

@@ -8,7 +8,7 @@ from typing import final
 import rerun.blueprint as rrb
 from rerun import AsComponents
 
-from evedrop.model import packet_words
+from evedrop.model import receiver
 from evedrop.score.track import Track
 from evedrop.show.view import lanes
 from evedrop.show.view.column import Column
@@ -24,12 +24,12 @@ _PATH = "graph"
 _SENSOR, _ROUTER = "the sensor", "the router"
 _LINKS, _RECEIVERS = 150.0, 320.0  # where their columns are, right of sensor and router
 FATES = {
-    packet_words.STATE: STATE,
-    packet_words.INNOVATION: STATE,
-    packet_words.MISLED: MISLED,
-    packet_words.DISCARDED: TRUTH_CURVE,
-    packet_words.DROPPED: DROPPED_TEXT,
-    packet_words.SILENT: TRUTH_CURVE,
+    receiver.STATE: STATE,
+    receiver.INNOVATION: STATE,
+    receiver.MISLED: MISLED,
+    receiver.DISCARDED: TRUTH_CURVE,
+    receiver.DROPPED: DROPPED_TEXT,
+    receiver.SILENT: TRUTH_CURVE,
 }
 """The colour of each word of a lane."""
 KNOWN = {Track.IN_TRACK: IN_TRACK_TEXT, Track.DRIFTING: MISLED, Track.FOOLED: DROPPED_TEXT}

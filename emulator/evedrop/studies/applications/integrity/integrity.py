@@ -12,10 +12,10 @@ import numpy as np
 
 from evedrop.model.controllers.lqr import Lqr
 from evedrop.model.integrity import POLICIES, SENSOR_ATTACKS
+from evedrop.model.integrity.attacks import Replay
 from evedrop.model.integrity.loop import WatermarkedLoop
 from evedrop.model.integrity.monitor import MonitoredSlots, MonitorPlan
-from evedrop.model.integrity.policy import WatermarkPolicy
-from evedrop.model.integrity.replay import Replay
+from evedrop.model.integrity.policies import WatermarkPolicy
 from evedrop.model.integrity.theory import WatermarkTheory, loop_of
 from evedrop.model.process import Floats
 from evedrop.scenario.application import (

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from evedrop.model.digest import Digests, InputLog, RunDigest
 from evedrop.model.integrity.loop import WatermarkedLoop
 from evedrop.model.integrity.monitor import MonitoredSlots
-from evedrop.model.integrity.policy import WatermarkPolicy
+from evedrop.model.integrity.policies import WatermarkPolicy
 from evedrop.model.integrity.theory import WatermarkTheory
 from evedrop.model.metrics.standard_error import z_of
 from evedrop.model.plant import Plant

@@ -1,0 +1,161 @@
+"""The base class of loss models: from random numbers to lost packets. The rest of a link is in `evedrop.model.slot.link`."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from types import MappingProxyType
+from typing import Any, ClassVar
+
+import numpy as np
+
+from evedrop.model.kernels.elementary import sum_in_order
+from evedrop.model.links.way import Way
+from evedrop.model.process import Floats, parts_of
+from evedrop.model.receiver import Codes, Flags
+
+
+class Fate(IntEnum):
+    """The outcome of a packet on a link."""
+
+    DELIVERED = 0
+    LOST = 1
+    """Erased by the link's loss model."""
+    CORRUPTED = 2
+    """Damaged on the way, as its checksum shows."""
+    OVERFLOW = 3
+    """The queue before a link of limited rate was full."""
+    CUT = 4
+    """Sent while the link was cut."""
+    LATE = 5
+    """Delayed by more slots than the receiver accepts."""
+    DOWN = 6
+    """Its receiver was down in a slot from its sending to its arrival."""
+    PAUSED = 7
+    """Its receiver was paused in such a slot."""
+    UNDERWAY = 8
+    """Still under way when the run ended."""
+    UNSENT = 9
+    """No packet was sent: the scheme stayed silent."""
+
+
+REASONS = tuple(fate.name.lower() for fate in Fate if fate not in (Fate.DELIVERED, Fate.UNSENT))
+"""The reasons for losses, in the order of `Fate`."""
+
+
+def fates_of(lost: Flags) -> Codes:
+    """`Fate` codes from flags of losses."""
+    codes: Codes = lost.view(np.uint8)
+    return codes
+
+
+@dataclass(frozen=True)
+class Chain:
+    """A Markov chain of link states, which at slot 0 is in its stationary distribution."""
+
+    transitions: Floats
+    """Row: from, column: to, (states, states)."""
+    stationary: Floats
+    """The stationary distribution, (states,)."""
+    quality: Floats
+    """Probability that a packet is delivered in each state, (states,)."""
+
+    @property
+    def independent(self) -> bool:
+        """Whether the fates of all packets are independent and identically distributed: a single state, as in the paper."""
+        return len(self.stationary) == 1
+
+
+class LossModel(ABC):
+    """Decides fates from uniform numbers, for all trials at once, slot by slot.
+
+    Each file of this folder defines one model, whose name in a scenario is the file's name. `parameters` are the entries
+    that the scenario gives it, each with an example.
+    """
+
+    parameters: ClassVar[Mapping[str, Any]] = MappingProxyType({})
+    optional: ClassVar[frozenset[str]] = frozenset()
+    recorded: ClassVar[str | None] = None
+    """The parameter that gets the contents of the recording `file`; None if there is none. Only for built-in models."""
+    ways: tuple[Way, Way] | None = None
+    """Where sender and receiver are in every slot; None if losses do not depend on that."""
+    uniforms_per_slot: int = 1
+
+    @classmethod
+    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """Mistakes in parameters, all of them known but some perhaps missing: (entry, value found and expected)."""
+        del given
+        return []
+
+    @property
+    @abstractmethod
+    def quality(self) -> float:
+        """Mean probability that a packet is delivered."""
+
+    def quality_at(self, slots: range) -> Floats:
+        """Unconditional probability that the packet of each of these slots is delivered, (slots,)."""
+        return np.full(len(slots), self.quality)
+
+    def rate_variance(self, slots: range) -> float:
+        """Variance, over trials, of one trial's fraction of delivered packets over these slots.
+
+        From the chain, or from independence; a model with neither must override it.
+        """
+        chain, count = self.chain, len(slots)
+        if chain is not None:
+            return count_variance(chain.transitions, chain.stationary, chain.quality, count) / count**2
+        qualities = (self.quality_at(part) for part in parts_of(slots))
+        return sum_in_order(float((quality * (1.0 - quality)).sum()) for quality in qualities) / count**2
+
+    @property
+    def memoryless(self) -> bool:
+        """Whether the fates of different slots are independent of each other, identically distributed, different or certain."""
+        return self.chain is not None and self.chain.independent
+
+    @property
+    def settles(self) -> bool:
+        """Whether the probability of a delivery is constant from some slot on, so that an error can have a limit."""
+        return self.chain is not None
+
+    @property
+    def chain(self) -> Chain | None:
+        """The Markov chain of the losses, for the theory; None if there is none."""
+        return None
+
+    @abstractmethod
+    def fates(self, first: int, uniforms: Floats) -> Codes:
+        """`Fate` of each packet of the next slots, (slots, R), from uniforms (slots, uniforms_per_slot, R).
+
+        first: the first of the slots, which follow those of the previous call. A model replaces its memory and never changes it
+        in place, so that a shallow copy of the model can continue from the same point.
+        """
+
+
+def count_variance(transitions: Floats, stationary: Floats, quality: Floats, slots: int) -> float:
+    """Variance of the number of packets that a chain in its stationary distribution delivers in `slots` slots.
+
+    transitions (states, states), stationary (states,), quality (states,): as in `Chain`; slots ≥ 1. Exact, by doubling: the
+    number of matrix products grows with the logarithm of the slots.
+    """
+    mean = float(stationary @ quality)
+    centred = quality - mean
+    # Without the stationary part the chain's powers decay, and no large numbers are subtracted from each other.
+    fading = transitions - stationary
+    own = np.eye(len(stationary))
+    power, partial, total = own - np.outer(np.ones(len(stationary)), stationary), np.zeros_like(own), np.zeros_like(own)
+    count = 0
+    for bit in f"{slots:b}":
+        # power = Tⁿ, partial = Σ_{j<n} T^j, total = Σ_{j<n} (n−j) T^j, of the chain without its stationary part
+        total = total + count * partial + power @ total
+        partial = partial + power @ partial
+        power = power @ power
+        count *= 2
+        if bit == "1":
+            partial = partial + power
+            total = total + partial
+            power = power @ fading
+            count += 1
+    together = float((stationary * centred) @ (2.0 * total @ centred)) - slots * float(stationary @ (centred * centred))
+    return max(0.0, together) + slots * float(stationary @ (quality * (1.0 - quality)))
