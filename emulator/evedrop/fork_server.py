@@ -111,15 +111,15 @@ def _become(request: bytes, files: list[int], own: tuple[int, int]) -> NoReturn:
             os.dup2(file, number)
         for file in (*files, *own):
             os.close(file)
-        found = json.loads(request)
-        sys.argv[1:] = found["words"]
+        message = json.loads(request)
+        sys.argv[1:] = message["words"]
         # Before the environment changes, next to which the system keeps the command line.
-        setproctitle(" ".join([sys.executable, "-P", "-m", "evedrop", *found["words"]]))
+        setproctitle(" ".join([sys.executable, "-P", "-m", "evedrop", *message["words"]]))
         os.environ.clear()
-        os.environ.update(found["environment"])
-        if found["folder"] is not None:
-            os.chdir(found["folder"])
-        os.umask(found["umask"])
+        os.environ.update(message["environment"])
+        if message["folder"] is not None:
+            os.chdir(message["folder"])
+        os.umask(message["umask"])
         from evedrop.__main__ import program  # noqa: PLC0415 - not needed by the process that forks
 
         program()

@@ -22,8 +22,8 @@ def print_budget(design: BudgetDesign) -> None:
     names = list(design.best.eavesdroppers)
     errors = [f"error of {name}" for name in names]
     shown = TextTable.headed([], ["threshold θ", "encrypted", "energy", *errors], [""])
-    for one in sorted({round(each.threshold, 9): each for each in (*design.others, design.best)}.items()):
-        metrics = one[1]
+    for choice in sorted({round(each.threshold, 9): each for each in (*design.others, design.best)}.items()):
+        metrics = choice[1]
         shown.add(
             number_text(metrics.threshold, ".6g"),
             number_text(metrics.encrypted_fraction, ".4f"),

@@ -70,5 +70,5 @@ def replay_command(folder: Path) -> str | None:
     trials = " --record-trials 1" if scenario.record_trials > 1 else ""
     trials += " --set shards=1" if scenario.shards > 1 else ""
     # A quantile over trials can be expected only of many trials.
-    expected = " --set 'expect=[]'" if any(one.quantile is not None for one in scenario.expect) else ""
+    expected = " --set 'expect=[]'" if any(expectation.quantile is not None for expectation in scenario.expect) else ""
     return f"evedrop run {shlex.quote(str(folder))} --pace 0.02{trials}{expected}"

@@ -11,12 +11,12 @@ if TYPE_CHECKING:
     from evedrop.results.comparison import Comparison
 
 
-def print_comparison(found: Comparison, folder: str) -> None:
+def print_comparison(comparison: Comparison, folder: str) -> None:
     """Print a comparison on standard output."""
     console = terminal()
-    console.print(comparison_heading(found))
-    console.show(schemes_table(found), tight=True)
-    console.show(pairs_table(found), tight=True, sections=True)
-    for line in comparison_lines(found):
+    console.print(comparison_heading(comparison))
+    console.show(schemes_table(comparison), tight=True)
+    console.show(pairs_table(comparison), tight=True, sections=True)
+    for line in comparison_lines(comparison):
         console.print(line)
     console.print(f"results: {folder}/compare.json, compare.png, scenarios/")

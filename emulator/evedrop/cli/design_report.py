@@ -22,14 +22,14 @@ def print_design(design: Design) -> None:
     if design.remark is not None:
         console.print(design.remark)
     else:
-        found = "error is unbounded"
+        error = "error is unbounded"
         if math.isfinite(design.trace):
-            found = (
+            error = (
                 f"trace is {design.trace:.4g}, {design.cost:.3g} times that of sending every state "
                 f"({design.plain_trace:.4g})"
             )
         console.print(
-            f"admissible: {design.bound:.6g} < μ_d ≤ 1; at this scenario's μ_d = {design.mu_d:g} the legitimate {found}"
+            f"admissible: {design.bound:.6g} < μ_d ≤ 1; at this scenario's μ_d = {design.mu_d:g} the legitimate {error}"
         )
     if design.minimum is not None:
         console.print(f"least μ_d for the wanted trace: {design.minimum:.6g}")

@@ -20,23 +20,23 @@ T = TypeVar("T")
 
 def crew(parser: argparse.ArgumentParser) -> None:
     """Add the options that say where trials are computed."""
-    what = "number of worker processes; does not affect the results"
-    parser.add_argument("--workers", type=int, metavar="N", help=what)
+    help_text = "number of worker processes; does not affect the results"
+    parser.add_argument("--workers", type=int, metavar="N", help=help_text)
     scheduler(parser)
 
 
 def scheduler(parser: argparse.ArgumentParser) -> None:
     """Add `--scheduler`, the address of a Dask scheduler."""
-    what = "let the workers of this Dask scheduler compute the trials, tcp://HOST:PORT (docs/montecarlo.md)"
-    parser.add_argument("--scheduler", metavar="ADDRESS", help=what)
+    help_text = "let the workers of this Dask scheduler compute the trials, tcp://HOST:PORT (docs/montecarlo.md)"
+    parser.add_argument("--scheduler", metavar="ADDRESS", help=help_text)
 
 
 def resuming(parser: argparse.ArgumentParser) -> None:
     """Add `--resume`, to go on with a study that was interrupted."""
-    what = (
+    help_text = (
         "go on with the interrupted study in the folder of --out; all but --workers and --scheduler must be as it was"
     )
-    parser.add_argument("--resume", action="store_true", help=what)
+    parser.add_argument("--resume", action="store_true", help=help_text)
 
 
 def check_resuming(options: argparse.Namespace) -> None:
@@ -47,8 +47,8 @@ def check_resuming(options: argparse.Namespace) -> None:
 
 def keeping(parser: argparse.ArgumentParser) -> None:
     """Add the options of a study that needs no results folder: one that keeps finished trials, and `--resume`."""
-    what = "write the result there, new or empty, and keep finished trials for --resume until it is complete"
-    parser.add_argument("--out", type=Path, metavar="DIR", help=what)
+    help_text = "write the result there, new or empty, and keep finished trials for --resume until it is complete"
+    parser.add_argument("--out", type=Path, metavar="DIR", help=help_text)
     resuming(parser)
 
 

@@ -104,9 +104,9 @@ def _check_names(options: argparse.Namespace) -> None:
     texts = [text for value in vars(options).values() for text in (value if isinstance(value, list) else [value])]
     for text in [here, *texts]:
         if isinstance(text, (str, Path)) and shown(text) != str(text):
-            what = "the current folder" if text is here else "it"
+            subject = "the current folder" if text is here else "it"
             raise UsageError(
-                f"{shown(text)}: {what} is not named in UTF-8, as results and messages are; use another name"
+                f"{shown(text)}: {subject} is not named in UTF-8, as results and messages are; use another name"
             )
 
 
@@ -126,10 +126,10 @@ def parser_of(first: str = "") -> Parser:
             if command.group not in groups:
                 groups[command.group] = _added(top, command.group, f"commands about {command.group}").add_commands()
             where = groups[command.group]
-        one = _added(where, command.name, does, _epilog(command))
-        one.set_defaults(command=command.run, parser=one)
+        added = _added(where, command.name, does, _epilog(command))
+        added.set_defaults(command=command.run, parser=added)
         for option in command.options:
-            option(one)
+            option(added)
         name = command.name if command.group is None else f"{command.group} {command.name}"
         parser.sections.setdefault(command.section, {})[name] = does
     return parser
@@ -149,11 +149,11 @@ def _epilog(command: Command) -> str:
 def _commands(first: str) -> Iterator[Command]:
     """The commands in the module of this first word; all commands if it is not the first word of a built-in one."""
     modules = [MODULES[first]] if first in MODULES else list(dict.fromkeys(MODULES.values()))
-    found: list[Command] = []
+    commands: list[Command] = []
     for name in modules:
-        found += import_module(f"evedrop.cli.commands.{name}").COMMANDS
+        commands += import_module(f"evedrop.cli.commands.{name}").COMMANDS
     order = [*MODULES]
-    yield from sorted(found, key=lambda command: order.index(command.group or command.name))
+    yield from sorted(commands, key=lambda command: order.index(command.group or command.name))
     if first not in MODULES:
         yield from _commands_of_packages()
 
@@ -165,11 +165,11 @@ def _commands_of_packages() -> Iterator[Command]:
     taken = {*MODULES}
     for point in entry_points(group=GROUP):
         try:
-            found: Sequence[Command] = import_module(point.value).COMMANDS
+            commands: Sequence[Command] = import_module(point.value).COMMANDS
         except Exception as error:  # a mistake in the package
             warn(f"the commands of {point.value} cannot be loaded ({type(error).__name__}: {error})")
             continue
-        for command in found:
+        for command in commands:
             if command.name in taken or command.group is not None:
                 warn(f"the command {command.name} of {point.value} is left out: expected a new name, and no group")
             else:

@@ -36,12 +36,12 @@ def number_type(least: float, most: float, words: str) -> Callable[[str], float]
 
     def number(text: str) -> float:
         try:
-            found = float(text)
+            value = float(text)
         except ValueError:
-            found = math.nan
-        if not least <= found <= most:
+            value = math.nan
+        if not least <= value <= most:
             raise argparse.ArgumentTypeError(f"{text} is not {words}")
-        return found
+        return value
 
     return number
 
@@ -59,14 +59,14 @@ def changes(parser: argparse.ArgumentParser) -> None:
 def entries(parser: argparse.ArgumentParser) -> None:
     """Add `--set`, and an option for each of the entries that are changed most often."""
     changes(parser)
-    for name, what in (
+    for name, help_text in (
         ("seed", "seed of all random numbers"),
         ("slots", "number of slots"),
         ("trials", "number of trials"),
         ("first-trial", "number of the first trial"),
         ("record-trials", "how many trials are recorded in full"),
     ):
-        parser.add_argument(f"--{name}", type=int, metavar="N", help=what)
+        parser.add_argument(f"--{name}", type=int, metavar="N", help=help_text)
     parser.add_argument("--pace", type=float, metavar="SECONDS", help="seconds per slot; 0 = as fast as possible")
     parser.add_argument("--secret", type=Path, metavar="FILE", help="a secret that is not derived from the seed")
 
@@ -77,9 +77,9 @@ def output(parser: argparse.ArgumentParser) -> None:
     as_json(parser, "print only the summary, as JSON, on standard output")
 
 
-def as_json(parser: argparse.ArgumentParser, what: str = "print JSON") -> None:
+def as_json(parser: argparse.ArgumentParser, help_text: str = "print JSON") -> None:
     """Add `--json`, for JSON instead of text; what: the help."""
-    parser.add_argument("--json", action="store_true", help=what)
+    parser.add_argument("--json", action="store_true", help=help_text)
 
 
 def served(parser: argparse.ArgumentParser) -> None:
@@ -127,7 +127,7 @@ def over_wire(parser: argparse.ArgumentParser) -> None:
 
 def _of_wire(options: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
     """The changes that give a scenario the network of `--wire`; none without it."""
-    sides = [one.partition("=") for one in getattr(options, "wire_side", ())]
+    sides = [assignment.partition("=") for assignment in getattr(options, "wire_side", ())]
     if getattr(options, "wire", None) is None:
         if sides or getattr(options, "wire_key", None) is not None:
             raise UsageError("--wire-key and --wire-side belong to a wire; give --wire FILE as well")

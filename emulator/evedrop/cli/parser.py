@@ -43,7 +43,9 @@ class _Help(argparse.RawDescriptionHelpFormatter):
         """The usage without optional arguments, which are listed below it."""
         if usage is None and prefix is None:
             options = argparse.Action([], "options", metavar="[options]")
-            usage = _usage(self._prog, [options, *(one for one in actions if one.required or not one.option_strings)])
+            usage = _usage(
+                self._prog, [options, *(action for action in actions if action.required or not action.option_strings)]
+            )
         super().add_usage(usage, actions, groups, prefix)
 
     def add_text(self, text: str | None) -> None:
@@ -97,7 +99,7 @@ class Parser(argparse.ArgumentParser):
 
     def options(self) -> set[str]:
         """The options of this parser and of all its commands, as a user types them."""
-        return set(self._own_options()).union(*(one.options() for one in self._commands.values()))
+        return set(self._own_options()).union(*(command.options() for command in self._commands.values()))
 
     def _own_options(self) -> list[str]:
         return [*getattr(self, "_option_string_actions", ())]
@@ -123,9 +125,9 @@ class Parser(argparse.ArgumentParser):
         if unknown:
             parser: Parser = getattr(options, "parser", self)
             word = unknown[0]
-            known = [name for name in parser._own_options() if name.startswith("--")]
-            what = "option" if word.startswith("-") else "argument"
-            parser.error(f"unknown {what} {word}{near(word.partition('=')[0], known)}")
+            names = [name for name in parser._own_options() if name.startswith("--")]
+            kind = "option" if word.startswith("-") else "argument"
+            parser.error(f"unknown {kind} {word}{near(word.partition('=')[0], names)}")
         return options
 
     def _check_commands(self, given: Sequence[str]) -> None:

@@ -31,7 +31,7 @@ def print_policies(design: PolicyDesign) -> None:
         console.show(_policies(front, design.states))
         if front.never:
             for price in sorted({price for _, price in front.never}):
-                weights = ", ".join(f"{weight:g}" for weight, one in front.never if one == price)
+                weights = ", ".join(f"{weight:g}" for weight, never_price in front.never if never_price == price)
                 console.print(
                     f"left out, because the best policy never sends: with λ = {price:g} the weights {weights}"
                 )
@@ -66,9 +66,10 @@ def _policies(front: Front, states: int) -> TextTable:
 
 def _by_holding_time(thresholds: Sequence[int], states: int) -> str:
     """The thresholds, equal ones in a row as a count."""
-    stretches = [(one, len(list(equal))) for one, equal in groupby(thresholds)]
+    stretches = [(threshold, len(list(equal))) for threshold, equal in groupby(thresholds)]
     return " ".join(
-        ("never" if one > states else str(one)) + (f" ×{count}" if count > 1 else "") for one, count in stretches
+        ("never" if threshold > states else str(threshold)) + (f" ×{count}" if count > 1 else "")
+        for threshold, count in stretches
     )
 
 

@@ -16,22 +16,22 @@ if TYPE_CHECKING:
 def print_schedules(design: ScheduleDesign) -> None:
     """Print the schedules as text."""
     console = terminal()
-    for name, found in design.schedules.items():
+    for name, schedule in design.schedules.items():
         console.print(
-            f"against {name}: the sum is {found.best.value:.6g} with this schedule, "
-            f"and {found.constant.value:.6g} with the best constant μ_d, {found.constant.mu_d[1]:.6g}"
+            f"against {name}: the sum is {schedule.best.value:.6g} with this schedule, "
+            f"and {schedule.constant.value:.6g} with the best constant μ_d, {schedule.constant.mu_d[1]:.6g}"
         )
-        console.show(_slots(found.best))
+        console.show(_slots(schedule.best))
         on_grid = (
             "the best schedule of the grid"
-            if found.exact
+            if schedule.exact
             else "the best schedule found on the part of the grid that was searched"
         )
         console.print(
-            f"{on_grid} has {found.grid.value:.6g}; "
+            f"{on_grid} has {schedule.grid.value:.6g}; "
             "none of the changes tried, of one μ_d or of two neighbouring ones, improves this schedule"
         )
-        numbers = list(found.best.mu_d)
+        numbers = list(schedule.best.mu_d)
         console.print(f"to run it, with slots = {len(numbers)}, write in [encoding]:")
         console.print(f"state_probability = {toml_of(numbers)}\n", soft_wrap=True, highlight=False, markup=False)
     if design.left_out:

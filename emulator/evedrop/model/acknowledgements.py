@@ -91,13 +91,13 @@ class HeedRule(NamedTuple):
 
 def _power(base: float, exponent: int) -> float:
     """A power by squaring."""
-    found = 1.0
+    power = 1.0
     while exponent:
         if exponent & 1:
-            found *= base
+            power *= base
         base *= base
         exponent >>= 1
-    return found
+    return power
 
 
 def heed_rule_of(attack: str, quality: float, overheard: float) -> HeedRule | None:

@@ -56,7 +56,7 @@ def probabilities_mistakes(given: Mapping[str, Any], name: str) -> list[tuple[st
     value = given.get(name)
     if not isinstance(value, list):
         return probability_mistakes(given, name)
-    wrong = [k for k, one in enumerate(value) if not is_probability(one)]
+    wrong = [k for k, element in enumerate(value) if not is_probability(element)]
     if wrong:
         return [(name, f"is {as_toml(value[wrong[0]])} for slot {wrong[0]}; expected numbers from 0 to 1")]
     return [] if value else [(name, "is an empty list; expected a number from 0 to 1, or one for each slot")]

@@ -164,7 +164,7 @@ class RecordedDelay(DelayModel):
         values = given.get("values", [0.0])
         if not isinstance(values, list) or not 1 <= len(values) <= MOST_DELAYS:
             return [("values", f"is not a list of 1 to {MOST_DELAYS} delays; expected values = [0.5, 2.0]")]
-        wrong = next((i for i, one in enumerate(values) if not is_number(one, 0.0, LONGEST)), None)
+        wrong = next((i for i, delay in enumerate(values) if not is_number(delay, 0.0, LONGEST)), None)
         if wrong is not None:
             return [(f"values.{wrong}", f"is not a delay; expected a number from 0 to {LONGEST:.0f}")]
         return []

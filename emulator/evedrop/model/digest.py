@@ -105,9 +105,9 @@ class PartialDigests:
     def finished(self) -> Digests:
         """The digests of all slots since the last call, (R, 16); the next slot begins another block."""
         self._hash_held()
-        digests = _joined(one.digest() for one in self._hashes)
-        for one in self._hashes:
-            one.reset()
+        digests = _joined(digest.digest() for digest in self._hashes)
+        for digest in self._hashes:
+            digest.reset()
         return digests
 
     def _hash_held(self) -> None:
@@ -118,8 +118,8 @@ class PartialDigests:
 
     def _hash(self, beliefs: Beliefs) -> None:
         for first, records in _records(beliefs.action != Action.LOST, beliefs.x_hat, beliefs.P):
-            for one, record in zip(self._hashes[first : first + len(records)], records, strict=True):
-                one.update(record)
+            for digest, record in zip(self._hashes[first : first + len(records)], records, strict=True):
+                digest.update(record)
 
 
 def _room(n: int, trials: int) -> Beliefs:
@@ -250,14 +250,14 @@ class BlockSums:
 
     def add(self, slots: range, numbers: Floats) -> dict[int, Floats]:
         """Add consecutive slots, (c, R); returns the sums (R,) of the blocks that end with one of them, by first slot."""
-        found: dict[int, Floats] = {}
+        finished: dict[int, Floats] = {}
         k = slots.start
         while k < slots.stop:
             stop = min(slots.stop, self._blocks.end(k))
             rows = numbers[k - slots.start : stop - slots.start]
             self.unfinished = added_in_order(self.unfinished, rows)
             if stop == self._blocks.end(k):
-                found[self._blocks.start(k)] = self.unfinished
+                finished[self._blocks.start(k)] = self.unfinished
                 self.unfinished = np.zeros_like(self.unfinished)
             k = stop
-        return found
+        return finished

@@ -118,7 +118,7 @@ class ModulatedCovariance:
 
     def _segment(self, k: int) -> tuple[Segment, int]:
         """The segment that contains a slot, and the first slot after the segment."""
-        starts = [one.start for one in self._link.segments] + [2**62]
+        starts = [segment.start for segment in self._link.segments] + [2**62]
         number = bisect_right(starts, k) - 1
         return self._link.segments[number], starts[number + 1]
 
@@ -141,8 +141,8 @@ class ModulatedCovariance:
             self._settled = self._step(self._settled, self._window[0], self._link.window)
         self._window.append(slot)
         states = self._settled
-        for one in self._window:
-            states = self._step(states, one, k - one.k)
+        for earlier in self._window:
+            states = self._step(states, earlier, k - earlier.k)
         assert states is not None  # noqa: S101 - the window contains slot k
         return states
 
@@ -151,7 +151,7 @@ class ModulatedCovariance:
         A, chain = self._process.A, slot.segment.chain
         quality = slot.quality * slot.segment.arrived[lag]
         whole = self._whole if self._slots_at is None else SlotOdds.of(self._slots_at(slot.k))
-        odds = {name: one[:, None, None] for name, one in whole.at(quality).items()}
+        odds = {name: values[:, None, None] for name, values in whole.at(quality).items()}
         weights = chain.stationary[:, None, None]
         if states is None or slot.before is None:
             first: Floats = odds["initial"] * weights * self._process.initial_covariance
@@ -237,12 +237,12 @@ def limit_states(process: Process, chain: Chain, outcomes_at: OutcomesAt) -> Flo
     """Lim E_k(s), (states, n, n); None if there is none."""
     outcomes = [outcomes_at(float(quality)) for quality in chain.quality]
     n, states = process.n, len(chain.stationary)
-    misled = any(one.misled > 0.0 for one in outcomes)
+    misled = any(outcome.misled > 0.0 for outcome in outcomes)
     if misled and radius(process) >= 1.0:
         return None
-    if not misled and all(one.predicted + one.leaked + one.initial == 0.0 for one in outcomes):
+    if not misled and all(outcome.predicted + outcome.leaked + outcome.initial == 0.0 for outcome in outcomes):
         return np.zeros((states, n, n))
-    kept = np.repeat([one.kept for one in outcomes], n * n)
+    kept = np.repeat([outcome.kept for outcome in outcomes], n * n)
     operator = kept[:, None] * np.kron(chain.transitions.T, np.kron(process.A, process.A))
     if np.max(np.abs(np.linalg.eigvals(operator))) >= 1.0 - 1e-12:
         return None
@@ -253,13 +253,13 @@ def limit_states(process: Process, chain: Chain, outcomes_at: OutcomesAt) -> Flo
 
 def _limit_sources(process: Process, chain: Chain, outcomes: list[Outcomes]) -> Floats:
     """The contribution of a slot to E(s) in the limit, (states, n, n)."""
-    misled = any(one.misled > 0.0 for one in outcomes)
+    misled = any(outcome.misled > 0.0 for outcome in outcomes)
     f = 2.0 * (process.A @ lyapunov(process, 1.0) @ process.A.T) if misled else np.zeros_like(process.Q)
-    M = remaining_limit(process) if any(one.leaked for one in outcomes) else np.zeros_like(process.Q)
+    M = remaining_limit(process) if any(outcome.leaked for outcome in outcomes) else np.zeros_like(process.Q)
     return np.array(
         [
-            weight * (one.predicted * process.Q + one.misled * f + one.leaked * M)
-            for weight, one in zip(chain.stationary, outcomes, strict=True)
+            weight * (outcome.predicted * process.Q + outcome.misled * f + outcome.leaked * M)
+            for weight, outcome in zip(chain.stationary, outcomes, strict=True)
         ]
     )
 
@@ -267,7 +267,7 @@ def _limit_sources(process: Process, chain: Chain, outcomes: list[Outcomes]) -> 
 def _limit_step(process: Process, chain: Chain, outcomes_at: OutcomesAt, states: Floats) -> Floats:
     outcomes = [outcomes_at(float(quality)) for quality in chain.quality]
     mixed = np.tensordot(chain.transitions.T, states, axes=1)
-    kept = np.array([one.kept for one in outcomes])[:, None, None]
+    kept = np.array([outcome.kept for outcome in outcomes])[:, None, None]
     stepped: Floats = kept * (process.A @ mixed @ process.A.T) + _limit_sources(process, chain, outcomes)
     return stepped
 
@@ -278,11 +278,11 @@ def tail_outcomes(chain: Chain, outcomes_at: OutcomesAt) -> Outcomes:
     Source: docs/mathematics.md, losses in bursts.
     """
     outcomes = [outcomes_at(float(quality)) for quality in chain.quality]
-    if all(one.predicted + one.leaked == 0.0 for one in outcomes):
+    if all(outcome.predicted + outcome.leaked == 0.0 for outcome in outcomes):
         return outcomes[0]
-    keeps = np.array([one.kept for one in outcomes])[:, None] * chain.transitions.T
+    keeps = np.array([outcome.kept for outcome in outcomes])[:, None] * chain.transitions.T
     rate = min(1.0, float(np.max(np.abs(np.linalg.eigvals(keeps)))))
-    misled = max(one.misled for one in outcomes)
+    misled = max(outcome.misled for outcome in outcomes)
     return Outcomes(predicted=rate, state=max(0.0, 1.0 - rate - misled), misled=misled, decoded=0.0, initial=1.0)
 
 
@@ -311,13 +311,13 @@ class LinearBlock:
         odds: lag → the probabilities of the outcomes in the chain's states, (S,) each, of a slot this number of slots ago;
         the last lag is that of settled slots.
         """
-        misleads = any(bool(np.any(one["misled"] > 0.0)) for one in odds)
-        *since, M = (_operator(process, chain, one, misleads) for one in odds)
+        misleads = any(bool(np.any(terms["misled"] > 0.0)) for terms in odds)
+        *since, M = (_operator(process, chain, terms, misleads) for terms in odds)
         states = len(chain.stationary) * process.n**2
         row = np.zeros(len(M))
         row[:states] = np.tile(np.eye(process.n).reshape(-1), len(chain.stationary))
-        for one in since:
-            row = row @ one
+        for terms in since:
+            row = row @ terms
         rows = np.empty((BLOCK, len(M)))
         for j in range(BLOCK):
             rows[j] = row = row @ M
@@ -383,7 +383,7 @@ def modulated_streaks(
     None for late packets and outages, for links whose models have different numbers of states, if the error leaves double
     precision, and for runs that are so long that too much had to be computed (MOST_NUMBERS).
     """
-    states = {len(one.chain.stationary) for one in link.segments}
+    states = {len(segment.chain.stationary) for segment in link.segments}
     too_long = slots * process.n**2 * max(states) > _LARGEST_RUN
     if link.window or link.outages or len(states) > 1 or not np.isfinite(total) or too_long:
         return None
@@ -400,7 +400,7 @@ def modulated_streaks(
             return None
         if np.sum(carried) >= (1.0 - REST) * total or length == slots:
             return Streaks(np.array(number).T, np.array(carried).T, total)
-        groups = [_lasting(distributions, carry, *one, length) for one in groups]
+        groups = [_lasting(distributions, carry, *segment, length) for segment in groups]
 
 
 def _slot_distributions_of(

@@ -46,9 +46,9 @@ def eavesdropper_outcomes(scheme: Scheme, strategy: str, parameters: Mapping[str
     return lambda quality: _known(scheme.eavesdropper_outcomes(quality, *uses))
 
 
-def _known(found: Outcomes | None) -> Outcomes:
-    assert found is not None  # noqa: S101 - the same scheme knows those of another quality
-    return found
+def _known(outcomes: Outcomes | None) -> Outcomes:
+    assert outcomes is not None  # noqa: S101 - the same scheme knows those of another quality
+    return outcomes
 
 
 def uses_of(strategy: str, parameters: Mapping[str, Any]) -> tuple[float, float] | None:

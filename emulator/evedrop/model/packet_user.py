@@ -52,16 +52,16 @@ class PacketUser(Receiver):
 
     def uses_block(self, slots: range) -> Flags | None:
         """`uses` of consecutive slots, (c, R); None means always in all of them."""
-        found = [self.uses(k) for k in slots]
-        if all(one is None for one in found):
+        uses = [self.uses(k) for k in slots]
+        if all(flags is None for flags in uses):
             return None
-        return np.array([np.ones(self.trials, np.bool_) if one is None else one for one in found])
+        return np.array([np.ones(self.trials, np.bool_) if flags is None else flags for flags in uses])
 
     def follow(self, slots: range, belief: Belief, gamma: Flags, z: Floats) -> tuple[Beliefs, Belief]:
         """`step` for consecutive slots."""
         action = _actions(gamma, self.uses_block(slots))
-        found = update.beliefs(self.process, slots.start, belief, action, z)
-        return found, found.last
+        beliefs = update.beliefs(self.process, slots.start, belief, action, z)
+        return beliefs, beliefs.last
 
 
 def _actions(gamma: Flags, uses: Flags | None) -> Codes:

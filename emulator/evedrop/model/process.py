@@ -36,8 +36,8 @@ _SINGULAR = 1e-13  # smallest eigenvalue of a correlation matrix that is not mer
 def product(M: Floats, x: Floats) -> Floats:
     """M x for every trial: M (…, m, n), x (…, n, R) → (…, m, R), with at most one axis before the last two."""
     if M.ndim == x.ndim == 2:
-        one: Floats = kernels.product(M[None], x[None])[0]
-        return one
+        products: Floats = kernels.product(M[None], x[None])[0]
+        return products
     return kernels.product(np.broadcast_to(M, (len(x), *M.shape[-2:])), x)
 
 
@@ -189,13 +189,13 @@ class StateFactors:
         if first < self._k:
             self._k, self._carried = 1, self._initial
         self._go_to(first)
-        found = np.zeros((len(slots), *self._A.shape))
+        factors = np.zeros((len(slots), *self._A.shape))
         if slots.stop > first:
-            rows = found[first - slots.start :]
+            rows = factors[first - slots.start :]
             rows[0] = self._carried
             rows[1:] = kernels.carried_factors(self._A, self._noise_factor, self._carried, len(rows) - 1)
             self._k, self._carried = slots.stop - 1, rows[-1].copy()
-        return found
+        return factors
 
     def _go_to(self, k: int) -> None:
         while self._k < k:
@@ -213,33 +213,35 @@ def mistakes_of(
 
     Source: docs/mathematics.md, model (assumptions).
     """
-    found: list[tuple[str, str]] = []
+    mistakes: list[tuple[str, str]] = []
     if max(map(len, (A, Q, initial_covariance))) > MOST_STATES:
         large = f"has {max(map(len, (A, Q, initial_covariance)))} rows; expected at most {MOST_STATES} states"
         return [("A", f"{large}: theory and check take time that grows with the cube of their number, and more")]
     for name, M in (("A", A), ("Q", Q), ("initial_covariance", initial_covariance)):
-        found += [(name, sentence) for sentence in _shape_mistakes(M, A.shape[0] if name != "A" else None)]
-    if found:
-        return found
+        mistakes += [(name, sentence) for sentence in _shape_mistakes(M, A.shape[0] if name != "A" else None)]
+    if mistakes:
+        return mistakes
     for name, M in (("Q", Q), ("initial_covariance", initial_covariance)):
-        found += [(name, sentence) for sentence in _covariance_mistakes(M)]
+        mistakes += [(name, sentence) for sentence in _covariance_mistakes(M)]
     if singular_noise:
-        found = [entry for entry in found if entry[0] != "Q" or "positive definite" not in entry[1]]
+        mistakes = [entry for entry in mistakes if entry[0] != "Q" or "positive definite" not in entry[1]]
         with suppress(ValueError):
             semidefinite_factor(Q)
-            return found
-        return [*found, ("Q", "has an eigenvalue below 0; expected a covariance")]
-    if any(name == "Q" and "positive definite" in sentence for name, sentence in found):
+            return mistakes
+        return [*mistakes, ("Q", "has an eigenvalue below 0; expected a covariance")]
+    if any(name == "Q" and "positive definite" in sentence for name, sentence in mistakes):
         reached = _reachable(A, Q)
         if reached < A.shape[0]:
-            found.append(
+            mistakes.append(
                 ("Q", f"the pair (A, √Q) is not controllable: the noise reaches {reached} of {A.shape[0]} directions; "
                  "expected process noise that moves every state, such as Q = 1e-3 times the identity")
             )  # fmt: skip
         with suppress(ValueError):  # an eigenvalue is below 0
             semidefinite_factor(Q)
-            found = [(name, f"{sentence}{_ALLOWS_SINGULAR}" if name == "Q" else sentence) for name, sentence in found]
-    return found
+            mistakes = [
+                (name, f"{sentence}{_ALLOWS_SINGULAR}" if name == "Q" else sentence) for name, sentence in mistakes
+            ]
+    return mistakes
 
 
 def _shape_mistakes(M: Floats, n: int | None) -> list[str]:

@@ -47,7 +47,7 @@ def outdated(kind: type, block: str, *single: str) -> bool:
 
     block: the name of that method; single: the names of the methods for a single slot.
     """
-    newest = next(one for one in kind.__mro__ if vars(one).keys() & {block, *single})
+    newest = next(definer for definer in kind.__mro__ if vars(definer).keys() & {block, *single})
     return block not in vars(newest)
 
 
@@ -219,11 +219,11 @@ class Receiver(ABC):
 
         A receiver may override this to take many slots at once; the numbers must be those of `step`, slot by slot.
         """
-        found = Beliefs.empty(z.shape)
+        beliefs = Beliefs.empty(z.shape)
         for row, k in enumerate(slots):
             belief = self.step(k, belief, Reception(gamma[row], z[row]))
-            found.put(row, belief)
-        return found, belief
+            beliefs.put(row, belief)
+        return beliefs, belief
 
 
 STATE = "state"

@@ -36,8 +36,8 @@ def triangular_solutions(L: Floats, z: Floats) -> Floats:
 def squares(X: Floats) -> Floats:
     """X Xᵀ of every trial, (n, n, R)."""
     factors = X.transpose(2, 0, 1).copy()
-    found: Floats = product(factors, factors.swapaxes(1, 2).copy()).transpose(1, 2, 0)
-    return found
+    squared: Floats = product(factors, factors.swapaxes(1, 2).copy()).transpose(1, 2, 0)
+    return squared
 
 
 NONE = -1
@@ -159,7 +159,7 @@ class _Watch:
         total = np.zeros(len(grown))
         for entry in grown.reshape(len(grown), step.size).T:
             total += np.minimum(np.abs(entry), _LARGEST) ** 2
-        self._keep(grown, [i for i, one in enumerate(total) if one <= self._limit])
+        self._keep(grown, [i for i, traces in enumerate(total) if traces <= self._limit])
         if len(self._slots) > _WATCHED:
             self._spacing *= 2
             self._keep(self._factors, [i for i, slot in enumerate(self._slots) if slot % self._spacing == 0])
@@ -184,14 +184,14 @@ def singular_warnings(process: Process) -> list[str]:
 def _inverses(C: Floats) -> Floats:
     """C⁻¹ of lower triangular matrices, (c, n, n)."""
     n = C.shape[1]
-    found = np.zeros_like(C)
+    inverses = np.zeros_like(C)
     for i in range(n):
         rest = np.zeros((len(C), n))
         rest[:, i] = 1.0
         for j in range(i):
-            rest -= C[:, i, j, None] * found[:, j]
-        found[:, i] = rest / C[:, i, i, None]
-    return found
+            rest -= C[:, i, j, None] * inverses[:, j]
+        inverses[:, i] = rest / C[:, i, i, None]
+    return inverses
 
 
 def initial_factor(process: Process, first: int) -> Floats:
@@ -293,12 +293,12 @@ class ReferenceReceiver(Receiver):
 
         A packet without a header has no reference: it is taken for the state.
         """
-        known = _Known(*belief.memory)
+        memory = _Known(*belief.memory)
         t, content = self._header(heard)
         by = np.where(content == Content.OPEN_LOOP, content, Content.CODED)
         named = heard.gamma & (t >= self._code.oldest(k)) & (t < k)
-        old = named & (t == known.t) & (by == known.by)
-        new = named & ~old & (t >= known.s)
+        old = named & (t == memory.t) & (by == memory.by)
+        new = named & ~old & (t >= memory.s)
         state = heard.gamma & (content == Content.STATE)
         followed = old | new
         read = state | followed
@@ -307,31 +307,31 @@ class ReferenceReceiver(Receiver):
         action = np.where(heard.gamma, np.uint8(Action.DISCARDED), np.uint8(Action.LOST))
         alone = np.flatnonzero(state & ~followed)
         if len(alone):
-            known = known.replaced(alone, self._only_state(k, heard.z[:, alone]))
+            memory = memory.replaced(alone, self._only_state(k, heard.z[:, alone]))
         some = np.flatnonzero(followed)
         if len(some):
-            before = known.taken(some)._replace(t=t[some], by=by[some])
+            before = memory.taken(some)._replace(t=t[some], by=by[some])
             after = self._filtered(k, before, new[some], state[some], heard.z[:, some])
-            known = known.replaced(some, after)
+            memory = memory.replaced(some, after)
         places = np.flatnonzero(read)
         if len(places):
-            x_hat[:, places] = known.x[:, places]
-            P[:, :, places] = squares(known.X[:, :, places])
-            exact = ~known.X[:, :, places].any(axis=(0, 1))
+            x_hat[:, places] = memory.x[:, places]
+            P[:, :, places] = squares(memory.X[:, :, places])
+            exact = ~memory.X[:, :, places].any(axis=(0, 1))
             action[places] = np.where(exact, np.uint8(Action.STATE), np.uint8(Action.INNOVATION))
-        return Belief(x_hat, P, action, known)
+        return Belief(x_hat, P, action, memory)
 
     def informed(self, k: int, x: Floats, belief: Belief) -> Belief:
         """The belief after slot k once that slot's true state x (n, R) is known as well; the reference stays as it was.
 
         As a reference, x_k has the rounding of the sensor's arithmetic, which grows with every later reference made from it.
         """
-        known = _Known(*belief.memory)
-        alone, some = np.flatnonzero(known.t == NONE), np.flatnonzero(known.t != NONE)
-        after = known.replaced(alone, self._only_state(k, x[:, alone]))
+        memory = _Known(*belief.memory)
+        alone, some = np.flatnonzero(memory.t == NONE), np.flatnonzero(memory.t != NONE)
+        after = memory.replaced(alone, self._only_state(k, x[:, alone]))
         if len(some):
             states = np.ones(len(some), np.bool_)
-            after = after.replaced(some, self._filtered(k, known.taken(some), ~states, states, x[:, some]))
+            after = after.replaced(some, self._filtered(k, memory.taken(some), ~states, states, x[:, some]))
         X = np.zeros_like(after.X)
         for i in range(len(x)):
             X[i, i] = UNIT_ROUNDOFF * (np.abs(x[i]) + self._code.standard_deviation(k)[i])
@@ -351,13 +351,13 @@ class ReferenceReceiver(Receiver):
         slots = (np.full(count, value, np.int64) for value in (k, NONE, Content.STATE))
         return _Known(z, np.zeros_like(z), nothing, nothing, *slots)
 
-    def _filtered(self, k: int, known: _Known, new: Flags, state: Flags, z: Floats) -> _Known:
+    def _filtered(self, k: int, memory: _Known, new: Flags, state: Flags, z: Floats) -> _Known:
         """The knowledge after a packet of slot k with the reference of slot `known.t`.
 
         new: whether this reference is new, so that t ≥ s; state: whether the packet contains the state.
         """
         n = self.process.n
-        x, r, X, R, noise = self._repeated(k, known, new)
+        x, r, X, R, noise = self._repeated(k, memory, new)
         shown = np.where(state, x, x - r)
         top = np.where(state, X, X - R)
         if self._singular:
@@ -372,21 +372,21 @@ class ReferenceReceiver(Receiver):
         r = r + product(factors[:, n:, :n].copy(), white.T[:, :, None].copy())[:, :, 0].T
         D = factors[:, n:, n:].transpose(1, 2, 0)
         # A coded packet shows x − r exactly, so that the errors of x and r are the same from here on.
-        return known._replace(
-            x=np.where(state, z, z + r), r=r, X=np.where(state, 0.0, D), D=D, s=np.full_like(known.s, k)
+        return memory._replace(
+            x=np.where(state, z, z + r), r=r, X=np.where(state, 0.0, D), D=D, s=np.full_like(memory.s, k)
         )
 
-    def _repeated(self, k: int, known: _Known, new: Flags) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    def _repeated(self, k: int, memory: _Known, new: Flags) -> tuple[Floats, Floats, Floats, Floats, Floats]:
         """The slots after s up to k: x, r (n, R), the columns of their errors (n, m, R), and noise in x alone (n, n, R)."""
-        s, t = known.s, known.t
+        s, t = memory.s, memory.t
         begun = new & (t == s)
-        x, r = known.x, np.where(begun, known.x, known.r)
-        X, R = known.X, np.where(begun, known.X, known.D)
+        x, r = memory.x, np.where(begun, memory.x, memory.r)
+        X, R = memory.X, np.where(begun, memory.X, memory.D)
         later = new & (t > s)
         if later.any():
             # The noise between s and t is in both x and r.
-            X, R = (np.concatenate([part, np.zeros_like(known.X)], axis=1) for part in (X, R))
-        open_loop = known.by == Content.OPEN_LOOP
+            X, R = (np.concatenate([part, np.zeros_like(memory.X)], axis=1) for part in (X, R))
+        open_loop = memory.by == Content.OPEN_LOOP
         for j in range(int(s.min()) + 1, k + 1):
             moved, carried = s < j, np.where(new, t < j, s < j)
             x, X = (

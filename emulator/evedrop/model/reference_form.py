@@ -38,7 +38,7 @@ def reference_floor(process: Process, received: float, acknowledged: tuple[float
     sigma, before = process.initial_covariance, np.zeros_like(Q)
     D, weights, first, spacing = np.empty((0, n, n)), np.empty(0), np.empty(0, np.int64), 1
     waiting = 0.0
-    found = np.empty(slots)
+    bounds = np.empty(slots)
     with np.errstate(over="ignore", invalid="ignore"):
         for k in range(slots):
             if k:
@@ -62,10 +62,10 @@ def reference_floor(process: Process, received: float, acknowledged: tuple[float
             spared *= 1.0 - c
             bound = np.trace(before) + c * np.trace(sigma) + weights @ (D * D).sum(axis=(1, 2))
             if not np.isfinite(bound):
-                found[k:] = np.inf
+                bounds[k:] = np.inf
                 break
-            found[k] = bound
-    return found
+            bounds[k] = bound
+    return bounds
 
 
 def _heard(apart: Floats, carried: Floats, G: Floats) -> Floats:
@@ -108,8 +108,8 @@ class ReferenceForm(ClosedForm):
         """The traces of all slots, (slots,)."""
         if self.bound:
             return reference_floor(self.process, self.received, self.acknowledged, self.slots)
-        found = reference_covariances(self.process, self.received, self.acknowledged, self.slots)
-        traces: Floats = np.trace(found, axis1=1, axis2=2)
+        covariances = reference_covariances(self.process, self.received, self.acknowledged, self.slots)
+        traces: Floats = np.trace(covariances, axis1=1, axis2=2)
         return traces
 
     @cached_property

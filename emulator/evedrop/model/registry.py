@@ -53,8 +53,8 @@ def place_of(error: BaseException, file: str | None = None) -> str:
         where = f", {Path(error.filename).name} line {error.lineno}"
         return f"{type(error).__name__}: {error.msg}{where}"
     where = f", {Path(own[-1].filename).name} line {own[-1].lineno}" if own else ""
-    said = " ".join(str(error).split())
-    return f"{type(error).__name__}: {said}{where}" if said else f"{type(error).__name__}{where}"
+    message = " ".join(str(error).split())
+    return f"{type(error).__name__}: {message}{where}" if message else f"{type(error).__name__}{where}"
 
 
 def asked(model: Any, given: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -62,13 +62,13 @@ def asked(model: Any, given: Mapping[str, Any]) -> list[tuple[str, str]]:
     entry = next(iter(given), "parameters")
     wanted = "expected it to return a list of (entry, what is wrong)"
     try:
-        found = model.mistakes(given)
+        answer = model.mistakes(given)
     except Exception as error:
         file = getattr(sys.modules.get(model.__module__), "__file__", None)
         return [(entry, f"cannot be checked: {model.__name__}.mistakes raised {place_of(error, file)}; {wanted}")]
-    if not isinstance(found, list) or not all(isinstance(one, tuple) and len(one) == 2 for one in found):
-        return [(entry, f"cannot be checked: {model.__name__}.mistakes returned {found!r}; {wanted}")]
-    return [(str(name), str(what)) for name, what in found]
+    if not isinstance(answer, list) or not all(isinstance(mistake, tuple) and len(mistake) == 2 for mistake in answer):
+        return [(entry, f"cannot be checked: {model.__name__}.mistakes returned {answer!r}; {wanted}")]
+    return [(str(name), str(sentence)) for name, sentence in answer]
 
 
 @final
@@ -112,8 +112,8 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         """The class itself, imported into this process with its module. Raises NotRegistered."""
         if name in self._built_in:
             return self._built_in[name]
-        target, said = self._target(name)
-        return self._checked(name, *_imported(name, target, said))
+        target, origin = self._target(name)
+        return self._checked(name, *_imported(name, target, origin))
 
     def foreign(self, name: str) -> bool:
         """Whether a class of this name would not be built in; the class need not exist."""
@@ -136,53 +136,53 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         if len(targets) > 1:
             both = " and ".join(targets)
             raise NotRegistered(name, f", a name that two installed packages use; expected one of {both} itself")
-        said = f", which an installed package says is {targets[0]}"
-        return _importable(name, targets[0], said), said
+        origin = f", which an installed package says is {targets[0]}"
+        return _importable(name, targets[0], origin), origin
 
-    def _checked(self, name: str, found: Any, said: str) -> type[T]:
+    def _checked(self, name: str, kind: Any, origin: str) -> type[T]:
         wanted = f"a class that inherits from evedrop.extend.{self.base.__name__}"
-        if not isinstance(found, type) or not issubclass(found, self.base):
-            raise NotRegistered(name, f"{said}, which is not a {self.base.__name__}; expected {wanted}")
-        lacking = sorted(getattr(found, "__abstractmethods__", ()))
+        if not isinstance(kind, type) or not issubclass(kind, self.base):
+            raise NotRegistered(name, f"{origin}, which is not a {self.base.__name__}; expected {wanted}")
+        lacking = sorted(getattr(kind, "__abstractmethods__", ()))
         if lacking:
             # The class that its author inherited from describes more than the base of all of this kind.
-            ours = next((one for one in found.__mro__ if one.__module__.startswith("evedrop.")), self.base)
+            ours = next((parent for parent in kind.__mro__ if parent.__module__.startswith("evedrop.")), self.base)
             these, them = ("these methods", "them") if len(lacking) > 1 else ("this method", "it")
             raise NotRegistered(
                 name,
-                f"{said}, which lacks {', '.join(lacking)}; expected a class with {these}, as "
+                f"{origin}, which lacks {', '.join(lacking)}; expected a class with {these}, as "
                 f"evedrop.extend.{ours.__name__} describes {them}",
             )
-        parameters = getattr(found, "parameters", {})
-        if not isinstance(parameters, Mapping) or not all(isinstance(one, str) for one in parameters):
+        parameters = getattr(kind, "parameters", {})
+        if not isinstance(parameters, Mapping) or not all(isinstance(parent, str) for parent in parameters):
             raise NotRegistered(
                 name,
-                f"{said}, whose parameters are not a table; expected the entries it takes, each with an example, "
+                f"{origin}, whose parameters are not a table; expected the entries it takes, each with an example, "
                 'such as parameters = {"threshold": 3}',
             )
-        return self._with_free_parameters(name, found, said)
+        return self._with_free_parameters(name, kind, origin)
 
-    def _with_free_parameters(self, name: str, found: type[T], said: str) -> type[T]:
-        taken = sorted(set(getattr(found, "parameters", ())) & set(self._reserved))
+    def _with_free_parameters(self, name: str, kind: type[T], origin: str) -> type[T]:
+        taken = sorted(set(getattr(kind, "parameters", ())) & set(self._reserved))
         if taken:
             raise NotRegistered(
-                name, f"{said}, one of whose parameters is called {taken[0]}, as an entry of every {self.kind} is"
+                name, f"{origin}, one of whose parameters is called {taken[0]}, as an entry of every {self.kind} is"
             )
-        return found
+        return kind
 
 
-def _importable(name: str, target: str, said: str) -> str:
+def _importable(name: str, target: str, origin: str) -> str:
     """The PACKAGE.MODULE:CLASS, if every process can import it. Raises NotRegistered otherwise."""
     if not _OWN.fullmatch(target):
-        raise NotRegistered(name, f"{said}; expected PACKAGE.MODULE:CLASS, such as mine:Masked")
+        raise NotRegistered(name, f"{origin}; expected PACKAGE.MODULE:CLASS, such as mine:Masked")
     if target.partition(":")[0] == _NOT_IN_CHILDREN:
         raise NotRegistered(
-            name, f"{said}, which other processes cannot import; expected a class in a module, a file of its own"
+            name, f"{origin}, which other processes cannot import; expected a class in a module, a file of its own"
         )
     return target
 
 
-def _imported(name: str, target: str, said: str) -> tuple[Any, str]:
+def _imported(name: str, target: str, origin: str) -> tuple[Any, str]:
     module_name, _, class_name = target.partition(":")
     try:
         module = importlib.import_module(module_name)
@@ -193,20 +193,22 @@ def _imported(name: str, target: str, said: str) -> tuple[Any, str]:
             if missing
             else "one that can be imported"
         )
-        what = str(error) if missing else place_of(error)
+        reason = str(error) if missing else place_of(error)
         raise NotRegistered(
-            name, f"{said}, and the module {module_name} cannot be imported ({what}); expected {wanted}"
+            name, f"{origin}, and the module {module_name} cannot be imported ({reason}); expected {wanted}"
         ) from error
-    found = getattr(module, class_name, None)
-    if found is None:
+    kind = getattr(module, class_name, None)
+    if kind is None:
         there = [
-            one for one, value in vars(module).items() if isinstance(value, type) and value.__module__ == module_name
+            candidate
+            for candidate, value in vars(module).items()
+            if isinstance(value, type) and value.__module__ == module_name
         ]
         choice = near(class_name, there, f"{module_name}:") or f"; expected one of {', '.join(there) or 'none'}"
         file = getattr(module, "__file__", None)
         where = f" ({file})" if file else ""
-        raise NotRegistered(name, f"{said}, and the module {module_name}{where} has no {class_name}{choice}")
-    return found, said
+        raise NotRegistered(name, f"{origin}, and the module {module_name}{where} has no {class_name}{choice}")
+    return kind, origin
 
 
 @lru_cache(maxsize=32)
@@ -215,7 +217,7 @@ def _entry_points(group: str, path: tuple[str, ...]) -> Mapping[str, tuple[str, 
     del path
     from importlib import metadata  # noqa: PLC0415 - a process that needs no entry points starts faster
 
-    found: dict[str, set[str]] = {}
+    values_of: dict[str, set[str]] = {}
     for point in metadata.entry_points(group=group):
-        found.setdefault(point.name, set()).add(point.value)
-    return {name: tuple(sorted(values)) for name, values in found.items()}
+        values_of.setdefault(point.name, set()).add(point.value)
+    return {name: tuple(sorted(values)) for name, values in values_of.items()}

@@ -67,7 +67,7 @@ class Staircase:
         blocks, pivots = _reached(process, scale)
         others = [[scale[j] if i == j else 0.0 for i in range(n)] for j in range(n) if j not in pivots]
         self.unreached, self.later = len(others), n - len(blocks[0])
-        self._T = np.array([*others, *(one for block in reversed(blocks) for one in block)]).T.copy()
+        self._T = np.array([*others, *(vector for block in reversed(blocks) for vector in block)]).T.copy()
         units = np.array(scale)
         self._inverse = inverse(self._T / units[:, None]) / units
         self.process = self._transformed(process, [len(others), *(len(block) for block in reversed(blocks))])
@@ -132,9 +132,9 @@ class Staircase:
             return np.zeros((0, factor.shape[1]))
         part = np.abs(product(self._inverse[: self.later], factor))
         size = product(np.abs(self._inverse[: self.later]), np.abs(factor))
-        found = np.zeros(part.shape)
-        np.divide(part, size, out=found, where=size > 0.0)
-        return found
+        ratios = np.zeros(part.shape)
+        np.divide(part, size, out=ratios, where=size > 0.0)
+        return ratios
 
     def blurred(self, factors: Floats, rounding: Floats) -> bool:
         """Whether an innovation is within rounding of a state with a probability above 1e-6, in any of c slots.
@@ -198,10 +198,10 @@ def _remainder(A: list[_Vector], v: _Vector, basis: list[tuple[int, _Vector]]) -
     """A v without its part in the span of the basis; None if nothing else is left. Raises ValueError if that is in doubt."""
     rest = [math.fsum(a * value for a, value in zip(row, v, strict=True)) for row in A]
     size = [sum_in_order(abs(a * value) for a, value in zip(row, v, strict=True)) for row in A]
-    for pivot, known in basis:
-        factor = rest[pivot] / known[pivot]
-        size = [s + abs(factor * value) for s, value in zip(size, known, strict=True)]
-        rest = [value - factor * other for value, other in zip(rest, known, strict=True)]
+    for pivot, earlier in basis:
+        factor = rest[pivot] / earlier[pivot]
+        size = [s + abs(factor * value) for s, value in zip(size, earlier, strict=True)]
+        rest = [value - factor * other for value, other in zip(rest, earlier, strict=True)]
         rest[pivot] = 0.0
     rest = [value if abs(value) > NOT_REACHED * s else 0.0 for value, s in zip(rest, size, strict=True)]
     left = max((abs(value) / s for value, s in zip(rest, size, strict=True) if value), default=0.0)

@@ -117,18 +117,18 @@ class Lineage:
 
     def split(self, stop: int, ancestors: NDArray[np.intp]) -> Lineage:
         """Replace each trial by a copy of one of the trials, (R,), in all slots before this one."""
-        return Lineage((*self.stops, stop), (*(one[ancestors] for one in self.columns), ancestors))
+        return Lineage((*self.stops, stop), (*(column[ancestors] for column in self.columns), ancestors))
 
     def read(self, slots: range, drawn: Words) -> Words:
         """The words that the trials read, from those that each would draw by itself, both (c, R, m)."""
         if not self.stops or slots.start >= self.stops[-1]:
             return drawn
-        found = drawn.copy()
+        words = drawn.copy()
         for row, k in enumerate(slots):
             stretch = bisect_right(self.stops, k)
             if stretch < len(self.stops):
-                np.take(drawn[row], self.columns[stretch], axis=0, out=found[row])
-        return found
+                np.take(drawn[row], self.columns[stretch], axis=0, out=words[row])
+        return words
 
 
 OWN = Lineage()

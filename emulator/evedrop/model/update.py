@@ -27,8 +27,8 @@ _STATE, _INNOVATION = int(Action.STATE), int(Action.INNOVATION)  # numpy compare
 
 def believed_covariance(process: Process, k: int, P: Floats, action: Codes) -> Floats:
     """P_k (n, n, R) as a receiver believes it, from P_{k−1} and the actions (R,)."""
-    found: Floats = kernels.follow_covariance(process.A, process.Q, P, action[None], k == 0)[0]
-    return found
+    covariance: Floats = kernels.follow_covariance(process.A, process.Q, P, action[None], k == 0)[0]
+    return covariance
 
 
 def belief(process: Process, k: int, before: Belief, action: Codes, z: Floats, chi: Floats | None = None) -> Belief:
@@ -42,8 +42,8 @@ def beliefs(
     process: Process, first: int, before: Belief, action: Codes, z: Floats, chi: Floats | None = None
 ) -> Beliefs:
     """The same for c consecutive slots from `first` on: action (c, R), z and χ (c, n, R)."""
-    known = (before.x_hat, before.P)
-    return Beliefs(*kernels.follow(process.A, process.Q, known, action, z, chi, first == 0), action)
+    start = (before.x_hat, before.P)
+    return Beliefs(*kernels.follow(process.A, process.Q, start, action, z, chi, first == 0), action)
 
 
 def actual_covariance(process: Process, k: int, P: Floats, action: Codes, nu: Flags, f: Floats) -> Floats:

@@ -14,10 +14,10 @@ T = TypeVar("T")
 class ByName(dict[str, T]):
     """Entries of results by name. An unknown name raises UnknownName, a KeyError that lists the known ones."""
 
-    def __init__(self, what: str, entries: Mapping[str, T]) -> None:
+    def __init__(self, kind: str, entries: Mapping[str, T]) -> None:
         """what: the kind of entry, such as "receiver"."""
         super().__init__(entries)
-        self._what = what
+        self._what = kind
 
     def __missing__(self, name: object) -> T:
         raise UnknownName(self._what, name, self)

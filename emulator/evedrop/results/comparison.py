@@ -108,10 +108,10 @@ class Cell:
         """
         if self.legitimate is None or self.eavesdropper is None or self.secrecy is None:
             return None
-        one, two = self.legitimate, self.eavesdropper
-        if not (one.infinite_variance or two.infinite_variance):
+        first, second = self.legitimate, self.eavesdropper
+        if not (first.infinite_variance or second.infinite_variance):
             return self.secrecy.ratio
-        user, other = (each.quantiles["0.5"] for each in (one, two))
+        user, other = (each.quantiles["0.5"] for each in (first, second))
         return other / user if user else math.inf
 
     @property
@@ -225,12 +225,12 @@ class SchemeResult:
     def price(self) -> float:
         """The largest error of the legitimate estimator under any attack: the limit of theory, if it is known."""
         users = [self.legitimate, *(cell.legitimate for cell in self.cells.values() if cell.legitimate is not None)]
-        return max(_lasting(one) for one in users)
+        return max(_lasting(user_error) for user_error in users)
 
 
 def _limit(of: SimulatedError) -> float:
-    known = None if of.theory is None else of.theory.limit
-    return math.nan if known is None else known
+    limit = None if of.theory is None else of.theory.limit
+    return math.nan if limit is None else limit
 
 
 def _error(of: SimulatedError | None) -> float:
@@ -239,8 +239,8 @@ def _error(of: SimulatedError | None) -> float:
 
 
 def _lasting(of: SimulatedError) -> float:
-    known = _limit(of)
-    return of.typical if math.isnan(known) else known
+    limit = _limit(of)
+    return of.typical if math.isnan(limit) else limit
 
 
 @dataclass(frozen=True)
@@ -260,12 +260,13 @@ class Comparison:
     @property
     def dominant(self) -> tuple[str, ...]:
         """Schemes that no other beats: none has a smaller legitimate error, or a larger error of the closest adversary."""
-        known = [one for one in self.schemes.values() if not math.isnan(one.kept)]
+        usable = [scheme for scheme in self.schemes.values() if not math.isnan(scheme.kept)]
         return tuple(
-            one.name
-            for one in known
+            scheme.name
+            for scheme in usable
             if all(
-                one.price <= other.price * (1.0 + _ALIKE) and one.kept >= other.kept * (1.0 - _ALIKE) for other in known
+                scheme.price <= other.price * (1.0 + _ALIKE) and scheme.kept >= other.kept * (1.0 - _ALIKE)
+                for other in usable
             )
         )
 
@@ -285,14 +286,14 @@ class Comparison:
             "dominant": list(self.dominant),
             "schemes": {
                 name: {
-                    "parameters": dict(one.parameters),
-                    "needs": {**asdict(one.needs), "packet_bits": one.needs.packet_bits},
-                    "legitimate": asdict(one.legitimate),
-                    "leak": None if one.leak is None else asdict(one.leak),
-                    "closest": None if one.closest is None else one.closest.match.adversary,
-                    "against": {adversary: cell.as_dict() for adversary, cell in one.cells.items()},
+                    "parameters": dict(scheme.parameters),
+                    "needs": {**asdict(scheme.needs), "packet_bits": scheme.needs.packet_bits},
+                    "legitimate": asdict(scheme.legitimate),
+                    "leak": None if scheme.leak is None else asdict(scheme.leak),
+                    "closest": None if scheme.closest is None else scheme.closest.match.adversary,
+                    "against": {adversary: cell.as_dict() for adversary, cell in scheme.cells.items()},
                 }
-                for name, one in self.schemes.items()
+                for name, scheme in self.schemes.items()
             },
             "left_out": {name: list(why) for name, why in self.left_out.items()},
         }
@@ -304,15 +305,15 @@ class Comparison:
     @property
     def table(self) -> pa.Table:
         """A row for each pair of scheme and adversary."""
-        return pa.Table.from_pylist([row for one in self.schemes.values() for row in _rows(one)])
+        return pa.Table.from_pylist([row for scheme in self.schemes.values() for row in _rows(scheme)])
 
 
-def _rows(one: SchemeResult) -> Iterator[dict[str, Any]]:
-    for adversary, cell in one.cells.items():
+def _rows(scheme: SchemeResult) -> Iterator[dict[str, Any]]:
+    for adversary, cell in scheme.cells.items():
         user, other = cell.legitimate, cell.eavesdropper
         leak = None if cell.secrecy is None else cell.secrecy.leak
         yield {
-            "scheme": one.name,
+            "scheme": scheme.name,
             "adversary": adversary,
             "not_defined": cell.match.not_defined,
             "eavesdropper_error": None if other is None else other.mean,
@@ -333,13 +334,13 @@ def _rows(one: SchemeResult) -> Iterator[dict[str, Any]]:
             "leaked_bits_standard_error": None if leak is None else leak.standard_error,
             "leaked_bits_theory": None if leak is None else leak.expected_bits,
             "leaked_bits_z": None if leak is None else leak.z,
-            "packet_bits": one.needs.packet_bits,
-            "sent_fraction": one.needs.sent_fraction,
-            "encrypted_fraction": one.needs.encrypted_fraction,
-            "bits_per_slot": one.needs.bits_per_slot,
-            "energy_per_slot": one.needs.energy_per_slot,
-            "secret_bits_per_slot": one.needs.secret_bits_per_slot,
-            "acknowledgements": one.needs.acknowledgements,
+            "packet_bits": scheme.needs.packet_bits,
+            "sent_fraction": scheme.needs.sent_fraction,
+            "encrypted_fraction": scheme.needs.encrypted_fraction,
+            "bits_per_slot": scheme.needs.bits_per_slot,
+            "energy_per_slot": scheme.needs.energy_per_slot,
+            "secret_bits_per_slot": scheme.needs.secret_bits_per_slot,
+            "acknowledgements": scheme.needs.acknowledgements,
         }
 
 

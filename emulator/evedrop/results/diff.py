@@ -70,12 +70,12 @@ def _by_rows_alone(a: Results, b: Results) -> RunDifference:
 
 def _unequal_digests(a: Results, b: Results) -> list[str]:
     """The entries of the summaries whose digests differ although both are of the same slots and trials."""
-    one, other = a.summary, b.summary
-    if any(one.get(name) != other.get(name) for name in ("slots", "trials", "first_trial")):
+    first, second = a.summary, b.summary
+    if any(first.get(name) != second.get(name) for name in ("slots", "trials", "first_trial")):
         return []
     digests = [
         {name: entry["digest"] for name, entry in summary.items() if isinstance(entry, dict) and entry.get("digest")}
-        for summary in (one, other)
+        for summary in (first, second)
     ]
     return sorted(name for name in digests[0].keys() & digests[1].keys() if digests[0][name] != digests[1][name])
 
@@ -112,14 +112,14 @@ class _Row:
 
 def _first(a: Results, b: Results) -> _Row | None:
     """The first recorded row of a receiver or the controller that differs."""
-    found = _first_row(a.trials, b.trials, ("slot", "trial", "peer"), _COMPARED)
+    row = _first_row(a.trials, b.trials, ("slot", "trial", "peer"), _COMPARED)
     inputs = (a.inputs, b.inputs)
     if inputs[0] is None or inputs[1] is None:
-        return found
+        return row
     compared = [name for name in _INPUTS if name in inputs[0].schema.names and name in inputs[1].schema.names]
     steered = _first_row(inputs[0], inputs[1], ("slot", "trial"), compared)
     # The decision in a slot follows from the estimate after it.
-    return steered if steered is not None and (found is None or steered.slot < found.slot) else found
+    return steered if steered is not None and (row is None or steered.slot < row.slot) else row
 
 
 def _first_row(a: pa.Table, b: pa.Table, keys: Sequence[str], compared: Sequence[str]) -> _Row | None:

@@ -95,7 +95,7 @@ def new_folder(folder: Path) -> Path:
 
 def make_private(folder: Path, exist_ok: bool = True) -> None:
     """Create a folder and its missing parents, for this user only. Raises OSError as `Path.mkdir` does."""
-    for missing in reversed([one for one in folder.parents if not one.exists()]):
+    for missing in reversed([parent for parent in folder.parents if not parent.exists()]):
         missing.mkdir(_FOLDER_MODE, exist_ok=True)
     folder.mkdir(_FOLDER_MODE, exist_ok=exist_ok)
 
@@ -104,13 +104,13 @@ def _narrow(folder: Path) -> None:
     """Remove the rights of all other users from an existing folder. Raises UsageError if it belongs to another user."""
     opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)  # so that the folder checked is the folder changed
     try:
-        found = os.fstat(opened)
-        if found.st_uid != os.geteuid():
+        status = os.fstat(opened)
+        if status.st_uid != os.geteuid():
             raise UsageError(
-                f"{folder} belongs to the user with the id {found.st_uid}, who could read the seed and the truth in it; "
+                f"{folder} belongs to the user with the id {status.st_uid}, who could read the seed and the truth in it; "
                 "give another folder, or a folder of your own"
             )
-        if found.st_mode & 0o077:
+        if status.st_mode & 0o077:
             os.fchmod(opened, _FOLDER_MODE)
     finally:
         os.close(opened)

@@ -57,10 +57,10 @@ class TableStream:
         self._writer = pa.ipc.new_stream(pa.PythonFile(self._sink, mode="w"), schema, options=options)
         # Arrow writes the schema with the first batch, and a reader needs the schema before there are rows.
         empty = [
-            pa.DictionaryArray.from_arrays(pa.array([], pa.int8()), self._names[one.name])
-            if one.name in self._names
-            else pa.array([], one.type)
-            for one in schema
+            pa.DictionaryArray.from_arrays(pa.array([], pa.int8()), self._names[field.name])
+            if field.name in self._names
+            else pa.array([], field.type)
+            for field in schema
         ]
         self._writer.write_batch(pa.RecordBatch.from_arrays(empty, schema=schema))
 
@@ -85,8 +85,8 @@ class TableStream:
             at_once = max(1, self._held_rows * BATCH_BYTES // max(1, self.held_bytes))
             for first in range(0, self._held_rows, at_once):
                 columns = [
-                    self._column(one, values[first : first + at_once])
-                    for one, values in zip(self._schema, whole, strict=True)
+                    self._column(column, values[first : first + at_once])
+                    for column, values in zip(self._schema, whole, strict=True)
                 ]
                 self._writer.write_batch(pa.RecordBatch.from_arrays(columns, schema=self._schema))
                 self._sink.flush()
@@ -94,17 +94,19 @@ class TableStream:
         self.rows += self._held_rows
         self._held, self._held_rows, self.held_bytes = [[] for _ in self._schema], 0, 0
 
-    def _column(self, one: pa.Field, values: NDArray[Any]) -> pa.Array:
-        if one.name in self._names:
-            return pa.DictionaryArray.from_arrays(pa.array(values.astype(np.int8)), self._names[one.name])
-        if pa.types.is_fixed_size_list(one.type):
+    def _column(self, column: pa.Field, values: NDArray[Any]) -> pa.Array:
+        if column.name in self._names:
+            return pa.DictionaryArray.from_arrays(pa.array(values.astype(np.int8)), self._names[column.name])
+        if pa.types.is_fixed_size_list(column.type):
             return pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), values.shape[1])
-        if pa.types.is_fixed_size_binary(one.type):
-            return pa.FixedSizeBinaryArray.from_buffers(one.type, len(values), [None, pa.py_buffer(values)])
-        if pa.types.is_binary(one.type):
+        if pa.types.is_fixed_size_binary(column.type):
+            return pa.FixedSizeBinaryArray.from_buffers(column.type, len(values), [None, pa.py_buffer(values)])
+        if pa.types.is_binary(column.type):
             ends = np.arange(len(values) + 1, dtype=np.int32) * np.int32(values.shape[1])
-            return pa.BinaryArray.from_buffers(one.type, len(values), [None, pa.py_buffer(ends), pa.py_buffer(values)])
-        return pa.array(values, one.type, from_pandas=one.name in NULLABLE)
+            return pa.BinaryArray.from_buffers(
+                column.type, len(values), [None, pa.py_buffer(ends), pa.py_buffer(values)]
+            )
+        return pa.array(values, column.type, from_pandas=column.name in NULLABLE)
 
     def close(self) -> None:
         """Close the file; rows held back are dropped."""
@@ -198,9 +200,9 @@ def last_round(folder: Path) -> TableRound:
         return TableRound()
     for line in reversed(lines):
         with contextlib.suppress(ValueError, TypeError, KeyError, AttributeError, OverflowError):
-            found = json.loads(line)
-            tables = {str(name): (Path(str(file)).name, int(rows)) for name, (file, rows) in found["tables"].items()}
-            return TableRound(str(found["at"]), int(found["slots"]), tables)
+            entry = json.loads(line)
+            tables = {str(name): (Path(str(file)).name, int(rows)) for name, (file, rows) in entry["tables"].items()}
+            return TableRound(str(entry["at"]), int(entry["slots"]), tables)
     return TableRound()
 
 
@@ -272,7 +274,7 @@ def finish(folder: Path) -> None:
 
 
 def _write_parquet(path: Path, schema: pa.Schema, batches: Iterator[pa.RecordBatch]) -> None:
-    names = [one.name for one in schema if pa.types.is_dictionary(one.type)]
+    names = [column.name for column in schema if pa.types.is_dictionary(column.type)]
     with (
         open(path, "wb", opener=private_opener) as file,
         pq.ParquetWriter(file, schema, compression="zstd", compression_level=1, use_dictionary=names) as writer,

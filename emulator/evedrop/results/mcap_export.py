@@ -108,8 +108,8 @@ class _Messages:
 
     def add(self, topic: str, kind: str, row: Mapping[str, Any]) -> None:
         """A message with the entries of a row, at the time of its slot; entries without a finite value are left out."""
-        found = {name: known for name, value in row.items() if (known := _finite(value)) is not None}
-        self._put(topic, kind, _schema(kind, row), int(row["slot"]), found)
+        message = {name: finite for name, value in row.items() if (finite := _finite(value)) is not None}
+        self._put(topic, kind, _schema(kind, row), int(row["slot"]), message)
 
     def add_event(self, event: RunEvent) -> None:
         """An event, as Foxglove's Log panel shows it."""
@@ -141,7 +141,7 @@ class _Messages:
 def _finite(value: Any) -> Any:
     """The value, or None for a number that JSON does not have; in a list, null is in its place."""
     if isinstance(value, list):
-        return [_finite(one) for one in value]
+        return [_finite(element) for element in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

@@ -25,10 +25,10 @@ class NotData(ValueError):
 def packed(value: object) -> bytes:
     """The value as bytes. Raises NotData for what is not a number, a text, an array, a container or an instance of a class."""
     try:
-        found: bytes = msgpack.packb(value, default=_extension, strict_types=True)
+        content: bytes = msgpack.packb(value, default=_extension, strict_types=True)
     except (TypeError, ValueError, OverflowError) as error:
         raise NotData(str(error)) from error
-    return found
+    return content
 
 
 def _extension(value: Any) -> msgpack.ExtType:
@@ -84,11 +84,11 @@ def _read(data: bytes) -> Any:
 
 def _value(code: int, data: bytes) -> Any:
     readers: Mapping[int, Callable[[Any], Any]] = {
-        _ARRAY: lambda found: np.frombuffer(found[2], _dtype(found[0])).reshape(found[1]).copy(),
+        _ARRAY: lambda parts: np.frombuffer(parts[2], _dtype(parts[0])).reshape(parts[1]).copy(),
         _OBJECT: _Attributes,
         _TUPLE: tuple,
         _SET: set,
-        _NUMBER: lambda found: np.frombuffer(found[1], _dtype(found[0]))[0],
+        _NUMBER: lambda parts: np.frombuffer(parts[1], _dtype(parts[0]))[0],
     }
     if code == _FUNCTION:
         return _Function()
@@ -96,10 +96,10 @@ def _value(code: int, data: bytes) -> Any:
 
 
 def _dtype(text: str) -> np.dtype[Any]:
-    found = np.dtype(text)
-    if found.kind not in "biufc":
-        raise NotData(f"an array of {found}")
-    return found
+    dtype = np.dtype(text)
+    if dtype.kind not in "biufc":
+        raise NotData(f"an array of {dtype}")
+    return dtype
 
 
 def _filled(value: Any, like: Any) -> Any:
@@ -118,21 +118,21 @@ def _filled(value: Any, like: Any) -> Any:
         examples = like if isinstance(like, Mapping) else {}
         names = {name: name for name in examples}  # an equal name of the example may have a class of its own
         other = next(reversed([*examples.values()]), None)
-        return {names.get(name, name): _filled(one, examples.get(name, other)) for name, one in value.items()}
+        return {names.get(name, name): _filled(element, examples.get(name, other)) for name, element in value.items()}
     return value
 
 
 def _each(values: Any, like: Any) -> list[Any]:
     examples = like if isinstance(like, (list, tuple)) else ()
     last = len(examples) - 1
-    return [_filled(one, examples[min(i, last)] if examples else None) for i, one in enumerate(values)]
+    return [_filled(element, examples[min(i, last)] if examples else None) for i, element in enumerate(values)]
 
 
 def _instance(state: Mapping[str, Any], like: Any) -> Any:
     if like is None or isinstance(like, (int, float, str, bytes, list, tuple, dict, np.ndarray)):
         raise NotData("an instance where the example has none")
     examples = like.__getstate__()
-    filled = {name: _filled(one, examples.get(name)) for name, one in state.items()}
+    filled = {name: _filled(element, examples.get(name)) for name, element in state.items()}
     made = object.__new__(type(like))
     if hasattr(made, "__setstate__"):
         made.__setstate__(filled)

@@ -78,7 +78,7 @@ class Results:
     @property
     def events(self) -> list[RunEvent]:
         """The events of the run; also of a run of an older version."""
-        return [RunEvent(one["slot"], one["event"], one["by"]) for one in self.summary.get("events", ())]
+        return [RunEvent(event["slot"], event["event"], event["by"]) for event in self.summary.get("events", ())]
 
     def _table(self, name: str, expected: pa.Schema | None = None) -> pa.Table:
         path = self.folder / f"{name}.parquet"
@@ -195,15 +195,15 @@ def _states_in(schema: pa.Schema) -> int:
     return int(x.list_size) if x is not None and pa.types.is_fixed_size_list(x) else 1
 
 
-def _differences(found: pa.Schema, wanted: pa.Schema) -> str:
+def _differences(schema: pa.Schema, wanted: pa.Schema) -> str:
     """How a table's columns differ from those of this version."""
-    digest = found.field("digest").type if "digest" in found.names else None
+    digest = schema.field("digest").type if "digest" in schema.names else None
     if digest is not None and pa.types.is_fixed_size_binary(digest) and digest.byte_width != DIGEST_BYTES:
         return (
             f"its digests have {digest.byte_width} bytes, and those of this version, which cover other bytes, have "
             f"{DIGEST_BYTES}: they cannot be compared"
         )
-    other = [field.name for field in wanted if field not in found] or found.names
+    other = [field.name for field in wanted if field not in schema] or schema.names
     return f"it differs in {', '.join(other)}"
 
 
@@ -239,19 +239,19 @@ def _read_summary(path: Path) -> dict[str, Any]:
     return summary
 
 
-def _is_event(found: Any) -> bool:
+def _is_event(event: Any) -> bool:
     return (
-        isinstance(found, dict)
-        and type(found.get("slot")) is int
-        and 0 <= found["slot"] <= MOST_SLOTS
-        and all(isinstance(found.get(name), str) for name in ("event", "by"))
+        isinstance(event, dict)
+        and type(event.get("slot")) is int
+        and 0 <= event["slot"] <= MOST_SLOTS
+        and all(isinstance(event.get(name), str) for name in ("event", "by"))
     )
 
 
 def _cut_short(folder: Path) -> dict[str, Any]:
     """The last metrics that were written, as the summary of a results folder that has no summary yet."""
-    found = last_round(folder)
-    at = found.at
+    last = last_round(folder)
+    at = last.at
     if not at:
         raise UsageError(
             f"{folder} has nothing yet: its run has just begun, or was killed then; run the scenario again"
@@ -265,7 +265,7 @@ def _cut_short(folder: Path) -> dict[str, Any]:
         if goes_on(folder)
         else f"cut short at {at}, because its run was killed or its disk was full"
     )
-    return {**summary, "slots": found.slots, "ended": ended + age_of_metrics(folder)}
+    return {**summary, "slots": last.slots, "ended": ended + age_of_metrics(folder)}
 
 
 def age_of_metrics(folder: Path) -> str:

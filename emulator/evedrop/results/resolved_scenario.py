@@ -30,12 +30,12 @@ def write_resolved(folder: Path, scenario: Scenario, taken: bool = False) -> Non
 def input_texts(scenario: Scenario) -> dict[str, str]:
     """The files that a complete scenario needs next to it: name → text."""
     plant, process = scenario.plant, scenario.process
-    found = {}
+    texts = {}
     if plant is not None and plant.disturbance_values:
-        found[DISTURBANCES] = table_text(plant.disturbances, plant.disturbance_units, plant.disturbance_values)
+        texts[DISTURBANCES] = table_text(plant.disturbances, plant.disturbance_units, plant.disturbance_values)
     if process.source == "file":
-        found[STATES] = table_text(process.states or (), process.units, process.state_values or ())
-    return found
+        texts[STATES] = table_text(process.states or (), process.units, process.state_values or ())
+    return texts
 
 
 def resolved(scenario: Scenario, taken: bool = False) -> str:

@@ -13,11 +13,11 @@ from evedrop.score.slots import Slots
 
 def write_rows(writer: ResultsWriter, slots: Slots, scored: Mapping[str, Scored], first_trial: int) -> None:
     """Write all rows of some slots."""
-    for name, one in scored.items():
-        writer.slot_rows(slots.first, name, one.sums, one.expected)
+    for name, values in scored.items():
+        writer.slot_rows(slots.first, name, values.sums, values.expected)
     writer.input_rows(slots, first_trial)
     writer.state_rows(slots)
-    writer.trial_rows(slots, {name: one.squared_error for name, one in scored.items()}, first_trial)
+    writer.trial_rows(slots, {name: values.squared_error for name, values in scored.items()}, first_trial)
     writer.journal_rows(slots)
 
 

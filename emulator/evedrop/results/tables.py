@@ -123,7 +123,7 @@ def input_columns(slots: Slots, plant: Plant, disturbances: Floats, first_trial:
     return [
         np.repeat(np.arange(some.start, some.stop), recorded),
         np.tile(np.arange(first_trial, first_trial + recorded), slots.count),
-        np.stack([plant.limited(one) for one in u]).transpose(0, 2, 1).reshape(slots.count * recorded, -1),
+        np.stack([plant.limited(inputs) for inputs in u]).transpose(0, 2, 1).reshape(slots.count * recorded, -1),
         *([np.repeat(disturbances[some], recorded, axis=0)] if disturbances.shape[1] else []),
         slots.inputs.failed[:, :recorded].reshape(-1),
         plant.clips(u).reshape(-1),

@@ -122,8 +122,10 @@ class WireSummary:
 
     def as_dict(self) -> dict[str, Any]:
         """The contents of summary.json."""
-        found: dict[str, Any] = plain({**asdict(self), "expectations": [one.as_dict() for one in self.expectations]})
-        return found
+        entries: dict[str, Any] = plain(
+            {**asdict(self), "expectations": [expectation.as_dict() for expectation in self.expectations]}
+        )
+        return entries
 
     @property
     def text(self) -> str:
@@ -134,17 +136,17 @@ class WireSummary:
     def read(cls, path: Path) -> WireSummary:
         """The summary in a file. Raises UsageError if it is not the summary of a wire of this version."""
         try:
-            found = json.loads(text_of(path, _MOST_BYTES))
+            entries = json.loads(text_of(path, _MOST_BYTES))
         except (OSError, Unreadable, ValueError, RecursionError) as error:
             why = (error.strerror if isinstance(error, OSError) else None) or error
             raise UsageError(f"{path} is not the summary of a wire ({why})") from error
-        if not isinstance(found, dict):
+        if not isinstance(entries, dict):
             raise _foreign(path, "it has no entries")
         from pydantic import ValidationError  # noqa: PLC0415 - as below
 
         try:
             # The summaries of an older version, all of wires that ended, lack the state.
-            return _adapter().validate_python({"state": "ended", **found})
+            return _adapter().validate_python({"state": "ended", **entries})
         except ValidationError as error:
             first = error.errors(include_url=False, include_input=False)[0]
             raise _foreign(path, f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error

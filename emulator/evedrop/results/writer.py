@@ -136,14 +136,14 @@ class ResultsWriter:
         try:
             if not self._broken:
                 self._round()
-        except OSError as found:
-            failure = found
+        except OSError as problem:
+            failure = problem
         for stream in (*self._streams.values(), *self._outdated):
             stream.close()
         try:
             finish(self._held.now)
-        except (OSError, pa.ArrowException) as found:  # the streams stay where they are, and can be read
-            failure = failure or (found if isinstance(found, OSError) else OSError(str(found)))
+        except (OSError, pa.ArrowException) as problem:  # the streams stay where they are, and can be read
+            failure = failure or (problem if isinstance(problem, OSError) else OSError(str(problem)))
         self._unfinished.close()
         if self._taken is not None:
             self._taken.close()

@@ -35,7 +35,7 @@ def link_summary_of(scenario: Scenario, receiver: str, tally: Tally) -> LinkSumm
     account = LinkAccount.of(tally)
     # In a run cut short, late packets that were still to come are lost, although the router does not report them.
     lost = {**tally.lost, "underway": account.lost - sum(tally.lost.values()) + tally.lost.get("underway", 0)}
-    found = _with_delays(
+    summary = _with_delays(
         LinkSummary(
             **asdict(account),
             lost_by={reason: count for reason, count in sorted(lost.items()) if count},
@@ -47,14 +47,14 @@ def link_summary_of(scenario: Scenario, receiver: str, tally: Tally) -> LinkSumm
         tally,
     )
     if tally.offered != tally.done * tally.trials:
-        return found  # trials were cut short at different slots, in which different models may have applied
+        return summary  # trials were cut short at different slots, in which different models may have applied
     if tally.unsent:
         # A scheme's packets may depend on the past: for a loss model with a memory they are not a fair sample.
         if len(pieces) != 1 or len(pieces[0][0]) < tally.done or not _independent(pieces[0][1]):
-            return found
+            return summary
         met -= tally.unsent
     if met <= 0:
-        return found
+        return summary
     rate = 1.0 - tally.lost.get("lost", 0) / met
     slots = sum(len(piece) for piece, _ in pieces)
     expected = (
@@ -66,7 +66,7 @@ def link_summary_of(scenario: Scenario, receiver: str, tally: Tally) -> LinkSumm
     variance *= slots * tally.trials / met if tally.unsent else 1.0
     low, high = interval(rate, expected, variance)
     within = low - _ROUNDING <= expected <= high + _ROUNDING
-    return replace(found, rate=rate, expected_rate=expected, interval=(low, high), within_interval=bool(within))
+    return replace(summary, rate=rate, expected_rate=expected, interval=(low, high), within_interval=bool(within))
 
 
 def _independent(loss: LossModel) -> bool:
@@ -143,9 +143,9 @@ def _expected_delays(schedule: LinkSchedule) -> list[float] | None:
         return None
     model, reorder = delay_of(schedule.settings["delay"]), schedule.settings.get("reorder", 0.0)
     there = [model.arrived(lag) for lag in range(schedule.window + 1)]
-    if any(one is None for one in there):
+    if any(fraction is None for fraction in there):
         return None
-    reached = [0.0, *(reorder + (1.0 - reorder) * one for one in there if one is not None), 1.0]
+    reached = [0.0, *(reorder + (1.0 - reorder) * fraction for fraction in there if fraction is not None), 1.0]
     return [after - before for before, after in pairwise(reached)]
 
 

@@ -58,10 +58,10 @@ class SolveTimes:
 
     def add_seconds(self, seconds: Iterable[float]) -> None:
         """Add some decisions."""
-        for one in seconds:
+        for duration in seconds:
             self.decisions += 1
-            self.seconds += one
-            self.longest = max(self.longest, one)
+            self.seconds += duration
+            self.longest = max(self.longest, duration)
 
     def merge(self, other: SolveTimes) -> None:
         """Add another process's decisions."""
@@ -135,19 +135,19 @@ class LoopTally:
     @classmethod
     def merged(cls, parts: Sequence[LoopTally | None]) -> LoopTally | None:
         """The totals of several sets of trials, in order."""
-        known = [part for part in parts if part is not None]
-        if not known:
+        tallies = [part for part in parts if part is not None]
+        if not tallies:
             return None
-        whole = copy(known[0])
-        for part in known[1:]:
+        whole = copy(tallies[0])
+        for part in tallies[1:]:
             whole.trial_slots += part.trial_slots
             whole.failed += part.failed
             whole.clipped += part.clipped
             whole.other_error += part.other_error
-        whole.of_trials = np.concatenate([part.of_trials for part in known], axis=1)
+        whole.of_trials = np.concatenate([part.of_trials for part in tallies], axis=1)
         whole.applications = {
-            name: type(one).merged([part.applications[name] for part in known])
-            for name, one in known[0].applications.items()
+            name: type(application).merged([part.applications[name] for part in tallies])
+            for name, application in tallies[0].applications.items()
         }
         return whole
 

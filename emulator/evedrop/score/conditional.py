@@ -52,17 +52,17 @@ class ConditionalError:
         self.slots += len(action)
         used, traces = action == _STATE, kernels.traces(covariances)
         rows: Iterable[tuple[Any, Any]] = zip(used, traces, strict=True)
-        known: Sequence[Any] = self._sum, self._mark, self._squares
+        sums: Sequence[Any] = self._sum, self._mark, self._squares
         if used.shape[1] == 1:  # Python's floats are many times as fast as arrays of one number, and have the same bits
-            rows, known = zip(used[:, 0].tolist(), traces[:, 0].tolist(), strict=True), [one.item() for one in known]
-        total, mark, squares = known
+            rows, sums = zip(used[:, 0].tolist(), traces[:, 0].tolist(), strict=True), [value.item() for value in sums]
+        total, mark, squares = sums
         # Slot by slot, so that the bits do not depend on how many slots are added at a time.
         for now, trace in rows:
             between = (total - mark) * now  # tr P is 0 where a state is used
             mark = mark + between
             squares = squares + between * between
             total = total + trace
-        self._sum, self._mark, self._squares = (np.atleast_1d(one) for one in (total, mark, squares))
+        self._sum, self._mark, self._squares = (np.atleast_1d(value) for value in (total, mark, squares))
 
     @property
     def expected(self) -> Floats:
@@ -84,8 +84,8 @@ class ConditionalError:
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             shape = self.expected**2 / self.variance
             at = shape * (error / self.expected)
-            found: Floats = np.minimum(2.0 * np.minimum(gammainc(shape, at), gammaincc(shape, at)), 1.0)
-        return found
+            probability: Floats = np.minimum(2.0 * np.minimum(gammainc(shape, at), gammaincc(shape, at)), 1.0)
+        return probability
 
     @classmethod
     def merged(cls, parts: Sequence[ConditionalError]) -> ConditionalError:

@@ -24,18 +24,18 @@ def directions_of(
     tallies: Mapping[str, Tally], expected: Mapping[str, Expectation]
 ) -> dict[str, dict[str, DirectionSummary]]:
     """Receiver → direction → its entry; empty without directions, and in a run without estimates."""
-    found: dict[str, dict[str, DirectionSummary]] = {}
+    summaries: dict[str, dict[str, DirectionSummary]] = {}
     user = tallies[LEGITIMATE]
     for receiver, tally in tallies.items():
         for name, errors in tally.directions.items():
             if not errors.done:
                 continue
-            one = _measured(errors, expected[receiver], rare_events_of(expected[receiver], tally))
+            summary = _measured(errors, expected[receiver], rare_events_of(expected[receiver], tally))
             if receiver != LEGITIMATE:
                 pair = (expected[LEGITIMATE], expected[receiver])
-                one = _judged(one, found[LEGITIMATE][name], (user.directions[name], errors), pair)
-            found.setdefault(receiver, {})[name] = one
-    return found
+                summary = _judged(summary, summaries[LEGITIMATE][name], (user.directions[name], errors), pair)
+            summaries.setdefault(receiver, {})[name] = summary
+    return summaries
 
 
 def _measured(errors: DirectionTally, expected: Expectation, rare: RareEvents | None) -> DirectionSummary:
@@ -50,15 +50,15 @@ def _measured(errors: DirectionTally, expected: Expectation, rare: RareEvents | 
 
 
 def _judged(
-    one: DirectionSummary,
+    summary: DirectionSummary,
     user: DirectionSummary,
     errors: tuple[DirectionTally, DirectionTally],
     expected: tuple[Expectation, Expectation],
 ) -> DirectionSummary:
     """The entry of an eavesdropper with its verdict; errors, expected: the user's and the eavesdropper's."""
     promised = None
-    if user.unbounded is not None and one.unbounded is not None:
-        promised = one.unbounded and not user.unbounded
+    if user.unbounded is not None and summary.unbounded is not None:
+        promised = summary.unbounded and not user.unbounded
     relative, perfect = Verdict.UNDECIDED, Verdict.FAILED if promised is False else Verdict.UNDECIDED
     if all(each.done == each.slots for each in errors):
         heavy = any(each.infinite_variance for each in expected)
@@ -69,4 +69,4 @@ def _judged(
             series = expected[0].along(errors[0].v, errors[0].slots)
             bound = math.inf if series is None or user.unbounded else float(np.max(series))
             perfect = perfect_verdict(other, legitimate, bound, test)
-    return replace(one, relative=relative.value, perfect=perfect.value, perfect_by_theory=promised)
+    return replace(summary, relative=relative.value, perfect=perfect.value, perfect_by_theory=promised)

@@ -59,8 +59,8 @@ class Evidence:
 
     def _judged(self, expect: ExpectTable, replay: str | None) -> Judged:
         judge = {"metric": self._metric, "link": self._link, "secrecy": self._secrecy, "in_step": self._in_step}
-        found, held = judge[expect.kind](expect)
-        return Judged(expect.text, held, found, expect.wanted, replay if held is False else None)
+        value, held = judge[expect.kind](expect)
+        return Judged(expect.text, held, value, expect.wanted, replay if held is False else None)
 
     def _metric(self, expect: ExpectTable) -> tuple[float | None, bool | None]:
         name = str(expect.metric)
@@ -98,8 +98,8 @@ class Evidence:
         tally = self.tallies[receiver].watched.tally(wanted[1])
         if expect.quantile is None:
             return tally.value
-        found = tally.of_trials
-        return None if found is None else float(np.quantile(found, expect.quantile))
+        values = tally.of_trials
+        return None if values is None else float(np.quantile(values, expect.quantile))
 
     def _link(self, expect: ExpectTable) -> tuple[Found, bool | None]:
         account = self.links[str(expect.link)]
@@ -113,9 +113,9 @@ class Evidence:
         relative = expect.secrecy == "relative"
         shown = verdict.relative if relative else verdict.perfect
         promised = verdict.relative_by_theory if relative else verdict.perfect_by_theory
-        found = f"{_THEORY[promised]}, {_RUN.get(shown.value, f'the run has {shown.value}')}"
+        verdicts = f"{_THEORY[promised]}, {_RUN.get(shown.value, f'the run has {shown.value}')}"
         complete = all(tally.done == tally.slots for tally in self.tallies.values())
-        return found, promised is True and shown is Verdict.HELD if complete else None
+        return verdicts, promised is True and shown is Verdict.HELD if complete else None
 
     def _secrecy_in(self, expect: ExpectTable) -> tuple[Found, bool | None]:
         """The same in one direction, where theory only promises perfect secrecy: relative secrecy is what the run shows."""
@@ -138,5 +138,5 @@ class Evidence:
         by = math.inf if expect.by is None else expect.by
         if tally.done <= by and tally.done < tally.slots:
             return None, None
-        found = tally.watched.tally(wanted[1]).value
-        return found, found is not None and found <= by
+        value = tally.watched.tally(wanted[1]).value
+        return value, value is not None and value <= by

@@ -67,18 +67,18 @@ class FilterTally:
     @classmethod
     def merged(cls, parts: Sequence[FilterTally | None]) -> FilterTally | None:
         """The sums of several sets of trials, in order."""
-        known = [part for part in parts if part is not None]
-        if not known:
+        tallies = [part for part in parts if part is not None]
+        if not tallies:
             return None
-        whole = copy(known[0])
+        whole = copy(tallies[0])
         whole.sums = dict(whole.sums)
-        for part in known[1:]:
+        for part in tallies[1:]:
             whole.slots = min(whole.slots, part.slots)
             whole.count += part.count
             for name, value in part.sums.items():
                 whole.sums[name] = whole.sums.get(name, 0.0) + value
         whole.of_trials = {
-            name: np.concatenate([part.of_trials[name] for part in known]) for name in known[0].of_trials
+            name: np.concatenate([part.of_trials[name] for part in tallies]) for name in tallies[0].of_trials
         }
         return whole
 
@@ -96,8 +96,10 @@ class FilterTally:
         errors = {name: value / max(1, self.count) for name, value in self.sums.items()}
         own = errors.pop(SENSOR, None)
         mean_trace = mean if self.slots else None
-        alike = all(self.slots * len(one) == self.count for one in self.of_trials.values())
-        spread = {name: standard_error(one / self.slots) if alike else None for name, one in self.of_trials.items()}
+        alike = all(self.slots * len(values) == self.count for values in self.of_trials.values())
+        spread = {
+            name: standard_error(values / self.slots) if alike else None for name, values in self.of_trials.items()
+        }
         error, own_of_trials = spread.pop(SENSOR, None), self.of_trials.get(SENSOR)
         z = z_of(own_of_trials / self.slots, mean_trace) if alike and self.slots and own_of_trials is not None else None
         of_mean = {"mean_squared_error": error, "mean_true_squared_errors": spread}

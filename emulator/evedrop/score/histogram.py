@@ -62,7 +62,7 @@ class SlotHistograms:
     def quantiles(self) -> Floats:
         """`LEVELS` of every slot, (slots, levels); NaN in slots that were left out or have no values."""
         edges = self._edges()
-        found = np.full((self._slots, len(LEVELS)), np.nan)
+        quantiles = np.full((self._slots, len(LEVELS)), np.nan)
         totals = self.counts.sum(axis=1)
         cumulative = np.cumsum(self.counts, axis=1)
         rows = np.flatnonzero(totals)
@@ -74,8 +74,8 @@ class SlotHistograms:
             part = np.clip((wanted - before) / np.maximum(count, 1), 0.0, 1.0)
             values = edges[bins] + part * (edges[bins + 1] - edges[bins])
             # In the first and the last bin, values are known only to be too small or too large.
-            found[rows * self._stride, column] = np.select([bins == 0, bins == _BINS - 1], [0.0, np.inf], values)
-        return found
+            quantiles[rows * self._stride, column] = np.select([bins == 0, bins == _BINS - 1], [0.0, np.inf], values)
+        return quantiles
 
     def _edges(self) -> Floats:
         bits = (self._base + np.arange(_BINS + 1, dtype=np.int64)) << _SHIFT

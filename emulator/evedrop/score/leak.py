@@ -109,14 +109,14 @@ class PacketBitsStream:
 
     def next(self, slots: int) -> PacketBits:
         """What those of the next slots reveal."""
-        known, some = self._revealed.next(slots), range(self._first, self._first + slots)
+        revealed, some = self._revealed.next(slots), range(self._first, self._first + slots)
         self._first = some.stop
         state = np.where(np.arange(some.start, some.stop) == 0, 1.0, in_slots(self._mu_d, some))
         clear, hidden = np.zeros(slots), np.zeros(slots)
-        for odds, bits in zip((state, 1.0 - state), known, strict=True):
+        for odds, bits in zip((state, 1.0 - state), revealed, strict=True):
             clear += np.where(np.isinf(bits), odds, 0.0)
             hidden += np.where(np.isinf(bits), 0.0, bits) * odds
-        return PacketBits(np.stack(known, axis=1), clear, hidden)
+        return PacketBits(np.stack(revealed, axis=1), clear, hidden)
 
 
 def revealed_by_packets(scenario: Scenario) -> PacketBitsStream | None:

@@ -58,12 +58,14 @@ class Scorekeeper:
         self, scenario: Scenario, trials: int, theory: Mapping[str, ExpectedTraceStream] | None = None
     ) -> None:
         if theory is None:
-            theory = {name: one.stream() for name, one in expectations_of(scenario).items()}
+            theory = {name: expectation.stream() for name, expectation in expectations_of(scenario).items()}
         self._theory = theory
         self._revealed = HeardBitsStream(scenario)
         self.run_tally = RunTally.from_scenario(scenario, trials)
 
-    def add_slots(self, slots: Slots, known: Mapping[str, tuple[Floats, Floats]] | None = None) -> dict[str, Scored]:
+    def add_slots(
+        self, slots: Slots, errors_and_traces: Mapping[str, tuple[Floats, Floats]] | None = None
+    ) -> dict[str, Scored]:
         """Score the next slots: receiver → its errors, sums and theory.
 
         known: receiver → its squared errors, and tr P of every trial, (c, R) each, if they have been computed.
@@ -72,15 +74,15 @@ class Scorekeeper:
         self._add_plant(slots)
         revealed = self._revealed.next(slots.count)
         for name, receiver in slots.receivers.items():
-            if known is None:
+            if errors_and_traces is None:
                 errors, traces = squared_errors(slots.x, receiver.x_hat), receiver.traces_of_trials
             else:
-                errors, traces = known[name]
-            one = Scored(
+                errors, traces = errors_and_traces[name]
+            values = Scored(
                 errors, slot_sums(errors, receiver.action, receiver.trace), self._theory[name].next_traces(slots.count)
             )
             tally = self.run_tally.tallies[name]
-            tally.add_slots(slots.first, *one)
+            tally.add_slots(slots.first, *values)
             if tally.conditional is not None:
                 tally.conditional.add_actions(receiver.action)
             if tally.leak is not None:
@@ -97,15 +99,22 @@ class Scorekeeper:
                 tally.account_late(receiver.late_delivered, *late)
             tally.watched.add_slots(
                 ScoredSlots(
-                    slots.first, errors, receiver.action, one.sums.trace, one.expected, late, slots.x, receiver.x_hat
+                    slots.first,
+                    errors,
+                    receiver.action,
+                    values.sums.trace,
+                    values.expected,
+                    late,
+                    slots.x,
+                    receiver.x_hat,
                 )
             )
-            scored[name] = one
+            scored[name] = values
         return scored
 
     def _add_plant(self, slots: Slots) -> None:
         """Add the slots' alarms, the controller's decisions, and the true errors of a sensor that filters."""
-        run_tally, estimates = self.run_tally, {name: one.x_hat for name, one in slots.receivers.items()}
+        run_tally, estimates = self.run_tally, {name: receiver.x_hat for name, receiver in slots.receivers.items()}
         if slots.alarms is not None and run_tally.detection is not None:
             run_tally.detection.add_alarms(slots.first, slots.alarms)
         if slots.true is not None and run_tally.filter is not None:
@@ -151,13 +160,13 @@ def summary_of(
     metric failed is not `complete`: it ended with that failure.
     """
     tallies, detection, loop = run_tally.tallies, run_tally.detection, run_tally.loop
-    digests = {name: None if name in ending.accused else one for name, one in digests.items()}
+    digests = {name: None if name in ending.accused else entry for name, entry in digests.items()}
     expected = expectations_of(scenario)
     peers = {name: _peer(name, tally, expected[name], digests[name], ending.mode) for name, tally in tallies.items()}
-    applications = {} if loop is None else {name: one.entry() for name, one in loop.applications.items()}
+    applications = {} if loop is None else {name: entry.entry() for name, entry in loop.applications.items()}
     user = tallies[LEGITIMATE]
     links = {name: link_summary_of(scenario, name, tally) for name, tally in tallies.items()}
-    secret = {one.eavesdropper: one for one in verdicts(scenario, tallies)}
+    secret = {entry.eavesdropper: entry for entry in verdicts(scenario, tallies)}
     directions = directions_of(tallies, expected)
     expectations = Evidence(scenario, peers, links, tallies, secret, applications, directions).judged(ending.replay)
     # Known only now that every metric has been computed.
@@ -178,7 +187,7 @@ def summary_of(
         outages=ending.outages,
         verification=verification_of(scenario, ending.accused) if ending.mode == "live" else None,
         misdelivered=ending.misdelivered,
-        secrecy={name: one.summary for name, one in secret.items()},
+        secrecy={name: entry.summary for name, entry in secret.items()},
         detection=None if detection is None else detection.summary(scenario),
         controller=None
         if loop is None
@@ -197,22 +206,22 @@ def _peer(name: str, tally: Tally, expected: Expectation, digest: str | None, mo
     metrics: dict[str, float | None] = {}
     of_mode: dict[str, float | None] = {}
     errors: dict[str, float | None] = {}
-    for metric, one in metrics_of(name).items():
-        if one.only_in_mode not in {None, mode}:
+    for metric, kind in metrics_of(name).items():
+        if kind.only_in_mode not in {None, mode}:
             continue
-        found = None if one.not_in_mode == mode else tally.metric(metric)
-        (metrics if one.only_in_mode is None else of_mode)[metric] = found
-        if one.rests_on != "theory":
-            meaningless = found is None or (one.of_error and infinite_variance)
+        value = None if kind.not_in_mode == mode else tally.metric(metric)
+        (metrics if kind.only_in_mode is None else of_mode)[metric] = value
+        if kind.rests_on != "theory":
+            meaningless = value is None or (kind.of_error and infinite_variance)
             errors[metric] = None if meaningless else tally.standard_error(metric)
-    known, comparable = {**metrics, **of_mode}, not expected.of_model or mode == COVARIANCE_ONLY
+    values, comparable = {**metrics, **of_mode}, not expected.of_model or mode == COVARIANCE_ONLY
     rare = rare_events_of(expected, tally) if comparable else None
     z = {
-        metric: z_of_error(tally.of_trials(metric), known[one.expected], expected, tally.done, rare)
-        if comparable and known[metric] is not None
+        metric: z_of_error(tally.of_trials(metric), values[kind.expected], expected, tally.done, rare)
+        if comparable and values[metric] is not None
         else None
-        for metric, one in metrics_of(name).items()
-        if one.expected is not None and metric in errors
+        for metric, kind in metrics_of(name).items()
+        if kind.expected is not None and metric in errors
     }
     return PeerSummary(metrics, _quantiles(tally), infinite_variance, digest, of_mode, errors, z, rare)
 
@@ -229,7 +238,7 @@ def _surprising(scenario: Scenario, tallies: Mapping[str, Tally]) -> SurprisingT
 
     None without such a trial: the run was cut short, has too few trials, or no receiver with such expectations.
     """
-    found: SurprisingTrial | None = None
+    surprising: SurprisingTrial | None = None
     for name, tally in tallies.items():
         own = tally.conditional
         if own is None or not own.slots or tally.done != tally.slots or tally.trials < _ENOUGH_TO_SURPRISE:
@@ -238,10 +247,12 @@ def _surprising(scenario: Scenario, tallies: Mapping[str, Tally]) -> SurprisingT
         probability = own.probability(means * tally.slots)
         # Where probabilities are too small for a float, the error decides.
         least = int(np.lexsort((-means, np.nan_to_num(probability, nan=1.0)))[0])
-        if expected[least] > 0.0 and (found is None or probability[least] < found.probability):
+        if expected[least] > 0.0 and (surprising is None or probability[least] < surprising.probability):
             trial = scenario.first_trial + least
-            found = SurprisingTrial(trial, name, *(float(one[least]) for one in (means, expected, probability)))
-    return found
+            surprising = SurprisingTrial(
+                trial, name, *(float(values[least]) for values in (means, expected, probability))
+            )
+    return surprising
 
 
 def digest_of(scenario: Scenario, receiver: str, blocks: Mapping[int, Digests]) -> str | None:
@@ -264,20 +275,20 @@ def verification_of(scenario: Scenario, accused: Collection[str] = ()) -> dict[s
     accused: processes whose misbehaviour ended the run.
     """
     recorded = _recorded_of(scenario)
-    found = {}
+    verifications = {}
     for name in scenario.receivers:
         metrics = {who: _resting_on(who, name) for who in ("recorder", "receiver", "recorded trials")}
         checked, of_recorded = metrics["recorder"], [*metrics["recorded trials"], "digest"]
         verified = [] if name in accused else checked + (of_recorded if recorded == scenario.trials else [])
-        own_word = [one for one in (*checked, *metrics["receiver"], *of_recorded) if one not in verified]
-        found[name] = Verification(0 if name in accused else recorded, verified, own_word)
-    return found
+        own_word = [figure for figure in (*checked, *metrics["receiver"], *of_recorded) if figure not in verified]
+        verifications[name] = Verification(0 if name in accused else recorded, verified, own_word)
+    return verifications
 
 
 def _resting_on(who: str, receiver: str) -> list[str]:
     """The metrics of a receiver of a live run with this value of `rests_on`."""
     metrics = metrics_of(receiver).items()
-    return [name for name, one in metrics if one.rests_on == who and one.only_in_mode is None]
+    return [name for name, kind in metrics if kind.rests_on == who and kind.only_in_mode is None]
 
 
 def _recorded_of(scenario: Scenario) -> int:

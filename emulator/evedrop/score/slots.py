@@ -48,7 +48,7 @@ class ReceiverSlots:
     def part(self, trials: slice) -> ReceiverSlots:
         """The same for some of the trials; counts over all trials stay as they are."""
         late, used, delivered = (
-            None if one is None else one[:, trials] for one in (self.late, self.late_used, self.late_delivered)
+            None if column is None else column[:, trials] for column in (self.late, self.late_used, self.late_delivered)
         )
         return replace(
             self,
@@ -118,12 +118,12 @@ class Slots:
 
     def part(self, trials: slice) -> Slots:
         """The same for some of the trials; counts over all trials stay as they are."""
-        sent, alarms = (None if one is None else one[:, trials] for one in (self.sent, self.alarms))
+        sent, alarms = (None if part is None else part[:, trials] for part in (self.sent, self.alarms))
         return replace(
             self,
             x=self.x[..., trials],
             nu=self.nu[:, trials],
-            receivers={name: one.part(trials) for name, one in self.receivers.items()},
+            receivers={name: part.part(trials) for name, part in self.receivers.items()},
             sent=sent,
             alarms=alarms,
             inputs=None if self.inputs is None else self.inputs.part(trials),
@@ -141,9 +141,9 @@ def _copied(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return value.copy()
     if isinstance(value, Mapping):
-        return {name: _copied(one) for name, one in value.items()}
+        return {name: _copied(entry) for name, entry in value.items()}
     if is_dataclass(value) and not isinstance(value, type):
-        return type(value)(**{one.name: _copied(getattr(value, one.name)) for one in fields(value)})
+        return type(value)(**{entry.name: _copied(getattr(value, entry.name)) for entry in fields(value)})
     return value
 
 
@@ -155,7 +155,7 @@ def concatenated(parts: Sequence[Slots]) -> Slots:
 
 def _joined(values: Sequence[Any]) -> Any:
     """The values of one entry in consecutive slots as one: arrays along the slots, tables and classes entry by entry."""
-    kinds = {type(one) for one in values}
+    kinds = {type(item) for item in values}
     if len(kinds) > 1:
         raise ValueError(f"some of the parts have an entry that others lack: {sorted(kind.__name__ for kind in kinds)}")
     first = values[0]
@@ -164,9 +164,11 @@ def _joined(values: Sequence[Any]) -> Any:
     if isinstance(first, np.ndarray):
         return np.concatenate(values)
     if isinstance(first, Mapping):
-        names = dict.fromkeys(name for one in values for name in one)
-        return {name: _joined([one.get(name) for one in values]) for name in names}
-    return type(first)(**{one.name: _joined([getattr(value, one.name) for value in values]) for one in fields(first)})
+        names = dict.fromkeys(name for item in values for name in item)
+        return {name: _joined([item.get(name) for item in values]) for name in names}
+    return type(first)(
+        **{item.name: _joined([getattr(value, item.name) for value in values]) for item in fields(first)}
+    )
 
 
 def all_set(flags: Flags | None, like: Flags) -> Flags:

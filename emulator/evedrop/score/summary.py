@@ -349,24 +349,26 @@ class Summary:
 
     def as_dict(self) -> dict[str, Any]:
         """The contents of summary.json, with infinite and undefined numbers as floats."""
-        found: dict[str, Any] = {}
-        for one in fields(self):
-            value = getattr(self, one.name)
-            found |= value if one.name == _OPEN else {one.name: _entry(value)}
-        return found
+        entries: dict[str, Any] = {}
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            entries |= value if entry.name == _OPEN else {entry.name: _entry(value)}
+        return entries
 
     @classmethod
-    def read(cls, found: Mapping[str, Any]) -> Summary:
+    def read(cls, entries: Mapping[str, Any]) -> Summary:
         """The summary in the contents of a summary.json.
 
         Raises KeyError for a missing entry, and TypeError or ValueError for a value of another type.
         """
         # Results of an older version lack directions.
-        known = [
-            one.name for one in fields(cls) if one.name != _OPEN and (one.name != "directions" or one.name in found)
+        names = [
+            entry.name
+            for entry in fields(cls)
+            if entry.name != _OPEN and (entry.name != "directions" or entry.name in entries)
         ]
-        own = {name: found[name] for name in known}
-        others = {name: value for name, value in found.items() if name not in own}
+        own = {name: entries[name] for name in names}
+        others = {name: value for name, value in entries.items() if name not in own}
         peers = {name: _peer_fields(peer) for name, peer in own["peers"].items()}
         summary = _adapter().validate_python({**own, "peers": peers, _OPEN: others})
         _expect_possible(summary)

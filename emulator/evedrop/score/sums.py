@@ -49,8 +49,8 @@ class SlotSums:
     def add_trials(self, first: int, other: SlotSums) -> None:
         """Add the sums of further trials over some slots from `first` on."""
         rows = slice(first, first + len(other.error))
-        for one in fields(self):
-            getattr(self, one.name)[rows] += getattr(other, one.name)
+        for column in fields(self):
+            getattr(self, column.name)[rows] += getattr(other, column.name)
 
     @property
     def standard_errors(self) -> Floats:
@@ -59,13 +59,13 @@ class SlotSums:
             mean = self.error / self.trials
             variance = np.maximum(0.0, self.error_squared / self.trials - mean * mean)
             variance = variance * self.trials / (self.trials - 1.0)
-            found: Floats = np.where(self.trials > 1, np.sqrt(variance / self.trials), np.nan)
-        return found
+            errors: Floats = np.where(self.trials > 1, np.sqrt(variance / self.trials), np.nan)
+        return errors
 
     def measured(self) -> SlotSums:
         """Only the slots that some trial reached: a run that was cut short lacks the last ones."""
         rows = slice(0, int(np.count_nonzero(self.trials)))
-        return SlotSums(*(getattr(self, one.name)[rows] for one in fields(self)))
+        return SlotSums(*(getattr(self, column.name)[rows] for column in fields(self)))
 
 
 def squared_errors(x: Floats, x_hat: Floats) -> Floats:
@@ -263,14 +263,14 @@ class Tally(ReceiverTally):
 
         None if the metric is not such a mean, if that is not known, or if trials were cut short at different slots.
         """
-        found = metric(name)
-        if not (found.averages_trials and self.alike):
+        kind = metric(name)
+        if not (kind.averages_trials and self.alike):
             return None
-        if issubclass(found, TallyMetric):
+        if issubclass(kind, TallyMetric):
             error: Floats = self.window_errors.sum(axis=0)
-            sums = found.sums_of_trials(TrialTally(error, self.traces, self.packets[0], self.packets[1]))
+            sums = kind.sums_of_trials(TrialTally(error, self.traces, self.packets[0], self.packets[1]))
             return None if sums is None else sums / self.done
-        return self.watched.tally(WatchedSlots(name, 0, self.slots)).of_trials if found.by_trial else None
+        return self.watched.tally(WatchedSlots(name, 0, self.slots)).of_trials if kind.by_trial else None
 
     def standard_error(self, name: str) -> float | None:
         """The standard error of a metric of the run; None if it has none."""

@@ -58,8 +58,8 @@ def track_of(squared_error: Floats, trace: Floats, noise: float) -> Codes:
 def is_fooled(squared_error: Floats, trace: Floats, noise: float) -> Flags:
     """Whether squared errors are far above the traces that a receiver believes; also if one is not a number. noise: tr Q."""
     with np.errstate(invalid="ignore"):
-        found: Flags = ~(squared_error <= FACTOR * np.maximum(trace, noise))
-    return found
+        fooled: Flags = ~(squared_error <= FACTOR * np.maximum(trace, noise))
+    return fooled
 
 
 @dataclass(frozen=True)

@@ -137,9 +137,9 @@ def sign_of_mean(samples: Floats) -> SignTest:
     Source: docs/mathematics.md, verdicts.
     """
     tests = student_test(samples, 0.0), skewed_test(samples, 0.0)
-    known = [test for test in tests if test is not None]
-    if known:
-        return SignTest(max(test.above for test in known), max(test.below for test in known))
+    possible = [test for test in tests if test is not None]
+    if possible:
+        return SignTest(max(test.above for test in possible), max(test.below for test in possible))
     mean = float(np.mean(samples))
     if len(samples) < 2 or mean == 0.0 or not math.isfinite(mean):
         return _NOTHING
@@ -160,12 +160,12 @@ def rejected(p_values: Mapping[int, float]) -> list[int]:
 
     Source: docs/mathematics.md, verdicts.
     """
-    found = []
-    for place, one in enumerate(sorted(p_values, key=lambda at: p_values[at])):
-        if p_values[one] > ERROR_RATE / (len(p_values) - place):
+    hypotheses = []
+    for place, hypothesis in enumerate(sorted(p_values, key=lambda at: p_values[at])):
+        if p_values[hypothesis] > ERROR_RATE / (len(p_values) - place):
             break
-        found.append(one)
-    return sorted(found)
+        hypotheses.append(hypothesis)
+    return sorted(hypotheses)
 
 
 def relative_verdict(
@@ -180,10 +180,10 @@ def relative_verdict(
     have: `held` must hold of the first of them as well, and `failed` of the second. None: these are the means of the trials.
     """
     least, most = (difference if each is None else each for each in (least, most))
-    known = [w for w, row in enumerate(difference) if not np.isnan(row).any()]
-    tests = {w: test(difference[w]) for w in known}
-    failed = rejected({w: max(tests[w].below, test(most[w]).below) for w in known})
-    doubtful = [w for w in known if max(tests[w].above, test(least[w]).above) > ERROR_RATE]
+    measured = [w for w, row in enumerate(difference) if not np.isnan(row).any()]
+    tests = {w: test(difference[w]) for w in measured}
+    failed = rejected({w: max(tests[w].below, test(most[w]).below) for w in measured})
+    doubtful = [w for w in measured if max(tests[w].above, test(least[w]).above) > ERROR_RATE]
     if failed:
         return Verdict.FAILED, _slots_of(failed, slots)
     if doubtful or not tests:
@@ -194,7 +194,7 @@ def relative_verdict(
 def _slots_of(windows: list[int], slots: int) -> str:
     """The slots of some windows in words: "1 to 124, 625 to 749"."""
     bounds = window_bounds(slots)
-    return ", ".join(f"{bounds[one]} to {bounds[one + 1] - 1}" for one in windows)
+    return ", ".join(f"{bounds[window]} to {bounds[window + 1] - 1}" for window in windows)
 
 
 def perfect_verdict(eavesdropper: Floats, legitimate: Floats, bound: float, test: SignTestOf) -> Verdict:
@@ -223,11 +223,11 @@ def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tall
     # A lower bound can support a promise, but cannot deny one.
     bounded = other_theory.bound is not None
     theirs = other_theory.bound or other_theory
-    known = user_theory.known and theirs.known
+    both_known = user_theory.known and theirs.known
     user_bound = user_theory.limit if user_theory.known else math.inf
     perfect_by_theory = (math.isfinite(user_bound) and math.isinf(theirs.limit)) or (None if bounded else False)
     # A limit too large to be computed neither promises nor denies anything.
-    perfect_by_theory = perfect_by_theory if known and not math.isnan(user_bound + theirs.limit) else None
+    perfect_by_theory = perfect_by_theory if both_known and not math.isnan(user_bound + theirs.limit) else None
     complete = user.done == user.slots
     # What theory promises does not depend on how soon a run was interrupted, but must not take long then.
     slots = user.slots if complete else min(user.slots, max(user.done, _PROMISED_SLOTS))
@@ -259,8 +259,8 @@ def secrecy(legitimate: tuple[Tally, Expectation], eavesdropper: tuple[str, Tall
         name,
         relative,
         perfect,
-        (always or (None if bounded else False)) if known else None,
-        holds_from if known and bounded_user else None,
+        (always or (None if bounded else False)) if both_known else None,
+        holds_from if both_known and bounded_user else None,
         windows,
         perfect_by_theory,
         ratio,
@@ -286,9 +286,9 @@ def ratio_of(legitimate: tuple[Tally, Expectation], other: Tally) -> tuple[float
         return math.nan, None, None
     first = int(window_bounds(user.slots)[WINDOWS // 2])
     if user.done == other.done == user.slots and first < user.slots:
-        theirs, ours = (one.window_errors[WINDOWS // 2 : WINDOWS].sum(axis=0) for one in (other, user))
+        theirs, ours = (tally.window_errors[WINDOWS // 2 : WINDOWS].sum(axis=0) for tally in (other, user))
     else:
-        first, (theirs, ours) = 0, (one.window_errors.sum(axis=0) for one in (other, user))
+        first, (theirs, ours) = 0, (tally.window_errors.sum(axis=0) for tally in (other, user))
     over, under = float(np.mean(theirs)), float(np.mean(ours))
     alike = user.alike and other.alike
     slots = (first, user.done - 1)

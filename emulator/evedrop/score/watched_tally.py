@@ -55,8 +55,8 @@ class GuardedTally(MetricTally):
     @property
     def value(self) -> float | None:
         """The metric over the slots so far; None if it has no value, or if it is not a number."""
-        found = self._asked(lambda: _number(self._begun.value))
-        return None if found is None or math.isnan(found) else found
+        value = self._asked(lambda: _number(self._begun.value))
+        return None if value is None or math.isnan(value) else value
 
     @property
     def of_trials(self) -> Floats | None:
@@ -66,10 +66,10 @@ class GuardedTally(MetricTally):
     @property
     def _begun(self) -> MetricTally:
         if self._tally is None:
-            found: object = metric(self._name).tally(self._trials)
-            if not isinstance(found, MetricTally):
-                raise NoAnswer(f"tally() gave {found!r:.40}; expected a MetricTally")
-            self._tally = found
+            tally: object = metric(self._name).tally(self._trials)
+            if not isinstance(tally, MetricTally):
+                raise NoAnswer(f"tally() gave {tally!r:.40}; expected a MetricTally")
+            self._tally = tally
         return self._tally
 
     def fail(self, why: str) -> None:
@@ -85,16 +85,16 @@ class GuardedTally(MetricTally):
         return None
 
 
-def _number(found: object) -> float | None:
-    if found is None or (isinstance(found, (int, float, np.number)) and not isinstance(found, bool)):
-        return None if found is None else float(found)
-    raise NoAnswer(f"value gave {found!r:.40}; expected a number, or None")
+def _number(answer: object) -> float | None:
+    if answer is None or (isinstance(answer, (int, float, np.number)) and not isinstance(answer, bool)):
+        return None if answer is None else float(answer)
+    raise NoAnswer(f"value gave {answer!r:.40}; expected a number, or None")
 
 
-def _numbers(found: object, trials: int) -> Floats:
-    if isinstance(found, np.ndarray) and found.shape == (trials,):
-        return found.astype(np.float64)
-    raise NoAnswer(f"of_trials gave {found!r:.40}; expected an array of {trials} numbers")
+def _numbers(answer: object, trials: int) -> Floats:
+    if isinstance(answer, np.ndarray) and answer.shape == (trials,):
+        return answer.astype(np.float64)
+    raise NoAnswer(f"of_trials gave {answer!r:.40}; expected an array of {trials} numbers")
 
 
 IN_STEP = "in_step"
@@ -132,15 +132,15 @@ def _since(scenario: Scenario, expect: ExpectTable) -> int:
 def watches_of(scenario: Scenario) -> dict[str, tuple[WatchedSlots, ...]]:
     """Receiver → all quantities that its metrics and the scenario's expectations need."""
     wanted = [watch for expect in scenario.expect if (watch := watch_of(scenario, expect)) is not None]
-    found = {}
+    watches = {}
     for receiver in scenario.receivers:
         own = [
             WatchedSlots(name, 0, scenario.slots)
-            for name, one in metrics_of(receiver).items()
-            if not issubclass(one, TallyMetric)
+            for name, kind in metrics_of(receiver).items()
+            if not issubclass(kind, TallyMetric)
         ]
-        found[receiver] = tuple(dict.fromkeys([*own, *(watch for name, watch in wanted if name == receiver)]))
-    return found
+        watches[receiver] = tuple(dict.fromkeys([*own, *(watch for name, watch in wanted if name == receiver)]))
+    return watches
 
 
 @final
@@ -169,11 +169,11 @@ class FirstState(MetricTally):
         return None if (self._first == _NEVER).any() else int(self._first.max())
 
 
-def _tally(what: str, trials: int) -> MetricTally:
+def _tally(name: str, trials: int) -> MetricTally:
     """A tally of a quantity, of no slots yet."""
-    if what == IN_STEP:
+    if name == IN_STEP:
         return FirstState(trials)
-    return GuardedTally(what, trials) if METRICS.foreign(what) else metric(what).tally(trials)
+    return GuardedTally(name, trials) if METRICS.foreign(name) else metric(name).tally(trials)
 
 
 @final

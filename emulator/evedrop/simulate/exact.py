@@ -97,8 +97,8 @@ class ExactSimulation:
             controller = ControllerCore(scenario.controller.strategy, scenario.assignment, disturbances, batch.trials)
             self._control_loop = _ControlLoop(roles, controller, self._sensor, digests[CONTROLLER], times)
         self._receivers = {
-            name: LinkedReceiver(one, scenario.window(name), scenario.timeline.outages[name])
-            for name, one in roles.receivers.items()
+            name: LinkedReceiver(role, scenario.window(name), scenario.timeline.outages[name])
+            for name, role in roles.receivers.items()
         }
         self._logs = {
             name: BlockDigests(batch.trials, scenario.slots, scenario.outage_bounds(name)) for name in roles.receivers
@@ -139,8 +139,8 @@ class ExactSimulation:
             else self._follow(name, chunk, link, whole)
             for name, link in links.items()
         }
-        for name, one in followed.items():
-            self._digests[name].update(self._logs[name].add(chunk, one.beliefs))
+        for name, followed_slots in followed.items():
+            self._digests[name].update(self._logs[name].add(chunk, followed_slots.beliefs))
         return self._chunk(chunk, whole, followed, links, np.array(alarms) if alarms else None, inputs)
 
     def _acknowledge(

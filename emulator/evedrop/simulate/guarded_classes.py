@@ -53,7 +53,7 @@ class Guard:
             self._classes[name] = eavesdropper_in_words(name, table.strategy, table.parameters)
             if is_foreign(table.strategy, table.parameters):
                 self._watched.add(name)
-        self._links = {one: list(_models_of(scenario.schedule(one))) for one in scenario.receivers}
+        self._links = {receiver: list(_models_of(scenario.schedule(receiver))) for receiver in scenario.receivers}
 
     def asking(self, receiver: str, slots: range) -> contextlib.AbstractContextManager[None]:
         """Turn an error in the block into one that names the receiver's class, the slots and the trials."""
@@ -64,8 +64,8 @@ class Guard:
         models = f" ({', '.join(self._links[receiver])})" if self._links[receiver] else ""
         return self._named(f"{receiver}'s link{models}", slots)
 
-    def _named(self, what: str, slots: range) -> contextlib.AbstractContextManager[None]:
-        return asking(what, slots, self._batch) if self._active else contextlib.nullcontext()
+    def _named(self, subject: str, slots: range) -> contextlib.AbstractContextManager[None]:
+        return asking(subject, slots, self._batch) if self._active else contextlib.nullcontext()
 
     def encoder(self, encoder: Encoder) -> Encoder:
         """The encoder; if its class is not built in, one that checks all its packets."""

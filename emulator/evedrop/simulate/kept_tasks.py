@@ -52,20 +52,20 @@ Study = Mapping[str, Any]
 
 def study_of(kind: str, options: Mapping[str, Any], scenarios: Sequence[Scenario]) -> Study:
     """What a study computes; kind: the command; options: those that change results, beside the scenarios, at least one."""
-    secrets = dict.fromkeys(one.secret_file for one in scenarios if one.secret_file is not None)
+    secrets = dict.fromkeys(scenario.secret_file for scenario in scenarios if scenario.secret_file is not None)
     first = scenarios[0].model_dump(mode="json", exclude_none=True)
     every = sha256()
-    for one in scenarios:
-        every.update(_json(one.model_dump(mode="json", exclude_none=True)))
-    found = {
+    for scenario in scenarios:
+        every.update(_json(scenario.model_dump(mode="json", exclude_none=True)))
+    study = {
         "study": kind,
         **options,
         "scenario": first,
         "scenarios": every.hexdigest(),
-        "secrets": [sha256(Path(one).read_bytes()).hexdigest() for one in secrets],
+        "secrets": [sha256(Path(scenario).read_bytes()).hexdigest() for scenario in secrets],
         "made_with": made_with(first),
     }
-    plain: Study = json.loads(json.dumps(found, default=str))
+    plain: Study = json.loads(json.dumps(study, default=str))
     return plain
 
 
@@ -106,7 +106,7 @@ def kept_tasks(folder: Path, study: Study, resume: bool) -> Iterator[KeptTasks]:
 def _check(folder: Path, study: Study) -> None:
     """Raise UsageError unless a folder has this study, and no process works in it."""
     try:
-        found = json.loads((folder / KEPT / _STUDY).read_text(encoding="utf-8"))
+        kept = json.loads((folder / KEPT / _STUDY).read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise UsageError(
             f"{folder} has no interrupted study: there is no {KEPT}/{_STUDY} in it, so its study is complete, or is not one "
@@ -114,25 +114,25 @@ def _check(folder: Path, study: Study) -> None:
         ) from None
     except (OSError, ValueError) as error:
         raise UsageError(f"{folder / KEPT / _STUDY} cannot be read ({error}); give another folder") from error
-    if found != study:
+    if kept != study:
         raise UsageError(
-            f"{folder} has another study: {'; '.join(_differences(found, study))}; give the same scenario and options, or "
+            f"{folder} has another study: {'; '.join(_differences(kept, study))}; give the same scenario and options, or "
             "another folder"
         )
     if goes_on(folder):
         raise UsageError(f"{folder} belongs to a run in progress; wait for its end, or give another folder")
 
 
-def _differences(found: Any, ours: Any, path: str = "") -> list[str]:
+def _differences(schema: Any, ours: Any, path: str = "") -> list[str]:
     """The first entries in which two studies differ."""
-    if not (isinstance(found, dict) and isinstance(ours, dict)):
-        return [f"{path.removeprefix('scenario.') or 'it'} is {_short(found)} there and {_short(ours)} here"]
+    if not (isinstance(schema, dict) and isinstance(ours, dict)):
+        return [f"{path.removeprefix('scenario.') or 'it'} is {_short(schema)} there and {_short(ours)} here"]
     lines: list[str] = []
-    for name in dict.fromkeys([*ours, *found]):
+    for name in dict.fromkeys([*ours, *schema]):
         if name == "scenarios" and (lines or not path):  # a hash says less than an entry does
             continue
-        if found.get(name) != ours.get(name):
-            lines += _differences(found.get(name), ours.get(name), f"{path}.{name}" if path else name)
+        if schema.get(name) != ours.get(name):
+            lines += _differences(schema.get(name), ours.get(name), f"{path}.{name}" if path else name)
     return lines[:_MOST_NAMED] or ["a scenario differs"]
 
 
@@ -185,12 +185,12 @@ class KeptTasks:
 
     def ranges(self, task: Task[Any]) -> list[range]:
         """The trials of the kept tasks that differ from this one in their trials only, in order."""
-        found = []
+        ranges = []
         for name in self._files:
             match = _NAME.fullmatch(name)
             if match is not None and match[1] == self._digest(task):
-                found.append(range(int(match[2]), int(match[3])))
-        return sorted(found, key=lambda one: one.start)
+                ranges.append(range(int(match[2]), int(match[3])))
+        return sorted(ranges, key=lambda trials: trials.start)
 
     def has(self, task: Task[Any]) -> bool:
         """Whether a task is kept; one whose file is damaged is forgotten, which is said on standard error."""
@@ -213,12 +213,12 @@ class KeptTasks:
         try:
             if content is None:
                 raise NotData("it is damaged")
-            found: R = unpacked(_inflated(content), self._examples[digest])
+            result: R = unpacked(_inflated(content), self._examples[digest])
         except (NotData, pa.ArrowException, OSError) as error:
             raise RunError(
                 f"{self._held.now / name} cannot be used ({error}); remove this file and resume again"
             ) from error
-        return found
+        return result
 
     def keep(self, task: Task[R], result: R) -> None:
         """Write a task's result; the file is complete at any moment. A result that is not data is left out. Raises OSError."""
@@ -275,30 +275,30 @@ class KeptTasks:
 
     def _digest(self, task: Task[Any]) -> str:
         """What a task computes, but for its trials."""
-        options = {one.name: getattr(task, one.name) for one in fields(task) if one.name not in _OF_TRIALS}
+        options = {option.name: getattr(task, option.name) for option in fields(task) if option.name not in _OF_TRIALS}
         key = (
             id(task.scenario),
             type(task),
             *options.values(),
         )  # the tasks of a scenario share its table, which may be large
         if key not in self._digests:
-            what = [type(task).__qualname__, options, task.scenario]
-            self._digests[key] = task.scenario, sha256(_json(what)).hexdigest()[:32]
+            content = [type(task).__qualname__, options, task.scenario]
+            self._digests[key] = task.scenario, sha256(_json(content)).hexdigest()[:32]
         return self._digests[key][1]
 
 
 def _seconds(place: Path) -> float:
     """How long a study had been worked on when its last task was kept; 0 if that is not known."""
     try:
-        found = json.loads((place / _SECONDS).read_text(encoding="ascii"))
+        seconds = json.loads((place / _SECONDS).read_text(encoding="ascii"))
     except (OSError, ValueError):
         return 0.0
-    return found if isinstance(found, float) and 0.0 <= found < math.inf else 0.0
+    return seconds if isinstance(seconds, float) and 0.0 <= seconds < math.inf else 0.0
 
 
 def _inflated(content: bytes) -> bytes:
     size = int.from_bytes(content[:8], "little")
     if size > _MOST_BYTES:
         raise NotData(f"it has {size} bytes")
-    found: bytes = pa.Codec("zstd").decompress(content[8:], size, asbytes=True)
-    return found
+    inflated: bytes = pa.Codec("zstd").decompress(content[8:], size, asbytes=True)
+    return inflated

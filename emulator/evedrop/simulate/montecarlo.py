@@ -278,10 +278,10 @@ def _check_scheme(scenario: Scenario, mode: Mode) -> None:
         "acts on acknowledgements": scheme.needs_acknowledgements,
         "may stay silent": scheme.may_be_silent,
     }
-    for what, so in reasons.items():
+    for does, so in reasons.items():
         if so:
             raise UsageError(
-                f"--{mode.value} follows events, not packets, and the scheme {name} {what}; leave --{mode.value} out"
+                f"--{mode.value} follows events, not packets, and the scheme {name} {does}; leave --{mode.value} out"
             )
     for receiver, table in scenario.eavesdroppers.items():
         follows = STRATEGIES[table.strategy].follows_gamma(table.parameters)
@@ -358,7 +358,7 @@ class Merger:
             for start in range(0, recorded.trials, BLOCK_TRIALS):  # the order of rows does not depend on the tasks
                 slots = recorded.part(slice(start, start + BLOCK_TRIALS))
                 writer.input_rows(slots, result.start + start)
-                errors = {name: squared_errors(slots.x, one.x_hat) for name, one in slots.receivers.items()}
+                errors = {name: squared_errors(slots.x, receiver.x_hat) for name, receiver in slots.receivers.items()}
                 writer.trial_rows(slots, errors, result.start + start)
 
     def _add_digests(self, start: int, digests: Mapping[str, Mapping[int, Any]], writer: ResultsWriter | None) -> None:

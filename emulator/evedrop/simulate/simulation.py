@@ -121,7 +121,10 @@ class Simulation:
         slots = self._batch.slots
         names = tuple(self._receivers)
         schedules = {name: self._scenario.schedule(name) for name in names}
-        links = {name: LinkCore(one, name, self._keys.link(name, one), self._batch) for name, one in schedules.items()}
+        links = {
+            name: LinkCore(schedule, name, self._keys.link(name, schedule), self._batch)
+            for name, schedule in schedules.items()
+        }
         play = {
             Mode.EXACT: self._exact,
             Mode.ERROR_COORDINATES: self._error_coordinates,
@@ -157,8 +160,10 @@ class Simulation:
 
     def learned(self) -> dict[str, Mapping[str, Floats]]:
         """Eavesdropper → what it has learned of the process after the last chunk, as `Eavesdropper.learned`; in exact mode."""
-        found = {name: one.learned(self._exact_simulation.belief(name)) for name, one in self._strategies.items()}
-        return {name: one for name, one in found.items() if one}
+        learned = {
+            name: values.learned(self._exact_simulation.belief(name)) for name, values in self._strategies.items()
+        }
+        return {name: values for name, values in learned.items() if values}
 
     def _error_coordinates(self) -> Callable[[range, Mapping[str, LinkCore]], Chunk]:
         n, trials = self._process.n, self._batch.trials
@@ -176,7 +181,7 @@ class Simulation:
                 nu, w = self._nu(k), noise.block(range(k, k + 1))[0]
                 if trajectory is not None:
                     trajectory.advance()
-                for name, action, one in self._acts(k, row, measured, delivered):
+                for name, action, values in self._acts(k, row, measured, delivered):
                     errors[name] = update.error(
                         self._process,
                         errors[name],
@@ -186,8 +191,8 @@ class Simulation:
                         lambda k=k: trajectory.predicted - self._chi(k),  # type: ignore[misc, union-attr]
                     )
                     covariances[name] = update.believed_covariance(self._process, k, covariances[name], action)
-                    one.error[row] = (errors[name] * errors[name]).sum(axis=0)
-                    one.trace[row] = trace_of(covariances[name])
+                    values.error[row] = (errors[name] * errors[name]).sum(axis=0)
+                    values.trace[row] = trace_of(covariances[name])
             return Chunk(chunk.start, measured)
 
         return play
@@ -248,13 +253,13 @@ class Simulation:
 
     def _misled(self) -> set[str]:
         """Receivers that may take an innovation for the state."""
-        found = set()
+        misled = set()
         for name in self._receivers.keys() & self._scenario.eavesdroppers.keys():
             table = self._scenario.eavesdroppers[name]
             outcomes = eavesdropper_outcomes(self._scheme, table.strategy, table.parameters)
             if outcomes is not None and outcomes(1.0).misled > 0.0:
-                found.add(name)
-        return found
+                misled.add(name)
+        return misled
 
     def _blank(self, chunk: range, links: Mapping[str, LinkCore]) -> dict[str, ReceiverChunk]:
         shape = (len(chunk), self._batch.trials)
@@ -267,7 +272,7 @@ class Simulation:
         self, k: int, row: int, measured: Mapping[str, ReceiverChunk], delivered: Mapping[str, Flags]
     ) -> Iterator[tuple[str, Codes, ReceiverChunk]]:
         """Every receiver's action in slot k, from one row of `delivered` (c, R)."""
-        for name, one in measured.items():
+        for name, values in measured.items():
             action = self._act(name, self._receivers[name], k, delivered[name][row])
-            one.action[row] = action
-            yield name, action, one
+            values.action[row] = action
+            yield name, action, values

@@ -54,10 +54,10 @@ class SplitMeans:
     @property
     def doubt(self) -> str | None:
         """Why the estimate is not to be trusted; None if it is."""
-        found = self.of_populations
-        if not np.isfinite(found).all():
+        means = self.of_populations
+        if not np.isfinite(means).all():
             return "an error leaves double precision; give fewer slots"
-        mean, error = float(found.mean()), standard_error(found)
+        mean, error = float(means.mean()), standard_error(means)
         if mean == 0.0 or error is None:
             return None
         if error > _WIDEST * mean:
@@ -68,18 +68,18 @@ class SplitMeans:
 
     def estimate(self, trials: int, expected: Expectation) -> RareEstimate:
         """The entry of the summary; trials: of each population; expected: what theory expects of the receiver."""
-        found, count = self.of_populations, len(self.errors)
+        means, count = self.of_populations, len(self.errors)
         about = (count, trials, len(self.splits), self.counting)
         if (doubt := self.doubt) is not None:
             return RareEstimate(None, None, None, *about, doubt, {})
-        mean, error = float(found.mean()), standard_error(found)
-        known = expected.known and not expected.of_model
-        theory = float(expected.traces(self.errors.shape[1]).mean()) if known else None
+        mean, error = float(means.mean()), standard_error(means)
+        comparable = expected.known and not expected.of_model
+        theory = float(expected.traces(self.errors.shape[1]).mean()) if comparable else None
         slots = {
             "mean_error": self.errors.mean(axis=0).tolist(),
             "standard_error": (self.errors.std(axis=0, ddof=1) / np.sqrt(count)).tolist(),
         }
-        return RareEstimate(mean, error, z_of(found, theory), *about, None, slots)
+        return RareEstimate(mean, error, z_of(means, theory), *about, None, slots)
 
 
 @final
@@ -106,7 +106,7 @@ class Splitter:
         self._others = scenario.eavesdroppers.keys() - {receiver, jammer}
         pilots = range(_FIRST_TRIAL, _FIRST_TRIAL + _PILOTS * trials)
         chunks = (chunk.receivers[receiver] for chunk in self._simulation(pilots, OWN).chunks())
-        errors = np.concatenate([self._size(one) for one in chunks])
+        errors = np.concatenate([self._size(piece) for piece in chunks])
         self._floor = importance_floor(errors, float(np.trace(scenario.process.process.Q)))
 
     def estimated(self, populations: int = POPULATIONS) -> SplitMeans:
@@ -114,9 +114,9 @@ class Splitter:
         pilots = self._simulated(range(_PILOTS), None)
         return self._simulated(range(_PILOTS, _PILOTS + populations), pilots.splits)
 
-    def _size(self, one: ReceiverChunk) -> Floats:
+    def _size(self, chunk: ReceiverChunk) -> Floats:
         """What makes a trial important, (c, R): the error, and what the receiver believes of it where both scatter."""
-        return one.error if self._mode is Mode.COVARIANCE_ONLY else 0.5 * (one.error + one.trace)
+        return chunk.error if self._mode is Mode.COVARIANCE_ONLY else 0.5 * (chunk.error + chunk.trace)
 
     def _simulated(self, numbers: range, splits: Collection[int] | None) -> SplitMeans:
         """The estimates of the populations with these numbers; splits: after which slots; None: wherever few trials count."""
@@ -148,24 +148,24 @@ class Splitter:
     def _slots(self, simulation: Simulation, start: int) -> Iterator[tuple[int, Floats, Floats]]:
         """Each slot from `start` on, with the errors of its trials, and what makes them important, (R,)."""
         for chunk in simulation.chunks():
-            one = chunk.receivers[self._receiver]
-            sizes = self._size(one)
-            for row in range(max(0, start - chunk.first), len(one.error)):
-                yield chunk.first + row, one.error[row], sizes[row]
+            receiver = chunk.receivers[self._receiver]
+            sizes = self._size(receiver)
+            for row in range(max(0, start - chunk.first), len(receiver.error)):
+                yield chunk.first + row, receiver.error[row], sizes[row]
 
 
 def rare_estimates(
     scenario: Scenario, mode: Mode, stopped: Callable[[], bool], on_progress: Callable[[int], None]
 ) -> dict[str, RareEstimate]:
     """Receiver → its estimate, by populations that together have at least the scenario's trials; empty once `stopped`."""
-    found: dict[str, RareEstimate] = {}
+    estimates: dict[str, RareEstimate] = {}
     trials, expected = trials_of(scenario), expectations_of(scenario)
     for name in scenario.receivers:
         means = Splitter(scenario, mode, name, trials, stopped, on_progress).estimated()
         if stopped():
             return {}
-        found[name] = means.estimate(trials, expected[name])
-    return found
+        estimates[name] = means.estimate(trials, expected[name])
+    return estimates
 
 
 def trials_of(scenario: Scenario) -> int:

@@ -99,10 +99,13 @@ def tasks_of(scenario: Scenario, mode: Mode, workers: int, kept: KeptTasks | Non
     work = BLOCK_TRIALS * scenario.slots * len(scenario.receivers)
     side_by_side = max(1, min(_SIDE_BY_SIDE, _MOST_WORK // work))
     bounds, at = list[tuple[int, int]](), scenario.first_trial
-    for one in (*done, range(end, end)):
-        if one.start >= at:  # no trial twice
-            bounds += [*_split(at, one.start, workers, side_by_side), *([(one.start, one.stop)] if one else [])]
-            at = one.stop
+    for done_range in (*done, range(end, end)):
+        if done_range.start >= at:  # no trial twice
+            bounds += [
+                *_split(at, done_range.start, workers, side_by_side),
+                *([(done_range.start, done_range.stop)] if done_range else []),
+            ]
+            at = done_range.stop
     return [TrialsTask(tables, start, stop, mode) for start, stop in bounds]
 
 
@@ -139,13 +142,17 @@ def carry_out(task: TrialsTask, on_progress: OnProgress, stopped: Stopped) -> Ba
             rows = slice(block.start - task.start, block.start - task.start + block.trials)
             if chunk.slots is None:
                 _add(
-                    block, task.mode, rows, chunk, {name: one[some.start : some.stop] for name, one in expected.items()}
+                    block,
+                    task.mode,
+                    rows,
+                    chunk,
+                    {name: receiver[some.start : some.stop] for name, receiver in expected.items()},
                 )
             else:
                 _score(block, keeper, rows, chunk, chunk.slots)
-        for name, one in chunk.receivers.items():
-            result.errors[name].add_values(chunk.first, one.error)
-            result.traces[name].add_values(chunk.first, one.trace)
+        for name, receiver in chunk.receivers.items():
+            result.errors[name].add_values(chunk.first, receiver.error)
+            result.traces[name].add_values(chunk.first, receiver.trace)
         if chunk.slots is not None and recorded:
             result.recorded.append(chunk.slots.part(slice(0, recorded)).copied())
         on_progress(len(trials) * count)
@@ -167,7 +174,7 @@ def _empty_block(
     """A block that begins with this trial, and the keeper of its score; expected: receiver → its expected traces, (slots,)."""
     names = scenario.receivers
     trials = min(BLOCK_TRIALS, task.stop - start)
-    keeper = Scorekeeper(scenario, trials, {name: KnownTraces(one) for name, one in expected.items()})
+    keeper = Scorekeeper(scenario, trials, {name: KnownTraces(traces) for name, traces in expected.items()})
     block = TrialBlock(
         start,
         trials,
@@ -188,12 +195,12 @@ def _score(block: TrialBlock, keeper: Scorekeeper, rows: slice, chunk: Chunk, sl
     """
     part = slots.part(rows)
     receivers = {}
-    for name, one in part.receivers.items():
+    for name, values in part.receivers.items():
         measured = chunk.receivers[name]
         account = _account(block, name, rows, chunk)
         trace = measured.trace[:, rows]
         receivers[name] = replace(
-            one,
+            values,
             trace=np.stack([trace.sum(axis=1), (trace * trace).sum(axis=1)], axis=1),
             delivered=account.delivered,
             lost=account.lost,
@@ -201,18 +208,20 @@ def _score(block: TrialBlock, keeper: Scorekeeper, rows: slice, chunk: Chunk, sl
             unsent=account.unsent,
         )
         keeper.run_tally.tallies[name].count(account)
-    known = {name: (one.error[:, rows], one.trace[:, rows]) for name, one in chunk.receivers.items()}
-    for name, scored in keeper.add_slots(replace(part, receivers=receivers), known).items():
+    errors_and_traces = {
+        name: (values.error[:, rows], values.trace[:, rows]) for name, values in chunk.receivers.items()
+    }
+    for name, scored in keeper.add_slots(replace(part, receivers=receivers), errors_and_traces).items():
         block.sums[name].add_trials(chunk.first, scored.sums)
 
 
 @np.errstate(over="ignore")
 def _add(block: TrialBlock, mode: Mode, rows: slice, chunk: Chunk, expected: Mapping[str, Floats]) -> None:
     """Add a chunk of another mode, which has no estimates, to a block."""
-    for name, one in chunk.receivers.items():
-        error, trace, action = one.error[:, rows], one.trace[:, rows], one.action[:, rows]
+    for name, values in chunk.receivers.items():
+        error, trace, action = values.error[:, rows], values.trace[:, rows], values.action[:, rows]
         sums = slot_sums(error, action)
-        if one.error is not one.trace:
+        if values.error is not values.trace:
             sums = slot_sums(error, action, np.stack([trace.sum(axis=1), (trace * trace).sum(axis=1)], axis=1))
         block.sums[name].add_trials(chunk.first, sums)
         tally = block.run_tally.tallies[name]

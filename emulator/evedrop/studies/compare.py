@@ -96,17 +96,19 @@ def compare_all(matchups: Matchups, folder: Path, on_event: OnEvent, plan: Plan,
                         took = written - began
             except RunError as error:
                 failure = error
-        found = _comparison(matchups, played)
-        if not found.schemes:
+        comparison = _comparison(matchups, played)
+        if not comparison.schemes:
             kept.remove_unless_any()
             raise failure or kept.interrupted("a scheme was done")
-        _write(folder, found, played)
+        _write(folder, comparison, played)
         if failure is not None:
             raise failure
         if len(played) < len(groups):
-            raise Interrupted(f"interrupted; {len(found.schemes)} of {len(matchups.schemes)} schemes are in {folder}")
+            raise Interrupted(
+                f"interrupted; {len(comparison.schemes)} of {len(matchups.schemes)} schemes are in {folder}"
+            )
         kept.forget()
-    return found
+    return comparison
 
 
 def _merged(group: Group, plan: Plan, results: Iterator[BatchResult]) -> Merger:
@@ -126,7 +128,7 @@ def _comparison(matchups: Matchups, played: Sequence[tuple[Group, Merger]]) -> C
     schemes = {}
     for scheme in whole:
         groups = [(group, merger) for group, merger in played if group.scheme == scheme]
-        cells = {one.adversary: Cell(one) for one in matchups.undefined if one.scheme == scheme}
+        cells = {match.adversary: Cell(match) for match in matchups.undefined if match.scheme == scheme}
         for group, merger in groups:
             cells |= _cells(group, merger.run_tally.tallies)
         scenario, merger = groups[0][0].scenario, groups[0][1]
@@ -147,10 +149,12 @@ def _comparison(matchups: Matchups, played: Sequence[tuple[Group, Merger]]) -> C
 def _cells(group: Group, totals: Mapping[str, Tally]) -> dict[str, Cell]:
     expected = expectations_of(group.scenario)
     measured = {name: _measured(group.scenario, name, tally, expected[name]) for name, tally in totals.items()}
-    secrecy = {one.eavesdropper: one for one in verdicts(group.scenario, totals)}
+    secrecy = {estimate.eavesdropper: estimate for estimate in verdicts(group.scenario, totals)}
     return {
-        one.adversary: Cell(one, measured[LEGITIMATE], measured[one.receiver], secrecy[one.receiver])
-        for one in group.matches
+        estimate.adversary: Cell(
+            estimate, measured[LEGITIMATE], measured[estimate.receiver], secrecy[estimate.receiver]
+        )
+        for estimate in group.matches
     }
 
 
@@ -167,8 +171,8 @@ def _needs(scenario: Scenario, packets: PacketTally) -> Needs:
         scheme.needs_acknowledgements,
         scheme.payload_bits,
         scheme.header_bits,
-        **{name: float(np.mean(one)) for name, one in of_trials.items()},
-        standard_errors={name: standard_error(one) for name, one in of_trials.items()},
+        **{name: float(np.mean(values)) for name, values in of_trials.items()},
+        standard_errors={name: standard_error(values) for name, values in of_trials.items()},
         secret_bits_per_slot=scheme.secret_bits,
         initial_secret_bits=scheme.initial_secret_bits,
     )
@@ -206,34 +210,34 @@ def _measured(scenario: Scenario, receiver: str, tally: Tally, expected: Expecta
 
 def _theory(scenario: Scenario, receiver: str, expected: Expectation) -> Theory | None:
     """The theory of a receiver: its error, or a lower bound for receivers of its kind; None if neither is known."""
-    known = expected if expected.known else expected.bound
-    if known is not None:
-        traces = known.traces(scenario.slots)
-        return Theory(float(np.mean(traces)), float(traces[-1]), known.limit, known is not expected)
+    usable = expected if expected.known else expected.bound
+    if usable is not None:
+        traces = usable.traces(scenario.slots)
+        return Theory(float(np.mean(traces)), float(traces[-1]), usable.limit, usable is not expected)
     if receiver == LEGITIMATE or receiver in scenario.leaks or expected.assumed:
         return None
-    found = scheme_of(scenario.process.process, scenario.encoding.spec).error_floor(scenario.slots)
-    if found is None:
+    scenario_theory = scheme_of(scenario.process.process, scenario.encoding.spec).error_floor(scenario.slots)
+    if scenario_theory is None:
         return None
-    floor, grows = found
+    floor, grows = scenario_theory
     return Theory(float(np.mean(floor)), float(floor[-1]), math.inf if grows else None, True)
 
 
-def _write(folder: Path, found: Comparison, played: Sequence[tuple[Group, Merger]]) -> None:
+def _write(folder: Path, reproduction: Comparison, played: Sequence[tuple[Group, Merger]]) -> None:
     from evedrop.show.view.comparison_picture import draw  # noqa: PLC0415 - matplotlib takes half a second
 
     with disk_errors(folder):
-        _write_found(folder, found)
+        _write_found(folder, reproduction)
         scenarios = folder / "scenarios"
         make_private(scenarios)
         for group, _ in played:
             write_private(scenarios / f"{group.name}.toml", resolved(group.scenario))
             for name, text in input_texts(group.scenario).items():
                 write_private(scenarios / name, text)
-        draw(private_pictures(folder / "compare"), found)
+        draw(private_pictures(folder / "compare"), reproduction)
 
 
-def _write_found(folder: Path, found: Comparison) -> None:
+def _write_found(folder: Path, result: Comparison) -> None:
     """Write compare.json with the schemes so far, if there are any; replaces the file atomically."""
-    if found.schemes:
-        replace_private(folder / "compare.json", found.as_json() + "\n")
+    if result.schemes:
+        replace_private(folder / "compare.json", result.as_json() + "\n")

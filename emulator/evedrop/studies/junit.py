@@ -26,21 +26,21 @@ def write_junit(path: Path, tested: Sequence[Finding], started: float) -> None:
 
 def junit_of(tested: Sequence[Finding], started: float) -> bytes:
     """The report: one test suite, with a test case for each scenario. A failed expectation is a failure, all else an error."""
-    failures = sum(one.outcome is Outcome.FAILED for one in tested)
-    errors = sum(one.outcome in {Outcome.MISTAKES, Outcome.BROKEN} for one in tested)
+    failures = sum(finding.outcome is Outcome.FAILED for finding in tested)
+    errors = sum(finding.outcome in {Outcome.MISTAKES, Outcome.BROKEN} for finding in tested)
     counts = {
         "name": "evedrop",
         "tests": str(len(tested)),
         "failures": str(failures),
         "errors": str(errors),
         "skipped": "0",
-        "time": f"{sum(one.seconds for one in tested):.3f}",
+        "time": f"{sum(finding.seconds for finding in tested):.3f}",
     }
     suites = ET.Element("testsuites", counts)
     when = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(started))
     suite = ET.SubElement(suites, "testsuite", {**counts, "timestamp": when})
-    for one in tested:
-        _add(suite, one)
+    for finding in tested:
+        _add(suite, finding)
     ET.indent(suites, " ")
     return bytes(ET.tostring(suites, encoding="utf-8", xml_declaration=True)) + b"\n"
 
@@ -53,14 +53,14 @@ def _add(suite: ET.Element, tested: Finding) -> None:
         "testcase",
         {"classname": printable(where), "name": printable(path.stem), "time": f"{tested.seconds:.3f}"},
     )
-    known = {"seed": tested.seed, "results": tested.folder, "report": tested.report}
-    if any(value is not None for value in known.values()):
+    attributes = {"seed": tested.seed, "results": tested.folder, "report": tested.report}
+    if any(value is not None for value in attributes.values()):
         properties = ET.SubElement(case, "properties")
-        for name, value in known.items():
+        for name, value in attributes.items():
             if value is not None:
                 ET.SubElement(properties, "property", {"name": name, "value": printable(str(value))})
     if tested.outcome is not Outcome.PASSED:
         kind = "failure" if tested.outcome is Outcome.FAILED else "error"
         message = tested.reasons[0] if tested.reasons else ""
-        said = ET.SubElement(case, kind, {"message": printable(message), "type": tested.outcome.name.lower()})
-        said.text = printable("\n".join(tested.reasons))
+        failure = ET.SubElement(case, kind, {"message": printable(message), "type": tested.outcome.name.lower()})
+        failure.text = printable("\n".join(tested.reasons))

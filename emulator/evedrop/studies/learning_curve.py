@@ -127,8 +127,8 @@ class _LearningTask(Task[_Part]):
         """Simulate the trials. Raises UsageError if no eavesdropper learns."""
         scenario = Scenario.read(self.scenario)
         windows = _windows(scenario)
-        found = _measured(scenario, range(self.start, self.stop), windows, on_progress, stopped)
-        return _Part(found, len(found) == len(windows))
+        measured = _measured(scenario, range(self.start, self.stop), windows, on_progress, stopped)
+        return _Part(measured, len(measured) == len(windows))
 
     def example(self) -> _Part:
         """A part with one window, of no receivers."""
@@ -142,31 +142,31 @@ def _measured(
     simulation = Simulation(scenario, trials, stops=[stop for _, stop in windows])
     process = scenario.process.process
     truth = {"A": process.A, "Q": process.Q, "mu_d": np.array(scenario.encoding.mu_d)}
-    found: list[_Measured] = []
+    measured: list[_Measured] = []
     sums: dict[str, Floats] = {}
     for chunk in simulation.chunks():
         count = 0
-        for name, one in chunk.receivers.items():
-            count = len(one.error)
-            sums[name] = _added(one.error, sums.get(name, np.zeros(len(trials))))
-        first, stop = windows[len(found)]
+        for name, receiver in chunk.receivers.items():
+            count = len(receiver.error)
+            sums[name] = _added(receiver.error, sums.get(name, np.zeros(len(trials))))
+        first, stop = windows[len(measured)]
         if chunk.first + count == stop:
             off = {
-                name: {key: _relative(values, truth[key]) for key, values in one.items()}
-                for name, one in simulation.learned().items()
+                name: {key: _relative(values, truth[key]) for key, values in receiver.items()}
+                for name, receiver in simulation.learned().items()
             }
-            found.append(_Measured(off, {name: total / (stop - first) for name, total in sums.items()}))
+            measured.append(_Measured(off, {name: total / (stop - first) for name, total in sums.items()}))
             sums = {}
         on_progress(count * len(trials))
         if stopped():
             break
-    return found
+    return measured
 
 
-def _relative(found: Floats, truth: Floats) -> Floats:
+def _relative(estimates: Floats, truth: Floats) -> Floats:
     """|found − truth| / |truth| of every trial: found (…, R) → (R,)."""
-    away = (found - truth[..., None]) ** 2
-    off: Floats = np.sqrt(_added(away.reshape(-1, found.shape[-1]), np.zeros(found.shape[-1])))
+    away = (estimates - truth[..., None]) ** 2
+    off: Floats = np.sqrt(_added(away.reshape(-1, estimates.shape[-1]), np.zeros(estimates.shape[-1])))
     return off / float(np.linalg.norm(truth))
 
 

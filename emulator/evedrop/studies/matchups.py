@@ -113,7 +113,7 @@ def matchups_of(
         matches = [_match(scenario, scheme, name) for name in chosen[1]]
         encoding = _encoding(scenario, scheme, parameters or {})
         for attack in ("none", *ATTACKERS.values()):
-            some = tuple(one for one in matches if one.not_defined is None and one.attack == attack)
+            some = tuple(pair for pair in matches if pair.not_defined is None and pair.attack == attack)
             if not some and attack != "none":
                 continue
             try:
@@ -152,44 +152,44 @@ def _unusable(scenario: Scenario, encoding: Tables) -> tuple[str, ...]:
 def _chosen(
     schemes: Sequence[str] | None, adversaries: Sequence[str] | None, parameters: Mapping[str, Any]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    found: list[str] = []
+    mistakes: list[str] = []
     chosen = []
-    for what, names, known in (("scheme", schemes, tuple(SCHEMES)), ("adversary", adversaries, adversaries_of())):
-        wanted = known if names is None else tuple(dict.fromkeys(names))
-        found += _strange(what, wanted, known, SCHEMES if what == "scheme" else STRATEGIES)
+    for kind, names, available in (("scheme", schemes, tuple(SCHEMES)), ("adversary", adversaries, adversaries_of())):
+        wanted = available if names is None else tuple(dict.fromkeys(names))
+        mistakes += _strange(kind, wanted, available, SCHEMES if kind == "scheme" else STRATEGIES)
         if not wanted:
-            found.append(f"no {what} is named; expected {listed(known)}")
+            mistakes.append(f"no {kind} is named; expected {listed(available)}")
         chosen.append(wanted)
     receivers = {name: receiver_name(name) for name in chosen[1]}
     for name, receiver in receivers.items():
         other = next(one for one, its in receivers.items() if its == receiver)
         if other != name:
-            found.append(
+            mistakes.append(
                 f"{name} and {other} would both be called {receiver} in a scenario; compare them one after the other"
             )
     entries = {one: SCHEMES[one].parameters for one in (*SCHEMES, *chosen[0]) if one in SCHEMES}
     for key in parameters:
         scheme, _, name = key.rpartition(".")
         if name not in entries.get(scheme, ()):
-            parts = [f"{one}.{entry}" for one, known in entries.items() for entry in known]
-            found.append(f"{key} is not a parameter of a scheme; expected {listed(parts)}{near(key, parts)}")
-    if found:
-        raise UsageError("\n  ".join(["nothing was compared:", *found]))
+            parts = [f"{one}.{entry}" for one, available in entries.items() for entry in available]
+            mistakes.append(f"{key} is not a parameter of a scheme; expected {listed(parts)}{near(key, parts)}")
+    if mistakes:
+        raise UsageError("\n  ".join(["nothing was compared:", *mistakes]))
     return chosen[0], chosen[1]
 
 
-def _strange(what: str, names: Iterable[str], known: Sequence[str], registry: Registry[Any]) -> list[str]:
+def _strange(kind: str, names: Iterable[str], available: Sequence[str], registry: Registry[Any]) -> list[str]:
     """What is wrong with names of schemes or adversaries; each may be a class of a plug-in."""
-    found = []
+    mistakes = []
     for name in names:
-        if name in known:
+        if name in available:
             continue
         try:
             _ = registry[name]
         except NotRegistered as error:
-            why = error.why or f"; expected {listed(known)}{near(name, known)}"
-            found.append(f"{name or 'nothing'} is not {'an' if what == 'adversary' else 'a'} {what}{why}")
-    return found
+            why = error.why or f"; expected {listed(available)}{near(name, available)}"
+            mistakes.append(f"{name or 'nothing'} is not {'an' if kind == 'adversary' else 'a'} {kind}{why}")
+    return mistakes
 
 
 def _match(scenario: Scenario, scheme: str, adversary: str) -> Match:
@@ -202,8 +202,8 @@ def _match(scenario: Scenario, scheme: str, adversary: str) -> Match:
         return Match(scheme, adversary, not_defined=why)
     table = _eavesdropper(scenario, scheme, strategy)
     parameters = {name: value for name, value in table.items() if name not in ("strategy", "link", "links", "window")}
-    for one in (strategy, table.get("reads_as")):
-        for reason in () if one is None else unsuited(scenario.process, scenario.plant, one):
+    for class_name in (strategy, table.get("reads_as")):
+        for reason in () if class_name is None else unsuited(scenario.process, scenario.plant, class_name):
             return Match(scheme, adversary, not_defined=reason.why)
     lacking = lacking_streams(STRATEGIES[strategy].streams(parameters), SCHEMES[scheme])
     if lacking:
@@ -230,7 +230,7 @@ def _scenario(scenario: Scenario, encoding: Tables, attack: str, matches: Sequen
     tables |= {
         "title": f"{scenario.title} ({scheme}{under})",
         "encoding": encoding,
-        "eavesdroppers": {one.receiver: _eavesdropper(scenario, scheme, str(one.strategy)) for one in matches},
+        "eavesdroppers": {match.receiver: _eavesdropper(scenario, scheme, str(match.strategy)) for match in matches},
         "event": [
             table
             for event, table in zip(scenario.event, tables["event"], strict=True)

@@ -60,18 +60,18 @@ def all_results(
             kept = stack.enter_context(kept_tasks(place.folder, study_of(kind, {}, [scenario]), place.resume))
             stack.enter_context(disk_errors(place.folder))
         with closing(crew.results(tasks, on_progress, stop.is_set, kept)) as results:
-            found = [result for result in results if result.complete]
-        if len(found) < len(tasks):
+            complete = [result for result in results if result.complete]
+        if len(complete) < len(tasks):
             if kept is None:
                 raise Interrupted("interrupted before all trials were done; nothing was kept")
             kept.remove_unless_any()
             raise kept.interrupted("all trials were done")
-        yield found
+        yield complete
         if kept is not None:
             kept.forget()
 
 
-def write_found(place: StudyPlace | None, name: str, found: object) -> None:
+def write_found(place: StudyPlace | None, name: str, result: object) -> None:
     """Write what a study found to a file of its results folder, as JSON; nothing without a folder. Raises OSError."""
     if place is not None:
-        replace_private(place.folder / name, json.dumps(found, ensure_ascii=False, indent=1) + "\n")
+        replace_private(place.folder / name, json.dumps(result, ensure_ascii=False, indent=1) + "\n")

@@ -38,12 +38,12 @@ def results(scenarios: Sequence[str], manner: Manner, jobs: int) -> Iterator[Fin
     with stop_on_signals() as stop, ThreadPoolExecutor(jobs) as threads:
         waiting = [threads.submit(crew.carry_out, scenario) for scenario in scenarios]
         try:
-            for one in waiting:
-                while not wait([one], _POLL_SECONDS).done:
+            for future in waiting:
+                while not wait([future], _POLL_SECONDS).done:
                     if stop.is_set():
                         raise _interrupted(manner)
                     crew.kill_suspended()
-                yield one.result()
+                yield future.result()
         finally:
             crew.end(waiting)
 
@@ -81,17 +81,19 @@ class _Crew:
             if self._over:
                 process.terminate()
             assert process.stdout is not None  # noqa: S101 - it was started with a pipe
-            said = process.stdout.read()
+            output = process.stdout.read()
             status = process.wait()
             del self._running[process.pid]
-        if not said:
+        if not output:
             how = f"ended with status {status}"
             if process.pid in self._suspended:
                 how = f"was suspended for {SUSPENDED_SECONDS:g} s (SIGSTOP)"
             return Finding(scenario, Outcome.BROKEN, 0.0, (f"its process {how}",))
-        found = json.loads(said)
-        places = {name: None if found[name] is None else Path(found[name]) for name in ("folder", "report")}
-        return Finding(**{**found, **places, "outcome": Outcome(found["outcome"]), "reasons": (*found["reasons"],)})
+        entries = json.loads(output)
+        places = {name: None if entries[name] is None else Path(entries[name]) for name in ("folder", "report")}
+        return Finding(
+            **{**entries, **places, "outcome": Outcome(entries["outcome"]), "reasons": (*entries["reasons"],)}
+        )
 
     def kill_suspended(self) -> None:
         """Kill a process that stays suspended."""
@@ -101,8 +103,8 @@ class _Crew:
 
     def end(self, waiting: Sequence[Future[Finding]]) -> None:
         """Start no further processes, and end the running ones, also suspended ones; kill those that do not end."""
-        for one in waiting:
-            one.cancel()
+        for future in waiting:
+            future.cancel()
         self._over = True
         for process in tuple(self._running.values()):
             process.send_signal(signal.SIGCONT)

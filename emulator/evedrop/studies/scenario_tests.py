@@ -98,19 +98,19 @@ class Finding:
 
 def scenarios_of(places: Sequence[str]) -> list[str]:
     """The scenarios in files, folders and built-in names, each once. Raises UsageError if none is found."""
-    found: dict[Path, str] = {}
+    scenarios: dict[Path, str] = {}
     for place in places:
         paths: Sequence[Path] = [Path(place)]
         if place in shipped():
-            found.setdefault(shipped()[place].resolve(), place)
+            scenarios.setdefault(shipped()[place].resolve(), place)
             continue
         if Path(place).is_dir():
             paths = list(scenarios_in(Path(place)))
         for path in paths:
-            found.setdefault(path.resolve(), str(path))
-    if not found:
+            scenarios.setdefault(path.resolve(), str(path))
+    if not scenarios:
         raise UsageError(f"no scenario in {', '.join(places)}; a scenario is a TOML file with [process] and [encoding]")
-    return list(found.values())
+    return list(scenarios.values())
 
 
 def carry_out(scenario: str, manner: Manner) -> Finding:

@@ -86,15 +86,15 @@ def secrecy_cost(
         raise UsageError(f"--trials {scenario.trials}: expected 2 or more, so that there is a standard error")
     tasks = parts_of(_CostTask, scenario, side_by_side)
     with all_results(tasks, plan or Plan(), on_progress, "cost", place) as parts:
-        found = _combined(scenario, loop, parts)
-        write_found(place, "cost.json", asdict(found))
-    return found
+        cost = _combined(scenario, loop, parts)
+        write_found(place, "cost.json", asdict(cost))
+    return cost
 
 
 def _combined(scenario: Scenario, loop: ControlledPlant, parts: Sequence[_Part]) -> SecrecyCost:
     """The cost from the power of all trials."""
     plain, truth, plain_truth = (
-        Meter.of_all(list(meters)) for meters in zip(*(one.meters for one in parts), strict=True)
+        Meter.of_all(list(meters)) for meters in zip(*(part.meters for part in parts), strict=True)
     )
     more = {
         "net_energy": plain.bought - plain.sold - (plain.other_bought - plain.other_sold),
@@ -136,26 +136,27 @@ class _CostTask(Task[_Part]):
 
 
 def _part_of(scenario: Scenario, trials: range, on_progress: OnProgress, stopped: Stopped) -> _Part:
-    found = [Meter.zero(len(trials)) for _ in range(3)]
+    meters = [Meter.zero(len(trials)) for _ in range(3)]
     tables: dict[str, Any] = scenario.model_dump(mode="json", exclude_none=True)
     alone = {**tables, "eavesdroppers": {}, "expect": []}  # eavesdroppers change nothing
     ours, plain = (
-        _powers(checked(one, scenario.title), trials) for one in (alone, {**alone, "encoding": {"scheme": "plain"}})
+        _powers(checked(changed, scenario.title), trials)
+        for changed in (alone, {**alone, "encoding": {"scheme": "plain"}})
     )
     for (power, truth), (other, other_truth) in zip(ours, plain, strict=True):
         pairs = ((power, other), (power, truth), (other, other_truth))
-        found = [meter.then(*pair) for meter, pair in zip(found, pairs, strict=True)]
+        meters = [meter.then(*pair) for meter, pair in zip(meters, pairs, strict=True)]
         on_progress(power.size)
         if stopped():
-            return _Part((found[0], found[1], found[2]), complete=False)
-    return _Part((found[0], found[1], found[2]), complete=True)
+            return _Part((meters[0], meters[1], meters[2]), complete=False)
+    return _Part((meters[0], meters[1], meters[2]), complete=True)
 
 
 def _powers(scenario: Scenario, trials: range) -> Iterator[tuple[Floats, Floats]]:
     """The application's power, and that of a controller that sees the truth, in kW, (c, R) each, some slots at a time."""
     loop = controlled_plant(scenario)
     assert loop is not None  # noqa: S101 - there is a controller
-    name, table = next(one for one in scenario.applications.items() if APPLICATIONS[one[0]].has_power)
+    name, table = next(item for item in scenario.applications.items() if APPLICATIONS[item[0]].has_power)
     feed = APPLICATIONS[name].power(loop, table, len(trials))
     assert feed is not None  # noqa: S101 - it has a power
     for chunk in Simulation(scenario, trials).chunks():
@@ -167,7 +168,9 @@ def _powers(scenario: Scenario, trials: range) -> Iterator[tuple[Floats, Floats]
 
 def _lacking() -> str:
     """Say that a scenario lacks an application that has a power, and name a scenario that does not."""
-    able = {name: one for name, one in applications_in(APPLICATIONS.names).items() if one.has_power}
-    examples = [one.example for one in able.values() if one.example is not None]
+    able = {
+        name: application for name, application in applications_in(APPLICATIONS.names).items() if application.has_power
+    }
+    examples = [application.example for application in able.values() if application.example is not None]
     hint = f"; try the scenario {' or '.join(examples)}" if examples else ""
     return f"there is no {' or '.join(able)} with a controller{hint}"

@@ -74,9 +74,9 @@ def _range(text: str, values: str) -> list[Any]:
         raise UsageError(f"--over {text}: the range is empty; expected first:last:step with the step towards last")
     if (last - first) / step >= MOST_POINTS:
         raise UsageError(f"--over {text} asks for more than {MOST_POINTS} values; take a wider step")
-    found = [first + i * step for i in range(int((last - first) / step) + 1)]
+    values_ = [first + i * step for i in range(int((last - first) / step) + 1)]
     whole = all(_WHOLE.fullmatch(value.strip()) for value in values.split(":"))
-    return [int(value) if whole else float(value) for value in found]
+    return [int(value) if whole else float(value) for value in values_]
 
 
 def sweep_over(
@@ -181,7 +181,7 @@ def _checked(
 ) -> list[tuple[Point, Scenario]]:
     """Every point with its scenario. Raises ScenarioError with the mistakes of all points."""
     points: list[Point] = [dict(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())]
-    found: list[tuple[Point, Scenario]] = []
+    checked_points: list[tuple[Point, Scenario]] = []
     mistakes: dict[str, None] = {}
     for point in points:
         try:
@@ -190,10 +190,10 @@ def _checked(
             mistakes.update(dict.fromkeys(error.mistakes))
             continue
         check_mode(scenario, plan.mode)
-        found.append((point, scenario))
+        checked_points.append((point, scenario))
     if mistakes:
         raise ScenarioError(_title(source), list(mistakes))
-    return found
+    return checked_points
 
 
 def _title(source: str | Path | Scenario) -> str:

@@ -87,14 +87,14 @@ def contents(path: Path, most: int) -> bytes:
         with opened(path) as file:
             # Asking for `most` bytes would reserve memory for all of them.
             size = os.fstat(file.fileno()).st_size
-            found = file.read(min(size, most) + 1)
-            if size < len(found) <= most:  # it has grown meanwhile
-                found += file.read(most + 1 - len(found))
+            content = file.read(min(size, most) + 1)
+            if size < len(content) <= most:  # it has grown meanwhile
+                content += file.read(most + 1 - len(content))
     except OSError as error:
         raise Unreadable(why_of(error)) from error
-    if len(found) > most:
+    if len(content) > most:
         raise Unreadable(f"it has more than {most} bytes")
-    return found
+    return content
 
 
 def text_of(path: Path, most: int) -> str:

@@ -6,10 +6,10 @@ import difflib
 from collections.abc import Iterable
 
 
-def near(found: object, names: Iterable[str], before: str = "") -> str:
+def near(word: object, names: Iterable[str], before: str = "") -> str:
     """A hint, `; did you mean NAME?`, if the value found is close to one of the names; otherwise an empty string.
 
     before: what to write before the name.
     """
-    close = difflib.get_close_matches(str(found), list(names), 1)
+    close = difflib.get_close_matches(str(word), list(names), 1)
     return f"; did you mean {before}{close[0]}?" if close else ""

@@ -41,7 +41,7 @@ def escaped(text: str) -> str:
     if text.isascii() and text.isprintable():
         return text
     return _STEERING.sub(
-        lambda found: rf"\x{ord(found[0]):02x}" if found[0] < "\xa0" else rf"\u{ord(found[0]):04x}", text
+        lambda match: rf"\x{ord(match[0]):02x}" if match[0] < "\xa0" else rf"\u{ord(match[0]):04x}", text
     )
 
 
@@ -60,7 +60,7 @@ def print_json(value: object) -> None:
     """Print a value as one line of JSON, whose content does not depend on the encoding of standard output."""
     encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
     text = json.dumps(value, ensure_ascii=codecs.lookup(encoding).name != "utf-8")
-    text = _STEERING.sub(lambda found: f"\\u{ord(found[0]):04x}", text)  # which JSON would leave as they are
+    text = _STEERING.sub(lambda match: f"\\u{ord(match[0]):04x}", text)  # which JSON would leave as they are
     sys.stdout.write(f"{text}\n")
 
 
@@ -164,7 +164,7 @@ def standard_streams() -> Iterator[Output]:
     """
     codecs.register_error(_SPELLED, _spelled)
     with contextlib.ExitStack() as stack:
-        out, err = (stack.enter_context(_unfailing(one)) for one in (sys.stdout, sys.stderr))
+        out, err = (stack.enter_context(_unfailing(stream)) for stream in (sys.stdout, sys.stderr))
         stack.enter_context(contextlib.redirect_stderr(cast(TextIO, err)))
         stack.enter_context(contextlib.redirect_stdout(cast(TextIO, out)))
         yield out
@@ -208,8 +208,8 @@ def _spelling(character: str) -> tuple[str, str]:
 
     if character in _SPELLINGS:
         return "", _SPELLINGS[character]
-    if found := _GREEK.match(unicodedata.name(character, "")):
-        return "", found[2].capitalize() if found[1] == "CAPITAL" else found[2].lower()
+    if match := _GREEK.match(unicodedata.name(character, "")):
+        return "", match[2].capitalize() if match[1] == "CAPITAL" else match[2].lower()
     how, *numbers = unicodedata.decomposition(character).split() or [""]
     if how in _MARKS and len(numbers) == 1:
         base = chr(int(numbers[0], 16))

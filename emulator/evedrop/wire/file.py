@@ -109,7 +109,7 @@ def resolved_wire(plan: WirePlan) -> str:
             "side": {name: _side_table(side) for name, side in plan.sides.items()},
             "link": [_link_table(link) for link in plan.links],
             "event": [_event_table(event) for event in plan.events],
-            "expect": [one.model_dump(exclude_none=True) for one in plan.expectations],
+            "expect": [expectation.model_dump(exclude_none=True) for expectation in plan.expectations],
         }
     )
 
@@ -174,11 +174,11 @@ def wire_event(
     """The event of a table. settings: those of each link when the event begins; first: those at the start of the wire."""
     start = table.at if table.start is None else table.start
     assert start is not None  # noqa: S101 - checked when the table was read
-    one, other = table.partition or ("", "")
+    side, other = table.partition or ("", "")
     changes = None
     if table.link is not None and table.set is not None:
         changes = changed_settings(settings[table.link], table.set, first[table.link])
-    partition = None if table.partition is None else (one, other)
+    partition = None if table.partition is None else (side, other)
     return WireEvent(start, table.to, partition, table.cut, table.link, changes, table.note)
 
 
@@ -248,7 +248,7 @@ def link_names(links: Tables) -> list[str]:
         if name is None:
             plain = f"{link.get('from')}-{link.get('to')}"
             numbered = (f"{plain}-{number}" for number in range(2, 2 * len(links) + 2))
-            name = next(one for one in (plain, *numbered) if one not in taken)
+            name = next(name_ for name_ in (plain, *numbered) if name_ not in taken)
             taken.add(name)
         names.append(str(name))
     return names
@@ -274,26 +274,26 @@ def _settings_of(links: Mapping[str, Mapping[str, Any]], name: str) -> LinkNow |
         return None
 
 
-def _tables(found: Any) -> Tables:
+def _tables(tables: Any) -> Tables:
     """The entries of a list of tables; a malformed one is empty."""
-    return [one if isinstance(one, Mapping) else {} for one in found] if isinstance(found, list) else []
+    return [table if isinstance(table, Mapping) else {} for table in tables] if isinstance(tables, list) else []
 
 
 def _endpoint_mistakes(sides: Mapping[str, Any]) -> Iterator[str]:
     """Two sides, or one side twice, at one place."""
     listens, connects = _places(sides, "listen"), _places(sides, "connect")
     round_and_round = "so that messages would go round"
-    for i, one in enumerate(listens):
-        if (other := _overlapping(one, listens[:i])) is not None:
-            same = "the same place" if one.endpoint == other.endpoint else f"the same place as {other.endpoint}"
-            yield f"{one.said}, {same} at which side {other.side} listens; expected another port"
-    for i, one in enumerate(connects):
-        if (other := _overlapping(one, listens)) is not None:
+    for i, placed in enumerate(listens):
+        if (other := _overlapping(placed, listens[:i])) is not None:
+            same = "the same place" if placed.endpoint == other.endpoint else f"the same place as {other.endpoint}"
+            yield f"{placed.said}, {same} at which side {other.side} listens; expected another port"
+    for i, placed in enumerate(connects):
+        if (other := _overlapping(placed, listens)) is not None:
             where = f"where side {other.side} of this wire listens, {round_and_round}"
-            yield f"{one.said}, {where}; expected a router outside of the wire"
-        if (other := _overlapping(one, connects[:i])) is not None:
-            why = "" if one.side == other.side else f", {round_and_round}"
-            yield f"{one.said}, the router to which side {other.side} connects{why}; expected another router"
+            yield f"{placed.said}, {where}; expected a router outside of the wire"
+        if (other := _overlapping(placed, connects[:i])) is not None:
+            why = "" if placed.side == other.side else f", {round_and_round}"
+            yield f"{placed.said}, the router to which side {other.side} connects{why}; expected another router"
 
 
 class _Placed(NamedTuple):
@@ -310,25 +310,25 @@ class _Placed(NamedTuple):
         return f"{self.path}: is {as_toml(self.endpoint)}"
 
 
-def _overlapping(one: _Placed, others: Sequence[_Placed]) -> _Placed | None:
-    return next((other for other in others if one.place.overlaps(other.place)), None)
+def _overlapping(endpoint: _Placed, others: Sequence[_Placed]) -> _Placed | None:
+    return next((other for other in others if endpoint.place.overlaps(other.place)), None)
 
 
 def _places(sides: Mapping[str, Any], entry: str) -> list[_Placed]:
-    found = []
+    places = []
     for name, side in sides.items():
         given = side.get(entry) if isinstance(side, Mapping) else None
-        several = {f".{i}": one for i, one in enumerate(given)} if isinstance(given, list) else {"": given}
+        several = {f".{i}": endpoint_ for i, endpoint_ in enumerate(given)} if isinstance(given, list) else {"": given}
         for number, endpoint in several.items():
             if isinstance(endpoint, str) and (place := place_of(endpoint)) is not None:
-                found.append(_Placed(f"side.{name}.{entry}{number}", name, endpoint, place))
-    return found
+                places.append(_Placed(f"side.{name}.{entry}{number}", name, endpoint, place))
+    return places
 
 
-def unknown(name: object, known: Sequence[str], what: str) -> str:
+def unknown(name: object, names: Sequence[str], kind: str) -> str:
     """The end of a message about a name that nothing has. what: `side` or `link`."""
-    choice = f"expected {listed(known)}" if known else f"the file has no {what}"
-    return f"is {as_toml(name)}; {choice}{near(name, known)}"
+    choice = f"expected {listed(names)}" if names else f"the file has no {kind}"
+    return f"is {as_toml(name)}; {choice}{near(name, names)}"
 
 
 def _side_mistakes(sides: Mapping[str, Any], links: Tables) -> Iterator[str]:
@@ -355,7 +355,7 @@ def _correlation_mistakes(links: Tables) -> Iterator[str]:
         if not isinstance(other, str):
             continue
         path = f"link.{i}.correlation.with"
-        others = [one for one in names if one != name]
+        others = [link_ for link_ in names if link_ != name]
         if other not in others:
             yield f"{path}: {unknown(other, others, 'other link')}"
             continue
@@ -400,7 +400,7 @@ def wire_lines(plan: WirePlan) -> Iterator[str]:
     """The sides, and the links in the order in which they are tried."""
     width = max(len(name) for name in (*plan.sides, *(link.name for link in plan.links)))
     for side in plan.sides.values():
-        where = [*side.listen, *(f"connects to {one}" for one in side.connect)]
+        where = [*side.listen, *(f"connects to {endpoint}" for endpoint in side.connect)]
         yield f"side  {side.name:<{width}}  {', '.join(where)}{_guards(side)}"
     for link in plan.links:
         tap = " (tap)" if link.tap else ""
@@ -464,14 +464,14 @@ def _effects(link: WireLink) -> str:
 
 def _guards(side: Side) -> str:
     """Who may use a side, if not every client that can reach it."""
-    said = [] if side.users is None else [f"users {', '.join(side.users)}"]
+    guards = [] if side.users is None else [f"users {', '.join(side.users)}"]
     if side.tls is not None and side.tls.authority is not None:
-        said.append("certificates required")
+        guards.append("certificates required")
     if side.keys != ("**",):
-        said.append(f"only {', '.join(side.keys)}")
+        guards.append(f"only {', '.join(side.keys)}")
     if side.peers:
-        said.append("mode peer allowed")
-    return f"  ({'; '.join(said)})" if said else ""
+        guards.append("mode peer allowed")
+    return f"  ({'; '.join(guards)})" if guards else ""
 
 
 def _openness(side: Side) -> Iterator[str]:

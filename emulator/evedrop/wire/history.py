@@ -110,7 +110,12 @@ class WireHistory:
     def end(self, counts: Mapping[Numbered, int], now: float, missing: int = 0) -> None:
         """End the latest start. missing: the number of rows for which the disk had no room. Raises OSError."""
         self._write(
-            {"end": self.start, "time": now, "counts": [[*one, n] for one, n in counts.items()], "missing": missing}
+            {
+                "end": self.start,
+                "time": now,
+                "counts": [[*numbered, n] for numbered, n in counts.items()],
+                "missing": missing,
+            }
         )
 
     def changes_of(self, link: str, key: str, kind: str) -> tuple[Change, ...]:
@@ -176,10 +181,10 @@ class WireHistory:
     def _add(self, link: str, settings: Mapping[str, Any], since: Mapping[tuple[str, str], int]) -> None:
         """Settings come into force; those of a start, at the present counts of all streams."""
         str(settings["loss"]["model"])  # raises an error unless they are settings
-        known = self._settings.setdefault(link, [])
+        earlier = self._settings.setdefault(link, [])
         counted = {(key, kind): n for (name, key, kind), n in self.counts.items() if name == link}
-        if not known or known[-1].settings != settings:
-            known.append(_Settings(settings, {**counted, **since}))
+        if not earlier or earlier[-1].settings != settings:
+            earlier.append(_Settings(settings, {**counted, **since}))
             self._of_new_keys.pop(link, None)
 
 
@@ -189,9 +194,9 @@ def _changes(settings: Iterable[tuple[int, Mapping[str, Any]]]) -> tuple[Change,
     return tuple(Change(at, last[at]) for at in sorted(last))
 
 
-def _number(found: Any) -> int:
+def _number(text: Any) -> int:
     """A number of a start or a message. Raises ValueError or TypeError."""
-    number = int(found)
+    number = int(text)
     if not 0 <= number < NEVER:
         raise ValueError(number)
     return number

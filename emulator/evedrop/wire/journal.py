@@ -363,10 +363,10 @@ class WireJournal:
             except OSError:  # the records are safe where they are
                 self._convert_after = now + _PATIENCE
 
-    def _hear(self, listeners: list[Any], *what: Any) -> None:
+    def _hear(self, listeners: list[Any], *arguments: Any) -> None:
         for listener in list(listeners):
             try:
-                listener(*what)
+                listener(*arguments)
             except Exception as error:  # a broken view must not end the journal
                 listeners.remove(listener)
                 self._tell(f"{listener!r} failed and gets no more records of the journal: {error!r}")
@@ -480,14 +480,14 @@ class JournalWords:
         self._unmap()
         os.close(self._file)
 
-    def _new_code(self, what: str, text: str) -> int:
+    def _new_code(self, kind: str, text: str) -> int:
         with self._naming:
-            codes, texts = self._codes[what], self._texts[what]
+            codes, texts = self._codes[kind], self._texts[kind]
             code = codes.get(text)
             if code is None:
                 code = len(texts)
                 texts.append(text)
-                self._write(f'["{what}", {code}, {json.dumps(text)}]\n'.encode())
+                self._write(f'["{kind}", {code}, {json.dumps(text)}]\n'.encode())
                 codes[text] = code  # last, because other threads read it without the lock
             return code
 
@@ -526,8 +526,8 @@ def words_in(unfinished: Path, start: int, links: list[str]) -> Words:
     with contextlib.suppress(FileNotFoundError):
         for line in _path(unfinished, start).read_bytes().splitlines():
             with contextlib.suppress(ValueError, TypeError, OverflowError, RecursionError):  # the last line may be torn
-                what, code, text = json.loads(line)
-                (words.keys if what == "key" else words.sources)[int(code)] = (
+                kind, code, text = json.loads(line)
+                (words.keys if kind == "key" else words.sources)[int(code)] = (
                     str(text).encode("utf-8", "replace").decode()
                 )
     return words
@@ -775,8 +775,8 @@ def unfinished_table(path: Path, links: Mapping[int, list[str]], killed: bool) -
 
 def part_names(journal: Path) -> list[str]:
     """The names of all parts of a journal, such as 001-0002 for the second part of the first start, in order."""
-    found = {path.stem for path in (*journal.glob("*.parquet"), *(journal / UNFINISHED).glob("*.rows"))}
-    parts = [name for name in found if re.fullmatch(r"\d{3,}-\d{4,}", name)]  # a user may keep files of others there
+    names_ = {path.stem for path in (*journal.glob("*.parquet"), *(journal / UNFINISHED).glob("*.rows"))}
+    parts = [name for name in names_ if re.fullmatch(r"\d{3,}-\d{4,}", name)]  # a user may keep files of others there
     return sorted(parts, key=lambda name: [int(number) for number in name.split("-")])
 
 

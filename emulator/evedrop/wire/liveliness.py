@@ -120,13 +120,13 @@ class LivelinessRelay:
 
     def _lives(self, name: str, key: str) -> bool:
         """Whether a token lives at a side at which the wire does not hold it: then a program there does."""
-        found, over = threading.Event(), threading.Event()
+        seen, over = threading.Event(), threading.Event()
 
         def take(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
-                found.set()
+                seen.set()
 
         handler = zenoh.handlers.Callback(take, drop=over.set, indirect=False)
         self._sides[name].session.liveliness().get(key, handler, timeout=_ANSWER_SECONDS)
         over.wait(_ANSWER_SECONDS)
-        return found.is_set()
+        return seen.is_set()

@@ -143,31 +143,31 @@ class Neighbours:
         programs, routers = {}, {}
         for name, side in self._sides.items():
             transports = side.session.info.transports()
-            programs[name] = {str(one.zid) for one in transports if one.whatami != zenoh.WhatAmI.ROUTER}
-            routers[name] = {str(one.zid) for one in transports if one.whatami == zenoh.WhatAmI.ROUTER}
+            programs[name] = {str(first.zid) for first in transports if first.whatami != zenoh.WhatAmI.ROUTER}
+            routers[name] = {str(first.zid) for first in transports if first.whatami == zenoh.WhatAmI.ROUTER}
         if sum(map(bool, routers.values())) > 1:
             self._probe()
-        found = set()
-        for one, other in combinations(self._sides, 2):
-            ends = {self._sides[one].zid, self._sides[other].zid}
-            joined = (routers[one] | ends) & routers[other] | routers[one] & ends
-            if not joined and routers[one] and routers[other] and self._passes(one, other):
-                joined = routers[one] | routers[other]
+        joined_sides = set()
+        for first, second in combinations(self._sides, 2):
+            ends = {self._sides[first].zid, self._sides[second].zid}
+            joined = (routers[first] | ends) & routers[second] | routers[first] & ends
+            if not joined and routers[first] and routers[second] and self._passes(first, second):
+                joined = routers[first] | routers[second]
             for state in self._states:
-                if {state.link.source, state.link.target} == {one, other}:
+                if {state.link.source, state.link.target} == {first, second}:
                     state.looped = bool(joined)
             if joined:
-                found.add((f"router{'s' if len(joined) > 1 else ''} {', '.join(sorted(joined))}", one, other))
-            found |= {(f"program {zid}", one, other) for zid in programs[one] & programs[other]}
-        for who, one, other in sorted(found - self._told):
-            (self._bypasses.add if who.startswith("router") else self._tell)(_sentence(who, one, other))
-        for who, one, other in sorted(self._told - found):
+                joined_sides.add((f"router{'s' if len(joined) > 1 else ''} {', '.join(sorted(joined))}", first, second))
+            joined_sides |= {(f"program {zid}", first, second) for zid in programs[first] & programs[second]}
+        for who, first, second in sorted(joined_sides - self._told):
+            (self._bypasses.add if who.startswith("router") else self._tell)(_sentence(who, first, second))
+        for who, first, second in sorted(self._told - joined_sides):
             self._tell(
-                f"messages no longer pass between the sides {one} and {other} through the {who}; the links between them go on"
+                f"messages no longer pass between the sides {first} and {second} through the {who}; the links between them go on"
                 if who.startswith("router")
-                else f"the {who} is no longer connected to the sides {one} and {other}"
+                else f"the {who} is no longer connected to the sides {first} and {second}"
             )
-        self._told = found
+        self._told = joined_sides
 
     def _probe(self) -> None:
         """Send a probe at each side. Those of the last seconds still count: on a busy machine they are slow."""
@@ -188,19 +188,19 @@ class Neighbours:
 
         return heard
 
-    def _passes(self, one: str, other: str) -> bool:
+    def _passes(self, first: str, second: str) -> bool:
         """Whether messages pass between two sides outside the wire, in either direction."""
         since = time.monotonic() - _PROBE_SECONDS
-        return any(self._heard.get(way, 0.0) > since for way in ((one, other), (other, one)))
+        return any(self._heard.get(way, 0.0) > since for way in ((first, second), (second, first)))
 
 
-def _sentence(who: str, one: str, other: str) -> str:
+def _sentence(who: str, a: str, b: str) -> str:
     if who.startswith("router"):
         return (
-            f"messages pass between the sides {one} and {other} outside the wire, through the {who}, so they would go round; the "
+            f"messages pass between the sides {a} and {b} outside the wire, through the {who}, so they would go round; the "
             "links between these sides carry nothing (dropped as looped) until this way is gone"
         )
     return (
-        f"the {who} is connected to the sides {one} and {other}: it gets a message from both, and its own messages come back to "
+        f"the {who} is connected to the sides {a} and {b}: it gets a message from both, and its own messages come back to "
         "it; connect it to one side"
     )

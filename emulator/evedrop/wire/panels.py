@@ -142,7 +142,7 @@ class WirePanels:
         for path, lane in self._lanes.styles().items():
             to.log(path, lane, static=True, strict=True)
         bright = [colour(i) for i in range(len(self._names))]
-        colours = [*bright, *(dim(one, _DIM) for one in bright)]
+        colours = [*bright, *(dim(shade, _DIM) for shade in bright)]
         widths = [2.0] * len(bright) + [1.2] * len(bright)
         for path, first in ((_RATES, "heard"), (_DELAYS, "99 %")):
             names = [*self._names, *(f"{name} {first}" for name in self._names)]
@@ -152,8 +152,13 @@ class WirePanels:
     def notes(self, notices: Sequence[Notice], to: rr.RecordingStream) -> None:
         """Record lines of the events."""
         if notices:
-            texts, levels = [one.text for one in notices], [one.level for one in notices]
-            _send(to, _EVENTS, [round(one.seconds, 1) for one in notices], rr.TextLog.columns(text=texts, level=levels))
+            texts, levels = [notice.text for notice in notices], [notice.level for notice in notices]
+            _send(
+                to,
+                _EVENTS,
+                [round(notice.seconds, 1) for notice in notices],
+                rr.TextLog.columns(text=texts, level=levels),
+            )
 
     def send(self, steps: WireSteps, to: rr.RecordingStream) -> None:
         """Record the next steps."""
@@ -202,19 +207,19 @@ class WirePanels:
     def _send_lanes(self, counts: Counts, begins: Floats, to: rr.RecordingStream) -> None:
         self._send_cuts(counts, begins, to)
         states = list(LaneState)
-        codes = (np.array([states.index(state_of(one)) for one in counts[:, i]]) for i in range(len(self._names)))
+        codes = (np.array([states.index(state_of(step)) for step in counts[:, i]]) for i in range(len(self._names)))
         for path, at, words in self._lanes.changes(codes):
             _send(to, path, begins[at], words)
 
     def _send_cuts(self, counts: Counts, begins: Floats, to: rr.RecordingStream) -> None:
-        for begin, one in zip(begins, counts, strict=True):
-            self._cuts.watch(one)
+        for begin, step in zip(begins, counts, strict=True):
+            self._cuts.watch(step)
             word = ", ".join(self._cuts.cut()) or _WHOLE
             if word != self._cut_word:
                 self._cut_word = word
                 self._cut_words[word] = " " if word == _WHOLE else word
                 colours = [
-                    LaneState.QUIET.colour if one == _WHOLE else LaneState.MOST.colour for one in self._cut_words
+                    LaneState.QUIET.colour if step == _WHOLE else LaneState.MOST.colour for step in self._cut_words
                 ]
                 labels = [*self._cut_words.values()]
                 shown = rr.StateConfiguration(values=[*self._cut_words], labels=labels, colors=colours)
@@ -224,9 +229,9 @@ class WirePanels:
     def _send_graph(self, counts: Counts, ends: Floats, to: rr.RecordingStream) -> None:
         assert self._total is not None  # noqa: S101 - send makes it
         recent, texts = [], []
-        for at, one in enumerate(counts, start=1):
-            self._recent.append(one)
-            self._total = self._total + one
+        for at, step in enumerate(counts, start=1):
+            self._recent.append(step)
+            self._total = self._total + step
             if self._pace.whole or at == len(counts):  # nobody sees those in between while they come
                 recent.append(self._total if self._pace.whole else np.sum(self._recent, 0))
                 texts.append(self._table(self._total))

@@ -142,13 +142,13 @@ class PublicationRelay:
         self.backlogs: list[Backlog] = []
         """The messages of each subscription that wait for the wire."""
         self._until = math.inf
-        expressions = [zenoh.KeyExpr(one) for one in expressions_of(side.side, plan.links)]
+        expressions = [zenoh.KeyExpr(text) for text in expressions_of(side.side, plan.links)]
         self._subscribers = []
         self._threads = []
         for at, expression in enumerate(expressions):
             channel: zenoh.handlers.FifoChannel[zenoh.Sample] = zenoh.handlers.FifoChannel(WAITING)
             subscriber = side.session.declare_subscriber(expression, channel, allowed_origin=REMOTE)
-            earlier = tuple(one for one in expressions[:at] if one.intersects(expression))
+            earlier = tuple(text for text in expressions[:at] if text.intersects(expression))
             self._subscribers.append(subscriber)
             self.duties.append(Duty(f"among the messages from the side {side.name}"))
             self.backlogs.append(Backlog(subscriber.handler, WAITING))

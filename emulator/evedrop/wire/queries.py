@@ -128,15 +128,15 @@ class QueryRelay:
         if now == self._services:
             return
         self._services = now
-        found: dict[str, dict[str, zenoh.KeyExpr]] = {name: {} for name in self._sides}
+        keys: dict[str, dict[str, zenoh.KeyExpr]] = {name: {} for name in self._sides}
         for side, key in now[0]:
-            found[side][key] = zenoh.KeyExpr(key)
+            keys[side][key] = zenoh.KeyExpr(key)
         for name, session in ((name, side.session) for name, side in self._sides.items()):
             others = {state.link.target for state in self._states if state.link.source == name and not state.looped}
             wanted = {
                 key: expression
                 for other in others
-                for key, expression in found[other].items()
+                for key, expression in keys[other].items()
                 if self._link(name, other, expression) is not None
             }
             mirrored = self._mirrored[name]
@@ -176,13 +176,16 @@ class QueryRelay:
     def _responsible(self, name: str, key: zenoh.KeyExpr) -> str | None:
         """The mirrored queryable that answers for a key; None: the one for everything."""
         with self._lock:
-            return min((text for text, (one, _) in self._mirrored[name].items() if one.includes(key)), default=None)
+            return min(
+                (text for text, (expression, _) in self._mirrored[name].items() if expression.includes(key)),
+                default=None,
+            )
 
     def _ask(self, asked: _Asked) -> None:
         """Ask the other sides."""
         key = asked.query.key_expr
         complete = self._responsible(asked.side, key) is not None
-        for target in dict.fromkeys(one.link.target for one in self._states if one.link.source == asked.side):
+        for target in dict.fromkeys(state.link.target for state in self._states if state.link.source == asked.side):
             querier = self._querier(target, asked.query, asked.key, complete)
             # The matching status knows only queryables that include the key.
             if "*" not in asked.key and not _matching(querier):
@@ -224,25 +227,25 @@ class QueryRelay:
                     _Message(lambda: query.reply_err(refusal.payload, encoding=refusal.encoding), error.payload),
                 )
             return
-        found = sample
+        answer = sample
 
         def send() -> None:
-            if found.kind == zenoh.SampleKind.PUT:
+            if answer.kind == zenoh.SampleKind.PUT:
                 query.reply(
-                    found.key_expr,
-                    found.payload,
-                    encoding=found.encoding,
-                    express=found.express,
-                    attachment=found.attachment,
-                    timestamp=found.timestamp,
+                    answer.key_expr,
+                    answer.payload,
+                    encoding=answer.encoding,
+                    express=answer.express,
+                    attachment=answer.attachment,
+                    timestamp=answer.timestamp,
                 )
             else:
                 query.reply_del(
-                    found.key_expr, express=found.express, attachment=found.attachment, timestamp=found.timestamp
+                    answer.key_expr, express=answer.express, attachment=answer.attachment, timestamp=answer.timestamp
                 )
 
-        message = _Message(send, found.payload, found.attachment, found.source_info)
-        self._cross(Kind.REPLY, asked, (source, asked.side), str(found.key_expr), found.key_expr, message)
+        message = _Message(send, answer.payload, answer.attachment, answer.source_info)
+        self._cross(Kind.REPLY, asked, (source, asked.side), str(answer.key_expr), answer.key_expr, message)
 
     def _cross(
         self, kind: Kind, asked: _Asked, way: tuple[str, str], key: str, expression: zenoh.KeyExpr, message: _Message
@@ -289,8 +292,8 @@ class QueryRelay:
             asked.release()
 
     def _link(self, source: str, target: str, key: zenoh.KeyExpr) -> LinkState | None:
-        found = self._plan.link_of(source, target, key, query=True)
-        return None if found is None else self._links[found.name]
+        link = self._plan.link_of(source, target, key, query=True)
+        return None if link is None else self._links[link.name]
 
     def _decided(
         self, state: LinkState, kind: str, key: str, expression: zenoh.KeyExpr, now: float, size: int

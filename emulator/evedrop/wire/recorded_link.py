@@ -57,7 +57,7 @@ class _Reader:
     def __init__(self, folder: Path, link: str | None, key: str | None) -> None:
         """Raises UsageError or TraceError."""
         self._folder = folder
-        table = pa.concat_tables([one.select(_COLUMNS) for one in journal_tables(folder)])
+        table = pa.concat_tables([table_.select(_COLUMNS) for table_ in journal_tables(folder)])
         self._link = self._chosen(table, link)
         rows = table.filter(pc.equal(table["link"].cast(pa.string()), self._link))
         rows = rows.unify_dictionaries().combine_chunks()
@@ -72,12 +72,12 @@ class _Reader:
         name = f"{self._folder}, link {self._link}" + (f", {self._keys}" if self._keys is not None else "")
         if not self._rows.num_rows:
             self._no("has no message on this link and key")
-        found = self._before(name, longest) if gaps else self._emulated(name)
+        recording = self._before(name, longest) if gaps else self._emulated(name)
         plan = self._planned()
         if plan is None:
-            return replace(found, notes=tuple(self._notes), keys=self._keys or "**")
+            return replace(recording, notes=tuple(self._notes), keys=self._keys or "**")
         return replace(
-            found, notes=tuple(self._notes), source=plan.source, target=plan.target, keys=self._keys or plan.keys
+            recording, notes=tuple(self._notes), source=plan.source, target=plan.target, keys=self._keys or plan.keys
         )
 
     def _emulated(self, name: str) -> MessageRecording:
@@ -89,20 +89,20 @@ class _Reader:
         order = np.lexsort((n, streams))
         streams, n = streams[order], n[order]
         fates = _fates(rows)[order]
-        known = ~np.isin(fates, list(_HIDDEN))
-        hidden = int((~known).sum())
+        decided = ~np.isin(fates, list(_HIDDEN))
+        hidden = int((~decided).sum())
         if hidden:
             self._notes.append(f"{hidden} messages met a cut, a full queue or a limit before the loss model: left out")
-        if not known.any():
+        if not decided.any():
             self._no("has only messages that met a cut, a full queue or a limit before the loss model")
         follows = (np.diff(streams) == 0) & (np.diff(n) == 1)
         heard = _floats(rows["time"])[order]
-        goes_on = np.concatenate([[False], follows & known[:-1]])
+        goes_on = np.concatenate([[False], follows & decided[:-1]])
         survived = ~np.isin(fates, [WireFate.LOST])
-        delivered, corrupted = known & (fates == WireFate.DELIVERED), fates == WireFate.CORRUPTED
+        delivered, corrupted = decided & (fates == WireFate.DELIVERED), fates == WireFate.CORRUPTED
         series = MessageSeries(
-            survived[known].astype(np.uint8),
-            parts=int((known & ~goes_on).sum()),
+            survived[decided].astype(np.uint8),
+            parts=int((decided & ~goes_on).sum()),
             repeated=int((_flags(rows["again"])[order] & delivered).sum()),
             seconds=float(np.median(np.diff(heard)[follows])) if follows.any() else None,
         )
@@ -143,9 +143,9 @@ class _Reader:
     def _chosen(self, table: pa.Table, link: str | None) -> str:
         """The name of the link that was named, or of the only one with messages."""
         counts = {
-            str(one["values"]): int(one["counts"])
-            for one in pc.value_counts(table["link"].cast(pa.string())).to_pylist()
-            if one["values"] is not None
+            str(entry["values"]): int(entry["counts"])
+            for entry in pc.value_counts(table["link"].cast(pa.string())).to_pylist()
+            if entry["values"] is not None
         }
         if link is None and len(counts) == 1:
             return next(iter(counts))
@@ -182,10 +182,10 @@ class _Reader:
             words = [word_for(text) for text in texts.dictionary.to_pylist()]
             same = np.array([*(words.index(word) for word in words), len(words)], np.int64)
             columns.append(same[codes])
-        found: NDArray[np.int64] = (
+        streams: NDArray[np.int64] = (
             np.unique(np.stack(columns), axis=1, return_inverse=True)[1].reshape(-1).astype(np.int64)
         )
-        return found
+        return streams
 
     def _note_changes(self, rows: pa.Table) -> None:
         """Tell that a link did not have the same settings all the time."""
@@ -199,11 +199,11 @@ class _Reader:
         """The link in the wire's file; None if it is not there."""
         with suppress(UsageError):
             plan = load_wire(self._folder / "wire.toml")
-            return next((one for one in plan.links if one.name == self._link), None)
+            return next((link for link in plan.links if link.name == self._link), None)
         return None
 
-    def _no(self, what: str, cause: Exception | None = None) -> NoReturn:
-        raise TraceError(str(self._folder), "file", what) from cause
+    def _no(self, problem: str, cause: Exception | None = None) -> NoReturn:
+        raise TraceError(str(self._folder), "file", problem) from cause
 
 
 def _stream_of(kind: str) -> str:
@@ -221,24 +221,24 @@ def _fates(rows: pa.Table) -> NDArray[np.uint8]:
     """`WireFate` of each row."""
     by_reason = {reason: fate for fate, reason in REASONS.items()}
     texts = rows["reason"].cast(pa.string()).combine_chunks().dictionary_encode()
-    table = np.array([*(by_reason[one] for one in texts.dictionary.to_pylist()), WireFate.DELIVERED], np.uint8)
-    found: NDArray[np.uint8] = table[texts.indices.fill_null(len(table) - 1).to_numpy(zero_copy_only=False)]
-    return found
+    table = np.array([*(by_reason[text] for text in texts.dictionary.to_pylist()), WireFate.DELIVERED], np.uint8)
+    fates: NDArray[np.uint8] = table[texts.indices.fill_null(len(table) - 1).to_numpy(zero_copy_only=False)]
+    return fates
 
 
 def _numbers(column: Any) -> NDArray[np.int64]:
-    found: NDArray[np.int64] = column.to_numpy().astype(np.int64)
-    return found
+    numbers: NDArray[np.int64] = column.to_numpy().astype(np.int64)
+    return numbers
 
 
 def _floats(column: Any) -> NDArray[np.float64]:
-    found: NDArray[np.float64] = column.to_numpy().astype(np.float64)
-    return found
+    numbers: NDArray[np.float64] = column.to_numpy().astype(np.float64)
+    return numbers
 
 
 def _flags(column: Any) -> NDArray[np.bool_]:
-    found: NDArray[np.bool_] = column.to_numpy().astype(np.bool_)
-    return found
+    flags: NDArray[np.bool_] = column.to_numpy().astype(np.bool_)
+    return flags
 
 
 def _some(names: Sequence[str]) -> str:

@@ -103,23 +103,23 @@ class WireView(RecordingThread[NDArray[Any], Notice]):
             amended, self._amended = self._amended, []
         now = self._now(notes)
         self._panels.notes(notes, to)
-        found = bool(notes)
+        sent = bool(notes)
         for rows in chunks:
             timed = rows.copy()
             timed["time"] = np.minimum(rows["time"] - self._shift, now)  # rows from before the clock was set
             for steps in self._counter.add(timed):
                 self._panels.send(steps, to)
-                found = True
+                sent = True
         for rows, fate in amended:
             self._counter.amend(rows, fate)
         if self._last or not 0.0 <= now - self._sent < _BATCH:
             self._sent = now
             for steps in (*self._counter.close(now - _LATE), *(self._counter.finish() if self._last else ())):
                 self._panels.send(steps, to)
-                found = True
+                sent = True
         if self._last:
             self._panels.end(to)
-        return found or self._last
+        return sent or self._last
 
     def _now(self, notes: list[Notice]) -> float:
         """The time as if the system's clock had never been set, in seconds since 1970; adds a note when it was set."""

@@ -119,10 +119,10 @@ def next_numbers(block: NDArray[Any]) -> Iterator[tuple[int, int, Kind, int]]:
     rows = block[(block["n"] >= 0) & (block["link"] != UNLINKED)]
     link, key, kind = (rows[name].astype(np.uint64) for name in ("link", "key", "kind"))
     streams = link << np.uint64(40) | key << np.uint64(8) | kind & np.uint64(0x7F)
-    found, places = np.unique(streams, return_inverse=True)
-    numbers = np.zeros(len(found), np.int64)
+    distinct, places = np.unique(streams, return_inverse=True)
+    numbers = np.zeros(len(distinct), np.int64)
     np.maximum.at(numbers, places, rows["n"] + 1)
-    for stream, n in zip(found.tolist(), numbers.tolist(), strict=True):
+    for stream, n in zip(distinct.tolist(), numbers.tolist(), strict=True):
         yield stream >> 40, stream >> 8 & 0xFFFF_FFFF, Kind(stream & 0xFF), n
 
 
@@ -296,10 +296,10 @@ def table_of(records: Records, words: Words) -> pa.Table:
     return pa.Table.from_arrays(columns, schema=PARQUET)
 
 
-def _words(codes: NDArray[np.uint32], words: Mapping[int, str], what: str) -> pa.DictionaryArray:
+def _words(codes: NDArray[np.uint32], words: Mapping[int, str], kind: str) -> pa.DictionaryArray:
     """A dictionary column with only the words that occur; code 0 is null, and a code without a word names itself."""
-    found, places = np.unique(codes, return_inverse=True)
-    texts = [words.get(code, f"unknown {what} {code}") for code in found.tolist()]
+    distinct, places = np.unique(codes, return_inverse=True)
+    texts = [words.get(code, f"unknown {kind} {code}") for code in distinct.tolist()]
     return pa.DictionaryArray.from_arrays(
         pa.array(places.astype(np.int32), mask=codes == 0), pa.array(texts, pa.string())
     )

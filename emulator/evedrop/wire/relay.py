@@ -169,8 +169,8 @@ class WireRelay:
         """
         self._liveliness.note()
         held = self._liveliness.tokens.items()
-        found = ((side, service_key(token)) for side, tokens in held for token in tokens)
-        self._queries.update((side, key) for side, key in found if key is not None)
+        services = ((side, service_key(token)) for side, tokens in held for token in tokens)
+        self._queries.update((side, key) for side, key in services if key is not None)
         self._liveliness.mirror()
 
     def _keep_up(self) -> None:

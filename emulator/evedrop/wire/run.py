@@ -67,7 +67,7 @@ def run_wire(
         end_at_once(f"{why}; {_on_disk(out)}", status, lambda: remove_control(out))
 
     with (
-        Watchdog(lambda what: leave(f"the wire no longer answers: {what}", RunError.exit_status)) as watchdog,
+        Watchdog(lambda problem: leave(f"the wire no longer answers: {problem}", RunError.exit_status)) as watchdog,
         stop_or_leave_on_signals(lambda: leave("interrupted again", Interrupted.exit_status)) as stop,
     ):
         with live_view(plan, out, view, say) as shown, WireJournal(out, plan) as journal:
@@ -119,9 +119,9 @@ def continuation(start: int, counts: Mapping[Numbered, int]) -> str:
         return f"start {start} continues start {start - 1}, which numbered no message"
     (link, key, kind), number = max(counts.items(), key=lambda item: item[1])
     others = f", and likewise for {len(counts) - 1:,} more" if len(counts) > 1 else ""
-    what = "message" if kind == PUT else kind
+    noun = "message" if kind == PUT else kind
     return (
-        f"start {start} continues start {start - 1}: {what} {number + 1:,} of {key} on the link {link} is next{others}; for the "
+        f"start {start} continues start {start - 1}: {noun} {number + 1:,} of {key} on the link {link} is next{others}; for the "
         "fates of a first start, give another folder"
     )
 

@@ -81,7 +81,7 @@ def wire(
     else:
         side = entries.get("side")
         if isinstance(side, Sequence) and not isinstance(side, str):
-            entries["side"] = {one: {} for one in side}
+            entries["side"] = {side_name: {} for side_name in side}
         plan, name = wire_of(entries), "wire"
     folder = claimed(default_folder(f"wire-{name}")) if out is None else Path(out)
     return RunningWire(plan, folder, seconds)
@@ -153,13 +153,13 @@ class RunningWire:
         }
         return zenoh.Config.from_json5(json.dumps(settings))
 
-    def partition(self, one: str, other: str) -> None:
+    def partition(self, side: str, other: str) -> None:
         """Let nothing pass between two sides, except liveliness and lossless messages."""
-        self._steer({"partition": [one, other]})
+        self._steer({"partition": [side, other]})
 
-    def heal(self, one: str, other: str | None = None) -> None:
+    def heal(self, side: str, other: str | None = None) -> None:
         """End the partition of two sides, or the cut of a link."""
-        self._steer({"heal": one} if other is None else {"join": [one, other]})
+        self._steer({"heal": side} if other is None else {"join": [side, other]})
 
     def cut(self, link: str) -> None:
         """Let nothing pass over a link, except lossless messages."""
@@ -171,10 +171,10 @@ class RunningWire:
 
     def status(self) -> WireStatus:
         """The state of the wire now. Raises UsageError if it does not run."""
-        found = self._ask(StatusRequest()).status
-        if not isinstance(found, WireStatus):
+        status = self._ask(StatusRequest()).status
+        if not isinstance(status, WireStatus):
             raise UsageError(f"{self.folder} is the folder of a run; expected that of a wire")
-        return found
+        return status
 
     def rows(self) -> pa.Table:
         """The journal so far: a row for each message and link (docs/wire.md, the journal)."""
@@ -206,11 +206,11 @@ class RunningWire:
             raise ExpectationFailed("\n".join(lines))
 
     def _endpoints_of(self, side: str) -> Sequence[str]:
-        found = self._endpoints.get(side, ())
-        if not found:
+        places = self._endpoints.get(side, ())
+        if not places:
             sides = [name for name, endpoints in self._endpoints.items() if endpoints]
             raise UsageError(f'side "{side}": expected a side that listens: {listed(sides)}')
-        return found
+        return places
 
     def _steer(self, event: Mapping[str, Any]) -> None:
         """Let an event begin now. Raises UsageError if the wire refuses it, or does not run."""
@@ -246,8 +246,8 @@ class RunningWire:
 
     def _failure(self, status: int) -> EvedropError:
         """The error for a process that failed, in its own words."""
-        said = "".join(self._errors).strip().removeprefix("evedrop: ")
-        text = said or f"the wire in {self.folder} ended with status {status}"
+        errors = "".join(self._errors).strip().removeprefix("evedrop: ")
+        text = errors or f"the wire in {self.folder} ended with status {status}"
         return UsageError(text) if status == UsageError.exit_status else RunError(text)
 
 

@@ -45,7 +45,9 @@ def over_wire(
     links = _links(scenario, plan, key, places, wrong) if key is not None and not wrong else {}
     lossless = not wrong and key is not None and plan.is_lossless(_expression(key, wrong))
     happens = moments(plan)
-    if scenario.slot_seconds is None and (len(happens) > 1 or any("delay" in one.settings for one in links.values())):
+    if scenario.slot_seconds is None and (
+        len(happens) > 1 or any("delay" in links_.settings for links_ in links.values())
+    ):
         wrong.append(
             "its delays and events are in seconds, and the scenario has no slot_seconds; give slot_seconds = 0.1"
         )
@@ -53,7 +55,7 @@ def over_wire(
         if not lossless:
             wrong += _unusable(name, link, links, happens)
     if wrong:
-        raise UsageError("\n".join(f"--wire: {one}" for one in wrong))
+        raise UsageError("\n".join(f"--wire: {links_}" for links_ in wrong))
     made: dict[str, Any] = {}
     for name, link in links.items():
         table = LEGITIMATE if name == LEGITIMATE else f"eavesdroppers.{name}"
@@ -71,14 +73,14 @@ def _places(scenario: Scenario, plan: WirePlan, sides: Mapping[str, str], wrong:
     """Sensor and receivers → the sides that they are on."""
     processes = (SENSOR, *scenario.receivers)
     wrong += [f"{name} is not {listed(processes)}" for name in sides if name not in processes]
-    found = {name: sides.get(name, name) for name in processes}
-    for name, side in found.items():
+    places = {name: sides.get(name, name) for name in processes}
+    for name, side in places.items():
         if side not in plan.sides:
             given = f"--wire-side {name}={next(iter(plan.sides))}"
             wrong.append(
                 f"{name} is on no side of the wire, whose sides are {listed(tuple(plan.sides))}; give such as {given}"
             )
-    return found
+    return places
 
 
 def _expression(key: str, wrong: list[str]) -> zenoh.KeyExpr:
@@ -97,7 +99,7 @@ def _links(
 ) -> dict[str, WireLink]:
     """Receiver → the link of the wire that takes its packets."""
     expression = _expression(key, wrong)
-    found: dict[str, WireLink] = {}
+    tables: dict[str, WireLink] = {}
     for name in scenario.receivers if not wrong else ():
         link = plan.link_of(places[SENSOR], places[name], expression)
         if link is None:
@@ -105,8 +107,8 @@ def _links(
         elif name != LEGITIMATE and scenario.eavesdroppers[name].links is not None:
             wrong.append(f"{name} has several links, and is on one side of the wire; give it one link")
         else:
-            found[name] = link
-    return found
+            tables[name] = link
+    return tables
 
 
 def _unusable(name: str, link: WireLink, links: Mapping[str, WireLink], happens: Sequence[Moment]) -> Iterator[str]:
@@ -118,7 +120,7 @@ def _unusable(name: str, link: WireLink, links: Mapping[str, WireLink], happens:
         why = "has ordered = true, and the delays of a scenario's packets do not depend on each other; leave it out"
         yield f"{link.name}, the link of {name}, {why}"
     tie = None if link.correlation is None else link.correlation[0]
-    if tie is not None and tie not in {one.name for other, one in links.items() if other != name}:
+    if tie is not None and tie not in {link_.name for other, link_ in links.items() if other != name}:
         yield f"{link.name}, the link of {name}, is tied to {tie}, which is not the link of another receiver"
 
 
@@ -127,7 +129,7 @@ def _tie(link: WireLink, links: Mapping[str, WireLink]) -> dict[str, Any] | None
     if link.correlation is None:
         return None
     to, strength = link.correlation
-    return {"with": next(name for name, one in links.items() if one.name == to), "strength": strength}
+    return {"with": next(name for name, candidate in links.items() if candidate.name == to), "strength": strength}
 
 
 def _table(settings: Mapping[str, Any], tie: Mapping[str, Any] | None = None) -> dict[str, Any]:
@@ -141,7 +143,7 @@ def _table(settings: Mapping[str, Any], tie: Mapping[str, Any] | None = None) ->
 def _events(name: str, link: WireLink, happens: Sequence[Moment], scenario: Scenario) -> Iterator[dict[str, Any]]:
     """The events of a receiver's link: the spans in which it is cut, and its settings where they are not those of the start."""
     seconds = scenario.slot_seconds or 1.0
-    slots = [min(scenario.slots, math.ceil(one.time / seconds - _ROUNDING)) for one in happens]
+    slots = [min(scenario.slots, math.ceil(happening.time / seconds - _ROUNDING)) for happening in happens]
     spans = [
         (start, stop, moment)
         for (start, stop), moment in zip(pairwise([*slots, scenario.slots]), happens, strict=True)

@@ -197,15 +197,17 @@ class WireScorekeeper:
         1 if an expectation failed, programs could have spoken past the wire, or the journal is incomplete; 3 if a message is
         unaccounted for.
         """
-        found = self.summary()
+        summary = self.summary()
         try:
-            replace_private(out / WIRE_SUMMARY_FILE, found.text)
+            replace_private(out / WIRE_SUMMARY_FILE, summary.text)
         except OSError as error:
             warn(f"the summary of the wire cannot be written ({error})")
             return 1
-        if found.unaccounted:
+        if summary.unaccounted:
             return 3
-        return 1 if found.failed_expectations or found.bypasses or found.journal.incomplete_since is not None else 0
+        return (
+            1 if summary.failed_expectations or summary.bypasses or summary.journal.incomplete_since is not None else 0
+        )
 
     def _judged(self, table: WireExpectTable, link: WireLinkSummary) -> Judged:
         if table.link is not None:
@@ -221,7 +223,7 @@ class WireScorekeeper:
 
     def _of_link(self, link: WireLink, tally: LinkTally) -> WireLinkSummary:
         streams = list(tally.streams.values())
-        tried, passed = (sum(getattr(one, name) for one in streams) for name in ("tried", "passed"))
+        tried, passed = (sum(getattr(counts, name) for counts in streams) for name in ("tried", "passed"))
         rate = model = between = within = None
         if tried:
             shared: dict[Any, tuple[float, float]] = {}
@@ -230,7 +232,7 @@ class WireScorekeeper:
                 for stream, stream_tally in tally.streams.items()
                 if stream_tally.tried
             ]
-            mean, variance = (sum_in_order(one[i] for one in moments) for i in (0, 1))
+            mean, variance = (sum_in_order(counts[i] for counts in moments) for i in (0, 1))
             low, high = bounds(mean, variance, tried)
             rate, model, between, within = (
                 passed / tried,
@@ -254,9 +256,9 @@ class WireScorekeeper:
             expected_rate=model,
             bounds=between,
             within_bounds=within,
-            delays={level: found for level, found in quantiles.items() if found is not None},
-            gap_messages=max((one.longest for one in streams), default=0),
-            gap_seconds=max((one.silence for one in streams), default=0.0),
+            delays={level: seconds for level, seconds in quantiles.items() if seconds is not None},
+            gap_messages=max((counts.longest for counts in streams), default=0),
+            gap_seconds=max((counts.silence for counts in streams), default=0.0),
         )
 
     def _moments(
@@ -301,8 +303,8 @@ def _split(records: Records, columns: NDArray[np.int64]) -> list[Records]:
 
 def _firsts(columns: NDArray[np.int64]) -> list[list[int]]:
     """The columns of each group."""
-    found: list[list[int]] = columns[:, np.r_[0, _changes(columns)]].T.tolist()
-    return found
+    firsts: list[list[int]] = columns[:, np.r_[0, _changes(columns)]].T.tolist()
+    return firsts
 
 
 _STANDARD_DEVIATIONS = 2.5758293035489004  # of a normal variable, for 99 %

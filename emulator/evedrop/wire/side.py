@@ -107,12 +107,12 @@ def expressions_of(side: Side, links: Iterable[WireLink] = ()) -> tuple[str, ...
 
     links: whose key expressions may name further keys that `**` hides.
     """
-    found = list(side.keys)
+    expressions = list(side.keys)
     if side.keys == ("**",):
-        found += [*HIDDEN, *(link.keys for link in links if "@" in link.keys)]
+        expressions += [*HIDDEN, *(link.keys for link in links if "@" in link.keys)]
     else:
-        found += [f"{key}/@adv/**" for key in side.keys if key.endswith("**")]
-    return tuple(dict.fromkeys(found))
+        expressions += [f"{key}/@adv/**" for key in side.keys if key.endswith("**")]
+    return tuple(dict.fromkeys(expressions))
 
 
 def side_config(side: Side, largest: int, users_file: str | None) -> ZenohConfig:

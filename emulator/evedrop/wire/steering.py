@@ -88,20 +88,20 @@ class WireConductor:
         """End a cut at once; returns the line that says so. Raises ScenarioError if the link is not cut."""
         return self._now(lambda plan, now: with_cut_ended(plan, link, now))
 
-    def end_partition(self, one: str, other: str) -> str:
+    def end_partition(self, side: str, other: str) -> str:
         """End a partition at once; returns the line that says so. Raises ScenarioError if the sides are not partitioned."""
-        return self._now(lambda plan, now: with_partition_ended(plan, one, other, now))
+        return self._now(lambda plan, now: with_partition_ended(plan, side, other, now))
 
     def _now(self, change: Callable[[WirePlan, float], tuple[WirePlan, str]]) -> str:
         with self._changed:
             now = self.seconds
             self._carry_out(now)
-            self._plan, said = change(self._plan, now)
+            self._plan, text = change(self._plan, now)
             self._relay.apply(moment_at(self._plan, now))
             self._done = now
-            self._say(f"{now:.1f} s: {said}")
+            self._say(f"{now:.1f} s: {text}")
             self._changed.notify()
-            return said
+            return text
 
     def _carry_out(self, now: float) -> None:
         """Carry out the events that are due."""
@@ -117,7 +117,7 @@ class WireConductor:
         with self._changed:
             while not self._ended:
                 self._carry_out(self.seconds)
-                following = [one for one in times(self._plan) if one > self._done]
+                following = [time_ for time_ in times(self._plan) if time_ > self._done]
                 self._clock.wait(self._changed, max(0.0, following[0] - self.seconds) if following else None)
 
 

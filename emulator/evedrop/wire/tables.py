@@ -35,10 +35,10 @@ LARGEST_BYTES = 2**40
 
 def in_unit(text: str, units: Mapping[str, float]) -> float | None:
     """The number in a text such as "20 ms", in the base unit; None if it is not a number with one of the units."""
-    found = _WITH_UNIT.fullmatch(text.strip())
-    if found is None or found[2] not in units:
+    match = _WITH_UNIT.fullmatch(text.strip())
+    if match is None or match[2] not in units:
         return None
-    number = float(found[1]) * units[found[2]]
+    number = float(match[1]) * units[match[2]]
     return round(number, 12)  # 20 ms are the number that 0.02 is
 
 
@@ -49,8 +49,8 @@ def in_seconds(text: str) -> float | None:
 
 def seconds_of(text: str) -> float | None:
     """The seconds in a text such as "20 ms" or "0.02", up to `LONGEST_SECONDS`; None if it is neither."""
-    found = in_seconds(text if text.strip()[-1:].isalpha() else f"{text} s")
-    return found if found is not None and found <= LONGEST_SECONDS else None
+    seconds = in_seconds(text if text.strip()[-1:].isalpha() else f"{text} s")
+    return seconds if seconds is not None and seconds <= LONGEST_SECONDS else None
 
 
 def _seconds(value: Any) -> Any:
@@ -66,12 +66,12 @@ def _size(value: Any) -> Any:
     return int(number) if isinstance(number, float) and number.is_integer() else number
 
 
-def _read(value: Any, units: Mapping[str, float], what: str) -> Any:
+def _read(value: Any, units: Mapping[str, float], wanted: str) -> Any:
     if not isinstance(value, str):
         return value
     number = in_unit(value, units)
     if number is None:
-        raise expected(f"{what}; the units are {', '.join(units)}")
+        raise expected(f"{wanted}; the units are {', '.join(units)}")
     return number
 
 
@@ -119,16 +119,16 @@ class EndpointPlace(NamedTuple):
 
 def place_of(endpoint: str) -> EndpointPlace | None:
     """The place of an endpoint; None if it is malformed."""
-    found = _ENDPOINT.fullmatch(endpoint)
-    if found is None or found[1] not in RELIABLE:
+    match = _ENDPOINT.fullmatch(endpoint)
+    if match is None or match[1] not in RELIABLE:
         return None
-    if found[1] == "unixsock-stream":
-        return EndpointPlace(found[1], found[2], None)
-    address = _HOST_AND_PORT.fullmatch(found[2])
+    if match[1] == "unixsock-stream":
+        return EndpointPlace(match[1], match[2], None)
+    address = _HOST_AND_PORT.fullmatch(match[2])
     if address is None or int(address[2]) > 65_535:
         return None
     host = "127.0.0.1" if address[1] == "localhost" else address[1]
-    return EndpointPlace(found[1], host, int(address[2]))
+    return EndpointPlace(match[1], host, int(address[2]))
 
 
 def checked_endpoint(endpoint: str) -> str:
@@ -153,7 +153,7 @@ def _bound(value: Any) -> Any:
 def _metric(text: str) -> str:
     _, dot, metric = text.rpartition(".")
     if not dot or metric not in WIRE_METRICS:
-        names = [f"LINK.{one}" for one in WIRE_METRICS]
+        names = [f"LINK.{name}" for name in WIRE_METRICS]
         raise expected(listed(names), near(metric, WIRE_METRICS))
     return text
 
@@ -184,21 +184,21 @@ class WireExpectTable(Table):
             ]
         if "metric" not in given:
             return [("metric", 'is missing; expected metric = "scan.delivery" with below or above, or link = "scan"')]
-        found = []
+        mistakes = []
         if not set(given) & set(_BOUNDS):
-            found.append(("below", "is missing, and so is above; add one of them, or both"))
+            mistakes.append(("below", "is missing, and so is above; add one of them, or both"))
         metric = WIRE_METRICS.get(str(table["metric"]).rpartition(".")[2])
         if (metric is not None and metric.has_quantile) == ("quantile" not in given):
-            names = [one.name for one in WIRE_METRICS.values() if one.has_quantile]
-            said = (
+            names = [kind.name for kind in WIRE_METRICS.values() if kind.has_quantile]
+            sentence = (
                 f"is missing; a {listed(names)} needs one"
                 if "quantile" not in given
                 else f"is set, but only a {listed(names)} has quantiles"
             )
-            found.append(
-                ("quantile", f"{said}; expected quantile = 0.99 with {listed([f'LINK.{one}' for one in names])}")
+            mistakes.append(
+                ("quantile", f"{sentence}; expected quantile = 0.99 with {listed([f'LINK.{kind}' for kind in names])}")
             )
-        return found
+        return mistakes
 
     @property
     def subject(self) -> str:
@@ -221,9 +221,9 @@ class WireExpectTable(Table):
         quantile = "" if self.quantile is None else f"{self.quantile:.10g} quantile of "
         return f"{quantile}{self.metric} {self.wanted}"
 
-    def holds(self, found: float) -> bool:
+    def holds(self, value: float) -> bool:
         """Whether a metric meets the expectation."""
-        return (self.below is None or found < self.below) and (self.above is None or found > self.above)
+        return (self.below is None or value < self.below) and (self.above is None or value > self.above)
 
 
 def expectation_mistakes(expectations: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Iterator[str]:
@@ -296,7 +296,7 @@ def delay_in_seconds(delay: Any) -> tuple[Any, list[Found]]:
     """A delay's table with its lengths of time as numbers of seconds, and the mistakes in them."""
     if not isinstance(delay, Mapping):
         return delay, []
-    made, found = dict(delay), []
+    made, mistakes = dict(delay), []
     model = DELAY_MODELS.get(str(delay.get("model")))
     for name in () if model is None else model.lengths:
         text = made.get(name)
@@ -305,10 +305,12 @@ def delay_in_seconds(delay: Any) -> tuple[Any, list[Found]]:
             made[name] = seconds
         elif isinstance(text, str):
             made.pop(name)
-            found.append((f"delay.{name}", f'is {as_toml(text)}; expected seconds, or a text such as "20 ms"'))
+            mistakes.append((f"delay.{name}", f'is {as_toml(text)}; expected seconds, or a text such as "20 ms"'))
     if made.pop("unit", "seconds") != "seconds":
-        found.append(("delay.unit", f"is {as_toml(delay['unit'])}; expected no unit: delays on a wire are in seconds"))
-    return made, found
+        mistakes.append(
+            ("delay.unit", f"is {as_toml(delay['unit'])}; expected no unit: delays on a wire are in seconds")
+        )
+    return made, mistakes
 
 
 class WireCorrelationTable(CorrelationTable):
@@ -334,17 +336,17 @@ class WireSettingsTable(LinkTable):
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
         """Those of a scenario's link; but a link without losses needs no loss model."""
-        delay, found = delay_in_seconds(table.get("delay"))
-        said = {entry for entry, _ in found}
+        delay, mistakes = delay_in_seconds(table.get("delay"))
+        complained = {entry for entry, _ in mistakes}
         perfect = {"loss": NOTHING_LOST} if table.get("quality") is None and table.get("loss") is None else {}
         of_link = super().mistakes({**table, **perfect, "delay": delay})
-        found += [one for one in of_link if one[0] not in said]
+        mistakes += [mistake for mistake in of_link if mistake[0] not in complained]
         loss = table.get("loss")
         if isinstance(loss, Mapping) and loss.get("once") is True:
-            found.append(
+            mistakes.append(
                 ("loss.once", "is true, but a wire has no last message; expected false: the recording repeats")
             )
-        return found
+        return mistakes
 
     @property
     def loss_spec(self) -> dict[str, Any]:
@@ -403,12 +405,14 @@ class SideTable(Table):
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
         """Certificates without an endpoint that uses them, and encrypted endpoints without certificates."""
         given = (
-            one
+            endpoint
             for name in ("listen", "connect")
             if isinstance(entry := _listed(table.get(name)), list)
-            for one in entry
+            for endpoint in entry
         )
-        secure = [one for one in given if isinstance(one, str) and one.partition("/")[0] in ENCRYPTED]
+        secure = [
+            endpoint for endpoint in given if isinstance(endpoint, str) and endpoint.partition("/")[0] in ENCRYPTED
+        ]
         if table.get("tls") is None and secure:
             return [("tls", f"is missing; expected a certificate and its key for {secure[0]}")]
         if table.get("tls") is not None and not secure:
@@ -442,19 +446,21 @@ class WireEventTable(Table):
         """Mistakes unless one thing happens, and its time is stated in one way."""
         kinds = ("partition", "cut", "set", "note")
         given = [name for name in kinds if table.get(name) is not None]
-        found: list[Found] = []
+        mistakes: list[Found] = []
         if len(given) != 1:
-            said = f"has {listed(given)} at once" if given else "does not say what happens"
-            found.append(("event", f'{said}; expected one of {listed(kinds)}, such as partition = ["robot", "base"]'))
+            sentence = f"has {listed(given)} at once" if given else "does not say what happens"
+            mistakes.append(
+                ("event", f'{sentence}; expected one of {listed(kinds)}, such as partition = ["robot", "base"]')
+            )
         if (table.get("link") is None) == ("set" in given):
             missing, there = ("link", "set") if "set" in given else ("set", "link")
             if table.get(there) is not None:
-                found.append(
+                mistakes.append(
                     (missing, f'is missing, but {there} is given; expected link = "robot-base" and what to set')
                 )
         if table.get("set") == {}:
-            found.append(("set", "is empty; expected what changes, such as set = { quality = 0.2 }"))
-        return found + cls._time_mistakes(table)
+            mistakes.append(("set", "is empty; expected what changes, such as set = { quality = 0.2 }"))
+        return mistakes + cls._time_mistakes(table)
 
     @classmethod
     def _time_mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
@@ -465,7 +471,7 @@ class WireEventTable(Table):
             return [("at", "and from are both there; expected one of them")]
         if start is None and to is not None:
             return [("to", "is given without from; expected from and to, or only at")]
-        first, last = (in_seconds(one) if isinstance(one, str) else one for one in (start, to))
+        first, last = (in_seconds(value) if isinstance(value, str) else value for value in (start, to))
         if isinstance(first, (int, float)) and isinstance(last, (int, float)) and last <= first:
             return [("to", f"is {as_toml(to)}, not after from, which is {as_toml(start)}; expected a later time")]
         return []

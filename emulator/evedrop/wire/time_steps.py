@@ -196,7 +196,7 @@ def legend(plan: WirePlan) -> str:
     """The legend of the lanes, with what this wire's file can cause."""
     states = [LaneState.DELIVERED, LaneState.SOME, LaneState.MOST, LaneState.CUT]
     settings = [*(link.settings for link in plan.links), *(event.settings or {} for event in plan.events)]
-    if any(one.get("rate") for one in settings):
+    if any(entry.get("rate") for entry in settings):
         states.append(LaneState.FULL)
     return " · ".join(f"{state.name_of_colour}: {state.word}" for state in states)
 
@@ -239,15 +239,15 @@ class LinkWatcher:
     def __init__(self, names: Iterable[str], step: float) -> None:
         self._step = step
         self._stretches = [_Stretch(name, step) for name in names]
-        self._names = [*(one.name for one in self._stretches), "keys without a link"]
+        self._names = [*(stretch.name for stretch in self._stretches), "keys without a link"]
         self._known: set[tuple[int, int]] = set()
 
     def watch(self, steps: WireSteps) -> list[Notice]:
         """The notices of the next steps, in order of time."""
-        found = [*self._own_losses(steps)]
+        notices = [*self._own_losses(steps)]
         for row, stretch in enumerate(self._stretches):
-            found += stretch.watch(steps.first, steps.counts[:, row])
-        return sorted(found, key=lambda notice: notice.seconds)
+            notices += stretch.watch(steps.first, steps.counts[:, row])
+        return sorted(notices, key=lambda notice: notice.seconds)
 
     def _own_losses(self, steps: WireSteps) -> Iterator[Notice]:
         """A line when a link loses a message for a reason that is not emulated, for the first time."""
@@ -279,14 +279,14 @@ class CutWatcher:
         for at, link in enumerate(self._links):
             if self._cut[at] is not None:
                 pairs.setdefault(frozenset((link.source, link.target)), []).append(at)
-        found = []
+        cut = []
         for links in pairs.values():
             first = self._links[links[0]]
             if len(links) > 1 and all(self._cut[at] for at in links):
-                found.append(f"{first.source}|{first.target}")
+                cut.append(f"{first.source}|{first.target}")
             else:
-                found += [self._links[at].name for at in links if self._cut[at]]
-        return found
+                cut += [self._links[at].name for at in links if self._cut[at]]
+        return cut
 
 
 @final
@@ -335,8 +335,8 @@ class _Stretch:
 
 def why(counts: Counts) -> str:
     """How many messages were not delivered for which reasons, most frequent first, such as "300 cut, 12 lost"."""
-    found = [(int(counts[at]), WORDS[fate]) for at, fate in enumerate(OUTCOMES) if fate in WORDS and counts[at]]
-    return ", ".join(f"{number:,} {word}" for number, word in sorted(found, key=lambda one: -one[0]))
+    losses = [(int(counts[at]), WORDS[fate]) for at, fate in enumerate(OUTCOMES) if fate in WORDS and counts[at]]
+    return ", ".join(f"{number:,} {word}" for number, word in sorted(losses, key=lambda loss: -loss[0]))
 
 
 def level_of(line: str) -> str:

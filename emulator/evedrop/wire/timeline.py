@@ -57,9 +57,9 @@ def moment_at(plan: WirePlan, time: float) -> Moment:
     apart = [set(event.partition) for event in lasting if event.partition is not None]
     named = {event.cut for event in lasting}
     cut = {link.name for link in plan.links if link.name in named or {link.source, link.target} in apart}
-    said = [_ended(event) for event in plan.events if event.stop == time and event.note is None]
-    said += [_begun(event) for event in plan.events if event.start == time]
-    return Moment(time, tuple(said), frozenset(cut), settings)
+    sentences = [_ended(event) for event in plan.events if event.stop == time and event.note is None]
+    sentences += [_begun(event) for event in plan.events if event.start == time]
+    return Moment(time, tuple(sentences), frozenset(cut), settings)
 
 
 def with_change(plan: WirePlan, table: Mapping[str, Any], time: float) -> tuple[WirePlan, str]:
@@ -69,10 +69,10 @@ def with_change(plan: WirePlan, table: Mapping[str, Any], time: float) -> tuple[
     """
     now = moment_at(plan, time).settings
     tied = {link.name for link in plan.links if link.correlation is not None}
-    found = {"at": time, **table}
-    mistakes = list(event_mistakes(found, [*plan.sides], [*now], lambda name: (now[name], name in tied)))
+    entries = {"at": time, **table}
+    mistakes = list(event_mistakes(entries, [*plan.sides], [*now], lambda name: (now[name], name in tied)))
     try:
-        checked = WireEventTable.model_validate(found)
+        checked = WireEventTable.model_validate(entries)
     except ValidationError as error:
         raise ScenarioError("event", [*sentences(error, WireEventTable), *mistakes]) from None
     if mistakes:
@@ -86,7 +86,7 @@ def with_cut_ended(plan: WirePlan, link: str, time: float) -> tuple[WirePlan, st
 
     Later events stay, and so do partitions. Raises ScenarioError if the link is not cut.
     """
-    names = [one.name for one in plan.links]
+    names = [link_.name for link_ in plan.links]
     if link not in names:
         raise ScenarioError("event", [f"heal: {unknown(link, names, 'link')}"])
     apart = link in moment_at(plan, time).cut
@@ -94,14 +94,14 @@ def with_cut_ended(plan: WirePlan, link: str, time: float) -> tuple[WirePlan, st
     return _ended_at(plan, time, lambda event: event.cut == link, f"heal: {link} is not cut by itself; {wanted}")
 
 
-def with_partition_ended(plan: WirePlan, one: str, other: str, time: float) -> tuple[WirePlan, str]:
+def with_partition_ended(plan: WirePlan, side: str, other: str, time: float) -> tuple[WirePlan, str]:
     """The plan in which two sides are not partitioned at a time. Raises ScenarioError if they are not partitioned before."""
     sides = [*plan.sides]
-    if strange := [f"heal: {unknown(name, sides, 'side')}" for name in (one, other) if name not in sides]:
+    if strange := [f"heal: {unknown(name, sides, 'side')}" for name in (side, other) if name not in sides]:
         raise ScenarioError("event", strange)
-    pair = {one, other}
-    said = f"heal: {one} and {other} are not partitioned; expected two sides that are"
-    return _ended_at(plan, time, lambda event: event.partition is not None and {*event.partition} == pair, said)
+    pair = {side, other}
+    refusal = f"heal: {side} and {other} are not partitioned; expected two sides that are"
+    return _ended_at(plan, time, lambda event: event.partition is not None and {*event.partition} == pair, refusal)
 
 
 def _ended_at(plan: WirePlan, time: float, of: Callable[[WireEvent], bool], otherwise: str) -> tuple[WirePlan, str]:
@@ -117,8 +117,8 @@ def _ended_at(plan: WirePlan, time: float, of: Callable[[WireEvent], bool], othe
 
 def _lasting(plan: WirePlan, time: float) -> list[WireEvent]:
     """The events that last at a time, in the order in which they began."""
-    found = [event for event in plan.events if event.start <= time and (event.stop is None or time < event.stop)]
-    return sorted(found, key=lambda event: event.start)
+    lasting = [event for event in plan.events if event.start <= time and (event.stop is None or time < event.stop)]
+    return sorted(lasting, key=lambda event: event.start)
 
 
 def _begun(event: WireEvent) -> str:

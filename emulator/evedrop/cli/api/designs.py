@@ -73,8 +73,8 @@ def design(
             "a least ratio is for eavesdroppers whose error has a closed form, and the scenario has none; add one, such as "
             f'eavesdroppers.genie={{strategy = "genie", link = {{quality = 0.9}}}}, or measure those it has: {measured}'
         )
-    found = design_of(made.process.process, mu, made.encoding.mu_d, adversaries, made.slots, max_trace, min_ratio)
-    return replace(found, left_out=left_out, measuring=measured)
+    designed = design_of(made.process.process, mu, made.encoding.mu_d, adversaries, made.slots, max_trace, min_ratio)
+    return replace(designed, left_out=left_out, measuring=measured)
 
 
 def _adversaries(made: Scenario, measured: str) -> tuple[float, list[Adversary], dict[str, str]]:
@@ -148,13 +148,16 @@ def design_schedule(
         )
     mu, adversaries, left_out = _adversaries(made, measured)
     bound, process = math.inf if max_trace is None else max_trace, made.process.process
-    found = {one.name: best_schedule(process, mu, one.outcomes, slots, bound, weight, block) for one in adversaries}
-    if not found:
+    schedules = {
+        adversary.name: best_schedule(process, mu, adversary.outcomes, slots, bound, weight, block)
+        for adversary in adversaries
+    }
+    if not schedules:
         raise UsageError(
             "a schedule is designed against eavesdroppers whose error has a closed form, and the scenario has none; add one, "
             f'such as eavesdroppers.genie={{strategy = "genie", link = {{quality = 0.9}}}}, or measure those it has: {measured}'
         )
-    return ScheduleDesign(found, left_out)
+    return ScheduleDesign(schedules, left_out)
 
 
 def design_policy(

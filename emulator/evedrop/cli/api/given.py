@@ -34,11 +34,11 @@ def scenario_of(scenario: str | Path | Scenario, changes: Mapping[str, Any], bey
 def plan_of(plan: Plan | None, workers: int | None, scheduler: str | None) -> Plan:
     """The plan of a call, whose own workers and scheduler give way to these. Raises UsageError as `Plan` does."""
     refuse_unless(plan is None or isinstance(plan, Plan), "plan", plan, 'a Plan, such as Plan(mode="covariance-only")')
-    found = plan or Plan()
+    base = plan or Plan()
     return replace(
-        found,
-        workers=found.workers if workers is None else workers,
-        scheduler=found.scheduler if scheduler is None else scheduler,
+        base,
+        workers=base.workers if workers is None else workers,
+        scheduler=base.scheduler if scheduler is None else scheduler,
     )
 
 

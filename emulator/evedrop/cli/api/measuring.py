@@ -19,10 +19,14 @@ def measuring_command(given: str | Path | Scenario, changes: Mapping[str, Any], 
     made: the scenario with these changes.
     """
     mu_d = made.encoding.parameters.get("state_probability")
-    one = isinstance(mu_d, (int, float))
-    words = ["evedrop", "sweep" if one else "montecarlo", "SCENARIO" if isinstance(given, Scenario) else str(given)]
+    constant = isinstance(mu_d, (int, float))
+    words = [
+        "evedrop",
+        "sweep" if constant else "montecarlo",
+        "SCENARIO" if isinstance(given, Scenario) else str(given),
+    ]
     for key, value in dotted(changes).items():
         words += ["--set", f"{key}={toml_of(value)}"]
-    if one:
+    if constant:
         words += ["--over", "encoding.state_probability=0.1:0.9:0.1"]
     return shlex.join(words)

@@ -104,16 +104,18 @@ class RunResults(Results, ReportedResults):
 
     @property
     def _facts(self) -> str:
-        one = self._typed
-        trials = "1 trial" if one.trials == 1 else f"{one.trials:,} trials"
-        return f"{one.slots:,} slots, {trials}, {'live' if one.mode == 'live' else f'in memory ({one.mode})'}"
+        summary = self._typed
+        trials = "1 trial" if summary.trials == 1 else f"{summary.trials:,} trials"
+        return (
+            f"{summary.slots:,} slots, {trials}, {'live' if summary.mode == 'live' else f'in memory ({summary.mode})'}"
+        )
 
     def _notes(self) -> Iterator[str]:
         if self.remark is not None:
             yield self.remark
         for lines in (closing.remarks, closing.verdicts, closing.doubts, closing.application_lines):
             yield from lines(self._typed)
-        yield from (one.sentence for one in self.expectations)
+        yield from (expectation.sentence for expectation in self.expectations)
 
     def plot(self, *panels: Panels, slots: range | None = None, trial: int | None = None) -> ShownFigure:
         """A figure: the errors of all trials with bands, and the lanes and the plane of one recorded trial.
@@ -131,7 +133,7 @@ class RunResults(Results, ReportedResults):
     def __repr__(self) -> str:
         error = ("mean_squared_error", "mean_actual_trace_covariance")
         errors = [
-            f"{name} {number_text(shown_metric(one.all_metrics, error), '.3g')}" for name, one in self.peers.items()
+            f"{name} {number_text(shown_metric(peer.all_metrics, error), '.3g')}" for name, peer in self.peers.items()
         ]
         remark = "" if self.remark is None else "; incomplete"
         return f"<RunResults of {self._typed.scenario!r}: {self._facts}; mean error: {', '.join(errors)}{remark}>"
@@ -192,9 +194,9 @@ class ComparisonResults(Comparison, ReportedResults):
     folder: Path = field(kw_only=True)
 
     @classmethod
-    def of(cls, found: Comparison, folder: Path) -> Self:
+    def of(cls, comparison: Comparison, folder: Path) -> Self:
         """A comparison whose files are in a folder."""
-        return cls(**{one.name: getattr(found, one.name) for one in fields(found)}, folder=folder)
+        return cls(**{field.name: getattr(comparison, field.name) for field in fields(comparison)}, folder=folder)
 
     def plot(self) -> ShownFigure:
         """A figure of matplotlib: the matrix of schemes and adversaries, with a mark, a colour and a ratio in every cell."""
@@ -217,10 +219,10 @@ class ComparisonResults(Comparison, ReportedResults):
     def _repr_html_(self) -> str:
         numbers = ["largest legitimate error", "error of the closest adversary"]
         table = TextTable.headed(["scheme"], numbers, ["beaten by another scheme"])
-        for one in self.schemes.values():
-            price, kept = (None if math.isnan(error) else error for error in (one.price, one.kept))
-            beaten = "–" if kept is None else "no" if one.name in self.dominant else "yes"
-            table.add(one.name, number_text(price, ".3g"), number_text(kept, ".3g"), beaten)
+        for scheme in self.schemes.values():
+            price, kept = (None if math.isnan(error) else error for error in (scheme.price, scheme.kept))
+            beaten = "–" if kept is None else "no" if scheme.name in self.dominant else "yes"
+            table.add(scheme.name, number_text(price, ".3g"), number_text(kept, ".3g"), beaten)
         return table_text(f"{self.title} · {self._facts}", table)
 
 

@@ -123,9 +123,9 @@ def sweep(
     wanted = 'a dict of lists by dotted key, such as {"encoding.state_probability": [0.2, 0.4]}'
     refuse_unless(over is not None, "over", over, wanted)
     values = _named(dotted(table_argument("over", over, wanted)), "over", scenario, given)
-    for key, found in values.items():
-        if not isinstance(found, list) or not found:
-            raise UsageError(f"over: {key} is {found!r}; expected a list of values, such as [0.2, 0.4]")
+    for key, chosen in values.items():
+        if not isinstance(chosen, list) or not chosen:
+            raise UsageError(f"over: {key} is {chosen!r}; expected a list of values, such as [0.2, 0.4]")
     if not values or math.prod(map(len, values.values())) > MOST_POINTS:
         raise UsageError(f"over: expected 1 to {MOST_POINTS} points, such as {{'slots': [100, 200]}}")
     with place_for(out, overwrite, resume) as place, progress(on_event, 0) as emit:
@@ -177,8 +177,8 @@ def compare(
     made = scenario_of(scenario, given)
     matchups = matchups_of(made, chosen.get("schemes"), chosen.get("adversaries"), parameters)
     with place_for(out, overwrite, resume) as place, progress(on_event, 0) as emit:
-        found = compare_all(matchups, place.folder, emit, plan_of(plan, workers, scheduler), resume=resume)
-        results = ComparisonResults.of(found, place.folder)
+        comparison = compare_all(matchups, place.folder, emit, plan_of(plan, workers, scheduler), resume=resume)
+        results = ComparisonResults.of(comparison, place.folder)
         place.keep_for(results)
         return results
 

@@ -39,13 +39,13 @@ def _check_classes(names: dict[str, str], parameters: dict[str, Any]) -> int:
     from evedrop.scenario.conformance.examine import examined
 
     status = 0
-    for one in examined(names, parameters):
-        broken = [verdict for verdict in one.verdicts if verdict.broken is not None]
+    for examination in examined(names, parameters):
+        broken = [verdict for verdict in examination.verdicts if verdict.broken is not None]
         print(
-            f"{one.title}: {f'{len(broken)} broken' if broken else 'all'} of {len(one.verdicts)} rules"
+            f"{examination.title}: {f'{len(broken)} broken' if broken else 'all'} of {len(examination.verdicts)} rules"
             + ("" if broken else " kept")
         )
-        for verdict in one.verdicts:
+        for verdict in examination.verdicts:
             print(f"  {'ok' if verdict.broken is None else 'BROKEN':<8}{verdict.rule}")
             if verdict.broken is not None:
                 print(f"          {verdict.broken}")
@@ -58,13 +58,15 @@ def _scenarios(parser: argparse.ArgumentParser) -> None:
 
 
 def _classes(parser: argparse.ArgumentParser) -> None:
-    for kind, what in (
+    for kind, subject in (
         ("scheme", "a scheme, or the scheme to check an eavesdropper with"),
         ("eavesdropper", "an eavesdropper"),
         ("link", "a loss model"),
         ("delay", "a delay model"),
     ):
-        text = f"check {what}: MODULE:CLASS of a module in this folder or an installed one; --set gives its parameters"
+        text = (
+            f"check {subject}: MODULE:CLASS of a module in this folder or an installed one; --set gives its parameters"
+        )
         parser.add_argument(f"--{kind}", metavar="NAME", help=text)
 
 

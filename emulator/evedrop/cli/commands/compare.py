@@ -37,7 +37,7 @@ def compare(options: argparse.Namespace) -> int:
         results_folder(options.out, f"compare-{Path(options.scenario).name}") as folder,
         ProgressLine(None, "trial-slots", options.json) as line,
     ):
-        found = compare_all(
+        comparison = compare_all(
             options.scenario,
             schemes=_names(options.schemes),
             adversaries=_names(options.adversaries),
@@ -49,9 +49,9 @@ def compare(options: argparse.Namespace) -> int:
             **{"trials": 200, **changes},
         )
     if options.json:
-        print_json(plain(found.as_dict()))
+        print_json(plain(comparison.as_dict()))
     else:
-        print_comparison(found, str(folder))
+        print_comparison(comparison, str(folder))
     report_page(folder, options.json)
     return 0
 

@@ -21,38 +21,38 @@ def cost(options: argparse.Namespace) -> int:
     """Compare a scenario's scheme with `plain`, trial by trial."""
     from evedrop.studies.secrecy_cost import secrecy_cost
 
-    _, found = studied(options, secrecy_cost)
+    _, result = studied(options, secrecy_cost)
     if options.json:
-        print_json(asdict(found))
+        print_json(asdict(result))
     else:
-        _print(found)
+        _print(result)
     return 0
 
 
-def _print(found: SecrecyCost) -> None:
+def _print(reproduction: SecrecyCost) -> None:
     """Print the table."""
     from evedrop.cli.report import terminal
     from evedrop.show.report.text_table import TextTable
 
-    names = {"scheme": found.scheme, "plain": "plain", "truth": "the truth"}
+    names = {"scheme": reproduction.scheme, "plain": "plain", "truth": "the truth"}
     heads = ("mean", "standard error", "95 % interval")
     table = TextTable.headed([""], heads, wrapped=["", *heads])
-    for name, one in found.more_than_plain.items():
-        table.add(f"{name.replace('_', ' ')}: {found.scheme} less plain", *_cells(one, 1.0, " Wh"))
-    for pair, measures in found.differences.items():
+    for name, measured in reproduction.more_than_plain.items():
+        table.add(f"{name.replace('_', ' ')}: {reproduction.scheme} less plain", *_cells(measured, 1.0, " Wh"))
+    for pair, measures in reproduction.differences.items():
         ours, _, theirs = pair.partition("_from_")
-        for measure, one in measures.items():
-            table.add(f"{measure}: {names[ours]} from {names[theirs]}", *_cells(one, 100.0, " %"))
+        for measure, measured in measures.items():
+            table.add(f"{measure}: {names[ours]} from {names[theirs]}", *_cells(measured, 100.0, " %"))
     console = terminal()
     console.print(
-        f"{found.trials} days, each with {found.scheme} and with plain, over the same link and with the same noise"
+        f"{reproduction.trials} days, each with {reproduction.scheme} and with plain, over the same link and with the same noise"
     )
     console.show(table)
 
 
-def _cells(one: MeanEstimate, scale: float, unit: str) -> tuple[str, str, str]:
-    mean, low, high = (number_text(scale * value, ".3g") for value in (one.mean, one.low, one.high))
-    error = ShownNumber(f"{float(f'{scale * one.standard_error:.3g}'):.2g}", scale * one.standard_error)
+def _cells(estimate: MeanEstimate, scale: float, unit: str) -> tuple[str, str, str]:
+    mean, low, high = (number_text(scale * value, ".3g") for value in (estimate.mean, estimate.low, estimate.high))
+    error = ShownNumber(f"{float(f'{scale * estimate.standard_error:.3g}'):.2g}", scale * estimate.standard_error)
     return mean + unit, error, f"{low} to {high}{unit}"
 
 

@@ -33,8 +33,8 @@ def design(options: argparse.Namespace) -> int:
     if kind == "--budget":
         budget = api.design_budget(options.scenario, options.budget, changes=changed)
         return _show(options, budget, lambda: print_budget(budget))
-    found = api.design(options.scenario, changes=changed, **given)
-    return _show(options, found, lambda: print_design(found))
+    designed = api.design(options.scenario, changes=changed, **given)
+    return _show(options, designed, lambda: print_design(designed))
 
 
 _OPTIONS: Mapping[str | None, Mapping[str, str]] = {
@@ -55,7 +55,7 @@ def _given(options: argparse.Namespace, kind: str | None) -> dict[str, Any]:
     takes = _OPTIONS[kind]
     for name in sorted({name for names in _OPTIONS.values() for name in names}):
         if getattr(options, name) is not None and name not in takes:
-            able = [f"{one or 'the design of μ_d'}" for one, names in _OPTIONS.items() if name in names]
+            able = [f"{kind_ or 'the design of μ_d'}" for kind_, names in _OPTIONS.items() if name in names]
             raise UsageError(f"--{name.replace('_', '-')} is for {' and '.join(able)}; leave it out")
     given = {python: getattr(options, name) for name, python in takes.items() if getattr(options, name) is not None}
     if kind == "--schedule" and "weight" in given:
@@ -65,9 +65,9 @@ def _given(options: argparse.Namespace, kind: str | None) -> dict[str, Any]:
     return given
 
 
-def _show(options: argparse.Namespace, found: _Printable, show: Callable[[], None]) -> int:
+def _show(options: argparse.Namespace, designed: _Printable, show: Callable[[], None]) -> int:
     if options.json:
-        print_json(found.as_dict())
+        print_json(designed.as_dict())
     else:
         show()
     return 0

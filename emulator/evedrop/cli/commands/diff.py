@@ -14,11 +14,11 @@ def diff(options: argparse.Namespace) -> int:
     from evedrop.results.reading import Results
 
     runs = [Results.read(run) for run in options.runs]
-    found = difference(*runs)
-    print(found.text)
+    differences = difference(*runs)
+    print(differences.text)
     for remark in filter(None, (run.remark for run in runs)):
         print(remark)
-    return 0 if found.same else 1
+    return 0 if differences.same else 1
 
 
 def _two_runs(parser: argparse.ArgumentParser) -> None:

@@ -38,8 +38,8 @@ def completion(options: argparse.Namespace) -> int:
 def _pages() -> dict[str, Path]:
     """Name → file of each page, those of subfolders after the rest."""
     folder = Path(str(resources.files("evedrop"))) / "docs"
-    found = {str(path.relative_to(folder).with_suffix("")): path for path in folder.rglob("*.md")}
-    return dict(sorted(found.items(), key=lambda one: (one[0].count("/"), one[0])))
+    pages = {str(path.relative_to(folder).with_suffix("")): path for path in folder.rglob("*.md")}
+    return dict(sorted(pages.items(), key=lambda item: (item[0].count("/"), item[0])))
 
 
 def _title(path: Path) -> str:

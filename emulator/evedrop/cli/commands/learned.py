@@ -45,8 +45,8 @@ def _print(rows: list[LearningRow], trials: int) -> None:
     for row in rows:
         for learner, values in row.parameters.items():
             cells = (
-                number_text(one.median, ".3g") + f" ({_with_error(one.mean, one.standard_error)})"
-                for one in values.values()
+                number_text(measured.median, ".3g") + f" ({_with_error(measured.mean, measured.standard_error)})"
+                for measured in values.values()
             )
             table.add(str(row.stop), learner, *cells)
     console.show(table)
@@ -56,9 +56,10 @@ def _print(rows: list[LearningRow], trials: int) -> None:
     table = TextTable.headed([], heads, wrapped=heads)
     for row in rows:
         for name, error in row.errors.items():
-            ratios = (one.get(name) for one in row.ratios.values())
+            ratios = (measured.get(name) for measured in row.ratios.values())
             cells = (
-                ShownNumber("", None) if one is None else _with_error(one.ratio, one.standard_error) for one in ratios
+                ShownNumber("", None) if measured is None else _with_error(measured.ratio, measured.standard_error)
+                for measured in ratios
             )
             table.add(str(row.first), str(row.stop), name, _with_error(error, row.standard_errors[name]), *cells)
     console.show(table)

@@ -38,8 +38,8 @@ def _table(options: argparse.Namespace) -> tuple[dict[str, Any], Sequence[str]]:
     from evedrop.scenario.fitting.fit import fit, lines
 
     _refuse_others(options, "a table of outcomes", ("column", "lost", "delay_column"))
-    found = fit(options.trace, options.column, options.delay_column, options.lost)
-    return found.as_dict(), lines(found)
+    fitted = fit(options.trace, options.column, options.delay_column, options.lost)
+    return fitted.as_dict(), lines(fitted)
 
 
 def _mcap(options: argparse.Namespace) -> tuple[dict[str, Any], Sequence[str]]:
@@ -68,8 +68,8 @@ def _messages(recording: MessageRecording, options: argparse.Namespace) -> tuple
 
     if options.save is not None:
         save_outcomes(recording, options.save)
-    found = fit_messages(recording, options.slot)
-    return found.as_dict(), message_lines(found)
+    fitted = fit_messages(recording, options.slot)
+    return fitted.as_dict(), message_lines(fitted)
 
 
 _ONLY = {
@@ -88,11 +88,13 @@ _ONLY = {
 """Option → the recordings that it is for."""
 
 
-def _refuse_others(options: argparse.Namespace, what: str, names: Sequence[str]) -> None:
+def _refuse_others(options: argparse.Namespace, subject: str, names: Sequence[str]) -> None:
     """Raise UsageError for options that this kind of recording does not have, and for times that are not positive."""
     for name, whose in _ONLY.items():
         if name not in names and getattr(options, name) not in {None, False}:
-            raise UsageError(f"--{name.replace('_', '-')} is for {whose}, and {options.trace} is {what}; leave it out")
+            raise UsageError(
+                f"--{name.replace('_', '-')} is for {whose}, and {options.trace} is {subject}; leave it out"
+            )
     for name in ("period", "outage", "slot"):
         value = getattr(options, name)
         if value is not None and not 0.0 < value < float("inf"):

@@ -32,14 +32,14 @@ def paper(options: argparse.Namespace) -> int:
     paper_of(options.name)
     if options.out is not None:
         _made(options.out)
-    found = reproduce(options.name, options.quick, lambda text: print(text, file=sys.stderr))
+    reproduction = reproduce(options.name, options.quick, lambda text: print(text, file=sys.stderr))
     if options.out is not None:
-        _write(found, options.out)
+        _write(reproduction, options.out)
     if options.json:
-        print_json(found.as_dict())
+        print_json(reproduction.as_dict())
     else:
-        _print(found)
-    return 1 if found.differing else 0
+        _print(reproduction)
+    return 1 if reproduction.differing else 0
 
 
 def _list(as_json: bool) -> None:
@@ -47,12 +47,17 @@ def _list(as_json: bool) -> None:
 
     if as_json:
         papers = {
-            name: {"title": one.title, "authors": one.authors, "published": one.published}
-            for name, one in PAPERS.items()
+            name: {"title": paper_class.title, "authors": paper_class.authors, "published": paper_class.published}
+            for name, paper_class in PAPERS.items()
         }
         print_json(papers)
         return
-    print_names({name: f"{one.authors}: {one.title}. {one.published}" for name, one in PAPERS.items()})
+    print_names(
+        {
+            name: f"{paper_class.authors}: {paper_class.title}. {paper_class.published}"
+            for name, paper_class in PAPERS.items()
+        }
+    )
 
 
 def _made(folder: Path) -> None:
@@ -61,11 +66,11 @@ def _made(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
 
 
-def _write(found: Reproduction, folder: Path) -> None:
-    text = json.dumps(found.as_dict(), indent=2, ensure_ascii=False)
+def _write(reproduction: Reproduction, folder: Path) -> None:
+    text = json.dumps(reproduction.as_dict(), indent=2, ensure_ascii=False)
     with _writable(folder):
-        (folder / f"{found.name}.json").write_text(f"{text}\n", encoding="utf-8")
-        (folder / f"{found.name}.md").write_text(found.as_markdown(), encoding="utf-8")
+        (folder / f"{reproduction.name}.json").write_text(f"{text}\n", encoding="utf-8")
+        (folder / f"{reproduction.name}.md").write_text(reproduction.as_markdown(), encoding="utf-8")
 
 
 @contextmanager
@@ -77,24 +82,26 @@ def _writable(folder: Path) -> Iterator[None]:
         raise UsageError(f"{folder} cannot be written ({error.strerror}); give another folder") from error
 
 
-def _print(found: Reproduction) -> None:
+def _print(reproduction: Reproduction) -> None:
     """Print the table, and below it a line for each reason."""
     from evedrop.cli.report import terminal
     from evedrop.show.report.text_table import TextTable
 
     console = terminal()
-    console.print(f"{found.title} · {found.authors} · {found.published}")
+    console.print(f"{reproduction.title} · {reproduction.authors} · {reproduction.published}")
     words, numbers = ["where", "what"], ["theirs", "ours", "tolerance"]
     table = TextTable.headed(words, numbers, ["verdict"], wrapped=[*words, *numbers])
     reasons: dict[str, int] = {}
-    for row in found.rows:
+    for row in reproduction.rows:
         note = f" [{reasons.setdefault(row.reason, len(reasons) + 1)}]" if row.reason else ""
         table.add(row.where, row.what, row.their_text, row.our_text, row.tolerance or "–", f"{row.verdict}{note}")
     console.show(table, tight=True)
     for reason, number in reasons.items():
         console.print(f"[{number}] {reason}")
-    console.print(f"{', '.join(f'{verdict}: {count}' for verdict, count in found.counts.items())}. {found.scope}")
-    if found.quick:
+    console.print(
+        f"{', '.join(f'{verdict}: {count}' for verdict, count in reproduction.counts.items())}. {reproduction.scope}"
+    )
+    if reproduction.quick:
         console.print("these are quick estimates: without --quick the standard errors are smaller")
 
 

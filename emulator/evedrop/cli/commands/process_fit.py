@@ -15,17 +15,17 @@ def fit(options: argparse.Namespace) -> int:
     from evedrop.scenario.fitting.process_fit import fit_process
 
     names = None if options.states is None else [name.strip() for name in options.states.split(",")]
-    found = fit_process(options.file, names, _numbers(options.reference))
+    fitted = fit_process(options.file, names, _numbers(options.reference))
     if options.json:
-        print_json(found.as_dict())
+        print_json(fitted.as_dict())
     else:
-        print("\n".join([*(f"# {line}" for line in found.remarks), "", found.toml]))
+        print("\n".join([*(f"# {line}" for line in fitted.remarks), "", fitted.toml]))
     return 0
 
 
 def _numbers(text: str | None) -> list[float] | None:
     try:
-        return None if text is None else [float(one) for one in text.split(",")]
+        return None if text is None else [float(number) for number in text.split(",")]
     except ValueError:
         raise UsageError(f"--reference {text}: expected numbers such as 55,50") from None
 

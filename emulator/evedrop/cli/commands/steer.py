@@ -87,19 +87,19 @@ def status(options: argparse.Namespace) -> int:
     ]
     of_runs = [answer for answer in answers if isinstance(answer, RunStatus)]
     of_wires = [answer for answer in answers if answer is not None and not isinstance(answer, RunStatus)]
-    found = of_wires[0] if of_wires else status_of_shards(of_runs)
+    merged = of_wires[0] if of_wires else status_of_shards(of_runs)
     if options.json:
-        print_json(asdict(found))
+        print_json(asdict(merged))
     else:
-        print("\n".join(found.lines))
+        print("\n".join(merged.lines))
     return 0
 
 
-def _ask(run: Path, request: OperatorRequest, what: str, patience: float = _PATIENCE) -> int:
+def _ask(run: Path, request: OperatorRequest, subject: str, patience: float = _PATIENCE) -> int:
     from evedrop.live.network.control_file import read_controls
 
     control = read_controls(run)[0]  # in a run in shards, any of them refuses
-    print(_answer(run, control, request, what, patience).said)
+    print(_answer(run, control, request, subject, patience).said)
     return 0
 
 
@@ -119,24 +119,24 @@ def _answer(run: Path, control: Control, request: OperatorRequest, what: str, pa
         except BriefError as error:
             raise UsageError(f"{run / 'control.json'}: {error}") from error
     try:
-        found = ask(control, request, patience)
+        answer = ask(control, request, patience)
         # A recorder that has lost its connection is back in a moment; these requests may be carried out twice.
-        while found is None and request.repeatable and time.monotonic() - began < _AWAY_SECONDS:
+        while answer is None and request.repeatable and time.monotonic() - began < _AWAY_SECONDS:
             read_controls(run)  # raises UsageError when the run is over
             time.sleep(_AGAIN_SECONDS)
-            found = ask(control, request, patience)
+            answer = ask(control, request, patience)
     except zenoh.ZError as error:
         raise no_run(
             run, f"no router answers at {control.router}: it was killed, or it lost its router and is restarting it"
         ) from error
-    if found is None and time.monotonic() - began >= patience:
+    if answer is None and time.monotonic() - began >= patience:
         raise UsageError(f"{what}: no answer from the run in {run}; look at its logs, or end it")
-    if found is None:
+    if answer is None:
         raise no_run(run, "it ended before it answered, or its router did, which is then restarted")
-    if found.refused:
-        count = "1 mistake" if len(found.refused) == 1 else f"{len(found.refused)} mistakes"
-        raise UsageError("\n".join([f"{what}: {count}, nothing was changed", *(f"  {one}" for one in found.refused)]))
-    return found
+    if answer.refused:
+        count = "1 mistake" if len(answer.refused) == 1 else f"{len(answer.refused)} mistakes"
+        raise UsageError("\n".join([f"{what}: {count}, nothing was changed", *(f"  {one}" for one in answer.refused)]))
+    return answer
 
 
 def _event(name: str, words: list[str]) -> dict[str, Any]:

@@ -29,17 +29,19 @@ def test(options: argparse.Namespace) -> int:
     manner = Manner(options.in_memory, options.trials, options.out, scheduler=options.scheduler, resume=options.resume)
     started, tested = time.time(), list[Finding]()
     try:
-        for one in results(scenarios, manner, options.jobs):
-            tested.append(one)
-            print(f"{one.outcome.word:<9}{one.seconds:7.1f} s  {one.scenario}", flush=True)
-            for line in one.lines:
+        for finding in results(scenarios, manner, options.jobs):
+            tested.append(finding)
+            print(f"{finding.outcome.word:<9}{finding.seconds:7.1f} s  {finding.scenario}", flush=True)
+            for line in finding.lines:
                 print(f"    {line}", flush=True)
     finally:
         if options.junit is not None:
             write_junit(options.junit, tested, started)
-    counts = Counter(one.outcome for one in tested)
-    said = ", ".join(f"{count} {outcome.word}" for outcome, count in sorted(counts.items(), key=lambda at: at[0].value))
-    print(f"{said}, in {time.time() - started:.1f} s")
+    counts = Counter(finding.outcome for finding in tested)
+    printed = ", ".join(
+        f"{count} {outcome.word}" for outcome, count in sorted(counts.items(), key=lambda at: at[0].value)
+    )
+    print(f"{printed}, in {time.time() - started:.1f} s")
     return max(outcome.value for outcome in counts)
 
 

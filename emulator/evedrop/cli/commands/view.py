@@ -181,10 +181,10 @@ def _view_wire(options: argparse.Namespace) -> int:
     return 0
 
 
-def _hold(what: str, viewer: Viewer) -> None:
+def _hold(subject: str, viewer: Viewer) -> None:
     """Say where a viewer is, and wait until it is closed."""
     where = f" at {viewer.address}, to anybody who has this address" if viewer.address else ""
-    print(f"the {what} is shown{where}; Ctrl-C ends it", flush=True)
+    print(f"the {subject} is shown{where}; Ctrl-C ends it", flush=True)
     if viewer.warning is not None:
         print(f"evedrop: warning: {viewer.warning}", file=sys.stderr)
     hold(viewer)
@@ -210,7 +210,7 @@ def _moments(text: str) -> tuple[float, float, float | None]:
         first, last, *step = (float(part) for part in text.split(":"))
     except ValueError:
         first, last, step = 0.0, -1.0, []
-    if not (0 <= first <= last < math.inf and len(step) <= 1 and all(0 < one < math.inf for one in step)):
+    if not (0 <= first <= last < math.inf and len(step) <= 1 and all(0 < seconds < math.inf for seconds in step)):
         raise argparse.ArgumentTypeError(f"{text} is not FIRST:LAST or FIRST:LAST:STEP, such as 100:200 or 100:200:2")
     return first, last, step[0] if step else None
 

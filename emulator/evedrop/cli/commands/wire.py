@@ -48,9 +48,9 @@ def wire(options: argparse.Namespace) -> int:
 
     gc.freeze()  # imported modules stay: the collections that new keys cause need not look at them
     with results_folder(options.out, f"wire-{options.file.stem}") as folder:
-        said = {"say": _hush, "complain": complain} if options.quiet else {"say": _say}
+        speaking = {"say": _hush, "complain": complain} if options.quiet else {"say": _say}
         with zenoh_log_apart():
-            status = run_wire(plan, folder, seconds=seconds, view=options.view, **said)
+            status = run_wire(plan, folder, seconds=seconds, view=options.view, **speaking)
         report_page(folder, options.quiet)
         return status
 
@@ -68,10 +68,10 @@ def _seconds(text: str) -> float:
     """The length of time of `--for`. Raises UsageError."""
     from evedrop.wire.tables import seconds_of
 
-    found = seconds_of(text)
-    if found is None or found == 0.0:
+    seconds = seconds_of(text)
+    if seconds is None or seconds == 0.0:
         raise UsageError(f'wire --for {text}: expected seconds, or a length of time such as "60 s"')
-    return found
+    return seconds
 
 
 def _file(parser: argparse.ArgumentParser) -> None:
@@ -84,8 +84,8 @@ def _file(parser: argparse.ArgumentParser) -> None:
 
 
 def _changes(parser: argparse.ArgumentParser) -> None:
-    what = "change an entry of the file by its dotted key, such as link.1.quality=0.5; repeatable"
-    parser.add_argument("--set", dest="changes", action="append", default=[], metavar="KEY=VALUE", help=what)
+    help_text = "change an entry of the file by its dotted key, such as link.1.quality=0.5; repeatable"
+    parser.add_argument("--set", dest="changes", action="append", default=[], metavar="KEY=VALUE", help=help_text)
 
 
 def _course(parser: argparse.ArgumentParser) -> None:

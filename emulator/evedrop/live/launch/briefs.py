@@ -249,7 +249,7 @@ def briefs_of(
             modules=modules(strategy=table.strategy, parameters=table.parameters),
         )
         made.append(brief(name, keys.eavesdropper(name, table.strategy, table.parameters), eavesdropper))
-    return {one.process: one for one in made}
+    return {made_brief.process: made_brief for made_brief in made}
 
 
 def _program_of(process: ProcessTable) -> ProgramEntry | None:
@@ -265,7 +265,7 @@ def _program_of(process: ProcessTable) -> ProgramEntry | None:
 def _answers(scenario: Scenario) -> dict[str, Any]:
     """The answers of eavesdroppers' classes that are not built in to all questions that the recorder will ask."""
     tables = scenario.eavesdroppers
-    names = {one for table in tables.values() for one in (table.strategy, table.reads_as) if one is not None}
+    names = {class_ for table in tables.values() for class_ in (table.strategy, table.reads_as) if class_ is not None}
     foreign = {name for name in names if STRATEGIES.foreign(name)}
     if foreign:
         from evedrop.scenario.expected.expectations import expectations_of  # noqa: PLC0415 - slow to import, and seldom needed
@@ -282,7 +282,7 @@ def _answers(scenario: Scenario) -> dict[str, Any]:
 
 def _outages(scenario: Scenario, receiver: str) -> list[tuple[int, int, bool]]:
     """A receiver's outages: first slot, first slot after, and whether it keeps its state."""
-    return [(one.start, one.stop, one.keeps_state) for one in scenario.timeline.outages[receiver]]
+    return [(outage.start, outage.stop, outage.keeps_state) for outage in scenario.timeline.outages[receiver]]
 
 
 def write_briefs(

@@ -356,13 +356,13 @@ class Children:
         """The router that a process gave up on, if the recorder or all its other users miss it, too; otherwise None."""
         if not self._lost_router(name):
             return None
-        if missed := next((one for one in (RELAY, ROUTER) if one in suspects), None):
+        if missed := next((process for process in (RELAY, ROUTER) if process in suspects), None):
             return missed
         place = self._briefs[name].router
-        others = [one for one, brief in self._briefs.items() if brief.router == place and one not in _HUBS]
+        others = [process for process, brief in self._briefs.items() if brief.router == place and process not in _HUBS]
         deadline = time.monotonic() + (_GONE_SECONDS if len(others) > 1 and not suspects else 0.0)
         while time.monotonic() < deadline:
-            if all(self._lost_router(one) for one in others):
+            if all(self._lost_router(process) for process in others):
                 return RELAY if RELAY in self._processes and name != SENSOR else ROUTER
             time.sleep(0.05)
         return None

@@ -166,13 +166,13 @@ def write_compose(scenario: Scenario, source: str, changed: bool, folder: Path, 
         make_private(folder)
         if not overwrite and any(folder.iterdir()):
             raise UsageError(f"{folder} is not empty; give another --compose DIR, or add --overwrite")
-        found = folder / COMPOSE_FILE
+        compose_file = folder / COMPOSE_FILE
         built_in = source in shipped()
         if built_in and not changed:
-            found.write_text(compose_text(scenario, source, (folder / "Dockerfile").exists()), encoding="utf-8")
-            return [found]
+            compose_file.write_text(compose_text(scenario, source, (folder / "Dockerfile").exists()), encoding="utf-8")
+            return [compose_file]
         own = folder / f"{_plain(Path(source).stem)}.toml"
-        written = [found]
+        written = [compose_file]
         if not built_in and own.exists() and os.path.samefile(own, source):
             if changed:
                 raise UsageError(f"{own} is the scenario itself, and would be replaced; give another --compose DIR")
@@ -181,7 +181,7 @@ def write_compose(scenario: Scenario, source: str, changed: bool, folder: Path, 
             for name, text in texts.items():
                 write_private(folder / name, text)
             written += [folder / name for name in texts]
-        found.write_text(compose_text(scenario, own.name, (folder / "Dockerfile").exists()), encoding="utf-8")
+        compose_file.write_text(compose_text(scenario, own.name, (folder / "Dockerfile").exists()), encoding="utf-8")
     except OSError as error:
         raise UsageError(f"{folder} cannot be written ({error.strerror}); give another --compose DIR") from error
     return written
@@ -198,12 +198,12 @@ def compose_text(scenario: Scenario, name: str, build: bool) -> str:
         ),
         _FAR_CLIENT if scenario.relayed else "",
         _BRIEFS.format(scenario=name, build=_BUILD if build else ""),
-        *(f"      - {one.name}:/briefs/{one.process}\n" for one in services),
-        *(_service(one, services) for one in services),
+        *(f"      - {service.name}:/briefs/{service.process}\n" for service in services),
+        *(_service(service, services) for service in services),
         _VIEW,
-        *(f"  {_key(one.name)}:\n" for one in services),
+        *(f"  {_key(service.name)}:\n" for service in services),
         "\nnetworks:\n",
-        *(f"  {one.network}: *closed\n" for one in services if one.process != ROUTER),
+        *(f"  {service.network}: *closed\n" for service in services if service.process != ROUTER),
         _OPEN_NETWORK,
     ]
     return "".join(parts)
@@ -232,41 +232,44 @@ def _services(scenario: Scenario) -> list[_Service]:
     relay = [RELAY] if scenario.relayed else []
     steered = [] if scenario.controller is None else [CONTROLLER]
     processes = [ROUTER, *relay, SENSOR, LEGITIMATE, *steered, *scenario.eavesdroppers, RECORDER]
-    found = []
+    services = []
     for process in processes:
         name = process
         while name in _OTHERS or (name != process and name in processes):
             name = f"eavesdropper-{name}"
         role = "eavesdropper" if process in scenario.eavesdroppers else process
-        found.append(_Service(name, process, role, scenario.relayed and process not in {ROUTER, RELAY, SENSOR}))
-    return found
+        services.append(_Service(name, process, role, scenario.relayed and process not in {ROUTER, RELAY, SENSOR}))
+    return services
 
 
-def _service(one: _Service, services: Sequence[_Service]) -> str:
+def _service(service: _Service, services: Sequence[_Service]) -> str:
     """A service as YAML."""
-    base = "process" if one.process == ROUTER else "far-client" if one.far else "client"
-    command = f"[{one.role}, /brief/brief.json"
-    lines = [f"  {_key(one.name)}:", f"    <<: *{base}"]
-    if one.process == RECORDER:
+    base = "process" if service.process == ROUTER else "far-client" if service.far else "client"
+    command = f"[{service.role}, /brief/brief.json"
+    lines = [f"  {_key(service.name)}:", f"    <<: *{base}"]
+    if service.process == RECORDER:
         lines += [
             f'    command: {command}, --serve, "0.0.0.0:17450"]',
             "    stop_grace_period: 1m # to write the results",
         ]
-        lines += [f'    volumes: ["{one.name}:/brief:ro", "./runs:/runs"]', f"    networks: [{one.network}, to-view]"]
+        lines += [
+            f'    volumes: ["{service.name}:/brief:ro", "./runs:/runs"]',
+            f"    networks: [{service.network}, to-view]",
+        ]
     else:
-        lines += [f"    command: {command}]", f'    volumes: ["{one.name}:/brief:ro"]']
-        lines += [f"    networks: [{', '.join(_networks(one, services))}]"]
+        lines += [f"    command: {command}]", f'    volumes: ["{service.name}:/brief:ro"]']
+        lines += [f"    networks: [{', '.join(_networks(service, services))}]"]
     return "\n" + "\n".join(lines) + "\n"
 
 
-def _networks(one: _Service, services: Sequence[_Service]) -> Iterator[str]:
+def _networks(service: _Service, services: Sequence[_Service]) -> Iterator[str]:
     """The networks of a process that is not the recorder: its own, and those of the processes that connect to it."""
-    if one.process != ROUTER:
-        yield one.network
-    if one.process in {ROUTER, RELAY}:
-        far = one.process == RELAY
+    if service.process != ROUTER:
+        yield service.network
+    if service.process in {ROUTER, RELAY}:
+        far = service.process == RELAY
         yield from (
-            other.network for other in services if other.process not in {ROUTER, one.process} and other.far == far
+            other.network for other in services if other.process not in {ROUTER, service.process} and other.far == far
         )
 
 

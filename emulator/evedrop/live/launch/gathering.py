@@ -132,31 +132,31 @@ def _age_of_metrics(shards: Sequence[Shard], scores: Sequence[RunTally], summari
 
 def _events(summaries: Mapping[int, Summary]) -> list[RunEvent]:
     """The events of all shards: each once, in order of slots."""
-    found = dict.fromkeys(event for summary in summaries.values() for event in summary.events)
-    return sorted(found, key=lambda one: one.slot)
+    events = dict.fromkeys(event for summary in summaries.values() for event in summary.events)
+    return sorted(events, key=lambda happening: happening.slot)
 
 
 def _outages(summaries: Mapping[int, Summary]) -> list[ConnectionOutage]:
     """The outages of all shards, each with its shard, in order of slots."""
-    found = [replace(one, shard=shard) for shard, summary in summaries.items() for one in summary.outages]
-    return sorted(found, key=lambda one: one.slot)
+    found = [replace(outage, shard=shard) for shard, summary in summaries.items() for outage in summary.outages]
+    return sorted(found, key=lambda outage: outage.slot)
 
 
 def _misdelivered(summaries: Mapping[int, Summary]) -> dict[str, int]:
     """Process → messages that it dropped, in all shards together."""
-    found: Counter[str] = Counter()
+    counts: Counter[str] = Counter()
     for summary in summaries.values():
-        found.update(summary.misdelivered)
-    return dict(found)
+        counts.update(summary.misdelivered)
+    return dict(counts)
 
 
 def _summaries(shards: Sequence[Shard]) -> dict[int, Summary]:
     """Number → summary, of the shards that have written one."""
-    found = {}
+    summaries_ = {}
     for shard in shards:
         with suppress(UsageError):
-            found[shard.number] = Results.read(shard.folder).typed_summary
-    return found
+            summaries_[shard.number] = Results.read(shard.folder).typed_summary
+    return summaries_
 
 
 def _tidy(folder: Path, shards: Sequence[Shard]) -> None:
@@ -193,7 +193,7 @@ class Gathered(ABC):
             pq.ParquetWriter(unfinished, schema, compression="zstd", compression_level=1) as writer,
         ):
             for first in count(0, self.slots_at_once):
-                parts = [one.below(first + self.slots_at_once) for one in rows]
+                parts = [reader.below(first + self.slots_at_once) for reader in rows]
                 if not any(part.num_rows for part in parts):
                     break
                 writer.write_table(self._one(first, parts, schema))
@@ -202,8 +202,8 @@ class Gathered(ABC):
         """The index of the receiver of every row; 0 for a table without receivers."""
         if not len(self.receivers):
             return np.zeros(table.num_rows, np.int64)
-        found = pc.index_in(table[self.by].cast(pa.string()), value_set=self.receivers)
-        codes: NDArray[np.int64] = found.to_numpy().astype(np.int64)
+        indices = pc.index_in(table[self.by].cast(pa.string()), value_set=self.receivers)
+        codes: NDArray[np.int64] = indices.to_numpy().astype(np.int64)
         return codes
 
     @abstractmethod
@@ -223,11 +223,11 @@ class Gathered(ABC):
             self.by: pa.DictionaryArray.from_arrays(pa.array(named), self.receivers),
         }
         arrays = []
-        for one in schema:
-            values = own.get(one.name)
+        for field in schema:
+            values = own.get(field.name)
             if values is None:
-                values = columns[one.name][places]
-                values = pa.array(values, one.type, from_pandas=one.name in NULLABLE)
+                values = columns[field.name][places]
+                values = pa.array(values, field.type, from_pandas=field.name in NULLABLE)
             arrays.append(values)
         return pa.Table.from_arrays(arrays, schema=schema)
 
@@ -268,11 +268,11 @@ class Statistics(Gathered):
     @np.errstate(invalid="ignore", divide="ignore", over="ignore")
     def _one(self, first: int, parts: Sequence[pa.Table], schema: pa.Schema) -> pa.Table:
         size = len(self.receivers) * self.slots_at_once
-        names = [one.name for one in schema if one.name not in ("slot", self.by, "trials", "standard_error")]
+        names = [field.name for field in schema if field.name not in ("slot", self.by, "trials", "standard_error")]
         columns: dict[str, Any] = {name: np.zeros(size) for name in names}
         total, spread = np.zeros(size), np.zeros(size)
-        found = [(self._places(first, part), part, part["trials"].to_numpy()) for part in parts]
-        for places, part, trials in found:
+        rows = [(self._places(first, part), part, part["trials"].to_numpy()) for part in parts]
+        for places, part, trials in rows:
             total[places] += trials
             for name in names:
                 values = part[name].to_numpy()
@@ -285,7 +285,7 @@ class Statistics(Gathered):
         for name in names:
             if not name.startswith(self._TAKEN):
                 columns[name] /= total
-        for places, part, trials in found:
+        for places, part, trials in rows:
             inner = np.where(trials > 1, part["standard_error"].to_numpy() ** 2 * trials * (trials - 1.0), 0.0)
             between = part["mean_squared_error"].to_numpy() - columns["mean_squared_error"][places]
             spread[places] += inner + trials * between**2
@@ -306,7 +306,7 @@ class Journals(Gathered):
 
     def _one(self, first: int, parts: Sequence[pa.Table], schema: pa.Schema) -> pa.Table:
         size = len(self.receivers) * self.slots_at_once
-        names = [one.name for one in schema if one.name not in ("slot", self.by, "delivered_mask")]
+        names = [field.name for field in schema if field.name not in ("slot", self.by, "delivered_mask")]
         columns: dict[str, Any] = {name: np.zeros(size, np.int64) for name in names}
         there, flags = np.zeros(size, np.bool_), np.zeros((size, sum(self._trials)), np.uint8)
         start = 0

@@ -136,22 +136,26 @@ def processes_of(scenario: Scenario) -> tuple[str, ...]:
 
 def _of_processes(file: HostsFile, scenario: Scenario) -> list[str]:
     """Mistakes in the lists of processes: unknown names, names given twice, and missing folders of classes."""
-    known, found, seen = processes_of(scenario), [], dict[str, str]()
+    processes, mistakes, seen = processes_of(scenario), [], dict[str, str]()
     for name, host in file.hosts.items():
         for process in host.processes:
             where = f"hosts.{name}.processes"
             if process == RECORDER:
-                found.append(f"{where}: names {RECORDER}, which is always on this machine, where it writes the results")
-            elif process not in known:
-                found.append(f"{where}: names {process}; expected {listed(known)}{near(process, known)}")
+                mistakes.append(
+                    f"{where}: names {RECORDER}, which is always on this machine, where it writes the results"
+                )
+            elif process not in processes:
+                mistakes.append(f"{where}: names {process}; expected {listed(processes)}{near(process, processes)}")
             elif process in seen:
-                found.append(f"{where}: names {process}, which is on {seen[process]} already; expected one host for it")
+                mistakes.append(
+                    f"{where}: names {process}, which is on {seen[process]} already; expected one host for it"
+                )
             seen.setdefault(process, name)
         if scenario.modules is not None and host.modules is None:
-            found.append(
+            mistakes.append(
                 f"hosts.{name}.modules: is missing; expected the folder there of the modules that the scenario names"
             )
-    return found
+    return mistakes
 
 
 def _endpoints(file: HostsFile, scenario: Scenario, mistakes: list[str]) -> RouterEndpoints | None:
@@ -161,8 +165,8 @@ def _endpoints(file: HostsFile, scenario: Scenario, mistakes: list[str]) -> Rout
         try:
             made[name] = None if table is None else table.endpoint()
         except UsageError as error:
-            entry, equals, what = str(error).replace("--insecure", "insecure = true").partition(" = ")
-            mistakes.append(f"{name}.{entry}: {what}" if equals else f"{name}: {entry}")
+            entry, equals, problem = str(error).replace("--insecure", "insecure = true").partition(" = ")
+            mistakes.append(f"{name}.{entry}: {problem}" if equals else f"{name}: {entry}")
     if scenario.relayed and file.relay is None:
         mistakes.append(
             'relay: is missing; expected [relay] with listen = "tls/HOST:PORT": the scenario has two routers'

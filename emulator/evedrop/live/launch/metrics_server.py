@@ -50,15 +50,15 @@ class MetricsAddress:
     @classmethod
     def of(cls, text: str) -> MetricsAddress:
         """Parse HOST:PORT, with brackets around an IPv6 address. Raises UsageError if the text is malformed."""
-        found = _FORM.fullmatch(text)
-        host = "" if found is None else found[1] or found[2]
+        match = _FORM.fullmatch(text)
+        host = "" if match is None else match[1] or match[2]
         host = "127.0.0.1" if host == "localhost" else host
         try:
             address = ipaddress.ip_address(host)
-            port = int("" if found is None else found[3])
+            port = int("" if match is None else match[3])
         except ValueError:
             port = 2**16
-        if port >= 2**16 or (found is not None and bool(found[1]) != (address.version == 6)):
+        if port >= 2**16 or (match is not None and bool(match[1]) != (address.version == 6)):
             raise UsageError(
                 f"--metrics {text} is not an address and a port; give one such as 127.0.0.1:9464 or [::1]:9464"
             )

@@ -164,29 +164,29 @@ def answer_in(line: bytes) -> Answer:
 
 def greeting_in(line: bytes) -> Greeting:
     """The greeting of a line, of any version of the program. Raises ValueError if it is not one."""
-    found = _object_in(line)
-    expect(table({"evedrop": text}, strict=False), "", found)
-    return Greeting(found["evedrop"])
+    entries = _object_in(line)
+    expect(table({"evedrop": text}, strict=False), "", entries)
+    return Greeting(entries["evedrop"])
 
 
 def _message_in(line: bytes, kinds: Collection[type[M]]) -> M:
-    found = _object_in(line)
-    name = found.pop(_KIND, None)
+    entries = _object_in(line)
+    name = entries.pop(_KIND, None)
     kind = next((kind for kind in kinds if kind.kind == name), None)
     if kind is None:
         raise _no_message(line)
-    expect(table_of(kind), kind.kind, found)
-    return read(kind, found)
+    expect(table_of(kind), kind.kind, entries)
+    return read(kind, entries)
 
 
 def _object_in(line: bytes) -> dict[str, Any]:
     try:
-        found = json.loads(line)
+        entries = json.loads(line)
     except (ValueError, RecursionError) as error:
         raise _no_message(line) from error
-    if not isinstance(found, dict):
+    if not isinstance(entries, dict):
         raise _no_message(line)
-    return found
+    return entries
 
 
 def _no_message(line: bytes) -> ValueError:
@@ -413,8 +413,8 @@ class SshHost:
     def _reason(self) -> str:
         """The last line that ssh printed, or its exit status."""
         # Not by reading the file: ssh writes at the same position in it.
-        said = os.pread(self._said.fileno(), _MOST_SAID, 0).decode("utf-8", "replace")
-        lines = [line.strip() for line in said.splitlines() if line.strip()]
+        output = os.pread(self._said.fileno(), _MOST_SAID, 0).decode("utf-8", "replace")
+        lines = [line.strip() for line in output.splitlines() if line.strip()]
         status = self._ssh.poll()
         if lines:
             return lines[-1]

@@ -37,8 +37,12 @@ class RouterEndpoint:
     @property
     def names(self) -> tuple[str, ...]:
         """The host names and addresses by which the router is known."""
-        ports = (one for one in (self.connect, self.listen) if isinstance(one, Endpoint) and not one.everywhere)
-        return tuple(dict.fromkeys(one.host for one in ports))
+        ports = (
+            endpoint
+            for endpoint in (self.connect, self.listen)
+            if isinstance(endpoint, Endpoint) and not endpoint.everywhere
+        )
+        return tuple(dict.fromkeys(endpoint.host for endpoint in ports))
 
 
 @dataclass(frozen=True)
@@ -141,7 +145,7 @@ def loopback_endpoints(listen: str | None, relay: str | None = None, relayed: bo
     Two routers need ports: without certificates, which only TLS has, a router is recognised by its id alone, which is not a
     secret. Raises UsageError unless the endpoints are on loopback and a router can listen there.
     """
-    asked = next((one.partition("/")[0] for one in (listen, relay) if one is not None), "tls")
+    asked = next((text.partition("/")[0] for text in (listen, relay) if text is not None), "tls")
     router = _loopback_endpoint(listen, "--listen", asked)
     second = _loopback_endpoint(relay, "--relay", asked) if relayed or relay is not None else None
     while relay is None and second is not None and str(second.listen) == str(router.listen):
@@ -153,11 +157,11 @@ def loopback_endpoints(listen: str | None, relay: str | None = None, relayed: bo
 
 def warn_if_exposed(endpoints: RouterEndpoints) -> None:
     """Warn of ports of this machine without certificates. Of those that other machines reach, `--insecure` speaks."""
-    for one in (endpoints.router, endpoints.relay):
-        if one is not None and isinstance(one.listen, Endpoint) and one.listen.loopback and not one.secure:
+    for place in (endpoints.router, endpoints.relay):
+        if place is not None and isinstance(place.listen, Endpoint) and place.listen.loopback and not place.secure:
             warn(
-                f"{one.listen} is not encrypted, and a user of this machine who listens there before the router does can pose "
-                f"as the router and read everything; give tls/{str(one.listen).partition('/')[2]}"
+                f"{place.listen} is not encrypted, and a user of this machine who listens there before the router does can pose "
+                f"as the router and read everything; give tls/{str(place.listen).partition('/')[2]}"
             )
 
 
@@ -173,12 +177,12 @@ def _loopback_endpoint(listen: str | None, option: str, protocol: str) -> Router
             f"{option} {listen} is not a loopback endpoint; give one such as tls/127.0.0.1:17460, or start the processes by "
             "hand: evedrop brief"
         )
-    found = router_endpoint(listen)
+    given = router_endpoint(listen)
     try:
         endpoint.try_to_listen()
     except OSError as error:
         raise UsageError(f"{option} {listen}: {error.strerror}; leave it out") from error
-    return found
+    return given
 
 
 @dataclass(frozen=True)

@@ -36,11 +36,11 @@ class Shard:
         first = self.scenario.first_trial
         return range(first, first + self.scenario.trials)
 
-    def of_run(self, said: object) -> str:
+    def of_run(self, text: object) -> str:
         """A message of the shard as one of the run: names the shard, and its logs by their path in the run's folder."""
         trials = self.trials
         which = f"trial {trials[0]}" if len(trials) == 1 else f"trials {trials[0]} to {trials[-1]}"
-        return f"shard {self.number} ({which}): " + re.sub(r"(?<![\w/])logs/", f"logs/{self.name}/", str(said))
+        return f"shard {self.number} ({which}): " + re.sub(r"(?<![\w/])logs/", f"logs/{self.name}/", str(text))
 
 
 def shards_of(scenario: Scenario, folder: Path) -> list[Shard]:

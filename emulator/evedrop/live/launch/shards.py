@@ -87,10 +87,12 @@ class OneProgress:
 
     def _all(self) -> RunProgress:
         """The slowest shard's progress and rate, with the errors over all trials."""
-        slowest = min(self._latest.values(), key=lambda one: one.done)
+        slowest = min(self._latest.values(), key=lambda progress: progress.done)
         trials = sum(self._trials.values())
         errors = {
-            name: sum_in_order(self._trials[number] * one.squared_errors[name] for number, one in self._latest.items())
+            name: sum_in_order(
+                self._trials[number] * progress.squared_errors[name] for number, progress in self._latest.items()
+            )
             / trials
             for name in slowest.squared_errors
         }
@@ -127,8 +129,8 @@ class _ShardsState:
     @property
     def fault(self) -> tuple[Shard, BaseException] | None:
         """The first shard that failed, and its error, which ended the others; None if all ended well or the user ended them."""
-        found = (one for one in self.failures if not isinstance(one[1], Interrupted))
-        return next(found, None)
+        failures = (failure for failure in self.failures if not isinstance(failure[1], Interrupted))
+        return next(failures, None)
 
 
 def launch_shards(
@@ -150,7 +152,10 @@ def launch_shards(
     shards = shards_of(scenario, folder)
     progress, state = OneProgress(shards, on_event), _ShardsState()
     first, *others = [(shard, at, progress.of(shard)) for shard, at in zip(shards, endpoints, strict=True)]
-    threads = [threading.Thread(target=state.launched, args=(*one, "off", stop, starter)) for one in others]
+    threads = [
+        threading.Thread(target=state.launched, args=(*shard_and_folder, "off", stop, starter))
+        for shard_and_folder in others
+    ]
     for thread in threads:
         thread.start()
     # On this thread, not on another one: a viewer ends with the thread that started it.

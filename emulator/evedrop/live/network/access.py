@@ -183,7 +183,9 @@ def at_relay(run: str, table: list[Grant], zid: str) -> list[Grant]:
 
 
 def _sites(table: list[Grant]) -> tuple[list[Grant], list[Grant]]:
-    return [one for one in table if one.process in _NEAR], [one for one in table if one.process not in _NEAR]
+    return [grant for grant in table if grant.process in _NEAR], [
+        grant for grant in table if grant.process not in _NEAR
+    ]
 
 
 def _tokens(site: list[Grant]) -> tuple[str, ...]:
@@ -197,9 +199,9 @@ def _crossing(table: list[Grant]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     for key in keys:
         # The router writes the keys that no process in the table writes; it reads those that none reads, except the
         # relay's control key.
-        writers = {one.process for one in table if key in one.writes} or {ROUTER}
+        writers = {row.process for row in table if key in row.writes} or {ROUTER}
         other = RELAY if key.endswith(f"/control/{RELAY}") else ROUTER
-        readers = {one.process for one in table if key in one.reads} or {other}
+        readers = {row.process for row in table if key in row.reads} or {other}
         if writers - _NEAR and readers & _NEAR:
             to_router.append(key)
         if writers & _NEAR and readers - _NEAR:

@@ -168,8 +168,8 @@ def maker_of(certificate: bytes) -> str:
 
 
 def _common_name(name: x509.Name) -> str:
-    found = name.get_attributes_for_oid(NameOID.COMMON_NAME)
-    return str(found[0].value) if found else "(no name)"
+    attributes = name.get_attributes_for_oid(NameOID.COMMON_NAME)
+    return str(attributes[0].value) if attributes else "(no name)"
 
 
 def _first_line(error: Exception) -> str:

@@ -77,8 +77,8 @@ class Subscription:
 
         Raises SubscriptionClosedError as `recv` does.
         """
-        found = [self.recv()]
-        while len(found) < most and self._subscriber is not None:
+        messages = [self.recv()]
+        while len(messages) < most and self._subscriber is not None:
             try:
                 sample = self._subscriber.try_recv()
             except zenoh.ZError:  # as for `recv`, which continues with the next session
@@ -87,8 +87,8 @@ class Subscription:
                 break
             payload = self._dropped.contents(self._key, self._head, sample.payload.to_bytes())
             if payload is not None:
-                found.append(payload)
-        return found
+                messages.append(payload)
+        return messages
 
     def _received(self) -> bytes:
         while True:
@@ -276,12 +276,12 @@ class Connection:
             self._keeper = threading.Thread(target=self._keep_open, name="keeps-open", daemon=True)
             self._keeper.start()
 
-    def declare(self, one: One) -> One:
+    def declare(self, declaration: One) -> One:
         """Declare an object, now and on every later session."""
         with self._lock:
-            self._declared.append(one)
-            self._declare(self.session, one)
-        return one
+            self._declared.append(declaration)
+            self._declare(self.session, declaration)
+        return declaration
 
     def appear(self, key: str) -> None:
         """Show that this process is present, now and on every later session."""
@@ -309,14 +309,14 @@ class Connection:
         if self._keeper is not None and self._keeper is not threading.current_thread():
             self._keeper.join(_LINGER_SECONDS)  # it may be opening a session that nobody needs any more
         _close(self.session)
-        for one in self._declared:
-            if isinstance(one, Subscription):
-                one.close()
+        for declaration in self._declared:
+            if isinstance(declaration, Subscription):
+                declaration.close()
 
-    def _declare(self, session: zenoh.Session, one: Declared) -> None:
+    def _declare(self, session: zenoh.Session, declaration: Declared) -> None:
         """Declare an object on a session that may be closed already: the next session will have it, too."""
         try:
-            one.declare(session)
+            declaration.declare(session)
         except zenoh.ZError:
             if not session.is_closed():
                 raise
@@ -341,9 +341,9 @@ class Connection:
 
     def _replace(self, lost: zenoh.Session) -> None:
         self._changed(False)
-        for one in list(self._declared):
-            if isinstance(one, Watch):
-                one.lose()
+        for declaration in list(self._declared):
+            if isinstance(declaration, Watch):
+                declaration.lose()
         _close(lost)
         pause, longest = _AGAIN_SECONDS
         while not self._over.is_set() and self._again is not None:
@@ -362,8 +362,8 @@ class Connection:
             self.session, self._opened = session, time.monotonic()
             self.openings += 1
             self._listen(session)
-            for one in self._declared:
-                self._declare(session, one)
+            for declaration in self._declared:
+                self._declare(session, declaration)
             key = self._token_key
         self._changed(True)
         if key is not None:

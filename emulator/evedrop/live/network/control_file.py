@@ -62,9 +62,9 @@ def read_control(folder: Path) -> Control:
     """Read the control file of a run in progress. Raises UsageError if there is none, or it is malformed."""
     path = folder / _NAME
     try:
-        found = json.loads(text_of(path, _MOST_BYTES))
-        identity = found.get("identity")
-        control = Control(**{**found, "identity": None if identity is None else Identity(**identity)})
+        settings = json.loads(text_of(path, _MOST_BYTES))
+        identity = settings.get("identity")
+        control = Control(**{**settings, "identity": None if identity is None else Identity(**identity)})
     except Unreadable as error:
         if is_there(path):
             raise no_run(folder, f"{path.name} cannot be read ({error})") from error

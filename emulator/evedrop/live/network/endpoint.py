@@ -33,10 +33,10 @@ class Endpoint:
     @classmethod
     def of(cls, text: str) -> Endpoint:
         """Parse the endpoint of a port. Raises ValueError if the text is not one."""
-        found = _FORM.fullmatch(text)
-        if found is None:
+        match = _FORM.fullmatch(text)
+        if match is None:
             raise ValueError(f"{text} is not an endpoint")
-        protocol, sixth, host, port = found.groups()
+        protocol, sixth, host, port = match.groups()
         endpoint = cls(protocol, sixth or host, int(port))
         if not 0 < endpoint.port < 2**16:
             raise ValueError(f"{text} names no port")
@@ -82,8 +82,8 @@ class Endpoint:
 
     def try_to_listen(self) -> None:
         """Raise OSError unless this host can listen there."""
-        found = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM)
-        family, kind, protocol, _, address = found[0]
+        addresses = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM)
+        family, kind, protocol, _, address = addresses[0]
         with socket.socket(family, kind, protocol) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(address)

@@ -75,7 +75,7 @@ class Heartbeat:
             emit(Alive())
 
 
-def when_launcher_is_gone(then: Callable[[], None], said: Callable[[bytes], None] = lambda _: None) -> None:
+def when_launcher_is_gone(then: Callable[[], None], hear: Callable[[bytes], None] = lambda _: None) -> None:
     """Call `then`, on a thread of its own, when standard input closes: the launcher holds its other end.
 
     said: gets every line that the launcher writes.
@@ -87,7 +87,7 @@ def when_launcher_is_gone(then: Callable[[], None], said: Callable[[bytes], None
         while read := os.read(0, 4096):
             *lines, rest = (rest + read).split(b"\n")
             for line in lines:
-                said(line)
+                hear(line)
         then()
 
     threading.Thread(target=wait, name="launcher-watchdog", daemon=True).start()

@@ -73,9 +73,9 @@ class Order:
         """Send the answer."""
         self._question.answer(answer.pack())
 
-    def done(self, slot: int, said: str) -> None:
+    def done(self, slot: int, text: str) -> None:
         """Answer that the request takes effect from this slot on; said: what was done, in words."""
-        self.answer(Answer(slot, said))
+        self.answer(Answer(slot, text))
 
     def refuse(self, *mistakes: str) -> None:
         """Answer that the request is refused, and that nothing was changed."""
@@ -89,12 +89,12 @@ def read_answer(key: str, payload: bytes) -> Answer:
         return Answer(refused=message.names("refused"))
     for name, kind in _STATUSES.items():
         if message.has(name):
-            found = message.map(name)
+            entries = message.map(name)
             try:
-                expect(table_of(kind), name, found)
+                expect(table_of(kind), name, entries)
             except ValueError as error:
                 raise message.malformed(str(error), f"the status of a {'run' if name == 'status' else name}") from error
-            return Answer(status=read(kind, found))
+            return Answer(status=read(kind, entries))
     return Answer(message.integer("k"), message.text("said"))
 
 

@@ -117,13 +117,13 @@ class Pending:
 
         The next message must be the packet of slot `first`.
         """
-        found = [self._messages.popleft()]
-        while len(found) < most and self._messages:
+        messages = [self._messages.popleft()]
+        while len(messages) < most and self._messages:
             message = self._messages[0]
-            if message.fields.get("k") != first + len(found) or is_barrier(message) or is_resend(message):
+            if message.fields.get("k") != first + len(messages) or is_barrier(message) or is_resend(message):
                 break
-            found.append(self._messages.popleft())
-        return found
+            messages.append(self._messages.popleft())
+        return messages
 
     def __iter__(self) -> Iterator[Reader]:
         """All messages that still come, until the connection is closed."""
@@ -248,16 +248,16 @@ class GapDetector:
 
     def take_message(self, receive: Callable[[], Reader], due: int) -> Reader:
         """Wait for the message of slot `due`. Raises Gap as `missed` does."""
-        while (found := (message := receive()).integer("k")) != due:
-            self.missed(due, found)
+        while (slot := (message := receive()).integer("k")) != due:
+            self.missed(due, slot)
         return message
 
-    def missed(self, due: int, found: int) -> None:
+    def missed(self, due: int, slot: int) -> None:
         """Slot `found` arrived when `due` was expected. Raises Gap if slot `due` has been missing for too long."""
         now = self._clock.monotonic()
-        if found < due:
+        if slot < due:
             return
         if self._slot != due:
             self._slot, self._since = due, now
         elif now - self._since > self._patience:
-            raise Gap(self._key, due, found)
+            raise Gap(self._key, due, slot)

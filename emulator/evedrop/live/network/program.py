@@ -62,11 +62,11 @@ class ProgramStates:
         try:
             self._session = open_session(zenoh.Config.from_json5(json.dumps(program_config(entry))))
         except zenoh.ZError as error:
-            what = (
+            problem = (
                 "cannot listen at" if entry.listen is not None else f"cannot connect within {_CONNECT_SECONDS:.0f} s to"
             )
             raise BriefError(
-                f"process.zenoh: the sensor {what} {where} ({error}); start the router there first, or give another endpoint"
+                f"process.zenoh: the sensor {problem} {where} ({error}); start the router there first, or give another endpoint"
             ) from error
         self._subscriber = self._session.declare_subscriber(entry.key, self.hear)
 
@@ -109,9 +109,9 @@ class ProgramStates:
                 )
             payload = self._heard.popleft() if there else None
         if payload is None:
-            what = "no state came" if k == 0 else f"no state came after that of slot {k - 1}"
+            problem = "no state came" if k == 0 else f"no state came after that of slot {k - 1}"
             raise RunError(
-                f"{self._about}: {what} for {self._patience:.0f} s; check that its program runs and publishes this key, or "
+                f"{self._about}: {problem} for {self._patience:.0f} s; check that its program runs and publishes this key, or "
                 "raise longest_outage"
             )
         try:

@@ -103,7 +103,7 @@ class Downlink:
         """γ of slot k, which belongs to the current batch and was delivered, (R,)."""
         return self._core.gamma(k)
 
-    def deliver(self, slots: range, packets: Uplinked, known: bool = False) -> None:
+    def deliver(self, slots: range, packets: Uplinked, again: bool = False) -> None:
         """Send the deliveries of consecutive slots of the batch: the packets that arrive in each.
 
         known: the receiver has these deliveries; only update the packets under way.
@@ -114,7 +114,7 @@ class Downlink:
             rows = core.rows(slots)
             self._masks[rows], self._received[rows] = self._described(slots)
         arrivals = core.arrivals(slots, packets.z, packets.header)
-        if known:
+        if again:
             return
         first, trials = core.rows(slots).start, packets.z.shape[2]
         late, rests, put = arrivals.late, bool(self._rests) or core.fates.rests is not None, self._put
@@ -137,7 +137,7 @@ class Downlink:
         rest = self._core.rest(k)
         if rest is not None:
             self._rests[k] = rest
-        arrived = [one.k for one in late if one.heard.gamma[0]] + [k] * bool(gamma[0])
+        arrived = [packet.k for packet in late if packet.heard.gamma[0]] + [k] * bool(gamma[0])
         longest = max((self._rests.get(slot, 0.0) for slot in arrived), default=0.0)
         self._rests.pop(k - self._schedule.window, None)
         return longest * self._pace
@@ -210,9 +210,9 @@ class AckLink:
                 commands.check()
                 continue
             message = Reader(self._key, payload)
-            if (found := message.integer("k")) == k:
+            if (slot := message.integer("k")) == k:
                 return read_acknowledgement(message, k, self._trials)
-            self._due.missed(k, found)
+            self._due.missed(k, slot)
 
 
 def route(brief: Brief[RouterPart]) -> None:
@@ -245,7 +245,9 @@ class RouterLoop:
             if delayed_sender is None and wiring is not None and not self._is_waited_for(name, wiring):
                 self._bursts.append(Burst(put))
                 return self._bursts[-1].hold
-            delays = any("delay" in (one or {}) for one in (schedule.settings, *(c.settings for c in schedule.changes)))
+            delays = any(
+                "delay" in (settings or {}) for settings in (schedule.settings, *(c.settings for c in schedule.changes))
+            )
             return (
                 (lambda payload, _: put(payload)) if delayed_sender is None or not delays else delayed_sender.round(put)
             )
@@ -337,12 +339,12 @@ class RouterLoop:
     def _route(self, first: int, messages: Sequence[Reader]) -> None:
         """Deliver the packets of consecutive slots, unless it is known that they have been delivered."""
         packets = read_uplinks(messages, first, self._shape, self._brief.model.header)
-        slots, known = range(first, first + len(messages)), first < self._done
+        slots, again = range(first, first + len(messages)), first < self._done
         for downlink in self._downlinks.values():
-            downlink.deliver(slots, packets, known)
+            downlink.deliver(slots, packets, again)
         if self._ack_link is not None:
             sent = None if packets.sent is None else packets.sent[0]
-            if known:
+            if again:
                 self._ack_link.count(first, sent, self._downlinks)
             else:
                 self._ack_link.carry(first, sent, self._downlinks, self._commands)
@@ -393,7 +395,9 @@ class RouterLoop:
             message = Reader(self._session.keys.control(ROUTER), command.pack())
             raise message.malformed(f"invalid settings ({error!r:.80})", f"settings of the link of {name}") from error
         schedule = self._schedules[name]
-        self._schedules[name] = replace(schedule, changes=(*(one for one in schedule.changes if one.at < k), *changes))
+        self._schedules[name] = replace(
+            schedule, changes=(*(change for change in schedule.changes if change.at < k), *changes)
+        )
 
 
 def _opened(brief: Brief[RouterPart], access: ZenohConfig) -> Session:

@@ -280,7 +280,7 @@ class Session:
     @property
     def router_id(self) -> str | None:
         """Zenoh id of the connected router; a restarted router has another id."""
-        return next((str(found) for found in self.connection.session.info.routers_zid()), None)
+        return next((str(zid) for zid in self.connection.session.info.routers_zid()), None)
 
     def presence(self, processes: Iterable[str]) -> dict[str, bool]:
         """Process → whether it is present, kept up to date by a thread of Zenoh's."""

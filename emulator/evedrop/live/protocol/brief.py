@@ -95,9 +95,9 @@ class PlantEntry:
         measured = ("output_matrix", "measurement_noise") if plant.output_matrix is not None else ()
         matrices = ("input_matrix", "disturbance_matrix", "noise", "start", *measured)
         limits = ("input_lower", "input_upper", "state_lower", "state_upper")
-        found: dict[str, Any] = {name: getattr(plant, name).tolist() for name in matrices}
-        found |= {name: _with_none(getattr(plant, name)) for name in limits} | own
-        return cls(**found)
+        entries: dict[str, Any] = {name: getattr(plant, name).tolist() for name in matrices}
+        entries |= {name: _with_none(getattr(plant, name)) for name in limits} | own
+        return cls(**entries)
 
     @property
     def plant(self) -> Plant:
@@ -287,9 +287,9 @@ _ACK_CHANNEL: Check = maybe(
 _CHANGES = listed(table({"at": SLOT, "settings": maybe(named(anything)), "cut": maybe(flag)}))
 
 
-def _noise(path: str, found: Any) -> Iterator[str]:
+def _noise(path: str, value: Any) -> Iterator[str]:
     """Check that a value is a matrix or a word."""
-    yield from (text if isinstance(found, str) else MATRIX)(path, found)
+    yield from (text if isinstance(value, str) else MATRIX)(path, value)
 
 
 @dataclass(frozen=True)
@@ -320,7 +320,7 @@ class LinkEntry:
     @classmethod
     def of(cls, schedule: LinkSchedule) -> LinkEntry:
         """The entry of a link's schedule."""
-        outages = [[one.start, one.stop, int(one.reason)] for one in schedule.outages]
+        outages = [[outage.start, outage.stop, int(outage.reason)] for outage in schedule.outages]
         return cls(schedule.settings, schedule.window, schedule.changes, outages, schedule.correlation)
 
     @property
@@ -631,13 +631,13 @@ def read_brief(path: Path, role: str | None = None) -> AnyBrief:
             status = os.fstat(file.fileno())
             if status.st_mode & 0o077:
                 raise BriefError(f"{path} is readable by others; a brief holds keys: chmod 600 {path}")
-            found = file.read(_MOST_BYTES) if status.st_size <= _MOST_BYTES else None
+            content = file.read(_MOST_BYTES) if status.st_size <= _MOST_BYTES else None
     except (OSError, Unreadable) as error:
         raise BriefError(f"{path}: {why_of(error)}; give the file that `evedrop brief` wrote") from error
     try:
-        if found is None:
+        if content is None:
             raise ValueError(f"it has more than {_MOST_BYTES} bytes")
-        brief = brief_from(json.loads(found.decode("utf-8")))
+        brief = brief_from(json.loads(content.decode("utf-8")))
     except (ValueError, RecursionError) as error:
         raise BriefError(f"{path} is not a brief of this version ({error}); {WRITE_AGAIN}") from error
     if role is not None and brief.role != role:
@@ -647,14 +647,14 @@ def read_brief(path: Path, role: str | None = None) -> AnyBrief:
     return brief
 
 
-def brief_from(found: Any) -> AnyBrief:
+def brief_from(entries: Any) -> AnyBrief:
     """The brief of a decoded JSON text. Raises ValueError if it is not one."""
-    expect(table_of(Brief), "", found)
-    if found["role"] not in PARTS:
-        raise ValueError(f"unknown role {found['role']:.40}, expected one of {', '.join(PARTS)}")
-    kind = PARTS[found["role"]]
-    expect(table_of(kind), "part", found["part"])
-    brief: AnyBrief = read(Brief, {**found, "part": read(kind, found["part"])})
+    expect(table_of(Brief), "", entries)
+    if entries["role"] not in PARTS:
+        raise ValueError(f"unknown role {entries['role']:.40}, expected one of {', '.join(PARTS)}")
+    kind = PARTS[entries["role"]]
+    expect(table_of(kind), "part", entries["part"])
+    brief: AnyBrief = read(Brief, {**entries, "part": read(kind, entries["part"])})
     model = brief.model
     try:
         matrices = [np.array(M, np.float64) for M in (model.A, model.Q, model.initial_covariance)]

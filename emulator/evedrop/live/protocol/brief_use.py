@@ -91,8 +91,8 @@ def _scheme(brief: AnyBrief, part: SensorPart | LegitimatePart) -> Scheme:
     spec = part.scheme
     kind = SCHEMES[spec["scheme"]]
     for name in sorted(set(kind.parameters) ^ (set(spec) - {"scheme"})):
-        what = "missing" if name in kind.parameters else "not a parameter of the scheme"
-        raise BriefError(f"part.scheme.{name} is {what}; {WRITE_AGAIN}")
+        problem = "missing" if name in kind.parameters else "not a parameter of the scheme"
+        raise BriefError(f"part.scheme.{name} is {problem}; {WRITE_AGAIN}")
     with _using("part.scheme"):
         return scheme_of(brief.model.process, spec)
 
@@ -105,18 +105,18 @@ def _expect_plant(brief: AnyBrief, entry: PlantEntry, disturbances: str | None =
             raise ValueError(f"it does not have {n} states, as the model does")
         if disturbances is None:
             return
-        found = decoded(disturbances, brief.slots)
-        if found.shape[1] != plant.disturbance_matrix.shape[1] or not np.isfinite(found).all():
-            raise ValueError(f"it has {found.shape[1]} disturbances in each slot, or they are not finite")
+        disturbances_ = decoded(disturbances, brief.slots)
+        if disturbances_.shape[1] != plant.disturbance_matrix.shape[1] or not np.isfinite(disturbances_).all():
+            raise ValueError(f"it has {disturbances_.shape[1]} disturbances in each slot, or they are not finite")
 
 
 def _expect_states(brief: AnyBrief, part: SensorPart) -> None:
     n, program = brief.model.process.n, part.program
     with _using("part.states"):
         if part.states is not None:
-            found = decoded(part.states, brief.slots)
-            if found.shape[1] != n or not np.isfinite(found).all():
-                raise ValueError(f"it has {found.shape[1]} states, not {n}, or they are not finite")
+            states = decoded(part.states, brief.slots)
+            if states.shape[1] != n or not np.isfinite(states).all():
+                raise ValueError(f"it has {states.shape[1]} states, not {n}, or they are not finite")
     with _using("part.program"):
         if program is not None:
             if {len(program.states), len(program.reference), len(program.offsets or program.states)} != {n}:
@@ -130,7 +130,7 @@ def _expect_monitor(brief: AnyBrief, entry: MonitorEntry, plant: PlantEntry | No
         if plant is None or plant.output_matrix is None:
             raise ValueError("there is no filter whose innovations could be tested")
         plan, p, m = entry.plan, len(plant.output_matrix), plant.plant.inputs
-        shapes = [one.shape for one in (plan.watermark, plan.shift, plan.marked.precision, plan.unmarked.precision)]
+        shapes = [array.shape for array in (plan.watermark, plan.shift, plan.marked.precision, plan.unmarked.precision)]
         if shapes != [(m, m), (p, m), (p, p), (p, p)]:
             raise ValueError(f"its matrices are {shapes}, and there are {m} inputs and {p} measurements")
         Monitor(plan, bytes(KEY_BYTES), brief.batch)
@@ -139,8 +139,8 @@ def _expect_monitor(brief: AnyBrief, entry: MonitorEntry, plant: PlantEntry | No
 
 def _expect_controller(brief: AnyBrief, part: ControllerPart) -> None:
     if part.strategy not in CONTROLLERS:
-        known = ", ".join(sorted(CONTROLLERS))
-        raise BriefError(f"part.strategy is {part.strategy:.40}, expected one of {known}; {WRITE_AGAIN}")
+        names = ", ".join(sorted(CONTROLLERS))
+        raise BriefError(f"part.strategy is {part.strategy:.40}, expected one of {names}; {WRITE_AGAIN}")
     _expect_plant(brief, part.plant, part.disturbances)
     with _using("part.assignment"):
         assignment = part.assignment.assignment(brief.model.process, part.plant.plant)
@@ -171,5 +171,5 @@ def _using(path: str) -> Iterator[None]:
     except (BriefError, NotRegistered):
         raise
     except Exception as error:
-        said = f"{type(error).__name__}: {next(iter(str(error).splitlines()), '')}"
-        raise BriefError(f"{path} cannot be used ({said}); {WRITE_AGAIN}") from error
+        reason = f"{type(error).__name__}: {next(iter(str(error).splitlines()), '')}"
+        raise BriefError(f"{path} cannot be used ({reason}); {WRITE_AGAIN}") from error

@@ -60,18 +60,18 @@ class Reader:
     def _unpacked(self) -> Mapping[Any, Any]:
         count = None if len(self._payload) <= _SMALL_BYTES else _counter(self._parts)
         try:
-            found = msgpack.unpackb(
+            fields = msgpack.unpackb(
                 self._payload, raw=False, strict_map_key=False, list_hook=count, object_hook=count, max_ext_len=0
             )
         except Exception as error:
             raise self.malformed(f"not msgpack ({type(error).__name__})", "a msgpack map") from error
-        if not isinstance(found, dict):
-            raise self.malformed(f"a {type(found).__name__}", "a msgpack map")
-        return found
+        if not isinstance(fields, dict):
+            raise self.malformed(f"a {type(fields).__name__}", "a msgpack map")
+        return fields
 
-    def malformed(self, found: str, expected: str) -> MalformedMessage:
+    def malformed(self, got: str, expected: str) -> MalformedMessage:
         """The error for this message, with what was found in it and what was expected."""
-        return MalformedMessage(self.key, found, expected, self._payload, writer_of(self.key))
+        return MalformedMessage(self.key, got, expected, self._payload, writer_of(self.key))
 
     @property
     def fields(self) -> Mapping[Any, Any]:
@@ -114,7 +114,7 @@ class Reader:
     def names(self, name: str) -> tuple[str, ...]:
         """A list of strings."""
         value = self._fields.get(name)
-        if not isinstance(value, list) or not all(isinstance(one, str) for one in value):
+        if not isinstance(value, list) or not all(isinstance(element, str) for element in value):
             raise self.malformed(f"{name} = {shown(value)}", f"a list {name} of strings")
         return tuple(value)
 
@@ -163,9 +163,9 @@ class Reader:
     def maps(self, name: str) -> list[Reader]:
         """A list of maps, each as a reader of its own."""
         value = self._fields.get(name)
-        if not isinstance(value, list) or not all(isinstance(one, dict) for one in value):
+        if not isinstance(value, list) or not all(isinstance(element, dict) for element in value):
             raise self.malformed(f"{name} = {shown(value)}", f"a list {name} of maps")
-        return [Reader(self.key, self._payload, one) for one in value]
+        return [Reader(self.key, self._payload, element) for element in value]
 
     def nested(self, name: str) -> Reader:
         """A map field, as a reader of its own."""
@@ -276,10 +276,10 @@ def named_in(message: bytes) -> str | None:
     unpacker = msgpack.Unpacker()
     unpacker.feed(message[:_SHOWN_BYTES])
     try:
-        found = unpacker.unpack()
+        key = unpacker.unpack()
     except Exception:  # msgpack raises various errors for bytes that are not a message
         return None
-    return found if isinstance(found, str) else None
+    return key if isinstance(key, str) else None
 
 
 @final
@@ -301,9 +301,9 @@ class Dropped:
             number = self.count
         named = named_in(message)
         if number == 10 ** (len(str(number)) - 1):
-            what = f"names {named}" if named is not None else "names no key"
+            problem = f"names {named}" if named is not None else "names no key"
             sys.stderr.write(
-                f"evedrop: {self._process}: dropped a message that came on {key} and {what} (number {number}); "
+                f"evedrop: {self._process}: dropped a message that came on {key} and {problem} (number {number}); "
                 "if it was needed, it is sent again\n"
             )
             sys.stderr.flush()

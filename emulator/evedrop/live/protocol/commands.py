@@ -164,7 +164,9 @@ class Again(ControlCommand):
 
     def pack(self) -> bytes:
         """Encode it as a message."""
-        links = {} if self.links is None else {"links": {name: _packed(one) for name, one in self.links.items()}}
+        links = (
+            {} if self.links is None else {"links": {name: _packed(changes) for name, changes in self.links.items()}}
+        )
         return pack({"do": self.do, "n": self.round, "k": self.slot, **links})
 
     @classmethod
@@ -184,23 +186,23 @@ def _packed(changes: Sequence[Change]) -> list[dict[str, Any]]:
     """Changes of a link as in a message."""
     return [
         {
-            "at": one.at,
-            **({} if one.settings is None else {"settings": one.settings}),
-            **({} if one.cut is None else {"cut": one.cut}),
+            "at": change.at,
+            **({} if change.settings is None else {"settings": change.settings}),
+            **({} if change.cut is None else {"cut": change.cut}),
         }
-        for one in changes
+        for change in changes
     ]
 
 
-def _changes(found: Reader, name: str, slots: int) -> tuple[Change, ...]:
+def _changes(message: Reader, name: str, slots: int) -> tuple[Change, ...]:
     """The changes of a link in a field of a message; slots: of the run."""
     return tuple(
         Change(
-            one.integer("at", 0, slots),
-            one.map("settings") if one.has("settings") else None,
-            one.flag("cut") if one.has("cut") else None,
+            change.integer("at", 0, slots),
+            change.map("settings") if change.has("settings") else None,
+            change.flag("cut") if change.has("cut") else None,
         )
-        for one in found.maps(name)
+        for change in message.maps(name)
     )
 
 

@@ -73,8 +73,8 @@ def last_word_file(folder: Path, process: str) -> Path:
 def read_last_word(file: Path) -> LastWord | None:
     """The last word in a file; None if there is none that can be read."""
     with suppress(Unreadable, ValueError, RecursionError):
-        found = json.loads(contents(file, _MOST_BYTES))
-        expect(table_of(LastWord), "", found)
-        word = read(LastWord, found)
+        entries = json.loads(contents(file, _MOST_BYTES))
+        expect(table_of(LastWord), "", entries)
+        word = read(LastWord, entries)
         return LastWord(word.cause, escaped(word.sentence), word.blamed)
     return None

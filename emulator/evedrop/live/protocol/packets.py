@@ -120,7 +120,7 @@ def delivery(
     if truth:
         fields["truth"] = truth
     if late:
-        fields["late"] = [_packets(one.k, one.heard) for one in late]
+        fields["late"] = [_packets(packet.k, packet.heard) for packet in late]
     return pack(fields)
 
 
@@ -150,12 +150,12 @@ def read_delivery(
     parts = message.maps("late") if message.has("late") else []
     if len(parts) > 2 * (k - oldest + 1):  # for each slot, its packets and their second copies
         raise message.malformed(f"{len(parts)} entries in late", f"at most two for each slot from {oldest} to {k}")
-    for one in parts:
-        slot = one.integer("k")
+    for packet in parts:
+        slot = packet.integer("k")
         if not oldest <= slot <= k:
             since = "" if oldest == 0 else f", from {oldest} on"
-            raise one.malformed(f"a late packet of slot {slot}", f"one of slot {k} or before{since}")
-        late.append(Late(slot, _heard(one, shape, header)))
+            raise packet.malformed(f"a late packet of slot {slot}", f"one of slot {k} or before{since}")
+        late.append(Late(slot, _heard(packet, shape, header)))
     heard = _heard(message, shape, header)
     if message.has("truth"):
         heard = heard._replace(truth=message.finite("truth", shape))
@@ -214,15 +214,15 @@ def read_uplinks(messages: Sequence[Reader], first: int, shape: tuple[int, int],
         (read_uplink(message, k, shape), read_extras(message, shape, header))
         for k, message in enumerate(messages, first)
     ]
-    extras = [one for _, one in read]
+    extras = [extra for _, extra in read]
     return Uplinked(
         np.array([z for z, _ in read]),
         [z.tobytes() for z, _ in read],
-        np.array([one.header for one in extras]) if header else None,
+        np.array([extra.header for extra in extras]) if header else None,
         None
-        if all(one.sent is None for one in extras)
-        else np.array([np.ones(shape[1], np.bool_) if one.sent is None else one.sent for one in extras]),
-        {row: one.truth for row, one in enumerate(extras) if one.truth is not None},
+        if all(extra.sent is None for extra in extras)
+        else np.array([np.ones(shape[1], np.bool_) if extra.sent is None else extra.sent for extra in extras]),
+        {row: extra.truth for row, extra in enumerate(extras) if extra.truth is not None},
     )
 
 
@@ -235,11 +235,11 @@ def read_deliveries(
         return plain
     read = [read_delivery(message, k, shape, header, window) for k, message in enumerate(messages, first)]
     return Arrivals(
-        np.array([one.heard.gamma for one in read]),
-        np.array([one.heard.z for one in read]),
-        np.array([one.heard.header for one in read]) if header else None,
-        {row: one.late for row, one in enumerate(read) if one.late},
-        {row: one.heard.truth for row, one in enumerate(read) if one.heard.truth is not None},
+        np.array([delivery_.heard.gamma for delivery_ in read]),
+        np.array([delivery_.heard.z for delivery_ in read]),
+        np.array([delivery_.heard.header for delivery_ in read]) if header else None,
+        {row: delivery_.late for row, delivery_ in enumerate(read) if delivery_.late},
+        {row: delivery_.heard.truth for row, delivery_ in enumerate(read) if delivery_.heard.truth is not None},
     )
 
 
@@ -253,16 +253,16 @@ def _plain_deliveries(messages: Sequence[Reader], shape: tuple[int, int]) -> Arr
     """The deliveries, if they have nothing but packets and pass all checks."""
     n, trials = shape
     size = (trials + 7) // 8
-    found = [message.fields for message in messages]
-    masks = [mask for one in found if isinstance(mask := one.get("gamma"), bytes) and len(mask) == size]
-    if len(masks) < len(found) or not all(one.keys() <= _DELIVERY for one in found):
+    maps = [message.fields for message in messages]
+    masks = [mask for fields in maps if isinstance(mask := fields.get("gamma"), bytes) and len(mask) == size]
+    if len(masks) < len(maps) or not all(fields.keys() <= _DELIVERY for fields in maps):
         return None
     bits = np.frombuffer(b"".join(masks), np.uint8).reshape(len(masks), size)
     if trials % 8 and (bits[:, -1] >> trials % 8).any():
         return None
     gamma = flags_of(bits, trials)
     counts = np.count_nonzero(gamma, axis=1).tolist()
-    packed = _finite([one.get("z", b"") for one in found], [n * count for count in counts])
+    packed = _finite([fields.get("z", b"") for fields in maps], [n * count for count in counts])
     return None if packed is None else Arrivals(gamma, kernels.scatter(gamma, packed, n))
 
 

@@ -128,12 +128,12 @@ class LinkStatus:
         return f"{self.delivered} of {self.offered} packets delivered, {fraction}"
 
 
-def _links(found: Mapping[str, Any]) -> dict[str, LinkStatus]:
-    return {name: read(LinkStatus, one) for name, one in found.items()}
+def _links(tables: Mapping[str, Any]) -> dict[str, LinkStatus]:
+    return {name: read(LinkStatus, table) for name, table in tables.items()}
 
 
-def _events(found: Sequence[Mapping[str, Any]]) -> list[RunEvent]:
-    return [read(RunEvent, one) for one in found]
+def _events(events: Sequence[Mapping[str, Any]]) -> list[RunEvent]:
+    return [read(RunEvent, happening) for happening in events]
 
 
 @dataclass(frozen=True)
@@ -162,16 +162,16 @@ class RunStatus:
         missing = ", ".join(name for name, is_there in self.processes.items() if not is_there)
         yield f"processes: {there}" + (f"; not on the network: {missing}" if missing else "")
         yield from (f"link {name}: {link}" for name, link in self.links.items())
-        yield from (f"event at slot {one.slot}: {one.event} (by the {one.by})" for one in self.events)
+        yield from (f"event at slot {event.slot}: {event.event} (by the {event.by})" for event in self.events)
 
 
 def status_of_shards(statuses: Sequence[RunStatus]) -> RunStatus:
     """The status of a run in shards: the slowest one's slot; processes present if they are in all shards; and all packets."""
     slowest = min(statuses, key=lambda status: status.slot)
-    processes = {name: all(one.processes[name] for one in statuses) for name in slowest.processes}
+    processes = {name: all(shard.processes[name] for shard in statuses) for name in slowest.processes}
     links = {
         name: LinkStatus.of(
-            *(sum(getattr(one.links[name], what) for one in statuses) for what in ("offered", "delivered"))
+            *(sum(getattr(shard.links[name], count) for shard in statuses) for count in ("offered", "delivered"))
         )
         for name in slowest.links
     }

@@ -31,28 +31,28 @@ def read_state(payload: bytes, entry: ProgramEntry) -> Floats:
     n = len(entry.states)
     if len(payload) > MOST_BYTES:
         raise ValueError(f"has {len(payload)} bytes; expected at most {MOST_BYTES}")
-    found = list(_named(payload, entry) if entry.offsets is None else _placed(payload, entry.offsets))
-    if len(found) != n:
+    values = list(_named(payload, entry) if entry.offsets is None else _placed(payload, entry.offsets))
+    if len(values) != n:
         raise ValueError(f"is {_shown(payload)}; expected {n} numbers, one for each of {', '.join(entry.states)}")
-    for name, value in zip(entry.states, found, strict=True):
+    for name, value in zip(entry.states, values, strict=True):
         if not is_number(value, -LARGEST, LARGEST):
             raise ValueError(f"has {name} = {str(value)[:_SHOWN]}; expected a finite number of at most {LARGEST:g}")
-    return deviations(np.array(found, np.float64), np.array(entry.reference))
+    return deviations(np.array(values, np.float64), np.array(entry.reference))
 
 
 def _named(payload: bytes, entry: ProgramEntry) -> Iterator[Any]:
     """The values in a JSON list, or under the names of the states in a JSON object."""
     try:
-        found = json.loads(payload)
+        values = json.loads(payload)
     except (ValueError, RecursionError):
-        found = None
-    if isinstance(found, Mapping):
-        missing = next((name for name in entry.states if name not in found), None)
+        values = None
+    if isinstance(values, Mapping):
+        missing = next((name for name in entry.states if name not in values), None)
         if missing is not None:
             raise ValueError(f"is {_shown(payload)}, without {missing}; expected {', '.join(entry.states)} in it")
-        yield from (found[name] for name in entry.states)
-    elif isinstance(found, list):
-        yield from found
+        yield from (values[name] for name in entry.states)
+    elif isinstance(values, list):
+        yield from values
     else:
         example = json.dumps(dict.fromkeys(entry.states, 0.0))
         raise ValueError(f"is {_shown(payload)}; expected JSON such as {example}, or a list of numbers")

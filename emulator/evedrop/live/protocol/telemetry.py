@@ -130,8 +130,8 @@ def read_failed(message: Reader, shape: tuple[int, ...]) -> Flags:
 def read_digests(message: Reader, trials: int, blocks: list[int]) -> dict[int, Digests]:
     """Decode digests: block, by its first slot → digests, (R, 16); blocks: those that end in the slots of the message."""
     digests: dict[int, Digests] = {}
-    found = message.map("digests")
-    for block, value in found.items():
+    by_block = message.map("digests")
+    for block, value in by_block.items():
         if type(block) is not int or block not in blocks:
             expected = (
                 f"of the blocks that end in these slots, {blocks}" if blocks else "none: no block ends in these slots"
@@ -191,7 +191,7 @@ class Report:
 
 
 def _packed_sums(sums: Mapping[int, Floats]) -> dict[int, bytes]:
-    return {block: one.astype("<f8").tobytes() for block, one in sums.items()}
+    return {block: block_sums.astype("<f8").tobytes() for block, block_sums in sums.items()}
 
 
 def _read_sums(message: Reader, trials: int, blocks: list[int]) -> dict[int, Floats]:
@@ -199,17 +199,17 @@ def _read_sums(message: Reader, trials: int, blocks: list[int]) -> dict[int, Flo
     given = message.map("trace_sums") if message.has("trace_sums") else {}
     if set(given) != set(blocks):
         raise message.malformed(f"trace_sums of blocks {shown(list(given))}", f"those of {blocks}")
-    found = {}
+    sums = {}
     for block in blocks:
         value = given[block]
         if not isinstance(value, bytes) or len(value) != 8 * trials:
             raise message.malformed(f"trace_sums of block {block}", f"{8 * trials} bytes a block")
-        found[block] = np.frombuffer(value, "<f8").astype(np.float64)
-        if not (np.isfinite(found[block]).all() and (found[block] >= 0.0).all()):
+        sums[block] = np.frombuffer(value, "<f8").astype(np.float64)
+        if not (np.isfinite(sums[block]).all() and (sums[block] >= 0.0).all()):
             raise message.malformed(
                 f"trace_sums of block {block} with a number below 0, or not finite", "sums of traces"
             )
-    return found
+    return sums
 
 
 def read_report(message: Reader, first: int, extent: Extent, blocks: Blocks, window: int = 0) -> Report:

@@ -167,13 +167,13 @@ class Conductor:
         others = [name for name in self._present if name not in {ROUTER, RELAY} and name not in self.absent]
         told: set[str] = set()
         deadline = self._clock.monotonic() + patience
-        said = 0.0
+        sent = 0.0
         while self._clock.monotonic() < deadline:
             left = [name for name in others if not self._has_ended(name, told)]
             if not left and self._present[ROUTER]:
                 break
-            if self._clock.monotonic() - said > _END_SECONDS:
-                said = self._clock.monotonic()
+            if self._clock.monotonic() - sent > _END_SECONDS:
+                sent = self._clock.monotonic()
                 for name in left:
                     if self._present[name]:
                         self.send_to(name, EndRun())
@@ -194,12 +194,12 @@ class Conductor:
     def _end_router(self, name: str) -> None:
         """Tell a router that the run is over until it confirms it: the router by a message, the relay by its token."""
         deadline = self._clock.monotonic() + _ROUTERS_SECONDS
-        said = 0.0
+        sent = 0.0
         while self._clock.monotonic() < deadline and name not in self.misdelivered:
             if name == RELAY and not self._present[name] and self._session.linked():
                 return
-            if self._clock.monotonic() - said > _END_SECONDS:
-                said = self._clock.monotonic()
+            if self._clock.monotonic() - sent > _END_SECONDS:
+                sent = self._clock.monotonic()
                 self.send_to(name, EndRun())
             self._hear_out(self._next())
 

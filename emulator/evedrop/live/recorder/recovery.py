@@ -121,15 +121,15 @@ class Recovery:
             self._conductor.fail_cut_off(gone, self._flow.longest_outage)
 
     def _all_back(self, now: float) -> None:
-        found = self._missing
+        missing = self._missing
         # All processes vanish with the recorder's own router, or with the connection to it. Behind a relay, the sensor
         # vanishes with the router, and both with the link between the routers.
         own = RELAY if self._conductor.relayed else ROUTER
-        if own in found:
-            found = {own if self._conductor.router_changed() else RECORDER: found[own]}
-        elif ROUTER in found:
-            found = {ROUTER: found[ROUTER]}
-        for name, beginning in found.items():
+        if own in missing:
+            missing = {own if self._conductor.router_changed() else RECORDER: missing[own]}
+        elif ROUTER in missing:
+            missing = {ROUTER: missing[ROUTER]}
+        for name, beginning in missing.items():
             self._back.setdefault(name, beginning)
         self._missing, self._returned = {}, None
         self._target = self._done + self._flow.window + self._flow.batch
@@ -157,8 +157,8 @@ class Recovery:
         """
         now = self._clock.monotonic()
         self._close(done, now)
-        found = self._missing
-        found = next(({name: found[name]} for name in (RELAY, ROUTER) if name in found), found)
+        missing = self._missing
+        missing = next(({name: missing[name]} for name in (RELAY, ROUTER) if name in missing), missing)
         until = done if complete else None
-        self.outages += [ConnectionOutage(name, slot, until, now - since) for name, (slot, since) in found.items()]
+        self.outages += [ConnectionOutage(name, slot, until, now - since) for name, (slot, since) in missing.items()]
         self._missing = {}

@@ -86,12 +86,12 @@ class Stall:
         places = reported()
         for process, k in places.items():
             # It reports at least once in every batch of slots: do not believe that it is further without a report.
-            said = min(self._answers[process].slot, k + self._batch) if process in self._answers else -1
-            place = (said, k)
+            slot = min(self._answers[process].slot, k + self._batch) if process in self._answers else -1
+            place = (slot, k)
             if process not in self._moved or self._moved[process][0] < place:
                 # The first answer does not count as a move: it is unknown when the process reached that slot.
-                known = self._moved.get(process)
-                first = known is None or (known[0][0] == -1 and known[0][1] == k)
+                moved = self._moved.get(process)
+                first = moved is None or (moved[0][0] == -1 and moved[0][1] == k)
                 self._moved[process] = (place, 0.0 if first else self._stalled)
         if self._stalled - self._asked > self._patience / 10.0:
             self._asked = self._stalled
@@ -103,10 +103,10 @@ class Stall:
         silent = tuple(silent_of(places, self._answers, unneeded))
         still = self._stalled - max(self._moved[name][1] for name in silent)
         if still > self._patience:
-            what = " and ".join(_described(name, self._answers.get(name)) for name in silent)
+            described = " and ".join(_described(name, self._answers.get(name)) for name in silent)
             raise Silence(
                 silent,
-                f"alive, and silent for {still:.0f} s while the run waits for slot {self._done} ({what}); look at "
+                f"alive, and silent for {still:.0f} s while the run waits for slot {self._done} ({described}); look at "
                 f"{' and '.join(f'logs/{name}.log' for name in silent)}, or raise longest_outage",
             )
 

@@ -154,11 +154,11 @@ class Steering:
         reported: all slots below it are joined; complete: whether these are all slots of the run.
         """
         if self._step is not None:
-            said = self._step.passed(reported)
+            text = self._step.passed(reported)
             if complete:
-                self._step.order.done(reported, f"{said}; the run is over")
+                self._step.order.done(reported, f"{text}; the run is over")
             else:
-                self._step.order.refuse(f"{said}; the run was ended before the step was over")
+                self._step.order.refuse(f"{text}; the run was ended before the step was over")
         self._step = None
         while self._orders:
             self._orders.popleft().refuse("the run ended first; nothing was done")
@@ -177,11 +177,11 @@ class Steering:
         self._fail(f"{act.said}: not done yet; look at logs/{act.names[0]}.log")
         return False
 
-    def _fail(self, what: str) -> None:
+    def _fail(self, problem: str) -> None:
         """Raise RunError if the run has been waiting for too long; what: the missing condition."""
         if time.monotonic() - self._since > READY_SECONDS:
             raise RunError(
-                f"{READY_SECONDS:.0f} s after the run was held before slot {self.at}, {what}; look at the logs"
+                f"{READY_SECONDS:.0f} s after the run was held before slot {self.at}, {problem}; look at the logs"
             )
 
     def _may(self, act: Act) -> bool:
@@ -203,11 +203,11 @@ class Steering:
             case LinkRequest(event):
                 self._change(k, order, event)
             case PauseRequest():
-                said = f"held already, before slot {k}" if self.paused else f"held before slot {k}"
+                text = f"held already, before slot {k}" if self.paused else f"held before slot {k}"
                 if not self.paused:
                     self._pause(k, "pause the run")
                 self._forget_step(k, "the run was paused")
-                order.done(k, said)
+                order.done(k, text)
             case ResumeRequest():
                 if self.paused:
                     self._note(k, "resume the run", "operator")
@@ -235,15 +235,15 @@ class Steering:
         self._keep(changed)
         for name in act.names:
             self._changed.add(name)
-            changes = tuple(one for one in changed.timeline.changes[name] if one.at >= k)
+            changes = tuple(change for change in changed.timeline.changes[name] if change.at >= k)
             self._conductor.send_to(ROUTER, LinkChange(name, changes))
         order.done(k, f"from slot {k} on: {act.said}")
 
-    def _pause(self, k: int, said: str | None = None) -> None:
+    def _pause(self, k: int, text: str | None = None) -> None:
         self.paused = True
         self._on_event(Held(k))
-        if said is not None:
-            self._note(k, said, "operator")
+        if text is not None:
+            self._note(k, text, "operator")
 
     def _step_is_over(self, step: OperatorStep, k: int) -> None:
         self._step = None
@@ -256,8 +256,8 @@ class Steering:
             self._step.order.done(k, f"{self._step.passed(k)}; {why} before the step was over")
         self._step = None
 
-    def _note(self, k: int, said: str, by: str) -> None:
-        self.events.append(RunEvent(k, said, by))
+    def _note(self, k: int, text: str, by: str) -> None:
+        self.events.append(RunEvent(k, text, by))
 
     def _release(self) -> None:
         self.at = None
@@ -298,6 +298,6 @@ def status_of(
         slots_per_second=0.0 if steering.paused else rate,
         state="paused" if steering.paused else "running" if steering.at is None else "held",
         processes=conductor.processes,
-        links={name: LinkStatus.of(one.offered, one.delivered) for name, one in accounts.items()},
+        links={name: LinkStatus.of(account.offered, account.delivered) for name, account in accounts.items()},
         events=steering.events,
     )

@@ -64,15 +64,15 @@ class Verifier:
             first = stop
 
     def _check_digests(self, name: str, report: Report, start: int, stop: int) -> None:
-        found = self._digests[name].finished()
+        digests = self._digests[name].finished()
         claimed = report.digests[start][: self._recorded]
-        wrong = (found != claimed).any(axis=1)
+        wrong = (digests != claimed).any(axis=1)
         if wrong.any():
             r = int(np.argmax(wrong))
             raise Contradiction(
                 name,
                 f"its digest of slots {start} to {stop - 1} of trial {self._first_trial + r} is {claimed[r].tobytes().hex()}, "
-                f"and what it reported of these slots gives {found[r].tobytes().hex()}",
+                f"and what it reported of these slots gives {digests[r].tobytes().hex()}",
             )
 
     def _add_to_block(self, name: str, report: Report, rows: slice) -> None:
@@ -86,17 +86,17 @@ class Verifier:
         """Check that the sums of tr P of a block's trials are those of the recorded trials, and of all trials together."""
         of_recorded, of_all = self._block_sums.pop(name)
         claimed = report.trace_sums[start]
-        known = np.append(of_recorded, of_all)
+        sums = np.append(of_recorded, of_all)
         with np.errstate(over="ignore", invalid="ignore"):
-            found = np.append(claimed[: self._recorded], claimed.sum())
-            wrong = ~(np.abs(found - known) <= _ROUNDING * np.maximum(np.abs(known), np.abs(found)))
+            stated = np.append(claimed[: self._recorded], claimed.sum())
+            wrong = ~(np.abs(stated - sums) <= _ROUNDING * np.maximum(np.abs(sums), np.abs(stated)))
         if wrong.any():
             place = int(np.argmax(wrong))
             which = "all trials" if place == self._recorded else f"trial {self._first_trial + place}"
             raise Contradiction(
                 name,
-                f"its sum of tr P over slots {start} to {stop - 1} of {which} is {found[place]:.17g}, and what it reported of "
-                f"these slots gives {known[place]:.17g}",
+                f"its sum of tr P over slots {start} to {stop - 1} of {which} is {stated[place]:.17g}, and what it reported of "
+                f"these slots gives {sums[place]:.17g}",
             )
 
     def _check_traces(self, name: str, report: Report) -> None:
@@ -105,11 +105,11 @@ class Verifier:
         trials, claimed = report.x_hat.shape[2], report.trace
         others = trials - traces.shape[1]
         with np.errstate(over="ignore", invalid="ignore"):  # a receiver may have made these numbers up
-            known = np.stack([traces.sum(axis=1), (traces * traces).sum(axis=1)], axis=1)
+            sums_ = np.stack([traces.sum(axis=1), (traces * traces).sum(axis=1)], axis=1)
             size = np.stack([np.sqrt(trials * np.abs(claimed[:, 1])), np.abs(claimed[:, 1])], axis=1)
-            left = claimed - known
+            left = claimed - sums_
             if others == 0:
-                wrong = (np.abs(left) > _ROUNDING * np.maximum(size, np.abs(known))).any(axis=1)
+                wrong = (np.abs(left) > _ROUNDING * np.maximum(size, np.abs(sums_))).any(axis=1)
             else:
                 # For any numbers: |sum| ≤ √(count · sum of squares). The remaining sum of squares is known within rounding.
                 squares = left[:, 1] + _ROUNDING * size[:, 1]
@@ -117,7 +117,7 @@ class Verifier:
                 wrong = (squares < 0.0) | (np.abs(left[:, 0]) > room)
         if wrong.any():
             row = int(np.argmax(wrong))
-            sums = [f"{value:.17g}" for value in (*claimed[row], *known[row])]
+            sums = [f"{value:.17g}" for value in (*claimed[row], *sums_[row])]
             raise Contradiction(
                 name,
                 f"its sums of tr P and of (tr P)² in slot {report.first + row} are {sums[0]} and {sums[1]}, and those of the "
@@ -129,16 +129,20 @@ class Verifier:
         left = self._leaving.pop((name, end), None)
         if left is None:
             return
-        for what, said, reported in (
+        for quantity, on_leaving, reported in (
             ("x_hat", left.x_hat, report.x_hat[-1]),
             ("P", left.P[..., : self._recorded], report.P[-1]),
         ):
-            if said.tobytes() != np.ascontiguousarray(reported).tobytes():
-                place = tuple(int(i) for i in np.argwhere(said != reported)[0]) if (said != reported).any() else (0,)
+            if on_leaving.tobytes() != np.ascontiguousarray(reported).tobytes():
+                place = (
+                    tuple(int(i) for i in np.argwhere(on_leaving != reported)[0])
+                    if (on_leaving != reported).any()
+                    else (0,)
+                )
                 raise Contradiction(
                     name,
-                    f"before slot {end}, with which it goes away, its {what} of trial {self._first_trial + place[-1]} is "
-                    f"{said[place]}, and in its report of slot {end - 1} it is {reported[place]}",
+                    f"before slot {end}, with which it goes away, its {quantity} of trial {self._first_trial + place[-1]} is "
+                    f"{on_leaving[place]}, and in its report of slot {end - 1} it is {reported[place]}",
                 )
 
     def joined(self, slots: Slots) -> None:

@@ -67,10 +67,10 @@ def held(assignment: Assignment, entry: Floats | None = None) -> tuple[Floats, F
 @np.errstate(over="ignore", invalid="ignore")
 def _riccati(F: Floats, G: Floats, H: Floats) -> Floats:
     """The limit P of P = Fᵀ P (1 + G P)⁻¹ F + H."""
-    one = np.eye(len(F))
+    identity = np.eye(len(F))
     for _ in range(_DOUBLINGS):
         try:
-            W = inverse(one + product(G, H))
+            W = inverse(identity + product(G, H))
         except ValueError as error:
             raise ValueError("the Riccati equation has no solution") from error
         FW = product(F, W)

@@ -71,13 +71,15 @@ class Mpc(Controller):
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
         """A horizon that is not a number of decisions, or a weight that is not positive."""
-        found = []
+        mistakes = []
         horizon, soft = given.get("horizon", 1), given.get("soft", 1.0)
         if type(horizon) is not int or not 1 <= horizon <= 1000:
-            found.append(("horizon", f"is {horizon!r}; expected a whole number from 1 to 1000, such as horizon = 60"))
+            mistakes.append(
+                ("horizon", f"is {horizon!r}; expected a whole number from 1 to 1000, such as horizon = 60")
+            )
         if type(soft) not in (int, float) or not 0.0 < soft < 1e12:
-            found.append(("soft", f"is {soft!r}; expected a number above 0, such as soft = 1000.0"))
-        return found
+            mistakes.append(("soft", f"is {soft!r}; expected a number above 0, such as soft = 1000.0"))
+        return mistakes
 
     @classmethod
     def objections(cls, assignment: Assignment) -> list[tuple[str, str]]:
@@ -106,10 +108,10 @@ class Mpc(Controller):
         for r, solver in enumerate(self.solvers):
             linear, lower, upper = programme.at(x_hat[:, r], d if d.ndim == 1 else d[:, r], self._u[:, r])
             solver.update(q=linear, l=lower, u=upper)
-            found = solver.solve(raise_error=False)
-            self.failed[r] = found.info.status_val != self._solved
+            solution = solver.solve(raise_error=False)
+            self.failed[r] = solution.info.status_val != self._solved
             if not self.failed[r]:
-                decided[:, r] = programme.first(found.x, self._u[:, r])
+                decided[:, r] = programme.first(solution.x, self._u[:, r])
         self._u = decided
         return decided
 
@@ -142,13 +144,13 @@ class _Programme:
         self._rate_weights = assignment.rate_weights
         self._input_lower, self._input_upper = plant.input_lower, plant.input_upper
         states, inputs = n * N, m * N
-        one, before = sparse.eye(N), sparse.eye(N, k=-1)
-        change = one - before
-        weight_u = sparse.kron(one, sparse.diags(assignment.input_weights))
+        identity, before = sparse.eye(N), sparse.eye(N, k=-1)
+        change = identity - before
+        weight_u = sparse.kron(identity, sparse.diags(assignment.input_weights))
         weight_r = sparse.kron(change.T @ change, sparse.diags(assignment.rate_weights))
         weights = sparse.block_diag(
             [
-                sparse.kron(one, sparse.diags(assignment.state_weights)),
+                sparse.kron(identity, sparse.diags(assignment.state_weights)),
                 weight_u + weight_r,
                 float(assignment.parameters["soft"]) * sparse.eye(states),
             ]
@@ -156,7 +158,7 @@ class _Programme:
         self.weights = sparse.triu(2.0 * weights, format="csc")
         self.linear = np.zeros(2 * states + inputs)
         no = sparse.csc_matrix
-        dynamics = [sparse.eye(states) - sparse.kron(before, A), -sparse.kron(one, B), no((states, states))]
+        dynamics = [sparse.eye(states) - sparse.kron(before, A), -sparse.kron(identity, B), no((states, states))]
         limits = [sparse.eye(states), no((states, inputs)), sparse.eye(states)]
         own = [no((inputs, states)), sparse.eye(inputs), no((inputs, states))]
         changes = [no((inputs, states)), sparse.kron(change, sparse.eye(m)), no((inputs, states))]

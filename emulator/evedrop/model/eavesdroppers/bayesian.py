@@ -80,5 +80,5 @@ class Bayesian(PacketReader):
             )
             mixture = Mixture(*parted)
             parts.append(Beliefs(stairs.outward(x_hat), stairs.outward_covariance(P), action))
-        found = Beliefs.joined(parts)
-        return found, found.last._replace(memory=mixture)
+        beliefs = Beliefs.joined(parts)
+        return beliefs, beliefs.last._replace(memory=mixture)

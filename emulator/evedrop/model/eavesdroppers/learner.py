@@ -262,14 +262,14 @@ class Known:
 def known(process: Process, state_probability: float, knows: Iterable[str]) -> Known:
     """What an eavesdropper is told; state_probability: μ_d; knows: names among `KNOWABLE`."""
     names = frozenset(knows)
-    one = np.eye(process.n)
+    identity = np.eye(process.n)
 
     def factors(name: str, M: Floats) -> Factors:
-        return Factors.alike(Factor.of_triangular(cholesky(M if name in names else one).tolist()), (1,))
+        return Factors.alike(Factor.of_triangular(cholesky(M if name in names else identity).tolist()), (1,))
 
     return Known(
         names,
-        process.A if "A" in names else one,
+        process.A if "A" in names else identity,
         factors("Q", process.Q),
         state_probability if "mu_d" in names else 0.5,
         factors("initial_covariance", process.initial_covariance),
@@ -345,8 +345,8 @@ def unheard(known: Known, scale: Floats) -> LearnerPosterior:
     sigma = Factors(*(np.repeat(part, trials, axis=-1) for part in known.initial))
     if "initial_covariance" not in known.names:
         sigma = Factors(np.zeros_like(sigma.lower), np.repeat(scale[None], n, axis=0))
-    one = Mixture(np.ones((1, trials)), np.zeros((n, 1, trials)), *(part[:, None, :].copy() for part in sigma))
-    return LearnerPosterior(*one, *sigma, np.zeros(trials))
+    mixture = Mixture(np.ones((1, trials)), np.zeros((n, 1, trials)), *(part[:, None, :].copy() for part in sigma))
+    return LearnerPosterior(*mixture, *sigma, np.zeros(trials))
 
 
 def advanced(k: int, known: Known, theta: Parameters, posterior: LearnerPosterior, gamma: Flags, z: Floats) -> Advanced:
@@ -507,7 +507,7 @@ def factored(M: Floats, least: Floats) -> Factors:
 def divided(M: Floats, P: Factors) -> Floats:
     """M P⁻¹ of every trial, (n, n, R): row by row, by substitution forwards and backwards."""
     n, U = len(M), P.unit()
-    found = np.empty_like(M)
+    quotient = np.empty_like(M)
     for r, row in enumerate(M):
         y: list[Floats] = []
         for i in range(n):
@@ -516,39 +516,39 @@ def divided(M: Floats, P: Factors) -> Floats:
                 rest = rest - U[i][j] * y[j]
             y.append(rest)
         for i, value in enumerate(y):
-            found[r, i] = value / P.diagonal[i]
-    return backwards(found, P)
+            quotient[r, i] = value / P.diagonal[i]
+    return backwards(quotient, P)
 
 
 def backwards(M: Floats, P: Factors) -> Floats:
     """M U⁻¹ of every trial, (n, n, R), U of the factors P."""
     n, U = len(M), P.unit()
-    found = np.empty_like(M)
+    solution = np.empty_like(M)
     for r, row in enumerate(M):
         for i in reversed(range(n)):
             rest = row[i]
             for j in range(i + 1, n):
-                rest = rest - U[j][i] * found[r, j]
-            found[r, i] = rest
-    return found
+                rest = rest - U[j][i] * solution[r, j]
+            solution[r, i] = rest
+    return solution
 
 
 def applied_factors(P: Factors, M: Floats) -> Floats:
     """U D^½ M of every trial, (n, n, R), from the factors P."""
     U, scaled = P.unit(), np.sqrt(P.diagonal)[:, None] * M
-    found = scaled.copy()
+    applied = scaled.copy()
     for i in range(len(M)):
         for j in range(i):
-            found[i] = found[i] + U[i][j] * scaled[j]
-    return found
+            applied[i] = applied[i] + U[i][j] * scaled[j]
+    return applied
 
 
 def multiplied(M: Floats, N: Floats) -> Floats:
     """M N of every trial, (n, n, R)."""
-    found: Floats = M[:, 0, None] * N[0]
+    result: Floats = M[:, 0, None] * N[0]
     for j in range(1, len(N)):
-        found = found + M[:, j, None] * N[j]
-    return found
+        result = result + M[:, j, None] * N[j]
+    return result
 
 
 def outer(M: Floats, N: Floats) -> Floats:

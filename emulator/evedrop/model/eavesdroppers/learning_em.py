@@ -139,9 +139,9 @@ class LearningEm(Learner):
     def prior(self, first: int = 0) -> Belief:
         """x̂ = 0, and the covariance I for want of Σ0."""
         n, trials = self.process.n, self.trials
-        one, posterior = np.ones(trials), unheard(self.known, np.ones(trials))
-        theta = self.known.start(one)
-        learned = Learned(posterior, theta, Moments.imagined(theta.A, one), one)
+        ones, posterior = np.ones(trials), unheard(self.known, np.ones(trials))
+        theta = self.known.start(ones)
+        learned = Learned(posterior, theta, Moments.imagined(theta.A, ones), ones)
         none = np.zeros((0, trials), np.bool_), np.zeros((0, n, trials))
         memory = Memory(learned, np.zeros((n, trials)), np.full((1, trials), first), *none)
         return self._believed(np.zeros(trials, np.uint8), memory)
@@ -204,10 +204,10 @@ def climbing_slots(n: int, keeps: int) -> list[int]:
     age = _EACH
     while age < _EACH * n:
         age *= 2
-    found = [min(age, keeps)]
-    while 2 * found[-1] <= keeps:
-        found.append(2 * found[-1])
-    return found
+    ages = [min(age, keeps)]
+    while 2 * ages[-1] <= keeps:
+        ages.append(2 * ages[-1])
+    return ages
 
 
 def kept_mistakes(given: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -67,13 +67,13 @@ def lattice(known: Known, particles: int) -> Parameters:
 
 
 def _primes(count: int) -> list[int]:
-    found: list[int] = []
+    primes: list[int] = []
     candidate = 2
-    while len(found) < count:
-        if all(candidate % prime for prime in found):
-            found.append(candidate)
+    while len(primes) < count:
+        if all(candidate % prime for prime in primes):
+            primes.append(candidate)
         candidate += 1
-    return found
+    return primes
 
 
 def drawn(
@@ -122,7 +122,7 @@ class Cloud(NamedTuple):
 
     def at(self, columns: NDArray[np.intp]) -> Cloud:
         """Some of the columns."""
-        posterior, theta, moments = ([part[..., columns] for part in one] for one in self[:3])
+        posterior, theta, moments = ([part[..., columns] for part in group] for group in self[:3])
         return Cloud(LearnerPosterior(*posterior), Parameters(*theta), Moments(*moments), self.weight[columns])
 
     def moved(self, chosen: Flags, theta: Parameters, moments: Moments) -> Cloud:
@@ -166,8 +166,8 @@ class LearningParticle(Learner):
     def prior(self, first: int = 0) -> Belief:  # noqa: ARG002 - it knows nothing of earlier slots
         """x̂ = 0, and the covariance I for want of Σ0."""
         theta = Parameters(*(np.repeat(part, self.trials, axis=-1) for part in lattice(self.known, self._count)))
-        one = np.ones(self._count * self.trials)
-        cloud = Cloud(unheard(self.known, one), theta, self._imagined(theta, one), np.zeros_like(one))
+        ones = np.ones(self._count * self.trials)
+        cloud = Cloud(unheard(self.known, ones), theta, self._imagined(theta, ones), np.zeros_like(ones))
         nothing = np.zeros((self.process.n, self.trials))
         return self._believed(cloud, np.zeros(self.trials, np.uint8), np.ones(self.trials), nothing)
 

@@ -74,10 +74,10 @@ class RemoteCalls:
         wanted = set(names)
         return {question: answer for question, answer in self._known.items() if json.loads(question)[0] in wanted}
 
-    def learn(self, known: Mapping[str, Any]) -> None:
+    def learn(self, answers: Mapping[str, Any]) -> None:
         """Add answers from a process that has asked."""
         with self._lock:
-            self._known.update({str(question): dict(answer) for question, answer in known.items()})
+            self._known.update({str(question): dict(answer) for question, answer in answers.items()})
 
     def folder_of(self, name: str) -> str | None:
         """The folder that was searched first for a class, if the class was asked anything."""
@@ -140,8 +140,8 @@ class _Child:
             limit = _Limit(self._seconds)
             _write(process.stdin.fileno(), f"{self._first}{question}\n".encode(), limit)
             self._first = ""
-            found = json.loads(_line(process.stdout.fileno(), limit))
-            if not isinstance(found, dict):
+            reply = json.loads(_line(process.stdout.fileno(), limit))
+            if not isinstance(reply, dict):
                 raise NoAnswer("its answer was invalid")
         except BaseException as error:
             self.end()
@@ -151,7 +151,7 @@ class _Child:
             if isinstance(error, (OSError, ValueError, RecursionError)):
                 raise NoAnswer(f"the process that was to answer for it ended (status {status})") from error
             raise
-        return found
+        return reply
 
     def end(self) -> None:
         """End the process."""
@@ -218,7 +218,7 @@ class RemoteClasses:
         if not isinstance(parameters, dict):
             raise NotRegistered(name, ", whose answer is invalid; expected a class that declares its parameters")
         base = _RemoteTaker if facts.get("takes") is True else _RemoteEavesdropper
-        said = {
+        attributes = {
             "parameters": parameters,
             "pools_links": facts.get("pools_links") is True,
             **{name: facts.get(name) is True for name in ("inverts_noise", "reads_leaks", "tests_range")},
@@ -227,20 +227,20 @@ class RemoteClasses:
             "_ask": staticmethod(lambda do, *given: self.calls.call(name, do, self._registry, *given)),
             "__module__": __name__,
         }
-        return type(name.rpartition(":")[2], (base,), said)
+        return type(name.rpartition(":")[2], (base,), attributes)
 
 
-def _only_against(found: Any) -> tuple[str | tuple[str, ...], str] | None:
+def _only_against(answer: Any) -> tuple[str | tuple[str, ...], str] | None:
     """A scheme, or several, and a reason, if that is what the class says."""
-    if not isinstance(found, list) or len(found) != 2 or not isinstance(found[1], str):
+    if not isinstance(answer, list) or len(answer) != 2 or not isinstance(answer[1], str):
         return None
-    if isinstance(found[0], list) and all(isinstance(one, str) for one in found[0]):
-        return tuple(found[0]), found[1]
-    return (found[0], found[1]) if isinstance(found[0], str) else None
+    if isinstance(answer[0], list) and all(isinstance(name, str) for name in answer[0]):
+        return tuple(answer[0]), answer[1]
+    return (answer[0], answer[1]) if isinstance(answer[0], str) else None
 
 
-def _wrong(what: str, found: Any, expected: str) -> NoAnswer:
-    return NoAnswer(f"{what} is {found!r}; expected {expected}")
+def _wrong(subject: str, value: Any, expected: str) -> NoAnswer:
+    return NoAnswer(f"{subject} is {value!r}; expected {expected}")
 
 
 class _RemoteEavesdropper(Eavesdropper):
@@ -256,52 +256,52 @@ class _RemoteEavesdropper(Eavesdropper):
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
         """The class's answer."""
-        found = cls._ask("mistakes", dict(given))
-        if not isinstance(found, list) or not all(isinstance(one, list) and len(one) == 2 for one in found):
-            raise _wrong("mistakes()", found, "a list of (entry, what is wrong)")
-        return [(str(entry), str(what)) for entry, what in found]
+        answer = cls._ask("mistakes", dict(given))
+        if not isinstance(answer, list) or not all(isinstance(pair, list) and len(pair) == 2 for pair in answer):
+            raise _wrong("mistakes()", answer, "a list of (entry, what is wrong)")
+        return [(str(entry), str(sentence)) for entry, sentence in answer]
 
     @classmethod
     def streams(cls, parameters: Mapping[str, Any]) -> tuple[str, ...]:
         """The class's answer."""
-        found = cls._ask("streams", dict(parameters))
-        if not isinstance(found, list) or not all(isinstance(one, str) for one in found):
-            raise _wrong("streams()", found, "names of streams")
-        return tuple(found)
+        answer = cls._ask("streams", dict(parameters))
+        if not isinstance(answer, list) or not all(isinstance(name, str) for name in answer):
+            raise _wrong("streams()", answer, "names of streams")
+        return tuple(answer)
 
     @classmethod
     def betrayed(cls, parameters: Mapping[str, Any]) -> int | None:
         """The class's answer."""
-        found = cls._ask("betrayed", dict(parameters))
-        if found is not None and (type(found) is not int or found < 0):
-            raise _wrong("betrayed()", found, "a slot, from 0 on, or None")
-        return found
+        answer = cls._ask("betrayed", dict(parameters))
+        if answer is not None and (type(answer) is not int or answer < 0):
+            raise _wrong("betrayed()", answer, "a slot, from 0 on, or None")
+        return answer
 
     @classmethod
     def follows_gamma(cls, parameters: Mapping[str, Any]) -> bool:
         """The class's answer."""
-        found = cls._ask("follows_gamma", dict(parameters))
-        if not isinstance(found, bool):
-            raise _wrong("follows_gamma()", found, "True or False")
-        return found
+        answer = cls._ask("follows_gamma", dict(parameters))
+        if not isinstance(answer, bool):
+            raise _wrong("follows_gamma()", answer, "True or False")
+        return answer
 
     @classmethod
     def outcomes(cls, parameters: Mapping[str, Any], mu_d: float) -> OutcomesAt | None:
         """The class's answer, at every quality that is asked for."""
-        known = cls._ask("outcomes", dict(parameters), mu_d)
-        if not known:
+        has_outcomes = cls._ask("outcomes", dict(parameters), mu_d)
+        if not has_outcomes:
             return None
 
         def at(mu_e: float) -> Outcomes:
-            found = cls._ask("outcomes_at", dict(parameters), mu_d, float(mu_e))
+            answer = cls._ask("outcomes_at", dict(parameters), mu_d, float(mu_e))
             names = [*_FRACTIONS, "initial"]
-            if not isinstance(found, dict) or sorted(found) != sorted(names):
-                raise _wrong("outcomes()", found, f"the probabilities {', '.join(names)}")
-            if not all(_is_probability(value) for value in found.values()):
-                raise _wrong("outcomes()", found, "probabilities")
-            if abs(sum_in_order(found[name] for name in _FRACTIONS) - 1.0) > _ROUNDING:
-                raise _wrong("outcomes()", found, f"{', '.join(_FRACTIONS)} that sum to 1")
-            return Outcomes(**found)
+            if not isinstance(answer, dict) or sorted(answer) != sorted(names):
+                raise _wrong("outcomes()", answer, f"the probabilities {', '.join(names)}")
+            if not all(_is_probability(value) for value in answer.values()):
+                raise _wrong("outcomes()", answer, "probabilities")
+            if abs(sum_in_order(answer[name] for name in _FRACTIONS) - 1.0) > _ROUNDING:
+                raise _wrong("outcomes()", answer, f"{', '.join(_FRACTIONS)} that sum to 1")
+            return Outcomes(**answer)
 
         return at
 
@@ -319,10 +319,10 @@ class _RemoteTaker(_RemoteEavesdropper, PacketTaker):
     @classmethod
     def use_probabilities(cls, parameters: Mapping[str, Any]) -> tuple[float, float]:
         """The class's answer."""
-        found = cls._ask("use_probabilities", dict(parameters))
-        if not isinstance(found, list) or len(found) != 2 or not all(map(_is_probability, found)):
-            raise _wrong("use_probabilities()", found, "two probabilities")
-        return found[0], found[1]
+        answer = cls._ask("use_probabilities", dict(parameters))
+        if not isinstance(answer, list) or len(answer) != 2 or not all(map(_is_probability, answer)):
+            raise _wrong("use_probabilities()", answer, "two probabilities")
+        return answer[0], answer[1]
 
 
 def _is_probability(value: Any) -> bool:

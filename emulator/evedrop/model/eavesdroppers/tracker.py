@@ -173,12 +173,12 @@ class Tracker(PacketReader):
         if not len(of.weight):
             of = Mixture(*(with_a_place(part, part.ndim - 2) for part in of))
         first = np.arange(len(of.weight))[:, None] == 0
-        one = Mixture(
+        fresh = Mixture(
             np.where(first, 0.5, np.zeros((1, 2 * self.trials))),
             _twice(mean)[:, None, :],
             *Factors.alike(spread, (1, 2 * self.trials)),
         )
-        return Mixture(*(np.where(_twice(where), *pair) for pair in zip(one, of, strict=True)))
+        return Mixture(*(np.where(_twice(where), *pair) for pair in zip(fresh, of, strict=True)))
 
     def _few(self, of: Mixture, changed: Flags) -> Mixture:
         """Weights that sum to 1 where they changed (R,), at most as many histories as there is capacity for, and no gaps."""

@@ -68,8 +68,8 @@ class Likelihood(PacketReader):
             P = Factors(*(np.where(innovation, *pair) for pair in zip(informed, predicted, strict=True)))
         P = Factors(np.where(state, 0.0, P.lower), np.where(state, 0.0, P.diagonal))
         action = np.where(gamma, np.where(state, np.uint8(Action.STATE), np.uint8(Action.INNOVATION)), np.uint8(0))
-        found = np.where(state, received, stairs.outward(x_hat))
-        return Belief(found, stairs.outward_covariance(covariance(P)), action, P)
+        estimate = np.where(state, received, stairs.outward(x_hat))
+        return Belief(estimate, stairs.outward_covariance(covariance(P)), action, P)
 
     def _is_state(self, k: int, d: Floats, P: Factors, white: Floats) -> Flags:
         mu_d = in_slot(self._mu_d, k)
@@ -119,7 +119,7 @@ class PowerTest(PacketReader):
         for a, b in zip(noise.white(z), states.white(z), strict=True):
             evidence = evidence + (a * a - b * b)
         ratios = zip(noise.state_diagonal, states.state_diagonal, strict=True)
-        for one, other in ratios:
-            evidence = evidence + log(np.array([one / other]))
+        for first, second in ratios:
+            evidence = evidence + log(np.array([first / second]))
         flags: Flags = evidence > 0.0
         return flags

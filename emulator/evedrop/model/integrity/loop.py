@@ -90,8 +90,8 @@ class WatermarkedLoop:
 
 def spread(M: Floats, covariance: Floats) -> Floats:
     """M Σ Mᵀ, symmetric."""
-    found = product(product(M, covariance), _transposed(M))
-    return 0.5 * (found + found.T)
+    result = product(product(M, covariance), _transposed(M))
+    return 0.5 * (result + result.T)
 
 
 @np.errstate(over="ignore", invalid="ignore")

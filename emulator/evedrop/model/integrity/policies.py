@@ -134,16 +134,16 @@ class Parsimonious(WatermarkPolicy):
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
         """Numbers that are not probabilities, and thresholds in the wrong order."""
-        found = [
+        mistakes = [
             (name, f"is {given[name]}; expected a number between 0 and 1, both excluded")
             for name in (UPPER, RATE)
             if not 0.0 < given[name] < 1.0
         ]
         if not 0.0 <= given[LOWER] < 1.0:
-            found.append((LOWER, f"is {given[LOWER]}; expected a number from 0 to less than 1"))
-        if not found and given[LOWER] >= given[UPPER]:
-            found.append((LOWER, f"is {given[LOWER]}, and {UPPER} is {given[UPPER]}; expected {LOWER} < {UPPER}"))
-        return found
+            mistakes.append((LOWER, f"is {given[LOWER]}; expected a number from 0 to less than 1"))
+        if not mistakes and given[LOWER] >= given[UPPER]:
+            mistakes.append((LOWER, f"is {given[LOWER]}, and {UPPER} is {given[UPPER]}; expected {LOWER} < {UPPER}"))
+        return mistakes
 
     def step(self, statistic: Floats, llr: Floats) -> Floats:
         """The posterior probability that an attack has begun (Shiryaev)."""

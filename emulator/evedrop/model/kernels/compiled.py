@@ -151,11 +151,11 @@ def follow(
 def follow_covariance(A: Floats, Q: Floats, P: Floats, action: Codes, initial: bool = False) -> Floats:
     """As `reference.follow_covariance`."""
     (slots, trials), n = action.shape, len(A)
-    found = np.empty((slots, n, n, trials))
+    covariances = np.empty((slots, n, n, trials))
     before, codes = _doubles(P, (n, n, trials)), _bytes(action, (slots, trials))
-    out = _buffer("double[]", found)
+    out = _buffer("double[]", covariances)
     _follow(A, Q, (slots, n, trials), initial, _NULL, before, codes, _NULL, _NULL, _NULL, out)
-    return found
+    return covariances
 
 
 def _follow(A: Floats, Q: Floats, sizes: tuple[int, int, int], initial: bool, *arrays: Any) -> None:
@@ -263,10 +263,10 @@ def triangular_factors(M: Floats) -> Floats:
 def carried_factors(A: Floats, G: Floats, carried: Floats, count: int) -> Floats:
     """As `reference.carried_factors`."""
     n = len(A)
-    found = np.empty((count, n, n))
-    numbers = (_doubles(one, (n, n)) for one in (A, G, carried))
-    _check_factor(_lib.kernels_carried_factors(n, count, *numbers, _buffer("double[]", found)), n)
-    return found
+    factors = np.empty((count, n, n))
+    numbers = (_doubles(matrix, (n, n)) for matrix in (A, G, carried))
+    _check_factor(_lib.kernels_carried_factors(n, count, *numbers, _buffer("double[]", factors)), n)
+    return factors
 
 
 def _check_factor(failed: int, n: int) -> None:

@@ -23,10 +23,10 @@ _LOG_EVEN = (3.999999999940941908e-01, 2.222219843214978396e-01, 1.5313837699209
 
 def sum_in_order(numbers: Iterable[float]) -> float:
     """The sum of numbers, added one after the other: the same bits with every Python, whose `sum` compensates since 3.12."""
-    found = 0.0
+    total = 0.0
     for number in numbers:
-        found += number
-    return found
+        total += number
+    return total
 
 
 def product(M: Floats, x: Floats) -> Floats:

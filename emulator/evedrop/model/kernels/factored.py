@@ -46,14 +46,14 @@ class Factors(NamedTuple):
     """D, (n, S)."""
 
     @classmethod
-    def alike(cls, one: Factor, shape: tuple[int, ...]) -> Factors:
+    def alike(cls, factor: Factor, shape: tuple[int, ...]) -> Factors:
         """The factors of equal matrices."""
-        lower = [value for i, row in enumerate(one.unit) for value in row[:i]]
-        columns = ((len(values), *(1 for _ in shape)) for values in (lower, one.diagonal))
+        lower = [value for i, row in enumerate(factor.unit) for value in row[:i]]
+        columns = ((len(values), *(1 for _ in shape)) for values in (lower, factor.diagonal))
         return cls(
             *(
                 np.broadcast_to(np.array(values).reshape(column), (len(values), *shape)).copy()
-                for values, column in zip((lower, one.diagonal), columns, strict=True)
+                for values, column in zip((lower, factor.diagonal), columns, strict=True)
             )
         )
 
@@ -123,9 +123,9 @@ def orthogonalised(
 
 def _times(a: Entry, b: Entry) -> Entry:
     """The product of two entries; an entry that is 0 or 1 in all matrices costs nothing."""
-    for one, other in ((a, b), (b, a)):
-        if isinstance(one, float) and one in {0.0, 1.0}:
-            return other if one else 0.0
+    for first, second in ((a, b), (b, a)):
+        if isinstance(first, float) and first in {0.0, 1.0}:
+            return second if first else 0.0
     return a * b
 
 

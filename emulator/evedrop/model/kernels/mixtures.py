@@ -74,17 +74,17 @@ def merge(of: Mixture, trials: NDArray[np.intp]) -> None:
     without = weight.copy()
     without[first, columns] = np.inf
     second = np.argmin(without, axis=0)
-    one, two = ((place, trials) for place in (first, second))
-    total = of.weight[one] + of.weight[two]
-    a, b = of.weight[one] / total, of.weight[two] / total
-    apart = [m[two] - m[one] for m in of.mean]
-    U, V = ([[*row] for row in Factors(of.lower[:, p, t], of.diagonal[:, p, t]).unit()] for p, t in (one, two))
-    weights = [*(a * of.diagonal[(slice(None), *one)]), *(b * of.diagonal[(slice(None), *two)]), a * b]
+    kept, gone = ((place, trials) for place in (first, second))
+    total = of.weight[kept] + of.weight[gone]
+    a, b = of.weight[kept] / total, of.weight[gone] / total
+    apart = [m[gone] - m[kept] for m in of.mean]
+    U, V = ([[*row] for row in Factors(of.lower[:, p, t], of.diagonal[:, p, t]).unit()] for p, t in (kept, gone))
+    weights = [*(a * of.diagonal[(slice(None), *kept)]), *(b * of.diagonal[(slice(None), *gone)]), a * b]
     lower, diagonal = orthogonalised([u + v + [d] for u, v, d in zip(U, V, apart, strict=True)], weights)
     for m, d in zip(of.mean, apart, strict=True):
-        m[one] += b * d
-    of.lower[(slice(None), *one)], of.diagonal[(slice(None), *one)] = lower, diagonal
-    of.weight[one], of.weight[two] = total, 0.0
+        m[kept] += b * d
+    of.lower[(slice(None), *kept)], of.diagonal[(slice(None), *kept)] = lower, diagonal
+    of.weight[kept], of.weight[gone] = total, 0.0
 
 
 def opened(of: Mixture, state: Floats, z: Floats, capacity: int) -> Mixture:
@@ -229,8 +229,8 @@ def _weighed(
     )
     state, other = _type_probabilities(model.state_probability, summed(ratios), gamma)
     mean += _taken(np.where(gamma, leak.innovation(white), 0.0), trial)
-    for after, known in zip(predicted, informed, strict=True):
-        np.copyto(after, known, where=heard)
+    for after, after_informed in zip(predicted, informed, strict=True):
+        np.copyto(after, after_informed, where=heard)
     spread = [np.zeros(part.shape) for part in of[1:]]
     for whole, part in zip(spread, (mean, *predicted), strict=True):
         for row, values in zip(whole.reshape(len(whole), of.weight.size), part, strict=True):
@@ -280,6 +280,6 @@ def _weighed_ratios(
     likely = exp(np.minimum(exponent[some], _CERTAIN))
     ratios = np.zeros(weight.shape)
     with np.errstate(divide="ignore", over="ignore"):
-        found = weight[some] * likely / np.sqrt(determinant)
-    ratios[some] = np.where(found > _SURE, _SURE, found)
+        likelihoods = weight[some] * likely / np.sqrt(determinant)
+    ratios[some] = np.where(likelihoods > _SURE, _SURE, likelihoods)
     return ratios

@@ -165,9 +165,9 @@ def advance(A: Floats, noise: Floats, before: Floats) -> tuple[Floats, Floats]:
     _, n, trials = noise.shape
     expect_all((A, (n, n)), (before, (n, trials)))
     predicted, x = np.empty_like(noise), np.empty_like(noise)
-    for row, one in enumerate(noise):
+    for row, w in enumerate(noise):
         predicted[row] = product(A[None], before[None])[0]
-        before = x[row] = predicted[row] + one
+        before = x[row] = predicted[row] + w
     return predicted, x
 
 
@@ -212,13 +212,13 @@ def follow_covariance(A: Floats, Q: Floats, P: Floats, action: Codes, initial: b
     (slots, trials), n = action.shape, len(A)
     expect_all((A, (n, n)), (Q, (n, n)), (P, (n, n, trials)))
     expect_bytes(action, (slots, trials))
-    found = np.empty((len(action), *P.shape))
+    covariances = np.empty((len(action), *P.shape))
     for row, codes in enumerate(action):
         if not (initial and row == 0):
             carried = carry(A, P)
             P = np.where(codes == _INNOVATION, carried, carried + Q[:, :, None])
-        P = found[row] = np.where(codes == _STATE, 0.0, P)
-    return found
+        P = covariances[row] = np.where(codes == _STATE, 0.0, P)
+    return covariances
 
 
 def records(marks: Flags, a: Floats, P: Floats | None, out: Codes, first: int = 0) -> None:
@@ -291,10 +291,10 @@ def add_to_histograms(counts: NDArray[np.uint32], values: Floats, shift: int, ba
     rows, bins = counts.shape
     _, trials = values.shape
     expect(values, (rows, trials))
-    found = (np.ascontiguousarray(values).view(np.int64) >> shift) - base
-    np.clip(found, 0, bins - 1, out=found)
-    found += bins * np.arange(rows)[:, None]
-    counts += np.bincount(found.reshape(-1), minlength=rows * bins).reshape(rows, bins).astype(np.uint32)
+    bins_of = (np.ascontiguousarray(values).view(np.int64) >> shift) - base
+    np.clip(bins_of, 0, bins - 1, out=bins_of)
+    bins_of += bins * np.arange(rows)[:, None]
+    counts += np.bincount(bins_of.reshape(-1), minlength=rows * bins).reshape(rows, bins).astype(np.uint32)
 
 
 def scatter(flags: Flags, packed: Floats, n: int) -> Floats:
@@ -329,7 +329,7 @@ def triangular_factors(M: Floats) -> Floats:
     """
     expect_wide(M)
     count, n, _ = M.shape
-    return np.array([elementary.triangular_factor(one.tolist()) for one in M]).reshape(count, n, n)
+    return np.array([elementary.triangular_factor(matrix.tolist()) for matrix in M]).reshape(count, n, n)
 
 
 def carried_factors(A: Floats, G: Floats, carried: Floats, count: int) -> Floats:
@@ -339,10 +339,10 @@ def carried_factors(A: Floats, G: Floats, carried: Floats, count: int) -> Floats
     """
     n = len(A)
     expect_all((A, (n, n)), (G, (n, n)), (carried, (n, n)))
-    found = np.empty((count, *carried.shape))
+    factors = np.empty((count, *carried.shape))
     for row in range(count):
-        carried = found[row] = product(A[None], triangular_factors(np.concatenate([carried, G], axis=1)[None]))[0]
-    return found
+        carried = factors[row] = product(A[None], triangular_factors(np.concatenate([carried, G], axis=1)[None]))[0]
+    return factors
 
 
 def follow_mixture(

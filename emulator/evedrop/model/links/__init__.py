@@ -29,7 +29,7 @@ LOSS_MODELS: Registry[LossModel] = Registry("loss model", LossModel, "evedrop.li
 def loss_of(spec: Mapping[str, Any]) -> LossModel:
     """The loss model that a scenario describes: `{"model": …, …parameters}`, or what `pooled_spec` gives."""
     if spec["model"] == POOLED:
-        return Pooled([loss_of(one) for one in spec["links"]])
+        return Pooled([loss_of(link) for link in spec["links"]])
     parameters = {name: value for name, value in spec.items() if name != "model"}
     return LOSS_MODELS[spec["model"]](**parameters)
 

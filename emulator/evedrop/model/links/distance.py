@@ -84,7 +84,7 @@ class Distance(LossModel):
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
         """Mistakes in positions, numbers outside their bounds, and a sender and receiver in the same place."""
         ways = {name: way_mistakes(given[name]) for name in ("sender", "receiver") if name in given}
-        found = [(name, what) for name, mistakes in ways.items() for what in mistakes]
+        wrong = [(name, sentence) for name, mistakes in ways.items() for sentence in mistakes]
         for name, least, most in (
             ("reference_snr", -300.0, 300.0),
             ("exponent", 0.0, 10.0),
@@ -92,18 +92,18 @@ class Distance(LossModel):
             ("reference_distance", 1e-3, FARTHEST),
             ("shadowing", 0.0, 30.0),
         ):
-            found += number_mistakes(given, name, least, most)
+            wrong += number_mistakes(given, name, least, most)
         for name in ("shadowing_block", "fading_block"):
             value = given.get(name, 1)
             if type(value) is not int or not 1 <= value <= _LONGEST_BLOCK:
-                found.append(
+                wrong.append(
                     (name, f"is {as_toml(value)}; expected a whole number of slots from 1 to {_LONGEST_BLOCK}")
                 )
         if len(ways) == 2 and not any(ways.values()):
             shared_slot = _shared_slot(Way(given["sender"]), Way(given["receiver"]))
             if shared_slot is not None:
-                found.append(("receiver", f"is where the sender is, in slot {shared_slot}; expected another place"))
-        return found
+                wrong.append(("receiver", f"is where the sender is, in slot {shared_slot}; expected another place"))
+        return wrong
 
     @property
     def quality(self) -> float:

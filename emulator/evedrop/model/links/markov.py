@@ -39,10 +39,10 @@ class GilbertElliott(LossModel):
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
         """All are probabilities, and p and r are not both 0."""
-        found = probability_mistakes(given, "p", "r", "good", "bad")
-        if not found and given.get("p") == 0.0 and given.get("r") == 0.0:
-            found.append(("p", "and r are both 0, so the link stays in an unknown state; expected p or r above 0"))
-        return found
+        mistakes = probability_mistakes(given, "p", "r", "good", "bad")
+        if not mistakes and given.get("p") == 0.0 and given.get("r") == 0.0:
+            mistakes.append(("p", "and r are both 0, so the link stays in an unknown state; expected p or r above 0"))
+        return mistakes
 
     @property
     def _stationary_bad(self) -> float:
@@ -130,16 +130,18 @@ class Markov(LossModel):
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
         """A square matrix of probabilities whose rows sum to 1, one recurrent class, and a loss for each state."""
-        found = (
-            [("transitions", what) for what in _matrix_mistakes(given["transitions"])] if "transitions" in given else []
+        mistakes = (
+            [("transitions", sentence) for sentence in _matrix_mistakes(given["transitions"])]
+            if "transitions" in given
+            else []
         )
         if "loss" in given:
             loss, rows = given["loss"], given.get("transitions")
             right = isinstance(loss, list) and all(is_probability(value) for value in loss)
             if not right or (_square(rows) and len(loss) != len(rows)):
                 count = f"{len(rows)} numbers" if _square(rows) else "numbers"
-                found.append(("loss", f"is {as_toml(loss)}; expected {count} from 0 to 1, one for each state"))
-        return found
+                mistakes.append(("loss", f"is {as_toml(loss)}; expected {count} from 0 to 1, one for each state"))
+        return mistakes
 
     @property
     def quality(self) -> float:
@@ -182,12 +184,12 @@ class Markov(LossModel):
 
 def _in_turn(places: list[int], table: list[int]) -> list[int]:
     """The same loop for a single trial, for which numpy's calls would take ten times as long."""
-    found = places[:1]
+    sequence = places[:1]
     before = places[0]
     for place in places[1:]:
         before = table[place + before]
-        found.append(before)
-    return found
+        sequence.append(before)
+    return sequence
 
 
 def _bounds(rows: Floats) -> Floats:
@@ -224,15 +226,15 @@ def _matrix_mistakes(rows: Any) -> list[str]:
         return ["is not a matrix; expected a list of rows"]
     if len(rows) > _MOST_STATES or not _square(rows):
         return [f"is not square, or has more than {_MOST_STATES} rows; expected one row a state"]
-    found = []
+    mistakes = []
     for i, row in enumerate(rows):
         if not all(is_probability(value) for value in row):
-            found.append(f"row {i} is {as_toml(row)}; expected numbers from 0 to 1")
+            mistakes.append(f"row {i} is {as_toml(row)}; expected numbers from 0 to 1")
         elif abs(sum_in_order(row) - 1.0) > _SUM:
-            found.append(f"row {i} sums to {sum_in_order(row):.6g}; expected 1")
-    if not found and not _common(rows):
-        found.append("has several recurrent classes; expected a state that can be reached from all others")
-    return found
+            mistakes.append(f"row {i} sums to {sum_in_order(row):.6g}; expected 1")
+    if not mistakes and not _common(rows):
+        mistakes.append("has several recurrent classes; expected a state that can be reached from all others")
+    return mistakes
 
 
 def _common(rows: list[list[float]]) -> bool:

@@ -40,9 +40,9 @@ class Pooled(LossModel):
     def chain(self) -> Chain | None:
         """The joint states of all links; None if a link's losses do not follow a chain, or if there are too many states."""
         chains = [model.chain for model in self._models]
-        known = [chain for chain in chains if chain is not None]
-        small = prod(len(chain.stationary) for chain in known) <= _MOST_STATES
-        return reduce(_both, known) if small and len(known) == len(chains) else None
+        usable = [chain for chain in chains if chain is not None]
+        small = prod(len(chain.stationary) for chain in usable) <= _MOST_STATES
+        return reduce(_both, usable) if small and len(usable) == len(chains) else None
 
     def fates(self, first: int, uniforms: Floats) -> Codes:
         """The pooled fate of each packet."""
@@ -61,9 +61,11 @@ def pooled(fates: Sequence[Codes]) -> Codes:
     return result
 
 
-def _both(one: Chain, other: Chain) -> Chain:
-    missed = _product(1.0 - one.quality, 1.0 - other.quality)
-    return Chain(_product(one.transitions, other.transitions), _product(one.stationary, other.stationary), 1.0 - missed)
+def _both(first: Chain, second: Chain) -> Chain:
+    missed = _product(1.0 - first.quality, 1.0 - second.quality)
+    return Chain(
+        _product(first.transitions, second.transitions), _product(first.stationary, second.stationary), 1.0 - missed
+    )
 
 
 def _product(left: Floats, right: Floats) -> Floats:

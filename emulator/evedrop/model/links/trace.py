@@ -86,13 +86,15 @@ class RecordedLoss(LossModel):
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
         """A word of zeros and ones of limited length, and flags that do not contradict each other."""
-        found = word_mistakes(given, "outcomes") + flag_mistakes(given, "once", "random_start")
-        if not found and len(given.get("outcomes", "")) > MOST_OUTCOMES:
-            found.append(("outcomes", f"are {len(given['outcomes'])}; expected at most {MOST_OUTCOMES}"))
+        mistakes = word_mistakes(given, "outcomes") + flag_mistakes(given, "once", "random_start")
+        if not mistakes and len(given.get("outcomes", "")) > MOST_OUTCOMES:
+            mistakes.append(("outcomes", f"are {len(given['outcomes'])}; expected at most {MOST_OUTCOMES}"))
         if given.get("once") is True and given.get("random_start") is True:
-            what = "is given together with once, so that trials would run out of the recording; expected one of the two"
-            found.append(("random_start", what))
-        return found
+            sentence = (
+                "is given together with once, so that trials would run out of the recording; expected one of the two"
+            )
+            mistakes.append(("random_start", sentence))
+        return mistakes
 
     @property
     def quality(self) -> float:

@@ -50,18 +50,18 @@ def way_mistakes(given: Any) -> list[str]:
         return [] if right else [f"is {as_toml(given)}; {_EXPECTED}"]
     if len(given) > _MOST_WAYPOINTS:
         return [f"has {len(given)} waypoints; expected at most {_MOST_WAYPOINTS}"]
-    found = [
+    mistakes = [
         f"waypoint {i} is {as_toml(row)}; expected [slot, x, y], a whole number from 0 on and a position in metres"
         for i, row in enumerate(given)
         if not _is_waypoint(row)
     ]
-    if not found:
-        found = [
+    if not mistakes:
+        mistakes = [
             f"waypoint {i} is of slot {after[0]}, not after slot {before[0]}; expected slots that increase"
             for i, (before, after) in enumerate(pairwise(given), 1)
             if after[0] <= before[0]
         ]
-    return found
+    return mistakes
 
 
 def _is_waypoint(row: Any) -> bool:

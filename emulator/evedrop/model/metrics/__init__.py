@@ -87,13 +87,13 @@ def columns(where: Literal["column", "sweep_column"], mode: str | None = None) -
 
     where: the closing table, or the printed table of a sweep; mode: leave out metrics that a run in this mode does not have.
     """
-    found: dict[MetricColumn, list[str]] = {}
-    for name, one in all_metrics().items():
-        column: MetricColumn | None = getattr(one, where)
-        there = mode is None or (mode != one.not_in_mode and one.only_in_mode in {None, mode})
+    names_of: dict[MetricColumn, list[str]] = {}
+    for name, kind in all_metrics().items():
+        column: MetricColumn | None = getattr(kind, where)
+        there = mode is None or (mode != kind.not_in_mode and kind.only_in_mode in {None, mode})
         if column is not None and there:
-            found.setdefault(column, []).append(name)
-    return dict(sorted(found.items(), key=lambda item: item[0].place))
+            names_of.setdefault(column, []).append(name)
+    return dict(sorted(names_of.items(), key=lambda item: item[0].place))
 
 
 def shown_metric(row: Mapping[str, Any], names: Sequence[str]) -> float | None:

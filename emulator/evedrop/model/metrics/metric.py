@@ -59,7 +59,7 @@ class ScoredSlots:
             action=self.action[rows],
             trace=self.trace[rows],
             expected=self.expected[rows],
-            late=None if self.late is None else [one[rows] for one in self.late],
+            late=None if self.late is None else [column[rows] for column in self.late],
             x=None if self.x is None else self.x[rows],
             x_hat=None if self.x_hat is None else self.x_hat[rows],
         )

@@ -21,8 +21,8 @@ def standard_error(of_trials: Floats | None) -> float | None:
     if of_trials is None or len(of_trials) < 2 or not np.isfinite(of_trials).all():
         return None
     with np.errstate(over="ignore"):
-        found = float(np.std(of_trials, ddof=1)) / math.sqrt(len(of_trials))
-    return found if math.isfinite(found) else None
+        error = float(np.std(of_trials, ddof=1)) / math.sqrt(len(of_trials))
+    return error if math.isfinite(error) else None
 
 
 def ratio_error(over: Floats, under: Floats) -> float | None:

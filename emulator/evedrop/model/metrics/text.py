@@ -22,9 +22,9 @@ class ShownNumber(str):
 
     def __new__(cls, text: str, value: float | None, error: float | None = None, after: str = "") -> Self:
         """text: what is shown."""
-        found = super().__new__(cls, text)
-        found.value, found.error, found.after = value, error, after
-        return found
+        number = super().__new__(cls, text)
+        number.value, number.error, number.after = value, error, after
+        return number
 
     def __add__(self, after: str) -> ShownNumber:
         """The same number with a unit or a mark after it."""

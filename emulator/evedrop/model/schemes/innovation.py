@@ -103,8 +103,8 @@ class InnovationEstimator(Receiver):
     def follow(self, slots: range, belief: Belief, gamma: Flags, z: Floats) -> tuple[Beliefs, Belief]:
         """(A x̂, A P Aᵀ + Q) if lost, (z, 0) for the state, (A x̂ + z − χ, A P Aᵀ) for an innovation."""
         action = gamma.view(np.uint8) + (gamma & self._secret.nu_block(slots)).view(np.uint8)
-        found = update.beliefs(self.process, slots.start, belief, action, z, self._secret.chi_block(slots))
-        return found, found.last
+        beliefs = update.beliefs(self.process, slots.start, belief, action, z, self._secret.chi_block(slots))
+        return beliefs, beliefs.last
 
 
 class Innovation(Scheme):

@@ -85,9 +85,9 @@ class RandomCode(Scheme):
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
         """A number that is not a probability, or 0."""
         if given.get("plain_probability") == 0:
-            what = f"is {as_toml(given['plain_probability'])}, so the state is never sent again once there is a reference: "
-            what += "the first flipped acknowledgement would leave the user behind for good; expected a number above 0, up to 1"
-            return [("plain_probability", what)]
+            why = f"is {as_toml(given['plain_probability'])}, so the state is never sent again once there is a reference: "
+            why += "the first flipped acknowledgement would leave the user behind for good; expected a number above 0, up to 1"
+            return [("plain_probability", why)]
         return probability_mistakes(given, "plain_probability")
 
     def warnings(self) -> list[str]:
@@ -173,13 +173,13 @@ class ThresholdCode(Scheme):
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
         """Numbers that are not probabilities, and a threshold that no belief exceeds."""
-        found = probability_mistakes(given, "lost_belief", "assumed_quality", "assumed_flip")
+        mistakes = probability_mistakes(given, "lost_belief", "assumed_quality", "assumed_flip")
         if is_number(given.get("lost_belief"), 1.0, 1.0):
-            what = f"is {as_toml(given['lost_belief'])}, which no belief exceeds, so the state is never sent again once there is "
-            what += "a reference: the first flipped acknowledgement would leave the user behind for good; "
-            what += "expected a number below 1"
-            found.append(("lost_belief", what))
-        return found
+            why = f"is {as_toml(given['lost_belief'])}, which no belief exceeds, so the state is never sent again once there is "
+            why += "a reference: the first flipped acknowledgement would leave the user behind for good; "
+            why += "expected a number below 1"
+            mistakes.append(("lost_belief", why))
+        return mistakes
 
     def warnings(self) -> list[str]:
         """That of a singular A."""

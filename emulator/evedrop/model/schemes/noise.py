@@ -119,10 +119,10 @@ class Noise(Scheme):
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
         """μ_d is a probability, or a list of probabilities; the noise has a positive definite covariance."""
-        found = probabilities_mistakes(given, "state_probability")
+        mistakes = probabilities_mistakes(given, "state_probability")
         if (wrong := _mistake(given.get("noise_covariance", PACKETS))) is not None:
-            found.append(("noise_covariance", f"is {as_toml(given['noise_covariance'])}{wrong}"))
-        return found
+            mistakes.append(("noise_covariance", f"is {as_toml(given['noise_covariance'])}{wrong}"))
+        return mistakes
 
     @classmethod
     def mistakes_with(cls, process: Process, given: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -159,15 +159,15 @@ class Noise(Scheme):
         return self.outcomes(mu_e)
 
 
-def _mistake(found: Any) -> str | None:
+def _mistake(value: Any) -> str | None:
     """What is wrong with a covariance of noise, after its value; None if nothing is."""
-    if found == PACKETS:
+    if value == PACKETS:
         return None
     wanted = f'expected "{PACKETS}", for noise as large as the states, "filter" or a matrix such as [[0.01, 0.0], [0.0, 0.01]]'
-    if found == "filter":
+    if value == "filter":
         given = "expected output_matrix and measurement_noise in [plant]"
         return f', but the sensor has no filter; {given}, or a matrix, or "{PACKETS}", for noise as large as the states'
-    rows = found if isinstance(found, list) and found else [None]
+    rows = value if isinstance(value, list) and value else [None]
     if not all(isinstance(row, list) and len(row) == len(rows) and all(map(is_number, row)) for row in rows):
         return f"; {wanted}"
     N = np.array(rows, np.float64)

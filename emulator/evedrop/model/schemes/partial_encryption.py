@@ -90,18 +90,20 @@ class PartialEncryption(Scheme):
     @classmethod
     def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
         """A probability, and numbers of states, each once."""
-        found = probability_mistakes(given, "state_probability")
+        mistakes = probability_mistakes(given, "state_probability")
         states = given.get("encrypted", [])
-        known = isinstance(states, list) and all(type(one) is int and 0 <= one <= _LAST for one in states)
-        if not known or len(set(states)) < len(states):
-            what = f"is {as_toml(states)}; expected a list of different numbers of states, 0 for the first, such as [0]"
-            found.append(("encrypted", what))
-        return found
+        valid = isinstance(states, list) and all(type(state) is int and 0 <= state <= _LAST for state in states)
+        if not valid or len(set(states)) < len(states):
+            sentence = (
+                f"is {as_toml(states)}; expected a list of different numbers of states, 0 for the first, such as [0]"
+            )
+            mistakes.append(("encrypted", sentence))
+        return mistakes
 
     @classmethod
     def mistakes_with(cls, process: Process, given: Mapping[str, Any]) -> list[tuple[str, str]]:
         """States that the process does not have."""
-        beyond = [one for one in given["encrypted"] if one >= process.n]
+        beyond = [state for state in given["encrypted"] if state >= process.n]
         if not beyond:
             return []
         return [("encrypted", f"has {beyond[0]}, but the states are 0 to {process.n - 1}; remove it")]

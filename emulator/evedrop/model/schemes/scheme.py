@@ -219,9 +219,9 @@ class Scheme(ABC):
         """The scheme with μ_d(k) in all slots: itself, unless μ_d differs from slot to slot."""
         if not isinstance(self.mu_d, tuple):
             return self
-        found = copy(self)
-        found.mu_d = found.state_probability = in_slot(self.mu_d, k)
-        return found
+        scheme = copy(self)
+        scheme.mu_d = scheme.state_probability = in_slot(self.mu_d, k)
+        return scheme
 
     @classmethod
     def decides_initial_state(cls) -> bool:

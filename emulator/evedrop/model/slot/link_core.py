@@ -97,9 +97,9 @@ class Transit:
         """The same for consecutive slots: z (c, n, R), header (c, h, R)."""
         late = {}
         for row, k in enumerate(slots):
-            found = self.arrival(k, fates, row, z[row], None if header is None else header[row]).late
-            if found:
-                late[row] = found
+            late_ones = self.arrival(k, fates, row, z[row], None if header is None else header[row]).late
+            if late_ones:
+                late[row] = late_ones
         return Arrivals(fates.in_time, z, header, late)
 
     def _keep(self, k: int, wait: int, heard: Reception, copy: bool) -> None:

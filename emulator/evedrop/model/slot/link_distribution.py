@@ -115,7 +115,7 @@ def stretches(schedule: LinkSchedule) -> list[tuple[int, Mapping[str, Any], bool
     """The first slots of stretches with constant link settings, with the settings and whether the link is cut."""
     settings, cut = schedule.settings, False
     marks = [(0, settings, False)]
-    for change in sorted(schedule.changes, key=lambda one: one.at):
+    for change in sorted(schedule.changes, key=lambda later: later.at):
         settings = settings if change.settings is None else change.settings
         cut = cut if change.cut is None else change.cut
         marks = [mark for mark in marks if mark[0] != change.at] + [(change.at, settings, cut)]
@@ -130,7 +130,7 @@ def _segment(start: int, settings: Mapping[str, Any], cut: bool, window: int) ->
     if settings.get("delay") is not None:
         model, reorder = delay_of(settings["delay"]), settings.get("reorder", 0.0)
         there = [model.arrived(lag) for lag in range(window + 1)]
-        if any(one is None for one in there):
+        if any(probability is None for probability in there):
             return None
         arrived = reorder + (1.0 - reorder) * np.array(there, np.float64)
     passes = 0.0 if cut else 1.0 - settings.get("corrupt", 0.0)

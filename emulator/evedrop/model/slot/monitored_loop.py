@@ -52,13 +52,13 @@ def simulate(assignment: Assignment, plan: MonitorPlan, slots: int, trials: int,
     )
     monitor = Monitor(plan, keys["watermark"], batch)
     sensor = SensorCore(PlainEncoder(), states, local, None, monitor)
-    found: tuple[list[Floats], ...] = ([], [], [], [])
+    columns: tuple[list[Floats], ...] = ([], [], [], [])
     for k in range(slots):
         made = sensor.send(range(k, k + 1))
         u = -product(loop.L, made.x[0])
         sensor.set_inputs(u)
         applied, x = u + monitor.watermark, made.true[0]
         cost = assignment.state_weights @ (x * x) + assignment.input_weights @ (applied * applied)
-        for column, values in zip(found, (monitor.statistic, monitor.watermark, local.normalised, cost), strict=True):
+        for column, values in zip(columns, (monitor.statistic, monitor.watermark, local.normalised, cost), strict=True):
             column.append(values)
-    return LoopRun(*map(np.array, found))
+    return LoopRun(*map(np.array, columns))

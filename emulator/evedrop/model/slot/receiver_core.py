@@ -139,6 +139,6 @@ class Absence:
         """The beliefs after consecutive slots, at least one, in which nothing was received."""
         n, trials = self._belief.x_hat.shape
         nothing = np.zeros((len(slots), trials), np.uint8)
-        found = update.beliefs(self._process, slots.start, self._belief, nothing, np.zeros((len(slots), n, trials)))
-        self._belief = found.last
-        return found
+        beliefs = update.beliefs(self._process, slots.start, self._belief, nothing, np.zeros((len(slots), n, trials)))
+        self._belief = beliefs.last
+        return beliefs

@@ -120,16 +120,16 @@ class QuantisationError:
 
     def covariances(self, process: Process, slots: int) -> Floats:
         """R_k for k = 0 … slots−1, (slots, n, n); inf from where Σ_k overflows."""
-        found: Floats = self._of(state_covariances(process, slots))
-        return found
+        covariances: Floats = self._of(state_covariances(process, slots))
+        return covariances
 
     def limit(self, process: Process) -> Floats:
         """The limit of R_k, (n, n); its diagonal is inf unless A forgets."""
         return self._of(limit(process, NOBODY))
 
     def _of(self, sigma: Floats) -> Floats:
-        found: Floats = np.where(np.eye(sigma.shape[-1], dtype=np.bool_), self.fraction * sigma, 0.0)
-        return found
+        covariances: Floats = np.where(np.eye(sigma.shape[-1], dtype=np.bool_), self.fraction * sigma, 0.0)
+        return covariances
 
 
 def twin_track_bound(process: Process, slots: int) -> Floats:
@@ -173,7 +173,7 @@ def reference_covariances(
     Source: docs/mathematics.md, acknowledged references, flipped acknowledgements.
     """
     heard, unheard = acknowledged
-    found = np.empty((slots, process.n, process.n))
+    covariances = np.empty((slots, process.n, process.n))
     P = R = np.zeros_like(process.Q)
     with np.errstate(over="ignore", invalid="ignore"):
         for k in range(slots):
@@ -184,10 +184,10 @@ def reference_covariances(
             P = received * (1.0 - plain) * carried + (1.0 - received) * predicted
             R = (1.0 - unheard - plain * heard) * carried + unheard * predicted
             if not np.isfinite(P).all():
-                found[k:] = np.inf
+                covariances[k:] = np.inf
                 break
-            found[k] = P
-    return found
+            covariances[k] = P
+    return covariances
 
 
 def reference_limit(process: Process, received: float, acknowledged: tuple[float, float], plain: float = 0.0) -> float:
@@ -231,7 +231,7 @@ class SensorChain:
 
         quantisation: the error that a reset leaves, if it is not 0.
         """
-        found = np.empty((slots, process.n, process.n))
+        covariances = np.empty((slots, process.n, process.n))
         distribution = self.start
         E = np.zeros((len(distribution), process.n, process.n))
         left = None if quantisation is None else quantisation.covariances(process, slots)
@@ -243,11 +243,11 @@ class SensorChain:
                 if left is not None:
                     E = E + (distribution @ self.reset)[:, None, None] * left[k]
                 distribution = distribution @ (self.reset + self.carried)
-                found[k] = E.sum(axis=0)
-                if not np.isfinite(found[k]).all():
-                    found[k:] = np.inf
+                covariances[k] = E.sum(axis=0)
+                if not np.isfinite(covariances[k]).all():
+                    covariances[k:] = np.inf
                     break
-        return found
+        return covariances
 
     def limit(self, process: Process, quantisation: QuantisationError | None = None) -> Floats:
         """Limit of E P_k, (n, n), or its mean over a period if slots repeat; all inf if it is unbounded.
@@ -444,8 +444,8 @@ class ChainForm(ClosedForm):
     @cached_property
     def traces(self) -> Floats:
         """The traces of all slots, (slots,)."""
-        found = self.chain.covariances(self.process, self.slots, self.quantisation)
-        traces: Floats = np.trace(found, axis1=1, axis2=2)
+        covariances = self.chain.covariances(self.process, self.slots, self.quantisation)
+        traces: Floats = np.trace(covariances, axis1=1, axis2=2)
         return traces
 
     @cached_property
@@ -483,31 +483,35 @@ class NoiseTaken:
         """E P_k for k = 0 … slots−1, (slots, n, n); inf from where it overflows."""
         A, N = self.process.A, self.distribution.covariance
         sigma = state_covariances(self.process, slots)
-        found = np.empty_like(sigma)
+        covariances = np.empty_like(sigma)
         with np.errstate(over="ignore", invalid="ignore"):
             for k in range(slots):
-                one = Outcomes.eavesdropper(self.mu_e, in_slot(self.mu_d, k), *self.uses)
+                outcomes = Outcomes.eavesdropper(self.mu_e, in_slot(self.mu_d, k), *self.uses)
                 if k == 0:
-                    found[k] = one.initial * self.process.initial_covariance
+                    covariances[k] = outcomes.initial * self.process.initial_covariance
                 else:
                     taken = sigma[k] + (sigma[k] if N is None else N)
-                    found[k] = one.kept * (A @ found[k - 1] @ A.T) + one.predicted * self.process.Q + one.misled * taken
-                if not np.isfinite(found[k]).all():
-                    found[k:] = np.inf
+                    covariances[k] = (
+                        outcomes.kept * (A @ covariances[k - 1] @ A.T)
+                        + outcomes.predicted * self.process.Q
+                        + outcomes.misled * taken
+                    )
+                if not np.isfinite(covariances[k]).all():
+                    covariances[k:] = np.inf
                     break
-        return found
+        return covariances
 
     @property
     def limit(self) -> Floats:
         """The limit of E P_k with the mean of μ_d, (n, n); all inf for ρ ≥ 1, if noise is ever used."""
-        one, N = self.outcomes, self.distribution.covariance
-        if one.misled == 0.0:
-            return limit(self.process, one)
+        outcomes, N = self.outcomes, self.distribution.covariance
+        if outcomes.misled == 0.0:
+            return limit(self.process, outcomes)
         if radius(self.process) >= 1.0:
             return np.full_like(self.process.Q, math.inf)
         sigma = limit(self.process, NOBODY)
-        source = one.predicted * self.process.Q + one.misled * (sigma + (sigma if N is None else N))
-        return lyapunov(replace(self.process, Q=source), one.kept)
+        source = outcomes.predicted * self.process.Q + outcomes.misled * (sigma + (sigma if N is None else N))
+        return lyapunov(replace(self.process, Q=source), outcomes.kept)
 
 
 @final
@@ -600,11 +604,11 @@ class ClearStatesForm(ClosedForm):
         return Growth(self.growing, unstable_part(self.process.A, np.eye(self.process.n), 1.0 - MARGINAL))
 
     def _followed(self, slots: int) -> Floats:
-        found = np.full(slots, np.inf)
+        traces = np.full(slots, np.inf)
         A, noise = self.process.A, self.process.noise_factor
         X = self._read(cholesky(self.process.initial_covariance))
         for k in range(slots):
-            found[k] = float((X * X).sum())
+            traces[k] = float((X * X).sum())
             moved = A @ X
             if not np.abs(moved).max() < _LARGEST:
                 break
@@ -612,10 +616,10 @@ class ClearStatesForm(ClosedForm):
                 moved = np.concatenate([moved, noise], axis=1)
             after = self._read(moved) if self.mu_d > 0.0 else moved
             if np.array_equal(after, X):
-                found[k:] = found[k]
+                traces[k:] = traces[k]
                 break
             X = after
-        return found
+        return traces
 
     def _read(self, X: Floats) -> Floats:
         """A factor of the covariance once the unencrypted states have been read, (n, n), from one of it before, (n, m)."""
@@ -624,9 +628,9 @@ class ClearStatesForm(ClosedForm):
         L = kernels.triangular_factors(X[order][None].copy())[0]
         L[:clear] = 0.0
         L[:, :clear] = 0.0
-        found: Floats = np.empty_like(L)
-        found[order] = L
-        return found
+        factor: Floats = np.empty_like(L)
+        factor[order] = L
+        return factor
 
 
 def _invariant_hull(A: Floats, columns: Floats) -> Floats:

@@ -161,7 +161,7 @@ class ExpectedCovariance:
         self._process = process
         self._outcomes = outcomes
         self._remaining = RemainingCovariances(process) if outcomes.leaked else None
-        matrices = (np.float64(one).tobytes() for one in (process.A, process.Q))
+        matrices = (np.float64(matrix).tobytes() for matrix in (process.A, process.Q))
         key = (*matrices, n, outcomes.kept, outcomes.predicted, outcomes.misled)
         self._powers, self._kept_powers, self._diffusion, self._spread, self._weights = _block_tables(*key)
         with np.errstate(over="ignore", invalid="ignore"):
@@ -211,10 +211,10 @@ class ExpectedCovariance:
         self._block = _unbounded_from_overflow(block)
 
     def _slot_by_slot(self, E: Floats, remaining: RemainingCovariances) -> Floats:
-        block, one, A = np.empty(self._powers.shape), self._outcomes, self._process.A
-        noise = one.predicted * self._process.Q
+        block, outcomes, A = np.empty(self._powers.shape), self._outcomes, self._process.A
+        noise = outcomes.predicted * self._process.Q
         for j in range(len(block)):
-            E = block[j] = one.kept * (A @ E @ A.T) + noise + one.leaked * remaining.next()
+            E = block[j] = outcomes.kept * (A @ E @ A.T) + noise + outcomes.leaked * remaining.next()
         return block
 
 
@@ -357,7 +357,7 @@ def _block_tables(
 
     dynamics, noise: A and Q as bytes. A run asks for the same ones in every verdict, and they take milliseconds.
     """
-    A, Q = (np.frombuffer(one).reshape(n, n) for one in (dynamics, noise))
+    A, Q = (np.frombuffer(matrix).reshape(n, n) for matrix in (dynamics, noise))
     with np.errstate(over="ignore", invalid="ignore"):
         length = block_length(A)
         diffusion, spread = np.empty((length, n, n)), np.empty((length, n, n))
@@ -368,10 +368,10 @@ def _block_tables(
             W = carried + Q
             diffusion[j], spread[j] = E, W
         weights = 2.0 * misled * np.cumsum(kept ** np.arange(length))
-        found = (powers_of(A, length), powers_of(math.sqrt(kept) * A, length), diffusion, spread, weights)
-    for table in found:
+        tables = (powers_of(A, length), powers_of(math.sqrt(kept) * A, length), diffusion, spread, weights)
+    for table in tables:
         table.flags.writeable = False
-    return found
+    return tables
 
 
 def powers_of(A: Floats, length: int) -> Floats:
@@ -419,8 +419,8 @@ def unstable_part(A: Floats, within: Floats, least: float) -> Floats:
     if not within.shape[1]:
         return within
     _, Z, count = schur(within.T @ A @ within, sort=lambda real, imaginary: math.hypot(real, imaginary) >= least)
-    found: Floats = within @ Z[:, :count]
-    return found
+    part: Floats = within @ Z[:, :count]
+    return part
 
 
 def growth(process: Process, outcomes: Outcomes) -> Growth:

@@ -132,14 +132,14 @@ class Design:
         legitimate: dict[str, Any] = {"bound": json_value(self.bound), "trace": json_value(self.trace)}
         if self.minimum is not None:
             legitimate["minimum"] = self.minimum
-        found = {
+        entries = {
             "rho": self.rho,
             "legitimate": legitimate,
             "eavesdroppers": {name: against.as_dict() for name, against in self.eavesdroppers.items()},
         }
         if self.choice is not None:
-            found["choice"] = self.choice.as_dict()
-        return {**found, "left_out": self.left_out} if self.left_out else found
+            entries["choice"] = self.choice.as_dict()
+        return {**entries, "left_out": self.left_out} if self.left_out else entries
 
 
 def design(
@@ -251,9 +251,9 @@ def least_state_probability(process: Process, mu: float, max_trace: float) -> fl
     low = stability_bound(process, mu)
     best = limit_trace(process, Outcomes.plain(mu))
     if not low < 1.0 or not best < max_trace:
-        found = f"{best:.6g}" if low < 1.0 and math.isfinite(best) else "unbounded"
+        least = f"{best:.6g}" if low < 1.0 and math.isfinite(best) else "unbounded"
         raise UsageError(
-            f"no μ_d keeps the legitimate trace below {max_trace:g}: at μ_d = 1, where it is least, it is {found}; "
+            f"no μ_d keeps the legitimate trace below {max_trace:g}: at μ_d = 1, where it is least, it is {least}; "
             "ask for a larger trace, or improve the legitimate link"
         )
 
@@ -299,10 +299,10 @@ def _argmax(process: Process, mu: float, adversary: Adversary, gain: Callable[[f
     lowest = int(np.argmin(losses))
     if not np.all(np.isfinite(losses)) or losses[lowest] >= 0.0 or lowest in (0, len(points) - 1):
         return None
-    found = minimize_scalar(
+    optimum = minimize_scalar(
         loss, bounds=(points[lowest - 1], points[lowest + 1]), method="bounded", options={"xatol": 1e-10}
     )
-    mu_d = float(found.x)
+    mu_d = float(optimum.x)
     return mu_d if mu_d - low > ATTAINED * (1.0 - low) else None
 
 

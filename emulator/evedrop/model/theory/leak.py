@@ -57,10 +57,12 @@ def remaining_limit(process: Process) -> Floats:
     """
     stairs = Staircase(process)
     if stairs.singular:
-        reached, found = slice(stairs.unreached, None), np.zeros_like(process.Q)
+        reached, covariance = slice(stairs.unreached, None), np.zeros_like(process.Q)
         some = stairs.process
-        found[reached, reached] = _remaining_limit(*(M[reached, reached] for M in (some.A, some.Q, some.noise_factor)))
-        return stairs.outward_covariance(found[:, :, None])[:, :, 0]
+        covariance[reached, reached] = _remaining_limit(
+            *(M[reached, reached] for M in (some.A, some.Q, some.noise_factor))
+        )
+        return stairs.outward_covariance(covariance[:, :, None])[:, :, 0]
     return _remaining_limit(process.A, process.Q, process.noise_factor)
 
 

@@ -65,13 +65,13 @@ def _next_block(dynamics: bytes, factor: bytes, n: int, start: bytes) -> tuple[F
     dynamics, factor, start: A, Q^½ and a factor of C in the first of these slots, as bytes. A study asks for the same ones for
     each block of its trials.
     """
-    A, noise, carried = (np.frombuffer(one).reshape(n, n) for one in (dynamics, factor, start))
+    A, noise, carried = (np.frombuffer(matrix).reshape(n, n) for matrix in (dynamics, factor, start))
     largest = _AS_GOOD_AS_INFINITE * float(np.abs(noise).max()) or math.inf
     more = kernels.carried_factors(A, noise, carried, block_length(A))
-    found = _bits(np.concatenate([carried[None], more[:-1]]), noise)
-    found.flags.writeable = False
+    block = _bits(np.concatenate([carried[None], more[:-1]]), noise)
+    block.flags.writeable = False
     # A column that is scaled down still means a variance that is as good as infinite.
-    return found, (more[-1] / np.maximum(1.0, np.abs(more[-1]).max(axis=0) / largest)).tobytes()
+    return block, (more[-1] / np.maximum(1.0, np.abs(more[-1]).max(axis=0) / largest)).tobytes()
 
 
 @final

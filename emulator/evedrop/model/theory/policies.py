@@ -110,7 +110,7 @@ def policy_chains(send: NDArray[np.bool_], mu: float, mu_e: float) -> tuple[Sens
     Source: docs/mathematics.md, the best policy.
     """
     last = len(send) - 1
-    found = {(last, last): 0}
+    index_of = {(last, last): 0}
     moves: list[tuple[int, int, float, bool, bool]] = []
     queue = [(last, last)]
     for i, j in queue:
@@ -119,17 +119,17 @@ def policy_chains(send: NDArray[np.bool_], mu: float, mu_e: float) -> tuple[Sens
         for (user, chance), (eve, chance_e) in product(heard, heard_e):
             if chance * chance_e > 0.0:
                 to = (0 if user else min(i + 1, last), 0 if eve else min(j + 1, last))
-                if to not in found:
-                    found[to] = len(found)
+                if to not in index_of:
+                    index_of[to] = len(index_of)
                     queue.append(to)
-                moves.append((found[i, j], found[to], chance * chance_e, user, eve))
-    start = np.zeros(len(found))
+                moves.append((index_of[i, j], index_of[to], chance * chance_e, user, eve))
+    start = np.zeros(len(index_of))
     start[0] = 1.0
-    matrices = np.zeros((4, len(found), len(found)))
+    matrices = np.zeros((4, len(index_of), len(index_of)))
     for s, r, chance, user, eve in moves:
         matrices[int(user), s, r] += chance
         matrices[2 + int(eve), s, r] += chance
-    sends = np.array([float(send[state]) for state in found])
+    sends = np.array([float(send[state]) for state in index_of])
     return SensorChain(start, matrices[1], matrices[0]), SensorChain(start, matrices[3], matrices[2]), sends
 
 
@@ -194,7 +194,7 @@ class Front:
     def as_dict(self) -> dict[str, object]:
         """The JSON of `evedrop design --policy`; inf is null."""
         return {
-            "scheduled": [{"threshold": i + 1, **one.as_dict()} for i, one in enumerate(self.thresholds)],
+            "scheduled": [{"threshold": i + 1, **entry.as_dict()} for i, entry in enumerate(self.thresholds)],
             "policies": [
                 {
                     "weights": list(point.weights),
@@ -205,7 +205,7 @@ class Front:
                 }
                 for point in self.points
             ],
-            "never": [list(one) for one in self.never],
+            "never": [list(entry) for entry in self.never],
             "dominated": self.dominated,
         }
 
@@ -265,13 +265,13 @@ def front(
         if not policy.ever_sends:
             never.append((weight, price))
             continue
-        found = policy_metrics(process, policy.send, links.mu, links.mu_e)
+        figures = policy_metrics(process, policy.send, links.mu, links.mu_e)
         cheapest = _cheapest(alone, weight, price)
-        if points and points[-1].price == price and points[-1].metrics.to_lower == found.to_lower:
+        if points and points[-1].price == price and points[-1].metrics.to_lower == figures.to_lower:
             points[-1] = replace(points[-1], weights=(points[-1].weights[0], weight), scheduled=cheapest)
         else:
-            points.append(FrontPoint((weight, weight), price, policy.thresholds, found, cheapest))
-    kept = [one for one in points if not any(other.metrics.dominates(one.metrics) for other in points)]
+            points.append(FrontPoint((weight, weight), price, policy.thresholds, figures, cheapest))
+    kept = [point for point in points if not any(other.metrics.dominates(point.metrics) for other in points)]
     return Front(alone, tuple(kept), tuple(never), len(points) - len(kept))
 
 

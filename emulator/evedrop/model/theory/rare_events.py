@@ -77,9 +77,9 @@ def streaks(process: Process, outcomes: Outcomes, slots: int) -> Streaks | None:
     begun, spread = _begun(process, outcomes, slots, last)
     F = math.sqrt(kept) * process.A
     powers = np.concatenate([np.eye(process.n)[None], powers_of(F, block_length(F))])
-    base, noise, found = powers[0], 0.0, np.zeros((2, 3, 0))
-    while found.shape[2] < slots and found[1].sum() < (1.0 - REST) * total:
-        length = np.arange(found.shape[2], min(slots, found.shape[2] + len(powers) - 1))
+    base, noise, terms = powers[0], 0.0, np.zeros((2, 3, 0))
+    while terms.shape[2] < slots and terms[1].sum() < (1.0 - REST) * total:
+        length = np.arange(terms.shape[2], min(slots, terms.shape[2] + len(powers) - 1))
         if length[-1] >= last:
             last = min(slots, 4 * (int(length[-1]) + 1))
             begun, spread = _begun(process, outcomes, slots, last)
@@ -87,9 +87,9 @@ def streaks(process: Process, outcomes: Outcomes, slots: int) -> Streaks | None:
         base = powers[-1] @ base
         q = _traces(F_l, process.Q)
         u = np.empty(len(length))
-        for i, one in enumerate(q):
+        for i, trace in enumerate(q):
             u[i] = noise
-            noise = kept * noise + lost * one
+            noise = kept * noise + lost * trace
         often = kept**length
         number = [often * begun[row], often * misled * after, often * outcomes.initial]
         carried = [
@@ -97,8 +97,8 @@ def streaks(process: Process, outcomes: Outcomes, slots: int) -> Streaks | None:
             np.zeros(len(length)) if spread is None else misled * (_traces(F_l, spread[row]) + after * u),
             outcomes.initial * (_traces(F_l, process.initial_covariance) + u),
         ]
-        found = np.concatenate([found, [number, carried]], axis=2)
-    return Streaks(found[0], found[1], total)
+        terms = np.concatenate([terms, [number, carried]], axis=2)
+    return Streaks(terms[0], terms[1], total)
 
 
 def total_of(next_traces: Callable[[int], Floats], slots: int) -> float:
@@ -121,7 +121,7 @@ def _begun(process: Process, outcomes: Outcomes, slots: int, last: int) -> tuple
             spread = np.cumsum(np.concatenate([spread[-1:], 2.0 * noise.next(count)]), axis=0)[1:]
         if part.stop > slots - last:
             kept.append((begun, spread))
-    numbers, sums = (np.concatenate(one)[-last:] for one in zip(*kept, strict=True))
+    numbers, sums = (np.concatenate(arrays)[-last:] for arrays in zip(*kept, strict=True))
     return numbers, sums if outcomes.misled else None
 
 
@@ -135,15 +135,15 @@ class _InStep:
 
     def next(self, slots: int) -> Floats:
         """That of the next slots, (slots,)."""
-        found, one = np.empty(slots), self._outcomes
+        probabilities, outcomes = np.empty(slots), self._outcomes
         for k in range(slots):
-            found[k] = self._next
-            after = 1.0 - one.initial if self._first else one.state + one.decoded * self._next
+            probabilities[k] = self._next
+            after = 1.0 - outcomes.initial if self._first else outcomes.state + outcomes.decoded * self._next
             if not self._first and after == self._next:  # and so in all later slots
-                found[k:] = after
+                probabilities[k:] = after
                 break
             self._next, self._first = after, False
-        return found
+        return probabilities
 
 
 def _traces(F: Floats, P: Floats) -> Floats:

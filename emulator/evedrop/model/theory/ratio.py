@@ -164,10 +164,10 @@ def cheapest(
             f"no μ_d gives {min_ratio:g}×: none is admissible, because the legitimate error is unbounded even if every packet is "
             "the state; improve the legitimate link"
         )
-    found = large_enough(process, mu, adversaries, min_ratio)
-    kept = tuple((max(a, minimum or 0.0), b) for a, b in found if minimum is None or b > minimum)
+    intervals = large_enough(process, mu, adversaries, min_ratio)
+    kept = tuple((max(a, minimum or 0.0), b) for a, b in intervals if minimum is None or b > minimum)
     if not kept:
-        raise UsageError(_impossible(process, mu, adversaries, min_ratio, found, minimum, max_trace))
+        raise UsageError(_impossible(process, mu, adversaries, min_ratio, intervals, minimum, max_trace))
     mu_d = kept[-1][1]
     return Choice(
         min_ratio=min_ratio,
@@ -196,15 +196,15 @@ def large_enough(
         return ratio(mu_d) >= min_ratio * (1.0 - _ROUNDING)
 
     points = _points(process, low, adversaries, ratio)
-    found: list[tuple[float, float]] = []
+    intervals: list[tuple[float, float]] = []
     begin = low if holds(points[0]) else None
     for a, b in pairwise(points):
         if begin is None and holds(b):
             begin = _edge(b, a, holds)
         elif begin is not None and not holds(b):
-            found.append((begin, _edge(a, b, holds)))
+            intervals.append((begin, _edge(a, b, holds)))
             begin = None
-    return tuple(found if begin is None else [*found, (begin, 1.0)])
+    return tuple(intervals if begin is None else [*intervals, (begin, 1.0)])
 
 
 def cost_of(process: Process, mu: float, mu_d: float) -> float:
@@ -214,7 +214,7 @@ def cost_of(process: Process, mu: float, mu_d: float) -> float:
 
 
 def _ratios(process: Process, mu: float, adversaries: Sequence[Adversary], mu_d: float) -> dict[str, float]:
-    return {one.name: ratio_of(*traces_of(process, mu, one, mu_d)) for one in adversaries}
+    return {adversary.name: ratio_of(*traces_of(process, mu, adversary, mu_d)) for adversary in adversaries}
 
 
 def _least_ratio(process: Process, mu: float, adversaries: Sequence[Adversary]) -> Callable[[float], float]:
@@ -234,7 +234,11 @@ def _points(
     """Points of (low, 1] in ascending order: many between the poles, each local extremum of the ratio, and 1."""
     from scipy.optimize import minimize_scalar  # noqa: PLC0415 - slow to import
 
-    poles = {low, 1.0, *(bound for one in adversaries if low < (bound := adversary_bound(process, one)) < 1.0)}
+    poles = {
+        low,
+        1.0,
+        *(bound for adversary in adversaries if low < (bound := adversary_bound(process, adversary)) < 1.0),
+    }
     points = {float(point) for a, b in pairwise(sorted(poles)) for point in points_between(a, b)} | {1.0}
     points = {point for point in points if low < point <= 1.0}
     for a, b, c in zip(ordered := sorted(points), ordered[1:], ordered[2:], strict=False):
@@ -273,7 +277,7 @@ def _impossible(
     mu: float,
     adversaries: Sequence[Adversary],
     min_ratio: float,
-    found: Sequence[tuple[float, float]],
+    intervals: Sequence[tuple[float, float]],
     minimum: float | None,
     max_trace: float | None,
 ) -> str:
@@ -285,12 +289,12 @@ def _impossible(
         return f"no μ_d gives {min_ratio:g}×{every}{bounded}; ask for a larger trace"
     dear = "is unbounded" if math.isinf(most.cost) else f"is {most.cost:.3g} times that of sending all states"
     where = f"at μ_d = {most.mu_d:.4g}" if most.attained else f"approached as μ_d falls to {most.mu_d:.4g}"
-    said = f"no μ_d gives {min_ratio:g}×{every}{bounded}; the most is {most.ratio:.4g}× {where}"
-    said += f", where the legitimate error {dear}"
+    sentence = f"no μ_d gives {min_ratio:g}×{every}{bounded}; the most is {most.ratio:.4g}× {where}"
+    sentence += f", where the legitimate error {dear}"
     if len(adversaries) > 1 and most.attained:
         each = _ratios(process, mu, adversaries, most.mu_d)
-        said += f" ({', '.join(f'{name} {ratio:.4g}×' for name, ratio in each.items())})".replace("inf×", "∞×")
-    if found:
-        trace = limit_trace(process, Outcomes.legitimate(mu, found[-1][1]))
-        said += f"; {min_ratio:g}× needs a legitimate trace of {trace:.4g}, at μ_d = {found[-1][1]:.4g}"
-    return said
+        sentence += f" ({', '.join(f'{name} {ratio:.4g}×' for name, ratio in each.items())})".replace("inf×", "∞×")
+    if intervals:
+        trace = limit_trace(process, Outcomes.legitimate(mu, intervals[-1][1]))
+        sentence += f"; {min_ratio:g}× needs a legitimate trace of {trace:.4g}, at μ_d = {intervals[-1][1]:.4g}"
+    return sentence

@@ -51,23 +51,23 @@ class SlotRecursion:
     def next(self, k: int, E: Floats, mu_d: Floats) -> Floats:
         """E P_k, (S, n, n), from E P_{k−1}, (S, n, n), with μ_d(k), (S,)."""
         kept, predicted, misled, leaked = (self._base[:, None] + self._slope[:, None] * mu_d)[:, :, None, None]
-        found: Floats = (
+        covariance: Floats = (
             kept * (self._A @ E @ self._A.T)
             + predicted * self._Q
             + misled * self._misled[k]
             + leaked * self._remaining[k]
         )
-        return found
+        return covariance
 
     def traces(self, mu_d: Floats) -> Floats:
         """Trace of E P_k for k = 0 … N−1 of schedules, (S, N) → (S, N); μ_d(0) is taken as 1."""
-        found = np.empty(mu_d.shape)
+        traces = np.empty(mu_d.shape)
         E = np.broadcast_to(self.initial, (len(mu_d), *self.initial.shape))
-        found[:, 0] = np.trace(self.initial)
+        traces[:, 0] = np.trace(self.initial)
         for k in range(1, mu_d.shape[1]):
             E = self.next(k, E, mu_d[:, k])
-            found[:, k] = np.trace(E, axis1=1, axis2=2)
-        return found
+            traces[:, k] = np.trace(E, axis1=1, axis2=2)
+        return traces
 
 
 def _probabilities(outcomes: Outcomes) -> Floats:
@@ -102,14 +102,14 @@ _SNAP = 1e-6  # a μ_d nearer than this to 0 or 1 is meant to be it
 
 def patterns(slots: int, blocks: list[slice]) -> list[Floats]:
     """Schedules, (N,), to climb from: states in one block alone, or in all blocks up to one. They need not keep Ω."""
-    found = []
+    schedules = []
     count = max(2, min(_MOST_PATTERNS, _PATTERN_SLOTS // slots))
     for i in np.unique(np.linspace(0, len(blocks) - 1, count).astype(np.int64)).tolist():
         for first in (i, 0):
             mu_d = np.zeros(slots)
             mu_d[0] = mu_d[blocks[first].start : blocks[i].stop] = 1.0
-            found.append(mu_d)
-    return found
+            schedules.append(mu_d)
+    return schedules
 
 
 def climbed(problem: ScheduleProblem, start: Floats, blocks: list[slice]) -> Floats:
@@ -123,8 +123,8 @@ def climbed(problem: ScheduleProblem, start: Floats, blocks: list[slice]) -> Flo
     bound = problem.max_trace if math.isfinite(problem.max_trace) else 1.0
     scale = max(abs(float(replace(problem, max_trace=math.inf).sums(np.ones((1, slots)))[0])), 1e-300)
     member = np.zeros((slots, len(blocks)))
-    for i, one in enumerate(blocks):
-        member[one, i] = 1.0
+    for i, block in enumerate(blocks):
+        member[block, i] = 1.0
 
     def schedule(of: Floats) -> Floats:
         found: Floats = member @ np.clip(of, 0.0, 1.0)
@@ -158,7 +158,7 @@ def climbed(problem: ScheduleProblem, start: Floats, blocks: list[slice]) -> Flo
     }
     found = minimize(
         loss,
-        np.array([start[one.start] for one in blocks]),
+        np.array([start[block.start] for block in blocks]),
         jac=slope,
         bounds=[(0.0, 1.0)] * len(blocks),
         constraints=[constraint] if math.isfinite(problem.max_trace) else [],
@@ -187,8 +187,8 @@ def _repaired(problem: ScheduleProblem, mu_d: Floats) -> Floats:
             high = float(fractions[0])
             break
         low, high = float(fractions[first - 1]), float(fractions[first])
-    found: Floats = mu_d + high * way
-    return found
+    repaired: Floats = mu_d + high * way
+    return repaired
 
 
 _POINTS, _REFINEMENTS = 33, 8  # the least feasible μ_d of a block is found to 33⁻⁸
@@ -235,8 +235,8 @@ class ScheduleDesign:
 
     def as_dict(self) -> dict[str, object]:
         """The JSON of `evedrop design --schedule`; `left_out` is present only if it has values."""
-        found: dict[str, object] = {"eavesdroppers": json_value(self.schedules)}
-        return {**found, "left_out": self.left_out} if self.left_out else found
+        entries: dict[str, object] = {"eavesdroppers": json_value(self.schedules)}
+        return {**entries, "left_out": self.left_out} if self.left_out else entries
 
 
 def best_schedule(
@@ -273,12 +273,12 @@ def best_schedule(
             "legitimate link"
         )
     edges = sorted({*range(1, slots, block), slots})
-    blocks = [slice(*one) for one in pairwise(edges)]
+    blocks = [slice(*bounds) for bounds in pairwise(edges)]
     grid, exact = _best_of_grid(process, problem, blocks, np.linspace(0.0, 1.0, levels), capacity)
     constant = _ascended(problem, np.ones(slots), [slice(1, slots)])
     starts = [grid, constant, _lowest(problem, blocks)]
-    found = [climbed(problem, start, blocks) for start in (*starts, *patterns(slots, blocks))]
-    starts += sorted(found, key=problem.sum_of, reverse=True)[:_ASCENDED]
+    schedules = [climbed(problem, start, blocks) for start in (*starts, *patterns(slots, blocks))]
+    starts += sorted(schedules, key=problem.sum_of, reverse=True)[:_ASCENDED]
     best = max((_ascended(problem, start, blocks) for start in starts), key=problem.sum_of)
     best = _improved_by_pairs(problem, best, blocks)
     # Upwards, where the user's error is smaller: digits beyond these depend on the machine.
@@ -303,17 +303,17 @@ def _best_of_grid(
     mu_d = np.ones((1, problem.slots))
     E, F = problem.user.initial[None], problem.eavesdropper.initial[None]
     value, exact = np.zeros(1), True
-    for one in blocks:
+    for block in blocks:
         count = len(levels)
         mu_d, E, F, value = (np.repeat(array, count, axis=0) for array in (mu_d, E, F, value))
-        mu_d[:, one] = np.tile(levels, len(mu_d) // count)[:, None]
-        for k in range(one.start, one.stop):
+        mu_d[:, block] = np.tile(levels, len(mu_d) // count)[:, None]
+        for k in range(block.start, block.stop):
             E, F = problem.user.next(k, E, mu_d[:, k]), problem.eavesdropper.next(k, F, mu_d[:, k])
             ours = np.trace(E, axis1=1, axis2=2)
             value = value + (1.0 - problem.weight) * np.trace(F, axis1=1, axis2=2) - problem.weight * ours
             kept = ours <= problem.max_trace * (1.0 + ROUNDING)
             mu_d, E, F, value = mu_d[kept], E[kept], F[kept], value[kept]
-        later = _later_traces(process, np.stack([E, F]), problem.slots - one.stop)
+        later = _later_traces(process, np.stack([E, F]), problem.slots - block.stop)
         best = _undominated(np.column_stack([-later[0], later[1], value]))
         if len(best) > capacity:
             exact = False
@@ -327,12 +327,12 @@ def _best_of_grid(
 
 def _later_traces(process: Process, covariances: Floats, slots: int) -> Floats:
     """Trace of A^m P A^mᵀ for m = 0 … slots, (…, n, n) → (…, slots + 1): all of P that matters later."""
-    found = np.empty((*covariances.shape[:-2], slots + 1))
+    traces = np.empty((*covariances.shape[:-2], slots + 1))
     G = np.eye(process.n)
     for m in range(slots + 1):
-        found[..., m] = (covariances * G).sum(axis=(-2, -1))
+        traces[..., m] = (covariances * G).sum(axis=(-2, -1))
         G = process.A.T @ G @ process.A
-    return found
+    return traces
 
 
 def _undominated(scores: Floats) -> NDArray[np.int64]:
@@ -341,19 +341,19 @@ def _undominated(scores: Floats) -> NDArray[np.int64]:
     scores = scores / scale
     order = np.argsort(-scores.sum(axis=1), kind="stable")
     kept = np.empty((len(order), scores.shape[1]))
-    found: list[int] = []
+    rows_kept: list[int] = []
     for row in order.tolist():
-        if not (kept[: len(found)] >= scores[row] - ROUNDING).all(axis=1).any():
-            kept[len(found)] = scores[row]
-            found.append(row)
-    return np.array(found, np.int64)
+        if not (kept[: len(rows_kept)] >= scores[row] - ROUNDING).all(axis=1).any():
+            kept[len(rows_kept)] = scores[row]
+            rows_kept.append(row)
+    return np.array(rows_kept, np.int64)
 
 
 def _lowest(problem: ScheduleProblem, blocks: list[slice]) -> Floats:
     """The schedule, (N,), whose blocks have the least μ_d, one after the other, with which sending states keeps Ω later."""
     mu_d = np.ones(problem.slots)
-    for one in blocks:
-        mu_d[one] = _least_feasible(problem, mu_d, one)
+    for block in blocks:
+        mu_d[block] = _least_feasible(problem, mu_d, block)
     return mu_d
 
 
@@ -366,13 +366,13 @@ def _ascended(problem: ScheduleProblem, mu_d: Floats, blocks: list[slice]) -> Fl
     best = problem.sum_of(mu_d)
     while True:
         before = best
-        for one in blocks:
-            low = _least_feasible(problem, mu_d, one)
-            tried = np.append(np.linspace(low, 1.0, _POINTS), mu_d[one.start])
-            sums = problem.sums(_with(mu_d, one, tried))
+        for block in blocks:
+            low = _least_feasible(problem, mu_d, block)
+            tried = np.append(np.linspace(low, 1.0, _POINTS), mu_d[block.start])
+            sums = problem.sums(_with(mu_d, block, tried))
             if sums.max() > best:
                 best = float(sums.max())
-                mu_d[one] = tried[int(np.argmax(sums))]
+                mu_d[block] = tried[int(np.argmax(sums))]
         if best - before <= _GAIN * abs(best):
             return mu_d
 
@@ -382,26 +382,26 @@ def _improved_by_pairs(problem: ScheduleProblem, mu_d: Floats, blocks: list[slic
     before = -math.inf
     while (best := problem.sum_of(mu_d)) - before > _PAIR_GAIN * abs(best):
         before = best
-        for one, other in pairwise(blocks):
+        for first_block, second_block in pairwise(blocks):
             middle, width = np.full(2, 0.5), 0.5
             while width > _NARROW:
                 axes = (np.clip(np.linspace(at - width, at + width, _MESH), 0.0, 1.0) for at in middle)
                 first, second = (axis.reshape(-1) for axis in np.meshgrid(*axes))
-                tried = _with(mu_d, one, first)
-                tried[:, other] = second[:, None]
+                tried = _with(mu_d, first_block, first)
+                tried[:, second_block] = second[:, None]
                 sums = problem.sums(tried)
-                found = int(np.argmax(sums))
-                middle, width = np.array([first[found], second[found]]), width / _ZOOM
-                best, mu_d = max(((best, mu_d), (float(sums[found]), tried[found])), key=itemgetter(0))
+                index = int(np.argmax(sums))
+                middle, width = np.array([first[index], second[index]]), width / _ZOOM
+                best, mu_d = max(((best, mu_d), (float(sums[index]), tried[index])), key=itemgetter(0))
         mu_d = _ascended(problem, mu_d, blocks)
     return mu_d
 
 
-def _least_feasible(problem: ScheduleProblem, mu_d: Floats, one: slice) -> float:
-    low, high = 0.0, float(mu_d[one.start])
+def _least_feasible(problem: ScheduleProblem, mu_d: Floats, block: slice) -> float:
+    low, high = 0.0, float(mu_d[block.start])
     for _ in range(_REFINEMENTS):
         tried = np.linspace(low, high, _POINTS)
-        feasible = np.isfinite(problem.sums(_with(mu_d, one, tried)))
+        feasible = np.isfinite(problem.sums(_with(mu_d, block, tried)))
         first = int(np.argmax(feasible))  # the last one is feasible, or was
         if first == 0:
             return float(tried[0])
@@ -409,7 +409,7 @@ def _least_feasible(problem: ScheduleProblem, mu_d: Floats, one: slice) -> float
     return high
 
 
-def _with(mu_d: Floats, one: slice, tried: Floats) -> Floats:
-    found = np.repeat(mu_d[None], len(tried), axis=0)
-    found[:, one] = tried[:, None]
-    return found
+def _with(mu_d: Floats, block: slice, tried: Floats) -> Floats:
+    schedules = np.repeat(mu_d[None], len(tried), axis=0)
+    schedules[:, block] = tried[:, None]
+    return schedules

@@ -48,8 +48,8 @@ def ended(process: subprocess.Popen[bytes]) -> int:
         raise _hung("did not end") from error
 
 
-def _hung(what: str) -> RunError:
+def _hung(subject: str) -> RunError:
     return RunError(
-        f"the process that draws {what} for {DRAWING_SECONDS:g} s, and was ended; something that it uses hangs, such as the "
+        f"the process that draws {subject} for {DRAWING_SECONDS:g} s, and was ended; something that it uses hangs, such as the "
         "driver of the graphics card, or a disk; try again, on another disk or with another driver"
     )

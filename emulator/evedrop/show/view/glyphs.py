@@ -9,7 +9,7 @@ _UNASSIGNED = frozenset("\u0387\u038b\u038d\u03a2")
 
 def drawable(text: str) -> str:
     """The text with a question mark for each letter that the viewer's font may lack."""
-    return "".join(one if _known(one) else "?" for one in text)
+    return "".join(character if _known(character) else "?" for character in text)
 
 
 def _known(letter: str) -> bool:

@@ -36,7 +36,7 @@ class ErrorDistance:
 
     def __init__(self, scene: Scene) -> None:
         unit = scene.units[0] if scene.units else ""
-        others = [i for i, one in enumerate(scene.units) if one != unit]
+        others = [i for i, unit_ in enumerate(scene.units) if unit_ != unit]
         self._count = others[0] if others else scene.n
         self._unit = f" {unit}" if unit else ""
         self._level, self._step = -1, 0  # of the last slot
@@ -62,13 +62,13 @@ class ErrorDistance:
         distances: Floats = np.sqrt(np.sum(apart**2, axis=1))
         return distances
 
-    def codes(self, known: Codes, distances: Floats) -> NDArray[np.int64]:
+    def codes(self, levels: Codes, distances: Floats) -> NDArray[np.int64]:
         """Codes of `lane` in the next slots, (c,), for what is known and distances, (c,).
 
         A word names the largest distance since this stretch of equal knowledge began, so that it does not flicker.
         """
         step = np.searchsorted(self._steps, np.nan_to_num(distances, nan=np.inf), side="left")
-        level = known.astype(np.int64)
+        level = levels.astype(np.int64)
         begins = np.cumsum(np.diff(level, prepend=self._level) != 0)  # the number of the stretch of equal knowledge
         if len(level):
             carried = np.where(begins == 0, self._step, 0)

@@ -47,9 +47,9 @@ class PanelSet:
     def layout(self) -> rrb.Blueprint:
         """The views of all panels: rows over the whole width, and columns between them."""
         placed = [
-            one
+            view
             for name, panel in [*self._panels.items()]
-            for one in self._tried(name, partial(_views, panel, _drawable if PANELS.foreign(name) else _placed))
+            for view in self._tried(name, partial(_views, panel, _drawable if PANELS.foreign(name) else _placed))
         ]
         return rrb.Blueprint(
             _arranged(placed),
@@ -74,7 +74,7 @@ class PanelSet:
         self._each(lambda panel: _send(panel.notes(notes), to))
 
     def _each(self, ask: Callable[[ViewPanel], Sequence[T]]) -> list[T]:
-        return [one for name, panel in [*self._panels.items()] for one in self._tried(name, partial(ask, panel))]
+        return [answer for name, panel in [*self._panels.items()] for answer in self._tried(name, partial(ask, panel))]
 
     def _tried(self, name: str, ask: Callable[[], Sequence[T]]) -> Sequence[T]:
         """A panel's answer; empty if it fails: a package's panel is then left out from now on, and a built-in one raises."""
@@ -91,46 +91,53 @@ class PanelSet:
 
 def _arranged(placed: Sequence[PlacedView]) -> rrb.Container:
     """Rows above, columns, and rows below; each takes the share of the height that its views need, and columns the rest."""
-    sides = {side: [one for one in placed if one.side == side] for side in (*ROWS_ABOVE, *COLUMNS, *ROWS_BELOW)}
+    sides = {side: [view for view in placed if view.side == side] for side in (*ROWS_ABOVE, *COLUMNS, *ROWS_BELOW)}
     columns = [
-        (rrb.Vertical(*(one.view for one in sides[side]), row_shares=[one.share for one in sides[side]]), width)
+        (rrb.Vertical(*(view.view for view in sides[side]), row_shares=[view.share for view in sides[side]]), width)
         for side, width in zip(COLUMNS, _WIDTHS, strict=True)
         if sides[side]
     ]
-    heights = {side: max((one.height for one in sides[side]), default=0.0) for side in (*ROWS_ABOVE, *ROWS_BELOW)}
+    heights = {side: max((view.height for view in sides[side]), default=0.0) for side in (*ROWS_ABOVE, *ROWS_BELOW)}
     rest = max(_LEAST_REST, 1.0 - sum(heights.values()))
     rows: list[tuple[rrb.Container, float]] = []
     for side in (*ROWS_ABOVE, None, *ROWS_BELOW):
         if side is None:
             rows.append(
-                (rrb.Horizontal(*(one for one, _ in columns), column_shares=[width for _, width in columns]), rest)
+                (rrb.Horizontal(*(view for view, _ in columns), column_shares=[width for _, width in columns]), rest)
             )
         elif sides[side]:
-            row = rrb.Horizontal(*(one.view for one in sides[side]), column_shares=[one.share for one in sides[side]])
+            row = rrb.Horizontal(
+                *(view.view for view in sides[side]), column_shares=[view.share for view in sides[side]]
+            )
             rows.append((row, max(heights[side], _LEAST_ROW)))
     return rrb.Vertical(*(row for row, _ in rows), row_shares=[share for _, share in rows])
 
 
 def _views(panel: ViewPanel, check: Callable[[PlacedView], PlacedView]) -> list[PlacedView]:
-    return [check(one) for one in panel.views()]
+    return [check(view) for view in panel.views()]
 
 
-def _placed(one: PlacedView) -> PlacedView:
+def _placed(view: PlacedView) -> PlacedView:
     """The same view, if a layout can contain it. Raises an error otherwise."""
     sides = (*ROWS_ABOVE, *COLUMNS, *ROWS_BELOW)
-    if not isinstance(one, PlacedView) or one.side not in sides or not one.share > 0.0 or not 0.0 <= one.height < 1.0:
+    if (
+        not isinstance(view, PlacedView)
+        or view.side not in sides
+        or not view.share > 0.0
+        or not 0.0 <= view.height < 1.0
+    ):
         raise TypeError(
-            f"views() gave {one!r}; expected a PlacedView, {listed(sides)}, with a share above 0 and a height below 1"
+            f"views() gave {view!r}; expected a PlacedView, {listed(sides)}, with a share above 0 and a height below 1"
         )
-    return one
+    return view
 
 
-def _drawable(one: PlacedView) -> PlacedView:
+def _drawable(view: PlacedView) -> PlacedView:
     """The same, and Rerun can draw it. Rerun keeps some threads for each view that is tried like this."""
     create_in_memory_blueprint(
-        application_id="view", blueprint=rrb.Blueprint(_placed(one).view)
+        application_id="view", blueprint=rrb.Blueprint(_placed(view).view)
     ).storage.drain_as_bytes()
-    return one
+    return view
 
 
 def _style(styles: Mapping[str, rr.AsComponents], to: rr.RecordingStream) -> tuple[()]:

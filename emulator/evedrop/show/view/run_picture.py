@@ -56,7 +56,7 @@ def run_figure(results: Results, wanted: Sequence[str], slots: range | None, tri
         raise UsageError(f"plot: {slots} are not slots of the run; expected some such as range(0, {last + 1})")
     receivers = rows["peer"].unique().to_pylist()
     noise = recorded_noise(results.folder)
-    one = None if names == ["errors"] else _RecordedTrial(results, receivers, trial, slots)
+    recorded_trial = None if names == ["errors"] else _RecordedTrial(results, receivers, trial, slots)
     heights = [_HEIGHTS[name](len(receivers)) for name in names]
     with drawing(_WIDTH, sum(heights)) as figure:
         figure.suptitle(str(results.summary["scenario"]), x=0.02, ha="left", fontsize=11)
@@ -64,8 +64,8 @@ def run_figure(results: Results, wanted: Sequence[str], slots: range | None, tri
         for name, axes in zip(names, places, strict=True):
             if name == "errors":
                 _errors(axes, rows, receivers, slots, error_floor(noise, pc.max(rows["trials"]).as_py()))
-            elif one is not None:
-                (one.lanes if name == "lanes" else one.plane)(axes)
+            elif recorded_trial is not None:
+                (recorded_trial.lanes if name == "lanes" else recorded_trial.plane)(axes)
     return figure
 
 
@@ -79,24 +79,24 @@ def _errors(axes: Axes, rows: pa.Table, receivers: list[str], slots: range | Non
         mine = rows.filter(pc.equal(rows["peer"], name))
         if slots is not None:
             mine = mine.filter(pc.is_in(mine["slot"], pa.array(slots, pa.int64())))
-        found = {column: mine[column].to_numpy() for column in mine.column_names if column != "peer"}
+        columns = {column: mine[column].to_numpy() for column in mine.column_names if column != "peer"}
         ink = hexadecimal(colour(i))
-        error, theory = found["mean_squared_error"], found["expected_trace_covariance"]
+        error, theory = columns["mean_squared_error"], columns["expected_trace_covariance"]
         if np.isnan(error).all():
-            error = found["mean_actual_trace_covariance"]
+            error = columns["mean_actual_trace_covariance"]
         heights += [error, theory]
         dot = "o" if len(error) == 1 else ""  # a line through one slot cannot be seen
         line = _LINES[i // len(RECEIVERS) % len(_LINES)]
-        axes.plot(found["slot"], np.maximum(error, floor), line, color=ink, label=name, linewidth=1.3, marker=dot)
-        axes.plot(found["slot"], np.maximum(theory, floor), "--", color=ink, linewidth=0.9)
-        if (found["trials"] > 1).any():
+        axes.plot(columns["slot"], np.maximum(error, floor), line, color=ink, label=name, linewidth=1.3, marker=dot)
+        axes.plot(columns["slot"], np.maximum(theory, floor), "--", color=ink, linewidth=0.9)
+        if (columns["trials"] > 1).any():
             many = True
             with np.errstate(all="ignore"):
                 fraction = np.exp(
-                    2.0 * found["standard_error"] / error
+                    2.0 * columns["standard_error"] / error
                 )  # symmetric on the logarithmic axis, and never below 0
             edges = (np.maximum(edge, floor) for edge in (error / fraction, error * fraction))
-            axes.fill_between(found["slot"], *edges, color=ink, alpha=0.25, linewidth=0)
+            axes.fill_between(columns["slot"], *edges, color=ink, alpha=0.25, linewidth=0)
     axis = ErrorAxis.of(heights, floor)
     if axis is not None:  # otherwise the axis has nothing to show, and no logarithms
         axes.set_yscale("log")
@@ -116,8 +116,10 @@ class _RecordedTrial:
         if trial is None and trials:
             trial = trials[0]
         if trial not in trials:
-            said = f"recorded are {', '.join(map(str, trials[:8]))}" if trials else "the run has recorded none"
-            raise UsageError(f"plot: trial {trial} is not recorded; {said}, and 'errors' needs none")
+            recorded_trials = (
+                f"recorded are {', '.join(map(str, trials[:8]))}" if trials else "the run has recorded none"
+            )
+            raise UsageError(f"plot: trial {trial} is not recorded; {recorded_trials}, and 'errors' needs none")
         rows = rows.filter(pc.equal(rows["trial"], trial))
         last = int(pc.max(rows["slot"]).as_py())
         self.slots = slots or range(max(0, last + 1 - _LAST), last + 1)

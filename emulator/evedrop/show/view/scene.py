@@ -82,7 +82,7 @@ class PeerSlots:
 
     def mapped(self, change: Callable[[NDArray[Any]], NDArray[Any]]) -> PeerSlots:
         """The same with every array changed, for example cut to some slots."""
-        return PeerSlots(*(change(getattr(self, one.name)) for one in fields(self)))
+        return PeerSlots(*(change(getattr(self, field.name)) for field in fields(self)))
 
 
 @dataclass(frozen=True)
@@ -97,8 +97,8 @@ class Moved:
     @classmethod
     def joined(cls, moves: Sequence[Moved]) -> Moved:
         """Consecutive slots as one."""
-        curves = {path: _joined([one.curves[path] for one in moves], axis=1) for path in moves[0].curves}
-        return cls(_joined([one.values for one in moves]), curves)
+        curves = {path: _joined([move.curves[path] for move in moves], axis=1) for path in moves[0].curves}
+        return cls(_joined([move.values for move in moves]), curves)
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class SceneSlots:
         first = chunks[0]
         peers = {
             name: PeerSlots(
-                *(_joined([getattr(chunk.peers[name], one.name) for chunk in chunks]) for one in fields(peer))
+                *(_joined([getattr(chunk.peers[name], field.name) for chunk in chunks]) for field in fields(peer))
             )
             for name, peer in first.peers.items()
         }

@@ -45,15 +45,15 @@ def open_recording(
     from evedrop.show.view.scene import Scene, Shown  # noqa: PLC0415 - the same
 
     quality = scenario.quality
-    known = {
+    described = {
         LEGITIMATE: scenario.encoding.scheme,
-        **{name: one.strategy for name, one in scenario.eavesdroppers.items()},
+        **{name: table.strategy for name, table in scenario.eavesdroppers.items()},
     }
     receivers = [
         Shown(
             name,
             "legitimate" if name == LEGITIMATE else "eavesdropper",
-            {**known, **(words or {})}[name],
+            {**described, **(words or {})}[name],
             None if name in unknown_links else quality[name],
         )
         for name in scenario.receivers

@@ -55,17 +55,17 @@ def _others(rows: list[dict[str, Any]], keys: Sequence[str]) -> list[tuple[Any, 
 
 def _draw_on(axes: list[Axes], rows: list[dict[str, Any]], keys: Sequence[str]) -> None:
     marks, lines = (
-        [name for name, one in all_metrics().items() if one.sweep_picture == way] for way in ("marks", "lines")
+        [name for name, scheme in all_metrics().items() if scheme.sweep_picture == way] for way in ("marks", "lines")
     )
     peers = list(dict.fromkeys(row["peer"] for row in rows))
-    for one, values in zip(axes, _others(rows, keys), strict=True):
+    for scheme, values in zip(axes, _others(rows, keys), strict=True):
         for peer, colour, mark in zip(peers, _COLOURS * 10, _MARKS * 9, strict=False):
             mine = [row for row in rows if row["peer"] == peer and tuple(row[key] for key in keys[1:]) == values]
             x = _positions([row[keys[0]] for row in mine])
             theory = [_height(row, lines) for row in mine]
             numbers = all(isinstance(row[keys[0]], (int, float)) for row in mine)
-            one.plot(x, theory, "-" if numbers else "_", color=colour, linewidth=1.2, markersize=26)
-            one.errorbar(
+            scheme.plot(x, theory, "-" if numbers else "_", color=colour, linewidth=1.2, markersize=26)
+            scheme.errorbar(
                 x,
                 [_height(row, marks) for row in mine],
                 [_height(row, [error_column(name) for name in marks]) for row in mine],
@@ -77,21 +77,21 @@ def _draw_on(axes: list[Axes], rows: list[dict[str, Any]], keys: Sequence[str]) 
                 label=peer,
             )
             if not numbers:
-                one.set_xticks(x, [str(row[keys[0]]) for row in mine])
-                one.set_xlim(-0.5, len(x) - 0.5)
-        one.set_yscale("log")
-        one.set_xlabel(keys[0])
-        one.set_title(", ".join(f"{key} = {value}" for key, value in zip(keys[1:], values, strict=True)))
-    limits = [limit for one in axes for limit in one.get_ylim()]
-    for one in axes:
-        one.set_ylim(min(limits), max(limits))
+                scheme.set_xticks(x, [str(row[keys[0]]) for row in mine])
+                scheme.set_xlim(-0.5, len(x) - 0.5)
+        scheme.set_yscale("log")
+        scheme.set_xlabel(keys[0])
+        scheme.set_title(", ".join(f"{key} = {value}" for key, value in zip(keys[1:], values, strict=True)))
+    limits = [limit for scheme in axes for limit in scheme.get_ylim()]
+    for scheme in axes:
+        scheme.set_ylim(min(limits), max(limits))
     axes[0].set_ylabel("mean error ± standard error (lines: theory)")
     axes[0].legend()
 
 
 def _height(row: dict[str, Any], metrics: list[str]) -> float:
-    found = shown_metric(row, metrics)
-    return math.nan if found is None else found
+    value = shown_metric(row, metrics)
+    return math.nan if value is None else value
 
 
 def _positions(values: list[Any]) -> list[float]:

@@ -24,8 +24,8 @@ def telling_slot(results: Results) -> int | None:
 
     Raises UsageError if the folder's tables cannot be read.
     """
-    found = recorded(results.folder)
-    scenario = found.scenario
+    record = recorded(results.folder)
+    scenario = record.scenario
     if scenario.controller is not None:  # its panels show the whole run, up to the slot
         return None
     trials = results.trials
@@ -36,7 +36,7 @@ def telling_slot(results: Results) -> int | None:
     for name in scenario.receivers:
         rows = first.filter(pc.equal(first["peer"], name)).sort_by("slot")
         errors[name], traces[name] = rows["squared_error"].to_numpy(), rows["trace_covariance"].to_numpy()
-    return most_telling(errors, traces, found.noise)
+    return most_telling(errors, traces, record.noise)
 
 
 def most_telling(errors: Mapping[str, Floats], traces: Mapping[str, Floats], noise: float) -> int:

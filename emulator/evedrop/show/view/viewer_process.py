@@ -116,14 +116,14 @@ def spawn(
         except BaseException:
             _give_up(process)
             raise
-        found = f"ended with status {process.poll()}" if process.poll() is not None else "was not ready in time"
+        problem = f"ended with status {process.poll()}" if process.poll() is not None else "was not ready in time"
         _give_up(process)
         log.seek(start)
         text = log.read().decode(errors="replace")
     if (why := without_driver(text)) is not None:
         raise UsageError(why)
     last = text.strip().splitlines()[-5:]
-    raise UsageError("\n".join([f"the viewer {found}; turn the view off to do without it. Its log ends:", *last]))
+    raise UsageError("\n".join([f"the viewer {problem}; turn the view off to do without it. Its log ends:", *last]))
 
 
 def without_driver(log: str) -> str | None:
@@ -151,10 +151,10 @@ def _give_up(process: subprocess.Popen[bytes]) -> None:
 
 def executable() -> Path:
     """The file of Rerun's command. Raises UsageError if rerun-sdk is not installed."""
-    found = importlib.util.find_spec("rerun_cli")
-    if found is None or found.origin is None:
+    spec = importlib.util.find_spec("rerun_cli")
+    if spec is None or spec.origin is None:
         raise UsageError("the viewer is not installed; install rerun-sdk, or turn the view off")
-    folder = Path(found.origin).parent
+    folder = Path(spec.origin).parent
     bundled = folder / "Rerun.app" / "Contents" / "MacOS" / "Rerun"
     return bundled if sys.platform == "darwin" and bundled.exists() else folder / "rerun"
 

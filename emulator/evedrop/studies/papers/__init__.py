@@ -38,5 +38,12 @@ def reproduce(name: str, quick: bool = False, progress: Progress = silent) -> Re
 
     Raises UsageError if there is no such paper.
     """
-    one = paper(name)
-    return Reproduction(name, one.title, one.authors, one.published, quick, tuple(one().rows(quick, progress)))
+    paper_class = paper(name)
+    return Reproduction(
+        name,
+        paper_class.title,
+        paper_class.authors,
+        paper_class.published,
+        quick,
+        tuple(paper_class().rows(quick, progress)),
+    )

@@ -60,11 +60,11 @@ def simulate(mu: float, mu_d: float, trials: int, slots: int, progress: Callable
     return Occupation(_fractions(steps / slots), _fractions(words / slots), trials, slots)
 
 
-def draw(path: Path, found: list[Occupation]) -> str:
+def draw(path: Path, result: list[Occupation]) -> str:
     """Draw the figure; returns its caption."""
     with panels(path, 2, 9.6, 4.0) as (left, right):
         for index, ((mu, mu_d), occupation, colour, mark) in enumerate(
-            zip(CASES, found, (BLUE, RED), ("o", "s"), strict=True)
+            zip(CASES, result, (BLUE, RED), ("o", "s"), strict=True)
         ):
             label = rf"$\mu = {mu}$, $\mu_d = {mu_d}$"
             theory = step_probabilities(mu, mu_d, STEPS)
@@ -91,7 +91,7 @@ def draw(path: Path, found: list[Occupation]) -> str:
         right.set_ylabel("fraction of slots")
         right.set_title("(b) words of up to three events")
     return (
-        f"Limiting distribution of the legitimate estimator's Markov chain, {found[0].trials} trials × {found[0].slots} "
+        f"Limiting distribution of the legitimate estimator's Markov chain, {result[0].trials} trials × {result[0].slots} "
         f"slots after {_BURN_IN} slots of burn-in; bars are 99 % intervals over trials."
     )
 

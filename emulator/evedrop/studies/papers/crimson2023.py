@@ -108,8 +108,8 @@ def _example() -> Iterator[PublishedNumber]:
         "the threshold on μ depends on both loss probabilities, which we do not know: many pairs give 0.14, such "
         f"as 0.4 for the user and 0.25 for the eavesdropper ({near:.3f}); with 0.5 and 0.3 it is {far:.3f}, with equal ones 0"
     )
-    what = "the μ above which the eavesdropper's error exceeds the user's"
-    yield PublishedNumber.stated(_SLIDES, what, 0.14, "0 to 1", NumberVerdict.NOT_PUBLIC, reason)
+    quantity = "the μ above which the eavesdropper's error exceeds the user's"
+    yield PublishedNumber.stated(_SLIDES, quantity, 0.14, "0 to 1", NumberVerdict.NOT_PUBLIC, reason)
 
 
 def _recursions(trials: int, slots: int) -> Iterator[PublishedNumber]:
@@ -120,16 +120,16 @@ def _recursions(trials: int, slots: int) -> Iterator[PublishedNumber]:
         "user": published_error(LOSSES, NOISE),
         "naive": published_error(LOSSES, NOISE, open_loop() + filter_error()),
     }
-    for name, what in (("user", "tr EP of the user"), ("naive", "tr EPᵉ of an eavesdropper that is unaware")):
+    for name, quantity in (("user", "tr EP of the user"), ("naive", "tr EPᵉ of an eavesdropper that is unaware")):
         mean, error = published[name]
         yield PublishedNumber.compared(
-            where, f"{what}, by simulation", formulas[name], mean, error, errors=4.0, printed=False
+            where, f"{quantity}, by simulation", formulas[name], mean, error, errors=4.0, printed=False
         )
     P_OL = float(np.trace(open_loop()))
     reason = f"no eavesdropper of the paper tests packets; one that hears nothing has {P_OL:.4f}"
     for name in ("power-test", "bayesian"):
-        for covariance, found in (("P̄", published), ("that of the estimates", full)):
-            mean, error = found[name]
+        for covariance, means_of in (("P̄", published), ("that of the estimates", full)):
+            mean, error = means_of[name]
             yield PublishedNumber.stated(
                 where,
                 f"{name}, noise of covariance {covariance}",
@@ -169,7 +169,7 @@ def mean_errors(noise_covariance: object, trials: int, slots: int) -> dict[str, 
             if k >= _START:
                 totals[name] += ((x - beliefs[name].x_hat) ** 2).sum(axis=0)
     means = {name: total / slots for name, total in totals.items()}
-    return {name: (float(one.mean()), float(one.std(ddof=1) / np.sqrt(trials))) for name, one in means.items()}
+    return {name: (float(errors.mean()), float(errors.std(ddof=1) / np.sqrt(trials))) for name, errors in means.items()}
 
 
 def _detector(trials: int) -> Iterator[PublishedNumber]:

@@ -127,51 +127,53 @@ class Luecke2022(Paper):
         size = QUICK if quick else FULL
         L = float(ReferenceCode(STABLE).at(1)[0, 0])
         yield PublishedNumber.compared("tutorial", "L for A = 0.9, Q = 1", 1.11111111, L, absolute=5e-9)
-        for one in STABLE_NUMBERS:
-            progress(f"A = 0.9, {one.policy}")
+        for published in STABLE_NUMBERS:
+            progress(f"A = 0.9, {published.policy}")
             trials, slots = size.stable
-            means = mean_traces(STABLE, one.policy, (MU, *one.eavesdropper), trials, slots)
-            yield from _estimated(one, means, trials * slots)
-        for one in UNSTABLE_NUMBERS:
-            progress(f"unstable A, {one.policy}")
+            means = mean_traces(STABLE, published.policy, (MU, *published.eavesdropper), trials, slots)
+            yield from _estimated(published, means, trials * slots)
+        for published in UNSTABLE_NUMBERS:
+            progress(f"unstable A, {published.policy}")
             slots = _RUN_SLOTS // size.run_trials
-            means = mean_traces(UNSTABLE, one.policy, (MU, *one.eavesdropper), size.runs * size.run_trials, slots, True)
-            yield from _by_quantiles(one, means.reshape(2, size.runs, -1).mean(axis=2))
+            means = mean_traces(
+                UNSTABLE, published.policy, (MU, *published.eavesdropper), size.runs * size.run_trials, slots, True
+            )
+            yield from _by_quantiles(published, means.reshape(2, size.runs, -1).mean(axis=2))
         reason = "neither the numbers nor the program of the optimal policy of the partially observed decision process are public"
         yield PublishedNumber.stated("examples", "the optimal policy", None, None, NumberVerdict.NOT_PUBLIC, reason)
 
 
-def _estimated(one: _Published, means: Floats, slots: int) -> Iterator[PublishedNumber]:
+def _estimated(printed: _Published, means: Floats, slots: int) -> Iterator[PublishedNumber]:
     """The rows of user and eavesdroppers; means: of each trial, (1 + eavesdroppers, R); slots: of all trials together."""
     mean, error = means.mean(axis=1), means.std(axis=1, ddof=1) / math.sqrt(means.shape[1])
-    where = "random_policy/" if one.policy.theta is None else "threshold_policy/"
-    for i, ((mu_e, eavesdropper), user) in enumerate(zip(one.eavesdropper.items(), one.user, strict=True)):
+    where = "random_policy/" if printed.policy.theta is None else "threshold_policy/"
+    for i, ((mu_e, eavesdropper), user) in enumerate(zip(printed.eavesdropper.items(), printed.user, strict=True)):
         for name, theirs, row in (("user", user, 0), ("eavesdropper", eavesdropper, i + 1)):
             yield PublishedNumber.compared(
-                where, f"{name}, {one.policy}, μ_e = {mu_e}", theirs, float(mean[row]), float(error[row]),
+                where, f"{name}, {printed.policy}, μ_e = {mu_e}", theirs, float(mean[row]), float(error[row]),
                 relative=0.02, errors=4.0, their_error=float(error[row]) * math.sqrt(slots / _THEIR_SLOTS),
             )  # fmt: skip
 
 
-def _by_quantiles(one: _Published, runs: Floats) -> Iterator[PublishedNumber]:
+def _by_quantiles(printed: _Published, runs: Floats) -> Iterator[PublishedNumber]:
     """The rows of user and eavesdropper where no expectation is finite; runs: the mean of each run, (2, runs)."""
-    ((mu_e, eavesdropper),) = one.eavesdropper.items()
+    ((mu_e, eavesdropper),) = printed.eavesdropper.items()
     for name, theirs, factor, means in (
-        ("user", one.user[0], growth(one.policy, MU), runs[0]),
-        ("eavesdropper", eavesdropper, growth(one.policy, mu_e, user=False), runs[1]),
+        ("user", printed.user[0], growth(printed.policy, MU), runs[0]),
+        ("eavesdropper", eavesdropper, growth(printed.policy, mu_e, user=False), runs[1]),
     ):
         low, middle, high = np.quantile(means, [0.05, 0.5, 0.95])
         reason = (
             f"the expectation has no bound: while the {name} lacks the reference, its expected error grows {factor:.3g}-fold "
-            f"{'a slot' if one.policy.theta is None else 'from one phase of unencrypted states to the next'}; the means of runs "
-            f"of {_RUN_SLOTS:,} slots go from {low:.3g} to {high:.3g} (5 and 95 %), with the median {middle:.3g}"
+            f"{'a slot' if printed.policy.theta is None else 'from one phase of unencrypted states to the next'}; the means of "
+            f"runs of {_RUN_SLOTS:,} slots go from {low:.3g} to {high:.3g} (5 and 95 %), with the median {middle:.3g}"
         )
         verdict = NumberVerdict.NOT_COMPARABLE
         if name == "user":
             verdict = NumberVerdict.PROGRAM
             reason += "; they chose the policy so that this error is 2, but its mean settles nowhere"
-        what = f"{name}, unstable A, {one.policy}, μ_e = {mu_e}"
-        yield PublishedNumber.stated("solve_optim.py", what, theirs, math.inf, verdict, reason)
+        who = f"{name}, unstable A, {printed.policy}, μ_e = {mu_e}"
+        yield PublishedNumber.stated("solve_optim.py", who, theirs, math.inf, verdict, reason)
 
 
 def growth(policy: TransmissionPolicy, quality: float, user: bool = True) -> float:
@@ -180,9 +182,9 @@ def growth(policy: TransmissionPolicy, quality: float, user: bool = True) -> flo
     quality: of its link; user: whether it is the one whose acknowledgements are flipped.
     """
     rates = rates_of("flip", MU, quality, flip=FLIP)
-    found = policy.scheme(UNSTABLE).lost_reference(quality, rates.user if user else rates.eavesdropper)
-    assert found is not None  # noqa: S101 - both schemes have references
-    return found.growth
+    reference = policy.scheme(UNSTABLE).lost_reference(quality, rates.user if user else rates.eavesdropper)
+    assert reference is not None  # noqa: S101 - both schemes have references
+    return reference.growth
 
 
 def mean_traces(

@@ -80,7 +80,9 @@ def simulate(trials: int, slots: int, progress: Callable[[str], None]) -> Day:
     schedules = [Schedule(stream_key(root, f"schedule/{mu_d}"), mu_d, batch) for mu_d in STATE_PROBABILITIES]
     width = len(schedules)
     processes = (process(), process(), uncertain_process())
-    covariances = [np.repeat(one.initial_covariance[:, :, None], width * trials, axis=2) for one in processes]
+    covariances = [
+        np.repeat(filter_process.initial_covariance[:, :, None], width * trials, axis=2) for filter_process in processes
+    ]
     misled = misled_covariances(processes[-1], slots)
     sums = np.zeros((len(RECEIVERS), width * trials))
     for k, received in enumerate(zip(*(deliveries(link, slots) for link in links), strict=True)):
@@ -92,8 +94,8 @@ def simulate(trials: int, slots: int, progress: Callable[[str], None]) -> Day:
             np.where(gamma_e, np.uint8(Action.STATE), np.uint8(Action.LOST)),
         )
         covariances = [
-            actual_covariance(one, k, P, action, nu, misled[k])
-            for one, P, action in zip(processes, covariances, actions, strict=True)
+            actual_covariance(filter_process, k, P, action, nu, misled[k])
+            for filter_process, P, action in zip(processes, covariances, actions, strict=True)
         ]
         for row, covariance in enumerate(covariances):
             sums[row] += covariance[0, 0] + covariance[1, 1]

@@ -60,8 +60,8 @@ class Naha2021(Paper):
         yield _false_alarms(trials)
         yield from _costs(trials)
         yield _parsimonious(trials)
-        for what, reason in _NOT_PUBLIC.items():
-            yield PublishedNumber.stated("2201.09389", what, None, None, NumberVerdict.NOT_PUBLIC, reason)
+        for quantity, reason in _NOT_PUBLIC.items():
+            yield PublishedNumber.stated("2201.09389", quantity, None, None, NumberVerdict.NOT_PUBLIC, reason)
 
 
 _NOT_PUBLIC: Mapping[str, str] = {
@@ -121,9 +121,9 @@ def _without_watermark(trials: int) -> PublishedNumber:
     slots = 501
     fraction, error = _mean(np.isfinite(_run(0.0, slots, min(trials, 1000), 1, _always(_LOW)).first_alarms(_LOW)) * 1.0)
     theory = _theory(0.0)
-    said = f"{_WORDS}0: h/D for h = 8 is {_LOW / theory.divergence:.0f} slots; the fraction detected within 500"
+    quantity = f"{_WORDS}0: h/D for h = 8 is {_LOW / theory.divergence:.0f} slots; the fraction detected within 500"
     return PublishedNumber.stated(
-        "delay", said, None, fraction, NumberVerdict.NOT_COMPARABLE,
+        "delay", quantity, None, fraction, NumberVerdict.NOT_COMPARABLE,
         "h/D is far beyond the 500 slots of the run, so the fraction that it predicts is too small to compare", error,
     )  # fmt: skip
 
@@ -146,8 +146,8 @@ def _costs(trials: int) -> Iterator[PublishedNumber]:
     plain = _run(0.0, 250, few, None, _always(_UNREACHED)).cost
     for level in _LEVELS:
         ours, error = _mean((_run(level, 250, few, None, _always(_UNREACHED)).cost - plain)[start:].mean(axis=0))
-        said = f"Σ_e = {level:g}: tr[(BᵀΠB + U) Σ_e], and the measured increase of the cost per slot"
-        yield PublishedNumber.compared("cost", said, _theory(level).cost, ours, error, errors=4.0, printed=False)
+        quantity = f"Σ_e = {level:g}: tr[(BᵀΠB + U) Σ_e], and the measured increase of the cost per slot"
+        yield PublishedNumber.compared("cost", quantity, _theory(level).cost, ours, error, errors=4.0, printed=False)
 
 
 def _parsimonious(trials: int) -> PublishedNumber:

@@ -99,8 +99,8 @@ def microgrid_application(day: Floats) -> list[PublishedNumber]:
     ]  # fmt: skip
 
 
-def _compared(where: str, what: str, paper: str, ours: float, erratum: str = "") -> PublishedNumber:
+def _compared(where: str, quantity: str, paper: str, ours: float, erratum: str = "") -> PublishedNumber:
     """Ours, rounded to our six decimals, within half a unit of the last digit that the paper prints."""
     digits = len(paper.partition(".")[2])
     half = 0.5 * 10.0**-digits
-    return PublishedNumber.compared(where, what, float(paper), round(ours, 6), absolute=half, erratum=erratum)
+    return PublishedNumber.compared(where, quantity, float(paper), round(ours, 6), absolute=half, erratum=erratum)

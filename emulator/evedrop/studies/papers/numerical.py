@@ -33,8 +33,8 @@ def process() -> Process:
 def designs() -> dict[float, Against]:
     """The designs by the eavesdropper's link quality."""
     smart = [Adversary(f"{mu_e:g}", mu_e, 1.0, 0.0) for mu_e in QUALITIES]
-    found = design(process(), MU, 0.6, smart, slots=80)
-    return {mu_e: found.eavesdroppers[f"{mu_e:g}"] for mu_e in QUALITIES}
+    designed = design(process(), MU, 0.6, smart, slots=80)
+    return {mu_e: designed.eavesdroppers[f"{mu_e:g}"] for mu_e in QUALITIES}
 
 
 def gain(mu_e: float, mu_d: float) -> float:
@@ -43,11 +43,11 @@ def gain(mu_e: float, mu_d: float) -> float:
     return limit_trace(process(), Outcomes.eavesdropper(mu_e, mu_d, 1.0, 0.0)) / ours - 1.0
 
 
-def draw(path: Path, found: dict[float, Against]) -> str:
+def draw(path: Path, result: dict[float, Against]) -> str:
     """Draw the figure; returns its caption."""
     low = stability_bound(process(), MU)
     curves = {}
-    for mu_e, against in found.items():
+    for mu_e, against in result.items():
         start = max(low, against.bound)
         mu_d = start + (1.0 - start) * np.geomspace(1e-4, 1.0, 240)
         curves[mu_e] = mu_d, [gain(mu_e, value) for value in mu_d]
@@ -55,7 +55,7 @@ def draw(path: Path, found: dict[float, Against]) -> str:
         for axes in (whole, close):
             axes.axhline(0.0, color="#888888", linewidth=0.8)
             axes.axvline(low, color="#888888", linewidth=0.8)
-            for mu_e, against in found.items():
+            for mu_e, against in result.items():
                 colour, line, word = _LOOKS[mu_e]
                 label = f"$\\mu_e = {mu_e:.2f}$ ({word})"
                 axes.plot(*curves[mu_e], line, color=colour, label=label)
@@ -67,7 +67,7 @@ def draw(path: Path, found: dict[float, Against]) -> str:
                         markersize=5, markerfacecolor="white",
                     )  # fmt: skip
             axes.set_xlabel(r"probability of sending the state, $\mu_d$")
-        perfect = found[0.85].perfect
+        perfect = result[0.85].perfect
         if perfect is not None:
             whole.axvspan(*perfect, color="#c800c8", alpha=0.13, linewidth=0)
             whole.text(

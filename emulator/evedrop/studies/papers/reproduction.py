@@ -66,7 +66,7 @@ class PublishedNumber:
     def compared(
         cls,
         where: str,
-        what: str,
+        quantity: str,
         theirs: float,
         ours: float,
         standard_error: float | None = None,
@@ -97,18 +97,18 @@ class PublishedNumber:
             words.append(f"{errors:g} standard errors")
             bounds.append(errors * math.hypot(standard_error or 0.0, their_error))
         if not bounds:
-            raise ValueError(f"{where}, {what}: no tolerance; expected relative, absolute or errors")
+            raise ValueError(f"{where}, {quantity}: no tolerance; expected relative, absolute or errors")
         agrees = abs(ours - theirs) <= max(bounds)
         same = NumberVerdict.AGREES if printed else NumberVerdict.FORMULA
         otherwise = NumberVerdict.ERRATUM if erratum else NumberVerdict.DIFFERS
         return cls(
-            where, what, theirs, ours, standard_error, " or ".join(words),
+            where, quantity, theirs, ours, standard_error, " or ".join(words),
             same if agrees else otherwise, "" if agrees else erratum, printed,
         )  # fmt: skip
 
     @classmethod
     def stated(
-        cls, where: str, what: str, theirs: Value, ours: Value, verdict: NumberVerdict, reason: str = "",
+        cls, where: str, quantity: str, theirs: Value, ours: Value, verdict: NumberVerdict, reason: str = "",
         standard_error: float | None = None, *, printed: bool = True,
     ) -> Self:  # fmt: skip
         """A row whose verdict no tolerance decides; printed: as for `compared`.
@@ -116,8 +116,8 @@ class PublishedNumber:
         Raises ValueError for a verdict without the reason that it needs.
         """
         if not reason and verdict not in {NumberVerdict.AGREES, NumberVerdict.FORMULA}:
-            raise ValueError(f"{where}, {what}: the verdict {verdict} needs a reason")
-        return cls(where, what, theirs, ours, standard_error, "", verdict, reason, printed)
+            raise ValueError(f"{where}, {quantity}: the verdict {verdict} needs a reason")
+        return cls(where, quantity, theirs, ours, standard_error, "", verdict, reason, printed)
 
     @property
     def their_text(self) -> str:
@@ -162,8 +162,8 @@ class Reproduction:
     @property
     def counts(self) -> dict[str, int]:
         """Verdict → number of rows, for the verdicts that occur."""
-        found = {str(one): sum(row.verdict is one for row in self.rows) for one in NumberVerdict}
-        return {name: count for name, count in found.items() if count}
+        counts = {str(verdict): sum(row.verdict is verdict for row in self.rows) for verdict in NumberVerdict}
+        return {name: count for name, count in counts.items() if count}
 
     @property
     def printed_compared(self) -> int:

@@ -41,12 +41,12 @@ def process() -> Process:
 
 def outcomes() -> dict[str, Outcomes]:
     """Receiver → its outcomes in a slot."""
-    found = {"legitimate": Outcomes.legitimate(MU, MU_D)}
+    by_name = {"legitimate": Outcomes.legitimate(MU, MU_D)}
     for name in ("smart", "suspicious", "naive"):
         outcomes_at = STRATEGIES[name].outcomes(_SUSPICIOUS, MU_D)
         if outcomes_at is not None:
-            found[name] = outcomes_at(MU)
-    return found
+            by_name[name] = outcomes_at(MU)
+    return by_name
 
 
 @dataclass(frozen=True)

@@ -35,16 +35,16 @@ class ApplicationPanels(ViewPanel):
     def styles(self) -> dict[str, rr.SeriesLines | rr.SeriesPoints]:
         """The styles that the application describes; a receiver's own colour if it gives none."""
         colours = {shown.name: colour(i) for i, shown in enumerate(self.scene.receivers)}
-        found: dict[str, rr.SeriesLines | rr.SeriesPoints] = {}
+        styles: dict[str, rr.SeriesLines | rr.SeriesPoints] = {}
         for panel in self.scene.panels:
             for curve in panel.curves:
                 bright = curve.colour or colours[curve.name]
-                found[f"{panel.path}/{curve.name}"] = (
+                styles[f"{panel.path}/{curve.name}"] = (
                     rr.SeriesPoints(names=curve.name, colors=bright, markers="circle", marker_sizes=curve.width)
                     if curve.drawn == "points"
                     else line_style(curve.name, bright, curve.width, steps=curve.drawn == "steps")
                 )
-        return found
+        return styles
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
         """A column for every curve: lines are thinned, points are not."""

@@ -79,7 +79,7 @@ def logarithms(scene: Scene, path: str, slots: NDArray[np.int64], values: Floats
 
     Smaller values are raised to the floor of `error_floor`: after a state was received, the error is 0.
     """
-    known = ~np.isnan(values)  # no theory covers some links
-    if known.any():
+    covered = ~np.isnan(values)  # no theory covers some links
+    if covered.any():
         floor = error_floor(scene.noise, scene.trials)
-        yield scalars(path, slots[known], np.log10(np.maximum(values[known], floor)))
+        yield scalars(path, slots[covered], np.log10(np.maximum(values[covered], floor)))

@@ -43,16 +43,16 @@ class SquaredError(ViewPanel):
 
     def styles(self) -> dict[str, rr.SeriesLines]:
         """Each curve in its receiver's colour, and the edges of its band dim."""
-        found = {}
+        styles = {}
         for i, shown in enumerate(self.scene.receivers):
-            found[f"{_PATH}/{shown.name}"] = rr.SeriesLines(
+            styles[f"{_PATH}/{shown.name}"] = rr.SeriesLines(
                 names=shown.name, colors=colour(i), widths=1.5, aggregation_policy=LARGEST
             )
             for side in _SIDES if self._with_bands else ():
-                found[f"{_BAND}/{shown.name}/{side}"] = rr.SeriesLines(
+                styles[f"{_BAND}/{shown.name}/{side}"] = rr.SeriesLines(
                     names=_NO_NAME, colors=dim(colour(i), 0.5), widths=1.0, aggregation_policy=LARGEST
                 )
-        return found
+        return styles
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
         """A curve for each receiver, and two for the edges of its band."""

@@ -77,14 +77,14 @@ class LastPacket(ViewPanel):
             return
         sent = [lanes.SENT.words[code] for code in lanes.sent(slots)[at].tolist()]
         links = [self._fates(shown, slots, at.tolist()) for shown in self.scene.receivers]
-        known = [self._known(shown, slots, at.tolist()) for shown in self.scene.receivers]
+        words = [self._known(shown, slots, at.tolist()) for shown in self.scene.receivers]
         labels, colours = [], []
         for k, word in enumerate(sent):
             nodes = [
                 (f"sensor: {word}", TRUTH),
                 ("router", TRUTH),
-                *(one[k] for one in links),
-                *(one[k] for one in known),
+                *(column[k] for column in links),
+                *(column[k] for column in words),
             ]
             labels += [label for label, _ in nodes]
             colours += [colour for _, colour in nodes]

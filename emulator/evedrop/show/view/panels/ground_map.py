@@ -46,18 +46,18 @@ class GroundMap(ViewPanel):
 
     def styles(self) -> dict[str, rr.AsComponents]:
         """The ways of the whole run as lines; receivers in their colours, senders white."""
-        found: dict[str, rr.AsComponents] = {}
+        styles: dict[str, rr.AsComponents] = {}
         size = rr.Radius.ui_points
         for i, shown in enumerate(self.scene.receivers):
             if shown.name in self.scene.ways:
                 ways = [self._corners(way) for way in self.scene.ways[shown.name]]
                 lines = rr.LineStrips2D(ways, colors=[dim(TRUTH, 0.45), dim(colour(i), 0.55)], radii=size(1.0))
-                found[f"{_PATH}/{shown.name}/ways"] = lines
-                found[f"{_PATH}/{shown.name}/link"] = rr.LineStrips2D.from_fields(colors=[colour(i)], radii=size(0.7))
-                found[f"{_PATH}/{shown.name}/at"] = rr.Points2D.from_fields(
+                styles[f"{_PATH}/{shown.name}/ways"] = lines
+                styles[f"{_PATH}/{shown.name}/link"] = rr.LineStrips2D.from_fields(colors=[colour(i)], radii=size(0.7))
+                styles[f"{_PATH}/{shown.name}/at"] = rr.Points2D.from_fields(
                     colors=[TRUTH, colour(i)], radii=size(5.0), show_labels=True
                 )
-        return found
+        return styles
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
         """Both ends of each link, and their distance in metres."""
@@ -68,7 +68,7 @@ class GroundMap(ViewPanel):
         for name, ways in self.scene.ways.items():
             ends = np.stack([_on_map(way, k.astype(np.float64)) for way in ways], axis=1)
             distances = np.hypot(*(ends[:, 1] - ends[:, 0]).T)
-            labels = [text for one in distances.tolist() for text in ("sensor", f"{name}: {one:,.0f} m away")]
+            labels = [text for distance in distances.tolist() for text in ("sensor", f"{name}: {distance:,.0f} m away")]
             yield Column(f"{_PATH}/{name}/link", k, rr.LineStrips2D.columns(strips=ends))
             points = rr.Points2D.columns(positions=ends.reshape(-1, 2), labels=labels)
             yield Column(f"{_PATH}/{name}/at", k, points.partition([2] * len(k)))

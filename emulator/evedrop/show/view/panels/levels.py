@@ -35,12 +35,12 @@ class Levels(ViewPanel):
 
     def styles(self) -> dict[str, rr.SeriesLines]:
         """Each estimate in its receiver's colour; the truth grey and wide."""
-        found = {}
+        styles = {}
         for i in range(self.scene.n):
-            found[f"{_PATH}/{i}/{TRUTH}"] = line_style("truth", TRUTH_CURVE, 1.8)
+            styles[f"{_PATH}/{i}/{TRUTH}"] = line_style("truth", TRUTH_CURVE, 1.8)
             for j, shown in enumerate(self.scene.receivers):
-                found[f"{_PATH}/{i}/{shown.name}"] = line_style(shown.name, colour(j), 0.9)
-        return found
+                styles[f"{_PATH}/{i}/{shown.name}"] = line_style(shown.name, colour(j), 0.9)
+        return styles
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
         """Every state, true and estimated."""

@@ -46,6 +46,6 @@ class Packets(ViewPanel):
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
         """The lanes' changes."""
-        found = [lanes.sent(slots), *(lanes.received(shown, slots) for shown in self.scene.receivers)]
-        for path, at, words in self._lanes.changes(found):
+        lanes_of = [lanes.sent(slots), *(lanes.received(shown, slots) for shown in self.scene.receivers)]
+        for path, at, words in self._lanes.changes(lanes_of):
             yield Column(path, slots.numbers[at], words)

@@ -39,10 +39,10 @@ class StateOverTime(ViewPanel):
 
     def styles(self) -> dict[str, rr.SeriesLines]:
         """Each estimate in its receiver's colour; the truth grey and wide."""
-        found = {f"{_PATH}/{TRUTH}": rr.SeriesLines(names="truth", colors=TRUTH_CURVE, widths=2.5)}
+        styles = {f"{_PATH}/{TRUTH}": rr.SeriesLines(names="truth", colors=TRUTH_CURVE, widths=2.5)}
         for i, shown in enumerate(self.scene.receivers):
-            found[f"{_PATH}/{shown.name}"] = rr.SeriesLines(names=shown.name, colors=colour(i), widths=1.5)
-        return found
+            styles[f"{_PATH}/{shown.name}"] = rr.SeriesLines(names=shown.name, colors=colour(i), widths=1.5)
+        return styles
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
         """The truth, and every estimate."""

@@ -75,19 +75,19 @@ class StatePlane(ViewPanel):
 
     def styles(self) -> dict[str, rr.AsComponents]:
         """Each estimate in its receiver's colour; the truth white, on top of the others."""
-        found = _point_styles(TRUTH, WHITE, radius=3.5, order=40.0)
+        styles = _point_styles(TRUTH, WHITE, radius=3.5, order=40.0)
         for i, shown in enumerate(self.scene.receivers):
-            found |= _point_styles(shown.name, colour(i), radius=5.0, order=30.0 - i)
+            styles |= _point_styles(shown.name, colour(i), radius=5.0, order=30.0 - i)
             if i > 0:
-                found[_arrow(shown.name)] = rr.LineStrips2D.from_fields(
+                styles[_arrow(shown.name)] = rr.LineStrips2D.from_fields(
                     colors=[colour(i)], radii=rr.Radius.ui_points(1.5)
                 )
-                found[_away(shown.name)] = rr.Points2D.from_fields(
+                styles[_away(shown.name)] = rr.Points2D.from_fields(
                     colors=[WHITE], radii=rr.Radius.ui_points(0.0), show_labels=True
                 )
         # Invisible: the view fits its range to it.
-        found[_FRAME] = rr.LineStrips2D.from_fields(colors=[GROUND], radii=rr.Radius.ui_points(0.1))
-        return found
+        styles[_FRAME] = rr.LineStrips2D.from_fields(colors=[GROUND], radii=rr.Radius.ui_points(0.1))
+        return styles
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
         """Points, trails, ellipses, and the frame around them."""
@@ -133,7 +133,7 @@ class StatePlane(ViewPanel):
         truth, points, low, high = seen
         far = ~inside(points, low, high)
         drawn = arrows(truth[far], points[far], low[far], high[far])
-        texts = [f"{name}: {self._distance.text(one)}" for one in distances[far].tolist()]
+        texts = [f"{name}: {self._distance.text(distance)}" for distance in distances[far].tolist()]
         lengths = far.astype(np.int64)
         yield Column(_arrow(name), k, rr.LineStrips2D.columns(strips=drawn).partition(lengths))
         centres = np.full((len(k), 2), np.nan, np.float32)
@@ -231,15 +231,15 @@ def ellipses(centres: Floats, P: Floats) -> Points:
 
 def inside(points: Points, low: Points, high: Points) -> NDArray[np.bool_]:
     """Which points, (f, 2), are in the frames from low to high, (f, 2)."""
-    found: NDArray[np.bool_] = np.all((points >= low) & (points <= high), axis=1)
-    return found
+    within_bounds: NDArray[np.bool_] = np.all((points >= low) & (points <= high), axis=1)
+    return within_bounds
 
 
 def within(pieces: Points, low: Points, high: Points, otherwise: Points) -> Points:
     """The pieces of a path, (f, p, 2); one that leaves its frame becomes a dot at a point of `otherwise`, (f, 2)."""
     stays = np.asarray(np.all((pieces >= low[:, None]) & (pieces <= high[:, None]), axis=(1, 2)))
-    found: Points = np.where(stays[:, None, None], pieces, otherwise[:, None])
-    return found
+    kept: Points = np.where(stays[:, None, None], pieces, otherwise[:, None])
+    return kept
 
 
 def borders(truth: Points, points: Points, low: Points, high: Points) -> Points:
@@ -278,13 +278,13 @@ def apart(centres: Points, others: Sequence[Points], low: Points, high: Points) 
 
     NaN where there is no label.
     """
-    found, size = centres.astype(np.float64), (high - low).astype(np.float64)
-    line = np.where(found[:, 1] > (low + high)[:, 1] / 2, -_LINE, _LINE) * size[:, 1]
+    placed, size = centres.astype(np.float64), (high - low).astype(np.float64)
+    line = np.where(placed[:, 1] > (low + high)[:, 1] / 2, -_LINE, _LINE) * size[:, 1]
     for _ in range(2 * len(others)):  # each of them covers two lines at most
-        distances = [np.abs(found - other) for other in others]
-        covered = np.any([np.all(one < size * [2 * _LABEL, 0.99 * _LINE], axis=1) for one in distances], axis=0)
-        found[:, 1] += np.where(covered, line, 0.0)
-    return found.astype(np.float32)
+        distances = [np.abs(placed - other) for other in others]
+        covered = np.any([np.all(gap < size * [2 * _LABEL, 0.99 * _LINE], axis=1) for gap in distances], axis=0)
+        placed[:, 1] += np.where(covered, line, 0.0)
+    return placed.astype(np.float32)
 
 
 def _shown(values: NDArray[Any]) -> Points:

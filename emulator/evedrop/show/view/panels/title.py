@@ -38,4 +38,4 @@ class Title(ViewPanel):
 
 def _plain(text: str) -> str:
     """The text with every character of Markdown escaped."""
-    return "".join(f"\\{one}" if one in "\\`*_{}[]()<>#+-.!|~$" else one for one in text)
+    return "".join(f"\\{character}" if character in "\\`*_{}[]()<>#+-.!|~$" else character for character in text)

@@ -28,16 +28,16 @@ class TraceOfP(ViewPanel):
 
     def styles(self) -> dict[str, rr.SeriesLines]:
         """Each receiver's colour: bright for its belief, dim for theory."""
-        found = {}
+        styles = {}
         for i, shown in enumerate(self.scene.receivers):
             bright, label = colour(i), shown.name
-            found[f"{_BELIEVED}/{label}"] = rr.SeriesLines(
+            styles[f"{_BELIEVED}/{label}"] = rr.SeriesLines(
                 names=label, colors=bright, widths=1.5, interpolation_mode="StepAfter", aggregation_policy=LARGEST
             )
-            found[f"{_THEORY}/{label}"] = rr.SeriesLines(
+            styles[f"{_THEORY}/{label}"] = rr.SeriesLines(
                 names=f"{label}, theory", colors=dim(bright, 0.6), widths=1.0, aggregation_policy=LARGEST
             )
-        return found
+        return styles
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
         """Two curves for each receiver; only the first if no theory covers it."""

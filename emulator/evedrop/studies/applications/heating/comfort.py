@@ -84,9 +84,9 @@ class ComfortTally(ApplicationTally):
         for row, inputs in zip(outside, u, strict=True):  # slot by slot: the same bits however the slots are divided
             self._outside = self._outside + row
             self._power = self._power + self._plant.limited(inputs)[self._heater]
-        for name, known in self._known.items():
+        for name, count in self._known.items():
             believed = self._range.outside(estimates[name][:, state])
-            self._known[name] = known + np.count_nonzero((believed > 0.0) == (outside > 0.0), axis=0)
+            self._known[name] = count + np.count_nonzero((believed > 0.0) == (outside > 0.0), axis=0)
 
     @classmethod
     def merged(cls, parts: Sequence[Self]) -> Self:
@@ -116,8 +116,8 @@ class ComfortTally(ApplicationTally):
             "discomfort": float(self._outside.mean()) * self._hours if slots else None,
             "heating_energy": float(self._power.mean()) * self._hours if slots else None,
             "receivers": {
-                name: {"known_fraction": int(known.sum()) / slots if slots else None}
-                for name, known in self._known.items()
+                name: {"known_fraction": int(count.sum()) / slots if slots else None}
+                for name, count in self._known.items()
             },
         }
 
@@ -167,13 +167,13 @@ class Comfort(Application):
         """The discomfort, the energy, and how often receivers know whether the room is comfortable."""
         if summary["discomfort"] is None:
             return []
-        known = ", ".join(
+        fractions = ", ".join(
             f"{name} {cls.text(summary, (name, 'known_fraction'), '.3f')}" for name in summary["receivers"]
         )
         return [
             f"the room is uncomfortable by {cls.text(summary, ('discomfort',), '.3g')} K h, and the heater gives "
             f"{cls.text(summary, ('heating_energy',), '.3g')} kWh",
-            f"fraction of slots in which each knows whether the room is comfortable: {known}",
+            f"fraction of slots in which each knows whether the room is comfortable: {fractions}",
         ]
 
     @classmethod

@@ -59,7 +59,7 @@ class IntegrityFeed(PanelFeed):
             f"{_EVIDENCE}/threshold": np.stack([slots, np.full(len(slots), self._policy.threshold)]),
             f"{_EVIDENCE}/alarm": np.stack([slots[raised], statistic[raised]]),
         }
-        return curves | {f"{_WATERMARK}/e{i}": np.stack([slots, one]) for i, one in enumerate(e.T)}
+        return curves | {f"{_WATERMARK}/e{i}": np.stack([slots, values]) for i, values in enumerate(e.T)}
 
 
 @final
@@ -113,21 +113,23 @@ class Integrity(Application):
         if summary["false_alarm_fraction"] is None:
             return []
         bound = summary["false_alarm_bound"]
-        said = f"false alarms in {cls.text(summary, ('false_alarm_fraction',), '.3g')} of the trials"
-        lines = [said if bound is None else f"{said}, by theory at most {bound:.3g}"]
+        alarms = f"false alarms in {cls.text(summary, ('false_alarm_fraction',), '.3g')} of the trials"
+        lines = [alarms if bound is None else f"{alarms}, by theory at most {bound:.3g}"]
         if summary["detected_fraction"] is not None:
-            found = f"the attack is detected in {cls.text(summary, ('detected_fraction',), '.3g')} of the other trials"
+            sentence = (
+                f"the attack is detected in {cls.text(summary, ('detected_fraction',), '.3g')} of the other trials"
+            )
             if summary["mean_delay"] is not None:
-                found += f", after {cls.text(summary, ('mean_delay',), '.3g')} slots"
+                sentence += f", after {cls.text(summary, ('mean_delay',), '.3g')} slots"
             if summary["expected_delay"] is not None:
-                found += f"; h/D is {summary['expected_delay']:.3g}"
-            lines.append(found)
+                sentence += f"; h/D is {summary['expected_delay']:.3g}"
+            lines.append(sentence)
         if summary["watermark_cost"] is not None and summary["watermark_fraction"]:
-            said = f"the watermark costs {cls.text(summary, ('watermark_cost',), '.3g')} a slot before the attack"
+            alarms = f"the watermark costs {cls.text(summary, ('watermark_cost',), '.3g')} a slot before the attack"
             expected, z = summary["expected_watermark_cost"], summary["watermark_cost_z"]
             if expected is not None:
-                said += f", by theory {expected:.3g}" + ("" if z is None else f" (z {z:.1f})")
-            lines.append(f"{said}; it is on in {cls.text(summary, ('watermark_fraction',), '.3g')} of all slots")
+                alarms += f", by theory {expected:.3g}" + ("" if z is None else f" (z {z:.1f})")
+            lines.append(f"{alarms}; it is on in {cls.text(summary, ('watermark_fraction',), '.3g')} of all slots")
         return lines
 
     @classmethod
@@ -200,9 +202,9 @@ def _objections(loop: ControlledPlant, table: IntegrityTable) -> Iterator[str]:
     watermarked = loop_of(assignment)
     if described is not None:
         name, given = described
-        found = SENSOR_ATTACKS[name].objections(given, watermarked, _spans(loop, table)[0][0])
-        yield from (f"integrity.attack.{entry}: {what}" for entry, what in found)
-        if found:
+        objections = SENSOR_ATTACKS[name].objections(given, watermarked, _spans(loop, table)[0][0])
+        yield from (f"integrity.attack.{entry}: {objection}" for entry, objection in objections)
+        if objections:
             return
     yield from _theory_mistakes(watermarked, table, m)
 

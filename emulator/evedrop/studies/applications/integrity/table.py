@@ -58,20 +58,20 @@ def _policy_mistakes(table: Mapping[str, Any], own: Mapping[str, Any]) -> list[F
     if policy is None:
         return []
     given = {name: value for name, value in table.items() if name not in own}
-    found = [
+    mistakes = [
         (name, f"is missing; the policy {table['policy']} needs it, such as {name} = {as_toml(example)}")
         for name, example in policy.parameters.items()
         if name not in given
     ]
-    known = f"expected {listed(sorted(policy.parameters))}"
-    what = f"is set, but the policy {table['policy']} has no such parameter; {known}"
-    found += [(name, what) for name in given if name not in policy.parameters]
-    found += [
+    expected = f"expected {listed(sorted(policy.parameters))}"
+    sentence = f"is set, but the policy {table['policy']} has no such parameter; {expected}"
+    mistakes += [(name, sentence) for name in given if name not in policy.parameters]
+    mistakes += [
         (name, f"is {as_toml(value)}; expected a number, such as {name} = {as_toml(policy.parameters[name])}")
         for name, value in given.items()
         if name in policy.parameters and not is_number(value)
     ]
-    return found or policy.mistakes({name: float(value) for name, value in given.items()})
+    return mistakes or policy.mistakes({name: float(value) for name, value in given.items()})
 
 
 def _watermark_mistakes(table: Mapping[str, Any]) -> list[Found]:
@@ -100,9 +100,9 @@ def _attack_mistakes(table: Mapping[str, Any]) -> list[Found]:
     attack = SENSOR_ATTACKS.get(str(name))
     choice = f"expected {listed(sorted(SENSOR_ATTACKS))}"
     if attack is None:
-        said = "is missing" if name is None else f"is {as_toml(name)}"
-        return [(f"attack.{MODEL}", f"{said}; {choice}{near(str(name), SENSOR_ATTACKS)}")]
-    found = [
+        problem = "is missing" if name is None else f"is {as_toml(name)}"
+        return [(f"attack.{MODEL}", f"{problem}; {choice}{near(str(name), SENSOR_ATTACKS)}")]
+    mistakes = [
         (f"attack.{entry}", f"is missing; the attack {name} needs it, such as {entry} = {as_toml(example)}")
         for entry, example in attack.parameters.items()
         if entry not in entries and entry not in attack.optional
@@ -111,14 +111,14 @@ def _attack_mistakes(table: Mapping[str, Any]) -> list[Found]:
         if entry == MODEL:
             continue
         if entry not in attack.parameters:
-            known = f"expected {listed(sorted(attack.parameters))}"
-            found.append((f"attack.{entry}", f"is not a parameter of the attack {name}; {known}"))
+            expected = f"expected {listed(sorted(attack.parameters))}"
+            mistakes.append((f"attack.{entry}", f"is not a parameter of the attack {name}; {expected}"))
             continue
         example = attack.parameters[entry]
         if isinstance(example, list) and not (
             numbers(value) and value and all(np.isfinite(row).all() for row in value)
         ):
-            found.append((f"attack.{entry}", f"is {as_toml(value)}; expected a matrix, such as {as_toml(example)}"))
+            mistakes.append((f"attack.{entry}", f"is {as_toml(value)}; expected a matrix, such as {as_toml(example)}"))
         elif isinstance(example, int) and not (type(value) is int and 1 <= value <= 1_000_000):
-            found.append((f"attack.{entry}", f"is {as_toml(value)}; expected a whole number from 1 to 1000000"))
-    return found
+            mistakes.append((f"attack.{entry}", f"is {as_toml(value)}; expected a whole number from 1 to 1000000"))
+    return mistakes

@@ -96,8 +96,8 @@ class IntegrityTally(ApplicationTally):
         weighed = product(loop.weight, entered)
         from_best = 2.0 * (plant.limited(u) + product(loop.L, x)) + entered
         total: Floats = np.zeros(e.shape[1])
-        for one, other in zip(from_best, weighed, strict=True):
-            total = total + one * other
+        for first, second in zip(from_best, weighed, strict=True):
+            total = total + first * second
         return total
 
     @classmethod
@@ -123,18 +123,18 @@ class IntegrityTally(ApplicationTally):
         case, slots = self._case, int(self._slots[0])
         before = min(slots, case.before)
         false = (self._first >= 0) & (self._first < case.before)
-        found: dict[tuple[str, ...], Floats] = {
+        values: dict[tuple[str, ...], Floats] = {
             ("false_alarm_fraction",): false.astype(np.float64),
             ("watermark_fraction",): self._marked / slots,
         }
         if before:
-            found["watermark_cost",] = self._cost / before
+            values["watermark_cost",] = self._cost / before
         if case.attack_from is not None and slots > case.attack_from:
             sound = self._first[~false]
             detected = sound >= 0
-            found["detected_fraction",] = detected.astype(np.float64)
-            found["mean_delay",] = (sound[detected] - case.attack_from + 1).astype(np.float64)
-        return found
+            values["detected_fraction",] = detected.astype(np.float64)
+            values["mean_delay",] = (sound[detected] - case.attack_from + 1).astype(np.float64)
+        return values
 
     def summary(self) -> dict[str, Any]:
         """The summary's entry."""

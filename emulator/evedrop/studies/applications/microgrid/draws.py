@@ -40,11 +40,11 @@ class Draws:
     def times(self, rate: Floats) -> list[int]:
         """Places of a Poisson process, in order: `rate` is the expected number at each, (places,)."""
         total = np.cumsum(rate)
-        found, reached = [], self.exponential(1.0)
+        times, reached = [], self.exponential(1.0)
         while reached < total[-1]:
-            found.append(int(np.searchsorted(total, reached, side="right")))
+            times.append(int(np.searchsorted(total, reached, side="right")))
             reached += self.exponential(1.0)
-        return found
+        return times
 
     def _ahead(self, count: int) -> range:
         self._next += count

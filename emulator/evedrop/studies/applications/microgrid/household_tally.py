@@ -176,8 +176,8 @@ class HouseholdTally(ApplicationTally):
                 guesses = privacy.means(np.stack(loads[: self._periods]), self._window).T
                 told[name] = np.array(
                     [
-                        [privacy.area(one, active) for one in guesses],
-                        [privacy.detection_rate(one, active, self._table.false_alarms) for one in guesses],
+                        [privacy.area(guess, active) for guess in guesses],
+                        [privacy.detection_rate(guess, active, self._table.false_alarms) for guess in guesses],
                     ]
                 )
         return told

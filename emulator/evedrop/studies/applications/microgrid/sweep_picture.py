@@ -33,9 +33,11 @@ def draw(path: Path, table: pa.Table, key: str) -> None:
         energies.set_ylim(bottom=0.0)
         energies.set_title("(a) energy")
         for name, colour, mark in (("net", BLUE, "o"), ("total", GREEN, "s"), ("summed", ORANGE, "D")):
-            found = [row[f"{name}_difference"] for row in house]
-            percent = [float("nan") if one is None or one <= 0.0 else 100.0 * one for one in found]
-            bars = [100.0 * one for one in _bars(house, f"{name}_difference")]
+            result = [row[f"{name}_difference"] for row in house]
+            percent = [
+                float("nan") if difference is None or difference <= 0.0 else 100.0 * difference for difference in result
+            ]
+            bars = [100.0 * difference for difference in _bars(house, f"{name}_difference")]
             fractions.errorbar(x, percent, bars, fmt=f"{mark}-", color=colour, label=name)
         fractions.axhline(_LIMIT, color=GREY, linewidth=0.9, linestyle=":", label=f"the paper: {_LIMIT} %")
         fractions.set_yscale("log")
@@ -59,7 +61,7 @@ def draw(path: Path, table: pa.Table, key: str) -> None:
 def _bars(rows: list[dict[str, Any]], column: str) -> list[float]:
     """The standard errors of a column; NaN, which draws nothing, where a row has none."""
     errors = (row[error_column(column)] for row in rows)
-    return [float("nan") if one is None else one for one in errors]
+    return [float("nan") if error is None else error for error in errors]
 
 
 def _of_one_line(rows: list[dict[str, Any]], key: str) -> list[dict[str, Any]]:
