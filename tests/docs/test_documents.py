@@ -45,7 +45,7 @@ OTHER_OPTIONS = {
     "emulator/evedrop/live/launch/compose.py",  # those of docker compose
     "emulator/evedrop/simulate/cluster.py",  # those of dask worker
     "emulator/evedrop/cli/pytest_plugin.py",
-    "emulator/evedrop/show/report/page.py",  # names in its style sheet
+    "emulator/evedrop/show/report/chart.py",  # names in its style sheet
     "emulator/evedrop/show/view/headless.py",  # the viewer's
     "emulator/evedrop/show/view/viewer.py",
     "emulator/evedrop/show/view/viewer_process.py",  # the sandbox's

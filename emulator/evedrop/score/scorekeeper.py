@@ -280,7 +280,7 @@ def verification_of(scenario: Scenario, accused: Collection[str] = ()) -> dict[s
         metrics = {who: _resting_on(who, name) for who in ("recorder", "receiver", "recorded trials")}
         checked, of_recorded = metrics["recorder"], [*metrics["recorded trials"], "digest"]
         verified = [] if name in accused else checked + (of_recorded if recorded == scenario.trials else [])
-        own_word = [figure for figure in (*checked, *metrics["receiver"], *of_recorded) if figure not in verified]
+        own_word = [metric for metric in (*checked, *metrics["receiver"], *of_recorded) if metric not in verified]
         verifications[name] = Verification(0 if name in accused else recorded, verified, own_word)
     return verifications
 

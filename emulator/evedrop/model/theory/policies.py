@@ -265,12 +265,12 @@ def front(
         if not policy.ever_sends:
             never.append((weight, price))
             continue
-        figures = policy_metrics(process, policy.send, links.mu, links.mu_e)
+        metrics = policy_metrics(process, policy.send, links.mu, links.mu_e)
         cheapest = _cheapest(alone, weight, price)
-        if points and points[-1].price == price and points[-1].metrics.to_lower == figures.to_lower:
+        if points and points[-1].price == price and points[-1].metrics.to_lower == metrics.to_lower:
             points[-1] = replace(points[-1], weights=(points[-1].weights[0], weight), scheduled=cheapest)
         else:
-            points.append(FrontPoint((weight, weight), price, policy.thresholds, figures, cheapest))
+            points.append(FrontPoint((weight, weight), price, policy.thresholds, metrics, cheapest))
     kept = [point for point in points if not any(other.metrics.dominates(point.metrics) for other in points)]
     return Front(alone, tuple(kept), tuple(never), len(points) - len(kept))
 
