@@ -60,7 +60,7 @@ def test_a_study_without_resources_is_no_failed_expectation(
     def fail(*_: object, **__: object) -> None:
         raise error
 
-    monkeypatch.setattr(montecarlo, "teller", fail)
+    monkeypatch.setattr(montecarlo, "progress_counter", fail)
     done = evedrop(*STUDY, "--out", "x")
     assert (done.status, done.out) == (3, "")
     assert done.err.startswith(f"evedrop: {says}")

@@ -78,7 +78,7 @@ def output(parser: argparse.ArgumentParser) -> None:
 
 
 def as_json(parser: argparse.ArgumentParser, help_text: str = "print JSON") -> None:
-    """Add `--json`, for JSON instead of text; what: the help."""
+    """Add `--json`, for JSON instead of text; help_text: the help."""
     parser.add_argument("--json", action="store_true", help=help_text)
 
 

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-_SHOWN = 60  # characters of a value that messages repeat
+_SHOWN = 80  # characters of a value that messages repeat
 MOST_SLOTS = 1_000_000
 
 

@@ -68,7 +68,7 @@ class Scorekeeper:
     ) -> dict[str, Scored]:
         """Score the next slots: receiver → its errors, sums and theory.
 
-        known: receiver → its squared errors, and tr P of every trial, (c, R) each, if they have been computed.
+        errors_and_traces: receiver → its squared errors, and tr P of every trial, (c, R) each, if they have been computed.
         """
         scored = {}
         self._add_plant(slots)

@@ -33,7 +33,7 @@ class FewLines:
     """Tells lines; beyond `MOST`, only that there were more. Threads may call its methods at the same time."""
 
     def __init__(self, tell: Callable[[str], None], subject: str) -> None:
-        """tell: for each line; what: the matter, in the plural, such as "ways past the wire"."""
+        """tell: for each line; subject: the matter, in the plural, such as "ways past the wire"."""
         self._tell, self._what = tell, subject
         self._told = 0
         self._lock = threading.Lock()

@@ -78,7 +78,7 @@ class Heartbeat:
 def when_launcher_is_gone(then: Callable[[], None], hear: Callable[[bytes], None] = lambda _: None) -> None:
     """Call `then`, on a thread of its own, when standard input closes: the launcher holds its other end.
 
-    said: gets every line that the launcher writes.
+    hear: gets every line that the launcher writes.
     """
 
     def wait() -> None:

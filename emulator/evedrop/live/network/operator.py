@@ -74,7 +74,7 @@ class Order:
         self._question.answer(answer.pack())
 
     def done(self, slot: int, text: str) -> None:
-        """Answer that the request takes effect from this slot on; said: what was done, in words."""
+        """Answer that the request takes effect from this slot on; text: what was done, in words."""
         self.answer(Answer(slot, text))
 
     def refuse(self, *mistakes: str) -> None:

@@ -253,7 +253,7 @@ class GapDetector:
         return message
 
     def missed(self, due: int, slot: int) -> None:
-        """Slot `found` arrived when `due` was expected. Raises Gap if slot `due` has been missing for too long."""
+        """Slot `slot` arrived when `due` was expected. Raises Gap if slot `due` has been missing for too long."""
         now = self._clock.monotonic()
         if slot < due:
             return

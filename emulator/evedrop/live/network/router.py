@@ -106,7 +106,7 @@ class Downlink:
     def deliver(self, slots: range, packets: Uplinked, again: bool = False) -> None:
         """Send the deliveries of consecutive slots of the batch: the packets that arrive in each.
 
-        known: the receiver has these deliveries; only update the packets under way.
+        again: the receiver has these deliveries; only update the packets under way.
         """
         core = self._core
         if packets.sent is not None:

@@ -178,7 +178,7 @@ class Steering:
         return False
 
     def _fail(self, problem: str) -> None:
-        """Raise RunError if the run has been waiting for too long; what: the missing condition."""
+        """Raise RunError if the run has been waiting for too long; problem: the missing condition."""
         if time.monotonic() - self._since > READY_SECONDS:
             raise RunError(
                 f"{READY_SECONDS:.0f} s after the run was held before slot {self.at}, {problem}; look at the logs"
