@@ -164,8 +164,8 @@ def test_a_delay_is_cut_to_the_longest() -> None:
         ({}, "{}"),
         ({"a": [1, 2.5], "b": {"c": "ä"}}, '{ a = [1, 2.5], b = { c = "ä" } }'),
         (False, "false"),
-        ("x" * 100, json.dumps("x" * 61)[:60] + "…"),
-        ([1] * 100, "[" + "1, " * 19 + "1,…"),
+        ("x" * 100, json.dumps("x" * 81)[:80] + "…"),
+        ([1] * 100, "[" + "1, " * 26 + "1…"),
     ],
 )
 def test_a_value_is_shown_as_a_scenario_has_it(value: object, text: str) -> None:
