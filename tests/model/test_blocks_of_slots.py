@@ -14,6 +14,7 @@ from evedrop.model.digest import BlockDigests
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.eavesdroppers.fixed_rules import Naive, Suspicious
+from evedrop.model.packet_user import PacketUser
 from evedrop.model.process import Floats, Process, Trajectory
 from evedrop.model.receiver import Action, Belief, Beliefs, Flags, Receiver, Reception
 from evedrop.model.schemes import SCHEMES, scheme_of
@@ -135,6 +136,31 @@ def test_a_subclass_that_changes_a_slot_changes_blocks_too() -> None:
     found, _ = late.follow(slots, late.prior(), gamma, z)
     assert not found.action[:4].any()
     assert found.action[4:].any()
+
+
+class Always(PacketUser):
+    """Says slot by slot that every packet is used."""
+
+    def uses(self, k: int) -> Flags | None:  # noqa: ARG002 - every slot alike
+        """Always."""
+        return None
+
+
+def test_a_class_that_always_uses_packets_may_say_so_slot_by_slot() -> None:
+    """A block of such slots has no flags, either."""
+    assert Always(MARGINAL, BATCH.trials).uses_block(range(3)) is None
+
+
+def test_the_secret_slot_by_slot_is_that_of_a_block() -> None:
+    """ν and χ, and with them what the estimator does with a packet."""
+    secret = SharedSecret(MARGINAL, 0.4, keys_of(("schedule", "noise")), BATCH)
+    slots, gamma = range(BATCH.slots), coins(0.7, BATCH.slots, BATCH.trials)
+    nu, chi = secret.nu_block(slots), secret.chi_block(slots)
+    assert np.array_equal(nu, [secret.nu(k) for k in slots])
+    assert np.array_equal(chi, [secret.chi(k) for k in slots])
+    estimator = InnovationEstimator(MARGINAL, BATCH.trials, secret)
+    actions = np.array([estimator.act(k, gamma[k]) for k in slots])
+    assert np.array_equal(actions, np.select([~gamma, nu], [Action.LOST, Action.INNOVATION], Action.STATE))
 
 
 class Deaf:
