@@ -36,7 +36,7 @@ def link_mistakes(tables: ValidTables) -> Iterator[str]:
 def _correlation_mistakes(entry: str, name: str, link: LinkTable, other: str, tables: ValidTables) -> Iterator[str]:
     links = tables.links
     if other not in tables.receivers or other == name:
-        others = [one for one in tables.receivers if one != name]
+        others = [receiver for receiver in tables.receivers if receiver != name]
         yield f"{entry}: is {as_toml(other)}; expected another receiver" + (f": {listed(others)}" if others else "")
     elif other in links and links[other].correlation is not None:
         yield f"{entry}: is {other}, whose own losses are tied to another link's; expected a link without correlation"
@@ -84,8 +84,8 @@ def acknowledgement_mistakes(tables: ValidTables) -> Iterator[str]:
 def scheme_mistakes(tables: ValidTables) -> Iterator[str]:
     """Parameters of the scheme that do not fit the process."""
     if tables.process is not None and tables.encoding is not None and tables.scheme is not None:
-        for entry, what in tables.scheme.mistakes_with(tables.process.process, tables.encoding.parameters):
-            yield f"encoding.{entry}: {what}"
+        for entry, sentence in tables.scheme.mistakes_with(tables.process.process, tables.encoding.parameters):
+            yield f"encoding.{entry}: {sentence}"
 
 
 def strategy_mistakes(tables: ValidTables) -> Iterator[str]:
@@ -95,7 +95,7 @@ def strategy_mistakes(tables: ValidTables) -> Iterator[str]:
         lacking = [] if tables.scheme is None else lacking_streams(strategy.streams(table.parameters), tables.scheme)
         if lacking and tables.encoding is not None:
             entry, value = ("reads_as", table.reads_as) if table.reads_as else ("strategy", table.strategy)
-            able = [one for one in READERS if not READERS[one].streams({})]
+            able = [reader for reader in READERS if not READERS[reader].streams({})]
             yield (
                 f"{path}.{entry}: is {as_toml(value)}, which is defined by its knowledge of the {listed(lacking)}, and the "
                 f"scheme {tables.encoding.scheme} has none; expected {listed(sorted(able))}"
@@ -128,10 +128,10 @@ def application_mistakes(tables: ValidTables) -> Iterator[str]:
 
 def _named_mistakes(name: str, application: type[Application], table: Table, tables: ValidTables) -> Iterator[str]:
     process, plant = tables.process, tables.plant
-    known: dict[Kind, list[str]] = {} if process is None else {"states": process.states or []}
-    known |= {} if plant is None else {"inputs": plant.inputs, "disturbances": plant.disturbances}
+    names: dict[Kind, list[str]] = {} if process is None else {"states": process.states or []}
+    names |= {} if plant is None else {"inputs": plant.inputs, "disturbances": plant.disturbances}
     for entry, kind in application.names.items():
-        given, there = getattr(table, entry), known.get(kind)
+        given, there = getattr(table, entry), names.get(kind)
         if given is not None and there is not None and given not in there:
             where = f"process.{kind}" if kind == "states" else f"plant.{kind}"
             choice = f"expected one of {listed(there)}" if there else f"expected {where} = [{as_toml(given)}, …]"

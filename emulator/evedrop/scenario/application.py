@@ -284,8 +284,8 @@ class Application(ABC):
     def sweep_columns(cls, summary: Summary, receiver: str) -> dict[str, float | None]:
         """Its columns in a receiver's row of a sweep's table: column → value."""
         paths = {name: [name] for name in cls.metrics} | {name: [receiver, name] for name in cls.receiver_metrics}
-        found = {name: cls.metric(summary, path) for name, path in paths.items()}
-        return found | {error_column(name): cls.standard_error(summary, path) for name, path in paths.items()}
+        columns = {name: cls.metric(summary, path) for name, path in paths.items()}
+        return columns | {error_column(name): cls.standard_error(summary, path) for name, path in paths.items()}
 
 
 def _place(path: Sequence[str]) -> Sequence[str]:
@@ -312,11 +312,11 @@ def applications_in(tables: Iterable[str], besides: Container[str] = ()) -> dict
 
 def unloadable_in(tables: Iterable[str], besides: Container[str] = ()) -> dict[str, str]:
     """Name → why it cannot be loaded, in words that follow the name, for applications among these names. besides: as above."""
-    found = {}
+    reasons = {}
     for name in tables:
         if name not in besides and name in APPLICATIONS.names:
             try:
                 _ = APPLICATIONS[name]
             except NotRegistered as error:
-                found[name] = error.why
-    return found
+                reasons[name] = error.why
+    return reasons

@@ -82,8 +82,8 @@ def _plant_and_process(plant: PlantTable, process: ProcessTable) -> Iterator[str
     elif plant.start is not None:
         inside["start"] = plant.start
     limits = {"state_lower": plant.state_lower, "state_upper": plant.state_upper}
-    for name, what in limit_mistakes(limits, "state", n, "one for each state", inside):
-        yield f"{name}: {what}" if name.startswith("process.") else f"plant.{name}: {what}"
+    for name, sentence in limit_mistakes(limits, "state", n, "one for each state", inside):
+        yield f"{name}: {sentence}" if name.startswith("process.") else f"plant.{name}: {sentence}"
 
 
 def _rows(plant: PlantTable, slots: int | None) -> Iterator[str]:
@@ -115,8 +115,8 @@ def _controller_and_plant(
     if plant.disturbance_matrix is not None and len(plant.disturbance_matrix) != n:
         return
     assignment = assignment_of(controller, process.process, plant_of(plant, process.around), slot_seconds)
-    for entry, what in CONTROLLERS[controller.strategy].objections(assignment):
-        yield f"controller.{entry}: {what}"
+    for entry, sentence in CONTROLLERS[controller.strategy].objections(assignment):
+        yield f"controller.{entry}: {sentence}"
 
 
 def _outages(tables: ValidTables, controller: ControllerTable) -> Iterator[str]:

@@ -44,22 +44,22 @@ def with_faults(tables: Mapping[str, Any], scenario: Scenario) -> tuple[dict[str
     """
     table = scenario.nemesis
     assert table is not None  # noqa: S101 - checked by the caller
-    found = [*_mistakes(table, scenario)]
+    mistakes = [*_mistakes(table, scenario)]
     nemesis = _Nemesis(table, scenario)
     room = MOST_EVENTS - len(scenario.event)
-    events = [] if found else [event for _, event in zip(range(room + 1), nemesis.events(), strict=False)]
+    events = [] if mistakes else [event for _, event in zip(range(room + 1), nemesis.events(), strict=False)]
     if len(events) > room:
-        found.append(f"{NEMESIS}.every: comes to more than {room} events; expected fewer faults: a larger every")
-    elif not found and nemesis.targets and not nemesis.possible:
-        found.append(f"{NEMESIS}.faults: none of them may happen to any of the targets; expected cut")
+        mistakes.append(f"{NEMESIS}.every: comes to more than {room} events; expected fewer faults: a larger every")
+    elif not mistakes and nemesis.targets and not nemesis.possible:
+        mistakes.append(f"{NEMESIS}.faults: none of them may happen to any of the targets; expected cut")
     own = tables.get("event", [])
     rest = {name: entries for name, entries in tables.items() if name != NEMESIS}
-    return {**rest, "event": [*own, *sorted(events, key=lambda event: int(event["from"]))]}, found
+    return {**rest, "event": [*own, *sorted(events, key=lambda event: int(event["from"]))]}, mistakes
 
 
 def _mistakes(table: NemesisTable, scenario: Scenario) -> Iterator[str]:
     """Mistakes that the nemesis's `set` would cause on the link of any target."""
-    said = set[str]()
+    told = set[str]()
     for name in _targets(table, scenario) if table.set is not None else ():
         link = scenario.link(name)
         try:
@@ -76,8 +76,8 @@ def _mistakes(table: NemesisTable, scenario: Scenario) -> Iterator[str]:
                 )
             if link.correlation is not None and changed.loss_spec["model"] != link.loss_spec["model"]:
                 lines.append(f"{NEMESIS}.set.loss.model: differs from that of {name}'s link, whose losses are tied")
-        yield from (line for line in lines if line not in said)
-        said.update(lines)
+        yield from (line for line in lines if line not in told)
+        told.update(lines)
 
 
 def _targets(table: NemesisTable, scenario: Scenario) -> tuple[str, ...]:
@@ -94,7 +94,9 @@ class _Nemesis:
         self.targets = _targets(table, scenario)
         self._until = scenario.slots if table.to is None else table.to
         self._root = stream_key(root_of_seed(scenario.seed if table.seed is None else table.seed), NEMESIS)
-        self._kinds = sorted((EVENTS[one] for one in table.faults), key=lambda kind: (_fault(kind).place, kind.kind))
+        self._kinds = sorted(
+            (EVENTS[fault] for fault in table.faults), key=lambda kind: (_fault(kind).place, kind.kind)
+        )
         self._taken = {name: self._taken_by_file(name) for name in self.targets}
 
     def events(self) -> Iterator[dict[str, Any]]:

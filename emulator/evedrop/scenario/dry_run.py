@@ -51,21 +51,23 @@ def dry_run(scenario: Scenario) -> list[str]:
         return []
     batch = Batch(min(scenario.slots, _SLOTS), _TRIALS, scenario.first_trial)
     problem = Problem(scenario.process.process, batch)
-    found = [*_link_mistakes(scenario, problem)]
+    mistakes = [*_link_mistakes(scenario, problem)]
     spec = scenario.encoding.spec
     kind = SCHEMES[scenario.encoding.scheme]
     if SCHEMES.foreign(scenario.encoding.scheme):
         broken = how_broken(SchemeChecks(lambda process: scheme_of(process, spec), kind).at_first, problem)
         if broken is not None:
-            return [*found, f"encoding.scheme: is {as_toml(scenario.encoding.scheme)}; in a dry run: {broken}"]
+            return [*mistakes, f"encoding.scheme: is {as_toml(scenario.encoding.scheme)}; in a dry run: {broken}"]
     for name, table in scenario.eavesdroppers.items():
         entry = "strategy" if table.reads_as is None else "reads_as"
         if not SCHEMES.foreign(scenario.encoding.scheme) and not STRATEGIES.foreign(getattr(table, entry)):
             continue
         broken = _eavesdropper_broken(scenario, table, entry, batch)
         if broken is not None:
-            found.append(f"eavesdroppers.{name}.{entry}: is {as_toml(getattr(table, entry))}; in a dry run: {broken}")
-    return found
+            mistakes.append(
+                f"eavesdroppers.{name}.{entry}: is {as_toml(getattr(table, entry))}; in a dry run: {broken}"
+            )
+    return mistakes
 
 
 def _eavesdropper_broken(scenario: Scenario, table: EavesdropperTable, entry: str, batch: Batch) -> str | None:
@@ -82,12 +84,12 @@ def _eavesdropper_broken(scenario: Scenario, table: EavesdropperTable, entry: st
     registry = "STRATEGIES" if entry == "strategy" else "READERS"
     try:
         drawn = (batch.slots, batch.trials, batch.first_trial)
-        found = REMOTE_CALLS.call(name, "dry_run", registry, table.strategy, table.parameters, spec, process, drawn)
-        if found is None:
+        answer = REMOTE_CALLS.call(name, "dry_run", registry, table.strategy, table.parameters, spec, process, drawn)
+        if answer is None:
             _ask_for_theory(scenario, table)
     except NoAnswer as error:
         return str(error)
-    return None if found is None else str(found)
+    return None if answer is None else str(answer)
 
 
 def _ask_for_theory(scenario: Scenario, table: EavesdropperTable) -> None:
@@ -118,11 +120,11 @@ def _link_mistakes(scenario: Scenario, problem: Problem) -> Iterator[str]:
 def _model_mistakes(settings: Mapping[str, Any]) -> bool:
     """Whether a loss or delay model cannot be constructed from its description."""
     for name, models in (("loss", LOSS_MODELS), ("delay", DELAY_MODELS)):
-        found = settings.get(name)
-        if found is not None and not isinstance(found, Mapping):
+        model = settings.get(name)
+        if model is not None and not isinstance(model, Mapping):
             return True
-        given = {entry: value for entry, value in (found or {}).items() if entry != "unit"}
-        if found is not None and model_mistakes(name, given, models):
+        given = {entry: value for entry, value in (model or {}).items() if entry != "unit"}
+        if model is not None and model_mistakes(name, given, models):
             return True
     return False
 

@@ -32,19 +32,19 @@ class EncodingTable(Table):
         if scheme is None and is_own(table.get("scheme")):
             return []
         if scheme is None:
-            anywhere = {name for one in SCHEMES.values() for name in one.parameters}
+            anywhere = {name for scheme_class in SCHEMES.values() for name in scheme_class.parameters}
             return [
                 (name, "is not a parameter of any scheme; remove the line") for name in given if name not in anywhere
             ]
-        found = [
+        mistakes = [
             (name, f"is missing; the scheme {table['scheme']} needs it, such as {name} = {as_toml(example)}")
             for name, example in scheme.parameters.items()
             if name not in given
         ]
-        known = f"expected {listed(sorted(scheme.parameters))}" if scheme.parameters else "remove the line"
-        what = f"is set, but the scheme {table['scheme']} has no such parameter; {known}"
-        found += [(name, what) for name in given if name not in scheme.parameters]
-        return found + asked(scheme, {name: value for name, value in given.items() if name in scheme.parameters})
+        expected_names = f"expected {listed(sorted(scheme.parameters))}" if scheme.parameters else "remove the line"
+        sentence = f"is set, but the scheme {table['scheme']} has no such parameter; {expected_names}"
+        mistakes += [(name, sentence) for name in given if name not in scheme.parameters]
+        return mistakes + asked(scheme, {name: value for name, value in given.items() if name in scheme.parameters})
 
     @property
     def parameters(self) -> dict[str, Any]:

@@ -30,7 +30,7 @@ def event_mistakes(tables: ValidTables) -> Iterator[str]:
         tables.scheme,
         "" if tables.encoding is None else tables.encoding.scheme,
         attack if "acknowledgements" in tables.given else "none",
-        any(one.has_monitor for one in tables.applications.values()),
+        any(application.has_monitor for application in tables.applications.values()),
     )
     for i, event in tables.event:
         path = f"event.{i}"
@@ -53,7 +53,7 @@ def event_mistakes(tables: ValidTables) -> Iterator[str]:
 
 
 def _compared(path: str, event: EventKind, surroundings: Surroundings) -> Iterator[str]:
-    return (f"{path}.{entry}: {what}" for entry, what in event.compared(surroundings))
+    return (f"{path}.{entry}: {sentence}" for entry, sentence in event.compared(surroundings))
 
 
 def _own(path: str, kind: type[EventKind], ask: Callable[[], Iterator[str]]) -> list[str]:
@@ -66,7 +66,7 @@ def _own(path: str, kind: type[EventKind], ask: Callable[[], Iterator[str]]) -> 
 
 def _acts(tables: ValidTables) -> list[Numbered]:
     """All acts, each with the number of its event, in order of slots."""
-    return sorted(((i, act) for i, event in tables.event for act in event.acts()), key=lambda one: one[1].at)
+    return sorted(((i, act) for i, event in tables.event for act in event.acts()), key=lambda numbered: numbered[1].at)
 
 
 def away_in(tables: ValidTables, name: str, slot: int) -> str | None:

@@ -93,14 +93,14 @@ class ExpectTable(Table):
             one_each = f"expected one of {', '.join(_ENTRIES)} in a table"
             return [(kind, f"is given together with {kinds[0]}; {one_each}") for kind in kinds[1:]]
         (kind,) = kinds
-        found = [
+        mistakes = [
             (name, f"is set, but {kind} has no such entry; remove the line")
             for other, entries in _ENTRIES.items()
             for name in entries
             if other != kind and name in given
         ]
         check = {"metric": _metric_mistakes, "link": _nothing, "secrecy": _secrecy_mistakes, "in_step": _step_mistakes}
-        return found + check[kind](table)
+        return mistakes + check[kind](table)
 
     @property
     def kind(self) -> str:
@@ -140,14 +140,14 @@ class ExpectTable(Table):
             subject = f"{subject} over slots {self.slots[0]} to {self.slots[1] - 1}"
         return f"{subject} {self.wanted}"
 
-    def holds(self, found: float) -> bool:
+    def holds(self, value: float) -> bool:
         """Whether a metric meets the expectation."""
-        if (self.below is not None and not found < self.below) or (self.above is not None and not found > self.above):
+        if (self.below is not None and not value < self.below) or (self.above is not None and not value > self.above):
             return False
         if self.near is None:
             return True
         relative = self.within_relative or 0.0
-        return abs(found - self.near) <= (self.within if self.within is not None else relative * abs(self.near))
+        return abs(value - self.near) <= (self.within if self.within is not None else relative * abs(self.near))
 
 
 def link_metric(metric: str) -> tuple[str, tuple[str, ...]] | None:
@@ -171,38 +171,38 @@ def _metric_mistakes(table: Mapping[str, Any]) -> list[Found]:
     """Mistakes unless there is a bound to compare with, and slots or a quantile only for a metric that allows them."""
     below, above, middle = (table.get(name) for name in ("below", "above", "near"))
     distances = [name for name in ("within", "within_relative") if table.get(name) is not None]
-    found: list[Found] = []
+    mistakes: list[Found] = []
     if middle is None and distances:
-        found.append((distances[0], "is set without near; expected near = 0.01 as well"))
+        mistakes.append((distances[0], "is set without near; expected near = 0.01 as well"))
     elif middle is None and below is None and above is None:
-        what = "is missing, and so is above; add below, above or near, such as below = 0.01"
-        found.append(("below", what))
+        sentence = "is missing, and so is above; add below, above or near, such as below = 0.01"
+        mistakes.append(("below", sentence))
     elif middle is not None and not distances:
-        found.append(("within", "is missing; expected within = 0.002, or within_relative = 0.1, with near"))
+        mistakes.append(("within", "is missing; expected within = 0.002, or within_relative = 0.1, with near"))
     elif len(distances) > 1:
-        found.append(("within_relative", "is given together with within; expected one of them"))
+        mistakes.append(("within_relative", "is given together with within; expected one of them"))
     elif middle == 0 and distances == ["within_relative"]:
-        found.append(("within_relative", "is set, but any fraction of near = 0 is 0; expected within"))
+        mistakes.append(("within_relative", "is set, but any fraction of near = 0 is 0; expected within"))
     if below is not None and above is not None and is_number(below) and is_number(above) and not above < below:
-        found.append(("above", f"is {as_toml(above)}, and below is {as_toml(below)}; expected above < below"))
+        mistakes.append(("above", f"is {as_toml(above)}, and below is {as_toml(below)}; expected above < below"))
     metric = table["metric"]
     if not isinstance(metric, str):
-        return found
+        return mistakes
     link = link_metric(metric)
     for name in ("slots", "quantile"):
         if direction_metric(metric) is not None and table.get(name) is not None:
-            found.append((name, "is set, but the error in a direction is the mean of the whole run; remove the line"))
+            mistakes.append(
+                (name, "is set, but the error in a direction is the mean of the whole run; remove the line")
+            )
         if link is not None and table.get(name) is not None:
             instead = f"expected none, or the metric {link[0]}.received_fraction"
-            found.append((name, f"is set, but a link's account is of the whole run; {instead}"))
-    known = expectable_metrics()
-    of_receiver = known.get(metric.rpartition(".")[2])
+            mistakes.append((name, f"is set, but a link's account is of the whole run; {instead}"))
+    names = expectable_metrics()
+    of_receiver = names.get(metric.rpartition(".")[2])
     if link is None and table.get("quantile") is not None and of_receiver is not None and not of_receiver.by_trial:
-        instead = (
-            f"expected a metric that every trial has: {listed([name for name, one in known.items() if one.by_trial])}"
-        )
-        found.append(("quantile", f"is set, but {metric} is not known trial by trial; {instead}"))
-    return found
+        instead = f"expected a metric that every trial has: {listed([name for name, name_ in names.items() if name_.by_trial])}"
+        mistakes.append(("quantile", f"is set, but {metric} is not known trial by trial; {instead}"))
+    return mistakes
 
 
 def _secrecy_mistakes(table: Mapping[str, Any]) -> list[Found]:
@@ -239,24 +239,24 @@ class Around:
 
     def mistakes(self, expectation: ExpectTable) -> list[Found]:
         """Unknown receivers and metrics, slots beyond the run, and quantiles of too few trials."""
-        found: list[Found] = []
+        mistakes: list[Found] = []
         direction = None if expectation.metric is None else direction_metric(expectation.metric)
         if expectation.metric is not None and (direction is None or direction[0] not in self.receivers):
-            found += self._metric_mistakes(expectation.metric)
+            mistakes += self._metric_mistakes(expectation.metric)
             application = expectation.metric.partition(".")[0]
             if application in self.applications:
                 mean = (
                     f"is set, but the {application}'s metrics are means over trials of the whole run; remove the line"
                 )
-                found += [(name, mean) for name in ("slots", "quantile") if getattr(expectation, name) is not None]
+                mistakes += [(name, mean) for name in ("slots", "quantile") if getattr(expectation, name) is not None]
         names = {"link": self.receivers, "in_step": self.receivers, "against": self.receivers[1:]}
-        for entry, known in names.items():
+        for entry, names_ in names.items():
             name = getattr(expectation, entry)
-            if name is not None and name not in known:
-                choice = f"expected {listed(known)}" if known else "there is no eavesdropper; add one"
-                found.append((entry, f"is {as_toml(name)}; {choice}{near(name, known)}"))
-        found += self._direction_mistakes(expectation)
-        return found + self._slot_mistakes(expectation) + self._quantile_mistakes(expectation.quantile)
+            if name is not None and name not in names_:
+                choice = f"expected {listed(names_)}" if names_ else "there is no eavesdropper; add one"
+                mistakes.append((entry, f"is {as_toml(name)}; {choice}{near(name, names_)}"))
+        mistakes += self._direction_mistakes(expectation)
+        return mistakes + self._slot_mistakes(expectation) + self._quantile_mistakes(expectation.quantile)
 
     def _unknown_direction(self, name: str) -> str | None:
         """What to do if the process has no such direction; None if it has, or has mistakes."""
@@ -273,17 +273,17 @@ class Around:
         if metric is not None and metric[0] in self.receivers:
             named.append(("metric", metric[1], f"{DIRECTIONS}.{metric[0]}."))
         return [
-            (entry, f"is {as_toml(before + name)}; {what}")
+            (entry, f"is {as_toml(before + name)}; {sentence}")
             for entry, name, before in named
-            if name is not None and (what := self._unknown_direction(name)) is not None
+            if name is not None and (sentence := self._unknown_direction(name)) is not None
         ]
 
     def _metric_mistakes(self, metric: str) -> list[Found]:
         link = link_metric(metric)
         if link is not None and link[0] in self.receivers and _LOST_BY.fullmatch(".".join(link[1])):
             return []
-        known = expectable_metrics()
-        own = [f"{receiver}.{name}" for receiver in self.receivers for name in metrics_of(receiver) if name in known]
+        metrics = expectable_metrics()
+        own = [f"{receiver}.{name}" for receiver in self.receivers for name in metrics_of(receiver) if name in metrics]
         links = [f"{LINKS}.{receiver}.{name}" for receiver in self.receivers for name in LINK_METRICS]
         first = metric.partition(".")[0]
         if first not in self.receivers and first in APPLICATIONS:
@@ -293,11 +293,11 @@ class Around:
             broken = unloadable_metrics().get(name)
             if broken is not None:
                 return [("metric", f"is {as_toml(metric)}{broken}")]
-            names = f"RECEIVER ({', '.join(self.receivers)}).METRIC ({', '.join(known)})"
+            names = f"RECEIVER ({', '.join(self.receivers)}).METRIC ({', '.join(metrics)})"
             of_links = f"{LINKS}.RECEIVER.METRIC ({', '.join(LINK_METRICS)}, lost_by.REASON)"
             hint = near(metric, [*own, *links])
             return [("metric", f"is {as_toml(metric)}; expected {names} or {of_links}{hint}")]
-        why = self.no_theory(first) if link is None and known[name].needs_theory else None
+        why = self.no_theory(first) if link is None and metrics[name].needs_theory else None
         if why is not None:
             return [("metric", f"is {as_toml(metric)}, but {why}; expected another metric")]
         return []
@@ -307,25 +307,25 @@ class Around:
         if name not in self.applications:
             wanted = f"expected a table [{name}], or another metric"
             return [("metric", f"is {as_toml(metric)}, but there is no {name}; {wanted}")]
-        known = [f"{name}.{one}" for one in own]
-        known += [f"{name}.{receiver}.{one}" for receiver in self.receivers for one in of_receivers]
-        if metric in known:
+        metrics = [f"{name}.{name_}" for name_ in own]
+        metrics += [f"{name}.{receiver}.{name_}" for receiver in self.receivers for name_ in of_receivers]
+        if metric in metrics:
             return []
         choice = [f"{name}.METRIC ({', '.join(own)})"] if own else []
         choice += [f"{name}.RECEIVER.METRIC ({', '.join(of_receivers)})"] if of_receivers else []
-        return [("metric", f"is {as_toml(metric)}; expected {' or '.join(choice)}{near(metric, known)}")]
+        return [("metric", f"is {as_toml(metric)}; expected {' or '.join(choice)}{near(metric, metrics)}")]
 
     def _slot_mistakes(self, expectation: ExpectTable) -> list[Found]:
         if self.slots is None:
             return []
-        found: list[Found] = []
+        mistakes: list[Found] = []
         span = expectation.slots
         if span is not None and span[1] > self.slots:
-            found.append(("slots", f"is {as_toml(span)}; expected from < to ≤ slots, which is {self.slots}"))
+            mistakes.append(("slots", f"is {as_toml(span)}; expected from < to ≤ slots, which is {self.slots}"))
         for name, slot in (("by", expectation.by), ("since", expectation.since)):
             if slot is not None and slot >= self.slots:
-                found.append((name, f"is {slot}; expected a slot of the run, 0 to {self.slots - 1}"))
-        return found
+                mistakes.append((name, f"is {slot}; expected a slot of the run, 0 to {self.slots - 1}"))
+        return mistakes
 
     def _quantile_mistakes(self, quantile: float | None) -> list[Found]:
         if self.trials is None or quantile is None:

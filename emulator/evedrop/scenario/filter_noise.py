@@ -80,11 +80,11 @@ def settled_of(process: ProcessTable, plant: PlantTable) -> FilterStep:
     n = len(process.A)
     if plant.output_matrix is None or measured_mistakes(plant, n) or noise_mistakes(plant, n):
         raise ValueError("no filter")
-    known = Process(np.array(process.A), np.eye(n), np.array(process.initial_covariance))
+    model = Process(np.array(process.A), np.eye(n), np.array(process.initial_covariance))
     described = plant_of(plant, process.around)
-    if _unsettled(known.A, described, _CERTAINLY) is not None:  # thousands of slots would show it, too
+    if _unsettled(model.A, described, _CERTAINLY) is not None:  # thousands of slots would show it, too
         raise ValueError("the filter does not settle")
-    return settled(known, described)
+    return settled(model, described)
 
 
 def is_singular(Q: Floats) -> bool:
@@ -95,38 +95,38 @@ def is_singular(Q: Floats) -> bool:
 def measured_mistakes(plant: PlantTable, n: int) -> list[str]:
     """Mistakes in `output_matrix` and `measurement_noise`, for n states."""
     C, V = plant.output_matrix, plant.measurement_noise
-    found: list[str] = []
+    mistakes: list[str] = []
     if C is None or V is None:
-        return found
+        return mistakes
     if max(n, len(C)) > MOST_STATES:
         large = f"is of {len(C)} measurements of {n} states"
         return [
             f"plant.output_matrix: {large}; expected at most {MOST_STATES} of each, because the filter uses plain arithmetic"
         ]
-    found += [
+    mistakes += [
         f"plant.{name}: has an entry that is infinite or not a number; expected finite numbers"
         for name, rows in (("output_matrix", C), ("measurement_noise", V))
-        if not all(math.isfinite(one) for row in rows for one in row)
+        if not all(math.isfinite(number) for row in rows for number in row)
     ]
-    if found:
-        return found
+    if mistakes:
+        return mistakes
     if not C or any(len(row) != n for row in C):
         wrong = next((len(row) for row in C if len(row) != n), 0)
-        found.append(f"plant.output_matrix: has a row of {wrong} numbers; expected {n}, one for each state")
+        mistakes.append(f"plant.output_matrix: has a row of {wrong} numbers; expected {n}, one for each state")
     noise, p = [*map(len, V)], len(C)
     if noise != [p] * p:
-        found.append(
+        mistakes.append(
             f"plant.measurement_noise: has rows of {noise} numbers; expected {p} × {p}, as output_matrix has rows"
         )
-        return found
+        return mistakes
     matrix = np.array(V, np.float64)
     try:
         semidefinite_factor(matrix)
     except ValueError:
-        found.append("plant.measurement_noise: has an eigenvalue below 0; expected a covariance, such as [[0.01]]")
+        mistakes.append("plant.measurement_noise: has an eigenvalue below 0; expected a covariance, such as [[0.01]]")
     if not np.array_equal(matrix, matrix.T):
-        found.append("plant.measurement_noise: is not symmetric; expected a covariance, such as [[0.01]]")
-    return found
+        mistakes.append("plant.measurement_noise: is not symmetric; expected a covariance, such as [[0.01]]")
+    return mistakes
 
 
 def filter_mistakes(tables: ValidTables) -> Iterator[str]:

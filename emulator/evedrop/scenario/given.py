@@ -25,16 +25,16 @@ _MOST_BYTES = 65_536
 _EXAMPLE = 'zenoh = { key = "robot/pose", connect = "tcp/127.0.0.1:7447" }'
 
 
-def _key(found: str) -> str:
-    if not _KEY.fullmatch(found):
+def _key(text: str) -> str:
+    if not _KEY.fullmatch(text):
         raise expected("one key without wildcards")
-    return found
+    return text
 
 
-def _endpoint(found: str) -> str:
-    if not _ENDPOINT.fullmatch(found):
+def _endpoint(text: str) -> str:
+    if not _ENDPOINT.fullmatch(text):
         raise expected("an endpoint of Zenoh")
-    return found
+    return text
 
 
 Endpoint = Annotated[str, Field(strict=True, examples=["tcp/127.0.0.1:7447"]), AfterValidator(_endpoint)]
@@ -85,8 +85,8 @@ def source_mistakes(table: Mapping[str, Any], n: int) -> Iterator[Found]:
         yield "states", 'is missing; expected the names of the states in file or message, such as states = ["x", "y"]'
     for entry in ("states", "units") if given else ():
         found = table.get(entry)
-        words = found if isinstance(found, list) and all(isinstance(one, str) for one in found) else []
-        wrong = next((one for one in words if not _WORD.fullmatch(one)), None)
+        words = found if isinstance(found, list) and all(isinstance(word, str) for word in found) else []
+        wrong = next((word for word in words if not _WORD.fullmatch(word)), None)
         if wrong is not None:
             yield entry, f'has {as_toml(wrong)}; expected words for the first line of a CSV file, without [ ] , " and #'
         elif entry == "states" and len({*words}) < len(words):

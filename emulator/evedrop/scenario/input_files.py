@@ -40,14 +40,14 @@ def read_tables(tables: Mapping[str, Any]) -> list[str]:
 
     A file of states is left alone unless states come from it. Returns the mistakes, with their paths.
     """
-    found = []
+    mistakes = []
     for name, (kind, *labels) in _TABLES.items():
         table = tables.get(name)
         unused = kind == "state" and isinstance(table, dict) and table.get("source") != "file"
         if isinstance(table, dict) and isinstance(table.get(f"{kind}_file"), str) and not unused:
             wrong = _read(tables, table, kind, *(table.get(label) for label in labels))
-            found += [f"{name}.{kind}_file: {what}" for what in wrong]
-    return found
+            mistakes += [f"{name}.{kind}_file: {sentence}" for sentence in wrong]
+    return mistakes
 
 
 def _read(tables: Mapping[str, Any], table: dict[str, Any], kind: str, names: object, units: object) -> list[str]:
@@ -71,7 +71,7 @@ def _read(tables: Mapping[str, Any], table: dict[str, Any], kind: str, names: ob
         )
     except DisturbanceError as error:
         table[values] = []
-        return [f"{file} {what}" for what in error.mistakes]
+        return [f"{file} {sentence}" for sentence in error.mistakes]
     return []
 
 
@@ -117,7 +117,7 @@ def read_recordings(tables: Mapping[str, Any]) -> list[str]:
     for path, trace, model in _recorded(tables):
         parameter = str(model.recorded)
         given, of_delays = parameter in trace, path.endswith("delay")
-        wrong = [f"{path}.{entry}: {what}" for entry, what in _replace(trace, model, of_delays)]
+        wrong = [f"{path}.{entry}: {sentence}" for entry, sentence in _replace(trace, model, of_delays)]
         mistakes += wrong
         contents = trace[parameter]
         if of_delays:

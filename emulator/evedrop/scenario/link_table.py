@@ -43,24 +43,24 @@ class LinkTable(Table):
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
         """Mistakes unless there is one of quality and loss, each model has exactly its parameters, and no entry is pointless."""
-        found: list[Found] = []
+        mistakes: list[Found] = []
         if table.get("quality") is None and table.get("loss") is None:
-            found.append(("quality", "is missing; expected quality = 0.9, or a loss model"))
+            mistakes.append(("quality", "is missing; expected quality = 0.9, or a loss model"))
         elif table.get("quality") is not None and table.get("loss") is not None:
-            found.append(("quality", "is given together with loss, whose short form it is; expected one of them"))
-        found += model_mistakes("loss", table.get("loss"), LOSS_MODELS)
+            mistakes.append(("quality", "is given together with loss, whose short form it is; expected one of them"))
+        mistakes += model_mistakes("loss", table.get("loss"), LOSS_MODELS)
         delay = table.get("delay")
         if isinstance(delay, Mapping):
-            found += model_mistakes("delay", {name: delay[name] for name in delay if name != "unit"}, DELAY_MODELS)
+            mistakes += model_mistakes("delay", {name: delay[name] for name in delay if name != "unit"}, DELAY_MODELS)
             if delay.get("unit", "slots") not in ("slots", "seconds"):
-                found.append(("delay.unit", f'is {as_toml(delay["unit"])}; expected "slots" or "seconds"'))
+                mistakes.append(("delay.unit", f'is {as_toml(delay["unit"])}; expected "slots" or "seconds"'))
         elif table.get("reorder"):
-            found.append(
+            mistakes.append(
                 ("reorder", "is given without a delay, so that nothing can overtake; expected a delay as well")
             )
         if table.get("queue") is not None and table.get("rate") is None:
-            found.append(("queue", "is given without a rate, so that nothing queues; expected a rate as well"))
-        return found
+            mistakes.append(("queue", "is given without a rate, so that nothing queues; expected a rate as well"))
+        return mistakes
 
     @classmethod
     def pooled(cls, links: list[LinkTable]) -> LinkTable:
@@ -94,7 +94,7 @@ class LinkTable(Table):
                 for name in DELAY_MODELS[delay["model"]].lengths:
                     value = delay[name]
                     delay[name] = (
-                        [one / slot_seconds for one in value] if isinstance(value, list) else value / slot_seconds
+                        [delay_ / slot_seconds for delay_ in value] if isinstance(value, list) else value / slot_seconds
                     )
             made["delay"] = delay
         return made

@@ -28,7 +28,7 @@ def fault_of(name: object) -> Fault | None:
 
 def _drawn(name: str) -> str:
     if fault_of(name) is None:
-        faults = sorted(one for one in EVENTS.names if fault_of(one) is not None)
+        faults = sorted(event for event in EVENTS.names if fault_of(event) is not None)
         raise expected(listed(faults), near(name, faults))
     return name
 
@@ -55,28 +55,31 @@ class NemesisTable(Table):
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
         """Entries that a fault lacks or that no fault uses, a span that ends before it begins, and names that appear twice."""
-        found: list[Found] = []
+        mistakes: list[Found] = []
         faults = table.get("faults")
         if isinstance(faults, list):
-            found += cls._fault_mistakes(table, faults)
+            mistakes += cls._fault_mistakes(table, faults)
         for entry in ("faults", "targets"):
             names = table.get(entry)
             if isinstance(names, list) and len(set(map(str, names))) < len(names):
-                found.append((entry, "has a name twice; expected each once"))
+                mistakes.append((entry, "has a name twice; expected each once"))
         start, to = table.get("from", 0), table.get("to")
         if type(start) is int and type(to) is int and to <= start:
-            found.append(("to", f"is {to}, not after from, which is {start}; expected a later slot"))
-        return found
+            mistakes.append(("to", f"is {to}, not after from, which is {start}; expected a later slot"))
+        return mistakes
 
     @classmethod
     def _fault_mistakes(cls, table: Mapping[str, Any], faults: Sequence[object]) -> Iterator[Found]:
         """Entries that a fault needs, and entries that no fault uses."""
         drawn = {name: fault for name in dict.fromkeys(map(str, faults)) if (fault := fault_of(name)) is not None}
         for name, fault in drawn.items():
-            for entry, what in fault.needs.items():
+            for entry, entry_words in fault.needs.items():
                 if table.get(entry) is None:
                     example = as_toml((cls.model_fields[entry].examples or [0])[0])
-                    yield entry, f"is missing, but the fault {name} is drawn; expected {what}: {entry} = {example}"
+                    yield (
+                        entry,
+                        f"is missing, but the fault {name} is drawn; expected {entry_words}: {entry} = {example}",
+                    )
         used = {entry for fault in drawn.values() for entry in fault.entries}
         for name, kind in EVENTS.items():
             for entry in kind.fault.entries if kind.fault is not None else ():

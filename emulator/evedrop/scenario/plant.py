@@ -46,43 +46,43 @@ class PlantTable(Table):
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
         """Entries that do not fit each other; whether they fit the process is checked later."""
-        found: list[Found] = []
+        mistakes: list[Found] = []
         for kind in ("input", "disturbance"):
             names, matrix, units = table.get(f"{kind}s") or [], table.get(f"{kind}_matrix"), table.get(f"{kind}_units")
             if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
                 continue
             if len(names) > MOST_STATES:
-                found.append((f"{kind}s", f"has {len(names)} names; expected at most {MOST_STATES}"))
+                mistakes.append((f"{kind}s", f"has {len(names)} names; expected at most {MOST_STATES}"))
                 continue
             twice = sorted(name for name, count in Counter(names).items() if count > 1)
-            found += [(f"{kind}s", f"has {as_toml(name)} twice") for name in twice]
+            mistakes += [(f"{kind}s", f"has {as_toml(name)} twice") for name in twice]
             if names and matrix is None:
-                found.append(
+                mistakes.append(
                     (f"{kind}_matrix", f"is missing; expected a row for each state, a number for each of {kind}s")
                 )
             if matrix is not None and numbers(matrix) and any(len(row) != len(names) for row in matrix):
                 wrong = next(row for row in matrix if len(row) != len(names))
-                found.append(
+                mistakes.append(
                     (
                         f"{kind}_matrix",
                         f"has a row of {len(wrong)} numbers; expected {len(names)}, one for each of {kind}s",
                     )
                 )
             if isinstance(units, list) and len(units) != len(names):
-                found.append(
+                mistakes.append(
                     (f"{kind}_units", f"has {len(units)} entries; expected {len(names)}, one for each of {kind}s")
                 )
         inputs = table.get("inputs") or []
         if isinstance(inputs, list):
-            found += limit_mistakes(table, "input", len(inputs), "one for each of inputs", {})
-        for one, other in (("output_matrix", "measurement_noise"), ("measurement_noise", "output_matrix")):
-            if table.get(one) is not None and table.get(other) is None:
+            mistakes += limit_mistakes(table, "input", len(inputs), "one for each of inputs", {})
+        for number, other in (("output_matrix", "measurement_noise"), ("measurement_noise", "output_matrix")):
+            if table.get(number) is not None and table.get(other) is None:
                 example = as_toml((cls.model_fields[other].examples or [0])[0])
-                found.append((other, f"is missing, but {one} is given; expected {other} = {example}, or neither"))
+                mistakes.append((other, f"is missing, but {number} is given; expected {other} = {example}, or neither"))
         rows, disturbances = table.get("disturbance_values"), table.get("disturbances") or []
         if isinstance(disturbances, list):
             if disturbances and rows is None:
-                found.append(
+                mistakes.append(
                     ("disturbance_file", 'is missing; expected disturbance_file = "day.csv", or disturbance_values')
                 )
             # A day has 86 400 rows: their numbers are checked elsewhere, in a faster way.
@@ -90,8 +90,8 @@ class PlantTable(Table):
             if whole and rows is not None and {*map(len, rows)} != {len(disturbances)}:
                 i = next(i for i, row in enumerate(rows) if len(row) != len(disturbances))
                 few = f"row {i} has {len(rows[i])} numbers; expected {len(disturbances)}, one for each of disturbances"
-                found.append(("disturbance_values", few))
-        return found
+                mistakes.append(("disturbance_values", few))
+        return mistakes
 
 
 def limit_mistakes(
@@ -101,28 +101,28 @@ def limit_mistakes(
 
     count: how many limits there must be; why: the reason for that number; within: name → values that must lie between them.
     """
-    found: list[Found] = []
+    mistakes: list[Found] = []
     limits: dict[str, list[float]] = {}
     for name in (f"{kind}_lower", f"{kind}_upper"):
         values = table.get(name)
         if values is None or not numbers([values]):
             continue
         if len(values) != count:
-            found.append((name, f"has {len(values)} entries; expected {count}, {why}"))
+            mistakes.append((name, f"has {len(values)} entries; expected {count}, {why}"))
         else:
             limits[name] = values
     lower, upper = limits.get(f"{kind}_lower"), limits.get(f"{kind}_upper")
     for i, (least, most) in enumerate(zip(lower or [], upper or [], strict=False)):
         if least > most:
-            found.append(
+            mistakes.append(
                 (f"{kind}_lower", f"entry {i} is {least}, above that of {kind}_upper, which is {most}; swap them")
             )
     for name, values in within.items():
         for i, value in enumerate(values):
             if (lower is not None and value < lower[i]) or (upper is not None and value > upper[i]):
                 span = f"{lower[i] if lower is not None else '−∞'} to {upper[i] if upper is not None else '∞'}"
-                found.append((name, f"entry {i} is {value}, outside its limits, {span}; change one of them"))
-    return found
+                mistakes.append((name, f"entry {i} is {value}, outside its limits, {span}; change one of them"))
+    return mistakes
 
 
 class ControllerTable(Table):
@@ -141,24 +141,26 @@ class ControllerTable(Table):
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
         """Weights and limits below 0, and missing, unknown or wrong parameters of the strategy."""
-        found: list[Found] = []
+        mistakes: list[Found] = []
         for name in ("state_weights", "input_weights", "rate_weights", "rate_limits"):
             values = table.get(name)
             if values is not None and numbers([values]) and any(value < 0.0 for value in values):
-                found.append((name, f"has {min(values)}; expected numbers of 0 or more"))
+                mistakes.append((name, f"has {min(values)}; expected numbers of 0 or more"))
         strategy = CONTROLLERS.get(str(table.get("strategy")))
         given = {name: value for name, value in table.items() if name not in cls.model_fields}
         if strategy is None:
-            return found
-        found += [
+            return mistakes
+        mistakes += [
             (name, f"is missing; the strategy {table['strategy']} needs it, such as {name} = {as_toml(example)}")
             for name, example in strategy.parameters.items()
             if name not in given and name not in strategy.optional
         ]
-        known = f"expected {listed(sorted(strategy.parameters))}" if strategy.parameters else "remove the line"
-        what = f"is set, but the strategy {table['strategy']} has no such parameter; {known}"
-        found += [(name, what) for name in given if name not in strategy.parameters]
-        return found + strategy.mistakes({name: value for name, value in given.items() if name in strategy.parameters})
+        expected_names = f"expected {listed(sorted(strategy.parameters))}" if strategy.parameters else "remove the line"
+        sentence = f"is set, but the strategy {table['strategy']} has no such parameter; {expected_names}"
+        mistakes += [(name, sentence) for name in given if name not in strategy.parameters]
+        return mistakes + strategy.mistakes(
+            {name: value for name, value in given.items() if name in strategy.parameters}
+        )
 
     @property
     def parameters(self) -> dict[str, Any]:

@@ -53,14 +53,14 @@ def trusted_in(tables: Any) -> Iterator[str]:
 
 def sources_of(tables: Any) -> dict[str, str]:
     """`module NAME` → `sha256 …` of its file, for every module that tables name and that can be found. Imports none of them."""
-    found = {}
+    sources = {}
     folder = tables.get("modules") if isinstance(tables, Mapping) else None
     for name in named_in(tables):
         module = name.partition(":")[0]
         file = getattr(sys.modules.get(module), "__file__", None) or _file_of(module, folder)
         if file is not None and Path(file).is_file():
-            found[f"module {module}"] = f"sha256 {sha256(Path(file).read_bytes()).hexdigest()}"
-    return found
+            sources[f"module {module}"] = f"sha256 {sha256(Path(file).read_bytes()).hexdigest()}"
+    return sources
 
 
 def _file_of(module: str, folder: str | None) -> str | None:
@@ -105,18 +105,18 @@ def elsewhere(folder: str, tables: Any) -> Iterator[str]:
         top = name.partition(":")[0].partition(".")[0]
         there = PathFinder.find_spec(top, [folder])
         asked_in = REMOTE_CALLS.folder_of(name)
-        known = getattr(sys.modules.get(top), "__spec__", None)
-        if known is None and asked_in is not None:
-            known = PathFinder.find_spec(top, [asked_in])
+        spec = getattr(sys.modules.get(top), "__spec__", None)
+        if spec is None and asked_in is not None:
+            spec = PathFinder.find_spec(top, [asked_in])
         if there is None:
             continue
-        if known is not None and _home(there) != _home(known):
+        if spec is not None and _home(there) != _home(spec):
             yield (
                 f"has a module {top} ({_home(there)}), and another one of this name is loaded already "
-                f"({_home(known)}); give one of them another name"
+                f"({_home(spec)}); give one of them another name"
             )
             continue
-        installed = None if known is not None else _installed(top)
+        installed = None if spec is not None else _installed(top)
         if installed is not None and _home(there) != _home(installed) and not _put_there(installed):
             yield (
                 f"has a module {top} ({_home(there)}), and another one of this name is installed ({_home(installed)}); "

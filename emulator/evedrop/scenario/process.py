@@ -49,7 +49,7 @@ class ProcessTable(Table):
 
         A matrix that is missing or malformed is not compared with the others.
         """
-        found: list[Found] = []
+        mistakes: list[Found] = []
         matrices: dict[str, NDArray[np.float64]] = {}
         for name in _MATRICES:
             field = cls.model_fields[name]
@@ -62,22 +62,24 @@ class ProcessTable(Table):
             else:
                 count = "1 row" if len(rows) == 1 else f"{len(rows)} rows"
                 shape = f"{count} of {listed([str(n) for n in sorted(lengths)])} numbers" if rows else "no rows"
-                found.append(
+                mistakes.append(
                     (name, f"has {shape}; expected a square matrix, such as {as_toml((field.examples or [0])[0])}")
                 )
         if matrices:
-            known = matrices.get("A", next(iter(matrices.values())))
-            placeholder = np.eye(len(known))
+            square = matrices.get("A", next(iter(matrices.values())))
+            placeholder = np.eye(len(square))
             A, Q, initial = (matrices.get(name, placeholder) for name in _MATRICES)
             singular = table.get("singular_noise") is True
-            found += [(name, what) for name, what in mistakes_of(A, Q, initial, singular) if name in matrices]
-            found += _direction_mistakes(table.get("directions"), len(known))
-            found += source_mistakes(table, len(known))
+            mistakes += [
+                (name, sentence) for name, sentence in mistakes_of(A, Q, initial, singular) if name in matrices
+            ]
+            mistakes += _direction_mistakes(table.get("directions"), len(square))
+            mistakes += source_mistakes(table, len(square))
             for name in ("reference", "states", "units"):
                 values = table.get(name)
-                if isinstance(values, list) and len(values) != len(known):
-                    found.append((name, f"has {len(values)} entries; expected {len(known)}, one for each state"))
-        return found
+                if isinstance(values, list) and len(values) != len(square):
+                    mistakes.append((name, f"has {len(values)} entries; expected {len(square)}, one for each state"))
+        return mistakes
 
     @property
     def around(self) -> list[float]:
@@ -104,12 +106,12 @@ def _direction_mistakes(directions: object, n: int) -> list[Found]:
     """Directions that have not n numbers, or only zeros; entries that are malformed are not looked at."""
     if not isinstance(directions, Mapping):
         return []
-    found: list[Found] = []
+    mistakes: list[Found] = []
     for name, weights in directions.items():
-        if not isinstance(weights, list) or not all(is_number(one) for one in weights):
+        if not isinstance(weights, list) or not all(is_number(weight) for weight in weights):
             continue
         if len(weights) != n:
-            found.append((f"directions.{name}", f"has {len(weights)} entries; expected {n}, one for each state"))
+            mistakes.append((f"directions.{name}", f"has {len(weights)} entries; expected {n}, one for each state"))
         elif not any(weights):
-            found.append((f"directions.{name}", "is zero; expected a direction, such as [1.0, 0.0]"))
-    return found
+            mistakes.append((f"directions.{name}", "is zero; expected a direction, such as [1.0, 0.0]"))
+    return mistakes

@@ -13,10 +13,10 @@ from typing import Any, ClassVar
 from evedrop.model.entries import SLOT, Check, entry, listed, maybe, named, plain, text, whole
 
 
-def _real(path: str, found: Any) -> Iterator[str]:
+def _real(path: str, value: Any) -> Iterator[str]:
     """Check that a value is a number; errors of an estimate may be infinite."""
-    if type(found) not in (int, float):
-        yield f"{path} is {found!r:.40}, expected a number"
+    if type(value) not in (int, float):
+        yield f"{path} is {value!r:.40}, expected a number"
 
 
 _TEXTS: Check = listed(text)

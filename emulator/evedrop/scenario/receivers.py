@@ -51,39 +51,45 @@ class EavesdropperTable(Table):
         strange = [name for name in table if name not in cls.model_fields]
         if strategy is None:
             lost = table.get("link") is None and table.get("links") is None
-            found = [("link", f"is missing; expected link = {example}")] if lost else []
+            mistakes = [("link", f"is missing; expected link = {example}")] if lost else []
             # Nobody knows which entries a class that cannot be loaded has.
-            known = strange if is_own(table.get("strategy")) else []
-            return found + [(name, no_entry(name, [*cls.model_fields])) for name in strange if name not in known]
+            expected_names = strange if is_own(table.get("strategy")) else []
+            return mistakes + [
+                (name, no_entry(name, [*cls.model_fields])) for name in strange if name not in expected_names
+            ]
         reader = READERS.get(str(table.get("reads_as"))) if "reads_as" in strategy.parameters else None
         parameters = {**strategy.parameters, **(reader.parameters if reader is not None else {})}
         wanted = {"links" if strategy.pools_links else "link", *parameters}
-        found = [
+        mistakes = [
             (name, no_entry(name, [*{**cls.model_fields, **parameters}])) for name in strange if name not in wanted
         ]
-        found += [
-            (name, f"is missing; the strategy {table['strategy']} needs it; expected {name} = {as_toml(one)}")
-            for name, one in parameters.items()
+        mistakes += [
+            (name, f"is missing; the strategy {table['strategy']} needs it; expected {name} = {as_toml(parameter)}")
+            for name, parameter in parameters.items()
             if name not in cls.model_fields and table.get(name) is None
         ]
         for name, field in cls.model_fields.items():
             given = table.get(name) is not None
             if name in wanted and not given:
                 of = "" if name == "link" else f"the strategy {table['strategy']} needs it; "
-                found.append((name, f"is missing; {of}expected {name} = {as_toml((field.examples or [0])[0])}"))
+                mistakes.append((name, f"is missing; {of}expected {name} = {as_toml((field.examples or [0])[0])}"))
             if given and name not in {"strategy", "window", *wanted}:
                 instead = "; its entry is links" if name == "link" else ""
-                what = f"is set, but the strategy {table['strategy']} has no such parameter{instead}; remove the line"
-                found.append((name, what))
+                sentence = (
+                    f"is set, but the strategy {table['strategy']} has no such parameter{instead}; remove the line"
+                )
+                mistakes.append((name, sentence))
         for kind in (strategy, reader):
             if kind is not None:
-                found += asked(kind, {name: table[name] for name in kind.parameters if table.get(name) is not None})
+                mistakes += asked(kind, {name: table[name] for name in kind.parameters if table.get(name) is not None})
         for i, link in enumerate(table.get("links") or []) if isinstance(table.get("links"), list) else ():
             entries = {name for name, value in link.items() if value} if isinstance(link, Mapping) else set()
             more = sorted(entries - {"quality", "loss"})
             if more:
-                found.append((f"links.{i}", f"has {listed(more)}; links that are pooled have only a quality or a loss"))
-        return found
+                mistakes.append(
+                    (f"links.{i}", f"has {listed(more)}; links that are pooled have only a quality or a loss")
+                )
+        return mistakes
 
     @property
     def parameters(self) -> dict[str, Any]:

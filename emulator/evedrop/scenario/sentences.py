@@ -31,14 +31,14 @@ def sentences(error: ValidationError, root: type[Table]) -> list[str]:
         path = ".".join(str(part) for part in detail["loc"] if part != "[key]")
         if detail["type"] == "mistakes":
             inner: list[Found] = detail["ctx"]["mistakes"]
-            lines += [f"{path}.{name}: {what}" if path else f"{name}: {what}" for name, what in inner]
+            lines += [f"{path}.{name}: {sentence}" if path else f"{name}: {sentence}" for name, sentence in inner]
         else:
             lines.append(f"{path}: {_sentence(detail, root)}")
     return lines
 
 
 def _sentence(detail: ErrorDetails, root: type[Table]) -> str:
-    kind, found, context = detail["type"], detail["input"], detail.get("ctx", {})
+    kind, value, context = detail["type"], detail["input"], detail.get("ctx", {})
     table, field = _field(detail["loc"], root)
     name = str(detail["loc"][-1]) if detail["loc"] else ""
     example = f", such as {as_toml(field.examples[0])}" if field is not None and field.examples else ""
@@ -47,19 +47,19 @@ def _sentence(detail: ErrorDetails, root: type[Table]) -> str:
     if kind == "extra_forbidden":
         return no_entry(name, table.entries())
     if kind == "expected":
-        said = context.get("said") or f"; expected {context['expected']}{context['hint'] or example}"
-        return f"is {as_toml(found)}{said}"
+        ending = context.get("said") or f"; expected {context['expected']}{context['hint'] or example}"
+        return f"is {as_toml(value)}{ending}"
     if kind in {"greater_than_equal", "less_than_equal", "less_than"}:
         words = {"ge": "at least", "le": "at most", "lt": "less than"}
         bound = " and ".join(f"{words[name]} {context[name]}" for name in words if name in context)
-        return f"is {as_toml(found)}; expected a number {bound}{example}"
+        return f"is {as_toml(value)}; expected a number {bound}{example}"
     if kind in {"too_long", "too_short", "string_too_long"}:
         things = "characters" if kind == "string_too_long" else "entries"
         few = kind == "too_short"
         limit = f"fewer than {context['min_length']}" if few else f"more than {context['max_length']}"
         return f"has {limit} {things}; expected {'at least' if few else 'at most'} that many"
     expected = _EXPECTED.get(kind, detail["msg"])
-    return f"is {as_toml(found)}; expected {expected}{example}"
+    return f"is {as_toml(value)}; expected {expected}{example}"
 
 
 def _field(location: Sequence[int | str], root: type[Table]) -> tuple[type[Table], FieldInfo | None]:

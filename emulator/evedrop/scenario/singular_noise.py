@@ -47,8 +47,8 @@ def singular_mistakes(tables: ValidTables) -> Iterator[str]:
             if strategy is None:
                 continue
             for reason in unsuited(table, tables.plant, strategy):
-                what = f"eavesdroppers.{name}.{entry}: is {strategy}"
-                yield f"{what}, which {reason.why}; expected {reason.expected}"
+                place = f"eavesdroppers.{name}.{entry}: is {strategy}"
+                yield f"{place}, which {reason.why}; expected {reason.expected}"
             kind = STRATEGIES.get(strategy)
             tested = tested or (kind is not None and kind.tests_range)
     if tested and tables.slots is not None:

@@ -29,12 +29,12 @@ MOST = 2**1023
 NAME = re.compile(r"[a-z][a-z0-9_-]{0,31}")
 
 
-def expected(what: str, hint: str = "") -> PydanticCustomError:
+def expected(words: str, hint: str = "") -> PydanticCustomError:
     """The error about one value, to be raised in a check. what: the expected value; hint: what to add, such as a similar name.
 
     The message also says what was found.
     """
-    return PydanticCustomError("expected", "one value", {"expected": what, "hint": hint})
+    return PydanticCustomError("expected", "one value", {"expected": words, "hint": hint})
 
 
 def _probability(value: float) -> float:
@@ -117,17 +117,17 @@ class Table(BaseModel):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _all_at_once(cls, found: Any, check: ModelWrapValidatorHandler[Self]) -> Self:
+    def _all_at_once(cls, entries: Any, check: ModelWrapValidatorHandler[Self]) -> Self:
         """Check each entry and all entries together, so that one mistake does not hide another."""
-        together = cls.mistakes(found) if isinstance(found, Mapping) else []
+        together = cls.mistakes(entries) if isinstance(entries, Mapping) else []
         mistakes = PydanticCustomError("mistakes", "several", {"mistakes": together})
         try:
-            table = check(found)
+            table = check(entries)
         except ValidationError as error:
             if not together:
                 raise
             lines = [again(detail) for detail in error.errors(include_url=False)]
-            lines.append(InitErrorDetails(type=mistakes, input=found))
+            lines.append(InitErrorDetails(type=mistakes, input=entries))
             raise ValidationError.from_exception_data(cls.__name__, lines) from None
         if together:
             raise mistakes
@@ -138,7 +138,7 @@ def _table_in(annotation: Any) -> type[Table] | None:
     """The first class of tables in a type such as `list[LinkTable] | None`."""
     if isinstance(annotation, type) and issubclass(annotation, Table):
         return annotation
-    return next((found for one in get_args(annotation) if (found := _table_in(one)) is not None), None)
+    return next((table for argument in get_args(annotation) if (table := _table_in(argument)) is not None), None)
 
 
 def again(detail: ErrorDetails, *above: str) -> InitErrorDetails:
@@ -151,7 +151,7 @@ def again(detail: ErrorDetails, *above: str) -> InitErrorDetails:
 def numbers(rows: Any) -> bool:
     """Whether these are rows of numbers, of any lengths; they may be infinite, or NaN."""
     return isinstance(rows, list) and all(
-        isinstance(row, list) and all(isinstance(one, float) or is_number(one, -MOST, MOST) for one in row)
+        isinstance(row, list) and all(isinstance(element, float) or is_number(element, -MOST, MOST) for element in row)
         for row in rows
     )
 
@@ -168,8 +168,8 @@ def model_mistakes(entry: str, found: Any, models: Registry[Any]) -> list[Found]
         if "model" not in found:
             return [(f"{entry}.model", f"is missing; expected model = {as_toml(models.names[0])}, or another")]
         name = found["model"]
-        said = _no_class(name, models) or f"; expected {listed(models.names)}{near(name, models.names)}"
-        return [(f"{entry}.model", f"is {as_toml(name)}{said}")]
+        problem = _no_class(name, models) or f"; expected {listed(models.names)}{near(name, models.names)}"
+        return [(f"{entry}.model", f"is {as_toml(name)}{problem}")]
     given = {name: value for name, value in found.items() if name != "model"}
     mistakes = [
         (f"{entry}.{name}", f"is missing; expected {name} = {as_toml(example)}")
@@ -183,4 +183,4 @@ def model_mistakes(entry: str, found: Any, models: Registry[Any]) -> list[Found]
         if name not in model.parameters
     ]
     known = {name: value for name, value in given.items() if name in model.parameters}
-    return mistakes + [(f"{entry}.{name}", what) for name, what in asked(model, known)]
+    return mistakes + [(f"{entry}.{name}", sentence) for name, sentence in asked(model, known)]

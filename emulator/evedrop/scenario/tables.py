@@ -178,7 +178,7 @@ class Scenario(Table):
         return self.model_dump(mode="json", exclude_none=True, exclude_unset=True)
 
     def __repr__(self) -> str:
-        others = [f"{name} ({one.strategy})" for name, one in self.eavesdroppers.items()]
+        others = [f"{name} ({table.strategy})" for name, table in self.eavesdroppers.items()]
         facts = [f"{self.slots} slots", f"{len(self.process.A)} states", f"scheme {self.encoding.scheme}"]
         return f"<Scenario {as_toml(self.title)}: {', '.join([*facts, *others])}>"
 
@@ -219,11 +219,11 @@ class Scenario(Table):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _with_applications(cls, found: Any, check: ModelWrapValidatorHandler[Self]) -> Self:
+    def _with_applications(cls, entries: Any, check: ModelWrapValidatorHandler[Self]) -> Self:
         """Check the tables of applications together with the fields, so that a mistake in one does not hide one in the other."""
-        if not isinstance(found, Mapping):
-            return check(found)
-        applications, broken = applications_in(found, cls.model_fields), unloadable_in(found, cls.model_fields)
+        if not isinstance(entries, Mapping):
+            return check(entries)
+        applications, broken = applications_in(entries, cls.model_fields), unloadable_in(entries, cls.model_fields)
         made: dict[str, Table] = {}
         mistakes = [
             InitErrorDetails(
@@ -233,12 +233,12 @@ class Scenario(Table):
         ]
         for name, application in applications.items():
             try:
-                made[name] = application.table.model_validate(found[name])
+                made[name] = application.table.model_validate(entries[name])
             except ValidationError as error:
                 mistakes += [again(detail, name) for detail in error.errors(include_url=False)]
         scenario = None
         try:
-            scenario = check({name: value for name, value in found.items() if name not in {*applications, *broken}})
+            scenario = check({name: value for name, value in entries.items() if name not in {*applications, *broken}})
         except ValidationError as error:
             mistakes = [again(detail) for detail in error.errors(include_url=False)] + mistakes
         if scenario is None or mistakes:
@@ -265,7 +265,7 @@ class Scenario(Table):
             return []
         if not Path(folder).is_dir():
             return [("modules", f'is "{folder}", which is not a folder; expected the folder that contains the modules')]
-        return [("modules", what) for what in elsewhere(str(Path(folder).absolute()), table)]
+        return [("modules", sentence) for sentence in elsewhere(str(Path(folder).absolute()), table)]
 
     @property
     def relayed(self) -> bool:
@@ -312,7 +312,9 @@ class Scenario(Table):
     @property
     def leaks(self) -> dict[str, int]:
         """Eavesdropper → the slot whose true state is betrayed to it, for eavesdroppers to which one is."""
-        slots = {name: STRATEGIES[one.strategy].betrayed(one.parameters) for name, one in self.eavesdroppers.items()}
+        slots = {
+            name: STRATEGIES[table.strategy].betrayed(table.parameters) for name, table in self.eavesdroppers.items()
+        }
         return {name: slot for name, slot in slots.items() if slot is not None}
 
     def link(self, receiver: str) -> LinkTable:
@@ -347,7 +349,7 @@ class Scenario(Table):
         """The slots in which a receiver goes away or comes back: each begins a new block of its digest. None for a controller."""
         if receiver == CONTROLLER:
             return []
-        return sorted({slot for one in self.timeline.outages[receiver] for slot in (one.start, one.stop)})
+        return sorted({slot for outage in self.timeline.outages[receiver] for slot in (outage.start, outage.stop)})
 
 
 def _builders() -> Builders:

@@ -22,16 +22,16 @@ def toml_text(tables: Mapping[str, Any]) -> str:
     return _LIST.sub(_joined, text)
 
 
-def _joined(found: re.Match[str]) -> str:
-    items = re.findall(_ITEM, found["items"])
-    whole = f"{found['before']}[{', '.join(items)}]"
+def _joined(match: re.Match[str]) -> str:
+    items = re.findall(_ITEM, match["items"])
+    whole = f"{match['before']}[{', '.join(items)}]"
     if len(whole) < _WIDTH:
         return whole
     if any(item.startswith('"') for item in items):  # a text must not be broken at its spaces
-        return found[0]
-    indent = found["indent"] + _STEP
+        return match[0]
+    indent = match["indent"] + _STEP
     wrapper = textwrap.TextWrapper(
         _WIDTH, initial_indent=indent, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
     )
     lines = wrapper.fill(", ".join(items))
-    return f"{found['before']}[\n{lines},\n{found['indent']}]"
+    return f"{match['before']}[\n{lines},\n{match['indent']}]"

@@ -103,12 +103,12 @@ class ValidTables:
         eavesdroppers = tables.get("eavesdroppers", {})
         all_receivers = isinstance(eavesdroppers, Mapping)
         eavesdroppers = eavesdroppers if all_receivers else {}
-        found = {LEGITIMATE: tables.get(LEGITIMATE), **eavesdroppers}
-        links = {name: one["link"] for name, one in found.items() if isinstance(one, Mapping) and "link" in one}
+        receivers = {LEGITIMATE: tables.get(LEGITIMATE), **eavesdroppers}
+        links = {name: one["link"] for name, one in receivers.items() if isinstance(one, Mapping) and "link" in one}
         return cls(
             scenario=None,
             given=given,
-            receivers=tuple(found),
+            receivers=tuple(receivers),
             all_receivers=all_receivers,
             links=_valid(LinkTable.model_validate, links.items()),
             applications=applications,
@@ -140,26 +140,26 @@ def _numbered(check: Callable[[Any], T], tables: object) -> tuple[tuple[int, T],
 def _valid(check: Callable[[Any], T], entries: Iterable[tuple[K, object]]) -> dict[K, T]:
     """The result of a check for each entry, without the entries that it refuses."""
     made = {}
-    for key, found in entries:
+    for key, entry in entries:
         with suppress(ValidationError):
-            made[key] = check(found)
+            made[key] = check(entry)
     return made
 
 
-def _expectation(found: object) -> ExpectTable:
+def _expectation(value: object) -> ExpectTable:
     """An expectation with the entries that are valid by themselves: it may lack some, or have too many."""
-    entries = found if isinstance(found, Mapping) else {}
+    entries = value if isinstance(value, Mapping) else {}
     return ExpectTable.model_construct(
         **{name: _single(ExpectTable, name, entries.get(name)) for name in ExpectTable.model_fields}
     )
 
 
-def _single(table: type[Table], name: str, found: object) -> Any:
+def _single(table: type[Table], name: str, value: object) -> Any:
     """One entry of a table; its default if it is not given, None if it has a mistake."""
     field = table.model_fields[name]
-    if found is None:
+    if value is None:
         return None if field.is_required() else field.default
-    return _valid(_adapter(table, name).validate_python, [(name, found)]).get(name)
+    return _valid(_adapter(table, name).validate_python, [(name, value)]).get(name)
 
 
 @cache

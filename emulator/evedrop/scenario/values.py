@@ -54,7 +54,7 @@ def _unusable(tables: Any) -> Iterator[str]:
             if value.bit_length() > _LARGEST_BITS:
                 yield f"{_dotted(path)}: is a whole number of {value.bit_length()} bits; expected at most {_LARGEST_BITS}"
         elif kind is str and not (value.isascii() and value.isprintable()):
-            strange = next((one for one in value if _is_strange(one)), None)
+            strange = next((character for character in value if _is_strange(character)), None)
             if strange is not None:
                 yield (
                     f"{_dotted(path)}: is {as_toml(value)} with the character U+{ord(strange):04X} in it; expected text "
@@ -80,4 +80,7 @@ def _is_strange(character: str) -> bool:
 def _dotted(path: tuple[str, ...]) -> str:
     """A dotted path of bounded length, with plain characters only."""
     names = [name if len(name) <= _LONGEST_NAME else f"{name[:20]}…" for name in path[: _DEEPEST + 1]]
-    return "".join("?" if _is_strange(one) or one in _PLAIN else one for one in ".".join(names)) or "the scenario"
+    return (
+        "".join("?" if _is_strange(character) or character in _PLAIN else character for character in ".".join(names))
+        or "the scenario"
+    )

@@ -42,9 +42,9 @@ class WireTable(Table):
     def stream_keys(self, streams: tuple[str, ...]) -> Mapping[str, bytes]:
         """Stream → its key, for those streams of receivers' links that are a wire's."""
         root = root_of_seed(self.seed)
-        found = {}
+        keys_ = {}
         for stream in streams:
             kind, _, receiver = stream.partition("/")
             if receiver in self.links:
-                found[stream] = wire_stream_key(root, f"{kind}/{self.links[receiver]}", PUT, self.key)
-        return found
+                keys_[stream] = wire_stream_key(root, f"{kind}/{self.links[receiver]}", PUT, self.key)
+        return keys_

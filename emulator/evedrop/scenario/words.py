@@ -11,9 +11,9 @@ from evedrop.system.hints import near
 __all__ = ["as_toml", "dotted", "listed", "no_entry"]
 
 
-def no_entry(name: str, known: Sequence[str]) -> str:
+def no_entry(name: str, names: Sequence[str]) -> str:
     """The message about an entry that a table does not have."""
-    choice = near(name, known) or f"; expected one of {', '.join(known)}"
+    choice = near(name, names) or f"; expected one of {', '.join(names)}"
     return f"is not an entry of this table{choice}"
 
 

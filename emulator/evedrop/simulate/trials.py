@@ -70,7 +70,7 @@ class BatchResult:
 @final
 @dataclass(frozen=True)
 class TrialsTask(Task[BatchResult]):
-    """Some consecutive blocks of trials, of which all metrics are kept."""
+    """Consecutive blocks of trials whose metrics are all kept."""
 
     mode: Mode
 

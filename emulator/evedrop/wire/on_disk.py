@@ -1,4 +1,4 @@
-"""What a wire's folder says of a wire that runs in another process, has ended or was killed: its summary so far.
+"""Reads the folder of a wire that runs in another process, has ended or was killed: its summary so far.
 
 The closing report has the summary as a table, and sentences below it, as text.
 

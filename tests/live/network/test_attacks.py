@@ -125,7 +125,7 @@ def test_a_report_that_no_run_has_is_refused(evedrop: Evedrop, does: str, said: 
 
 
 def test_what_is_verified_and_what_is_not(evedrop: Evedrop) -> None:
-    """The summary says of how many trials the digests were computed again, and which metrics rest on a receiver's own word."""
+    """The summary says for how many trials digests were recomputed, and which metrics rest on a receiver's own report."""
     done = evedrop(
         "run", "eavesdroppers", "--slots", "40", "--trials", "4", "--record-trials", "3", "--view", "off", "--json"
     )

@@ -5,6 +5,7 @@ With L = A, for comparison, an eavesdropper that lost the reference learns the s
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import final
@@ -50,38 +51,25 @@ class AcknowledgedEncoder(Encoder):
         self._slot = np.where(acknowledged, k, self._slot)
 
 
-def _reference_form(scheme: Acknowledged, conditions: ReceiverConditions) -> ReferenceForm | None:
-    return ReferenceForm.of(scheme.process, conditions, open_loop=False)
-
-
-class Acknowledged(Scheme):
-    """Subtracts a reference that the user has; an eavesdropper that missed a reference can never recover it.
-
-    The reference is carried so that a packet is independent of the state it is sent for, unless A is singular. There is no
-    secret: receivers differ only in which packets they heard, and the sensor knows that of one of them. The scheme therefore
-    depends on acknowledgements that are neither blocked nor forged.
-
-    Source: Tsiamis, Gatsis, Pappas (2018, 2020); docs/mathematics.md, acknowledged references.
-    """
+class _AcknowledgedReferences(Scheme):
+    """Subtracts a reference that the user has, as its acknowledgements show."""
 
     best_reader = "reference"
-    closed_forms = MappingProxyType({"legitimate": _reference_form, "reference": _reference_form})
     needs_acknowledgements = True
     reads_packets = True
-    header = ("slot t of the reference; −1: none, z is the state",)
-
-    def warnings(self) -> list[str]:
-        """That of a singular A."""
-        return singular_warnings(self.process)
 
     def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
         """The references; nothing is secret."""
         return NoInnovations(
             self.process,
             batch.trials,
-            lambda: AcknowledgedEncoder(ReferenceCode(self.process), self.process.n, batch.trials),
+            lambda: self._encoder(batch.trials),
             lambda: self.estimator(keys, batch),
         )
+
+    @abstractmethod
+    def _encoder(self, trials: int) -> Encoder:
+        """The sensor's side."""
 
     def estimator(self, keys: Mapping[str, bytes], batch: Batch) -> Receiver:  # noqa: ARG002 - there is no secret
         """A receiver that keeps the references it may have acknowledged."""
@@ -95,6 +83,32 @@ class Acknowledged(Scheme):
         """Nothing ends the growth: no later packet reveals the reference."""
         remedy = "random-code or threshold-code is used, which send the state now and then"
         return LostReference(growth_by_coin(self.process, 0.0, received), remedy)
+
+
+def _reference_form(scheme: Acknowledged, conditions: ReceiverConditions) -> ReferenceForm | None:
+    return ReferenceForm.of(scheme.process, conditions, open_loop=False)
+
+
+class Acknowledged(_AcknowledgedReferences):
+    """Subtracts a reference that the user has; an eavesdropper that missed a reference can never recover it.
+
+    The reference is carried so that a packet is independent of the state it is sent for, unless A is singular. There is no
+    secret: receivers differ only in which packets they heard, and the sensor knows that of one of them. The scheme therefore
+    depends on acknowledgements that are neither blocked nor forged.
+
+    Source: Tsiamis, Gatsis, Pappas (2018, 2020); docs/mathematics.md, acknowledged references.
+    """
+
+    closed_forms = MappingProxyType({"legitimate": _reference_form, "reference": _reference_form})
+    header = ("slot t of the reference; −1: none, z is the state",)
+
+    def warnings(self) -> list[str]:
+        """That of a singular A."""
+        return singular_warnings(self.process)
+
+    def _encoder(self, trials: int) -> Encoder:
+        """Carries the reference by L."""
+        return AcknowledgedEncoder(ReferenceCode(self.process), self.process.n, trials)
 
 
 @final
@@ -113,37 +127,15 @@ def _open_loop_form(scheme: OpenLoop, conditions: ReceiverConditions) -> Referen
     return ReferenceForm.of(scheme.process, conditions, open_loop=True)
 
 
-class OpenLoop(Scheme):
+class OpenLoop(_AcknowledgedReferences):
     """Subtracts a reference that the user has, carried by A; an eavesdropper that missed it follows the stable modes later.
 
     Source: Tsiamis, Gatsis, Pappas (2018, 2020); docs/mathematics.md, acknowledged references.
     """
 
-    best_reader = "reference"
     closed_forms = MappingProxyType({"legitimate": _open_loop_form, "reference": _open_loop_form})
-    needs_acknowledgements = True
-    reads_packets = True
     header = ("slot t of the reference; −1: no reference", "0: z is the state; 2: z is the state minus A^{k−t} x_t")
 
-    def shared(self, keys: Mapping[str, bytes], batch: Batch) -> Shared:
-        """The references; nothing is secret."""
-        code = ReferenceCode(self.process, open_loop=True)
-        return NoInnovations(
-            self.process,
-            batch.trials,
-            lambda: OpenLoopEncoder(code, self.process.n, batch.trials),
-            lambda: self.estimator(keys, batch),
-        )
-
-    def estimator(self, keys: Mapping[str, bytes], batch: Batch) -> Receiver:  # noqa: ARG002 - there is no secret
-        """A receiver that keeps the references it may have acknowledged."""
-        return ReferenceReceiver(self.process, batch.trials)
-
-    def outcomes(self, mu: float) -> Outcomes:
-        """A state with every packet, whichever acknowledgements arrive."""
-        return Outcomes.plain(mu)
-
-    def lost_reference(self, received: float, acknowledged: tuple[float, float]) -> LostReference:  # noqa: ARG002 - it lasts
-        """Nothing ends the growth: no later packet reveals the reference."""
-        remedy = "random-code or threshold-code is used, which send the state now and then"
-        return LostReference(growth_by_coin(self.process, 0.0, received), remedy)
+    def _encoder(self, trials: int) -> Encoder:
+        """Carries the reference by A."""
+        return OpenLoopEncoder(ReferenceCode(self.process, open_loop=True), self.process.n, trials)

@@ -59,13 +59,13 @@ def _answered(question: bytes) -> bytes:
     name, do, registry, *given = json.loads(question)
     try:
         kind: type[Eavesdropper] = _registry(registry).imported(name)
-        found: dict[str, Any] = {"is": _ASKED[do](kind, *given)}
+        answer: dict[str, Any] = {"is": _ASKED[do](kind, *given)}
     except NotRegistered as error:
-        found = {"not_registered": error.why}
+        answer = {"not_registered": error.why}
     except BaseException as error:
-        found = {"raised": place_of(error, getattr(sys.modules.get(name.partition(":")[0]), "__file__", None))}
+        answer = {"raised": place_of(error, getattr(sys.modules.get(name.partition(":")[0]), "__file__", None))}
     try:
-        return f"{json.dumps(found)}\n".encode()
+        return f"{json.dumps(answer)}\n".encode()
     except (TypeError, ValueError):
         return b'{"raised": "its answer is not made of numbers, texts, lists and tables"}\n'
 

@@ -125,9 +125,9 @@ def _streams(one: _Named) -> list[str]:
         raise UsageError(f"--eavesdropper {one.name}: {error}") from error
 
 
-def _scheme_for(one: _Named) -> _Named:
+def _scheme_for(named: _Named) -> _Named:
     """The paper's scheme, or the first scheme that has the keys the eavesdropper asks for."""
-    needed = {*_streams(one)}
+    needed = {*_streams(named)}
     for name in (PAPERS_SCHEME, *SCHEMES):
         if needed <= {*SCHEMES[name].secret_streams}:
             return _Named(name, SCHEMES[name], dict(SCHEMES[name].parameters))

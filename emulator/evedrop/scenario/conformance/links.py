@@ -53,7 +53,7 @@ class LossChecks:
             ("slots in pieces", self.pieces),
             ("a copy that goes on", self.copied),
         ]
-        return judged((exact, small()), ([("the quality it says", self.rate)], [_long(one) for one in large()]))
+        return judged((exact, small()), ([("the quality it says", self.rate)], [_long(loss) for loss in large()]))
 
     def _made(self) -> LossModel:
         with calling(f"{self._kind.__name__}(…)", self._kind):
@@ -68,17 +68,17 @@ class LossChecks:
 
     def _fates(self, model: LossModel, first: int, uniforms: Floats) -> Codes:
         with calling(f"fates() of slot {first} and on", self._kind):
-            found = model.fates(first, uniforms)
+            fates = model.fates(first, uniforms)
         slots, _, trials = uniforms.shape
-        expect_array(f"fates() of slot {first} and on", found, np.uint8, (slots, trials), "slots, R trials")
-        other = ~np.isin(found, (Fate.DELIVERED, Fate.LOST))
+        expect_array(f"fates() of slot {first} and on", fates, np.uint8, (slots, trials), "slots, R trials")
+        other = ~np.isin(fates, (Fate.DELIVERED, Fate.LOST))
         if other.any():
             row, trial = np.argwhere(other)[0]
             raise Broken(
-                f"slot {first + row}, trial {trial}: the fate is {found[row, trial]}; expected Fate.DELIVERED or Fate.LOST, "
+                f"slot {first + row}, trial {trial}: the fate is {fates[row, trial]}; expected Fate.DELIVERED or Fate.LOST, "
                 "such as by fates_of(lost)"
             )
-        return found
+        return fates
 
     def _whole(self, problem: Problem) -> Codes:
         model = self._made()
@@ -115,19 +115,19 @@ class LossChecks:
         uniforms = self._uniforms(pair[0], problem)
         each: list[list[Codes]] = [[], []]
         for k in range(problem.slots):
-            for model, found in zip(pair, each, strict=True):
-                found.append(self._fates(model, k, uniforms[k : k + 1]))
-        said = "{0!r} by itself and {1!r} with another one of its kind, slot by slot"
-        for found in each:
-            self._same(once, np.concatenate(found), problem, said, "keep no state outside of the model")
+            for model, fates in zip(pair, each, strict=True):
+                fates.append(self._fates(model, k, uniforms[k : k + 1]))
+        words = "{0!r} by itself and {1!r} with another one of its kind, slot by slot"
+        for fates in each:
+            self._same(once, np.concatenate(fates), problem, words, "keep no state outside of the model")
 
     def alone(self, problem: Problem) -> None:
         """A trial alone gives the same fates as among others."""
         among = self._whole(problem)
         for trial in (0, problem.batch.trials - 1):
-            one = self._whole(problem.part(trial, 1))
-            said = f"{{0!r}} among {problem.batch.trials} trials and {{1!r}} alone"
-            self._same(among[:, trial : trial + 1], one, problem.part(trial, 1), said, _COLUMN)
+            by_itself = self._whole(problem.part(trial, 1))
+            words = f"{{0!r}} among {problem.batch.trials} trials and {{1!r}} alone"
+            self._same(among[:, trial : trial + 1], by_itself, problem.part(trial, 1), words, _COLUMN)
 
     def pieces(self, problem: Problem) -> None:
         """Slots give the same fates in one call and in several."""
@@ -144,9 +144,9 @@ class LossChecks:
         self._fates(model, 0, uniforms[:5])
         other = copy.copy(model)
         self._fates(model, 5, uniforms[5:])
-        found = np.concatenate([once[:5], self._fates(other, 5, uniforms[5:])])
+        fates = np.concatenate([once[:5], self._fates(other, 5, uniforms[5:])])
         remedy = "replace what the model remembers, and never change an array of it in place"
-        self._same(once, found, problem, "{0!r}, and {1!r} of a copy made before slot 5", remedy)
+        self._same(once, fates, problem, "{0!r}, and {1!r} of a copy made before slot 5", remedy)
 
     def rate(self, problem: Problem) -> None:
         """The fraction delivered has the mean and the variance over trials that the model states."""
@@ -164,9 +164,9 @@ class LossChecks:
                 f"{variance:.3g}; give `chain`, or a rate_variance() of its own"
             )
 
-    def _same(self, one: Codes, other: Codes, problem: Problem, said: str, remedy: str) -> None:
-        rows = [[{"the fate": row} for row in codes] for codes in (one, other)]
-        expect_same(rows[0], rows[1], slice(None), problem.batch.first_trial, said, remedy)
+    def _same(self, first: Codes, second: Codes, problem: Problem, words: str, remedy: str) -> None:
+        rows = [[{"the fate": row} for row in codes] for codes in (first, second)]
+        expect_same(rows[0], rows[1], slice(None), problem.batch.first_trial, words, remedy)
 
 
 @final
@@ -194,33 +194,37 @@ class DelayChecks:
             numbers = frozen((reader.normals(slots) if model.normal else reader.uniforms(slots))[:, 0])
             where = f"delays() of slot {first} and on"
             with calling(where, self._kind):
-                found = model.delays(first, numbers)
-            expect_array(where, found, np.float64, numbers.shape, "slots, R trials")
-            expect_finite(where, found)
-            if (found < 0.0).any():
-                raise Broken(f"{where}: one is {found.min()}; expected slots, 0 or more")
-            parts.append(found)
+                delays = model.delays(first, numbers)
+            expect_array(where, delays, np.float64, numbers.shape, "slots, R trials")
+            expect_finite(where, delays)
+            if (delays < 0.0).any():
+                raise Broken(f"{where}: one is {delays.min()}; expected slots, 0 or more")
+            parts.append(delays)
         return np.concatenate(parts)
 
     def shapes(self, problem: Problem) -> None:
         """Delays, and the probabilities that the model states, have the right shapes and types."""
         self._delays(problem)
         with calling("arrived()", self._kind):
-            said = [self._model().arrived(lag) for lag in range(4)]
-        known = [one for one in said if one is not None]
-        for lag, one in enumerate(said):
-            if one is not None:
-                expect_probability(f"arrived({lag})", one)
-        if known and (len(known) < len(said) or known != sorted(known) or not 0.0 <= known[0] <= known[-1] <= 1.0):
-            raise Broken(f"arrived() of 0 to 3 is {said}; expected probabilities that do not fall, or None always")
+            probabilities = [self._model().arrived(lag) for lag in range(4)]
+        given = [probability for probability in probabilities if probability is not None]
+        for lag, probability in enumerate(probabilities):
+            if probability is not None:
+                expect_probability(f"arrived({lag})", probability)
+        if given and (
+            len(given) < len(probabilities) or given != sorted(given) or not 0.0 <= given[0] <= given[-1] <= 1.0
+        ):
+            raise Broken(
+                f"arrived() of 0 to 3 is {probabilities}; expected probabilities that do not fall, or None always"
+            )
 
     def alone(self, problem: Problem) -> None:
         """A trial alone gives the same delays as among others."""
         among = self._delays(problem)
         for trial in (0, problem.batch.trials - 1):
-            one = self._delays(problem.part(trial, 1))
-            said = f"{{0!r}} among {problem.batch.trials} trials and {{1!r}} alone"
-            self._same(among[:, trial : trial + 1], one, problem.part(trial, 1), said, _COLUMN)
+            by_itself = self._delays(problem.part(trial, 1))
+            words = f"{{0!r}} among {problem.batch.trials} trials and {{1!r}} alone"
+            self._same(among[:, trial : trial + 1], by_itself, problem.part(trial, 1), words, _COLUMN)
 
     def pieces(self, problem: Problem) -> None:
         """Slots give the same delays in one call as in several calls to new instances."""
@@ -231,14 +235,18 @@ class DelayChecks:
         """The fraction of packets in time is the stated one."""
         delays = self._delays(problem)
         for lag in range(4):
-            said = self._model().arrived(lag)
-            found = float((delays < lag + 1).mean())
-            if said is not None and abs(found - said) > SIGMAS * np.sqrt(max(said * (1.0 - said), 1e-3) / delays.size):
-                raise Broken(f"{found:.4f} of the delays are below {lag + 1} slots, and arrived({lag}) is {said:.4f}")
+            promised = self._model().arrived(lag)
+            fraction = float((delays < lag + 1).mean())
+            if promised is not None and abs(fraction - promised) > SIGMAS * np.sqrt(
+                max(promised * (1.0 - promised), 1e-3) / delays.size
+            ):
+                raise Broken(
+                    f"{fraction:.4f} of the delays are below {lag + 1} slots, and arrived({lag}) is {promised:.4f}"
+                )
 
-    def _same(self, one: Floats, other: Floats, problem: Problem, said: str, remedy: str) -> None:
-        rows = [[{"the delay": row} for row in delays] for delays in (one, other)]
-        expect_same(rows[0], rows[1], slice(None), problem.batch.first_trial, said, remedy)
+    def _same(self, first: Floats, second: Floats, problem: Problem, words: str, remedy: str) -> None:
+        rows = [[{"the delay": row} for row in delays] for delays in (first, second)]
+        expect_same(rows[0], rows[1], slice(None), problem.batch.first_trial, words, remedy)
 
 
 def _long(problem: Problem) -> Problem:

@@ -54,7 +54,7 @@ def sent_of(packet: Packet) -> dict[str, Any]:
 
 def frozen_belief(belief: Belief) -> Belief:
     """A read-only copy."""
-    memory = tuple(frozen(one) for one in belief.memory)
+    memory = tuple(frozen(part) for part in belief.memory)
     return Belief(frozen(belief.x_hat), frozen(belief.P), frozen(belief.action), memory)
 
 
@@ -122,8 +122,8 @@ def sides(scheme: Scheme, problem: Problem, kind: type[Scheme], apart: bool) -> 
         with calling("estimator() of what is shared", kind):
             estimator = shared.estimator()
     if not isinstance(encoder, Encoder) or not isinstance(estimator, Receiver):
-        found = f"{type(encoder).__name__} and {type(estimator).__name__}"
-        raise Broken(f"the two sides are {found}; expected an Encoder and a Receiver")
+        classes = f"{type(encoder).__name__} and {type(estimator).__name__}"
+        raise Broken(f"the two sides are {classes}; expected an Encoder and a Receiver")
     return encoder, estimator
 
 
@@ -194,18 +194,18 @@ def expect_belief(where: str, belief: Any, problem: Problem) -> None:
             raise Broken(f"{where}.memory[{i}] is not an array whose last axis is the {trials} trials")
 
 
-def expect_beliefs(slots: range, found: Any, problem: Problem) -> None:
+def expect_beliefs(slots: range, given: Any, problem: Problem) -> None:
     """Raise Broken unless this is what `Receiver.follow` must return for consecutive slots."""
-    if not (type(found) is tuple and len(found) == 2 and isinstance(found[0], Beliefs)):
-        what = (
-            f"a tuple of {', '.join(type(one).__name__ for one in found)}"
-            if type(found) is tuple
-            else type(found).__name__
+    if not (type(given) is tuple and len(given) == 2 and isinstance(given[0], Beliefs)):
+        got = (
+            f"a tuple of {', '.join(type(element).__name__ for element in given)}"
+            if type(given) is tuple
+            else type(given).__name__
         )
         raise Broken(
-            f"{slots_text(slots)}: follow() returned {what}; expected the Beliefs after each slot, and the Belief after the last"
+            f"{slots_text(slots)}: follow() returned {got}; expected the Beliefs after each slot, and the Belief after the last"
         )
-    beliefs, after = found
+    beliefs, after = given
     _expect_arrays(f"{slots_text(slots)}: Beliefs", beliefs, (len(slots),), problem)
     if not (np.isfinite(beliefs.x_hat).all() and np.isfinite(beliefs.P).all() and asymmetry(beliefs.P) is None):
         for row, k in enumerate(slots):

@@ -60,24 +60,24 @@ class ReceiverChecks(ABC):
         """Two that take turns do the same as one alone."""
         once = self.undisturbed(problem)
         for rows in zip(*zip(self.rows(problem), self.rows(problem), strict=True), strict=True):
-            said = "{0!r} by itself and {1!r} with another one of its kind"
-            expect_same(once, rows, slice(None), problem.batch.first_trial, said, self.state)
+            words = "{0!r} by itself and {1!r} with another one of its kind"
+            expect_same(once, rows, slice(None), problem.batch.first_trial, words, self.state)
 
     def alone(self, problem: Problem) -> None:
         """A trial alone gives the same bits as among others."""
         among = self.undisturbed(problem)
         for trial in (0, problem.batch.trials - 1):
-            one = list(self.rows(problem.part(trial, 1)))
-            said = f"{{0!r}} among {problem.batch.trials} trials and {{1!r}} alone"
+            by_itself = list(self.rows(problem.part(trial, 1)))
+            words = f"{{0!r}} among {problem.batch.trials} trials and {{1!r}} alone"
             number = problem.batch.first_trial + trial
-            expect_same(among, one, slice(trial, trial + 1), number, said, _COLUMN)
+            expect_same(among, by_itself, slice(trial, trial + 1), number, words, _COLUMN)
 
     def lost(self, problem: Problem) -> None:
         """The value in place of a lost packet changes nothing."""
         zeros, rubbish = self.undisturbed(problem), list(self.rows(problem, 1e30))
-        said = "{0!r} or {1!r}, depending on z where nothing was received"
+        words = "{0!r} or {1!r}, depending on z where nothing was received"
         remedy = "look at z where gamma is true alone, such as by np.where(heard.gamma, …)"
-        expect_same(zeros, rubbish, slice(None), problem.batch.first_trial, said, remedy)
+        expect_same(zeros, rubbish, slice(None), problem.batch.first_trial, words, remedy)
 
 
 def expect_pure(receiver: Receiver, steps: Sequence[Step], problem: Problem, kind: type) -> None:
@@ -85,13 +85,13 @@ def expect_pure(receiver: Receiver, steps: Sequence[Step], problem: Problem, kin
     rows = []
     for k, (before, heard, _) in reversed([*enumerate(steps)]):
         with calling(f"slot {k}: step(), asked for again after later slots,", kind):
-            found = receiver.step(k, before, heard)
-        expect_belief(f"slot {k}: Belief", found, problem)
-        rows.append(row_of(found))
-    said = "{0!r} at first and {1!r} when the slot is asked for again"
+            belief = receiver.step(k, before, heard)
+        expect_belief(f"slot {k}: Belief", belief, problem)
+        rows.append(row_of(belief))
+    words = "{0!r} at first and {1!r} when the slot is asked for again"
     remedy = "keep what a receiver remembers in Belief.memory, and nothing in itself"
     once = [row_of(after) for _, _, after in steps]
-    expect_same(once, rows[::-1], slice(None), problem.batch.first_trial, said, remedy)
+    expect_same(once, rows[::-1], slice(None), problem.batch.first_trial, words, remedy)
     with calling("prior(first=3)", kind):
         expect_belief("prior(first=3): Belief", receiver.prior(3), problem)
 
@@ -105,8 +105,10 @@ def expect_actions(receiver: Receiver, steps: Sequence[Step], problem: Problem, 
         other = action != after.action
         if other.any():
             at = int(np.argmax(other))
-            found = f"act() says {_name(action[at])} and step() did {_name(after.action[at])}"
-            raise Broken(f"slot {k}, trial {problem.batch.first_trial + at}: {found}; make them agree, or {remedy}")
+            contradiction = f"act() says {_name(action[at])} and step() did {_name(after.action[at])}"
+            raise Broken(
+                f"slot {k}, trial {problem.batch.first_trial + at}: {contradiction}; make them agree, or {remedy}"
+            )
         P = update.believed_covariance(problem.process, k, before.P, action)
         unlike = (P != after.P).any(axis=(0, 1))
         if unlike.any():

@@ -57,7 +57,7 @@ def key(name: str) -> bytes:
 
 
 @contextlib.contextmanager
-def calling(what: str, kind: type) -> Iterator[None]:
+def calling(call: str, kind: type) -> Iterator[None]:
     """Turn any error of custom code into one that names the call, and the place in that code."""
     try:
         yield
@@ -65,13 +65,13 @@ def calling(what: str, kind: type) -> Iterator[None]:
         raise
     except _NotAskedFor as error:
         named = "in streams()" if hasattr(kind, "streams") else "in secret_streams, and in estimator_streams"
-        raise Broken(f"{what} {error}; name every stream {named}, or leave it alone") from error
+        raise Broken(f"{call} {error}; name every stream {named}, or leave it alone") from error
     except Exception as error:
         file = getattr(sys.modules.get(kind.__module__), "__file__", None)
-        said = place_of(error, file)
+        reason = place_of(error, file)
         if "read-only" in str(error):
-            raise Broken(f"{what} changes in place what it is given ({said}); make a new array instead") from error
-        raise Broken(f"{what} raised {said}; expected no error") from error
+            raise Broken(f"{call} changes in place what it is given ({reason}); make a new array instead") from error
+        raise Broken(f"{call} raised {reason}; expected no error") from error
 
 
 def frozen(array: Array) -> Array:
@@ -81,65 +81,67 @@ def frozen(array: Array) -> Array:
     return made
 
 
-def expect_array(where: str, found: Any, dtype: Any, shape: tuple[int, ...], means: str) -> None:
+def expect_array(where: str, array: Any, dtype: Any, shape: tuple[int, ...], means: str) -> None:
     """Raise Broken unless a value is an array of this type and shape. where: such as `slot 3: Packet.z`."""
-    if not isinstance(found, np.ndarray):
+    if not isinstance(array, np.ndarray):
         raise Broken(
-            f"{where} is {type(found).__name__}; expected an array of {np.dtype(dtype)}, shape {shape}: {means}"
+            f"{where} is {type(array).__name__}; expected an array of {np.dtype(dtype)}, shape {shape}: {means}"
         )
-    if found.shape != shape:
-        raise Broken(f"{where} has shape {found.shape}; expected {shape}: {means}")
-    if found.dtype != np.dtype(dtype):
+    if array.shape != shape:
+        raise Broken(f"{where} has shape {array.shape}; expected {shape}: {means}")
+    if array.dtype != np.dtype(dtype):
         raise Broken(
-            f"{where} has type {found.dtype}; expected {np.dtype(dtype)}, such as by .astype(np.{np.dtype(dtype)})"
+            f"{where} has type {array.dtype}; expected {np.dtype(dtype)}, such as by .astype(np.{np.dtype(dtype)})"
         )
 
 
-def expect_finite(where: str, found: Array, first: int = 0) -> None:
+def expect_finite(where: str, array: Array, first: int = 0) -> None:
     """Raise Broken where a number is not finite; the last axis is the trials, from number `first` on."""
-    bad = ~np.isfinite(found)
+    bad = ~np.isfinite(array)
     if bad.any():
         trial = first + int(np.argwhere(bad)[0][-1])
-        raise Broken(f"{where}, trial {trial}, is {found[bad].flat[0]}; expected finite numbers")
+        raise Broken(f"{where}, trial {trial}, is {array[bad].flat[0]}; expected finite numbers")
 
 
 Row = Mapping[str, Array]
 """The results of one slot: name → array whose last axis is the trials."""
 
 
-def expect_names(where: str, found: Any) -> None:
+def expect_names(where: str, names_given: Any) -> None:
     """Raise Broken unless a value is a tuple of distinct names."""
-    names = isinstance(found, (tuple, list)) and all(isinstance(name, str) and name for name in found)
-    if not names or len(set(found)) < len(found):
-        raise Broken(f"{where} is {_short(found)}; expected a tuple of names, each once, such as ('schedule',)")
+    names = isinstance(names_given, (tuple, list)) and all(isinstance(name, str) and name for name in names_given)
+    if not names or len(set(names_given)) < len(names_given):
+        raise Broken(f"{where} is {_short(names_given)}; expected a tuple of names, each once, such as ('schedule',)")
 
 
-def expect_bool(where: str, found: Any) -> None:
+def expect_bool(where: str, value: Any) -> None:
     """Raise Broken unless a value is True or False."""
-    if type(found) is not bool:
-        raise Broken(f"{where} is {_short(found)}; expected True or False")
+    if type(value) is not bool:
+        raise Broken(f"{where} is {_short(value)}; expected True or False")
 
 
-def expect_probability(where: str, found: Any) -> None:
+def expect_probability(where: str, value: Any) -> None:
     """Raise Broken unless a value is a number from 0 to 1."""
-    if isinstance(found, bool) or not isinstance(found, (int, float, np.floating)) or not 0.0 <= found <= 1.0:
-        raise Broken(f"{where} is {_short(found)}; expected a number from 0 to 1")
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.floating)) or not 0.0 <= value <= 1.0:
+        raise Broken(f"{where} is {_short(value)}; expected a number from 0 to 1")
 
 
-def expect_outcomes(where: str, found: Any) -> None:
+def expect_outcomes(where: str, outcomes: Any) -> None:
     """Raise Broken unless a value is `Outcomes` of probabilities, or None."""
-    if found is None:
+    if outcomes is None:
         return
-    if not isinstance(found, Outcomes):
-        raise Broken(f"{where} is {_short(found)}; expected Outcomes, or None: no closed form")
-    for one in fields(Outcomes):
-        value = getattr(found, one.name)
+    if not isinstance(outcomes, Outcomes):
+        raise Broken(f"{where} is {_short(outcomes)}; expected Outcomes, or None: no closed form")
+    for field in fields(Outcomes):
+        value = getattr(outcomes, field.name)
         if (
             isinstance(value, bool)
             or not isinstance(value, (int, float, np.floating))
             or not -_SLACK <= value <= 1 + _SLACK
         ):
-            raise Broken(f"{where}.{one.name} is {_short(value)}; expected a probability, or None in place of Outcomes")
+            raise Broken(
+                f"{where}.{field.name} is {_short(value)}; expected a probability, or None in place of Outcomes"
+            )
 
 
 def _short(value: Any) -> str:
@@ -148,27 +150,33 @@ def _short(value: Any) -> str:
 
 
 def expect_same(
-    one: Sequence[Row], other: Sequence[Row], trials: slice, first: int, said: str, remedy: str, start: int = 0
+    first_rows: Sequence[Row],
+    second_rows: Sequence[Row],
+    trials: slice,
+    first: int,
+    words: str,
+    remedy: str,
+    start: int = 0,
 ) -> None:
     """Raise Broken at the first slot, array and trial in which two records differ by a bit.
 
-    trials: those of `one` that `other` has; first: the number of the first of them; said: a text with places for both values;
-    start: the first slot.
+    trials: those of `first_rows` that `second_rows` has; first: the number of the first of them; words: a text with places for
+    both values; start: the first slot.
     """
-    for k, (row, again) in enumerate(zip(one, other, strict=True), start):
-        for name, found in row.items():
-            mine, theirs = found[..., trials], again[name]
+    for k, (row, again) in enumerate(zip(first_rows, second_rows, strict=True), start):
+        for name, value in row.items():
+            mine, theirs = value[..., trials], again[name]
             differ = mine.view(np.uint8) != theirs.view(np.uint8) if mine.dtype == np.bool_ else _differ(mine, theirs)
             if differ.any():
                 place = tuple(np.argwhere(differ)[0])
-                values = said.format(mine[place].item(), theirs[place].item())
+                values = words.format(mine[place].item(), theirs[place].item())
                 raise Broken(f"slot {k}, trial {first + int(place[-1])}: {name} is {values}; {remedy}")
 
 
-def _differ(one: Array, other: Array) -> NDArray[np.bool_]:
+def _differ(first: Array, second: Array) -> NDArray[np.bool_]:
     """Where bits differ: a NaN equals itself, and 0 differs from −0."""
-    width = f"u{one.dtype.itemsize}"
-    return np.asarray(np.ascontiguousarray(one).view(width) != np.ascontiguousarray(other).view(width))
+    width = f"u{first.dtype.itemsize}"
+    return np.asarray(np.ascontiguousarray(first).view(width) != np.ascontiguousarray(second).view(width))
 
 
 Rule = tuple[str, Callable[[Any], None]]

@@ -65,8 +65,8 @@ class SchemeChecks(ReceiverChecks):
 
     def _slots(self, problem: Problem, apart: bool = False) -> list[Slot]:
         if (id(problem), apart) not in self._played:
-            found = list(played(self._scheme_of, problem, self._kind, apart=apart))
-            self._played[id(problem), apart] = (problem, found)
+            slots = list(played(self._scheme_of, problem, self._kind, apart=apart))
+            self._played[id(problem), apart] = (problem, slots)
         return self._played[id(problem), apart][1]
 
     def rows(self, problem: Problem, rubbish: float = 0.0) -> Iterator[Row]:
@@ -92,8 +92,8 @@ class SchemeChecks(ReceiverChecks):
             self._slots(problem, apart)
         for mu in _QUALITIES:
             with calling("outcomes()", self._kind):
-                found = scheme.outcomes(mu)
-            expect_outcomes(f"outcomes({mu})", found)
+                outcomes = scheme.outcomes(mu)
+            expect_outcomes(f"outcomes({mu})", outcomes)
             with calling("eavesdropper_outcomes()", self._kind):
                 theirs = scheme.eavesdropper_outcomes(mu, 1.0, 1.0)
             expect_outcomes(f"eavesdropper_outcomes({mu}, 1.0, 1.0)", theirs)
@@ -103,16 +103,16 @@ class SchemeChecks(ReceiverChecks):
         expect_array("encrypted()", encrypted, np.bool_, packets.nu.shape, "slots, one for each of the R trials")
         with calling("packet_bits, secret_bits and initial_secret_bits", self._kind):
             bits = (scheme.packet_bits, scheme.secret_bits, scheme.initial_secret_bits)
-        if any(type(one) is not int or one < 0 for one in bits):
+        if any(type(count) is not int or count < 0 for count in bits):
             raise Broken(f"packet_bits, secret_bits and initial_secret_bits are {bits!r:.80}; expected whole numbers")
 
     def apart(self, problem: Problem) -> None:
         """Sensor and estimator made separately, as in a live run, do the same as in memory."""
         together = [slot.row for slot in self._slots(problem)]
-        said = "{0!r} made from shared() and {1!r} made from encoder() and estimator()"
+        words = "{0!r} made from shared() and {1!r} made from encoder() and estimator()"
         remedy = "make both sides from the keys alone, so that processes of their own agree"
         rows = [slot.row for slot in self._slots(problem, apart=True)]
-        expect_same(together, rows, slice(None), problem.batch.first_trial, said, remedy)
+        expect_same(together, rows, slice(None), problem.batch.first_trial, words, remedy)
 
     def again(self, problem: Problem) -> None:
         """The estimator gives the same answer for a slot after later slots."""
@@ -120,7 +120,7 @@ class SchemeChecks(ReceiverChecks):
         scheme = made(self._scheme_of, problem, self._kind)
         with calling("estimator()", self._kind):
             estimator = scheme.estimator(NamedKeys.of(scheme.estimator_streams), problem.batch)
-        expect_pure(estimator, [(one.before, one.heard, one.after) for one in slots], problem, self._kind)
+        expect_pure(estimator, [(slot.before, slot.heard, slot.after) for slot in slots], problem, self._kind)
 
     def first(self, problem: Problem) -> None:
         """The packet of slot 0 is not an innovation, because there is no state before it."""
@@ -136,7 +136,7 @@ class SchemeChecks(ReceiverChecks):
             return
         with calling("estimator()", self._kind):
             estimator = scheme.estimator(NamedKeys.of(scheme.estimator_streams), problem.batch)
-        steps = [(one.before, one.heard, one.after) for one in self._slots(problem)]
+        steps = [(slot.before, slot.heard, slot.after) for slot in self._slots(problem)]
         expect_actions(estimator, steps, problem, self._kind, "set reads_packets = True if it depends on more than γ")
 
     def blocks(self, problem: Problem) -> None:

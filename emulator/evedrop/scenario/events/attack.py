@@ -36,7 +36,7 @@ class Attack(EventKind):
         if given != self.attacked:
             yield self.kind, f"is {as_toml(given)}; expected {as_toml(self.attacked)}"
         else:
-            yield from ((self.kind, what) for what in self.undescribed(surroundings))
+            yield from ((self.kind, sentence) for sentence in self.undescribed(surroundings))
 
     @classmethod
     def in_turn(cls, events: Sequence[tuple[int, Self]]) -> Iterator[str]:

@@ -106,8 +106,8 @@ class EventKind(When):
         try:
             _expect_acts(list(self.acts()))
         except Exception as error:
-            said = str(error) if isinstance(error, NoAnswer) else f"acts() raised {place_of(error)}"
-            wrong = [(self.kind, f"is an event that cannot be carried out: {said}")]
+            reason = str(error) if isinstance(error, NoAnswer) else f"acts() raised {place_of(error)}"
+            wrong = [(self.kind, f"is an event that cannot be carried out: {reason}")]
             raise PydanticCustomError("mistakes", "one", {"mistakes": wrong}) from error
         return self
 
@@ -130,8 +130,8 @@ class EventKind(When):
     @property
     def names(self) -> tuple[str, ...]:
         """The receivers it happens to."""
-        found: Any = () if self.names_in is None else getattr(self, self.names_in)
-        return (found,) if isinstance(found, str) else tuple(found)
+        value: Any = () if self.names_in is None else getattr(self, self.names_in)
+        return (value,) if isinstance(value, str) else tuple(value)
 
     @property
     def first(self) -> int:
@@ -140,9 +140,9 @@ class EventKind(When):
         assert slot is not None  # noqa: S101 - checked when it was made
         return slot
 
-    def begin(self, said: str, effect: Effect) -> Act:
+    def begin(self, words: str, effect: Effect) -> Act:
         """The act with which it begins."""
-        return Act(self.first, self.kind, self.names, said, effect)
+        return Act(self.first, self.kind, self.names, words, effect)
 
 
 def _expect_acts(acts: Sequence[object]) -> None:
@@ -160,7 +160,7 @@ def _expect_acts(acts: Sequence[object]) -> None:
 
 def begun_too_early(events: Sequence[tuple[int, EventKind]]) -> Iterator[str]:
     """Mistakes where an event of a kind begins before the previous one has ended; events: each with its number."""
-    in_order = sorted(events, key=lambda one: one[1].first)
+    in_order = sorted(events, key=lambda numbered: numbered[1].first)
     for (_, before), (i, event) in pairwise(in_order):
         if before.to is None or before.to > event.first:
             yield (

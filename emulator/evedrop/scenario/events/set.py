@@ -32,12 +32,12 @@ class Set(EventKind):
     @classmethod
     def mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
         """A missing link, and an empty set of changes."""
-        found: list[Found] = []
+        mistakes: list[Found] = []
         if table.get("link") is None:
-            found.append(("link", 'is missing; expected the link that is changed, such as link = "legitimate"'))
+            mistakes.append(("link", 'is missing; expected the link that is changed, such as link = "legitimate"'))
         if table.get("set") == {}:
-            found.append(("set", "is empty; expected what changes, such as set = { quality = 0.2 }"))
-        return found
+            mistakes.append(("set", "is empty; expected what changes, such as set = { quality = 0.2 }"))
+        return mistakes
 
     def acts(self) -> Iterator[Act]:
         """The changes, and their end."""

@@ -25,5 +25,9 @@ class Spoof(Attack):
     def undescribed(self, surroundings: Surroundings) -> Iterator[str]:
         """Mistakes unless an attack on measurements is described."""
         if not surroundings.monitored:
-            able = [f"[{name}]" for name, one in applications_in(APPLICATIONS.names).items() if one.has_monitor]
+            able = [
+                f"[{name}]"
+                for name, application in applications_in(APPLICATIONS.names).items()
+                if application.has_monitor
+            ]
             yield f"no attack is described; expected a table {' or '.join(able)} with an attack as well"

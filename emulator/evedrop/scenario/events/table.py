@@ -39,16 +39,16 @@ class EventTable(When):
     def _what_mistakes(cls, table: Mapping[str, Any]) -> list[Found]:
         given = cls._given(table)
         unloadable = [name for name in cls.broken if table.get(name) is not None]
-        found: list[Found] = [(name, f"is an event{cls.broken[name]}") for name in unloadable]
+        mistakes: list[Found] = [(name, f"is an event{cls.broken[name]}") for name in unloadable]
         if len(given) != 1 and not unloadable:
-            said = f"has {listed([kind.kind for kind in given])} at once" if given else "does not say what happens"
-            found.append(("event", f'{said}; expected one of {listed([*cls.kinds])}, such as cut = "legitimate"'))
+            problem = f"has {listed([kind.kind for kind in given])} at once" if given else "does not say what happens"
+            mistakes.append(("event", f'{problem}; expected one of {listed([*cls.kinds])}, such as cut = "legitimate"'))
         if len(given) == 1:
-            found += asked(given[0], table)
+            mistakes += asked(given[0], table)
         has = {entry for kind in given for entry in kind.own_entries()}
-        alone = {entry: what for kind in cls.kinds.values() for entry, what in kind.alone.items()}
-        return found + [
-            (entry, what) for entry, what in alone.items() if table.get(entry) is not None and entry not in has
+        alone = {entry: sentence for kind in cls.kinds.values() for entry, sentence in kind.alone.items()}
+        return mistakes + [
+            (entry, sentence) for entry, sentence in alone.items() if table.get(entry) is not None and entry not in has
         ]
 
     @classmethod
@@ -102,12 +102,12 @@ def _table_of(kinds: tuple[tuple[str, type[EventKind]], ...], broken: tuple[tupl
     return table
 
 
-def event_of(found: object) -> EventKind:
+def event_of(given: object) -> EventKind:
     """The event that a table describes. Raises ValidationError with every mistake in it."""
-    if isinstance(found, EventKind):
-        return found
-    table = event_table(found if isinstance(found, Mapping) else ())
-    checked = table.model_validate(found)
+    if isinstance(given, EventKind):
+        return given
+    table = event_table(given if isinstance(given, Mapping) else ())
+    checked = table.model_validate(given)
     entries = checked.model_dump(exclude_none=True, exclude_unset=True)
     return next(kind for name, kind in table.kinds.items() if name in entries).model_validate(entries)
 

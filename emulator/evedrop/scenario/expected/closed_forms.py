@@ -34,8 +34,8 @@ class ClosedStream:
 
 def closed_of(scenario: Scenario, receiver: str) -> ClosedForm | None:
     """A receiver's closed form; None if scheme and strategy have none, or the links violate its assumptions."""
-    found = stated_form(scenario, receiver)
-    return _of_scheme(scenario, receiver) if found is None else found
+    form = stated_form(scenario, receiver)
+    return _of_scheme(scenario, receiver) if form is None else form
 
 
 def stated_form(scenario: Scenario, receiver: str) -> ClosedForm | None:

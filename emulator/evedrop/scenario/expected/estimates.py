@@ -26,7 +26,7 @@ def warnings_of(scenario: Scenario) -> list[str]:
 
     Source: docs/mathematics.md, secrecy and design (stability bound).
     """
-    found = []
+    warnings = []
     process, mu_d = scenario.process.process, scenario.encoding.mu_d
     expectation = expectations_of(scenario)[LEGITIMATE]
     alike = None if expectation.link is None else expectation.link.alike
@@ -34,28 +34,28 @@ def warnings_of(scenario: Scenario) -> list[str]:
     bound = stability_bound(process, mu)
     if alike is None:
         if math.isinf(expectation.limit):
-            found.append(
+            warnings.append(
                 f"the legitimate estimator's expected error grows without bound: with spectral radius "
                 f"{process.spectral_radius:.6g} and state_probability {mu_d:g} the losses of its link last too long"
             )
     elif expectation.has_limit and not mu_d > bound and process.spectral_radius >= 1.0 and mu < 1.0:
         needed = f"{bound:.6g}" if math.isfinite(bound) else "∞"
-        found.append(
+        warnings.append(
             f"the legitimate estimator's expected error grows without bound: state_probability is {mu_d:g}, and with "
             f"link quality {mu:g} and spectral radius {process.spectral_radius:.6g} it must exceed {needed}"
             + ("; no state_probability can, the link must be better" if bound >= 1.0 else "")
         )
-    found += _reference_warnings(scenario, mu)
-    found += [*_filter_warnings(scenario), *scheme_of(process, scenario.encoding.spec).warnings()]
+    warnings += _reference_warnings(scenario, mu)
+    warnings += [*_filter_warnings(scenario), *scheme_of(process, scenario.encoding.spec).warnings()]
     size = written_bytes(scenario)
     if size > _LARGE_BYTES:
-        found.append(
+        warnings.append(
             f"this run will write about {size / 1e9:.1f} GB of results; fewer slots or record_trials write less"
         )
     for module, source in sources_of(scenario.model_dump(mode="json")).items():
         if scenario.made_with.get(module, source) != source:
-            found.append(f"the {module} is not the one these results were made with; its digests may differ")
-    return found
+            warnings.append(f"the {module} is not the one these results were made with; its digests may differ")
+    return warnings
 
 
 def _reference_warnings(scenario: Scenario, mu: float) -> list[str]:
@@ -84,24 +84,24 @@ def _filter_warnings(scenario: Scenario) -> list[str]:
 
     Source: docs/mathematics.md, a filter at the sensor.
     """
-    found = []
+    warnings = []
     process, driven = scenario.process.process, scenario.driven
     if driven is not None and driven.output_matrix is not None:
         wanted = settled(process, driven).innovation
         if np.abs(wanted - process.Q).max() > _NEAR * np.abs(wanted).max():
             small = process.n <= _SHOWN_STATES
-            found.append(
+            warnings.append(
                 f"process.Q is {process.Q.tolist() if small else 'another'}, but the sensor's filter adds, per slot, noise "
                 f"with the covariance {wanted.tolist() if small else 'of its innovations'}: "
                 f'process.Q = "filter" uses that; inputs and disturbances are not in it'
             )
     if process.singular_noise and is_singular(process.Q):
-        found.append(
+        warnings.append(
             "process.Q is singular: apart from A, inputs and disturbances, consecutive states differ only "
             "within its range, so anybody who knows A and Q recognises, with certainty, two states in a row, and an "
             "innovation after a state"
         )
-    return found
+    return warnings
 
 
 def written_bytes(scenario: Scenario) -> float:

@@ -46,8 +46,8 @@ class KnownTraces:
 
     def next_traces(self, slots: int) -> Floats:
         """The traces of the next slots, (slots,)."""
-        found, self._left = self._left[:slots], self._left[slots:]
-        return found
+        traces, self._left = self._left[:slots], self._left[slots:]
+        return traces
 
 
 @final
@@ -145,10 +145,10 @@ class Expectation:
         outcomes = None if self.closed is not None else self._outcomes
         if outcomes is None:
             return None
-        stream, found = ExpectedCovariance(self.process, outcomes), np.empty(slots)
+        stream, variances = ExpectedCovariance(self.process, outcomes), np.empty(slots)
         for part in parts_of(range(slots)):
-            found[part.start : part.stop] = np.einsum("i,kij,j->k", v, stream.next(len(part)), v)
-        return found
+            variances[part.start : part.stop] = np.einsum("i,kij,j->k", v, stream.next(len(part)), v)
+        return variances
 
     def is_rounding(self, error: float, slots: int) -> bool:
         """Whether a mean squared error over slots 0 … slots−1 is only rounding: below 1e-24 of the state's own square."""
@@ -218,12 +218,12 @@ def expectations_of(scenario: Scenario) -> dict[str, Expectation]:
     table = scenario.process
     if table.given and not table.theory:
         return dict.fromkeys(scenario.receivers, Expectation(table.process, None, None, of_model=True, assumed=True))
-    found = {}
+    expectations = {}
     scheme, mu_d = scheme_of(scenario.process.process, scenario.encoding.spec), scenario.encoding.state_probabilities
     for name in scenario.receivers:
         closed = closed_of(scenario, name)
         bound = closed is not None and closed.bound
-        found[name] = Expectation(
+        expectations[name] = Expectation(
             scenario.process.process,
             distribution_of(scenario.schedule(name)),
             outcomes_of(scenario, name),
@@ -234,34 +234,34 @@ def expectations_of(scenario: Scenario) -> dict[str, Expectation]:
             bound_slots_at=None if mu_d is None else lambda k: partial(_bound, scheme.in_slot(k)),
             of_model=scenario.of_model,
         )
-    return found
+    return expectations
 
 
 def _in_slots(mu_d: tuple[float, ...], outcomes_in: SlotOutcomes) -> SlotOutcomes:
     """The outcomes of each slot, asked for once for each value of μ_d."""
-    known: dict[float, OutcomesAt] = {}
+    outcomes_of: dict[float, OutcomesAt] = {}
 
     def at(k: int) -> OutcomesAt:
         value = in_slot(mu_d, k)
-        if value not in known:
-            known[value] = outcomes_in(k)
-        return known[value]
+        if value not in outcomes_of:
+            outcomes_of[value] = outcomes_in(k)
+        return outcomes_of[value]
 
     return at
 
 
 def _known_in_slot(scenario: Scenario, receiver: str, scheme: Scheme, k: int) -> OutcomesAt:
-    found = _outcomes_of(scenario, receiver, scheme.in_slot(k))
-    assert found is not None  # noqa: S101 - the mean over the slots has outcomes, so each slot has
-    return found
+    outcomes = _outcomes_of(scenario, receiver, scheme.in_slot(k))
+    assert outcomes is not None  # noqa: S101 - the mean over the slots has outcomes, so each slot has
+    return outcomes
 
 
 def _bound(scheme: Scheme, quality: float) -> Outcomes:
-    found = scheme.bound_outcomes(quality)
-    assert found is not None  # noqa: S101 - checked before
-    return found
+    outcomes = scheme.bound_outcomes(quality)
+    assert outcomes is not None  # noqa: S101 - checked before
+    return outcomes
 
 
 def expected_traces_of(scenario: Scenario) -> dict[str, Floats]:
     """Receiver → trace of the expected actual error covariance in every slot, (slots,); NaN without a theory."""
-    return {name: one.traces(scenario.slots) for name, one in expectations_of(scenario).items()}
+    return {name: expectation.traces(scenario.slots) for name, expectation in expectations_of(scenario).items()}

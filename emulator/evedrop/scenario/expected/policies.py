@@ -37,12 +37,12 @@ class PolicyDesign:
 
     def as_dict(self) -> dict[str, object]:
         """The JSON of `evedrop design --policy`; `left_out` is present only if it has values."""
-        found: dict[str, object] = {
+        entries: dict[str, object] = {
             "mu": self.mu,
             "states": self.states,
-            "eavesdroppers": {name: one.as_dict() for name, one in self.fronts.items()},
+            "eavesdroppers": {name: front.as_dict() for name, front in self.fronts.items()},
         }
-        return {**found, "left_out": self.left_out} if self.left_out else found
+        return {**entries, "left_out": self.left_out} if self.left_out else entries
 
 
 def policies_of(scenario: Scenario, weights: Sequence[float], prices: Sequence[float], states: int) -> PolicyDesign:
@@ -70,7 +70,7 @@ def policies_of(scenario: Scenario, weights: Sequence[float], prices: Sequence[f
             "the design of a policy needs an eavesdropper whose error has a closed form under this scheme; expected a "
             f"strategy of {listed(sorted(set(kind.closed_forms) - {LEGITIMATE}))}"
         )
-    unknown = [name for name, one in heard.items() if one is None]
+    unknown = [name for name, conditions in heard.items() if conditions is None]
     unknown = [LEGITIMATE] if LEGITIMATE in unknown else unknown  # without the user's, no other closed form is known
     if unknown:
         raise UsageError(
@@ -96,10 +96,10 @@ def policies_of(scenario: Scenario, weights: Sequence[float], prices: Sequence[f
             f"max(0, 1 − ρ⁻²) = {bound:.6g}; give a better link, such as legitimate.link.quality={0.5 + 0.5 * bound:.3g}"
         )
     fronts = {}
-    for name, one in heard.items():
-        if name == LEGITIMATE or one is None:
+    for name, conditions in heard.items():
+        if name == LEGITIMATE or conditions is None:
             continue
-        links = ScheduledLinks(mu, one[0], acknowledged, one[1])
+        links = ScheduledLinks(mu, conditions[0], acknowledged, conditions[1])
         fronts[name] = front(process, links, weights, prices, states)
         if not fronts[name].points:
             raise UsageError(_never(scenario, name, links, max(weights), min(prices), states))
@@ -108,10 +108,10 @@ def policies_of(scenario: Scenario, weights: Sequence[float], prices: Sequence[f
 
 def _heard(scenario: Scenario, receiver: str) -> tuple[float, tuple[float, float]] | None:
     """`received` and `acknowledged` of a receiver's conditions; None if its error has no closed form under them."""
-    found = conditions_of(scenario, receiver)
-    if found.received is None or found.acknowledged is None or stated_form(scenario, receiver) is None:
+    conditions = conditions_of(scenario, receiver)
+    if conditions.received is None or conditions.acknowledged is None or stated_form(scenario, receiver) is None:
         return None
-    return found.received, found.acknowledged
+    return conditions.received, conditions.acknowledged
 
 
 def _check_numbers(scenario: Scenario, weights: Sequence[float], prices: Sequence[float], states: int) -> None:

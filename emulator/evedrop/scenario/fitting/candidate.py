@@ -47,14 +47,14 @@ class Candidate:
     @property
     def text(self) -> str:
         """The parameters, with their intervals."""
-        found = []
+        parts = []
         for name, value in self.spec.items():
             if name != "model":
                 interval = self.intervals.get(name)
-                found.append(
+                parts.append(
                     f"{name} = {value:.4g}" + (f" ({interval[0]:.4g} … {interval[1]:.4g})" if interval else "")
                 )
-        return ", ".join(found)
+        return ", ".join(parts)
 
 
 def wilson(hits: int, count: int) -> Interval:
@@ -85,7 +85,7 @@ def delay_candidates(delays: Floats) -> list[Candidate]:
         return [Candidate("constant", {"model": "constant", "value": rounded(least)}, 0.0, 1)]
     standard_deviation = float(delays.std())
     spread = -0.5 * count * (math.log(2.0 * math.pi * standard_deviation * standard_deviation) + 1.0)
-    found = [
+    candidates = [
         Candidate(
             "normal",
             {"model": "normal", "mean": rounded(mean), "standard_deviation": rounded(standard_deviation)},
@@ -101,7 +101,7 @@ def delay_candidates(delays: Floats) -> list[Candidate]:
         logs = float(np.log(delays / least).sum())
         shape = count / logs
         likelihood = count * (math.log(shape) - math.log(least)) - (shape + 1.0) * logs
-        found.append(
+        candidates.append(
             Candidate(
                 "pareto",
                 {"model": "pareto", "least": rounded(least), "shape": rounded(shape)},
@@ -110,7 +110,7 @@ def delay_candidates(delays: Floats) -> list[Candidate]:
                 {"shape": normal_interval(shape, shape / math.sqrt(count))},
             )
         )
-    return found
+    return candidates
 
 
 def bernoulli(outcomes: Outcomes) -> Candidate:
@@ -165,4 +165,6 @@ def _starts(outcomes: Outcomes) -> list[TwoStates]:
     for slots in (20.0, 200.0, 2000.0):
         if slots * 4 < len(outcomes):
             starts.append(TwoStates(0.5 / slots, 1.0 / slots, 0.3 * loss, min(0.95, 2.5 * loss)))
-    return [TwoStates(*(float(np.clip(value, 1e-4, 0.999)) for value in vars(one).values())) for one in starts]
+    return [
+        TwoStates(*(float(np.clip(value, 1e-4, 0.999)) for value in vars(two_states).values())) for two_states in starts
+    ]

@@ -54,12 +54,12 @@ class Fit:
     @property
     def chosen(self) -> Candidate:
         """The loss model with the least BIC."""
-        return min(self.candidates, key=lambda one: one.bic(self.count))
+        return min(self.candidates, key=lambda candidate: candidate.bic(self.count))
 
     @property
     def chosen_delay(self) -> Candidate | None:
         """The delay model with the least BIC; None if no delays were measured."""
-        return min(self.delay_candidates, key=lambda one: one.bic(self.delays), default=None)
+        return min(self.delay_candidates, key=lambda candidate: candidate.bic(self.delays), default=None)
 
     @property
     def link(self) -> dict[str, Any]:
@@ -95,13 +95,13 @@ class Fit:
             "trace": self.trace,
             "outcomes": self.count,
             "lost": self.lost,
-            "candidates": [one.as_dict(self.count) for one in self.candidates],
+            "candidates": [candidate.as_dict(self.count) for candidate in self.candidates],
             "chosen": self.chosen.name,
             "bursts": vars(self.bursts),
             "gaps": vars(self.gaps),
             "goodness": self.goodness,
             "delays": self.delays,
-            "delay_candidates": [one.as_dict(self.delays) for one in self.delay_candidates],
+            "delay_candidates": [candidate.as_dict(self.delays) for candidate in self.delay_candidates],
             "chosen_delay": None if delay is None else delay.name,
             "link": self.link,
             "toml": self.toml,
@@ -124,8 +124,8 @@ def fit(path: Path, column: str | None = None, delay_column: str | None = None, 
     delays = np.empty(0) if wanted is None else recording.delays(wanted)
     delays = delays[~np.isnan(delays)]
     if wanted is not None and len(delays) < FEWEST_DELAYS:
-        what = f"{wanted} has {len(delays)} delays; expected {FEWEST_DELAYS} or more, such as a longer recording"
-        raise TraceError(str(path), "file", what)
+        problem = f"{wanted} has {len(delays)} delays; expected {FEWEST_DELAYS} or more, such as a longer recording"
+        raise TraceError(str(path), "file", problem)
     return fit_outcomes(str(path), outcomes, delays)
 
 
@@ -176,31 +176,31 @@ def _runs(outcomes: Outcomes, chosen: Candidate, lost: bool) -> RunLengths:
     )
 
 
-def lines(found: Fit) -> list[str]:
+def lines(fitted: Fit) -> list[str]:
     """The fit as printed lines."""
-    fraction = 100.0 * found.lost / found.count
-    mean = "none of them ended" if found.bursts.mean is None else f"{found.bursts.mean:.4g} slots on average"
+    fraction = 100.0 * fitted.lost / fitted.count
+    mean = "none of them ended" if fitted.bursts.mean is None else f"{fitted.bursts.mean:.4g} slots on average"
     return [
-        f"{found.trace}: {found.count} outcomes, {found.lost} lost ({fraction:.4g} %), {found.bursts.count} bursts, {mean}",
-        *model_lines(found),
-        found.toml,
+        f"{fitted.trace}: {fitted.count} outcomes, {fitted.lost} lost ({fraction:.4g} %), {fitted.bursts.count} bursts, {mean}",
+        *model_lines(fitted),
+        fitted.toml,
     ]
 
 
-def model_lines(found: Fit) -> list[str]:
+def model_lines(fitted: Fit) -> list[str]:
     """The candidates, the models that were taken, and how well they fit, as printed lines."""
-    told = _table(found.candidates, found.chosen, found.count)
-    told.append(f"taken: {found.chosen.name}, by BIC; its bursts last {found.bursts.fitted:.4g} slots on average")
-    told.append(f"fit: {found.goodness}")
-    if found.chosen_delay is not None:
-        told.append(f"{found.delays} delays")
-        told += _table(found.delay_candidates, found.chosen_delay, found.delays)
+    told = _table(fitted.candidates, fitted.chosen, fitted.count)
+    told.append(f"taken: {fitted.chosen.name}, by BIC; its bursts last {fitted.bursts.fitted:.4g} slots on average")
+    told.append(f"fit: {fitted.goodness}")
+    if fitted.chosen_delay is not None:
+        told.append(f"{fitted.delays} delays")
+        told += _table(fitted.delay_candidates, fitted.chosen_delay, fitted.delays)
     return told
 
 
 def _table(candidates: Sequence[Candidate], chosen: Candidate, count: int) -> list[str]:
     rows = [f"  {'model':<16} {'log-likelihood':>16} {'BIC':>14}  parameters"]
-    for one in candidates:
-        mark = "*" if one is chosen else " "
-        rows.append(f"{mark} {one.name:<16} {one.log_likelihood:>16.2f} {one.bic(count):>14.2f}  {one.text}")
+    for tried in candidates:
+        mark = "*" if tried is chosen else " "
+        rows.append(f"{mark} {tried.name:<16} {tried.log_likelihood:>16.2f} {tried.bic(count):>14.2f}  {tried.text}")
     return rows

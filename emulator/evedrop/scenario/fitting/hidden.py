@@ -71,9 +71,9 @@ def most_likely(outcomes: Outcomes, starts: Iterable[TwoStates]) -> tuple[TwoSta
     All starting points take some steps on the first part of the recording; the best two continue to the end on all of it.
     """
     some = ChunkedOutcomes(outcomes[:_SCOUTED])
-    scouted = sorted((_climb(some, start, _SCOUTING) for start in starts), key=lambda found: -found[1])
+    scouted = sorted((_climb(some, start, _SCOUTING) for start in starts), key=lambda climbed: -climbed[1])
     whole = ChunkedOutcomes(outcomes)
-    model, likelihood = max((_climb(whole, start, _MOST) for start, _ in scouted[:2]), key=lambda found: found[1])
+    model, likelihood = max((_climb(whole, start, _MOST) for start, _ in scouted[:2]), key=lambda climbed: climbed[1])
     return model.ordered(), likelihood
 
 
@@ -171,7 +171,7 @@ class ChunkedOutcomes:
         counts = np.zeros((6, chunks))
         for t in reversed(range(steps)):
             to_good, to_bad = in_good[t] * after_good / scale[t], in_bad[t] * after_bad / scale[t]
-            known = chunks if t < self._rest else chunks - 1
+            complete = chunks if t < self._rest else chunks - 1
             was_bad = bad[t]
             was_good = 1.0 - was_bad
             moves = (
@@ -181,7 +181,7 @@ class ChunkedOutcomes:
                 was_bad * to_bad * (1.0 - r),
             )
             for count, move in zip(counts, moves, strict=False):
-                count[:known] += move[:known]
+                count[:complete] += move[:complete]
             lost = self._symbols[t] == 0
             counts[4] += (moves[0] + moves[2]) * lost
             counts[5] += (moves[1] + moves[3]) * lost
@@ -193,10 +193,10 @@ class ChunkedOutcomes:
 def _maximised(counts: Floats) -> TwoStates:
     """The parameters that make the expected counts most likely."""
     gg, gb, bg, bb, good_lost, bad_lost = counts.tolist()
-    found = (
+    fractions = (
         gb / max(_LEAST, gg + gb),
         bg / max(_LEAST, bg + bb),
         good_lost / max(_LEAST, gg + bg),
         bad_lost / max(_LEAST, gb + bb),
     )
-    return TwoStates(*(min(1.0 - _LEAST, max(_LEAST, value)) for value in found))
+    return TwoStates(*(min(1.0 - _LEAST, max(_LEAST, value)) for value in fractions))

@@ -56,8 +56,8 @@ class MessageFit:
     def _chances(self) -> dict[str, float]:
         series, corrupt = self.recording.series, self.recording.corrupt or 0.0
         whole = float(series.outcomes.sum()) * (1.0 - corrupt)  # a damaged message does not arrive twice
-        found = {"duplicate": series.repeated / whole if whole else 0.0, "corrupt": corrupt}
-        return {name: rounded(value) for name, value in found.items() if value}
+        chances = {"duplicate": series.repeated / whole if whole else 0.0, "corrupt": corrupt}
+        return {name: rounded(value) for name, value in chances.items() if value}
 
     def as_dict(self) -> dict[str, Any]:
         """The fit as JSON values."""
@@ -96,25 +96,25 @@ def fit_messages(recording: MessageRecording, slot: float | None = None) -> Mess
     )
 
 
-def message_lines(found: MessageFit) -> list[str]:
+def message_lines(fitted: MessageFit) -> list[str]:
     """The fit as printed lines."""
-    fit = found.fit
+    fit = fitted.fit
     mean = "none of them ended" if fit.bursts.mean is None else f"{fit.bursts.mean:.4g} messages on average"
     fraction = 100.0 * fit.lost / fit.count
     told = [f"{fit.trace}: {fit.count} messages, {fit.lost} lost ({fraction:.4g} %), {fit.bursts.count} bursts, {mean}"]
-    told += [f"  {sentence}" for sentence in (*_counted(found), *found.recording.notes)]
-    told += [*model_lines(fit), "# for a wire file:", found.wire_toml]
-    link = found.scenario_link
+    told += [f"  {sentence}" for sentence in (*_counted(fitted), *fitted.recording.notes)]
+    told += [*model_lines(fit), "# for a wire file:", fitted.wire_toml]
+    link = fitted.scenario_link
     if link is None:
         return [*told, "# a scenario needs the length of a slot: give --slot SECONDS"]
     if fit.chosen_delay is None:
         return [*told, "# for a scenario in which a message is a slot:", f"link = {toml_of(link)}"]
-    return [*told, f"# for a scenario with slots of {found.slot:.4g} s:", f"link = {toml_of(link)}"]
+    return [*told, f"# for a scenario with slots of {fitted.slot:.4g} s:", f"link = {toml_of(link)}"]
 
 
-def _counted(found: MessageFit) -> list[str]:
+def _counted(fitted: MessageFit) -> list[str]:
     """What else happened to the messages, in sentences."""
-    series = found.recording.series
+    series = fitted.recording.series
     told = []
     if series.repeated:
         told.append(f"{series.repeated} arrived twice")

@@ -62,17 +62,17 @@ class ProcessFit:
         """The states whose residuals depend on those before, so that noise that is white does not explain them."""
         quantile = normal_quantile(np.array([1.0 - 0.5 * _LEVEL / len(self.A)])).item()
         limit = quantile / math.sqrt(self.transitions)
-        found = zip(self.recording.names, np.abs(self.correlation), strict=True)
-        return [name for name, size in found if size > limit]
+        correlations = zip(self.recording.names, np.abs(self.correlation), strict=True)
+        return [name for name, size in correlations if size > limit]
 
     @property
     def table(self) -> dict[str, Any]:
         """The entries of `[process]`."""
         recording, entries = self.recording, {"states": list(self.recording.names)}
-        found: dict[str, Any] = {**entries, **({} if recording.units is None else {"units": list(recording.units)})}
-        found |= {} if not self.reference.any() else {"reference": self.reference.tolist()}
-        found |= {name: getattr(self, name).tolist() for name in ("A", "Q", "initial_covariance")}
-        return {**found, **({"singular_noise": True} if self.exact else {}), "theory": True}
+        entries_: dict[str, Any] = {**entries, **({} if recording.units is None else {"units": list(recording.units)})}
+        entries_ |= {} if not self.reference.any() else {"reference": self.reference.tolist()}
+        entries_ |= {name: getattr(self, name).tolist() for name in ("A", "Q", "initial_covariance")}
+        return {**entries_, **({"singular_noise": True} if self.exact else {}), "theory": True}
 
     @property
     def toml(self) -> str:
@@ -86,20 +86,20 @@ class ProcessFit:
     def remarks(self) -> list[str]:
         """The fit in sentences."""
         names = self.recording.names
-        found = [f"{self.recording.path}: {self.transitions + 1} states of {', '.join(names)}"]
-        for what, values, errors in (("A", self.A, self.A_error), ("Q", self.Q, self.Q_error)):
+        remarks = [f"{self.recording.path}: {self.transitions + 1} states of {', '.join(names)}"]
+        for matrix, values, errors in (("A", self.A, self.A_error), ("Q", self.Q, self.Q_error)):
             rows = zip(values.tolist(), errors.tolist(), strict=True)
             shown = [", ".join(f"{v:.4g} ± {e:.2g}" for v, e in zip(*row, strict=True)) for row in rows]
-            found += [f"{what}: {line}" for line in shown]
-        found.append(f"spectral radius {self.spectral_radius:.6g}")
+            remarks += [f"{matrix}: {line}" for line in shown]
+        remarks.append(f"spectral radius {self.spectral_radius:.6g}")
         if self.exact:
-            found.append(f"{', '.join(self.exact)}: without noise, so Q is singular")
+            remarks.append(f"{', '.join(self.exact)}: without noise, so Q is singular")
         if self.unexplained:
-            found.append(
+            remarks.append(
                 f"{', '.join(self.unexplained)}: the residuals depend on those before, so no process with white noise explains "
                 "them: theory describes these states only roughly; more states, or fewer slots a second, may help"
             )
-        return found
+        return remarks
 
     def as_dict(self) -> dict[str, Any]:
         """The fit as JSON values."""
@@ -110,7 +110,9 @@ class ProcessFit:
             "standard_errors": errors,
             "slot_seconds": self.recording.seconds,
             "spectral_radius": self.spectral_radius,
-            "residual_correlation": [None if math.isnan(one) else one for one in self.correlation.tolist()],
+            "residual_correlation": [
+                None if math.isnan(correlation) else correlation for correlation in self.correlation.tolist()
+            ],
             "unexplained": self.unexplained,
         }
 
@@ -136,13 +138,13 @@ def fit_process(path: Path, names: Sequence[str] | None = None, reference: Seque
         raise UsageError(f"{path} has {np.abs(x).max():g}; expected numbers of at most {LARGEST:g}")
     size = np.sqrt(np.mean(x * x, axis=0))
     scaled = x[:-1] / np.where(size > 0.0, size, 1.0)
-    found, _, rank, _ = np.linalg.lstsq(scaled, x[1:], rcond=None)
+    solution, _, rank, _ = np.linalg.lstsq(scaled, x[1:], rcond=None)
     if rank < n:
         raise UsageError(
             f"{path}: the states depend on each other, or do not move, so that A is not determined; leave some of "
             f"{', '.join(recording.names)} out, by --states"
         )
-    A = (found / size[:, None]).T
+    A = (solution / size[:, None]).T
     with np.errstate(over="ignore", invalid="ignore"):  # of states that are tiny: then A is refused
         residuals = x[1:] - x[:-1] @ A.T
     noisy = np.sqrt(np.mean(residuals * residuals, axis=0)) > _EXACT * size
@@ -155,7 +157,7 @@ def fit_process(path: Path, names: Sequence[str] | None = None, reference: Seque
     wrong = mistakes_of(A, Q, initial, not noisy.all())
     if wrong:
         raise UsageError(
-            f"{path} is not explained by a process: " + "; ".join(f"{name} {what}" for name, what in wrong)
+            f"{path} is not explained by a process: " + "; ".join(f"{name} {problem}" for name, problem in wrong)
         )
     with np.errstate(invalid="ignore", divide="ignore"):
         correlation = np.sum(residuals[1:] * residuals[:-1], axis=0) / np.sum(residuals * residuals, axis=0)

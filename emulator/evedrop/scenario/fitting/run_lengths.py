@@ -64,11 +64,11 @@ class RunLengthDistribution:
     def longer(self, most: int) -> Floats:
         """P(length > l) for l = 0 … most, (most + 1,)."""
         stay, at = (self.transitions * self.chance).tolist(), self._opening.tolist()
-        found = []
+        probabilities = []
         for _ in range(most + 1):
-            found.append(sum_in_order(at))
+            probabilities.append(sum_in_order(at))
             at = [sum_in_order(a * row[j] for a, row in zip(at, stay, strict=True)) for j in range(len(at))]
-        return np.array(found)
+        return np.array(probabilities)
 
 
 def p_value(lengths: NDArray[np.intp], distribution: RunLengthDistribution, parameters: int) -> float | None:
@@ -88,8 +88,8 @@ def p_value(lengths: NDArray[np.intp], distribution: RunLengthDistribution, para
     if len(bounds) < 2:
         return None
     expected = -np.diff([*longer[bounds], 0.0]) * len(lengths)
-    found = np.bincount(np.searchsorted(bounds, lengths, side="left") - 1, minlength=len(bounds))
-    statistic = float(((found - expected) ** 2 / expected).sum())
+    counts = np.bincount(np.searchsorted(bounds, lengths, side="left") - 1, minlength=len(bounds))
+    statistic = float(((counts - expected) ** 2 / expected).sum())
     from scipy.stats import chi2  # noqa: PLC0415 - takes a second, which reading recordings does not need
 
     return float(chi2.sf(statistic, max(1, len(bounds) - 1 - parameters)))

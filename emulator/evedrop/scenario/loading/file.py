@@ -170,8 +170,8 @@ def checked(
     # A class that breaks in a dry run breaks again when it is asked about itself: report that only once.
     mistakes = recordings + broken + _across(tables, beyond_horizon, scenario, silent=bool(broken))
     if scenario.nemesis is not None:
-        tables, found = with_faults(tables, scenario)
-        mistakes += found
+        tables, more = with_faults(tables, scenario)
+        mistakes += more
         if not mistakes:
             scenario = Scenario.read(tables)
             mistakes = _across(tables, beyond_horizon, scenario)
@@ -253,8 +253,8 @@ def with_event(scenario: Scenario, event: Mapping[str, Any], at: int) -> Scenari
     kinds = [kind for kind in EVENTS.values() if kind.by_operator]
     strange = [name for name in event if not any(name in kind.own_entries() for kind in kinds)]
     if strange:
-        known = listed([" with ".join(kind.own_entries()) for kind in kinds])
-        raise ScenarioError("event", [f"{name}: cannot be done now; expected {known}" for name in strange])
+        choices = listed([" with ".join(kind.own_entries()) for kind in kinds])
+        raise ScenarioError("event", [f"{name}: cannot be done now; expected {choices}" for name in strange])
     if scenario.modules is None and any(named_in(event)):
         name = next(iter(named_in(event)))
         raise ScenarioError(

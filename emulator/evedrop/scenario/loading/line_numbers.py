@@ -24,10 +24,10 @@ _TOKEN = re.compile(
 
 def lines_of_entries(text: str) -> dict[str, int]:
     """Dotted path → line, from 1, of each table and entry of a valid TOML text; inside a value there are no paths."""
-    found: dict[str, int] = {}
+    lines_: dict[str, int] = {}
     for path, line in _paths(text):
-        found.setdefault(path, line)
-    return found
+        lines_.setdefault(path, line)
+    return lines_
 
 
 def given_twice(text: str, line: int) -> str | None:
@@ -40,8 +40,8 @@ def given_twice(text: str, line: int) -> str | None:
     except ValueError:  # no entry, or none that can be read
         return None
     lines = dict(reversed(earlier))  # the first line of each path
-    inside = next((one for one in lines if one.startswith(f"{path}.")), None)
-    around = max((one for one in lines if path.startswith(f"{one}.")), key=len, default=None)
+    inside = next((other_path for other_path in lines if other_path.startswith(f"{path}.")), None)
+    around = max((other_path for other_path in lines if path.startswith(f"{other_path}.")), key=len, default=None)
     first = path if path in lines else inside or around
     if first is None:
         return None

@@ -48,15 +48,15 @@ _ANY_PROCESS = Process(np.eye(1), np.eye(1), np.eye(1))  # the existence of a th
 
 def mistakes_across(tables: ValidTables, beyond_horizon: bool) -> list[str]:
     """Mistakes across tables, as far as a faulty file can be checked."""
-    found: list[str] = []
+    mistakes: list[str] = []
     if tables.process is not None and tables.slots is not None and not beyond_horizon:
-        found += horizon_mistakes(tables.process.process, tables.slots)
+        mistakes += horizon_mistakes(tables.process.process, tables.slots)
     trials = tables.trials
     if trials is not None and tables.record_trials is not None and tables.record_trials > trials:
-        found.append(f"record_trials: is {tables.record_trials}; expected at most trials, which is {trials}")
+        mistakes.append(f"record_trials: is {tables.record_trials}; expected at most trials, which is {trials}")
     if trials is not None and tables.shards is not None and tables.shards > trials:
         most = f"expected at most trials, which is {trials}: a shard has one trial or more"
-        found.append(f"shards: is {tables.shards}; {most}")
+        mistakes.append(f"shards: is {tables.shards}; {most}")
     for phase in (
         scheme_mistakes,
         strategy_mistakes,
@@ -70,23 +70,23 @@ def mistakes_across(tables: ValidTables, beyond_horizon: bool) -> list[str]:
         link_mistakes,
         event_mistakes,
     ):
-        found += phase(tables)
-    if tables.scenario is not None and not found:
-        found += _application_objections(tables.scenario)
+        mistakes += phase(tables)
+    if tables.scenario is not None and not mistakes:
+        mistakes += _application_objections(tables.scenario)
     if tables.nemesis is not None and tables.all_receivers:
-        found += nemesis_mistakes(tables.nemesis, tables.slots, tables.receivers)
-    if tables.scenario is not None and not found:
+        mistakes += nemesis_mistakes(tables.nemesis, tables.slots, tables.receivers)
+    if tables.scenario is not None and not mistakes:
         try:
             _ = tables.scenario.timeline
         except ValidationError as error:
             together = "event: several of them together result in an invalid link"
-            found += [f"{together}: {line}" for line in sentences(error, LinkTable)]
+            mistakes += [f"{together}: {line}" for line in sentences(error, LinkTable)]
     if tables.secret_file is not None:
         try:
             secret_in(tables.secret_file)
         except UsageError as error:
-            found.append(str(error))
-    return [*found, *_expectation_mistakes(tables, sound=not found)]
+            mistakes.append(str(error))
+    return [*mistakes, *_expectation_mistakes(tables, sound=not mistakes)]
 
 
 def _expectation_mistakes(tables: ValidTables, sound: bool) -> Iterator[str]:
@@ -100,7 +100,7 @@ def _expectation_mistakes(tables: ValidTables, sound: bool) -> Iterator[str]:
         None if tables.process is None else list(tables.process.directions or {}),
     )
     for i, expectation in tables.expect if tables.all_receivers else ():
-        yield from (f"expect.{i}.{entry}: {what}" for entry, what in around.mistakes(expectation))
+        yield from (f"expect.{i}.{entry}: {sentence}" for entry, sentence in around.mistakes(expectation))
 
 
 def _assumed(process: ProcessTable | None) -> str | None:
@@ -132,15 +132,20 @@ def _no_theory(name: str, tables: ValidTables, sound: bool) -> str | None:
         return f"no theory covers {name}'s link"
     if tables.scenario is None or not sound:
         return None
-    known = expectations_of(tables.scenario)[name].known
-    return None if known else f"no theory covers {name} with these links, attacks and events together"
+    has_theory = expectations_of(tables.scenario)[name].known
+    return None if has_theory else f"no theory covers {name} with these links, attacks and events together"
 
 
 def _application_objections(scenario: Scenario) -> list[str]:
     """Mistakes that applications find in a scenario that is otherwise valid."""
     loop = controlled_plant(scenario)
-    found = [(name, APPLICATIONS[name], table) for name, table in scenario.applications.items() if loop is not None]
-    return [said for _, one, table in found if loop is not None for said in one.objections(loop, table)]
+    objecting = [(name, APPLICATIONS[name], table) for name, table in scenario.applications.items() if loop is not None]
+    return [
+        objection
+        for _, application, table in objecting
+        if loop is not None
+        for objection in application.objections(loop, table)
+    ]
 
 
 def horizon_mistakes(process: Process, slots: int) -> list[str]:

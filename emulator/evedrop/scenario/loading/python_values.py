@@ -59,26 +59,26 @@ class _Reader:
 
     def plain(self, path: str, value: Any) -> Any:
         """One value; None leaves out its entry."""
-        found: Any
+        made: Any
         if value is None or type(value) in _PLAIN:
-            found = value
+            made = value
         elif isinstance(value, BaseModel):
-            found = value.model_dump(mode="json", exclude_none=True, exclude_unset=True)
+            made = value.model_dump(mode="json", exclude_none=True, exclude_unset=True)
         elif isinstance(value, Mapping):
-            inner = {name: self.plain(f"{path}.{name}", one) for name, one in value.items()}
-            found = {name: one for name, one in inner.items() if one is not None}
+            inner = {name: self.plain(f"{path}.{name}", entry) for name, entry in value.items()}
+            made = {name: entry for name, entry in inner.items() if entry is not None}
         elif isinstance(value, (list, tuple, range)):
-            found = [self.plain(f"{path}.{i}", one) for i, one in enumerate(value)]
+            made = [self.plain(f"{path}.{i}", entry) for i, entry in enumerate(value)]
         elif isinstance(value, (Path, str)):  # strings of numpy, and members of an enumeration
-            found = str(value)
+            made = str(value)
         elif isinstance(value, type):
-            found = self._name(path, value)
+            made = self._name(path, value)
         elif hasattr(value, "__array__"):  # arrays and numbers of numpy, and what numpy can read, such as tensors
-            found = self._numbers(path, value)
+            made = self._numbers(path, value)
         else:
-            found = None
+            made = None
             self._refuse(path, value)
-        return found
+        return made
 
     def _numbers(self, path: str, value: Any) -> Any:
         array = np.asarray(value)
@@ -92,41 +92,41 @@ class _Reader:
         wanted = "a number, a text, a list, a dict, a numpy array of numbers, or a class"
         self.mistakes.append(f"{path}: is a {kind}{of}; expected {wanted}")
 
-    def _name(self, path: str, found: type) -> str | None:
+    def _name(self, path: str, kind: type) -> str | None:
         """The name of a class in a scenario: that of a built-in one, or MODULE:CLASS."""
         for registry in _REGISTRIES:
             for name in registry:
-                if registry[name] is found:
+                if registry[name] is kind:
                     return name
-        why = _not_importable(found)
+        why = _not_importable(kind)
         if why is not None:
-            self.mistakes.append(f"{path}: is the class {found.__name__} {why}")
+            self.mistakes.append(f"{path}: is the class {kind.__name__} {why}")
             return None
-        folder = _folder_of(found)
+        folder = _folder_of(kind)
         if folder is not None:
             self.folders.append(folder)
-        return f"{found.__module__}:{found.__name__}"
+        return f"{kind.__module__}:{kind.__name__}"
 
 
-def _not_importable(found: type) -> str | None:
+def _not_importable(kind: type) -> str | None:
     """Why other processes cannot import a class, in words that follow its name; None if they can."""
-    if found.__module__ == _MAIN:
+    if kind.__module__ == _MAIN:
         return (
             "of a notebook or of the program itself, which the processes of a run cannot import; write it to a file, such "
-            f"as mine.py (in a notebook: %%writefile mine.py at the top of its cell), then: from mine import {found.__name__}"
+            f"as mine.py (in a notebook: %%writefile mine.py at the top of its cell), then: from mine import {kind.__name__}"
         )
-    if getattr(sys.modules.get(found.__module__), found.__name__, None) is not found:
+    if getattr(sys.modules.get(kind.__module__), kind.__name__, None) is not kind:
         return (
-            f"of {found.__module__}, which the processes of a run cannot import by its name; define it at the top level "
+            f"of {kind.__module__}, which the processes of a run cannot import by its name; define it at the top level "
             "of a module, and make the scenario with the class as it is in the module now"
         )
     return None
 
 
-def _folder_of(found: type) -> str | None:
+def _folder_of(kind: type) -> str | None:
     """The folder in which the module of a class is looked for; None if the module has no file."""
-    file = getattr(sys.modules[found.__module__], "__file__", None)
+    file = getattr(sys.modules[kind.__module__], "__file__", None)
     if file is None:
         return None
-    depth = found.__module__.count(".") + (Path(file).stem == "__init__")
+    depth = kind.__module__.count(".") + (Path(file).stem == "__init__")
     return str(Path(file).absolute().parents[depth])

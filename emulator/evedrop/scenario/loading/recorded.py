@@ -95,11 +95,11 @@ def recorded_noise(folder: Path) -> float:
 def _words(tables: Mapping[str, Any]) -> dict[str, str]:
     """Receiver → its scheme or strategy, as far as the tables are valid."""
     encoding, others = tables.get("encoding"), tables.get("eavesdroppers")
-    found = {LEGITIMATE: str(encoding.get("scheme"))} if isinstance(encoding, Mapping) else {}
+    words = {LEGITIMATE: str(encoding.get("scheme"))} if isinstance(encoding, Mapping) else {}
     for name, table in others.items() if isinstance(others, Mapping) else ():
         if isinstance(table, Mapping):
-            found[name] = str(table.get("strategy"))
-    return found
+            words[name] = str(table.get("strategy"))
+    return words
 
 
 def _without_classes(tables: dict[str, Any]) -> set[str]:

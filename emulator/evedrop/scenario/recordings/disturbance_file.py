@@ -73,17 +73,17 @@ def read_disturbances(
     rows = _rows(path, limit)
     head = next(rows, None)
     if head is None:
-        what = f"is empty; expected a line of names such as {_EXAMPLE}, then a line for every slot"
-        raise DisturbanceError(str(path), [what])
+        problem = f"is empty; expected a line of names such as {_EXAMPLE}, then a line for every slot"
+        raise DisturbanceError(str(path), [problem])
     columns, mistakes = _columns(head, names, units)
     if mistakes:
         raise DisturbanceError(str(path), mistakes)
-    found = _numbers(islice(rows, limit), len(head.cells), columns)
-    numbers, mistakes = found.numbers, found.mistakes
+    columns_read = _numbers(islice(rows, limit), len(head.cells), columns)
+    numbers, mistakes = columns_read.numbers, columns_read.mistakes
     timed = columns != [] and columns[0].name == _TIME and _TIME not in names
     if timed and not mistakes:
         times = [row[0] for row in numbers]
-        mistakes = list(_few(_time_mistakes(found.lines, times, slot_seconds, recorded), "times"))
+        mistakes = list(_few(_time_mistakes(columns_read.lines, times, slot_seconds, recorded), "times"))
     if not mistakes and slots is not None and len(numbers) < slots:
         few = f"has {len(numbers)} rows; expected slots, which is {slots}, or more"
         mistakes = [f"{few}: a longer file, or slots = {len(numbers)}" if numbers else few]
@@ -119,16 +119,16 @@ def recorded_states(path: Path, names: Sequence[str] | None = None) -> StateReco
     there = [match["name"] if (match := _HEADER.match(cell)) else cell for cell in head.cells]
     names = [name for name in there if name != _TIME] if names is None else names
     columns, mistakes = _columns(head, names, None)
-    found = _numbers(islice(rows, MOST_NUMBERS // max(1, len(columns))), len(head.cells), columns)
-    if mistakes := mistakes or found.mistakes:
+    columns_read = _numbers(islice(rows, MOST_NUMBERS // max(1, len(columns))), len(head.cells), columns)
+    if mistakes := mistakes or columns_read.mistakes:
         raise DisturbanceError(str(path), mistakes)
-    numbers, seconds = found.numbers, None
+    numbers, seconds = columns_read.numbers, None
     if columns[0].name == _TIME and _TIME not in names:
         times, numbers = [row[0] for row in numbers], [row[1:] for row in numbers]
         seconds = (times[-1] - times[0]) / (len(times) - 1) if len(times) > 1 else 0.0
         if len(times) > 1 and not 0.0 < seconds < math.inf:
             raise DisturbanceError(str(path), ["has times that do not grow from line to line; expected seconds"])
-        if mistakes := list(_few(_time_mistakes(found.lines, times, seconds, recorded=True), "times")):
+        if mistakes := list(_few(_time_mistakes(columns_read.lines, times, seconds, recorded=True), "times")):
             raise DisturbanceError(str(path), mistakes)
     units = [match["unit"].strip() for cell in head.cells if (match := _HEADER.match(cell)) and match["name"] in names]
     return StateRecording(str(path), names, units if len(units) == len(names) else None, numbers, seconds)
@@ -184,40 +184,40 @@ def _rows(path: Path, slots: int) -> Iterator[_Row]:
             if any(stripped) and not stripped[0].startswith("#"):
                 yield _Row(reader.line_num, stripped)
     except (Unreadable, csv.Error) as error:
-        what = f"cannot be read ({error}); expected a CSV file whose first line is such as {_EXAMPLE}"
-        raise DisturbanceError(str(path), [what]) from error
+        problem = f"cannot be read ({error}); expected a CSV file whose first line is such as {_EXAMPLE}"
+        raise DisturbanceError(str(path), [problem]) from error
 
 
 def _columns(head: _Row, names: Sequence[str], units: Sequence[str] | None) -> tuple[list[_Column], list[str]]:
     """The column of the time, if there is one, and those of the names; and mistakes in the first line."""
-    found: dict[str, tuple[int, str | None]] = {}
+    places: dict[str, tuple[int, str | None]] = {}
     mistakes = []
     for place, cell in enumerate(head.cells):
         match = _HEADER.match(cell)
         name, unit = (match["name"], match["unit"].strip()) if match else (cell, None)
-        if name in found and name in (_TIME, *names):
+        if name in places and name in (_TIME, *names):
             mistakes.append(f'line {head.line} names "{name}" twice; expected each column once')
-        found[name] = (place, unit)
+        places[name] = (place, unit)
     columns = []
-    if _TIME in found and _TIME not in names:
-        place, unit = found[_TIME]
+    if _TIME in places and _TIME not in names:
+        place, unit = places[_TIME]
         columns.append(_Column(_TIME, place, 1.0))
         if unit not in (None, "s"):
             mistakes.append(f'line {head.line}: the column "{_TIME}" is in [{unit}]; expected {_TIME} [s]')
     for i, name in enumerate(names):
         wanted = None if units is None or i >= len(units) else units[i]
-        if name not in found:
+        if name not in places:
             there = ", ".join(f'"{cell}"' for cell in head.cells[:8])
-            known = name if wanted is None else f"{name} [{wanted}]"
-            mistakes.append(f'line {head.line} has no column "{name}", only {there}; expected {known} among them')
+            names_ = name if wanted is None else f"{name} [{wanted}]"
+            mistakes.append(f'line {head.line} has no column "{name}", only {there}; expected {names_} among them')
             continue
-        place, unit = found[name]
+        place, unit = places[name]
         factor = 1.0 if wanted is None else _factor(unit, wanted)
         if factor is None:
             given = "has no unit" if unit is None else f"is in [{unit}]"
-            choice = [wanted, *(one for one in _KILOWATTS if one != wanted)] if wanted in _KILOWATTS else [wanted]
-            known = " or ".join(f"{name} [{one}]" for one in choice)
-            mistakes.append(f'line {head.line}: the column "{name}" {given}; expected {known}')
+            choice = [wanted, *(name_ for name_ in _KILOWATTS if name_ != wanted)] if wanted in _KILOWATTS else [wanted]
+            names_ = " or ".join(f"{name} [{name_}]" for name_ in choice)
+            mistakes.append(f'line {head.line}: the column "{name}" {given}; expected {names_}')
         else:
             columns.append(_Column(name, place, factor))
     return columns, mistakes
@@ -278,12 +278,14 @@ def _time_mistakes(lines: Sequence[int], times: Sequence[float], slot_seconds: f
             continue
         slots = (time - before) / slot_seconds
         missing = round(slots) - 1 if math.isfinite(slots) else 0
-        what = "times must grow by a slot from line to line"
+        problem = "times must grow by a slot from line to line"
         if missing > 0:
-            what = f"a gap of {missing:.10g} slot{'' if missing == 1 else 's'}: fill it, such as with the line before"
+            problem = (
+                f"a gap of {missing:.10g} slot{'' if missing == 1 else 's'}: fill it, such as with the line before"
+            )
         yield (
             f"line {line}: the time is {time:.10g} s after {before:.10g} s; expected {before + slot_seconds:.10g} s, "
-            f"for slots of {slot_seconds:.10g} s: {what}"
+            f"for slots of {slot_seconds:.10g} s: {problem}"
         )
 
 

@@ -61,31 +61,31 @@ class LinkRecording:
         """
         if column is not None and lost is not None:
             self._no("lost", "is given together with column; expected one of them", "--lost: leave out --column")
-        one, zero = ("delivered", "lost") if lost is None else ("lost", "delivered")
-        found = bytearray()
+        first_word, zero = ("delivered", "lost") if lost is None else ("lost", "delivered")
+        outcomes = bytearray()
         for place, value in self._values(self._column_of_outcomes() if column is lost is None else column or lost):
             outcome = _OUTCOMES.get(value.lower())
             if outcome is None:
-                self._no("file", f"{place} is {_shown(value)}; expected 0 ({zero}) or 1 ({one})")
-            found.append(outcome if lost is None else 1 - outcome)
-            if len(found) > MOST_OUTCOMES:
+                self._no("file", f"{place} is {_shown(value)}; expected 0 ({zero}) or 1 ({first_word})")
+            outcomes.append(outcome if lost is None else 1 - outcome)
+            if len(outcomes) > MOST_OUTCOMES:
                 self._no(
                     "file", f"has more than {MOST_OUTCOMES} outcomes; expected at most that many, such as a part of it"
                 )
-        if not found:
+        if not outcomes:
             self._no("file", f"is empty; {_EXPECTED}")
-        return np.frombuffer(bytes(found), np.uint8)
+        return np.frombuffer(bytes(outcomes), np.uint8)
 
     def delays(self, column: str | None = None) -> NDArray[np.float64]:
         """The delay of each packet in slots, (packets,); NaN for empty values. Raises TraceError as `outcomes` does."""
-        found = []
+        delays = []
         for place, value in self._values(self._column_of_delays() if column is None else column):
-            found.append(self._delay(place, value))
-            if len(found) > MOST_DELAYS:
+            delays.append(self._delay(place, value))
+            if len(delays) > MOST_DELAYS:
                 self._no(
                     "file", f"has more than {MOST_DELAYS} delays; expected at most that many, such as a part of it"
                 )
-        return np.array(found)
+        return np.array(delays)
 
     def _delay(self, place: str, value: str) -> float:
         if not value:
@@ -206,7 +206,7 @@ class LinkRecording:
         for batch in table.iter_batches(columns=[names[place]]):
             values = batch.column(0)
             # Text values are taken one at a time: every row may contain the same long text.
-            for value in (one.as_py() for one in values) if _is_dictionary(values) else values.to_pylist():
+            for value in (element.as_py() for element in values) if _is_dictionary(values) else values.to_pylist():
                 row += 1
                 yield f"row {row}", _as_text(value)
 
@@ -225,8 +225,8 @@ class LinkRecording:
     def _unreadable(self, error: Exception) -> NoReturn:
         self._no("file", f"cannot be read ({why_of(error)}); {_EXPECTED}", cause=error)
 
-    def _no(self, entry: str, what: str, typed: str | None = None, cause: Exception | None = None) -> NoReturn:
-        raise TraceError(str(self._path), entry, what, typed) from cause
+    def _no(self, entry: str, problem: str, typed: str | None = None, cause: Exception | None = None) -> NoReturn:
+        raise TraceError(str(self._path), entry, problem, typed) from cause
 
 
 def _rows(file: Iterable[str]) -> Iterator[tuple[int, list[str]]]:

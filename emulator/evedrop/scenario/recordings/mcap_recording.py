@@ -122,7 +122,7 @@ class _Reader:
     def recording(self, topic: str | None, period: float | None, longest: float | None) -> MessageRecording:
         """See `mcap_recording`."""
         self._channels = self._read()
-        self._began = min((int(one.logged[0]) for one in self._channels), default=0)
+        self._began = min((int(channel.logged[0]) for channel in self._channels), default=0)
         chosen = self._chosen(topic, period)
         name = f"{self._path}, {chosen.topic}"
         if _RELIABLE[0] in chosen.metadata or _RELIABLE[1] in chosen.metadata:
@@ -157,10 +157,10 @@ class _Reader:
                     _keep(self._records(path, reader, file), channels, number)
             except Unreadable as error:
                 self._no(f"cannot be read ({why_of(error)}); expected an MCAP recording", error)
-        found = _joined_by_topic(channels.items())
-        if not found:
+        messages = _joined_by_topic(channels.items())
+        if not messages:
             self._no("has no messages; expected an MCAP recording of a topic")
-        return found
+        return messages
 
     def _files(self) -> Sequence[Path]:
         if not is_folder(self._path):
@@ -187,16 +187,16 @@ class _Reader:
             elif not read:
                 self._no("does not begin as an MCAP recording does; expected one, decompressed", error)
             else:
-                what = f"is damaged ({why_of(error)}); expected an MCAP recording, such as mcap recover makes of it"
-                self._no(what, error)
+                problem = f"is damaged ({why_of(error)}); expected an MCAP recording, such as mcap recover makes of it"
+                self._no(problem, error)
 
     def _chosen(self, topic: str | None, period: float | None) -> _Messages:
         """The messages of the topic that was named, or of the only one that can be fitted."""
-        topics = Counter(one.topic for one in self._channels)
-        candidates = [one for one in self._channels if topic in {None, one.topic}]
+        topics = Counter(channel.topic for channel in self._channels)
+        candidates = [channel for channel in self._channels if topic in {None, channel.topic}]
         if not candidates:
             self._no(f'has no topic "{topic}"; it has {self._some(self._channels)}')
-        usable = candidates if period is not None else [one for one in candidates if one.is_numbered]
+        usable = candidates if period is not None else [channel for channel in candidates if channel.is_numbered]
         if not usable:
             self._unnumbered(candidates)
         if len(usable) > 1:
@@ -210,11 +210,11 @@ class _Reader:
 
     def _unnumbered(self, candidates: Sequence[_Messages]) -> NoReturn:
         """Say why nothing can be learned from messages without numbers."""
-        one = candidates[0]
-        usual = float(np.median(np.diff(np.sort(one.sent)))) if len(one.sent) > 1 else 0.0
-        hint = f" (the median of {one.topic} is {usual:.4g} s)" if len(candidates) == 1 else ""
+        first = candidates[0]
+        usual = float(np.median(np.diff(np.sort(first.sent)))) if len(first.sent) > 1 else 0.0
+        hint = f" (the median of {first.topic} is {usual:.4g} s)" if len(candidates) == 1 else ""
         self._no(
-            f"numbers no message of {self._some(candidates)}: every sequence is {one.sequences[0]}, as ros2 bag record writes "
+            f"numbers no message of {self._some(candidates)}: every sequence is {first.sequences[0]}, as ros2 bag record writes "
             "it, so what is missing cannot be seen. If the publisher sends regularly, give its period in seconds as "
             f"--period{hint}; else record a wire's journal, or with a recorder that keeps publication_sequence_number"
         )
@@ -249,7 +249,7 @@ class _Reader:
     def _check_counter(self, messages: _Messages) -> None:
         """Raise TraceError if one counter numbers the messages of all topics, so a gap is not a loss."""
         own = set(messages.sequences.tolist())
-        others = {number for one in self._channels if one is not messages for number in one.sequences.tolist()}
+        others = {number for other in self._channels if other is not messages for number in other.sequences.tolist()}
         span = range(min(own), max(own) + 1)
         missing = len(span) - len(own)
         elsewhere = sum(span.start <= number < span.stop for number in others - own)
@@ -291,9 +291,9 @@ class _Reader:
         delays: Floats = (messages.logged - messages.published)[series.kept] / 1e9
         wrong = int((delays < 0).sum())
         if wrong or delays.max() > _LONGEST_DELAY:
-            found = f"{wrong} of {len(delays)} are negative" if wrong else f"one is {delays.max():.4g} s"
+            problem = f"{wrong} of {len(delays)} are negative" if wrong else f"one is {delays.max():.4g} s"
             self._notes.append(
-                f"no delays: {found}, so sender and recorder did not use one clock (or one used simulated time)"
+                f"no delays: {problem}, so sender and recorder did not use one clock (or one used simulated time)"
             )
             return np.empty(0)
         self._notes.append("delays are from time of publication to log time: right if one clock made both")
@@ -301,12 +301,12 @@ class _Reader:
 
     def _some(self, channels: Sequence[_Messages]) -> str:
         """Topics with their messages."""
-        shown = [f"{one.topic} ({len(one.sequences)} messages)" for one in channels[:_MOST_SHOWN]]
+        shown = [f"{channel.topic} ({len(channel.sequences)} messages)" for channel in channels[:_MOST_SHOWN]]
         more = [] if len(channels) <= _MOST_SHOWN else [f"{len(channels) - _MOST_SHOWN} more"]
         return ", ".join(shown + more)
 
-    def _no(self, what: str, cause: Exception | None = None) -> NoReturn:
-        raise TraceError(str(self._path), "file", what) from cause
+    def _no(self, problem: str, cause: Exception | None = None) -> NoReturn:
+        raise TraceError(str(self._path), "file", problem) from cause
 
 
 def _in_chunk(chunk: Chunk) -> Iterator[Any]:
@@ -344,14 +344,14 @@ def _keep(records: Iterator[Any], channels: dict[tuple[int, int], _Channel], fil
 
 def _joined_by_topic(channels: Iterable[tuple[tuple[int, int], _Channel]]) -> list[_Messages]:
     """The messages of each channel in the order of recording; a channel continues in the next file of a split bag."""
-    found: dict[tuple[str, int], list[_Channel]] = {}
+    by_topic: dict[tuple[str, int], list[_Channel]] = {}
     met: Counter[tuple[int, str]] = Counter()
     for (file, _), channel in channels:
         if channel.sequences:
             met[file, channel.topic] += 1
-            found.setdefault((channel.topic, met[file, channel.topic]), []).append(channel)
+            by_topic.setdefault((channel.topic, met[file, channel.topic]), []).append(channel)
     joined = []
-    for (topic, _), parts in found.items():
+    for (topic, _), parts in by_topic.items():
         columns = (
             np.array([value for part in parts for value in getattr(part, name)], np.uint64).astype(np.int64)
             for name in ("sequences", "logged", "published")

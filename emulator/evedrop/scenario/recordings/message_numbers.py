@@ -62,17 +62,17 @@ class MessageSeries:
 
 def joined(series: Sequence[MessageSeries]) -> MessageSeries:
     """Several series, one after the other."""
-    times = [one.seconds for one in series if one.seconds is not None]
+    times = [part.seconds for part in series if part.seconds is not None]
     return MessageSeries(
-        np.concatenate([one.outcomes for one in series]),
-        sum(one.parts for one in series),
-        sum(one.repeated for one in series),
-        sum(one.late for one in series),
-        sum(one.restarts for one in series),
-        sum(one.leaps for one in series),
-        tuple(outage for one in series for outage in one.outages),
+        np.concatenate([part.outcomes for part in series]),
+        sum(part.parts for part in series),
+        sum(part.repeated for part in series),
+        sum(part.late for part in series),
+        sum(part.restarts for part in series),
+        sum(part.leaps for part in series),
+        tuple(outage for part in series for outage in part.outages),
         float(np.median(times)) if times else None,
-        np.concatenate([one.kept for one in series]),
+        np.concatenate([part.kept for part in series]),
     )
 
 
@@ -188,6 +188,6 @@ def _outcomes(parts: Iterable[list[int]]) -> Iterable[Outcomes]:
             raise ValueError(
                 f"has more than {MOST_OUTCOMES} outcomes; expected at most that many, such as a part of it"
             )
-        found = np.zeros(last - first + 1, np.uint8)
-        found[np.array(places) - first] = 1
-        yield found
+        outcomes = np.zeros(last - first + 1, np.uint8)
+        outcomes[np.array(places) - first] = 1
+        yield outcomes

@@ -134,10 +134,10 @@ class LogChart:
 def _draw(axes: Axes, curve: Curve, axis: ErrorAxis) -> None:
     """Draw a curve; a value that is not finite interrupts it. Nothing is clipped, for everything is inside."""
     x, y, ink = curve.x, axis.inside(curve.y), curve.colour
-    known = np.isfinite(curve.y)
+    finite = np.isfinite(curve.y)
     if curve.low is not None and curve.high is not None:
         low, high = axis.inside(curve.low), axis.inside(curve.high)
-        bounded = known & np.isfinite(low) & np.isfinite(high)
+        bounded = finite & np.isfinite(low) & np.isfinite(high)
         if curve.bars:
             bounded &= low < high
             axes.vlines(x[bounded], low[bounded], high[bounded], colors=ink, linewidths=2.0, clip_on=False)
@@ -145,8 +145,8 @@ def _draw(axes: Axes, curve: Curve, axis: ErrorAxis) -> None:
             axes.fill_between(x, low, high, where=bounded, color=ink, alpha=0.25, linewidth=0.0, clip_on=False)
     if not curve.bars:
         axes.plot(x, y, color=ink, linewidth=2.0, clip_on=False)
-    between = np.concatenate([[False], known, [False]])
-    marked = known if curve.bars else known & ~between[:-2] & ~between[2:]  # a line through one point cannot be seen
+    between = np.concatenate([[False], finite, [False]])
+    marked = finite if curve.bars else finite & ~between[:-2] & ~between[2:]  # a line through one point cannot be seen
     if marked.any():
         axes.plot(x[marked], y[marked], "o", color=ink, markersize=6.5 if curve.bars else 4.0, clip_on=False)
 

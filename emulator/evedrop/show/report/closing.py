@@ -44,10 +44,10 @@ def heading(summary: Summary) -> str:
 
 def outcome(summary: Summary) -> tuple[str, bool | None]:
     """The outcome of a run in a sentence, and whether it is good; None if there is nothing to judge."""
-    said, good = expectations_outcome(summary.expectations, "scenario")
+    sentence, good = expectations_outcome(summary.expectations, "scenario")
     if summary.ended != "complete":
-        return f"{summary.ended.splitlines()[0]}; {said}", False
-    return said[0].upper() + said[1:], good
+        return f"{summary.ended.splitlines()[0]}; {sentence}", False
+    return sentence[0].upper() + sentence[1:], good
 
 
 def expectations_outcome(expectations: Sequence[Judged], of: str) -> tuple[str, bool | None]:
@@ -157,13 +157,13 @@ def doubts(summary: Summary) -> Iterator[str]:
 
 def surprise(summary: Summary) -> str | None:
     """The most surprising trial, as a sentence; None without one."""
-    one = summary.surprising
-    if one is None:
+    trial = summary.surprising
+    if trial is None:
         return None
     return (
-        f"most surprising: trial {one.trial}, {one.receiver}, mean error "
-        f"{one.mean_error:.3g} against {one.expected_error:.3g} expected after the same losses "
-        f"(probability {one.probability:.1g})"
+        f"most surprising: trial {trial.trial}, {trial.receiver}, mean error "
+        f"{trial.mean_error:.3g} against {trial.expected_error:.3g} expected after the same losses "
+        f"(probability {trial.probability:.1g})"
     )
 
 
@@ -175,16 +175,16 @@ def directions_table(directions: Mapping[str, Mapping[str, DirectionSummary]]) -
         ["by theory", "relative secrecy", "perfect secrecy"],
     )
     for receiver, entries in directions.items():
-        for direction, one in entries.items():
+        for direction, values in entries.items():
             table.add(
                 receiver,
                 direction,
-                estimate(one.mean_squared_error, one.standard_error),
-                number_text(one.expected),
-                number_text(one.z, "+.1f"),
-                {True: "unbounded", False: "bounded", None: "–"}[one.unbounded],
-                one.relative or "–",
-                one.perfect or "–",
+                estimate(values.mean_squared_error, values.standard_error),
+                number_text(values.expected),
+                number_text(values.z, "+.1f"),
+                {True: "unbounded", False: "bounded", None: "–"}[values.unbounded],
+                values.relative or "–",
+                values.perfect or "–",
             )
     return table
 

@@ -27,30 +27,30 @@ WORDS = {
 """Each verdict in a word."""
 
 
-def comparison_heading(found: Comparison) -> str:
+def comparison_heading(comparison: Comparison) -> str:
     """What was compared, and how much of it."""
-    trials = f"{found.trials:,} trials" if found.trials > 1 else "1 trial"
-    return f"{found.title} · {found.slots:,} slots · {trials}"
+    trials = f"{comparison.trials:,} trials" if comparison.trials > 1 else "1 trial"
+    return f"{comparison.title} · {comparison.slots:,} slots · {trials}"
 
 
-def comparison_lines(found: Comparison) -> Iterator[str]:
+def comparison_lines(comparison: Comparison) -> Iterator[str]:
     """Notes to the tables: what was left out or is not defined, what their words mean, and which schemes dominate."""
-    yield from _left_out(found)
-    yield from _undefined(found)
-    yield from _remarks(found)
+    yield from _left_out(comparison)
+    yield from _undefined(comparison)
+    yield from _remarks(comparison)
 
 
-def schemes_table(found: Comparison) -> TextTable:
+def schemes_table(comparison: Comparison) -> TextTable:
     """A row for each scheme: its error, its cost, and its closest adversary."""
     numbers = ("legitimate", "theory", "ACKs", "sent", "bits", "energy", "secret", "clear", "leak")
     table = TextTable.headed(["scheme"], numbers, ["closest adversary", "verdict"])
-    for name, one in found.schemes.items():
-        cell, needs = one.closest, one.needs
+    for name, scheme in comparison.schemes.items():
+        cell, needs = scheme.closest, scheme.needs
         once = f" + {needs.initial_secret_bits}" if needs.initial_secret_bits else ""
         table.add(
             name,
-            simulated(one.legitimate),
-            theory(one.legitimate),
+            simulated(scheme.legitimate),
+            theory(scheme.legitimate),
             "yes" if needs.acknowledgements else "–",
             number_text(needs.sent_fraction, ".3g"),
             number_text(needs.bits_per_slot),
@@ -58,21 +58,21 @@ def schemes_table(found: Comparison) -> TextTable:
             f"{needs.secret_bits_per_slot}{once}" if needs.secret_bits_per_slot else "–",
             *(
                 ("–", "–")
-                if one.leak is None
-                else (number_text(one.leak.clear_fraction, ".3g"), number_text(one.leak.bits, ".3g"))
+                if scheme.leak is None
+                else (number_text(scheme.leak.clear_fraction, ".3g"), number_text(scheme.leak.bits, ".3g"))
             ),
             *(("–", "–") if cell is None else (cell.match.adversary, verdict(cell))),
         )
     return table
 
 
-def pairs_table(found: Comparison) -> TextTable:
+def pairs_table(comparison: Comparison) -> TextTable:
     """A row for each pair of scheme and adversary that is defined."""
     numbers = ("its error", "theory", "z", "legitimate", "theory", "ratio")
     table = TextTable.headed(["scheme", "adversary"], numbers, ["verdict"])
-    for name, one in found.schemes.items():
+    for name, scheme in comparison.schemes.items():
         shown = name
-        for adversary, cell in one.cells.items():
+        for adversary, cell in scheme.cells.items():
             if cell.eavesdropper is None or cell.legitimate is None:
                 continue
             table.add(
@@ -114,50 +114,50 @@ def _rare_fraction(of: SimulatedError | None) -> float:
     return 0.0 if of is None or of.rare_events is None or of.infinite_variance else of.rare_events.fraction
 
 
-def _left_out(found: Comparison) -> Iterator[str]:
+def _left_out(comparison: Comparison) -> Iterator[str]:
     """A line for each scheme that cannot be used with the process."""
-    for scheme, why in found.left_out.items():
+    for scheme, why in comparison.left_out.items():
         yield f"left out: {scheme}: {'; '.join(why)}"
 
 
-def _undefined(found: Comparison) -> Iterator[str]:
+def _undefined(comparison: Comparison) -> Iterator[str]:
     """A line for each adversary and reason that a pair is not defined, with its schemes."""
-    cells = [cell.match for one in found.schemes.values() for cell in one.cells.values()]
-    why = sorted((one.adversary, one.not_defined, one.scheme) for one in cells if one.not_defined is not None)
-    for (adversary, reason), some in groupby(why, lambda one: one[:2]):
+    cells = [cell.match for match in comparison.schemes.values() for cell in match.cells.values()]
+    why = sorted((match.adversary, match.not_defined, match.scheme) for match in cells if match.not_defined is not None)
+    for (adversary, reason), some in groupby(why, lambda match: match[:2]):
         yield f"not defined: {adversary} {reason} ({', '.join(scheme for _, _, scheme in some)})"
 
 
-def _remarks(found: Comparison) -> Iterator[str]:
+def _remarks(comparison: Comparison) -> Iterator[str]:
     yield (
         "sent: the fraction of slots with a packet; bits, energy: what the sensor sends, headers included, and spends in a "
         "slot on average; secret: the most bits that a slot uses, + bits that a trial uses once; "
         "clear: the fraction of slots whose packet is the state itself; leak: the bits about the path of states that another "
         "packet reveals without the secret"
     )
-    measured = [cell.eavesdropper for one in found.schemes.values() for cell in one.cells.values()]
-    if any(one is not None and one.infinite_variance for one in measured):
+    measured = [cell.eavesdropper for scheme in comparison.schemes.values() for cell in scheme.cells.values()]
+    if any(scheme is not None and scheme.infinite_variance for scheme in measured):
         yield (
             "med: the variance over trials is infinite, so the mean says nothing; this is the median trial, which lies far "
             "below the expectation of theory"
         )
     fractions = {
-        name: max((_rare_fraction(cell.eavesdropper) for cell in one.cells.values()), default=0.0)
-        for name, one in found.schemes.items()
+        name: max((_rare_fraction(cell.eavesdropper) for cell in scheme.cells.values()), default=0.0)
+        for name, scheme in comparison.schemes.items()
     }
     rare = [
         f"{name} up to {fraction_text(fraction)}" for name, fraction in fractions.items() if fraction > RARE_FRACTION
     ]
     if rare:
         yield (
-            f"{rare_events_words(found.trials)} carry a part of expected errors, whose means and standard errors are then "
+            f"{rare_events_words(comparison.trials)} carry a part of expected errors, whose means and standard errors are then "
             f"probably too small: {', '.join(rare)}"
         )
-    if any(one is not None and one.theory is not None and one.theory.bound for one in measured):
+    if any(scheme is not None and scheme.theory is not None and scheme.theory.bound for scheme in measured):
         yield "≥: no closed form is known; a lower bound on the expected error of any receiver without the secret"
-    if found.dominant:
-        more = "each of them dominates" if len(found.dominant) > 1 else "dominates"
+    if comparison.dominant:
+        more = "each of them dominates" if len(comparison.dominant) > 1 else "dominates"
         yield (
-            f"{', '.join(found.dominant)}: {more}: no other scheme costs the legitimate estimator less in the long run, "
+            f"{', '.join(comparison.dominant)}: {more}: no other scheme costs the legitimate estimator less in the long run, "
             "and no other scheme gives the closest adversary a larger error"
         )

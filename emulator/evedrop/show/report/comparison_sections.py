@@ -42,21 +42,21 @@ class ComparisonSource:
     @property
     def outcome(self) -> str:
         """How many pairs have each verdict, as a sentence."""
-        verdicts = [cell.verdict for one in self.found.schemes.values() for cell in one.cells.values()]
+        verdicts = [cell.verdict for scheme in self.found.schemes.values() for cell in scheme.cells.values()]
         counts = [(word, verdicts.count(word)) for word in SecrecyKept]
-        said = ", ".join(f"{count:,} {word.value}" for word, count in counts if count)
-        return f"Secrecy of {sum(count for _, count in counts):,} pairs of scheme and adversary: {said}"
+        counted = ", ".join(f"{count:,} {word.value}" for word, count in counts if count)
+        return f"Secrecy of {sum(count for _, count in counts):,} pairs of scheme and adversary: {counted}"
 
 
 def _matrix(of: ComparisonSource) -> Iterator[Markup]:
     """The verdict on each scheme against each adversary."""
-    found = of.found
+    comparison = of.found
     caption = "The adversary's error over the legitimate one, and the verdict on secrecy; ·: not defined"
     rows = [
-        (name, [_cell(scheme.cells[adversary]) for adversary in found.adversaries])
-        for name, scheme in found.schemes.items()
+        (name, [_cell(scheme.cells[adversary]) for adversary in comparison.adversaries])
+        for name, scheme in comparison.schemes.items()
     ]
-    yield made("matrix", ["scheme", *found.adversaries], rows, caption)
+    yield made("matrix", ["scheme", *comparison.adversaries], rows, caption)
 
 
 def _cell(cell: Cell) -> Mapping[str, str | None]:
@@ -85,13 +85,13 @@ def _pairs(of: ComparisonSource) -> Iterator[Markup]:
 
 def _repeat(of: ComparisonSource) -> Iterator[Markup]:
     """How to repeat the simulations."""
-    found = of.found
+    comparison = of.found
     yield made(
         "paragraph",
-        f"Seed {found.seed}, trials from {found.first_trial:,} on. Each simulation of the comparison again:",
+        f"Seed {comparison.seed}, trials from {comparison.first_trial:,} on. Each simulation of the comparison again:",
     )
     commands = [
-        f"evedrop montecarlo {shlex.quote(str(path.absolute()))} --trials {found.trials}"
+        f"evedrop montecarlo {shlex.quote(str(path.absolute()))} --trials {comparison.trials}"
         for path in sorted((of.folder / "scenarios").glob("*.toml"))
     ]
     yield made("code", "\n".join(commands))

@@ -20,8 +20,8 @@ from evedrop.show.report.wire_sections import WIRE_SECTIONS, WireSource
 def run_page(folder: Path) -> Page:
     """The report of a run."""
     source = RunSource.read(folder)
-    said, good = outcome(source.summary)
-    return Page(source.summary.scenario, amount(source.summary), said, good, parts_of(RUN_SECTIONS, source))
+    sentence, good = outcome(source.summary)
+    return Page(source.summary.scenario, amount(source.summary), sentence, good, parts_of(RUN_SECTIONS, source))
 
 
 def sweep_page(folder: Path) -> Page:

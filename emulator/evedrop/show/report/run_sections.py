@@ -55,18 +55,18 @@ def _metrics(of: RunSource) -> Iterator[Markup]:
 def _errors(of: RunSource) -> Iterator[Markup]:
     """The error of every receiver, slot by slot."""
     curves = [
-        Curve(name, of.colour(name), one.slot, one.error, one.low, one.high, one.theory)
-        for name, one in of.means.items()
+        Curve(name, of.colour(name), mean.slot, mean.error, mean.low, mean.high, mean.theory)
+        for name, mean in of.means.items()
     ]
     if not curves:
         return
     several = of.summary.trials > 1
     bands = "bands: its 95 % interval; " if several else ""
-    said = f"Mean squared error over {of.summary.trials:,} trials" if several else "Squared error of the trial"
+    caption = f"Mean squared error over {of.summary.trials:,} trials" if several else "Squared error of the trial"
     chart = LogChart(
-        f"{said} in every slot, by receiver, with what theory expects. The table above has its means.",
+        f"{caption} in every slot, by receiver, with what theory expects. The table above has its means.",
         "slot",
-        f"{said}; {bands}dotted: theory",
+        f"{caption}; {bands}dotted: theory",
         curves,
         x_range=(min(curve.first for curve in of.means.values()), max(curve.last for curve in of.means.values())),
         floor=error_floor(of.noise, of.summary.trials),
@@ -85,35 +85,37 @@ def _lost_track(of: RunSource) -> Iterator[Markup]:
         f"where its squared error or tr P is more than {FACTOR:g} tr Q, and is in track elsewhere.",
     )
     table = TextTable.headed(["receiver"], ["in track", "drifting", "fooled", "spans lost", "longest"])
-    for name, one in of.trial.items():
+    for name, recorded in of.trial.items():
         table.add(
             name,
-            *(f"{fraction:.1%}" for fraction in one.track.fractions),
-            f"{one.lost.count:,}",
-            f"slots {_where(one.lost.spans[0])}" if one.lost.count else "–",
+            *(f"{fraction:.1%}" for fraction in recorded.track.fractions),
+            f"{recorded.lost.count:,}",
+            f"slots {_where(recorded.lost.spans[0])}" if recorded.lost.count else "–",
         )
     yield made("table", table, "Fractions of the slots, and spans in which the receiver lost track")
     used = {code for lanes in of.trial.values() for code, fraction in enumerate(lanes.outcome.fractions) if fraction}
     yield made("legend", "Upper lanes:", KNOWLEDGE.legend())
     yield made("legend", "Lower lanes, packets:", EAVESDROPPER.legend(used))
-    for name, one in of.trial.items():
-        yield from _lanes(name, one)
+    for name, recorded in of.trial.items():
+        yield from _lanes(name, recorded)
 
 
 def _where(span: LostSpan) -> str:
     return f"{span.first:,} to {span.last:,}" if span.slots > 1 else f"{span.first:,}"
 
 
-def _lanes(name: str, one: RecordedTrial) -> Iterator[Markup]:
+def _lanes(name: str, recorded: RecordedTrial) -> Iterator[Markup]:
     """The two lanes of a receiver, and its longest spans."""
-    spans = one.lost.spans
+    spans = recorded.lost.spans
     yield made("heading", name)
-    label = f"{name}: in track in {one.track.fractions[Track.IN_TRACK]:.1%} of the slots 0 to {one.last:,}"
-    yield lane_picture(KNOWLEDGE, one.track.highest, label)
+    label = f"{name}: in track in {recorded.track.fractions[Track.IN_TRACK]:.1%} of the slots 0 to {recorded.last:,}"
+    yield lane_picture(KNOWLEDGE, recorded.track.highest, label)
     counted = ", ".join(
-        f"{fraction:.1%} {word}" for word, fraction in zip(OUTCOMES, one.outcome.fractions, strict=True) if fraction
+        f"{fraction:.1%} {word}"
+        for word, fraction in zip(OUTCOMES, recorded.outcome.fractions, strict=True)
+        if fraction
     )
-    yield lane_picture(EAVESDROPPER, one.outcome.commonest, f"{name}: packets by what became of them: {counted}")
+    yield lane_picture(EAVESDROPPER, recorded.outcome.commonest, f"{name}: packets by what became of them: {counted}")
     if spans:
         items = [
             f"slots {_where(span)}: lost track for {span.slots:,}"
@@ -141,15 +143,15 @@ def _links(of: RunSource) -> Iterator[Markup]:
         ["offered", "delivered", "late", "lost", "let through", "model", "interval"],
         ["within", "lost by"],
     )
-    for name, one in of.summary.links.items():
+    for name, link in of.summary.links.items():
         table.add(
             name,
-            *(f"{count:,}" for count in (one.offered, one.delivered, one.late, one.lost)),
-            number_text(one.rate, ".4f"),
-            number_text(one.expected_rate, ".4f"),
-            "–" if one.interval is None else f"{one.interval[0]:.4f} to {one.interval[1]:.4f}",
-            {True: "yes", False: "NO", None: "–"}[one.within_interval],
-            ", ".join(f"{count:,} {reason}" for reason, count in one.lost_by.items()) or "–",
+            *(f"{count:,}" for count in (link.offered, link.delivered, link.late, link.lost)),
+            number_text(link.rate, ".4f"),
+            number_text(link.expected_rate, ".4f"),
+            "–" if link.interval is None else f"{link.interval[0]:.4f} to {link.interval[1]:.4f}",
+            {True: "yes", False: "NO", None: "–"}[link.within_interval],
+            ", ".join(f"{count:,} {reason}" for reason, count in link.lost_by.items()) or "–",
         )
     if table.rows:
         yield made(

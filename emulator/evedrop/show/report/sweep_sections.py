@@ -52,13 +52,13 @@ class SweepSource:
     def read(cls, folder: Path) -> SweepSource:
         """Read a folder. Raises UsageError if it is not that of a sweep."""
         try:
-            found = json.loads(text_of(folder / "sweep.json", _MOST_BYTES))
-            rows, grid = pq.read_table(folder / SWEEP_TABLE).to_pylist(), found["over"]
+            entries = json.loads(text_of(folder / "sweep.json", _MOST_BYTES))
+            rows, grid = pq.read_table(folder / SWEEP_TABLE).to_pylist(), entries["over"]
             done, planned = len({tuple(row[key] for key in grid) for row in rows}), math.prod(map(len, grid.values()))
             sizes = (_size([row[name] for row in rows], name) for name in ("slots", "trials"))
             amount = " · ".join((f"{done:,} points of {', '.join(grid)}", *sizes))
             outcome = f"All {planned:,} points were done" if done == planned else f"{done:,} of {planned:,} points"
-            return cls(folder, rows, found["scenario"], found["changes"], grid, found["mode"], amount, outcome)
+            return cls(folder, rows, entries["scenario"], entries["changes"], grid, entries["mode"], amount, outcome)
         except Exception as error:  # pyarrow raises many kinds of errors for a damaged file
             raise UsageError(f"{folder} cannot be read as a sweep ({error}); run the sweep again") from error
 
@@ -71,13 +71,13 @@ def _size(counts: Sequence[int], of: str) -> str:
 
 def _verdicts(of: SweepSource) -> Iterator[Markup]:
     """The number of points in which secrecy held."""
-    found, lines = dict[str, Counter[str]](), list[str]()
+    counts_of, lines = dict[str, Counter[str]](), list[str]()
     for row in of.rows:
         if row["relative_secrecy"] is not None:
-            found.setdefault(row["peer"], Counter())[row["relative_secrecy"]] += 1
-    for name, counts in found.items():
-        said = ", ".join(f"{said} at {count:,} point{'' if count == 1 else 's'}" for said, count in counts.items())
-        lines.append(f"{name}: relative secrecy: {said}")
+            counts_of.setdefault(row["peer"], Counter())[row["relative_secrecy"]] += 1
+    for name, counts in counts_of.items():
+        word = ", ".join(f"{word} at {count:,} point{'' if count == 1 else 's'}" for word, count in counts.items())
+        lines.append(f"{name}: relative secrecy: {word}")
     yield made("sentences", lines)
 
 
@@ -104,19 +104,19 @@ def _errors(of: SweepSource) -> Iterator[Markup]:
 def _curve(name: str, i: int, rows: Sequence[Mapping[str, Any]], key: str, words: Sequence[str] | None) -> Curve:
     """The curve of the i-th receiver; words: the names of the places of the axis, if it has names."""
     marks, lines = (
-        [one for one, kind in all_metrics().items() if kind.sweep_picture == way] for way in ("marks", "lines")
+        [metric for metric, kind in all_metrics().items() if kind.sweep_picture == way] for way in ("marks", "lines")
     )
     x = [float(row[key]) if words is None else float(words.index(str(row[key]))) for row in rows]
     y, theory = (_values(rows, names) for names in (marks, lines))
-    scatter = 1.96 * np.nan_to_num(_values(rows, [error_column(one) for one in marks]))
+    scatter = 1.96 * np.nan_to_num(_values(rows, [error_column(metric) for metric in marks]))
     return Curve(
         name, palette.hexadecimal(palette.colour(i)), np.array(x), y, y - scatter, y + scatter, theory, bars=True
     )
 
 
 def _values(rows: Sequence[Mapping[str, Any]], names: list[str]) -> Floats:
-    found = [shown_metric(row, names) for row in rows]
-    return np.array([math.nan if one is None else one for one in found], np.float64)
+    metrics = [shown_metric(row, names) for row in rows]
+    return np.array([math.nan if metric is None else metric for metric in metrics], np.float64)
 
 
 def _metrics(of: SweepSource) -> Iterator[Markup]:

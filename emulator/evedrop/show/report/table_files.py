@@ -29,16 +29,16 @@ def csv_text(table: TextTable) -> str:
     columns = [[*cells] for cells in zip(*_whole_rows(table), strict=True)] or [[] for _ in table.columns]
     heads: list[str] = []
     written: list[Sequence[str]] = []
-    for heading, cells in zip(_distinct([one.heading for one in table.columns]), columns, strict=True):
+    for heading, cells in zip(_distinct([number.heading for number in table.columns]), columns, strict=True):
         numbers = [cell if isinstance(cell, ShownNumber) else ShownNumber(cell, None) for cell in cells]
         heads.append(heading)
         written.append([_value(cell) for cell in cells])
-        if any(one.error is not None for one in numbers):
+        if any(number.error is not None for number in numbers):
             heads.append(f"{heading} {ERROR}")
-            written.append(["" if one.error is None else repr(float(one.error)) for one in numbers])
-        if any(one.after for one in numbers):
+            written.append(["" if number.error is None else repr(float(number.error)) for number in numbers])
+        if any(number.after for number in numbers):
             heads.append(f"{heading} {UNIT}")
-            written.append([one.after.strip() for one in numbers])
+            written.append([number.after.strip() for number in numbers])
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(heads)
@@ -63,14 +63,14 @@ def _whole_rows(table: TextTable) -> list[tuple[str, ...]]:
 
 def _distinct(heads: Sequence[str]) -> list[str]:
     """The headings; one that another column has too gets the heading before it, or a number."""
-    found: list[str] = []
+    names_: list[str] = []
     for i, head in enumerate(heads):
         name = head if heads.count(head) == 1 or not i else f"{heads[i - 1]}: {head}"
         count = 2
-        while name in found:
+        while name in names_:
             name, count = f"{head} {count}", count + 1
-        found.append(name)
-    return found
+        names_.append(name)
+    return names_
 
 
 def latex_text(table: TextTable) -> str:
@@ -114,13 +114,13 @@ _NO_COMMAND = {
 
 def latex_escaped(text: str) -> str:
     """A text that LaTeX shows as it is: Greek letters, x̂, ± and ∞ as mathematics, and its own characters escaped."""
-    found: list[str] = []
+    parts: list[str] = []
     for character in unicodedata.normalize("NFD", text):
-        if character in _ACCENTS and found:
-            found.append(f"${_ACCENTS[character]}{{{found.pop().strip('$')}}}$")
+        if character in _ACCENTS and parts:
+            parts.append(f"${_ACCENTS[character]}{{{parts.pop().strip('$')}}}$")
         else:
-            found.append(_escaped(character))
-    whole = _POWERS.sub(lambda match: match[0].replace(f"}}$${match[1]}{{", ""), "".join(found))
+            parts.append(_escaped(character))
+    whole = _POWERS.sub(lambda match: match[0].replace(f"}}$${match[1]}{{", ""), "".join(parts))
     return unicodedata.normalize("NFC", whole.replace("$$", ""))
 
 
@@ -147,8 +147,8 @@ def write_csv(tables: Sequence[TextTable], path: Path) -> list[Path]:
     Raises UsageError if a file cannot be written.
     """
     paths = [path, *(path.with_name(f"{path.stem}-{number}{path.suffix}") for number in range(2, len(tables) + 1))]
-    for one, table in zip(paths, tables, strict=False):
-        _write(one, csv_text(table))
+    for target, table in zip(paths, tables, strict=False):
+        _write(target, csv_text(table))
     return paths[: len(tables)]
 
 

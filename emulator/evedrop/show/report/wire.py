@@ -47,24 +47,24 @@ def reasons_table(summary: WireSummary) -> TextTable:
     """Why messages did not arrive: a row for each link and reason."""
     table = TextTable.headed(["link"], ["messages"], ["reason"])
     for name, link in summary.links.items():
-        for by, said in ((link.lost_by, "lost"), (link.dropped_by, "dropped by the wire itself, or Zenoh")):
+        for by, fate in ((link.lost_by, "lost"), (link.dropped_by, "dropped by the wire itself, or Zenoh")):
             for reason, count in by.items():
-                table.add(name, f"{count:,}", f"{said}: {reason.replace('_', ' ')}")
+                table.add(name, f"{count:,}", f"{fate}: {reason.replace('_', ' ')}")
     return table
 
 
 def wire_outcome(summary: WireSummary) -> tuple[str, bool | None]:
     """The outcome of a wire in a sentence, and whether it is good; None if there is nothing to judge."""
-    said, good = expectations_outcome(summary.expectations, "wire")
+    sentence, good = expectations_outcome(summary.expectations, "wire")
     if summary.unaccounted:
-        return f"unaccounted for: {_messages(summary.unaccounted)}; {said}", False
+        return f"unaccounted for: {_messages(summary.unaccounted)}; {sentence}", False
     if summary.bypasses:
-        return f"no verdict, because programs could speak past the wire; {said}", False
+        return f"no verdict, because programs could speak past the wire; {sentence}", False
     if summary.journal.incomplete_since is not None:
-        return f"the journal is incomplete; {said}", False
+        return f"the journal is incomplete; {sentence}", False
     if _unfinished(summary):
-        return f"{_unfinished(summary)}; {said}", False if good is False else None
-    return said[0].upper() + said[1:], good
+        return f"{_unfinished(summary)}; {sentence}", False if good is False else None
+    return sentence[0].upper() + sentence[1:], good
 
 
 def wire_sentences(summary: WireSummary) -> Iterator[str]:

@@ -56,10 +56,10 @@ class WireSource:
         """A folder whose summary is known."""
         sides = [*dict.fromkeys(side for link in summary.links.values() for side in (link.source, link.target))]
         title = f"Wire of {', '.join(sides[:-1])} and {sides[-1]}" if sides else "Wire without links"
-        events = [(f"{one.seconds:,.1f} s", one.event) for one in summary.events]
+        events = [(f"{entry.seconds:,.1f} s", entry.event) for entry in summary.events]
         try:
             tables = tomllib.loads(text_of(folder / WIRE_FILE, _MOST_BYTES))
-            models = {one["name"]: _model(one["loss"]) for one in tables["link"]}
+            models = {entry["name"]: _model(entry["loss"]) for entry in tables["link"]}
         except (OSError, Unreadable, ValueError, KeyError, TypeError, AttributeError, RecursionError):
             models = {}
         return cls(folder, summary, title, wire_title(summary), wire_outcome(summary), models, events)
@@ -68,8 +68,8 @@ class WireSource:
 def _model(loss: Mapping[str, Any]) -> str:
     """A loss model with its parameters, such as "bernoulli: quality = 0.6"; a long recording is cut off."""
     words = ", ".join(f"{key} = {value}" for key, value in loss.items() if key != "model")
-    said = f"{loss['model']}: {words}" if words else str(loss["model"])
-    return said if len(said) <= _MOST_WORDS else f"{said[:_MOST_WORDS]}…"
+    text = f"{loss['model']}: {words}" if words else str(loss["model"])
+    return text if len(text) <= _MOST_WORDS else f"{text[:_MOST_WORDS]}…"
 
 
 def _expectations(of: WireSource) -> Iterator[Markup]:
@@ -105,8 +105,8 @@ def _losses(of: WireSource) -> Iterator[Markup]:
 def _events(of: WireSource) -> Iterator[Markup]:
     """Cuts, partitions and changes, of the file and of operators."""
     table = TextTable.headed([], ["at"], ["event"])
-    for one in of.events[:_MOST_EVENTS]:
-        table.add(*one)
+    for event in of.events[:_MOST_EVENTS]:
+        table.add(*event)
     if table.rows:
         more = f"; the first {_MOST_EVENTS} of {len(of.events):,}" if len(of.events) > _MOST_EVENTS else ""
         yield made("table", table, f"Cuts, partitions and changes, in seconds since the start{more}")
