@@ -112,14 +112,14 @@ def _become(request: bytes, files: list[int], own: tuple[int, int]) -> NoReturn:
         for file in (*files, *own):
             os.close(file)
         message = json.loads(request)
+        if message["folder"] is not None:
+            os.chdir(message["folder"])
+        os.umask(message["umask"])
         sys.argv[1:] = message["words"]
         # Before the environment changes, next to which the system keeps the command line.
         setproctitle(" ".join([sys.executable, "-P", "-m", "evedrop", *message["words"]]))
         os.environ.clear()
         os.environ.update(message["environment"])
-        if message["folder"] is not None:
-            os.chdir(message["folder"])
-        os.umask(message["umask"])
         from evedrop.__main__ import program  # noqa: PLC0415 - not needed by the process that forks
 
         program()
