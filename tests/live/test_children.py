@@ -163,6 +163,15 @@ def test_who_ends_for_lack_of_a_recorder_is_not_at_fault(bench: Bench, first: Pr
     assert "logs/eve.log" not in report
 
 
+def test_who_ends_for_lack_of_another_process_is_named(bench: Bench) -> None:
+    """The recorder was there."""
+    bench.starter.status = 3
+    for name in ("eve", "recorder"):
+        bench.children.start(bench.briefs[name])
+    bench.leaves("eve", LastWord.about(MissingProcesses("eve", ("legitimate",), "within 30 s; start them")))
+    assert bench.children.failure_report(ProcessExit("eve", 3), None).startswith("eve")
+
+
 @pytest.mark.parametrize(
     ("key", "sender"),
     [

@@ -29,7 +29,7 @@ from evedrop.live.launch.other_hosts import (
     own_version,
 )
 from evedrop.live.launch.starter import CONNECTION_LOST, FORK_SERVER_LOST
-from evedrop.live.protocol.last_word import last_word_file, read_last_word
+from evedrop.live.protocol.last_word import Cause, LastWord, last_word_file, read_last_word
 from evedrop.system.environment import own_environment
 from tests.conftest import LIMIT, wait_until
 from tests.live.network.bench import brief_of_eve
@@ -114,6 +114,19 @@ def test_a_process_whose_fork_server_is_gone_is_lost_with_its_host(connect: Conn
         with pytest.raises(RunError, match=r"^eve cannot be started: the connection with host beta ended: ssh ended"):
             host.start(8, brief_of_eve().write(tmp_path), file, {})
         host.close(time.monotonic() + LIMIT)
+
+
+def test_the_last_word_of_a_process_there_is_read_here(connect: Connect, tmp_path: Path) -> None:
+    """From the file in which a process of this machine would have left it."""
+    host = connect(GREETING)
+    ready(host)
+    file, word = last_word_file(tmp_path, "eve"), LastWord(Cause.NO_CONNECTION, "no router", ("router",))
+    with (tmp_path / "eve.log").open("wb") as log:
+        process = host.start(7, replace(brief_of_eve(), last_word=str(file)).write(tmp_path), log, {})
+    host._take(answer_in(line_of(ProcessEnded(7, 3, word))))
+    assert process.poll() == 3
+    assert read_last_word(file) == word
+    host.close(time.monotonic() + LIMIT)
 
 
 def test_what_a_login_shell_prints_is_passed_over(connect: Connect) -> None:
