@@ -12,7 +12,8 @@ COPY tools/constraints/project.txt build/wheels* /wheels/
 RUN if ls /wheels/*.whl >/dev/null 2>&1; then index=--no-index; fi; \
     /build/bin/pip download --quiet --disable-pip-version-check --no-cache-dir $index --find-links /wheels \
       --require-hashes --no-deps --requirement /wheels/project.txt --dest /packages
-COPY pyproject.toml hatch_build.py README.md LICENSE /source/
+COPY pyproject.toml README.md LICENSE /source/
+COPY tools/hatch_build.py /source/tools/
 COPY docs /source/docs
 COPY emulator /source/emulator
 COPY peers /source/peers
@@ -24,7 +25,7 @@ FROM ${EVEDROP_BASE:-${PINNED}}
 # A user of no other rights; whoever starts a container may name another one.
 RUN groupadd --gid 1000 evedrop && useradd --uid 1000 --gid 1000 --home-dir /tmp --no-create-home evedrop
 COPY --from=build /opt/evedrop /opt/evedrop
-COPY containers/briefs.sh containers/forward.py /opt/evedrop/
+COPY tools/containers/briefs.sh tools/containers/forward.py /opt/evedrop/
 ENV PATH=/opt/evedrop/bin:$PATH PYTHONUNBUFFERED=1 OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 EVEDROP_HEARTBEAT=/tmp/evedrop-heartbeat
 USER evedrop
 WORKDIR /tmp

@@ -101,7 +101,7 @@ setup: $(READY)
 # The locked versions, each checked against its hash; then this project itself, which needs no download. Its C kernels are
 # compiled with the machine's compiler, or that of the package ziglang if it is in the environment; without either, pip succeeds
 # all the same, and numpy does their work.
-$(READY): tools/constraints/project.txt pyproject.toml hatch_build.py $(wildcard emulator/evedrop/model/kernels/binding.py emulator/evedrop/model/kernels/source/*)
+$(READY): tools/constraints/project.txt pyproject.toml tools/hatch_build.py $(wildcard emulator/evedrop/model/kernels/binding.py emulator/evedrop/model/kernels/source/*)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python tools/install.py tools/constraints/project.txt
 	$(BIN)/python tools/install.py --project .

@@ -21,7 +21,7 @@ from evedrop.model.kernels import choice
 pytestmark = pytest.mark.wheel
 ROOT = Path(__file__).parents[1]
 REQUIRED = "EVEDROP_KERNELS_REQUIRED"
-SOURCES = ("pyproject.toml", "hatch_build.py", "README.md", "LICENSE")
+SOURCES = ("pyproject.toml", "tools/hatch_build.py", "README.md", "LICENSE")
 FOLDERS = ("emulator", "peers", "scenarios")
 BUILD = """
 import runpy, sys
@@ -36,8 +36,9 @@ def build(folder: Path, without: str = "-", **changes: str) -> subprocess.Comple
     copy = folder / "copy"
     for name in FOLDERS:
         shutil.copytree(ROOT / name, copy / name, True, shutil.ignore_patterns("_compiled*", "__pycache__"))
+    (copy / "tools").mkdir()
     for name in SOURCES:
-        shutil.copy(ROOT / name, copy)
+        shutil.copy(ROOT / name, copy / name)
     environment = {name: value for name, value in os.environ.items() if name not in {REQUIRED, "CC"}} | changes
     words = [sys.executable, "-c", BUILD, "build", "-t", "wheel", "-d", str(folder / "dist"), without]
     return subprocess.run(words, cwd=copy, env=environment, capture_output=True, text=True, check=False, timeout=300)

@@ -109,7 +109,7 @@ def test_a_build_replaces_only_the_kernels_of_its_own_python(tmp_path: Path) -> 
     )
     for name in (own, other):
         (kernels / name).touch()
-    hook = runpy.run_path(str(Path(__file__).parents[3] / "hatch_build.py"))["KernelsHook"]
+    hook = runpy.run_path(str(Path(__file__).parents[3] / "tools" / "hatch_build.py"))["KernelsHook"]
     said = Mock()
     hook(str(tmp_path), {}, None, None, str(tmp_path), "wheel", said).initialize("editable", {})
     assert [path.name for path in kernels.glob("_compiled.*")] == [other]

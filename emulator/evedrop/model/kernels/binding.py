@@ -1,6 +1,6 @@
 """The binding of the C kernels, made by cffi when the package is built. A run never imports this module.
 
-`compile_kernels` is called by `hatch_build.py`, with the machine's compiler or the one in the `ziglang` wheel.
+`compile_kernels` is called by `tools/hatch_build.py`, with the machine's compiler or the one in the `ziglang` wheel.
 """
 
 from __future__ import annotations
