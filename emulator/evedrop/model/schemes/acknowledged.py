@@ -100,6 +100,7 @@ class Acknowledged(_AcknowledgedReferences):
     """
 
     closed_forms = MappingProxyType({"legitimate": _reference_form, "reference": _reference_form})
+    lost_reference = _AcknowledgedReferences.lost_reference
     header = ("slot t of the reference; −1: none, z is the state",)
 
     def warnings(self) -> list[str]:
@@ -134,6 +135,7 @@ class OpenLoop(_AcknowledgedReferences):
     """
 
     closed_forms = MappingProxyType({"legitimate": _open_loop_form, "reference": _open_loop_form})
+    lost_reference = _AcknowledgedReferences.lost_reference
     header = ("slot t of the reference; −1: no reference", "0: z is the state; 2: z is the state minus A^{k−t} x_t")
 
     def _encoder(self, trials: int) -> Encoder:
