@@ -11,11 +11,9 @@ Source: docs/microgrid.md, privacy.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evedrop.model.process import Floats
-
-Flags = NDArray[np.bool_]
+from evedrop.model.receiver import Flags
 
 
 def means(values: Floats, window: int) -> Floats:

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from evedrop.model.process import Floats
+from evedrop.studies.applications.microgrid.appliances import SECONDS
 from evedrop.studies.applications.microgrid.draws import Draws
-
-SECONDS = 86_400
 
 
 @dataclass(frozen=True)
