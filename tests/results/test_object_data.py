@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evedrop.errors import ScenarioError, UsageError
-from evedrop.results.object_data import NotData, packed, unpacked
+from evedrop.results.shard_score import NotData, packed, unpacked
 from evedrop.scenario.loading import load, shipped
 from evedrop.simulate.montecarlo import check_mode
 from evedrop.simulate.simulation import Mode

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from evedrop.errors import RunError
-from evedrop.results.object_data import packed
-from evedrop.results.shard_score import dump_score, load_score
+from evedrop.results.shard_score import dump_score, load_score, packed
 from evedrop.scenario.loading import load
 from evedrop.scenario.tables import Scenario
 from evedrop.score.run_tally import RunTally

@@ -15,7 +15,7 @@ import pytest
 
 from evedrop.cli.main import main
 from evedrop.errors import UsageError
-from evedrop.results.wire_folder import WIRE_FILE
+from evedrop.results.wire_summary import WIRE_FILE
 from evedrop.system.files import is_locked
 from evedrop.wire import journal as journal_module
 from evedrop.wire.file import resolved_wire

@@ -16,7 +16,7 @@ from PIL import Image
 
 from evedrop.cli.main import main
 from evedrop.errors import UsageError
-from evedrop.results.wire_folder import WIRE_FILE
+from evedrop.results.wire_summary import WIRE_FILE
 from evedrop.wire import recording
 from evedrop.wire.file import resolved_wire
 from evedrop.wire.journal import WireJournal

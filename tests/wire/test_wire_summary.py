@@ -13,8 +13,7 @@ from typing import Any
 import pytest
 
 from evedrop.errors import ScenarioError, UsageError
-from evedrop.results.wire_folder import WIRE_FILE
-from evedrop.results.wire_summary import WireLinkSummary, WireSummary
+from evedrop.results.wire_summary import WIRE_FILE, WireLinkSummary, WireSummary
 from evedrop.show.report.wire import WITHOUT_MODEL, wire_failures, wire_sentences, wire_table
 from evedrop.show.report.writing import write_report
 from evedrop.wire.file import resolved_wire, wire_of

@@ -17,7 +17,7 @@ import pyarrow as pa
 from pydantic import TypeAdapter
 
 from evedrop.errors import UsageError
-from evedrop.results.by_name import ByName
+from evedrop.results.reading import ByName
 from evedrop.results.writer import plain
 from evedrop.score.summary import RareEvents, SecrecySummary
 from evedrop.score.verdict import Secrecy, SecrecyKept, Verdict

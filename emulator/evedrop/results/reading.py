@@ -10,13 +10,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeVar, final
 
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from evedrop.errors import UsageError
+from evedrop.errors import UnknownName, UsageError
 from evedrop.model.digest import DIGEST_BYTES
 from evedrop.model.streams import MOST_SLOTS
 from evedrop.results.growing_tables import batches_of, goes_on, is_unfinished, last_round, metrics_path, schema_of
@@ -26,6 +26,22 @@ from evedrop.scenario.arguments import path_argument
 from evedrop.scenario.progress_events import RunEvent
 from evedrop.score.summary import Summary
 from evedrop.system.files import Unreadable, opened, text_of
+
+T = TypeVar("T")
+
+
+@final
+class ByName(dict[str, T]):
+    """Entries of results by name. An unknown name raises UnknownName, a KeyError that lists the known ones."""
+
+    def __init__(self, kind: str, entries: Mapping[str, T]) -> None:
+        """what: the kind of entry, such as "receiver"."""
+        super().__init__(entries)
+        self._what = kind
+
+    def __missing__(self, name: object) -> T:
+        raise UnknownName(self._what, name, self)
+
 
 _MOST_BYTES = 2**28
 _PIECE_ROWS = 8192

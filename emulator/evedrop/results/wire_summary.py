@@ -1,6 +1,7 @@
-"""The contents of a wire's summary.json as typed classes: `WireSummary`, and a class for each kind of entry in it.
+"""The files of a wire's folder that other packages look for, and the contents of its summary.json as typed classes.
 
-The fields of a class are the entry's keys, in their order. Imports neither Zenoh nor Rerun.
+`WireSummary` has a class for each kind of entry in it; the fields of a class are the entry's keys, in their order. Imports
+neither Zenoh nor Rerun.
 
 Source: docs/wire.md, the summary.
 """
@@ -21,6 +22,16 @@ from evedrop.system.files import Unreadable, text_of
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
+
+
+WIRE_FILE = "wire.toml"
+"""The complete wire file in a wire's folder."""
+
+
+def is_wire(folder: Path) -> bool:
+    """Whether a results folder is that of a wire."""
+    return (folder / WIRE_FILE).is_file()
+
 
 WIRE_SUMMARY_FILE = "summary.json"
 """The summary in a wire's folder, written when the wire ends."""

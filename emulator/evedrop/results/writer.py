@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from evedrop.model.digest import Digests
+from evedrop.model.digest import DigestLog, Digests
 from evedrop.model.links.loss_model import REASONS
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats
@@ -25,22 +25,15 @@ from evedrop.model.receiver import ACTIONS, MISLED, NOTHING, TYPES, Action, Code
 from evedrop.names import CONTROLLER
 from evedrop.results.folder import HeldFolder
 from evedrop.results.growing_tables import BATCH_BYTES, UNFINISHED, TableStream, Unfinished, finish, write_metrics
+from evedrop.results.resolved_scenario import TakenStates
 from evedrop.results.summary_file import plain, summary_text, write_summary
-from evedrop.results.tables import (
-    DIGESTS,
-    JOURNAL,
-    NULLABLE,
-    SLOTS,
-    input_columns,
-    inputs_schema,
-    trials_schema,
-)
-from evedrop.results.taken_states import TakenStates
+from evedrop.results.tables import DIGESTS, JOURNAL, NULLABLE, SLOTS, input_columns, inputs_schema, trials_schema
 from evedrop.scenario.controlled import monitor_of
 from evedrop.scenario.input_files import disturbances_of
 from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.tables import Scenario
 from evedrop.score.histogram import LEVELS
+from evedrop.score.scorekeeper import Scored
 from evedrop.score.slots import Slots
 from evedrop.score.summary import Summary
 from evedrop.score.sums import SlotSums
@@ -338,3 +331,31 @@ def seen_actions(action: Codes, nu: Flags) -> Codes:
     """Indices into `ACTIONS`: the actions, with the truth about each packet's type."""
     misled = (action == Action.STATE) & nu
     return np.where(misled, np.uint8(ACTIONS.index(MISLED)), action)
+
+
+def write_rows(writer: ResultsWriter, slots: Slots, scored: Mapping[str, Scored], first_trial: int) -> None:
+    """Write all rows of some slots."""
+    for name, values in scored.items():
+        writer.slot_rows(slots.first, name, values.sums, values.expected)
+    writer.input_rows(slots, first_trial)
+    writer.state_rows(slots)
+    writer.trial_rows(slots, {name: values.squared_error for name, values in scored.items()}, first_trial)
+    writer.journal_rows(slots)
+
+
+@final
+class DigestRows:
+    """The digests of a run; their rows are written as blocks are reported."""
+
+    def __init__(self, digests: Mapping[str, DigestLog], first_trial: int) -> None:
+        """digests: receiver, or controller → block → digests of the trials from first_trial on; blocks are added later."""
+        self._digests = digests
+        self._first_trial = first_trial
+        self._written = dict.fromkeys(digests, 0)
+
+    def write(self, writer: ResultsWriter) -> None:
+        """Write the blocks that were added since the last call."""
+        for name, blocks in self._digests.items():
+            if len(blocks) > self._written[name]:
+                writer.digest_rows(self._first_trial, {name: blocks.after(self._written[name])})
+                self._written[name] = len(blocks)

@@ -1,7 +1,7 @@
 """Keeps the results of a study's finished tasks in its folder, so that an interrupted study can go on where it stopped.
 
 The folder `kept` in a results folder has `study.json`, which says exactly what is studied, and a file for each finished task.
-A file counts only if it is complete, undamaged, and of this study. All of it is data (`evedrop.results.object_data`).
+A file counts only if it is complete, undamaged, and of this study. All of it is data (`evedrop.results.shard_score`).
 
 Source: docs/results.md, an interrupted study.
 """
@@ -26,8 +26,8 @@ import pyarrow as pa
 from evedrop.errors import EvedropError, Interrupted, RunError, UsageError
 from evedrop.results.folder import HeldFolder, disk_errors, make_private, new_folder, private_replacement, write_private
 from evedrop.results.growing_tables import UNFINISHED, goes_on
-from evedrop.results.object_data import NotData, packed, unpacked
 from evedrop.results.resolved_scenario import made_with
+from evedrop.results.shard_score import NotData, packed, unpacked
 from evedrop.scenario.tables import Scenario
 from evedrop.simulate.tasks import R, Task
 from evedrop.system.files import try_lock

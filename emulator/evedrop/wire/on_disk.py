@@ -19,8 +19,7 @@ from rich.console import Console
 from evedrop.errors import UsageError
 from evedrop.model.checks import as_toml
 from evedrop.model.slot.link import Change
-from evedrop.results.wire_folder import WIRE_FILE
-from evedrop.results.wire_summary import WIRE_SUMMARY_FILE, JournalState, WireSummary
+from evedrop.results.wire_summary import WIRE_FILE, WIRE_SUMMARY_FILE, JournalState, WireSummary
 from evedrop.show.report.wire import wire_sentences, wire_table
 from evedrop.show.terminal_tables import rich_table
 from evedrop.system.files import is_locked

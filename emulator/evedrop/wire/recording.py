@@ -21,7 +21,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from evedrop.errors import UsageError
-from evedrop.results.wire_folder import WIRE_FILE
+from evedrop.results.wire_summary import WIRE_FILE
 from evedrop.show.view.recording import RecordingThread
 from evedrop.wire.file import load_wire
 from evedrop.wire.history import WireHistory

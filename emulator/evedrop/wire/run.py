@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, NoReturn
 from evedrop.errors import Interrupted, RunError
 from evedrop.live.network.control_file import remove_control
 from evedrop.results.folder import make_private, new_folder, write_private
-from evedrop.results.wire_folder import WIRE_FILE
-from evedrop.results.wire_summary import WIRE_SUMMARY_FILE
+from evedrop.results.wire_summary import WIRE_FILE, WIRE_SUMMARY_FILE
 from evedrop.scenario.wire_table import PUT
 from evedrop.show.report.wire import wire_failures
 from evedrop.show.view.viewer import Viewer, choose

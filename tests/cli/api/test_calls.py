@@ -27,7 +27,7 @@ from evedrop.cli.main import parser_of
 from evedrop.cli.options import changes_of
 from evedrop.errors import RunError, ScenarioError, UsageError
 from evedrop.model.metrics import all_metrics
-from evedrop.results.by_name import ByName
+from evedrop.results.reading import ByName
 from evedrop.scenario.loading import load
 from evedrop.scenario.progress_events import ProgressEvent, RunProgress
 from evedrop.score.built_in_metrics import BuiltInMetrics

@@ -14,9 +14,8 @@ import pyarrow as pa
 from evedrop.cli.api.notebook import table_text
 from evedrop.model.metrics import shown_metric
 from evedrop.model.metrics.text import number_text
-from evedrop.results.by_name import ByName
 from evedrop.results.comparison import Comparison
-from evedrop.results.reading import Results
+from evedrop.results.reading import ByName, Results
 from evedrop.score.summary import Judged, LinkSummary, PeerSummary, SecrecySummary, Summary
 from evedrop.show.report import closing
 from evedrop.show.report.comparison import pairs_table, schemes_table

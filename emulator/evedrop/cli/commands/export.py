@@ -17,7 +17,7 @@ def export(options: argparse.Namespace) -> int:
     """Write the results of a run as an MCAP file."""
     from evedrop.results.mcap_export import export_mcap
     from evedrop.results.reading import Results
-    from evedrop.results.wire_folder import is_wire
+    from evedrop.results.wire_summary import is_wire
     from evedrop.system.signals import raise_on_signals
 
     if is_wire(options.run):

@@ -11,7 +11,7 @@ from evedrop.errors import UsageError
 
 def report(options: argparse.Namespace) -> int:
     """Write the page of a results folder."""
-    from evedrop.results.wire_folder import is_wire
+    from evedrop.results.wire_summary import is_wire
     from evedrop.show.report.writing import write_report
 
     write = write_report

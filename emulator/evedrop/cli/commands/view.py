@@ -28,7 +28,7 @@ _LEAST, _MOST = 320, 3840  # pixels; the viewer takes more than its time limit f
 
 def view(options: argparse.Namespace) -> int:
     """Open a finished run or wire, draw it, or print its closing report again."""
-    from evedrop.results.wire_folder import is_wire
+    from evedrop.results.wire_summary import is_wire
 
     if is_wire(options.run):
         return _view_wire(options)

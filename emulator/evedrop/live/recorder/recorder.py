@@ -45,10 +45,9 @@ from evedrop.names import CONTROLLER, OPERATOR, RECORDER, ROUTER, SENSOR
 from evedrop.results.ending import note_end
 from evedrop.results.folder import HeldFolder, new_folder
 from evedrop.results.resolved_scenario import write_resolved
-from evedrop.results.rows import DigestRows, write_rows
 from evedrop.results.shard_score import dump_score
 from evedrop.results.summary_file import unwritten
-from evedrop.results.writer import ResultsWriter, write_summary
+from evedrop.results.writer import DigestRows, ResultsWriter, write_rows, write_summary
 from evedrop.scenario.progress_events import ConnectionOutage, RunEnded, RunEvent, RunProgress, Started, ViewOpened
 from evedrop.scenario.tables import Scenario
 from evedrop.score.expectations_held import replay_of

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from evedrop.results.comparison import COMPARISON
-from evedrop.results.wire_folder import WIRE_FILE
+from evedrop.results.wire_summary import WIRE_FILE
 from evedrop.show.report.closing import amount, outcome
 from evedrop.show.report.comparison import comparison_heading
 from evedrop.show.report.comparison_sections import COMPARISON_SECTIONS, ComparisonSource

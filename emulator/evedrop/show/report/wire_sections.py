@@ -12,8 +12,7 @@ from typing import Any
 from markupsafe import Markup
 
 from evedrop.errors import UsageError
-from evedrop.results.wire_folder import WIRE_FILE
-from evedrop.results.wire_summary import WIRE_SUMMARY_FILE, WireSummary
+from evedrop.results.wire_summary import WIRE_FILE, WIRE_SUMMARY_FILE, WireSummary
 from evedrop.show.report.page import facts_table, made
 from evedrop.show.report.text_table import TextTable
 from evedrop.show.report.wire import reasons_table, unlinked_sentence, wire_faults, wire_outcome, wire_table, wire_title
