@@ -9,7 +9,7 @@ import pytest
 
 from evedrop.cli import main as cli
 from evedrop.scenario.loading import load
-from evedrop.score.acknowledging import chart_of
+from evedrop.score.links import chart_of
 from evedrop.score.summary import Judged
 from evedrop.studies.scenario_tests import _reasons
 from tests.conftest import Evedrop

@@ -16,7 +16,7 @@ from evedrop.model.streams import Batch, stream_key
 from evedrop.model.theory.closed_forms import Hears, hijacked_schedule, scheduled
 from evedrop.scenario.expected.expectations import expectations_of
 from evedrop.scenario.loading import checked
-from evedrop.score.acknowledging import chart_of
+from evedrop.score.links import chart_of
 from evedrop.simulate.simulation import Simulation
 from tests.builders import UNSTABLE, listener, tables_of
 from tests.model.slot_loop import ROOT, coins

@@ -12,7 +12,7 @@ from evedrop.model.streams import Batch
 from evedrop.scenario.loading import checked
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.scenario.tables import Scenario
-from evedrop.score.channel import RATE_CONFIDENCE, interval, link_summary_of
+from evedrop.score.links import RATE_CONFIDENCE, interval, link_summary_of
 from evedrop.score.sums import Tally
 from tests.builders import scalar_tables
 

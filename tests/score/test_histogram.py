@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evedrop.model.process import Floats
-from evedrop.score.histogram import LEVELS, SlotHistograms
+from evedrop.score.sums import LEVELS, SlotHistograms
 from tests.examples import examples
 
 SCALE = 2e-3

@@ -18,7 +18,7 @@ from evedrop.model.schemes import scheme_of
 from evedrop.scenario.expected.expectations import expectations_of
 from evedrop.scenario.loading import checked
 from evedrop.scenario.tables import Scenario
-from evedrop.score.acknowledging import Detection, chart_of
+from evedrop.score.links import Detection, chart_of
 from evedrop.score.summary import DetectionSummary
 from evedrop.simulate.montecarlo import check_mode
 from evedrop.simulate.simulation import Mode, Simulation

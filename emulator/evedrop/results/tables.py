@@ -18,8 +18,8 @@ from evedrop.model.integrity.monitor import MonitoredSlots
 from evedrop.model.links.loss_model import REASONS
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats
-from evedrop.score.histogram import LEVELS
 from evedrop.score.slots import Slots
+from evedrop.score.sums import LEVELS
 from evedrop.system.files import opened
 
 SLOTS = pa.schema(

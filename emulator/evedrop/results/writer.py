@@ -32,11 +32,10 @@ from evedrop.scenario.controlled import monitor_of
 from evedrop.scenario.input_files import disturbances_of
 from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.tables import Scenario
-from evedrop.score.histogram import LEVELS
 from evedrop.score.scorekeeper import Scored
 from evedrop.score.slots import Slots
 from evedrop.score.summary import Summary
-from evedrop.score.sums import SlotSums
+from evedrop.score.sums import LEVELS, SlotSums
 
 _ROUND_SECONDS = 3.0  # the longest time between rounds, which a killed writer loses
 _ROUND_BYTES = (32 * 2**10, 4 * 2**20)  # the most that is held back, at the start of a run and later

@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from evedrop.scenario.tables import Scenario
-from evedrop.score.acknowledging import Detection
 from evedrop.score.closed_loop_tally import LoopTally, SolveTimes
 from evedrop.score.conditional import conditional_error_of
 from evedrop.score.filtering import FilterTally
 from evedrop.score.leak import LeakTally, leak_is_known
+from evedrop.score.links import Detection
 from evedrop.score.sums import DirectionTally, Tally, merged
 from evedrop.score.watched_tally import WatchedTally, watches_of
 

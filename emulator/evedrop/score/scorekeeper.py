@@ -20,18 +20,17 @@ from evedrop.names import CONTROLLER, LEGITIMATE
 from evedrop.scenario.expected.expectations import Expectation, ExpectedTraceStream, expectations_of
 from evedrop.scenario.progress_events import ConnectionOutage, RunEvent
 from evedrop.scenario.tables import Scenario
-from evedrop.score.channel import link_summary_of
 from evedrop.score.closed_loop_tally import Acted
 from evedrop.score.directions import directions_of
 from evedrop.score.expectations_held import Evidence
 from evedrop.score.filtering import true_errors
-from evedrop.score.histogram import LEVELS
 from evedrop.score.leak import HeardBitsStream
+from evedrop.score.links import link_summary_of
 from evedrop.score.rare_events import rare_events_of, z_of_error
 from evedrop.score.run_tally import RunTally
 from evedrop.score.slots import Slots
 from evedrop.score.summary import PeerSummary, Summary, SurprisingTrial, Verification
-from evedrop.score.sums import SlotSums, Tally, slot_sums, squared_errors, trial_means
+from evedrop.score.sums import LEVELS, SlotSums, Tally, slot_sums, squared_errors, trial_means
 from evedrop.score.verdict import Secrecy, secrecy
 
 _ENOUGH_TO_SURPRISE = 10  # trials

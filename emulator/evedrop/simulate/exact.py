@@ -32,9 +32,9 @@ from evedrop.scenario.input_files import disturbances_of, states_of
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.timeline import Away
-from evedrop.score.acknowledging import ack_channel_of, chart_of
 from evedrop.score.closed_loop_tally import SolveTimes
 from evedrop.score.filtering import local_filter_of
+from evedrop.score.links import ack_channel_of, chart_of
 from evedrop.score.slots import InputSlots, ReceiverSlots, Slots
 from evedrop.score.sums import squared_errors
 from evedrop.simulate.chunk import Chunk, PacketTally, ReceiverChunk

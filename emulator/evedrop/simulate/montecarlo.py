@@ -29,12 +29,11 @@ from evedrop.scenario.progress_events import FolderMoved, OnEvent, RunProgress
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.words import listed
 from evedrop.score.expectations_held import replay_of
-from evedrop.score.histogram import SlotHistograms
 from evedrop.score.run_tally import RunTally
 from evedrop.score.scorekeeper import RunOutcome, events_of, summary_of
 from evedrop.score.slots import concatenated
 from evedrop.score.summary import Summary
-from evedrop.score.sums import SlotSums, squared_errors
+from evedrop.score.sums import SlotHistograms, SlotSums, squared_errors
 from evedrop.simulate.chunk import PacketTally
 from evedrop.simulate.cluster import REACH_SECONDS, Cluster, connected
 from evedrop.simulate.kept_tasks import KeptTasks, kept_tasks, study_of

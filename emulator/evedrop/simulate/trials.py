@@ -19,11 +19,10 @@ from evedrop.model.process import Floats
 from evedrop.model.slot.link import Account, Accountant
 from evedrop.scenario.expected.expectations import KnownTraces, expected_traces_of
 from evedrop.scenario.tables import Scenario
-from evedrop.score.histogram import SlotHistograms
 from evedrop.score.run_tally import RunTally
 from evedrop.score.scorekeeper import Scorekeeper
 from evedrop.score.slots import Slots
-from evedrop.score.sums import SlotSums, slot_sums
+from evedrop.score.sums import SlotHistograms, SlotSums, slot_sums
 from evedrop.simulate.chunk import Chunk, PacketTally
 from evedrop.simulate.kept_tasks import KeptTasks
 from evedrop.simulate.simulation import Mode, Simulation

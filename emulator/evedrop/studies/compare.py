@@ -34,11 +34,10 @@ from evedrop.results.resolved_scenario import input_texts, resolved
 from evedrop.scenario.expected.expectations import Expectation, expectations_of
 from evedrop.scenario.progress_events import OnEvent
 from evedrop.scenario.tables import Scenario
-from evedrop.score.histogram import LEVELS
 from evedrop.score.leak import revealed_by_packets
 from evedrop.score.rare_events import rare_events_of, z_of_error
 from evedrop.score.scorekeeper import verdicts
-from evedrop.score.sums import Tally, trial_means
+from evedrop.score.sums import LEVELS, Tally, trial_means
 from evedrop.simulate.chunk import PacketTally
 from evedrop.simulate.kept_tasks import kept_tasks, study_of
 from evedrop.simulate.montecarlo import Merger, Plan, progress_counter

@@ -30,8 +30,7 @@ from evedrop.model.metrics import all_metrics
 from evedrop.results.reading import ByName
 from evedrop.scenario.loading import load
 from evedrop.scenario.progress_events import ProgressEvent, RunProgress
-from evedrop.score.built_in_metrics import BuiltInMetrics
-from evedrop.score.summary import PeerSummary
+from evedrop.score.summary import BuiltInMetrics, PeerSummary
 from evedrop.show.report import closing
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode

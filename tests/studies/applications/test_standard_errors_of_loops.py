@@ -14,7 +14,7 @@ import pytest
 from evedrop.cli.api import montecarlo
 from evedrop.scenario.application import APPLICATIONS, STANDARD_ERRORS, ApplicationTally
 from evedrop.scenario.loading import load
-from evedrop.score.acknowledging import Detection
+from evedrop.score.links import Detection
 from evedrop.simulate.montecarlo import Plan
 from evedrop.studies.sweep import sweep_over
 from tests.examples import mostly_long

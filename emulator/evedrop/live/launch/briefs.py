@@ -51,7 +51,7 @@ from evedrop.scenario.plugins import named_in
 from evedrop.scenario.process import ProcessTable
 from evedrop.scenario.stream_keys import StreamKeys
 from evedrop.scenario.tables import Scenario
-from evedrop.score.acknowledging import ack_channel_of, chart_of
+from evedrop.score.links import ack_channel_of, chart_of
 
 _WINDOW_BYTES = 64 * 2**20
 _MOST_SLOTS_AHEAD = 4096
