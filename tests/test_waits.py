@@ -36,8 +36,8 @@ EXCEPTIONS = {
         "the end of its worker closes the pipe, and a suspended worker is killed"
     ),
     "emulator/evedrop/simulate/workers.py work pipe.recv": "the end of the study closes the pipe",
-    "emulator/evedrop/studies/scenario_test_jobs.py results future.result": "the future is done",
-    "emulator/evedrop/studies/scenario_test_jobs.py carry_out process.wait": "the process has closed its output, or is killed",
+    "emulator/evedrop/studies/scenario_tests.py results future.result": "the future is done",
+    "emulator/evedrop/studies/scenario_tests.py carry_out process.wait": "the process has closed its output, or is killed",
     "emulator/evedrop/wire/outlet.py _wait self._bell.acquire": WORK,
     "emulator/evedrop/wire/queries.py _run self._heard.get": WORK,
     "peers/closed_loop.py of self._subscription.recv": PROCESS,

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from evedrop.cli import main as cli
-from evedrop.studies.papers import figures, microgrid
-from evedrop.studies.papers.figures import Size
+from evedrop.studies.papers import kennedy2022, microgrid
+from evedrop.studies.papers.kennedy2022 import Size
 from tests.examples import mostly_long
 
 NAMES = ("numerical", "microgrid", "strategies", "chain")
@@ -30,7 +30,7 @@ def made_in(folder: Path, drawn: tuple[str, ...]) -> Path:
         return honest(self, path, **how) if path.stem in drawn else path.touch()
 
     with (
-        patch.object(figures, "Size", lambda **_: small),
+        patch.object(kennedy2022, "Size", lambda **_: small),
         patch.object(Figure, "savefig", savefig),
         redirect_stdout(out),
         redirect_stderr(err),

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from evedrop.scenario.recordings.disturbance_file import read_disturbances
-from evedrop.studies.applications.microgrid import appliances, day, sun
-from evedrop.studies.applications.microgrid.draws import Draws
+from evedrop.studies.applications.microgrid import day
+from evedrop.studies.applications.microgrid.day import Draws
 
 KEPT = Path(str(resources.files("evedrop.scenarios")))
 TOLD = json.loads((KEPT / f"{day.NAME}.json").read_text(encoding="utf-8"))
@@ -87,22 +87,22 @@ def test_the_sun_is_a_days_with_clouds() -> None:
 
 def test_clouds_leave_a_fraction() -> None:
     """Of a clear sky's power, between their depth and all of it, but for the flicker; the same for a seed."""
-    fraction = sun.fraction_left(sun.Clouds(), Draws(11, "clouds"))
+    fraction = day.fraction_left(day.Clouds(), Draws(11, "clouds"))
     assert fraction.shape == (86_400,)
     assert 0.2 < fraction.min() < 0.6
     assert 1.0 < fraction.max() < 1.2
-    assert np.array_equal(fraction, sun.fraction_left(sun.Clouds(), Draws(11, "clouds")))
+    assert np.array_equal(fraction, day.fraction_left(day.Clouds(), Draws(11, "clouds")))
 
 
 def test_appliances_follow_the_profile() -> None:
     """Nobody puts the kettle on when the profile is at its least; energy is that of the appliances, not of the profile."""
     profile = np.full(86_400, 0.1)
     profile[18 * 3600 : 20 * 3600] = 1.0
-    days = np.mean([appliances.load_power(profile, seed) for seed in range(12)], axis=0)
+    days = np.mean([day.load_power(profile, seed) for seed in range(12)], axis=0)
     assert days[: 18 * 3600].max() < 0.5
     assert days[18 * 3600 : 20 * 3600].mean() > 5 * days[: 18 * 3600].mean()
-    doubled = appliances.load_power(2.0 * profile, 3)
-    assert np.array_equal(doubled, appliances.load_power(profile, 3))
+    doubled = day.load_power(2.0 * profile, 3)
+    assert np.array_equal(doubled, day.load_power(profile, 3))
 
 
 def test_draws_are_in_order() -> None:

@@ -17,7 +17,7 @@ from evedrop.model.controllers import mpc
 from evedrop.scenario.loading import checked
 from evedrop.score.energy import Meter, energy
 from evedrop.simulate.montecarlo import Plan
-from evedrop.studies.applications.microgrid import privacy
+from evedrop.studies.applications.microgrid import household
 from tests.builders import changed, listener
 from tests.conftest import Evedrop
 from tests.scenario.test_plant_tables import LOOP
@@ -143,7 +143,7 @@ def test_active_windows_are_the_days(tmp_path: Path) -> None:
     house = montecarlo(scenario, trials=2, out=tmp_path / "x", plan=Plan(workers=1)).summary["household"]
     load_power = np.array(scenario.plant.disturbance_values)[: 79 * 60, 1]
     assert house["windows"] == 79
-    assert house["active_windows"] == int(privacy.active(load_power, 60, 0.7).sum()) > 5
+    assert house["active_windows"] == int(household.active(load_power, 60, 0.7).sum()) > 5
     told = house["receivers"]
     assert told["legitimate"]["activity_area"] > 0.99
     assert told["smart"]["activity_area"] > 0.97

@@ -10,7 +10,7 @@ import pytest
 from evedrop.model.controllers import CONTROLLERS, Assignment
 from evedrop.model.plant import Plant
 from evedrop.model.process import Process
-from evedrop.studies.applications.microgrid.household_tally import HousePlaces, LoadGuess, PerfectLoop
+from evedrop.studies.applications.microgrid.household import HousePlaces, LoadGuess, PerfectLoop
 
 PERIOD, SLOTS = 5, 60
 A = np.array([[1.0, 0.01], [0.0, 0.99]])

@@ -16,7 +16,7 @@ from evedrop.scenario.loading import load
 from evedrop.show.view.plant_slots import LoopValues, driven_scene
 from evedrop.show.view.replay import replay
 from evedrop.simulate.montecarlo import Plan
-from evedrop.studies.applications.integrity.integrity import Integrity
+from evedrop.studies.applications.integrity import Integrity
 from tests.examples import mostly_long
 from tests.show.view.read_back import rows
 

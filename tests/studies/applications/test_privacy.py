@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evedrop.studies.applications.microgrid.privacy import active, area, detection_rate, means
+from evedrop.studies.applications.microgrid.household import active, area, detection_rate, means
 
 
 def test_a_window_is_active_by_its_mean() -> None:

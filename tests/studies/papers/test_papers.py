@@ -13,8 +13,7 @@ from unittest.mock import patch
 import pytest
 
 from evedrop.studies.papers import PAPERS, reproduce
-from evedrop.studies.papers.paper import Paper, Progress
-from evedrop.studies.papers.reproduction import NumberVerdict, PublishedNumber, Reproduction
+from evedrop.studies.papers.reproduction import NumberVerdict, Paper, Progress, PublishedNumber, Reproduction
 from tests.conftest import Evedrop
 from tests.examples import mostly_long
 

@@ -12,8 +12,8 @@ from evedrop.errors import UsageError
 
 def figures(options: argparse.Namespace) -> int:
     """Draw the paper's figures."""
-    from evedrop.studies.papers.figures import Size
-    from evedrop.studies.papers.figures import figures as draw
+    from evedrop.studies.papers.kennedy2022 import Size
+    from evedrop.studies.papers.kennedy2022 import figures as draw
 
     try:
         report = draw(

@@ -15,8 +15,7 @@ from evedrop.errors import UsageError
 def test(options: argparse.Namespace) -> int:
     """Run scenarios as tests; returns the worst of their exit statuses."""
     from evedrop.studies.junit import write_junit
-    from evedrop.studies.scenario_test_jobs import results
-    from evedrop.studies.scenario_tests import Finding, Manner, scenarios_of
+    from evedrop.studies.scenario_tests import Finding, Manner, results, scenarios_of
 
     if options.jobs < 1:
         raise UsageError(f"--jobs {options.jobs}: expected 1 or more")

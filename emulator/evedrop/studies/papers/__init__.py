@@ -12,8 +12,7 @@ from evedrop.studies.papers.crimson2023 import Crimson2023
 from evedrop.studies.papers.kennedy2022 import Kennedy2022
 from evedrop.studies.papers.luecke2022 import Luecke2022
 from evedrop.studies.papers.naha2021 import Naha2021
-from evedrop.studies.papers.paper import Paper, Progress, silent
-from evedrop.studies.papers.reproduction import Reproduction
+from evedrop.studies.papers.reproduction import Paper, Progress, Reproduction, silent
 from evedrop.system.hints import near
 
 PAPERS: Mapping[str, type[Paper]] = {

@@ -23,8 +23,7 @@ from evedrop.model.slot.link import link_of
 from evedrop.model.streams import Batch, BlockReader, root_of_seed, stream_key
 from evedrop.model.theory.covariances import NOBODY, limit, lyapunov
 from evedrop.studies.papers.deliveries import deliveries
-from evedrop.studies.papers.paper import Paper, Progress
-from evedrop.studies.papers.reproduction import NumberVerdict, PublishedNumber
+from evedrop.studies.papers.reproduction import NumberVerdict, Paper, Progress, PublishedNumber
 
 _A = np.array([[0.5, 0.1], [0.4, 0.6]])
 _SMALL = 0.01 * np.eye(2)

@@ -28,8 +28,7 @@ from evedrop.model.schemes.scheme import Scheme
 from evedrop.model.slot.link import link_of
 from evedrop.model.streams import Batch, root_of_seed, stream_key
 from evedrop.studies.papers.deliveries import deliveries
-from evedrop.studies.papers.paper import Paper, Progress
-from evedrop.studies.papers.reproduction import NumberVerdict, PublishedNumber
+from evedrop.studies.papers.reproduction import NumberVerdict, Paper, Progress, PublishedNumber
 
 MU, FLIP = 0.8, 0.1
 """The quality of the user's link and the probability of a flip, in all examples here."""

@@ -19,8 +19,7 @@ from evedrop.model.metrics.standard_error import standard_error
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process
 from evedrop.model.slot.monitored_loop import LoopRun, simulate
-from evedrop.studies.papers.paper import Paper, Progress
-from evedrop.studies.papers.reproduction import NumberVerdict, PublishedNumber
+from evedrop.studies.papers.reproduction import NumberVerdict, Paper, Progress, PublishedNumber
 
 _ONE, _INF = np.array([[1.0]]), np.array([np.inf])
 EXAMPLE = Assignment(

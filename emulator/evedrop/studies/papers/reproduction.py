@@ -1,4 +1,4 @@
-"""The numbers of a paper with ours: agreement, erratum, or the reason why they cannot be compared.
+"""The base class of papers, and their numbers with ours: agreement, erratum, or the reason why they cannot be compared.
 
 Source: docs/papers.md, how to read a verdict.
 """
@@ -6,12 +6,40 @@ Source: docs/papers.md, how to read a verdict.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from enum import StrEnum
-from typing import Any, Self, TypeAlias
+from typing import Any, ClassVar, Self, TypeAlias
 
 from evedrop.model.metrics.text import ShownNumber, estimate
+
+Progress: TypeAlias = Callable[[str], None]
+"""Receives a line for each step of a computation."""
+
+
+def silent(_: str) -> None:
+    """Ignore a progress report."""
+
+
+class Paper(ABC):
+    """A paper whose numbers can be computed. A subclass has no arguments; it is registered in `PAPERS`."""
+
+    title: ClassVar[str]
+    authors: ClassVar[str]
+    published: ClassVar[str]
+    """Where and when, and where its code is if it is public."""
+    text_read: ClassVar[bool] = False
+    """Whether we have read the text of the paper; without it, no number of it has the verdict `erratum`."""
+
+    @abstractmethod
+    def rows(self, quick: bool, progress: Progress) -> Iterable[PublishedNumber]:
+        """Every number of the paper, in the paper's order, with ours and a verdict.
+
+        quick: simulate so little that all rows take seconds; verdicts by standard errors still hold then. progress: call it with
+        a line before each step that takes seconds.
+        """
+
 
 Value: TypeAlias = float | str | None
 """A number; text for anything else, such as a range; None if there is nothing."""

@@ -1,41 +1,333 @@
 """The household: a house with a battery and solar cells, its energies, and what receivers can infer about its activity.
 
-Source: docs/scenario.md, household; docs/microgrid.md.
+Totals over a run are the energy bought and sold, the change by perfect knowledge, and how much an estimate of the battery
+reveals about the house: when people are at home and active. A day is divided into windows. In some of them the house is
+*active*: its mean load is at or above a threshold, which hardly happens unless somebody cooks or washes. A receiver that has
+guessed the load of every window takes the larger guesses for activity. The measure of success is the area under the curve of
+detections over false alarms: 1 if the guess for every active window is above that for every quiet one, ½ for a coin.
+
+Source: docs/scenario.md, household; docs/microgrid.md, energy and privacy; docs/results.md, household.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, final
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, final
 
 import numpy as np
+from pydantic import Field
 
+from evedrop.model.controllers import Assignment, Controller
+from evedrop.model.controllers.lqr import held
 from evedrop.model.metrics.text import estimate
-from evedrop.model.process import Floats
+from evedrop.model.plant import Plant
+from evedrop.model.process import Floats, Process, product
+from evedrop.model.receiver import Flags
 from evedrop.scenario.application import (
+    RECEIVERS,
     STANDARD_ERRORS,
     Application,
+    ApplicationTally,
     ControlledPlant,
     Kind,
     Panel,
     PanelCurve,
     PanelFeed,
+    PowerFeed,
     Summary,
 )
 from evedrop.scenario.table import Table
-from evedrop.score.energy import energy
+from evedrop.score.energy import Meter, energy
 from evedrop.show.view.palette import PLANT, TRUTH_CURVE
-from evedrop.studies.applications.microgrid.household_tally import (
-    HouseholdTable,
-    HouseholdTally,
-    HousePower,
-    guesses_of,
-)
-from evedrop.studies.applications.microgrid.privacy import means
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+
+def means(values: Floats, window: int) -> Floats:
+    """Means over each window, (windows, …), of values (slots, …). An incomplete last window is left out."""
+    windows = len(values) // window
+    mean: Floats = values[: windows * window].reshape(windows, window, *values.shape[1:]).mean(axis=1)
+    return mean
+
+
+def active(load: Floats, window: int, threshold: float) -> Flags:
+    """Whether the house is active in each window, (windows,); load: (slots,), in kW like the threshold."""
+    return np.greater_equal(means(load, window), threshold)
+
+
+def area(score: Floats, truth: Flags) -> float:
+    """Area under the curve: how often an active window scores above a quiet one, ties counted half; NaN without both kinds.
+
+    score: (windows,), the larger the likelier active; truth: (windows,).
+    """
+    on, off = score[truth], np.sort(score[~truth])
+    if not len(on) or not len(off):
+        return float("nan")
+    below = np.searchsorted(off, on, side="left") + np.searchsorted(off, on, side="right")
+    return float(0.5 * below.sum() / (len(on) * len(off)))
+
+
+def detection_rate(score: Floats, truth: Flags, false_alarms: float) -> float:
+    """Fraction of active windows that are detected if the fraction `false_alarms` of the quiet ones is taken for active.
+
+    A coin decides between windows with equal scores at the threshold, so that a receiver without knowledge detects the
+    fraction `false_alarms`. NaN without both kinds of windows.
+    """
+    on, off = score[truth], np.sort(score[~truth])[::-1]
+    if not len(on) or not len(off):
+        return float("nan")
+    allowed = false_alarms * len(off)
+    threshold = off[min(int(allowed), len(off) - 1)]
+    above, alike = int(np.sum(off > threshold)), int(np.sum(off == threshold))
+    fraction = min(1.0, (allowed - above) / alike)
+    return float(np.mean(on > threshold) + fraction * np.mean(on == threshold))
+
+
+Name = Annotated[str, Field(strict=True, min_length=1)]
+
+
+class HouseholdTable(Table):
+    """`[household]`: names of the plant's inputs, disturbances and states, powers in kW."""
+
+    grid: Annotated[Name, Field(examples=["P_grid"])]
+    load: Annotated[Name, Field(examples=["P_load"])]
+    battery: Annotated[Name, Field(examples=["SOC"])]
+    sun: Annotated[Name | None, Field(examples=["P_solar"])] = None
+    window_seconds: Annotated[float, Field(strict=True, gt=0.0, le=1e6, examples=[60.0])] = 60.0
+    active_above: Annotated[float, Field(strict=True, gt=0.0, le=1e6, examples=[0.7])] = 0.7
+    false_alarms: Annotated[float, Field(strict=True, gt=0.0, lt=1.0, examples=[0.05])] = 0.05
+
+    def window(self, period_seconds: float) -> int:
+        """The number of decisions in a window, at least 1; a decision lasts period_seconds."""
+        return max(1, round(self.window_seconds / period_seconds))
+
+
+def guesses_of(loop: ControlledPlant, table: HouseholdTable, trials: int) -> dict[str, LoadGuess]:
+    """Receiver → the guess of the load from its estimates."""
+    sun = None if table.sun is None else loop.disturbance(table.sun)
+    house = HousePlaces(loop.state(table.battery), loop.disturbance(table.load), sun)
+    shone = np.zeros(loop.slots) if sun is None else loop.disturbances[:, sun]
+    assignment, strategy = loop.assignment, loop.strategy
+    return {name: LoadGuess(assignment, strategy(assignment, trials), house, shone) for name in loop.receivers}
+
+
+@final
+class HousePower(PowerFeed):
+    """A house's grid power over a set of trials, and that of a controller that sees the truth."""
+
+    def __init__(self, loop: ControlledPlant, table: HouseholdTable, trials: int) -> None:
+        own = loop.strategy(loop.assignment, trials)
+        self._plant, self._grid = loop.plant, loop.input(table.grid)
+        self._perfect = PerfectLoop(loop.process, loop.plant, own, loop.period, loop.disturbances)
+
+    def take(self, x: Floats, u: Floats) -> tuple[Floats, Floats]:
+        """Add the next slots."""
+        grid, other = np.empty(u[:, 0].shape), np.empty(u[:, 0].shape)
+        for row, (state, inputs) in enumerate(zip(x, u, strict=True)):
+            other[row] = self._perfect.follow(state, inputs)[self._grid]
+            grid[row] = self._plant.limited(inputs)[self._grid]
+        return grid, other
+
+
+@final
+class HouseholdTally(ApplicationTally):
+    """A house's tally over a set of trials, whose slots come in order."""
+
+    def __init__(self, loop: ControlledPlant, table: HouseholdTable, trials: int) -> None:
+        self._table = table
+        self._slot_seconds = loop.slot_seconds
+        self._disturbances = loop.disturbances
+        self._period = loop.period
+        self._window = table.window(self._period * self._slot_seconds)
+        self._power = HousePower(loop, table, trials)
+        self._load = loop.disturbance(table.load)
+        self._guesses = guesses_of(loop, table, trials)
+        self._guessed: dict[str, list[Floats]] = {name: [] for name in loop.receivers}
+        self.meter = Meter.zero(trials)
+        self.done = 0
+
+    def add(self, x: Floats, u: Floats, estimates: Mapping[str, Floats]) -> None:
+        """Add the next slots: states (c, n, R), inputs as decided (c, m, R), and every receiver's estimates, (c, n, R)."""
+        self.meter = self.meter.then(*self._power.take(x, u))
+        for row in range(-self.done % self._period, len(x), self._period):
+            for name, guess in self._guesses.items():
+                load = guess.take(self.done + row, estimates[name][row])
+                if load is not None:
+                    self._guessed[name].append(load)
+        self.done += len(x)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The state without the controllers, which may hold objects bound to their process: a copy takes no further slots."""
+        return {name: value for name, value in self.__dict__.items() if name not in ("_power", "_guesses")}
+
+    @classmethod
+    def merged(cls, parts: Sequence[Self]) -> Self:
+        """The tally of several sets of trials, in order. If some have fewer slots, guesses cover the slots that all have."""
+        whole = copy(parts[0])
+        whole.meter = Meter.of_all([part.meter for part in parts])
+        whole.done = min(part.done for part in parts)
+        fewest = min(len(loads) for part in parts for loads in part._guessed.values())
+        whole._guessed = {}
+        for name in parts[0]._guessed:
+            rows = zip(*(part._guessed[name][:fewest] for part in parts), strict=True)
+            whole._guessed[name] = [np.concatenate(row) for row in rows]
+        return whole
+
+    @property
+    def of_trials(self) -> Mapping[tuple[str, ...], Floats]:
+        """Every metric of every trial, (R,); NaN or infinite where it does not exist."""
+        meter, seconds = self.meter, self._slot_seconds
+        apart = meter.difference
+        detected = self._detected(self._active)
+        return {
+            ("bought_energy",): energy(meter.bought, seconds),
+            ("sold_energy",): energy(meter.sold, seconds),
+            ("knowing_truth", "bought_energy"): energy(meter.other_bought, seconds),
+            ("knowing_truth", "sold_energy"): energy(meter.other_sold, seconds),
+            ("net_difference",): apart.net,
+            ("total_difference",): apart.total,
+            ("summed_difference",): apart.summed,
+            **{(RECEIVERS, name, "activity_area"): areas for name, (areas, _) in detected.items()},
+            **{(RECEIVERS, name, "detection_rate"): rates for name, (_, rates) in detected.items()},
+        }
+
+    def summary(self) -> dict[str, Any]:
+        """The summary's entry: means over trials; None for metrics that do not exist."""
+        meter, seconds = self.meter, self._slot_seconds
+        apart = meter.difference
+        return {
+            "bought_energy": _mean(energy(meter.bought, seconds)),
+            "sold_energy": _mean(energy(meter.sold, seconds)),
+            "knowing_truth": {
+                "bought_energy": _mean(energy(meter.other_bought, seconds)),
+                "sold_energy": _mean(energy(meter.other_sold, seconds)),
+            },
+            "net_difference": _mean(apart.net),
+            "total_difference": _mean(apart.total),
+            "summed_difference": _mean(apart.summed),
+            **self._activity(),
+        }
+
+    def _activity(self) -> dict[str, Any]:
+        """How well each receiver's guesses detect active windows, over the windows that have ended."""
+        active = self._active
+        told = {
+            name: {"activity_area": _mean(areas), "detection_rate": _mean(rates)}
+            for name, (areas, rates) in self._detected(active).items()
+        }
+        return {"windows": len(active), "active_windows": int(active.sum()), "receivers": told}
+
+    @property
+    def _active(self) -> Flags:
+        """Whether the house was active, for each window that has ended, (windows,)."""
+        load = means(self._disturbances[:, self._load], self._period)
+        return active(load[: self._periods], self._window, self._table.active_above)
+
+    @property
+    def _periods(self) -> int:
+        return min(len(loads) for loads in self._guessed.values())
+
+    def _detected(self, active: Flags) -> dict[str, Floats]:
+        """Receiver → the area and the rate of its detection, for each trial, (2, R); NaN before a window has ended, (2, 1)."""
+        told = {}
+        for name, loads in self._guessed.items():
+            told[name] = np.full((2, 1), np.nan)
+            if len(active):
+                guesses = means(np.stack(loads[: self._periods]), self._window).T
+                told[name] = np.array(
+                    [
+                        [area(guess, active) for guess in guesses],
+                        [detection_rate(guess, active, self._table.false_alarms) for guess in guesses],
+                    ]
+                )
+        return told
+
+
+def _mean(values: Floats) -> float | None:
+    """The mean over trials; None if a trial has no value."""
+    mean = float(np.mean(values))
+    return mean if np.isfinite(mean) else None
+
+
+@final
+class PerfectLoop:
+    """The other loop, slot by slot; slots come in order from 0.
+
+    controller: a new one, used by nothing else; period: slots between its decisions; disturbances: (slots, q).
+    """
+
+    def __init__(
+        self, process: Process, plant: Plant, controller: Controller, period: int, disturbances: Floats
+    ) -> None:
+        self._process = process
+        self._plant, self._controller, self._period = plant, controller, period
+        self._disturbances = disturbances
+        self._next = 0
+        self._e: Floats = np.zeros((process.n, controller.trials))
+        self._u: Floats = np.zeros((plant.inputs, controller.trials))
+
+    def follow(self, x: Floats, u: Floats) -> Floats:
+        """The other loop's inputs of the next slot, (m, R), within their limits; x (n, R) and u (m, R): those of this loop."""
+        if self._next % self._period == 0:
+            decided = self._controller.decide(self._next, x - self._e, self._disturbances[self._next])
+            self._u = self._plant.limited(decided)
+        apart = self._plant.moved(u) - self._plant.moved(self._u)
+        self._e = self._process.predict(self._e) + apart
+        self._next += 1
+        return self._u
+
+
+_BELIEVED = 0.9
+"""The fraction of a guess that the copy of the controller is told. A controller that compensates the load at once leaves no
+trace in the level, and a copy that is told all of a wrong guess would confirm that guess forever."""
+
+
+@dataclass(frozen=True)
+class HousePlaces:
+    """The places of a house's quantities in its plant: indices of a state and of disturbances."""
+
+    battery: int
+    load: int
+    sun: int | None
+
+
+@final
+class LoadGuess:
+    """Guesses, one for each decision; decisions come in order from slot 0.
+
+    controller: a new copy of the house's; sun: known power in every slot, (slots,).
+    """
+
+    def __init__(self, assignment: Assignment, controller: Controller, house: HousePlaces, sun: Floats) -> None:
+        self._assignment, self._controller, self._house, self._sun = assignment, controller, house, sun
+        self._power, self._driven = held(assignment)
+        self._disturbed = held(assignment, assignment.plant.disturbance_matrix)[1]
+        self._u: Floats = np.zeros((assignment.plant.inputs, controller.trials))
+        self._level: Floats | None = None
+        """The level that would be reached without load, (R,)."""
+
+    def take(self, k: int, x_hat: Floats) -> Floats | None:
+        """Mean load in kW of the period that ends with slot k, (R,); None at slot 0. x_hat: estimate of the state, (n, R)."""
+        house, assignment = self._house, self._assignment
+        guess = None
+        d = np.zeros((assignment.plant.disturbance_matrix.shape[1], x_hat.shape[1]))
+        if self._level is not None:
+            guess = (x_hat[house.battery] - self._level) / self._disturbed[house.battery, house.load]
+            d[house.load] = _BELIEVED * np.maximum(guess, 0.0)
+        shone = self._sun[k : k + assignment.period]
+        if house.sun is not None and len(shone):
+            d[house.sun] = shone[0]
+        self._u = assignment.plant.limited(self._controller.decide(k, x_hat, d))
+        level = product(self._power, x_hat) + product(self._driven, self._u)
+        if house.sun is not None and len(shone):
+            level += self._disturbed[:, house.sun, None] * shone.mean()
+        self._level = level[house.battery]
+        return guess
+
 
 ENERGY, GUESSES = "energy", "guesses"
 """Paths of panels."""

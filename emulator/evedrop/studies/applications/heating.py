@@ -1,7 +1,4 @@
-"""The comfort of a heated room: how long it is too cold or too warm, how much the heater heats, and whether receivers can tell.
-
-Source: docs/scenario.md, comfort.
-"""
+"""A heated room."""
 
 from __future__ import annotations
 

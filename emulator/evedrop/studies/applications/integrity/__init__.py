@@ -1,1 +1,0 @@
-"""The integrity of a closed loop: watermark, attack on the measurements, and detector."""
