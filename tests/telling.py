@@ -21,7 +21,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, NoReturn
 
 from evedrop import __main__ as command
-from evedrop.cli.progress_line import ProgressLine
+from evedrop.cli.console import ProgressLine
 from evedrop.fork_server import serve
 from evedrop.live.launch import starter
 from evedrop.scenario.progress_events import Held

@@ -147,7 +147,7 @@ MEANT_OTHERWISE = {
         "docs/python.md",
         "emulator/evedrop/cli/api/results.py",
         "emulator/evedrop/cli/commands/__init__.py",
-        "emulator/evedrop/cli/commands/figures.py",
+        "emulator/evedrop/cli/commands/paper.py",
         "emulator/evedrop/show/report/*_sections.py",
         "emulator/evedrop/show/report/chart.py",
         "emulator/evedrop/show/view/*",

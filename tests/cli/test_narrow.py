@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from evedrop.cli.main import main
-from evedrop.cli.names import name_lines
+from evedrop.cli.parser import name_lines
 from evedrop.cli.report import terminal
 from evedrop.show.report.text_table import TextTable
 from evedrop.show.terminal_tables import fitted, rich_table

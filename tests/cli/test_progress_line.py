@@ -9,7 +9,7 @@ import pytest
 from rich.cells import cell_len
 from rich.text import Text
 
-from evedrop.cli.progress_line import ProgressLine
+from evedrop.cli.console import ProgressLine
 from evedrop.scenario.progress_events import Held, RunProgress, Started
 
 

@@ -102,7 +102,7 @@ def _replayed(place: Path) -> None:
 
 def _look_at(place: Path) -> None:
     """As view, diff and their likes do, but for the drawing."""
-    from evedrop.cli.closing_report import print_results
+    from evedrop.cli.report import print_results
 
     results = Results.read(place)
     for table in ("slots", "trials", "journal", "digests", "inputs"):

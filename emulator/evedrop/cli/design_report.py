@@ -1,18 +1,26 @@
-"""The design of μ_d on the terminal."""
+"""Designs on the terminal: μ_d, energy budgets, policies of transmission, and schedules."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
+from itertools import groupby
 from typing import TYPE_CHECKING
 
-from evedrop.cli.report import terminal
+from evedrop.cli.report import left_out_line, terminal
+from evedrop.model.checks import toml_of
 from evedrop.model.metrics.text import finite_text, number_text
 from evedrop.show.report.text_table import TextTable
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from evedrop.model.theory.design import Design
+    from evedrop.model.theory.policies import Front, PolicyMetrics
     from evedrop.model.theory.ratio import Choice, LargestRatio
+    from evedrop.model.theory.schedules import MeanSchedule, ScheduleDesign
+    from evedrop.scenario.expected.energy_budget import BudgetDesign
+    from evedrop.scenario.expected.policies import PolicyDesign
 
 
 def print_design(design: Design) -> None:
@@ -92,3 +100,124 @@ def _half_open(interval: tuple[float, float], bound: float) -> str:
     """The interval of perfect secrecy; closed at its upper end, unless that is 1 and the error is bounded there."""
     low, high = interval
     return f"({low:.5f}, {high:.5f}{')' if high == bound == 1.0 else ']'}"
+
+
+def print_budget(design: BudgetDesign) -> None:
+    """Print the thresholds as a table, the one for the budget among them."""
+    console = terminal()
+    console.print(
+        f"an unencrypted packet costs {design.unencrypted:g}, an encrypted one {design.encrypted:g}; errors are traces in the "
+        f"limit; the user's is {finite_text(design.user)}"
+    )
+    names = list(design.best.eavesdroppers)
+    errors = [f"error of {name}" for name in names]
+    shown = TextTable.headed([], ["threshold θ", "encrypted", "energy", *errors], [""])
+    for choice in sorted({round(each.threshold, 9): each for each in (*design.others, design.best)}.items()):
+        metrics = choice[1]
+        shown.add(
+            number_text(metrics.threshold, ".6g"),
+            number_text(metrics.encrypted_fraction, ".4f"),
+            number_text(metrics.energy, ".6g"),
+            *(finite_text(metrics.eavesdroppers[name]) for name in names),
+            "the budget's" if metrics is design.best else "",
+        )
+    console.show(shown)
+    if design.left_out:
+        console.print(left_out_line(design.left_out, "no closed form of its error is known under this scheme"))
+    console.print(f"threshold = {design.best.threshold!r}")
+
+
+_METRICS = ("user's error", "its error", "sent")
+
+
+def print_policies(design: PolicyDesign) -> None:
+    """Print the fronts as text."""
+    console = terminal()
+    console.print(
+        f"legitimate link quality μ = {design.mu:g}; errors are traces in the limit; sent: the fraction of slots with a packet"
+    )
+    for name, front in design.fronts.items():
+        console.print(f"\nagainst {name}, the scheme with its threshold:")
+        console.show(_thresholds(front))
+        console.print(f"the best policy if the sensor also knew how long ago {name} heard a packet, which it does not:")
+        console.show(_policies(front, design.states))
+        if front.never:
+            for price in sorted({price for _, price in front.never}):
+                weights = ", ".join(f"{weight:g}" for weight, never_price in front.never if never_price == price)
+                console.print(
+                    f"left out, because the best policy never sends: with λ = {price:g} the weights {weights}"
+                )
+        if front.dominated:
+            policies = "policy" if front.dominated == 1 else "policies"
+            console.print(f"left out: {front.dominated} {policies} that another one dominates")
+    if design.left_out:
+        console.print(left_out_line(design.left_out, "no closed form of its error is known under this scheme"))
+
+
+def _thresholds(front: Front) -> TextTable:
+    shown = TextTable.headed([], ["threshold θ", *_METRICS])
+    for i, metrics in enumerate(front.thresholds):
+        shown.add(str(i + 1), *_metrics(metrics))
+    return shown
+
+
+def _policies(front: Front, states: int) -> TextTable:
+    last = "send from h ≥, by its holding time 1, 2 …"
+    shown = TextTable.headed([], ["weight", "λ", *_METRICS, "best θ"], [last], wrapped=[last])
+    for point in front.points:
+        low, high = point.weights
+        shown.add(
+            f"{low:g}" if low == high else f"{low:g} … {high:g}",
+            number_text(point.price, "g"),
+            *_metrics(point.metrics),
+            str(point.scheduled),
+            _by_holding_time(point.thresholds, states),
+        )
+    return shown
+
+
+def _by_holding_time(thresholds: Sequence[int], states: int) -> str:
+    """The thresholds, equal ones in a row as a count."""
+    stretches = [(threshold, len(list(equal))) for threshold, equal in groupby(thresholds)]
+    return " ".join(
+        ("never" if threshold > states else str(threshold)) + (f" ×{count}" if count > 1 else "")
+        for threshold, count in stretches
+    )
+
+
+def _metrics(metrics: PolicyMetrics) -> tuple[str, ...]:
+    return (*map(finite_text, (metrics.user, metrics.eavesdropper)), number_text(metrics.transmissions, ".4f"))
+
+
+def print_schedules(design: ScheduleDesign) -> None:
+    """Print the schedules as text."""
+    console = terminal()
+    for name, schedule in design.schedules.items():
+        console.print(
+            f"against {name}: the sum is {schedule.best.value:.6g} with this schedule, "
+            f"and {schedule.constant.value:.6g} with the best constant μ_d, {schedule.constant.mu_d[1]:.6g}"
+        )
+        console.show(_slots(schedule.best))
+        on_grid = (
+            "the best schedule of the grid"
+            if schedule.exact
+            else "the best schedule found on the part of the grid that was searched"
+        )
+        console.print(
+            f"{on_grid} has {schedule.grid.value:.6g}; "
+            "none of the changes tried, of one μ_d or of two neighbouring ones, improves this schedule"
+        )
+        numbers = list(schedule.best.mu_d)
+        console.print(f"to run it, with slots = {len(numbers)}, write in [encoding]:")
+        console.print(f"state_probability = {toml_of(numbers)}\n", soft_wrap=True, highlight=False, markup=False)
+    if design.left_out:
+        console.print(left_out_line(design.left_out, "no closed form of its error is known"))
+
+
+def _slots(schedule: MeanSchedule) -> TextTable:
+    """One row for each slot."""
+    shown = TextTable.headed([], ["slot", "μ_d", "user's error", "its error"])
+    for k, row in enumerate(zip(schedule.mu_d, schedule.user, schedule.eavesdropper, strict=True)):
+        mu_d, ours, theirs = row
+        shown.add(str(k), number_text(mu_d, ".6g"), number_text(ours), number_text(theirs))
+    return shown

@@ -80,7 +80,7 @@ def studied(
 
     Returns the scenario and what the study found.
     """
-    from evedrop.cli.progress_line import ProgressLine
+    from evedrop.cli.console import ProgressLine
     from evedrop.simulate.montecarlo import progress_counter
     from evedrop.studies.parts import StudyPlace
 

@@ -20,7 +20,7 @@ from evedrop.system.lacks import lack_of, refuse_scipy_without_room
 from evedrop.system.output import say, standard_streams, warn
 
 if TYPE_CHECKING:
-    from evedrop.cli.command import Command
+    from evedrop.cli.options import Command
 
 __all__ = ["is_role", "main"]
 

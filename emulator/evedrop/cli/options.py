@@ -10,14 +10,40 @@ import contextlib
 import math
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from evedrop.cli.command import Option
 from evedrop.errors import UsageError
 
 if TYPE_CHECKING:
     from evedrop.scenario.tables import Scenario
+    from evedrop.show.view.viewer import Viewer
+
+
+Option = Callable[[argparse.ArgumentParser], None]
+"""A function that adds an option, or several, to a command's parser."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command: its name, the function that carries it out, its description, and its options."""
+
+    name: str
+    run: Callable[[argparse.Namespace], int]
+    """Takes the options, and returns the exit status. Slow imports belong inside: all commands are loaded for `--help`."""
+    does: str
+    """In a few words, for `--help`."""
+    options: tuple[Option, ...] = ()
+    group: str | None = None
+    """The word before its name, such as `links` in `links fit`; None if it has no such word."""
+    section: str = "other commands"
+    """The title under which `--help` lists it."""
+    example: str = ""
+    """A command line that shows its use, without the program's name."""
+    page: str = ""
+    """The page of the documentation about it, such as `links`, as `evedrop docs` knows it."""
+
 
 _SET_HELP = "change an entry of the scenario by its dotted key; the value is read as TOML, else as a string; repeatable"
 
@@ -156,9 +182,19 @@ def loaded(options: argparse.Namespace, beyond_horizon: bool = False) -> Scenari
 
 def print_so_far(folder: Path, as_json: bool) -> None:
     """Print the closing report of a run, if it has results, and write its page."""
-    from evedrop.cli.closing_report import print_results, report_page
+    from evedrop.cli.report import print_results, report_page
 
     with contextlib.suppress(UsageError):
         print_results(folder, as_json)
         sys.stdout.flush()  # the words first: the page takes a tenth of a second
         report_page(folder, as_json)
+
+
+def hold(viewer: Viewer) -> None:
+    """Wait until the view is closed, or end it on Ctrl-C or SIGTERM."""
+    from evedrop.system.signals import stop_on_signals
+
+    with stop_on_signals() as stop:
+        while viewer.alive() and not stop.wait(0.1):
+            pass
+    viewer.stop()

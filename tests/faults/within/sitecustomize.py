@@ -97,7 +97,7 @@ if LAUNCHES or (CONFUSED and "evedrop.fork_server" in sys.orig_argv):
 
     _CHANGES = (
         {
-            "evedrop.cli.progress_line": _telling,
+            "evedrop.cli.console": _telling,
             "evedrop.live.protocol.brief": _wired,
             "evedrop.live.launch.other_hosts": _heard,
         }

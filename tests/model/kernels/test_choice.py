@@ -11,7 +11,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from evedrop.cli.progress_line import ProgressLine
+from evedrop.cli.console import ProgressLine
 from evedrop.model.kernels import binding, choice
 from evedrop.names import KERNELS_VARIABLE
 from evedrop.system.environment import own_environment

@@ -6,21 +6,22 @@ Source: docs/design.md.
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from evedrop.cli.api.given import scenario_of
-from evedrop.cli.api.measuring import measuring_command
 from evedrop.errors import UsageError
+from evedrop.model.checks import toml_of
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.schemes import SCHEMES
 from evedrop.model.slot.link_distribution import distribution_of
 from evedrop.names import LEGITIMATE
 from evedrop.scenario.arguments import number_argument, refuse_unless
 from evedrop.scenario.tables import Scenario
-from evedrop.scenario.words import listed
+from evedrop.scenario.words import dotted, listed
 
 if TYPE_CHECKING:
     from evedrop.model.theory.design import Design
@@ -28,6 +29,27 @@ if TYPE_CHECKING:
     from evedrop.model.theory.schedules import ScheduleDesign
     from evedrop.scenario.expected.energy_budget import BudgetDesign
     from evedrop.scenario.expected.policies import PolicyDesign
+
+
+def measuring_command(given: str | Path | Scenario, changes: Mapping[str, Any], made: Scenario) -> str:
+    """A command that simulates the scenario: over a grid of μ_d if it has one μ_d, otherwise as it is.
+
+    given: the scenario as the caller named it; a Scenario, which has no name, is called SCENARIO; changes: those of the call;
+    made: the scenario with these changes.
+    """
+    mu_d = made.encoding.parameters.get("state_probability")
+    constant = isinstance(mu_d, (int, float))
+    words = [
+        "evedrop",
+        "sweep" if constant else "montecarlo",
+        "SCENARIO" if isinstance(given, Scenario) else str(given),
+    ]
+    for key, value in dotted(changes).items():
+        words += ["--set", f"{key}={toml_of(value)}"]
+    if constant:
+        words += ["--over", "encoding.state_probability=0.1:0.9:0.1"]
+    return shlex.join(words)
+
 
 _LONGEST_SCHEDULE = 100  # designed in a minute
 _TWENTIETHS = tuple(float(i) / 20 for i in range(21))

@@ -6,8 +6,7 @@ import argparse
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
-from evedrop.cli.command import Command
-from evedrop.cli.options import as_json, changes, changes_of, scenario
+from evedrop.cli.options import Command, as_json, changes, changes_of, scenario
 from evedrop.cli.tables import tables
 from evedrop.errors import UsageError
 from evedrop.system.output import print_json
@@ -16,10 +15,7 @@ from evedrop.system.output import print_json
 def design(options: argparse.Namespace) -> int:
     """Print the admissible μ_d, the cost and secrecy of each choice; or when to send or to encrypt, or a μ_d for each slot."""
     from evedrop.cli import api
-    from evedrop.cli.budget_report import print_budget
-    from evedrop.cli.design_report import print_design
-    from evedrop.cli.policy_report import print_policies
-    from evedrop.cli.schedule_report import print_schedules
+    from evedrop.cli.design_report import print_budget, print_design, print_policies, print_schedules
 
     chosen = {"--policy": options.policy, "--schedule": options.schedule, "--budget": options.budget}
     kind = next((name for name, value in chosen.items() if value is not None and value is not False), None)

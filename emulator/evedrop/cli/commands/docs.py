@@ -6,8 +6,8 @@ import argparse
 from importlib import resources
 from pathlib import Path
 
-from evedrop.cli.command import Command
-from evedrop.cli.names import print_names
+from evedrop.cli.options import Command
+from evedrop.cli.parser import print_names
 from evedrop.errors import UsageError
 from evedrop.system.hints import near
 

@@ -1,4 +1,4 @@
-"""`evedrop paper`: the numbers of a paper, next to ours."""
+"""The papers: `evedrop paper` reproduces one, `evedrop figures` draws the founding paper's figures."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evedrop.cli.command import Command
-from evedrop.cli.names import print_names
-from evedrop.cli.options import as_json
+from evedrop.cli.options import Command, as_json
+from evedrop.cli.parser import print_names
 from evedrop.cli.tables import tables
 from evedrop.errors import UsageError
 from evedrop.system.output import print_json
@@ -111,6 +110,30 @@ def _papers(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="also write NAME.json and NAME.md there")
 
 
+def figures(options: argparse.Namespace) -> int:
+    """Draw the paper's figures."""
+    from evedrop.studies.papers.kennedy2022 import Size
+    from evedrop.studies.papers.kennedy2022 import figures as draw
+
+    try:
+        report = draw(
+            options.folder,
+            lambda text: print(text, file=sys.stderr),
+            Size(microgrid_trials=1000) if options.full else Size(),
+        )
+    except OSError as error:
+        raise UsageError(f"{options.folder} cannot be written ({error.strerror}); give another folder") from error
+    print(report)
+    return 0
+
+
+def _figures(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("folder", nargs="?", type=Path, default=Path("figures"), metavar="DIR")
+    parser.add_argument(
+        "--full", action="store_true", help="simulate the paper's 1000 trials of a day; takes minutes, not seconds"
+    )
+
+
 COMMANDS = (
     Command(
         "paper",
@@ -119,6 +142,15 @@ COMMANDS = (
         (_papers, as_json, tables),
         section="study",
         example="paper luecke2022",
+        page="papers",
+    ),
+    Command(
+        "figures",
+        figures,
+        "draw the figures of the paper, and a table of its numbers and ours",
+        (_figures,),
+        section="study",
+        example="figures paper/",
         page="papers",
     ),
 )

@@ -13,9 +13,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evedrop.cli.command import Command, Option
 from evedrop.cli.commands import ROLES
-from evedrop.cli.options import argument, changes_of, entries, loaded, scenario, served
+from evedrop.cli.options import Command, Option, argument, changes_of, entries, loaded, scenario, served
 from evedrop.errors import BriefError, EvedropError, UsageError
 
 if TYPE_CHECKING:
@@ -185,7 +184,7 @@ def _record(brief: Brief[RecorderPart], serve: str | None) -> int:
 
 def _report(folder: Path, status: int, how: str) -> None:
     """Print the end of a run that was started by hand."""
-    from evedrop.cli.closing_report import print_ending
+    from evedrop.cli.report import print_ending
 
     print_ending(folder, status, how)
 
@@ -253,6 +252,16 @@ def _role(role: str) -> Option:
 
 _BRIEF = argument("brief", "BRIEF")
 
+
+def host(options: argparse.Namespace) -> int:
+    """Start processes of a run for a launcher on another host."""
+    from evedrop.live.launch.other_hosts import serve_launcher
+
+    del options
+    serve_launcher()
+    return 0
+
+
 COMMANDS = (
     Command(
         "brief",
@@ -283,5 +292,13 @@ COMMANDS = (
             page="hosts",
         )
         for role in ROLES
+    ),
+    Command(
+        "host",
+        host,
+        "start processes of a run for `evedrop run --hosts`, which calls this over ssh",
+        section="processes",
+        example="host",
+        page="hosts",
     ),
 )

@@ -9,14 +9,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evedrop.cli.command import Command
-from evedrop.cli.holding import hold
-from evedrop.cli.options import entries, loaded, output, over_wire, print_so_far, scenario
+from evedrop.cli.options import Command, entries, hold, loaded, output, over_wire, print_so_far, scenario
 from evedrop.cli.tables import tables
 from evedrop.errors import Interrupted, RunError, UsageError
 
 if TYPE_CHECKING:
-    from evedrop.cli.progress_line import ProgressLine
+    from evedrop.cli.console import ProgressLine
     from evedrop.live.launch.hosts_file import HostsPlan
     from evedrop.live.launch.process_set import FinishedRun
     from evedrop.scenario.progress_events import OnEvent
@@ -42,7 +40,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _run(options: argparse.Namespace) -> FinishedRun:
-    from evedrop.cli.progress_line import ProgressLine
+    from evedrop.cli.console import ProgressLine
     from evedrop.live.launch.launcher import launch
     from evedrop.results.folder import results_folder
 

@@ -1,18 +1,20 @@
-"""`evedrop list`, `evedrop show` and `evedrop new`: list and print the built-in scenarios, and write one to start from."""
+"""The scenarios: `evedrop list`, `new`, `show` and `check`."""
 
 from __future__ import annotations
 
 import argparse
+import sys
+from typing import Any
 
-from evedrop.cli.command import Command
-from evedrop.cli.options import argument
+from evedrop.cli.options import Command, argument, changes, changes_of
+from evedrop.errors import UsageError
 
 
 def list_scenarios(_: argparse.Namespace) -> int:
     """Print the name and title of each built-in scenario, even if it needs an extra that is not installed."""
     import tomllib
 
-    from evedrop.cli.names import print_names
+    from evedrop.cli.parser import print_names
     from evedrop.scenarios import shipped
 
     print_names({name: tomllib.loads(path.read_text(encoding="utf-8"))["title"] for name, path in shipped().items()})
@@ -44,6 +46,65 @@ def _name(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", metavar="NAME", help="the name of a built-in scenario, as evedrop list prints it")
 
 
+def check(options: argparse.Namespace) -> int:
+    """Validate scenarios, or check classes against the rules."""
+    from evedrop.scenario.expected.estimates import warnings_of
+    from evedrop.scenario.loading import load
+
+    names = {kind: name for kind in ("scheme", "eavesdropper", "link", "delay") if (name := getattr(options, kind))}
+    if bool(names) == bool(options.scenarios):
+        raise UsageError("check: expected scenarios, or classes by --scheme, --eavesdropper, --link or --delay")
+    if names:
+        return _check_classes(names, changes_of(options))
+    status = 0
+    for name in options.scenarios:
+        try:
+            scenario = load(name, changes_of(options))
+        except UsageError as error:
+            print(error, file=sys.stderr)
+            status = error.exit_status
+            continue
+        print(f"{name}: {scenario.title}: {scenario.slots} slots, {', '.join(scenario.receivers)}: no mistakes")
+        for warning in warnings_of(scenario):
+            print(f"  warning: {warning}")
+    return status
+
+
+def _check_classes(names: dict[str, str], parameters: dict[str, Any]) -> int:
+    from evedrop.scenario.conformance.examine import examined
+
+    status = 0
+    for examination in examined(names, parameters):
+        broken = [verdict for verdict in examination.verdicts if verdict.broken is not None]
+        print(
+            f"{examination.title}: {f'{len(broken)} broken' if broken else 'all'} of {len(examination.verdicts)} rules"
+            + ("" if broken else " kept")
+        )
+        for verdict in examination.verdicts:
+            print(f"  {'ok' if verdict.broken is None else 'BROKEN':<8}{verdict.rule}")
+            if verdict.broken is not None:
+                print(f"          {verdict.broken}")
+        status = UsageError.exit_status if broken else status
+    return status
+
+
+def _scenarios(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("scenarios", nargs="*", metavar="SCENARIO")
+
+
+def _classes(parser: argparse.ArgumentParser) -> None:
+    for kind, subject in (
+        ("scheme", "a scheme, or the scheme to check an eavesdropper with"),
+        ("eavesdropper", "an eavesdropper"),
+        ("link", "a loss model"),
+        ("delay", "a delay model"),
+    ):
+        text = (
+            f"check {subject}: MODULE:CLASS of a module in this folder or an installed one; --set gives its parameters"
+        )
+        parser.add_argument(f"--{kind}", metavar="NAME", help=text)
+
+
 COMMANDS = (
     Command("list", list_scenarios, "list built-in scenarios", section="make", example="list", page="scenario"),
     Command(
@@ -62,6 +123,15 @@ COMMANDS = (
         (argument("file", "FILE"), _origin),
         section="make",
         example="new my-scenario.toml --from vehicle",
+        page="scenario",
+    ),
+    Command(
+        "check",
+        check,
+        "check scenarios or classes of your own, and start nothing",
+        (_scenarios, changes, _classes),
+        section="make",
+        example="check my-scenario.toml",
         page="scenario",
     ),
 )

@@ -12,8 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from evedrop.cli.command import Command
-from evedrop.cli.options import as_json
+from evedrop.cli.options import Command, as_json
 from evedrop.errors import BriefError, UsageError
 from evedrop.system.output import print_json
 

@@ -7,8 +7,8 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from evedrop.cli.command import Command
 from evedrop.cli.in_memory import check_resuming, resuming, scheduler
+from evedrop.cli.options import Command
 from evedrop.errors import UsageError
 
 

@@ -11,9 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evedrop.cli.command import Command
-from evedrop.cli.holding import hold
-from evedrop.cli.options import argument, number_type, served
+from evedrop.cli.options import Command, argument, hold, number_type, served
 from evedrop.cli.tables import tables
 from evedrop.errors import UsageError
 
@@ -36,7 +34,7 @@ def view(options: argparse.Namespace) -> int:
         raise UsageError("--time is for wires; a run has slots, so give --slot")
     _check_names(options)
     if options.table:
-        from evedrop.cli.closing_report import print_report_line, print_results
+        from evedrop.cli.report import print_report_line, print_results
         from evedrop.results.reading import results_of_this_version
 
         with results_of_this_version(options.run):
@@ -124,7 +122,7 @@ def _times_of(options: argparse.Namespace) -> Sequence[float]:
 
 def _film(recording: Path, options: argparse.Namespace, moments: Sequence[float]) -> int:
     """Draw some moments as a video."""
-    from evedrop.cli.progress_line import ProgressLine
+    from evedrop.cli.console import ProgressLine
     from evedrop.scenario.progress_events import RunProgress
     from evedrop.show.view.video import FRAME_RATE, VIDEO_SIZE, video_apart
 

@@ -7,8 +7,7 @@ import gc
 import sys
 from pathlib import Path
 
-from evedrop.cli.command import Command
-from evedrop.cli.options import changes_of
+from evedrop.cli.options import Command, changes_of
 from evedrop.errors import UsageError
 from evedrop.system.output import say as complain
 
@@ -41,7 +40,7 @@ def wire(options: argparse.Namespace) -> int:
         print(f"evedrop: warning: {warning}", file=sys.stderr)
     if options.check:
         return 0
-    from evedrop.cli.closing_report import report_page
+    from evedrop.cli.report import report_page
     from evedrop.live.network.zenoh_log import zenoh_log_apart
     from evedrop.results.folder import results_folder
     from evedrop.wire.run import run_wire

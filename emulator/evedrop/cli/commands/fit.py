@@ -1,4 +1,4 @@
-"""`evedrop links fit`: the loss model and delays of a recorded link."""
+"""`evedrop links fit` and `evedrop process fit`: models of recorded links and processes."""
 
 from __future__ import annotations
 
@@ -7,13 +7,37 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from evedrop.cli.command import Command
-from evedrop.cli.options import argument, as_json
+from evedrop.cli.options import Command, argument, as_json
 from evedrop.errors import UsageError
 from evedrop.system.output import print_json
 
 if TYPE_CHECKING:
     from evedrop.scenario.recordings.message_recording import MessageRecording
+
+
+def fit(options: argparse.Namespace) -> int:
+    """Fit a process to recorded states."""
+    from evedrop.scenario.fitting.process_fit import fit_process
+
+    names = None if options.states is None else [name.strip() for name in options.states.split(",")]
+    fitted = fit_process(options.file, names, _numbers(options.reference))
+    if options.json:
+        print_json(fitted.as_dict())
+    else:
+        print("\n".join([*(f"# {line}" for line in fitted.remarks), "", fitted.toml]))
+    return 0
+
+
+def _numbers(text: str | None) -> list[float] | None:
+    try:
+        return None if text is None else [float(number) for number in text.split(",")]
+    except ValueError:
+        raise UsageError(f"--reference {text}: expected numbers such as 55,50") from None
+
+
+def _process_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--states", metavar="X,Y", help="the columns that are states; default all but time")
+    parser.add_argument("--reference", metavar="X,Y", help="the levels from which states are deviations; default 0")
 
 
 def fit_link(options: argparse.Namespace) -> int:
@@ -101,7 +125,7 @@ def _refuse_others(options: argparse.Namespace, subject: str, names: Sequence[st
             raise UsageError(f"--{name} {value:g}: expected seconds, more than 0")
 
 
-def _fits(parser: argparse.ArgumentParser) -> None:
+def _link_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--column",
         metavar="C",
@@ -146,9 +170,19 @@ def _fits(parser: argparse.ArgumentParser) -> None:
 COMMANDS = (
     Command(
         "fit",
+        fit,
+        "find the process that explains recorded states",
+        (argument("file", "FILE"), _process_options, as_json),
+        group="process",
+        section="study",
+        example="process fit pose.csv",
+        page="programs",
+    ),
+    Command(
+        "fit",
         fit_link,
         "find the loss model and delays of a recorded link: a table, an MCAP recording or the folder of a wire",
-        (argument("trace", "RECORDING"), _fits, as_json),
+        (argument("trace", "RECORDING"), _link_options, as_json),
         group="links",
         section="study",
         example="links fit walk.csv",

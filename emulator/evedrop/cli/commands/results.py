@@ -1,0 +1,106 @@
+"""What is made of finished results: `evedrop report`, `export` and `diff`."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+
+from evedrop.cli.options import Command, argument, number_type
+from evedrop.errors import UsageError
+
+
+def report(options: argparse.Namespace) -> int:
+    """Write the page of a results folder."""
+    from evedrop.results.wire_summary import is_wire
+    from evedrop.show.report.writing import write_report
+
+    write = write_report
+    if is_wire(options.run):  # its summary may have to be made from its journal
+        from evedrop.wire.page import write_wire_report as write
+    try:
+        print(write(options.run))
+    except OSError as error:
+        raise UsageError(
+            f"{options.run}: report.html cannot be written ({error.strerror}); make the folder writable"
+        ) from error
+    return 0
+
+
+_LONGEST = 3600.0  # seconds per slot, as for pace
+
+
+def export(options: argparse.Namespace) -> int:
+    """Write the results of a run as an MCAP file."""
+    from evedrop.results.mcap_export import export_mcap
+    from evedrop.results.reading import Results
+    from evedrop.results.wire_summary import is_wire
+    from evedrop.system.signals import raise_on_signals
+
+    if is_wire(options.run):
+        raise UsageError(f"{options.run} is the folder of a wire; give the results folder of a run")
+    results = Results.read(options.run)
+    with raise_on_signals():
+        counts = export_mcap(results, options.file, options.period)
+    if results.remark is not None:
+        print(results.remark)
+    print(f"{sum(counts.values())} messages on {len(counts)} topics are in {options.file}")
+    return 0
+
+
+def _written(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("file", type=Path, metavar="FILE.mcap")
+    parser.add_argument(
+        "--period",
+        type=number_type(math.ulp(0.0), _LONGEST, f"a number of seconds above 0 and up to {_LONGEST:.0f}"),
+        metavar="SECONDS",
+        help="seconds per slot; default those of the scenario, or 1",
+    )
+
+
+def diff(options: argparse.Namespace) -> int:
+    """Compare two runs."""
+    from evedrop.results.diff import difference
+    from evedrop.results.reading import Results
+
+    runs = [Results.read(run) for run in options.runs]
+    differences = difference(*runs)
+    print(differences.text)
+    for remark in filter(None, (run.remark for run in runs)):
+        print(remark)
+    return 0 if differences.same else 1
+
+
+def _two_runs(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("runs", nargs=2, type=Path, metavar="RUN")
+
+
+COMMANDS = (
+    Command(
+        "report",
+        report,
+        "write report.html: a run, sweep, comparison or wire on one page",
+        (argument("run", "FOLDER"),),
+        section="inspect",
+        example="report runs/vehicle",
+        page="results",
+    ),
+    Command(
+        "export",
+        export,
+        "write a finished run as an MCAP file, for Foxglove",
+        (argument("run", "RUN"), _written),
+        section="inspect",
+        example="export runs/vehicle vehicle.mcap",
+        page="results",
+    ),
+    Command(
+        "diff",
+        diff,
+        "show the first difference between two runs",
+        (_two_runs,),
+        section="inspect",
+        example="diff runs/one runs/other",
+        page="results",
+    ),
+)
