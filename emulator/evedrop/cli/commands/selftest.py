@@ -101,7 +101,6 @@ def _processor() -> str:
 
 def selftest(_: argparse.Namespace) -> int:
     """Check that this machine computes the golden digests."""
-
     check = checks()
     for name, value in check.machine.items():
         print(f"{name:<16}{value}")
@@ -116,7 +115,7 @@ def selftest(_: argparse.Namespace) -> int:
 COMMANDS = (
     Command(
         "selftest",
-        checks,
+        selftest,
         "check this machine against reference digests",
         section="inspect",
         example="selftest",

@@ -1,4 +1,7 @@
-"""A heated room."""
+"""The comfort of a heated room: how long it is too cold or too warm, how much the heater heats, and whether receivers can tell.
+
+Source: docs/scenario.md, comfort.
+"""
 
 from __future__ import annotations
 
