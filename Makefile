@@ -94,6 +94,7 @@ lint-rest: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 	$(BIN)/python tools/package_drawing.py --check
+	$(BIN)/python -m pytest -q tools/lint
 	$(BIN)/python tools/lines_of_code.py
 
 setup: $(READY)

@@ -1,4 +1,4 @@
-"""What the site needs from the pages, without building it; `make docs` checks the rest."""
+"""Links of pages lead somewhere, and the site has every page, without building it; `make docs` checks the rest."""
 
 from __future__ import annotations
 
@@ -7,11 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from tests.docs.test_documents import heading
-
 ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+PAGES = sorted(path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md"))
 MADE = {"index.md", "gallery.md", "contributing.md", "security.md", "changelog.md"}
 """Pages of the site that tools/site/pages.py makes, besides those in reference/."""
+
+
+def heading(title: str) -> str:
+    """How a heading is linked to."""
+    return re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-")
 
 
 def test_the_navigation_has_every_page_once() -> None:
@@ -32,3 +37,21 @@ def test_links_of_pages_outside_docs_lead_somewhere(name: str) -> None:
         if anchor:
             titles = re.findall(r"^#+ (.*)$", other.read_text(encoding="utf-8"), re.MULTILINE)
             assert anchor in {heading(title) for title in titles}, target
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_between_documents_lead_somewhere(page: str) -> None:
+    """The page is there, and the heading in it."""
+    text = (DOCS / page).read_text(encoding="utf-8")
+    for target in re.findall(r"\]\(([^)#:\s]*(?:#[^)\s]*)?)\)", text):
+        name, _, anchor = target.partition("#")
+        other = (DOCS / page).parent / name if name else DOCS / page
+        assert other.is_file(), target
+        if anchor:
+            titles = re.findall(r"^#+ (.*)$", other.read_text(encoding="utf-8"), re.MULTILINE)
+            assert anchor in {heading(title) for title in titles}, target
+
+
+def test_a_heading_is_linked_to_without_its_signs() -> None:
+    """So that the tests above test something."""
+    assert heading("`[plant]` and a `key`: what it is") == "plant-and-a-key-what-it-is"

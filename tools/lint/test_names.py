@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SOURCES = sorted(path for folder in ("emulator", "peers") for path in (ROOT / folder).rglob("*.py"))
 
 
@@ -89,7 +89,7 @@ def test_classes_say_that_they_are_final_by_the_decorator() -> None:
 def test_no_two_test_files_have_the_same_name() -> None:
     """Pytest imports test files by their names alone, and collects only the first of two."""
     folders = defaultdict(list)
-    for folder in ("tests", "docs/examples"):
+    for folder in ("tests", "tools", "docs/examples"):
         for path in (ROOT / folder).rglob("test_*.py"):
             folders[path.name].append(str(path.parent))
     assert {name: where for name, where in folders.items() if len(where) > 1} == {}

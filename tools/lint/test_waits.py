@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 WORK = "a daemon thread that waits for its next work; nobody waits for the thread without a limit"
 PROCESS = "a process of a run: SIGTERM ends it at once, and so do the recorder, the launcher's end and a lost router"
 END = "a daemon thread that waits for the end of a process; nobody waits for the thread"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
 BY_TAG = {"pypa/cibuildwheel@v4.3.3"}
 """Actions whose commit nobody here could look up. Nothing else may join them."""
