@@ -128,6 +128,11 @@ def mistakes_of(read: Callable[..., object], *arguments: Any, **named: Any) -> l
     return error.mistakes
 
 
+def places_of(mistakes: Iterable[str]) -> list[str]:
+    """The entries that mistakes are about, in order."""
+    return [mistake.partition(": ")[0] for mistake in mistakes]
+
+
 def mistakes_in_good(changes: dict[str, Any], without: str = "") -> list[str]:
     """The mistakes of `GOOD` with these changes, by dotted key, and without one entry."""
     tables = changed(GOOD, **{without.replace(".", "__"): None}) if without else copy.deepcopy(GOOD)

@@ -30,7 +30,10 @@ from evedrop.names import KERNELS_VARIABLE
 from evedrop.results.reading import Results
 from tests.commands import LARGEST_FILE, NEWS, TELLING, CommandProcess, ForkedCommand
 from tests.examples import register_profiles
+from tests.golden.pages import golden
 from tests.privileged import say_what_was_skipped
+
+__all__ = ["golden"]
 
 FORKABLE = frozenset({"env", "cwd", "start_new_session", "stdout", "umask"})
 """The options of Popen that a forked command can have, too; it has a session of its own in any case."""

@@ -17,8 +17,9 @@ from evedrop.model.slot.link import NEVER
 from evedrop.results.resolved_scenario import write_resolved
 from evedrop.scenario.loading import checked, load
 from evedrop.scenario.tables import Scenario
-from tests.builders import listener, scalar_tables
+from tests.builders import listener, mistakes_of, places_of, scalar_tables
 from tests.examples import examples
+from tests.golden.pages import Golden
 
 NEMESIS: dict[str, Any] = {"faults": ["kill", "pause", "cut"], "every": 20, "lasting": 8}
 LOOP: dict[str, Any] = {
@@ -50,43 +51,41 @@ def happening(scenario: Scenario, name: str) -> list[tuple[int, int | None, str]
 WRONG: dict[str, tuple[dict[str, Any], list[str]]] = {
     "no such fault": (
         {"faults": ["kil"]},
-        ['nemesis.faults.0: is "kil"; expected cut, kill, partition, pause or set; did you mean kill?'],
+        ["nemesis.faults.0"],
     ),
     "nothing to do": (
         {"faults": []},
-        ["nemesis.faults: has fewer than 1 entries; expected at least that many"],
+        ["nemesis.faults"],
     ),
-    "too often": ({"every": 0.5}, ["nemesis.every: is 0.5; expected a number at least 1.0, such as 200"]),
+    "too often": ({"every": 0.5}, ["nemesis.every"]),
     "two at once": (
         {"lasting": "long", "evry": 3},
-        ['nemesis.lasting: is "long"; expected a number, such as 50', "nemesis.evry: is not an entry of this table; did you"],
+        ["nemesis.lasting", "nemesis.evry"],
     ),
-    "nobody": ({"targets": ["router"]}, ['nemesis.targets.0: is "router"; expected legitimate, eve or mallory']),
-    "twice": ({"targets": ["eve", "eve"]}, ["nemesis.targets: has a name twice; expected each once"]),
+    "nobody": ({"targets": ["router"]}, ["nemesis.targets.0"]),
+    "twice": ({"targets": ["eve", "eve"]}, ["nemesis.targets"]),
     "after the end": (
         {"from": 1000, "to": 1001},
-        ["nemesis.from: is 1000, but the last slot is 999", "nemesis.to: is 1001; expected at most 1000"],
+        ["nemesis.from", "nemesis.to"],
     ),
-    "ends before": ({"from": 9, "to": 9}, ["nemesis.to: is 9, not after from, which is 9; expected a later slot"]),
-    "set to nothing": ({"faults": ["set"]}, ["nemesis.set: is missing, but the fault set is drawn; expected what changes"]),
-    "set without it": ({"set": {"quality": 0.1}}, ['nemesis.set: is given, but "set" is not among faults']),
-    "state of nobody": ({"faults": ["cut"], "state": "last"}, ['nemesis.state: is given, but "kill" is not among faults']),
+    "ends before": ({"from": 9, "to": 9}, ["nemesis.to"]),
+    "set to nothing": ({"faults": ["set"]}, ["nemesis.set"]),
+    "set without it": ({"set": {"quality": 0.1}}, ["nemesis.set"]),
+    "state of nobody": ({"faults": ["cut"], "state": "last"}, ["nemesis.state"]),
     "wrong change": (
         {"faults": ["set"], "set": {"quality": 1.2}},
-        ["nemesis.set.quality: is 1.2; expected a number from 0 to 1"],
+        ["nemesis.set.quality"],
     ),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("what", WRONG)
-def test_mistakes_are_told_with_their_path(what: str) -> None:
+def test_mistakes_are_told_with_their_path(what: str, golden: Golden) -> None:
     """What was found, what was expected; several at once."""
-    nemesis, said = WRONG[what]
-    with pytest.raises(ScenarioError) as caught:
-        right(nemesis)
-    assert len(caught.value.mistakes) == len(said)
-    for expected in said:
-        assert any(line.startswith(expected) for line in caught.value.mistakes), caught.value.mistakes
+    nemesis, places = WRONG[what]
+    mistakes = mistakes_of(right, nemesis)
+    assert sorted(places_of(mistakes)) == sorted(places)
+    golden("check", mistakes)
 
 
 def test_mistakes_elsewhere_are_told_beside_those_of_a_nemesis() -> None:

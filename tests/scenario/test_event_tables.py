@@ -10,7 +10,8 @@ from evedrop.model.links.loss_model import Fate
 from evedrop.model.slot.link import NEVER
 from evedrop.scenario.loading import checked
 from evedrop.scenario.tables import Scenario
-from tests.builders import listener, mistakes_of, scalar_tables
+from tests.builders import listener, mistakes_of, places_of, scalar_tables
+from tests.golden.pages import Golden
 
 
 def eventful(*events: dict[str, Any], **more: Any) -> dict[str, Any]:
@@ -25,86 +26,87 @@ def right(*events: dict[str, Any], **more: Any) -> Scenario:
 
 
 WRONG: dict[str, tuple[list[dict[str, Any]], str]] = {
-    "beyond the end": ([{"at": 100, "cut": "eve"}], "event.0.at: is 100, but the last slot is 99; expected a slot of"),
-    "ends beyond": ([{"from": 9, "to": 101, "cut": "eve"}], "event.0.to: is 101; expected at most 100, the end of"),
+    "beyond the end": ([{"at": 100, "cut": "eve"}], "event.0.at"),
+    "ends beyond": ([{"from": 9, "to": 101, "cut": "eve"}], "event.0.to"),
     "before it begins": (
         [{"from": 9, "to": 9, "cut": "eve"}],
-        "event.0.to: is 9, not after from, which is 9; expected",
+        "event.0.to",
     ),
-    "no such link": ([{"at": 1, "cut": "mallory"}], 'event.0.cut: names "mallory"; expected legitimate or eve'),
+    "no such link": ([{"at": 1, "cut": "mallory"}], "event.0.cut"),
     "no receiver": (
         [{"at": 1, "kill": "router"}],
-        'event.0.kill: names "router": it is not a receiver; expected',
+        "event.0.kill",
     ),
     "two things": (
         [{"at": 1, "cut": "eve", "note": "x"}],
-        "event.0.event: has cut or note at once; expected one of set",
+        "event.0.event",
     ),
-    "nothing": ([{"at": 1}], "event.0.event: does not say what happens; expected one of set, cut"),
-    "no time": ([{"cut": "eve"}], "event.0.at: is missing; expected at = 400"),
-    "two times": ([{"at": 1, "from": 2, "to": 3, "cut": "eve"}], "event.0.at: and from are both there"),
+    "nothing": ([{"at": 1}], "event.0.event"),
+    "no time": ([{"cut": "eve"}], "event.0.at"),
+    "two times": ([{"at": 1, "from": 2, "to": 3, "cut": "eve"}], "event.0.at"),
     "no end": (
         [{"from": 2, "cut": "eve"}],
-        "event.0.to: is missing, but from is given; expected the slot in which it ends",
+        "event.0.to",
     ),
-    "end alone": ([{"at": 2, "to": 3, "cut": "eve"}], "event.0.to: is given without from"),
-    "no lasting thing": ([{"from": 2, "to": 3, "note": "x"}], "event.0.from: is given, but note happens in one slot"),
-    "set nothing": ([{"at": 1, "link": "eve", "set": {}}], "event.0.set: is empty; expected what changes"),
+    "end alone": ([{"at": 2, "to": 3, "cut": "eve"}], "event.0.to"),
+    "no lasting thing": ([{"from": 2, "to": 3, "note": "x"}], "event.0.from"),
+    "set nothing": ([{"at": 1, "link": "eve", "set": {}}], "event.0.set"),
     "set nowhere": (
         [{"at": 1, "set": {"quality": 0.5}}],
-        "event.0.link: is missing; expected the link that is changed",
+        "event.0.link",
     ),
     "set wrongly": (
         [{"at": 1, "link": "eve", "set": {"quality": 2.0}}],
-        "event.0.set.quality: is 2.0; expected a number",
+        "event.0.set.quality",
     ),
-    "set what is not": ([{"at": 1, "link": "eve", "set": {"colour": 2}}], "event.0.set.colour: is not a link setting"),
+    "set what is not": ([{"at": 1, "link": "eve", "set": {"colour": 2}}], "event.0.set.colour"),
     "set a model wrongly": (
         [{"at": 1, "link": "eve", "set": {"loss": {"model": "pattern", "outcomes": "12"}}}],
-        "event.0.set.loss.outcomes: is ",
+        "event.0.set.loss.outcomes",
     ),
     "heals what is whole": (
         [{"at": 1, "heal": "eve"}],
-        "event.0.heal: eve is not cut at slot 1; expected a cut before",
+        "event.0.heal",
     ),
     "restarts who is there": (
         [{"at": 1, "restart": "eve"}],
-        "event.0.restart: eve is not down at slot 1; expected a kill",
+        "event.0.restart",
     ),
     "killed twice": (
         [{"at": 1, "kill": "eve"}, {"at": 3, "kill": "eve"}],
-        "event.1.kill: eve is down already, from slot 1 on; expected it to be back",
+        "event.1.kill",
     ),
     "cut twice": (
         [{"from": 1, "to": 9, "cut": "eve"}, {"at": 3, "partition": ["eve"]}],
-        "event.1.cut: eve is cut already, from slot 1 on; expected a heal before",
+        "event.1.cut",
     ),
     "back and gone at once": (
         [{"from": 1, "to": 5, "kill": "eve"}, {"at": 5, "pause": "eve"}],
-        "event.1.pause: eve comes back only in slot 5; expected a later slot",
+        "event.1.pause",
     ),
     "state of nobody": (
         [{"at": 1, "cut": "eve", "state": "last"}],
-        "event.0.state: is given without a restart; remove",
+        "event.0.state",
     ),
     "jams nothing": (
         [{"at": 1, "jam": "acknowledgements"}],
-        "event.0.jam: the scheme innovation has no acknowledgements",
+        "event.0.jam",
     ),
-    "unknown entry": ([{"at": 1, "cut": "eve", "why": "x"}], "event.0.why: is not an entry of this table"),
+    "unknown entry": ([{"at": 1, "cut": "eve", "why": "x"}], "event.0.why"),
     "seconds without length": (
         [{"at": 1, "link": "eve", "set": {"delay": {"model": "constant", "value": 1.0, "unit": "seconds"}}}],
-        "event.0.set.delay.unit: is seconds; expected slot_seconds",
+        "event.0.set.delay.unit",
     ),
 }
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_a_wrong_event_is_named(name: str) -> None:
+def test_a_wrong_event_is_named(name: str, golden: Golden) -> None:
     """With its number, what was found and what was expected; exit status 2."""
-    events, line = WRONG[name]
-    found = mistakes_of(right, *events)
-    assert any(one.startswith(line) for one in found), found
+    events, place = WRONG[name]
+    mistakes = mistakes_of(right, *events)
+    assert place in places_of(mistakes)
+    golden("check", mistakes)
 
 
 def test_all_wrong_events_are_named_at_once() -> None:
