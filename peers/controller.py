@@ -11,7 +11,7 @@ from evedrop.live.protocol.brief import AnyBrief, Brief, ControllerPart, decoded
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import EndRun
 from evedrop.live.protocol.telemetry import decided, read_known
-from evedrop.model.slot.controller_core import ControllerCore
+from evedrop.model.slot.cores import ControllerCore
 from evedrop.names import CONTROLLER
 from evedrop.peers.closed_loop import kept_decisive
 

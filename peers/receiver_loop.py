@@ -19,7 +19,7 @@ from evedrop.live.protocol.commands import EndRun
 from evedrop.live.protocol.packets import acknowledgement, is_barrier, read_acknowledgement, read_deliveries
 from evedrop.live.protocol.telemetry import leaving
 from evedrop.model.receiver import Belief, Flags, Receiver
-from evedrop.model.slot.receiver_core import ReceiverCore
+from evedrop.model.slot.cores import ReceiverCore
 from evedrop.peers.closed_loop import Consultation
 
 

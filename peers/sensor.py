@@ -25,7 +25,7 @@ from evedrop.model.process import Floats
 from evedrop.model.receiver import Flags
 from evedrop.model.schemes import scheme_of
 from evedrop.model.schemes.scheme import Scheme
-from evedrop.model.slot.sensor_core import GivenStates, PlantCore, SensorCore, Sent, recorded
+from evedrop.model.slot.cores import GivenStates, PlantCore, SensorCore, Sent, recorded
 from evedrop.names import RECORDER, SENSOR
 from evedrop.peers.closed_loop import Steered
 from evedrop.scenario.conformance.checked import checked_encoder

@@ -17,8 +17,7 @@ from evedrop.model.delays import ConstantDelay, DelayModel
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, Knowledge, PacketReader, PacketTaker
 from evedrop.model.eavesdroppers.fixed_rules import Naive
 from evedrop.model.kernels import elementary
-from evedrop.model.links.bernoulli import Bernoulli
-from evedrop.model.links.loss_model import Chain, Fate, LossModel, fates_of
+from evedrop.model.links.loss_model import Bernoulli, Chain, Fate, LossModel, fates_of
 from evedrop.model.metrics.metric import MeanMetric, Metric, MetricColumn, MetricTally, ScoredSlots
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Action, Belief, Beliefs, Codes, Flags, Receiver, Reception, prior, trace_of

@@ -9,8 +9,7 @@ import pytest
 from evedrop.live.protocol.brief import Flow
 from evedrop.live.protocol.commands import Again, ControlCommand
 from evedrop.live.recorder.conductor import Conductor, Stop
-from evedrop.live.recorder.recovery import Recovery
-from evedrop.live.recorder.stall import patience_of
+from evedrop.live.recorder.recovery import Recovery, patience_of
 from evedrop.scenario.progress_events import ProgressEvent
 from evedrop.system.waiting import SYSTEM_CLOCK, Clock
 from tests.clock import TestClock

@@ -16,7 +16,7 @@ import pytest
 
 from evedrop import load_results, montecarlo, run
 from evedrop.errors import RunError, UsageError
-from evedrop.live.launch.shard import shards_of
+from evedrop.live.launch.gathering import shards_of
 from evedrop.live.launch.shards import OneProgress
 from evedrop.results.growing_tables import last_round
 from evedrop.results.reading import Results, age_of_metrics

@@ -9,7 +9,7 @@ import pytest
 from evedrop.errors import Silence
 from evedrop.live.protocol.commands import ProcessStatus
 from evedrop.live.protocol.keys import RunKeys
-from evedrop.live.recorder.stall import Stall, patience_of, silent_of
+from evedrop.live.recorder.recovery import Stall, patience_of, silent_of
 from tests.clock import TestClock
 
 KEYS = RunKeys("r")

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from evedrop.model.controllers.controller import Assignment
+from evedrop.model.controllers import Assignment
 from evedrop.model.integrity.monitor import MonitorPlan
 from evedrop.model.integrity.theory import loop_of
 from evedrop.model.plant import Plant

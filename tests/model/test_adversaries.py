@@ -10,8 +10,7 @@ import pytest
 from evedrop.model.eavesdroppers import READERS, STRATEGIES
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.links import loss_of
-from evedrop.model.links.loss_model import Fate
-from evedrop.model.links.pooled import pooled
+from evedrop.model.links.loss_model import Fate, pooled
 from evedrop.model.process import Floats, Process, Trajectory
 from evedrop.model.receiver import Reception
 from evedrop.model.slot.link import link_of

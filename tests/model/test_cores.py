@@ -19,10 +19,9 @@ from evedrop.model.schemes import SCHEMES, scheme_of
 from evedrop.model.schemes.innovation import InnovationEncoder, SharedSecret
 from evedrop.model.schemes.plain import PlainEncoder
 from evedrop.model.schemes.scheme import Packet, PacketBlock
+from evedrop.model.slot.cores import FollowedSlots, PlantCore, ReceiverCore, SensorCore, Sent
 from evedrop.model.slot.link import Change, LinkSchedule, ReceiverOutage, streams_of
 from evedrop.model.slot.link_core import Arrivals, LinkCore
-from evedrop.model.slot.receiver_core import FollowedSlots, ReceiverCore
-from evedrop.model.slot.sensor_core import PlantCore, SensorCore, Sent
 from evedrop.model.streams import Batch, stream_key
 from tests.builders import MARGINAL, stream_keys
 from tests.model.slot_loop import ROOT, keys_of

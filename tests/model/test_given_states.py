@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evedrop.model.process import product
-from evedrop.model.slot.sensor_core import GivenStates, PlantCore, deviations, recorded
+from evedrop.model.slot.cores import GivenStates, PlantCore, deviations, recorded
 from evedrop.model.streams import Batch
 from tests.builders import MARGINAL
 

@@ -15,7 +15,7 @@ from evedrop.model.integrity.theory import WatermarkTheory, loop_of, watermark_c
 from evedrop.model.plant import Plant
 from evedrop.model.schemes.plain import PlainEncoder
 from evedrop.model.schemes.scheme import PacketBlock
-from evedrop.model.slot.sensor_core import PlantCore, SensorCore, Sent
+from evedrop.model.slot.cores import PlantCore, SensorCore, Sent
 from evedrop.model.streams import Batch
 from tests.builders import stream_keys
 from tests.model.integrity_loop import ALWAYS, ONE, PLANAR, REPLACED, SCALAR, simulated

@@ -17,9 +17,9 @@ from evedrop.model.process import Process, Trajectory
 from evedrop.model.receiver import Action, Belief, Receiver, Reception, prior
 from evedrop.model.schemes.encrypted_schedule import EncryptedSchedule
 from evedrop.model.schemes.innovation import Innovation
+from evedrop.model.slot.cores import Absence, ReceiverCore
 from evedrop.model.slot.link import COUNTED_BURSTS, Accountant, Fates, Link, LinkSchedule, streams_of
 from evedrop.model.slot.link_core import Arrival, Arrivals, Late, Transit
-from evedrop.model.slot.receiver_core import Absence, ReceiverCore
 from evedrop.model.streams import Batch
 from tests.builders import stream_keys
 from tests.examples import examples

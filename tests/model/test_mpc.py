@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from evedrop.model.controllers import CONTROLLERS, Assignment, mpc
-from evedrop.model.controllers.mpc import Mpc
+from evedrop.model import controllers
+from evedrop.model.controllers import CONTROLLERS, Assignment, Mpc
 from evedrop.model.plant import Plant
 from evedrop.model.process import Process
 
@@ -163,7 +163,7 @@ def test_without_the_solver_it_says_what_to_install(monkeypatch: pytest.MonkeyPa
     assert Mpc.objections(assigned()) == []
     ((entry, _),) = Mpc.objections(assigned(input_weights=np.zeros(2), rate_weights=np.zeros(2)))
     assert entry == "input_weights"
-    monkeypatch.setattr(mpc, "find_spec", lambda _: None)
+    monkeypatch.setattr(controllers, "find_spec", lambda _: None)
     ((entry, what),) = Mpc.objections(assigned())
     assert entry == "strategy"
     assert "pip install '.[microgrid]' in the checkout" in what

@@ -16,8 +16,7 @@ from evedrop.model.checks import as_toml, count_mistakes, flag_mistakes
 from evedrop.model.controllers import CONTROLLERS
 from evedrop.model.delays import DELAY_MODELS, LONGEST, DelayModel, delay_of
 from evedrop.model.links import LOSS_MODELS, loss_of
-from evedrop.model.links.loss_model import LossModel
-from evedrop.model.links.pooled import Pooled
+from evedrop.model.links.loss_model import LossModel, Pooled
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes
 from evedrop.model.schemes import SCHEMES

@@ -9,14 +9,13 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 from evedrop.live.protocol.brief import AssignmentEntry, PlantEntry
-from evedrop.model.controllers import CONTROLLERS, Assignment
-from evedrop.model.controllers.lqr import Lqr, gain, held
+from evedrop.model.controllers import CONTROLLERS, Assignment, Lqr, gain, held
 from evedrop.model.kernels.elementary import semidefinite_factor
 from evedrop.model.plant import Drive, InputAwareEstimator, Offset, Plant
 from evedrop.model.process import Process, Trajectory
 from evedrop.model.receiver import Action, Reception
 from evedrop.model.schemes import scheme_of
-from evedrop.model.slot.controller_core import ControllerCore
+from evedrop.model.slot.cores import ControllerCore
 from evedrop.model.streams import Batch, root_of_seed, stream_key
 from tests.builders import stream_keys
 

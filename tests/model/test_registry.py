@@ -12,8 +12,7 @@ import pytest
 from evedrop.errors import NoAnswer, NotRegistered
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper, PacketTaker
 from evedrop.model.links import LOSS_MODELS
-from evedrop.model.links.bernoulli import Bernoulli
-from evedrop.model.links.loss_model import LossModel
+from evedrop.model.links.loss_model import Bernoulli, LossModel
 from evedrop.model.registry import Registry, asked, is_own, no_modules, place_of
 from evedrop.model.schemes import SCHEMES
 from tests.packages import install

@@ -15,9 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from evedrop.model.eavesdroppers.bayesian import Bayesian
+from evedrop.model.eavesdroppers.bayesian import Bayesian, Genie
 from evedrop.model.eavesdroppers.eavesdropper import Knowledge
-from evedrop.model.eavesdroppers.genie import Genie
 from evedrop.model.eavesdroppers.type_tests import Likelihood
 from evedrop.model.kernels.elementary import Floats
 from evedrop.model.process import Process, StateFactors

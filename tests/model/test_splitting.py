@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evedrop.model.process import Floats
-from evedrop.model.splitting import SplitPopulations, importance_floor
 from evedrop.model.streams import OWN, Batch, BlockReader, Lineage, stream_key
+from evedrop.simulate.splitting import SplitPopulations, importance_floor
 
 KEY = stream_key(b"any", "splitting")
 GROWTH, KEPT, SLOTS = 1.9, 0.5, 12

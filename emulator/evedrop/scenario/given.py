@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from evedrop.model.slot.sensor_core import LARGEST
+from evedrop.model.slot.cores import LARGEST
 from evedrop.scenario.table import Found, Table, expected, numbers
 from evedrop.scenario.words import as_toml
 

@@ -17,7 +17,7 @@ from evedrop.model.delays import DELAY_MODELS, MOST_DELAYS, DelayModel
 from evedrop.model.links import LOSS_MODELS
 from evedrop.model.links.loss_model import LossModel
 from evedrop.model.process import Floats
-from evedrop.model.slot.sensor_core import deviations
+from evedrop.model.slot.cores import deviations
 from evedrop.scenario.recordings.disturbance_file import found_file, read_disturbances
 from evedrop.scenario.recordings.link_recording import LinkRecording
 from evedrop.scenario.tables import Scenario

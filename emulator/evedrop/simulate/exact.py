@@ -21,10 +21,18 @@ from evedrop.model.plant import InputAwareEstimator
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Belief, Flags, Receiver, prior
 from evedrop.model.schemes.scheme import Scheme, Shared
-from evedrop.model.slot.controller_core import ControllerCore
+from evedrop.model.slot.cores import (
+    Absence,
+    ControllerCore,
+    FollowedSlots,
+    GivenStates,
+    PlantCore,
+    ReceiverCore,
+    SensorCore,
+    Sent,
+    recorded,
+)
 from evedrop.model.slot.link_core import Arrivals, LinkCore
-from evedrop.model.slot.receiver_core import Absence, FollowedSlots, ReceiverCore
-from evedrop.model.slot.sensor_core import GivenStates, PlantCore, SensorCore, Sent, recorded
 from evedrop.model.streams import Batch
 from evedrop.names import CONTROLLER, LEGITIMATE
 from evedrop.scenario.controlled import monitor_of

@@ -19,8 +19,12 @@ from rich.console import Console
 from evedrop.errors import UsageError
 from evedrop.model.checks import as_toml
 from evedrop.model.slot.link import Change
+from evedrop.results.reading import results_of_this_version
 from evedrop.results.wire_summary import WIRE_FILE, WIRE_SUMMARY_FILE, JournalState, WireSummary
+from evedrop.show.report.kinds import wire_page
 from evedrop.show.report.wire import wire_sentences, wire_table
+from evedrop.show.report.wire_sections import WireSource
+from evedrop.show.report.writing import write_page
 from evedrop.show.terminal_tables import rich_table
 from evedrop.system.files import is_locked
 from evedrop.wire.file import load_wire
@@ -127,3 +131,12 @@ def closing_lines(summary: WireSummary) -> list[str]:
     console = Console(file=text, force_terminal=False, width=max(100, shutil.get_terminal_size().columns))
     console.print(rich_table(wire_table(summary)))
     return [*(line.rstrip() for line in text.getvalue().splitlines()), *wire_sentences(summary)]
+
+
+def write_wire_report(folder: Path) -> Path:
+    """Write the page into a wire's folder, from its summary or else from its journal; returns its path.
+
+    Raises UsageError if neither can be read, and OSError if the page cannot be written.
+    """
+    with results_of_this_version(folder):
+        return write_page(folder, wire_page(WireSource.of(folder, summary_of_wire(folder))))

@@ -22,7 +22,7 @@ import pytest
 
 from evedrop import Scenario, compare, load_results, montecarlo, run, sweep
 from evedrop.cli.api import RunResults
-from evedrop.cli.api.given import place_for
+from evedrop.cli.api.running import place_for
 from evedrop.cli.main import parser_of
 from evedrop.cli.options import changes_of
 from evedrop.errors import RunError, ScenarioError, UsageError
@@ -108,7 +108,7 @@ def test_overwrite_never_removes_what_is_not_results(tmp_path: Path) -> None:
 def at_exit(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """What is to be done when this program ends; it is not done."""
     calls: list[Any] = []
-    monkeypatch.setattr("evedrop.cli.api.given.atexit.register", lambda *given, **_: calls.append(given))
+    monkeypatch.setattr("evedrop.cli.api.running.atexit.register", lambda *given, **_: calls.append(given))
     return calls
 
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from evedrop.model.delays import Normal
-from evedrop.model.links.bernoulli import Bernoulli
-from evedrop.model.links.loss_model import fates_of
+from evedrop.model.links.loss_model import Bernoulli, fates_of
 from evedrop.model.links.markov import GilbertElliott
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes

@@ -12,7 +12,7 @@ from evedrop.model.delays import DELAY_MODELS
 from evedrop.model.eavesdroppers import STRATEGIES
 from evedrop.model.eavesdroppers.fixed_rules import Naive, Suspicious
 from evedrop.model.links import LOSS_MODELS
-from evedrop.model.links.bernoulli import Bernoulli
+from evedrop.model.links.loss_model import Bernoulli
 from evedrop.model.receiver import Flags
 from evedrop.model.registry import asked
 from evedrop.model.schemes import SCHEMES

@@ -13,7 +13,7 @@ import pytest
 from evedrop.cli import main as cli
 from evedrop.cli.api import montecarlo
 from evedrop.errors import ScenarioError
-from evedrop.model.controllers import mpc
+from evedrop.model import controllers
 from evedrop.scenario.loading import checked
 from evedrop.score.energy import Meter, energy
 from evedrop.simulate.montecarlo import Plan
@@ -61,7 +61,7 @@ def test_without_the_solver_one_line_says_what_to_install(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Only the scenario that uses the extra needs it; the list of scenarios and the other scenarios do not."""
-    monkeypatch.setattr(mpc, "find_spec", lambda _: None)
+    monkeypatch.setattr(controllers, "find_spec", lambda _: None)
     assert cli.main(["check", "microgrid-mpc", "--set", "slots=200"]) == 2
     told = capsys.readouterr().err
     assert told.count("'.[microgrid]'") == 1

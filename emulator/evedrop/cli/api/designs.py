@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from evedrop.cli.api.given import scenario_of
+from evedrop.cli.api.running import scenario_of
 from evedrop.errors import UsageError
 from evedrop.model.checks import toml_of
 from evedrop.model.eavesdroppers import STRATEGIES

@@ -146,7 +146,7 @@ def _take_part(brief: AnyBrief) -> None:
 
         route(brief)
     elif has_part(brief, parts.RelayPart):
-        from evedrop.live.network.relay import relay
+        from evedrop.live.network.router import relay
 
         relay(brief)
     elif has_part(brief, parts.SensorPart):

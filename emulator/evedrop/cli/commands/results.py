@@ -17,7 +17,7 @@ def report(options: argparse.Namespace) -> int:
 
     write = write_report
     if is_wire(options.run):  # its summary may have to be made from its journal
-        from evedrop.wire.page import write_wire_report as write
+        from evedrop.wire.on_disk import write_wire_report as write
     try:
         print(write(options.run))
     except OSError as error:

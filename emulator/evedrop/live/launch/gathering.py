@@ -1,7 +1,8 @@
 """Merges the results folders of a run's shards into one, as the run would have written it without shards.
 
-Trials are concatenated and counts added. Means over all trials are computed from the shards' means, so they agree with an
-unsharded run's within rounding; digests, fates, recorded trials and everything else kept by trial are the same to the bit.
+A shard is a contiguous range of the run's trials, with a scenario and a results folder of its own. Trials are concatenated and
+counts added. Means over all trials are computed from the shards' means, so they agree with an unsharded run's within rounding;
+digests, fates, recorded trials and everything else kept by trial are the same to the bit.
 
 Tables are merged some slots at a time, so that a long run's tables fit into memory. The rows of each receiver are in order of
 slots, but the receivers alternate as they did in the run. A merged table has, for every few thousand slots, one receiver after
@@ -13,13 +14,14 @@ Source: docs/scale.md, shards.
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import chain, count
 from pathlib import Path
 from typing import Any, final
@@ -31,7 +33,6 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from evedrop.errors import UsageError
-from evedrop.live.launch.shard import Shard
 from evedrop.model.digest import DIGEST_BYTES, Digests, RunDigest, block_starts
 from evedrop.names import LEGITIMATE
 from evedrop.results.ending import noted
@@ -47,6 +48,55 @@ from evedrop.score.expectations_held import replay_of
 from evedrop.score.run_tally import RunTally
 from evedrop.score.scorekeeper import RunOutcome, summary_of
 from evedrop.score.summary import Summary
+
+SHARDS_FOLDER = "shards"  # in the results folder, until the shards are merged
+
+
+@dataclass(frozen=True)
+class Shard:
+    """A range of the trials of a run."""
+
+    number: int
+    """Number of the shard, from 1 on, in order of trials."""
+    scenario: Scenario
+    """The run's scenario, with only these trials."""
+    folder: Path
+    """Its own results folder."""
+
+    @property
+    def name(self) -> str:
+        """Name of the folder of its logs, in the run's log folder."""
+        return f"shard-{self.number}"
+
+    @property
+    def trials(self) -> range:
+        """The shard's trials, by their numbers in the scenario."""
+        first = self.scenario.first_trial
+        return range(first, first + self.scenario.trials)
+
+    def of_run(self, text: object) -> str:
+        """A message of the shard as one of the run: names the shard, and its logs by their path in the run's folder."""
+        trials = self.trials
+        which = f"trial {trials[0]}" if len(trials) == 1 else f"trials {trials[0]} to {trials[-1]}"
+        return f"shard {self.number} ({which}): " + re.sub(r"(?<![\w/])logs/", f"logs/{self.name}/", str(text))
+
+
+def shards_of(scenario: Scenario, folder: Path) -> list[Shard]:
+    """The shards of a run, as equal as possible; a shard without a recorded trial records its first trial nevertheless."""
+    trials, recorded, count = scenario.trials, scenario.record_trials, scenario.shards
+    bounds = [trials * i // count for i in range(count + 1)]
+    tables = scenario.model_dump(mode="json")
+    made = []
+    for number, start in enumerate(bounds[:-1], 1):
+        own = {
+            "trials": bounds[number] - start,
+            "first_trial": scenario.first_trial + start,
+            "record_trials": max(1, min(recorded - start, bounds[number] - start)),
+            "shards": 1,
+        }
+        made.append(Shard(number, Scenario.model_validate({**tables, **own}), folder / SHARDS_FOLDER / str(number)))
+    return made
+
 
 _RECORDING = "recording.rrd"
 

@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import final
 
 from evedrop.errors import Interrupted, RunError, UsageError
+from evedrop.live.launch.gathering import SHARDS_FOLDER, Shard, shards_of
 from evedrop.live.launch.ports import RouterEndpoints, loopback_endpoints
 from evedrop.live.launch.process_set import FinishedRun, launch_one
-from evedrop.live.launch.shard import SHARDS_FOLDER, Shard, shards_of
 from evedrop.live.launch.starter import Starter
 from evedrop.model.kernels.elementary import sum_in_order
 from evedrop.results.folder import HeldFolder, new_folder

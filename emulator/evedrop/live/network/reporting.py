@@ -19,7 +19,7 @@ from evedrop.model.digest import BlockDigests, Blocks, BlockSums, Digests, Input
 from evedrop.model.kernels.current import kernels
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Beliefs, Flags
-from evedrop.model.slot.sensor_core import Sent
+from evedrop.model.slot.cores import Sent
 
 
 def is_due(brief: AnyBrief, k: int) -> bool:

@@ -1,18 +1,19 @@
-"""The router: takes each packet of the uplink, lets every link decide its fate, delivers, and keeps the journal.
+"""The routers: one decides the fate of every packet; a second, the relay, passes on the granted messages and decides nothing.
 
     uplink ── k, z ──┬── link of receiver 1 ── fate, γ ── downlink/1
                      ├── link of receiver 2 ── fate, γ ── downlink/2      fates of all ── journal
                      └── …
 
-A receiver that is present gets one delivery in every slot, with everything that arrives in the slot. At a barrier on the
-uplink the router journals all slots before it and waits until the conductor lets it continue; links change nowhere else. When
-packets are sent again, the router routes them again, with the same fates, as a restarted router would.
+The router takes each packet of the uplink, lets every link decide its fate, delivers, and keeps the journal. A receiver that is
+present gets one delivery in every slot, with everything that arrives in the slot. At a barrier on the uplink the router journals
+all slots before it and waits until the conductor lets it continue; links change nowhere else. When packets are sent again, the
+router routes them again, with the same fates, as a restarted router would.
 
 Some of the conductor's commands are carried out at a barrier, others end any waiting. In real time, deliveries may be delayed by
 a fraction of a slot: they are sent when they are due, in order, while the router continues. Delays of whole slots are emulated
 time, the same in every run.
 
-Source: docs/protocol.md, control and lost connections.
+Source: docs/protocol.md, control, lost connections, and two routers.
 """
 
 from __future__ import annotations
@@ -29,10 +30,11 @@ from typing import final
 import numpy as np
 
 from evedrop.errors import EvedropError, NotRegistered
-from evedrop.live.network.access import access_control, at_router, grants, until_all_left, users_file
+from evedrop.live.network.access import access_control, at_relay, at_router, grants, until_all_left, users_file
+from evedrop.live.network.connecting import connected
 from evedrop.live.network.process_session import GapDetector, Pending, ProcessSession, most_slots
-from evedrop.live.network.session import Session, router_config
-from evedrop.live.protocol.brief import AnyBrief, Brief, RouterPart, Wiring
+from evedrop.live.network.session import ATTEMPT, Session, client_config, router_address_of, router_config
+from evedrop.live.protocol.brief import AnyBrief, Brief, RelayPart, RouterPart, Wiring
 from evedrop.live.protocol.codec import Reader
 from evedrop.live.protocol.commands import Again, ControlCommand, EndRun, Go, LinkChange
 from evedrop.live.protocol.keys import ZenohConfig
@@ -535,3 +537,38 @@ class DelayedSender:
                     self._changed.wait(wait if self._due else None)
                 _, _, put, payload = heapq.heappop(self._due)
             put(payload)
+
+
+def relay(brief: Brief[RelayPart]) -> None:
+    """Run the relay of a brief until the conductor ends it and all processes connected to it have left.
+
+    Raises BriefError if the router does not accept the brief, RunError if no router answers within the brief's patience.
+    """
+    part = brief.part
+    table = at_relay(brief.run, grants(brief.run, tuple(part.receivers), part.controller, relayed=True), part.zid)
+    # Connect as a client first, which reports errors; Zenoh links routers in the background and reports none.
+    with connected(router_address_of(brief), float(brief.patience)):
+        pass
+    with _opened_relay(brief, access_control(table, brief.identity is not None)) as session:
+        present = session.presence(grant.process for grant in table if grant.token is not None and grant.zid is None)
+        session.wait_for_link()
+        session.ready()
+        session.wait_for(EndRun)
+        until_all_left(present)
+
+
+def _opened_relay(brief: Brief[RelayPart], access: ZenohConfig) -> Session:
+    with users_file(brief.part.users) as users:
+        return Session(brief, _config(brief, str(users), access), brief.part.listen)
+
+
+def _config(brief: Brief[RelayPart], users: str, access: ZenohConfig) -> ZenohConfig:
+    """Configuration of a router that also connects to the first router as a client, and reconnects when the link is lost."""
+    listening = router_config(brief, users, access, brief.part.listen)
+    connecting = client_config(brief)
+    auth = {"usrpwd": {**listening["transport"]["auth"]["usrpwd"], **connecting["transport"]["auth"]["usrpwd"]}}
+    return {
+        **listening,
+        "connect": {**connecting["connect"], "timeout_ms": -1, "exit_on_failure": False},
+        "transport": {**listening["transport"], "auth": auth, "unicast": dict(ATTEMPT)},
+    }

@@ -22,7 +22,7 @@ import numpy as np
 from evedrop.errors import BriefError
 from evedrop.live.protocol.keys import KINDS
 from evedrop.model.acknowledgements import AckChannelSpec
-from evedrop.model.controllers.controller import Assignment
+from evedrop.model.controllers import Assignment
 from evedrop.model.detection import Chart
 from evedrop.model.entries import (
     LIMITS,

@@ -15,7 +15,7 @@ import numpy as np
 from evedrop.live.protocol.brief import ProgramEntry
 from evedrop.model.checks import is_number
 from evedrop.model.process import Floats
-from evedrop.model.slot.sensor_core import LARGEST, deviations
+from evedrop.model.slot.cores import LARGEST, deviations
 
 MOST_BYTES = 2**20
 """The most bytes of a message that is read."""

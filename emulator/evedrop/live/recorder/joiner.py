@@ -33,8 +33,8 @@ from evedrop.model.integrity.monitor import MonitoredSlots
 from evedrop.model.links.loss_model import REASONS
 from evedrop.model.process import Floats
 from evedrop.model.receiver import Belief, prior
+from evedrop.model.slot.cores import Absence
 from evedrop.model.slot.link import Account
-from evedrop.model.slot.receiver_core import Absence
 from evedrop.names import CONTROLLER, ROUTER, SENSOR
 from evedrop.scenario.tables import Scenario
 from evedrop.scenario.timeline import Away

@@ -35,8 +35,7 @@ from evedrop.live.protocol.requests import RunStatus, StatusRequest
 from evedrop.live.protocol.telemetry import is_held, is_leaving, read_leaving
 from evedrop.live.recorder.conductor import Conductor, Stop
 from evedrop.live.recorder.joiner import AbsenceReporter, Joiner
-from evedrop.live.recorder.recovery import Recovery
-from evedrop.live.recorder.stall import Stall, patience_of
+from evedrop.live.recorder.recovery import Recovery, Stall, patience_of
 from evedrop.live.recorder.steering import Steering, status_of
 from evedrop.live.recorder.verification import Verifier, extent_of
 from evedrop.model.digest import Blocks

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from evedrop.model.eavesdroppers.bayesian import Bayesian
+from evedrop.model.eavesdroppers.bayesian import Bayesian, Genie
 from evedrop.model.eavesdroppers.code_readers import ClearStates, Reference
 from evedrop.model.eavesdroppers.eavesdropper import Eavesdropper
 from evedrop.model.eavesdroppers.fixed_rules import ConstantEstimate, Naive, Selective, Smart, Suspicious
-from evedrop.model.eavesdroppers.genie import Genie
 from evedrop.model.eavesdroppers.learning_em import LearningEm
 from evedrop.model.eavesdroppers.learning_particle import LearningParticle
 from evedrop.model.eavesdroppers.remote_class import RemoteCalls, RemoteClasses

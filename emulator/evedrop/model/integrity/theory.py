@@ -9,8 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evedrop.model.controllers.controller import Assignment
-from evedrop.model.controllers.lqr import riccati
+from evedrop.model.controllers import Assignment, riccati
 from evedrop.model.integrity.attacks import SensorAttack
 from evedrop.model.integrity.loop import WatermarkedLoop, spread
 from evedrop.model.integrity.monitor import assumed

@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from evedrop.model.links.bernoulli import Bernoulli
 from evedrop.model.links.distance import Distance
-from evedrop.model.links.loss_model import LossModel
+from evedrop.model.links.loss_model import Bernoulli, LossModel, Pooled
 from evedrop.model.links.markov import GilbertElliott, Markov
-from evedrop.model.links.pooled import Pooled
 from evedrop.model.links.trace import Pattern, RecordedLoss
 from evedrop.model.registry import Registry
 

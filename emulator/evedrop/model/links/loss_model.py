@@ -1,16 +1,23 @@
-"""The base class of loss models: from random numbers to lost packets. The rest of a link is in `evedrop.model.slot.link`."""
+"""The base class of loss models, from random numbers to lost packets, and the two simplest.
+
+In the paper's link every packet is received with the same probability, independently of everything else. Several links may end at
+one receiver: a packet is then lost if it is lost on all of them. The rest of a link is in `evedrop.model.slot.link`.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import reduce
+from math import prod
 from types import MappingProxyType
 from typing import Any, ClassVar
 
 import numpy as np
 
+from evedrop.model.checks import probability_mistakes
 from evedrop.model.kernels.elementary import sum_in_order
 from evedrop.model.links.way import Way
 from evedrop.model.process import Floats, parts_of
@@ -159,3 +166,93 @@ def count_variance(transitions: Floats, stationary: Floats, quality: Floats, slo
             count += 1
     together = float((stationary * centred) @ (2.0 * total @ centred)) - slots * float(stationary @ (centred * centred))
     return max(0.0, together) + slots * float(stationary @ (quality * (1.0 - quality)))
+
+
+class Bernoulli(LossModel):
+    """P(γ_k = 1) = quality, which is μ for the legitimate estimator and μ_e for an eavesdropper.
+
+    Source: docs/mathematics.md, model.
+    """
+
+    parameters = MappingProxyType({"quality": 0.9})
+
+    def __init__(self, quality: float) -> None:
+        self._quality = quality
+
+    @classmethod
+    def mistakes(cls, given: Mapping[str, Any]) -> list[tuple[str, str]]:
+        """The quality is a probability."""
+        return probability_mistakes(given, "quality")
+
+    @property
+    def quality(self) -> float:
+        """The parameter."""
+        return self._quality
+
+    @property
+    def chain(self) -> Chain:
+        """A single state."""
+        return Chain(np.ones((1, 1)), np.ones(1), np.array([self._quality]))
+
+    def fates(self, first: int, uniforms: Floats) -> Codes:  # noqa: ARG002 - every slot alike
+        """Delivered where the uniform number is below the quality."""
+        return fates_of(uniforms[:, 0, :] >= self._quality)
+
+
+_MOST_STATES = 1024  # of the joint chain of all links: the transitions of a larger one would fill the memory
+
+
+class Pooled(LossModel):
+    """Pools independent loss models, each with its own random numbers. Scenarios cannot name it: see `colluding`.
+
+    Each of the models is checked by itself, so there is nothing to check here.
+    """
+
+    parameters: ClassVar[Mapping[str, Any]] = {}
+
+    def __init__(self, models: Sequence[LossModel]) -> None:
+        self._models = models
+        self.uniforms_per_slot = sum(model.uniforms_per_slot for model in models)
+
+    @property
+    def quality(self) -> float:
+        """1 − Π (1 − quality)."""
+        lost = 1.0
+        for model in self._models:
+            lost *= 1.0 - model.quality
+        return 1.0 - lost
+
+    @property
+    def chain(self) -> Chain | None:
+        """The joint states of all links; None if a link's losses do not follow a chain, or if there are too many states."""
+        chains = [model.chain for model in self._models]
+        usable = [chain for chain in chains if chain is not None]
+        small = prod(len(chain.stationary) for chain in usable) <= _MOST_STATES
+        return reduce(_both, usable) if small and len(usable) == len(chains) else None
+
+    def fates(self, first: int, uniforms: Floats) -> Codes:
+        """The pooled fate of each packet."""
+        each, start = [], 0
+        for model in self._models:
+            each.append(model.fates(first, uniforms[:, start : start + model.uniforms_per_slot]))
+            start += model.uniforms_per_slot
+        return pooled(each)
+
+
+def pooled(fates: Sequence[Codes]) -> Codes:
+    """`Fate` of the packets of several links, (slots, R) each: delivered if any delivers, otherwise lost as on the first."""
+    result = fates[0].copy()
+    for other in fates[1:]:
+        result[other == Fate.DELIVERED] = Fate.DELIVERED
+    return result
+
+
+def _both(first: Chain, second: Chain) -> Chain:
+    missed = _product(1.0 - first.quality, 1.0 - second.quality)
+    return Chain(
+        _product(first.transitions, second.transitions), _product(first.stationary, second.stationary), 1.0 - missed
+    )
+
+
+def _product(left: Floats, right: Floats) -> Floats:
+    return np.asarray(np.kron(left, right), np.float64)

@@ -6,7 +6,7 @@ Its account has the outcomes of its packets, slot by slot, and the distributions
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, NamedTuple, final
@@ -366,3 +366,12 @@ class Accountant:
             return delays
         through = (fates.codes == Fate.DELIVERED) | (fates.codes == Fate.LATE)
         return np.bincount(np.minimum(fates.delays[through], bins - 1), minlength=bins).astype(np.uint32)
+
+
+_AHEAD = 128  # slots drawn at once
+
+
+def deliveries(link: Link, slots: int) -> Iterator[Flags]:
+    """γ_k (R,) of slots 0 … slots−1, one after the other."""
+    for start in range(0, slots, _AHEAD):
+        yield from link.fates(range(start, min(start + _AHEAD, slots))).in_time

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evedrop.model.controllers.controller import Assignment
+from evedrop.model.controllers import Assignment
 from evedrop.model.integrity.monitor import Monitor, MonitorPlan
 from evedrop.model.integrity.theory import loop_of
 from evedrop.model.local_filter import LocalFilter
 from evedrop.model.process import Floats, product
 from evedrop.model.schemes.plain import PlainEncoder
-from evedrop.model.slot.sensor_core import PlantCore, SensorCore
+from evedrop.model.slot.cores import PlantCore, SensorCore
 from evedrop.model.streams import Batch, root_of_seed, stream_key
 
 

@@ -17,7 +17,7 @@ from evedrop.errors import UsageError
 from evedrop.model.checks import toml_of
 from evedrop.model.kernels.elementary import normal_quantile
 from evedrop.model.process import Floats, mistakes_of
-from evedrop.model.slot.sensor_core import LARGEST, deviations
+from evedrop.model.slot.cores import LARGEST, deviations
 from evedrop.scenario.recordings.disturbance_file import StateRecording, recorded_states
 
 FEWEST = 10

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, ConfigDict, Field
 
 from evedrop.model.checks import is_number
-from evedrop.model.controllers.lqr import Lqr
+from evedrop.model.controllers import Lqr
 from evedrop.model.digest import Digests, InputLog, RunDigest
 from evedrop.model.integrity import POLICIES, SENSOR_ATTACKS
 from evedrop.model.integrity.attacks import Replay

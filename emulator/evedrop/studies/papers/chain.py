@@ -13,11 +13,10 @@ import numpy as np
 
 from evedrop.model.process import Floats
 from evedrop.model.schedule import Schedule
-from evedrop.model.slot.link import link_of
+from evedrop.model.slot.link import deliveries, link_of
 from evedrop.model.streams import Batch, root_of_seed, stream_key
 from evedrop.model.theory.closed_forms import step_probabilities, word_probability
 from evedrop.show.view.figure_style import BLUE, RED, panels
-from evedrop.studies.papers.deliveries import deliveries
 
 CASES = ((0.9, 0.6), (0.6, 0.3))
 WORDS = ("D", "DI", "DD", "DII", "DID", "DDI", "DDD")

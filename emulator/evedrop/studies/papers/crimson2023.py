@@ -19,10 +19,9 @@ from evedrop.model.process import Floats, Process, Trajectory
 from evedrop.model.receiver import Receiver, Reception
 from evedrop.model.schedule import PACKETS
 from evedrop.model.schemes.noise import Noise
-from evedrop.model.slot.link import link_of
+from evedrop.model.slot.link import deliveries, link_of
 from evedrop.model.streams import Batch, BlockReader, root_of_seed, stream_key
 from evedrop.model.theory.covariances import NOBODY, limit, lyapunov
-from evedrop.studies.papers.deliveries import deliveries
 from evedrop.studies.papers.reproduction import NumberVerdict, Paper, Progress, PublishedNumber
 
 _A = np.array([[0.5, 0.1], [0.4, 0.6]])

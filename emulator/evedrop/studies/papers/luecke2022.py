@@ -25,9 +25,8 @@ from evedrop.model.schemes.mixed_packets import (
     forged_fraction,
 )
 from evedrop.model.schemes.scheme import Scheme
-from evedrop.model.slot.link import link_of
+from evedrop.model.slot.link import deliveries, link_of
 from evedrop.model.streams import Batch, root_of_seed, stream_key
-from evedrop.studies.papers.deliveries import deliveries
 from evedrop.studies.papers.reproduction import NumberVerdict, Paper, Progress, PublishedNumber
 
 MU, FLIP = 0.8, 0.1

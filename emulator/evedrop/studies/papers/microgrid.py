@@ -14,12 +14,11 @@ import numpy as np
 from evedrop.model.process import Floats, Process
 from evedrop.model.receiver import Action
 from evedrop.model.schedule import Schedule
-from evedrop.model.slot.link import link_of
+from evedrop.model.slot.link import deliveries, link_of
 from evedrop.model.streams import Batch, root_of_seed, stream_key
 from evedrop.model.theory.covariances import Outcomes, expected_traces, misled_covariances
 from evedrop.model.update import actual_covariance
 from evedrop.show.view.figure_style import BLUE, GREEN, GREY, RED, panels
-from evedrop.studies.papers.deliveries import deliveries
 
 MU = 0.6
 STATE_PROBABILITIES = tuple(round(0.1 * i, 1) for i in range(1, 10))

@@ -11,7 +11,7 @@ from typing import final
 
 import numpy as np
 
-from evedrop.model.controllers.controller import Assignment
+from evedrop.model.controllers import Assignment
 from evedrop.model.integrity import SENSOR_ATTACKS
 from evedrop.model.integrity.monitor import MonitorPlan
 from evedrop.model.integrity.theory import WatermarkTheory, loop_of

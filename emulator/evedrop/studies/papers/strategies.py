@@ -16,11 +16,10 @@ from evedrop.model.eavesdroppers.eavesdropper import Knowledge
 from evedrop.model.process import Floats, Process, Trajectory
 from evedrop.model.receiver import Receiver, Reception
 from evedrop.model.schemes.innovation import Innovation
-from evedrop.model.slot.link import link_of
+from evedrop.model.slot.link import deliveries, link_of
 from evedrop.model.streams import Batch, root_of_seed, stream_key
 from evedrop.model.theory.covariances import Outcomes, expected_traces
 from evedrop.show.view.figure_style import BLUE, GREEN, ORANGE, RED, panels
-from evedrop.studies.papers.deliveries import deliveries
 
 MU, MU_D, SLOTS = 0.9, 0.85, 26
 _BATCH = 2000

@@ -20,8 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, final
 import numpy as np
 from pydantic import Field
 
-from evedrop.model.controllers import Assignment, Controller
-from evedrop.model.controllers.lqr import held
+from evedrop.model.controllers import Assignment, Controller, held
 from evedrop.model.metrics.text import estimate
 from evedrop.model.plant import Plant
 from evedrop.model.process import Floats, Process, product

@@ -1,1 +1,0 @@
-"""Numerical building blocks that give the same bits on every machine."""
