@@ -371,5 +371,3 @@ class _Programme:
 
 
 CONTROLLERS: Mapping[str, type[Controller]] = {"lqr": Lqr, "mpc": Mpc}
-
-__all__ = ["CONTROLLERS", "Assignment", "Controller"]
