@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 def paper(options: argparse.Namespace) -> int:
     """Compute the numbers of a paper; list the papers if none is named. 1 if a number differs and nothing explains it."""
+    from evedrop.studies.papers import paper as paper_of
     from evedrop.studies.papers import reproduce
-    from evedrop.studies.papers import reproduction as paper_of
 
     if options.name is None:
         _list(options.json)
