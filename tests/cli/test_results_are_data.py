@@ -23,7 +23,7 @@ from evedrop.scenario.loading import load
 from evedrop.scenario.loading.recorded import recorded
 from evedrop.scenario.progress_events import silent
 from evedrop.score.sums import SlotSums
-from evedrop.show.view.replay import replay
+from evedrop.show.view.scene_slots import replay
 from evedrop.simulate.montecarlo import simulate
 from tests.conftest import Evedrop
 from tests.examples import mostly_long

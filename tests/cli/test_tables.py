@@ -19,8 +19,7 @@ from evedrop.cli.api import montecarlo, sweep
 from evedrop.cli.commands import MODULES, ROLES
 from evedrop.cli.tables import tables
 from evedrop.model.metrics.text import estimate, finite_text, number_text
-from evedrop.show.report.table_files import csv_text, latex_escaped, latex_text
-from evedrop.show.report.text_table import TextTable
+from evedrop.show.report.text_table import TextTable, csv_text, latex_escaped, latex_text
 from tests.conftest import Evedrop
 
 CLI = Path(evedrop.cli.__file__).parent

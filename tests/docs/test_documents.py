@@ -41,9 +41,8 @@ OTHER_OPTIONS = {
     "emulator/evedrop/simulate/cluster.py",  # those of dask worker
     "emulator/evedrop/cli/pytest_plugin.py",
     "emulator/evedrop/show/report/chart.py",  # names in its style sheet
-    "emulator/evedrop/show/view/headless.py",  # the viewer's
-    "emulator/evedrop/show/view/viewer.py",
-    "emulator/evedrop/show/view/viewer_process.py",  # the sandbox's
+    "emulator/evedrop/show/view/picture.py",  # the viewer's
+    "emulator/evedrop/show/view/viewer.py",  # the viewer's, and the sandbox's
 }
 """Modules that name the options of other programs."""
 _PIP = {"--force-reinstall"}

@@ -26,7 +26,7 @@ from evedrop.scenario.plugins import named_in
 from evedrop.scenario.progress_events import silent
 from evedrop.score.sums import SlotSums
 from evedrop.show.report.wire import wire_failures
-from evedrop.show.view.replay import replay
+from evedrop.show.view.scene_slots import replay
 from evedrop.simulate.montecarlo import simulate
 from evedrop.wire.journal import WireJournal, journal_tables
 from evedrop.wire.on_disk import scorekeeper_on_disk

@@ -160,7 +160,7 @@ def test_the_view_survives_where_there_is_no_theory(live: Results) -> None:
     """A replayed recording of a run in which one receiver's expected trace is nowhere."""
     from rerun.chunk import RrdReader
 
-    from evedrop.show.view.replay import replay
+    from evedrop.show.view.scene_slots import replay
 
     shown = {str(chunk.entity_path) for chunk in RrdReader(replay(live.folder)).stream().filter(is_static=False)}
     assert {"/error/pattern", "/trace/pattern", "/theory/legitimate"} <= shown

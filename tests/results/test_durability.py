@@ -35,7 +35,7 @@ from evedrop.score.run_tally import RunTally
 from evedrop.score.scorekeeper import RunOutcome, summary_of
 from evedrop.score.summary import Summary
 from evedrop.score.sums import SlotSums
-from evedrop.show.view.replay import replay
+from evedrop.show.view.scene_slots import replay
 from tests.conftest import Evedrop, Live, wait_until
 from tests.examples import examples, mostly_long
 from tests.rogue import with_rogue

@@ -17,7 +17,7 @@ from evedrop.errors import UsageError
 from evedrop.results.folder import new_folder, private_file
 from evedrop.results.resolved_scenario import resolved
 from evedrop.scenario.loading import load
-from evedrop.show.view.replay import replay
+from evedrop.show.view.scene_slots import replay
 from tests.conftest import Evedrop, Live, wait_until
 
 OPEN: dict[str, Any] = {"umask": 0o000}

@@ -20,7 +20,7 @@ from evedrop.cli.api import montecarlo
 from evedrop.errors import UsageError
 from evedrop.model.metrics import expectable_metrics
 from evedrop.scenario.loading import load
-from evedrop.show.report.sweep import sweep_table
+from evedrop.show.report.closing import sweep_table
 from evedrop.show.report.writing import write_report
 from evedrop.show.view.palette import colour, hexadecimal
 from evedrop.simulate.montecarlo import Plan

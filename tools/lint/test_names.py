@@ -134,7 +134,7 @@ FORMER = {
 """Former word → the word of the glossary, or the name, in its place. Parts of names count: `open_rooms`, `openRooms`."""
 MEANT_OTHERWISE = {
     "the share": (
-        "emulator/evedrop/show/view/panel_set.py",
+        "emulator/evedrop/show/view/recording.py",
         "emulator/evedrop/show/view/panels/panel.py",
     ),
     "deviation": ("docs/glossary.md",),

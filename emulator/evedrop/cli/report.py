@@ -18,8 +18,8 @@ from evedrop.results.reading import Results
 from evedrop.scenario.loading.recorded import recorded
 from evedrop.score.summary import Summary
 from evedrop.show.report import closing
+from evedrop.show.report.closing import sweep_table
 from evedrop.show.report.comparison import comparison_heading, comparison_lines, pairs_table, schemes_table
-from evedrop.show.report.sweep import sweep_table
 from evedrop.show.report.text_table import TextTable
 from evedrop.show.terminal_tables import fitted, rich_table
 from evedrop.system.output import print_json, say

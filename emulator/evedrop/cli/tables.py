@@ -53,7 +53,7 @@ def written_tables(options: argparse.Namespace) -> Iterator[None]:
 
 
 def _write(taken: Sequence[TextTable], as_csv: Path | None, latex: Path | None) -> None:
-    from evedrop.show.report.table_files import write_csv, write_latex
+    from evedrop.show.report.text_table import write_csv, write_latex
 
     if as_csv is not None:
         write_csv(taken, as_csv)

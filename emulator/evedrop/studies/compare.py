@@ -223,7 +223,7 @@ def _theory(scenario: Scenario, receiver: str, expected: Expectation) -> Theory 
 
 
 def _write(folder: Path, reproduction: Comparison, played: Sequence[tuple[Group, Merger]]) -> None:
-    from evedrop.show.view.comparison_picture import draw  # noqa: PLC0415 - matplotlib takes half a second
+    from evedrop.show.view.result_pictures import draw_comparison  # noqa: PLC0415 - matplotlib takes half a second
 
     with disk_errors(folder):
         _write_found(folder, reproduction)
@@ -233,7 +233,7 @@ def _write(folder: Path, reproduction: Comparison, played: Sequence[tuple[Group,
             write_private(scenarios / f"{group.name}.toml", resolved(group.scenario))
             for name, text in input_texts(group.scenario).items():
                 write_private(scenarios / name, text)
-        draw(private_pictures(folder / "compare"), reproduction)
+        draw_comparison(private_pictures(folder / "compare"), reproduction)
 
 
 def _write_found(folder: Path, result: Comparison) -> None:

@@ -154,9 +154,9 @@ def _write_table(folder: Path, rows: list[dict[str, Any]]) -> pa.Table:
 
 
 def _draw(folder: Path, table: pa.Table, grid: Grid, applications: Iterable[str]) -> None:
-    from evedrop.show.view.sweep_picture import draw  # noqa: PLC0415 - matplotlib takes half a second
+    from evedrop.show.view.result_pictures import draw_sweep  # noqa: PLC0415 - matplotlib takes half a second
 
-    draw(private_pictures(folder / "sweep"), table, tuple(grid))
+    draw_sweep(private_pictures(folder / "sweep"), table, tuple(grid))
     for name in applications:
         APPLICATIONS[name].draw_sweep(private_pictures(folder / name), table, next(iter(grid)))
 

@@ -21,10 +21,9 @@ from evedrop.model.checks import as_toml
 from evedrop.model.slot.link import Change
 from evedrop.results.reading import results_of_this_version
 from evedrop.results.wire_summary import WIRE_FILE, WIRE_SUMMARY_FILE, JournalState, WireSummary
-from evedrop.show.report.kinds import wire_page
 from evedrop.show.report.wire import wire_sentences, wire_table
 from evedrop.show.report.wire_sections import WireSource
-from evedrop.show.report.writing import write_page
+from evedrop.show.report.writing import wire_page, write_page
 from evedrop.show.terminal_tables import rich_table
 from evedrop.system.files import is_locked
 from evedrop.wire.file import load_wire

@@ -20,9 +20,8 @@ from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
 
 from evedrop.model.process import Floats
 from evedrop.show.view.column import ELAPSED
-from evedrop.show.view.drawn_graph import LETTER, LINE, DrawnGraph
 from evedrop.show.view.palette import DROPPED_TEXT, TRUTH, TRUTH_CURVE, colour, dim
-from evedrop.show.view.panels.state_lanes import StateLanes
+from evedrop.show.view.panels.fates import LETTER, LINE, DrawnGraph, StateLanes
 from evedrop.wire.plan import WirePlan
 from evedrop.wire.time_steps import (
     DELIVERED,

@@ -34,12 +34,17 @@ from evedrop.errors import UsageError
 from evedrop.results.reading import Results
 from evedrop.score.track import LongestSpans, LostSpan, Track, lost_spans, track_of
 from evedrop.show.report import closing
-from evedrop.show.report.chart import Curve, LogChart
-from evedrop.show.report.groups import GroupCounts, GroupMeans
+from evedrop.show.report.chart import Curve, GroupCounts, GroupMeans, LogChart
 from evedrop.show.report.page import Page, Part, made
-from evedrop.show.report.run_sections import RUN_SECTIONS, lane_picture
-from evedrop.show.report.run_source import OUTCOMES, PIXELS, RecordedTrial, RunSource
-from evedrop.show.report.slot_rows import RowExtent
+from evedrop.show.report.run_sections import (
+    OUTCOMES,
+    PIXELS,
+    RUN_SECTIONS,
+    RecordedTrial,
+    RowExtent,
+    RunSource,
+    lane_picture,
+)
 from evedrop.show.report.text_table import TextTable
 from evedrop.show.report.writing import REPORT, try_report, write_report
 from evedrop.show.view.lanes import Lane

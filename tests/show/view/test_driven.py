@@ -8,8 +8,7 @@ import pytest
 from evedrop import load_results, montecarlo
 from evedrop.errors import UsageError
 from evedrop.scenario.loading import checked, load
-from evedrop.show.view.plant_slots import LoopValues
-from evedrop.show.view.replay import replay
+from evedrop.show.view.scene_slots import LoopValues, replay
 from tests.show.view.drawn import panels_are_filled
 from tests.show.view.read_back import rows
 

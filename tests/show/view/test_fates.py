@@ -10,10 +10,9 @@ import numpy as np
 
 from evedrop.score.track import Track
 from evedrop.show.view import lanes
-from evedrop.show.view.knowledge import knowledge
+from evedrop.show.view.lanes import knowledge
 from evedrop.show.view.palette import DROPPED_TEXT, IN_TRACK_TEXT, MISLED, RUN_TEXTS, STATE, TRUTH, TRUTH_CURVE, Colour
-from evedrop.show.view.panels.fates import FATES, KNOWN, LastPacket
-from evedrop.show.view.panels.packets import Packets
+from evedrop.show.view.panels.fates import FATES, KNOWN, LastPacket, Packets
 from evedrop.show.view.recording import ViewRecording
 from tests.show.view.read_back import rows
 from tests.show.view.simulated_run import Simulated

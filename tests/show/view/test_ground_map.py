@@ -11,9 +11,9 @@ import rerun as rr
 
 from evedrop.model.links.way import Way
 from evedrop.scenario.loading import load
-from evedrop.show.view.panels.ground_map import GroundMap
+from evedrop.show.view.panels.plane import GroundMap
 from evedrop.show.view.recording import ViewRecording
-from evedrop.show.view.scored_slots import open_recording
+from evedrop.show.view.scene_slots import open_recording
 from tests.show.view.read_back import rows
 from tests.show.view.simulated_run import Simulated, orbit, simulate
 

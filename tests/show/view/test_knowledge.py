@@ -13,13 +13,12 @@ from scipy import stats
 
 from evedrop.model.process import Floats
 from evedrop.score.track import FACTOR, Track
-from evedrop.show.view.glyphs import drawable
-from evedrop.show.view.knowledge import ErrorDistance, knowledge
-from evedrop.show.view.lanes import KNOWLEDGE
-from evedrop.show.view.panels.knowledge import WhoKnowsWhat
-from evedrop.show.view.panels.title import Title
+from evedrop.show.view.lanes import KNOWLEDGE, ErrorDistance, knowledge
+from evedrop.show.view.panels.fates import WhoKnowsWhat
+from evedrop.show.view.panels.texts import Title
 from evedrop.show.view.recording import ViewRecording
 from evedrop.show.view.scene import PeerSlots, Scene, Shown
+from evedrop.show.view.scene_slots import drawable
 from tests.show.view.read_back import lane, rows
 from tests.show.view.simulated_run import Simulated
 

@@ -14,7 +14,7 @@ import pytest
 from evedrop import load_results, montecarlo
 from evedrop.model.process import Floats
 from evedrop.scenario.loading import load
-from evedrop.show.view.replay import replay
+from evedrop.show.view.scene_slots import replay
 from tests.builders import digests_of
 from tests.conftest import Evedrop
 from tests.packages import install

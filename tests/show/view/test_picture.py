@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 from evedrop.errors import UsageError
-from evedrop.show.view.headless import HeadlessViewer
-from evedrop.show.view.picture import check_picture_name, picture_apart
+from evedrop.show.view.picture import HeadlessViewer, check_picture_name, picture_apart
 from evedrop.show.view.recording import ViewRecording
-from evedrop.show.view.viewer_process import guarded
+from evedrop.show.view.viewer import guarded
 from tests.conftest import wait_until
 from tests.show.view.drawn import panels_are_filled, skipped_without_driver
 from tests.show.view.simulated_run import Simulated

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evedrop.show.view.panels.state_plane import apart, arrows, borders, inside, labels_of, within
+from evedrop.show.view.panels.plane import apart, arrows, borders, inside, labels_of, within
 from evedrop.show.view.recording import ViewRecording
 from tests.show.view.read_back import rows
 from tests.show.view.simulated_run import Simulated

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from evedrop.show.view.panels.error import SquaredError
-from evedrop.show.view.panels.state_plane import frames, stride
+from evedrop.show.view.panels.curves import SquaredError
+from evedrop.show.view.panels.plane import frames, stride
 from evedrop.show.view.recording import Scene, ViewRecording
 from tests.conftest import LIMIT
 from tests.examples import mostly_long

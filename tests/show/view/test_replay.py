@@ -10,7 +10,7 @@ import pytest
 
 from evedrop import load_results, montecarlo, run
 from evedrop.errors import UsageError
-from evedrop.show.view.replay import replay
+from evedrop.show.view.scene_slots import replay
 from evedrop.simulate.montecarlo import Plan
 from evedrop.simulate.simulation import Mode
 from tests.show.view.read_back import lane, rows

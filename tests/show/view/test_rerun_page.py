@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from evedrop.errors import UsageError
-from evedrop.show.view.rerun_page import RerunPage
-from evedrop.show.view.viewer_process import end, executable, spawn
+from evedrop.show.view.serving import RerunPage
+from evedrop.show.view.viewer import end, executable, spawn
 from evedrop.system.ports import free_port
 from tests.conftest import LIMIT
 

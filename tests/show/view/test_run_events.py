@@ -10,7 +10,7 @@ import pytest
 from evedrop import load_results, montecarlo
 from evedrop.cli.main import main
 from evedrop.scenario.progress_events import RunEvent
-from evedrop.show.view.replay import replay
+from evedrop.show.view.scene_slots import replay
 from tests.show.view.read_back import rows
 
 EVENTS = [{"at": 3, "link": "legitimate", "set": {"quality": 0.2}}, {"from": 5, "to": 9, "cut": "smart"}]

@@ -9,8 +9,8 @@ from PIL import Image
 
 from evedrop import montecarlo
 from evedrop.errors import UsageError
-from evedrop.show.view import video
-from evedrop.show.view.video import VIDEO_FILES, check_video, video_apart
+from evedrop.show.view import picture
+from evedrop.show.view.picture import VIDEO_FILES, check_video, video_apart
 from tests.conftest import Evedrop
 from tests.privileged import CannotRun, skip
 
@@ -36,7 +36,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> None:
         yield from pictures(moments)
         complaints.append("a complaint")
 
-    monkeypatch.setattr(video, "frames_apart", frames)
+    monkeypatch.setattr(picture, "frames_apart", frames)
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def test_an_interrupt_leaves_no_file(name: str, tmp_path: Path, monkeypatch: pyt
         yield from pictures(range(3))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(video, "frames_apart", frames)
+    monkeypatch.setattr(picture, "frames_apart", frames)
     with pytest.raises(KeyboardInterrupt):
         video_apart(tmp_path / "r.rrd", tmp_path / name, range(9), SIZE, 15.0, lambda _: None)
     assert list(tmp_path.iterdir()) == []
@@ -121,7 +121,7 @@ def test_slots_that_the_run_does_not_have_are_refused_at_once(tmp_path: Path, mo
         raise UsageError(f"slot {next(iter(moments))} is not in the run")
         yield
 
-    monkeypatch.setattr(video, "frames_apart", frames)
+    monkeypatch.setattr(picture, "frames_apart", frames)
     with pytest.raises(UsageError, match="slot 999999999999 is not in the run"):
         video_apart(tmp_path / "r.rrd", tmp_path / "v.gif", range(10**12), SIZE, 15.0, lambda _: None)
     assert list(tmp_path.iterdir()) == []

@@ -19,10 +19,9 @@ import pytest
 from rerun.chunk import RrdReader
 
 from evedrop.errors import UsageError
-from evedrop.show.view.growing_recording import Followed, feed
 from evedrop.show.view.recording import ViewRecording
+from evedrop.show.view.serving import Followed, feed, own_page
 from evedrop.show.view.viewer import Viewer, WebAddress, choose, open_run
-from evedrop.show.view.web_page import own_page
 from evedrop.system.ports import free_port
 from tests.conftest import LIMIT, wait_until
 from tests.examples import mostly_long
@@ -229,7 +228,7 @@ def test_nobody_can_connect_to_a_window(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("headless")
 def test_a_window_without_a_network_of_its_own_is_warned_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the system allows none it is started all the same, and the user is told what others can do."""
-    monkeypatch.setattr("evedrop.show.view.viewer_process._APART", "")
+    monkeypatch.setattr("evedrop.show.view.viewer._APART", "")
     started = window(tmp_path / "logs", tmp_path / "r.rrd")
     try:
         assert started.warning is not None

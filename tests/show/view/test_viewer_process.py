@@ -16,10 +16,9 @@ import pytest
 from rerun.chunk import RrdReader
 
 from evedrop.errors import UsageError
-from evedrop.show.view import headless, viewer_process
+from evedrop.show.view import picture, viewer
 from evedrop.show.view.recording import ViewRecording
-from evedrop.show.view.viewer import Viewer, WebAddress
-from evedrop.show.view.viewer_process import _LSOF, PortTaken, _lsof_says, end, owns, spawn
+from evedrop.show.view.viewer import _LSOF, PortTaken, Viewer, WebAddress, _lsof_says, end, owns, spawn
 from evedrop.system.ports import free_port
 from tests.conftest import LIMIT, wait_until
 from tests.privileged import CannotRun, skip
@@ -43,7 +42,7 @@ STARTER = """
 import sys, time
 from pathlib import Path
 from evedrop.system.ports import free_port
-from evedrop.show.view.viewer_process import spawn
+from evedrop.show.view.viewer import spawn
 port = free_port()
 print(spawn(port, ["--serve-grpc", "--port", str(port)], Path(sys.argv[1])).pid, flush=True)
 time.sleep(600)
@@ -106,7 +105,7 @@ def test_a_viewer_is_given_the_screen_and_no_tokens(server: subprocess.Popen[byt
 @LINUX
 def test_hung_viewer_is_stopped(server: subprocess.Popen[bytes], monkeypatch: pytest.MonkeyPatch) -> None:
     """A viewer that does not react is killed."""
-    monkeypatch.setattr(viewer_process, "_STOP_SECONDS", 0.3)
+    monkeypatch.setattr(viewer, "_STOP_SECONDS", 0.3)
     os.kill(server.pid, signal.SIGSTOP)
     end(server)
     assert server.poll() is not None
@@ -139,7 +138,7 @@ def test_who_listens_is_known(tmp_path: Path) -> None:
             assert {place: owns(*place) for place in table} == table
             if (lsof := Path("/usr/bin/lsof" if sys.platform == "linux" else _LSOF)).exists():
                 with pytest.MonkeyPatch.context() as patch:
-                    patch.setattr("evedrop.show.view.viewer_process._LSOF", str(lsof))
+                    patch.setattr("evedrop.show.view.viewer._LSOF", str(lsof))
                     assert {place: _lsof_says(*place) for place in table} == table
         finally:
             end(other)
@@ -149,7 +148,7 @@ def test_who_listens_is_known(tmp_path: Path) -> None:
 @pytest.fixture
 def shared_network(monkeypatch: pytest.MonkeyPatch) -> None:
     """A system that allows a viewer no network of its own."""
-    monkeypatch.setattr("evedrop.show.view.viewer_process._APART", "")
+    monkeypatch.setattr("evedrop.show.view.viewer._APART", "")
     monkeypatch.setenv("DISPLAY", ":0")
 
 
@@ -165,13 +164,13 @@ def test_who_takes_the_port_of_a_viewer_gets_nothing(
         recording.add(slots)
     assert recording.close()
     port = free_port()
-    for module in ("viewer", "headless"):
+    for module in ("viewer", "picture"):
         monkeypatch.setattr(f"evedrop.show.view.{module}.free_port", lambda: port)
     stolen = tmp_path / "stolen.rrd"
     thief = spawn(port, ["--port", str(port), "--save", str(stolen)], tmp_path)
     show: Callable[[], object] = {
         "window": lambda: Viewer.start("native", tmp_path, tmp_path / "r.rrd", complete=True, options=("--headless",)),
-        "picture": lambda: headless.opened(tmp_path / "r.rrd", (400, 300)).__enter__(),
+        "picture": lambda: picture.opened(tmp_path / "r.rrd", (400, 300)).__enter__(),
     }[how]
     try:
         with pytest.raises(PortTaken, match=f"listens at 127.0.0.1:{port}.*nothing was shown"):
@@ -197,8 +196,8 @@ def test_a_viewer_that_ends_after_it_listened_is_no_stranger(tmp_path: Path, mon
         wait_until(lambda: gone(pid), "the viewer's end")
         return owns(pid, port)
 
-    monkeypatch.setattr(viewer_process, "executable", lambda: program)
-    monkeypatch.setattr(viewer_process, "owns", asked_too_late)
+    monkeypatch.setattr(viewer, "executable", lambda: program)
+    monkeypatch.setattr(viewer, "owns", asked_too_late)
     port = free_port()
     with pytest.raises(UsageError, match="the viewer ended with status 7"):
         spawn(port, [str(port)], tmp_path)

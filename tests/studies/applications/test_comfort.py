@@ -13,7 +13,7 @@ from evedrop.errors import ScenarioError
 from evedrop.scenario.application import APPLICATIONS
 from evedrop.scenario.controlled import controlled_plant
 from evedrop.scenario.loading import load
-from evedrop.show.view.plant_slots import LoopValues, driven_scene
+from evedrop.show.view.scene_slots import LoopValues, driven_scene
 from evedrop.simulate.montecarlo import Plan
 from tests.conftest import Evedrop
 from tests.packages import install

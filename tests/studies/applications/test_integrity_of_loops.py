@@ -13,8 +13,7 @@ from evedrop.errors import ScenarioError
 from evedrop.model.integrity.monitor import MonitoredSlots
 from evedrop.scenario.controlled import controlled_plant, monitor_of
 from evedrop.scenario.loading import load
-from evedrop.show.view.plant_slots import LoopValues, driven_scene
-from evedrop.show.view.replay import replay
+from evedrop.show.view.scene_slots import LoopValues, driven_scene, replay
 from evedrop.simulate.montecarlo import Plan
 from evedrop.studies.applications.integrity import Integrity
 from tests.examples import mostly_long

@@ -18,8 +18,8 @@ from evedrop.results.comparison import Comparison
 from evedrop.results.reading import ByName, Results
 from evedrop.score.summary import Judged, LinkSummary, PeerSummary, SecrecySummary, Summary
 from evedrop.show.report import closing
+from evedrop.show.report.closing import sweep_table
 from evedrop.show.report.comparison import pairs_table, schemes_table
-from evedrop.show.report.sweep import sweep_table
 from evedrop.show.report.text_table import TextTable
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ class ReportedResults:
 
         Raises UsageError if a file cannot be written.
         """
-        from evedrop.show.report.table_files import write_csv  # no other method needs it
+        from evedrop.show.report.text_table import write_csv  # no other method needs it
 
         return write_csv(self._tables(), Path(path))
 
@@ -53,7 +53,7 @@ class ReportedResults:
 
         Raises UsageError if the file cannot be written.
         """
-        from evedrop.show.report.table_files import write_latex  # no other method needs it
+        from evedrop.show.report.text_table import write_latex  # no other method needs it
 
         return write_latex(self._tables(), Path(path))
 
@@ -125,7 +125,7 @@ class RunResults(Results, ReportedResults):
 
         Raises UsageError if there is no such panel, slot or recorded trial.
         """
-        from evedrop.show.view.run_picture import run_figure  # matplotlib takes half a second
+        from evedrop.show.view.result_pictures import run_figure  # matplotlib takes half a second
 
         return run_figure(self, panels, slots, trial)
 
@@ -165,7 +165,7 @@ class SweepResults(ReportedResults):
 
     def plot(self) -> ShownFigure:
         """A figure of matplotlib: each receiver's error against the first entry, with a panel for each value of the others."""
-        from evedrop.show.view.sweep_picture import sweep_figure  # matplotlib takes half a second
+        from evedrop.show.view.result_pictures import sweep_figure  # matplotlib takes half a second
 
         return sweep_figure(self.table, self.keys)
 
@@ -199,7 +199,7 @@ class ComparisonResults(Comparison, ReportedResults):
 
     def plot(self) -> ShownFigure:
         """A figure of matplotlib: the matrix of schemes and adversaries, with a mark, a colour and a ratio in every cell."""
-        from evedrop.show.view.comparison_picture import comparison_figure  # matplotlib takes half a second
+        from evedrop.show.view.result_pictures import comparison_figure  # matplotlib takes half a second
 
         return comparison_figure(self)
 

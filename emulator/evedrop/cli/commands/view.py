@@ -52,7 +52,7 @@ def view(options: argparse.Namespace) -> int:
     with raise_on_signals(), tempfile.TemporaryDirectory(prefix="evedrop-view-") as temporary:
         recording = options.run / "recording.rrd"
         if results is not None or not recording.is_file():
-            from evedrop.show.view.replay import replay
+            from evedrop.show.view.scene_slots import replay
         if results is not None:  # a run in progress, or a killed one, has no complete recording
             recording = replay(options.run, Path(temporary) / "recording.rrd")
         elif not recording.is_file():
@@ -77,7 +77,7 @@ def _check_names(options: argparse.Namespace) -> None:
 
         check_picture_name(options.picture)
     if options.video is not None:
-        from evedrop.show.view.video import FRAME_RATE, VIDEO_SIZE, check_video
+        from evedrop.show.view.picture import FRAME_RATE, VIDEO_SIZE, check_video
 
         check_video(options.video, options.size or VIDEO_SIZE, options.fps or FRAME_RATE)
         if options.slot is not None or options.time is not None:
@@ -105,7 +105,7 @@ def _slots_of(options: argparse.Namespace) -> Sequence[int]:
 
 def _times_of(options: argparse.Namespace) -> Sequence[float]:
     """The times of a video of a wire: by default in real time."""
-    from evedrop.show.view.video import FRAME_RATE
+    from evedrop.show.view.picture import FRAME_RATE
 
     if options.slots is not None:
         raise UsageError(f"--slots is for runs, and {options.run} is the folder of a wire; give --times")
@@ -124,7 +124,7 @@ def _film(recording: Path, options: argparse.Namespace, moments: Sequence[float]
     """Draw some moments as a video."""
     from evedrop.cli.console import ProgressLine
     from evedrop.scenario.progress_events import RunProgress
-    from evedrop.show.view.video import FRAME_RATE, VIDEO_SIZE, video_apart
+    from evedrop.show.view.picture import FRAME_RATE, VIDEO_SIZE, video_apart
 
     start = time.monotonic()
     with ProgressLine(len(moments), "frames") as line:

@@ -52,14 +52,14 @@ from evedrop.scenario.tables import Scenario
 from evedrop.score.expectations_held import replay_of
 from evedrop.score.scorekeeper import RunOutcome, Scored, Scorekeeper, digest_of, summary_of
 from evedrop.score.summary import Summary
-from evedrop.show.view.scored_slots import loop_values_of, open_recording, shown
+from evedrop.show.view.scene_slots import loop_values_of, open_recording, shown
 from evedrop.show.view.viewer import Viewer, WebAddress
 from evedrop.system.lacks import lack_of, preload_within_limit
 from evedrop.system.signals import heeded
 
 if TYPE_CHECKING:
-    from evedrop.show.view.plant_slots import LoopValues
     from evedrop.show.view.recording import ViewRecording
+    from evedrop.show.view.scene_slots import LoopValues
 
 
 _ORPHAN_SECONDS = 30.0  # to write the results once the launcher is gone

@@ -1,14 +1,15 @@
-"""The words of the closing report of a run: its table, and the sentences that go with it.
+"""The words of the closing report of a run or a sweep: its table, and the sentences that go with it.
 
-Source: docs/results.md.
+Source: docs/results.md; docs/montecarlo.md, sweeps.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
-from evedrop.model.metrics import columns, shown_metric, unloadable_metrics
+from evedrop.model.metrics import all_metrics, columns, error_column, shown_metric, unloadable_metrics, z_column
 from evedrop.model.metrics.text import count_text, estimate, fraction_text, number_text
 from evedrop.model.theory.rare_events import RARE
 from evedrop.scenario.application import applications_in
@@ -22,7 +23,7 @@ from evedrop.score.summary import (
     Summary,
     failed,
 )
-from evedrop.show.report.text_table import TextTable
+from evedrop.show.report.text_table import TextColumn, TextTable
 
 
 def amount(summary: Summary) -> str:
@@ -240,3 +241,24 @@ def _loop_line(controller: ControllerSummary) -> str:
     if controller.clipped_fraction:
         line += f"; {controller.clipped_fraction:.2%} were clipped by the plant"
     return line
+
+
+def sweep_table(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> TextTable:
+    """A row for each point and receiver; rows: those of sweep.parquet, keys: the entries that the sweep changed."""
+    metrics = columns("sweep_column")
+    compared = [z_column(name) for name in all_metrics() if rows and z_column(name) in rows[0]]
+    heads = [*keys, "peer", *(column.heading for column in metrics), "z", "ratio", "relative secrecy"]
+    table = TextTable([TextColumn(head, head not in {"peer", "relative secrecy"}) for head in heads])
+    for row in rows:
+        table.add(
+            *(f"{row[key]}" for key in keys),
+            row["peer"],
+            *(
+                estimate(shown_metric(row, names), shown_metric(row, list(map(error_column, names))), column.format)
+                for column, names in metrics.items()
+            ),
+            number_text(shown_metric(row, compared), "+.1f"),
+            estimate(row.get("ratio"), row.get("ratio_standard_error"), ".3g"),
+            row["relative_secrecy"] or "–",
+        )
+    return table

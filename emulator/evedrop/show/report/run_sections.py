@@ -1,25 +1,230 @@
-"""The sections of the report of a run. To add one, write a function and add it to `RUN_SECTIONS`."""
+"""The sections of the report of a run, and its data. To add a section, write a function and add it to `RUN_SECTIONS`.
+
+The data are the run's summary, its scenario, and the parts of its tables that the report shows. The rows of a table are read by
+receiver, in the order of the slots, piece by piece: memory does not grow with the slots.
+"""
 
 from __future__ import annotations
 
 import base64
 import shlex
-from collections.abc import Callable, Iterator, Mapping
+import tomllib
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from io import BytesIO
+from pathlib import Path
+from typing import Any, NamedTuple, final
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 from markupsafe import Markup
+from numpy.typing import NDArray
 
+from evedrop.errors import UsageError
 from evedrop.model.metrics.text import number_text
-from evedrop.model.receiver import Codes
+from evedrop.model.process import Floats
+from evedrop.model.receiver import NOTHING, SILENT, Codes
+from evedrop.results.reading import Results
+from evedrop.scenario.loading.recorded import recorded_noise
 from evedrop.score.expectations_held import repeating
-from evedrop.score.track import FACTOR, LostSpan, Track
+from evedrop.score.summary import Summary
+from evedrop.score.track import FACTOR, LongestSpans, LostSpan, Track, track_of
 from evedrop.show.report import closing
-from evedrop.show.report.chart import Curve, LogChart
+from evedrop.show.report.chart import POINTS, Curve, GroupCounts, GroupMeans, LogChart
 from evedrop.show.report.page import facts_table, made
-from evedrop.show.report.run_source import OUTCOMES, RecordedTrial, RunSource
 from evedrop.show.report.text_table import TextTable
+from evedrop.show.view import palette
 from evedrop.show.view.error_floor import error_floor
 from evedrop.show.view.lanes import EAVESDROPPER, KNOWLEDGE, Lane
+from evedrop.system.files import Unreadable, text_of
+
+
+class RowExtent(NamedTuple):
+    """The rows of a receiver: how many there are, and their first and last slot."""
+
+    rows: int
+    first: int
+    last: int
+
+
+@final
+class SlotRows:
+    """The rows of some receivers in a table of a run: a row for each slot, of one recorded trial if the table has trials."""
+
+    def __init__(self, results: Results, table: str, receivers: Collection[str], trial: int | None = None) -> None:
+        """Reads where the rows are. Raises UsageError if the table cannot be read, or lacks a column."""
+        self._results, self._table, self._receivers, self._trial = results, table, receivers, trial
+        self.extents: dict[str, RowExtent] = {}
+        """Of the receivers that have rows."""
+        self._in_order = True
+        for name, rows in self._by_receiver(results.pieces(table, self._with_keys([]))):
+            slots = rows["slot"].to_numpy()
+            first, last, before = int(slots.min()), int(slots.max()), self.extents.get(name)
+            self._in_order &= bool((np.diff(slots) > 0).all()) and (before is None or before.last < first)
+            if before is not None:
+                first, last = min(first, before.first), max(last, before.last)
+            self.extents[name] = RowExtent(len(slots) + (0 if before is None else before.rows), first, last)
+
+    def pieces(self, columns: Sequence[str]) -> Iterator[tuple[str, pa.Table]]:
+        """Some columns, as pieces: the receiver, and its next rows. All rows at once if the slots of the table are not in order.
+
+        Raises UsageError as the constructor does.
+        """
+        if self._in_order:
+            yield from self._by_receiver(self._results.pieces(self._table, self._with_keys(columns)))
+        else:  # somebody has written the table again
+            where = None if self._trial is None else pc.field("trial") == self._trial
+            whole = self._results.part(self._table, self._with_keys(columns), where).sort_by("slot")
+            yield from self._by_receiver(iter([whole]))
+
+    def _with_keys(self, columns: Sequence[str]) -> list[str]:
+        keys = ["slot", "peer", *([] if self._trial is None else ["trial"])]
+        return list(dict.fromkeys([*keys, *columns]))
+
+    def _by_receiver(self, tables: Iterator[pa.Table]) -> Iterator[tuple[str, pa.Table]]:
+        for table in tables:
+            of_trial = table if self._trial is None else table.filter(pc.equal(table["trial"], self._trial))
+            for name in self._receivers:
+                rows = of_trial.filter(pc.equal(of_trial["peer"], name))
+                if rows.num_rows:
+                    yield name, rows
+
+
+_MOST_BYTES = 2**24
+OUTCOMES = EAVESDROPPER.words
+"""The fates of a packet; the index of a word is its code."""
+MOST_SPANS = 12
+"""The most spans without track that a report lists for a receiver."""
+PIXELS = 2000
+"""The most pixels of a lane. Each of a long run stands for several slots: for their most frequent code, or the highest."""
+_INTERVAL = 1.96  # standard errors on either side: 95 %
+
+
+class SlotMeans(NamedTuple):
+    """The error of a receiver, at most `POINTS` points: slot by slot, or means of neighbouring slots; NaN where it is unknown."""
+
+    first: int
+    last: int
+    """The last slot."""
+    slot: Floats
+    error: Floats
+    low: Floats
+    """The 95 % interval of the mean over trials."""
+    high: Floats
+    theory: Floats
+
+
+@final
+class RecordedTrial:
+    """A receiver in the first recorded trial."""
+
+    def __init__(self, extent: RowExtent, noise: float) -> None:
+        """noise: tr Q."""
+        self._noise = noise
+        self.last = extent.last
+        """The last slot."""
+        self.outcome = GroupCounts(extent.rows, PIXELS, len(OUTCOMES))
+        """What became of every packet, as indices into `OUTCOMES`."""
+        self.track = GroupCounts(extent.rows, PIXELS, len(Track))
+        self.lost = LongestSpans(MOST_SPANS, extent.first)
+        """The spans in which it lost track."""
+
+    def add(self, rows: pa.Table) -> None:
+        """The rows of the next slots. Raises UsageError if one has an unknown action."""
+        sent, actions = (_listed(rows[name]) for name in ("sent", "action"))
+        unknown = sorted(set(actions[1]) - set(OUTCOMES))
+        if unknown:
+            raise UsageError(f"trials.parquet has the unknown action {unknown[0]}; run the scenario again")
+        codes = np.array([OUTCOMES.index(word) for word in actions[1]], np.uint8)[actions[0]]
+        silent = np.array([word == NOTHING for word in sent[1]], np.bool_)[sent[0]]
+        self.outcome.add(np.where(silent, np.uint8(OUTCOMES.index(SILENT)), codes))
+        track = track_of(_numbers(rows["squared_error"]), _numbers(rows["trace_covariance"]), self._noise)
+        self.track.add(track)
+        self.lost.add(track)
+
+
+@dataclass(frozen=True)
+class RunSource:
+    """A results folder of a run, read."""
+
+    folder: Path
+    results: Results
+    summary: Summary
+    scenario_text: str
+    """The scenario.toml of the folder; empty if it cannot be read."""
+
+    @classmethod
+    def read(cls, folder: Path) -> RunSource:
+        """Read a folder. Raises UsageError if it is not a results folder of this version."""
+        results = Results.read(folder)
+        try:
+            text = text_of(folder / "scenario.toml", _MOST_BYTES)
+        except (OSError, Unreadable):
+            text = ""
+        return cls(folder, results, results.typed_summary, text)
+
+    @cached_property
+    def tables(self) -> Mapping[str, Any]:
+        """The tables of the scenario; empty if they cannot be read."""
+        try:
+            return tomllib.loads(self.scenario_text)
+        except (ValueError, RecursionError):
+            return {}
+
+    def colour(self, receiver: str) -> str:
+        """The colour of a receiver, as in the view."""
+        return palette.hexadecimal(palette.colour(list(self.summary.peers).index(receiver)))
+
+    @cached_property
+    def means(self) -> dict[str, SlotMeans]:
+        """Receiver → its error in every slot. Raises UsageError if the table cannot be read."""
+        columns = ["slot", "mean_squared_error", "mean_actual_trace_covariance", "standard_error"]
+        table = SlotRows(self.results, "slots", self.summary.peers)
+        groups = {name: GroupMeans(extent.rows, POINTS, 5) for name, extent in table.extents.items()}
+        for name, rows in table.pieces([*columns, "expected_trace_covariance"]):
+            groups[name].add(_means(rows))
+        return {
+            name: SlotMeans(extent.first, extent.last, *groups[name].means) for name, extent in table.extents.items()
+        }
+
+    @cached_property
+    def trial(self) -> dict[str, RecordedTrial]:
+        """Receiver → its first recorded trial; empty without one. Raises UsageError if the table cannot be read."""
+        table = SlotRows(self.results, "trials", self.summary.peers, self.summary.first_trial)
+        trials = {name: RecordedTrial(extent, self.noise) for name, extent in table.extents.items()}
+        for name, rows in table.pieces(["sent", "action", "squared_error", "trace_covariance"]):
+            trials[name].add(rows)
+        return trials
+
+    @cached_property
+    def noise(self) -> float:
+        """The process noise tr Q; 0 if the scenario cannot be read."""
+        return recorded_noise(self.folder)
+
+
+def _means(rows: pa.Table) -> Floats:
+    """Slot, error, the ends of its interval, and what theory expects, (5, c)."""
+    error = _numbers(rows["mean_squared_error"])
+    actual = _numbers(rows["mean_actual_trace_covariance"])
+    error = np.where(np.isnan(error), actual, error)
+    scatter = _INTERVAL * _numbers(rows["standard_error"])
+    theory = _numbers(rows["expected_trace_covariance"])
+    return np.stack([_numbers(rows["slot"]), error, error - scatter, error + scatter, theory])
+
+
+def _numbers(column: pa.ChunkedArray) -> Floats:
+    return np.asarray(column.to_numpy(), np.float64)
+
+
+def _listed(column: pa.ChunkedArray) -> tuple[NDArray[np.intp], list[str]]:
+    """A column of words as indices, (c,), into the words that follow."""
+    whole = pc.dictionary_encode(column.cast(pa.string())).combine_chunks()
+    if isinstance(whole, pa.ChunkedArray):  # without rows
+        whole = whole.chunk(0) if whole.num_chunks else pa.array([], pa.string()).dictionary_encode()
+    return whole.indices.to_numpy(zero_copy_only=False).astype(np.intp), whole.dictionary.to_pylist()
+
 
 _MOST_TEXT = 40_000
 

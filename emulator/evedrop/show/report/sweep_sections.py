@@ -21,8 +21,8 @@ from evedrop.model.metrics import all_metrics, error_column, shown_metric
 from evedrop.model.process import Floats
 from evedrop.scenario.loading import value_of
 from evedrop.show.report.chart import Curve, LogChart
+from evedrop.show.report.closing import sweep_table
 from evedrop.show.report.page import made
-from evedrop.show.report.sweep import sweep_table
 from evedrop.show.view import palette
 from evedrop.system.files import text_of
 

@@ -1,9 +1,22 @@
-"""A table of texts, which the terminal and the page format differently."""
+"""A table of texts: the terminal and the page format it differently, and a file has it as CSV or LaTeX.
+
+In CSV, every number is at full precision; in LaTeX, it is as it is shown.
+
+Source: docs/results.md, tables in other programs.
+"""
 
 from __future__ import annotations
 
+import csv
+import io
+import re
+import unicodedata
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+
+from evedrop.errors import UsageError
+from evedrop.model.metrics.text import ShownNumber
 
 
 @dataclass(frozen=True)
@@ -43,3 +56,152 @@ class TextTable:
     def add(self, *cells: str) -> None:
         """Add a row."""
         self.rows.append(cells)
+
+
+ERROR, UNIT = "standard error", "unit"
+"""What the heading of a column says after that of its numbers."""
+_EMPTY = {"–", ""}
+
+
+def csv_text(table: TextTable) -> str:
+    """The table as CSV: numbers as Python writes them, and their standard errors and units in columns of their own.
+
+    A cell without a value is empty; a first cell that repeats the one above it is written out.
+    """
+    columns = [[*cells] for cells in zip(*_whole_rows(table), strict=True)] or [[] for _ in table.columns]
+    heads: list[str] = []
+    written: list[Sequence[str]] = []
+    for heading, cells in zip(_distinct([number.heading for number in table.columns]), columns, strict=True):
+        numbers = [cell if isinstance(cell, ShownNumber) else ShownNumber(cell, None) for cell in cells]
+        heads.append(heading)
+        written.append([_value(cell) for cell in cells])
+        if any(number.error is not None for number in numbers):
+            heads.append(f"{heading} {ERROR}")
+            written.append(["" if number.error is None else repr(float(number.error)) for number in numbers])
+        if any(number.after for number in numbers):
+            heads.append(f"{heading} {UNIT}")
+            written.append([number.after.strip() for number in numbers])
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(heads)
+    writer.writerows(zip(*written, strict=True))
+    return out.getvalue()
+
+
+def _value(cell: str) -> str:
+    if isinstance(cell, ShownNumber):
+        value = cell.value
+        return "" if value is None else repr(value if isinstance(value, int) else float(value))
+    return "" if cell in _EMPTY else cell
+
+
+def _whole_rows(table: TextTable) -> list[tuple[str, ...]]:
+    """The rows; a first cell that is empty is the one above it."""
+    rows: list[tuple[str, ...]] = []
+    for first, *others in table.rows:
+        rows.append((first or (rows[-1][0] if rows else ""), *others))
+    return rows
+
+
+def _distinct(heads: Sequence[str]) -> list[str]:
+    """The headings; one that another column has too gets the heading before it, or a number."""
+    names_: list[str] = []
+    for i, head in enumerate(heads):
+        name = head if heads.count(head) == 1 or not i else f"{heads[i - 1]}: {head}"
+        count = 2
+        while name in names_:
+            name, count = f"{head} {count}", count + 1
+        names_.append(name)
+    return names_
+
+
+def latex_text(table: TextTable) -> str:
+    r"""The table as a `tabular` of LaTeX, which needs no package; \hline above, below its heads, and at its end."""
+    kinds = "".join("r" if column.number else "l" for column in table.columns)
+    lines = [
+        *([f"% {' '.join(table.title.split())}"] if table.title else []),
+        rf"\begin{{tabular}}{{{kinds}}}",
+        r"\hline",
+        _row([column.heading for column in table.columns]),
+        r"\hline",
+        *(_row(row) for row in table.rows),
+        r"\hline",
+        r"\end{tabular}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _row(cells: Sequence[str]) -> str:
+    return " & ".join(map(latex_escaped, cells)) + r" \\"
+
+
+_SPECIAL = {
+    "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r"\$",
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": "$<$", ">": "$>$", "|": "$|$", '"': "''", "’": "'",
+    "−": "$-$", "–": "--", "—": "---", "±": r"$\pm$", "×": r"$\times$", "·": r"$\cdot$", "∞": r"$\infty$", "≥": r"$\geq$",
+    "≤": r"$\leq$", "≈": r"$\approx$", "→": r"$\to$", "∈": r"$\in$", "∪": r"$\cup$", "√": r"$\surd$", "…": r"\ldots{}",
+    "µ": r"$\mu$", "½": "$1/2$", "°": r"$^{\circ}$", "€": "EUR", "‰": r"$0/00$", "ᵀ": "$^{T}$", "\u00a0": "~", "\u202f": "~",
+}  # fmt: skip
+_ACCENTS = {
+    "\N{COMBINING CIRCUMFLEX ACCENT}": r"\hat",
+    "\N{COMBINING TILDE}": r"\tilde",
+    "\N{COMBINING MACRON}": r"\bar",
+}
+_POWERS = re.compile(r"([\^_])(?:\{[^{}]*\}\$\$\1)+\{")  # exponents, or indices, one after the other are a single one
+_NO_COMMAND = {
+    "omicron": "o", "Alpha": "A", "Beta": "B", "Epsilon": "E", "Zeta": "Z", "Eta": "H", "Iota": "I", "Kappa": "K", "Mu": "M",
+    "Nu": "N", "Omicron": "O", "Rho": "P", "Tau": "T", "Chi": "X",
+}  # fmt: skip
+
+
+def latex_escaped(text: str) -> str:
+    """A text that LaTeX shows as it is: Greek letters, x̂, ± and ∞ as mathematics, and its own characters escaped."""
+    parts: list[str] = []
+    for character in unicodedata.normalize("NFD", text):
+        if character in _ACCENTS and parts:
+            parts.append(f"${_ACCENTS[character]}{{{parts.pop().strip('$')}}}$")
+        else:
+            parts.append(_escaped(character))
+    whole = _POWERS.sub(lambda match: match[0].replace(f"}}$${match[1]}{{", ""), "".join(parts))
+    return unicodedata.normalize("NFC", whole.replace("$$", ""))
+
+
+def _escaped(character: str) -> str:
+    if character in _SPECIAL:
+        return _SPECIAL[character]
+    if character.isascii():
+        return character if character.isprintable() else " "
+    name = unicodedata.name(character, "").split()
+    if name[:1] == ["GREEK"] and "LETTER" in name:
+        letter = name[-1].lower() if "SMALL" in name else name[-1].capitalize()
+        letter = letter.replace("amda", "ambda")
+        return f"${_NO_COMMAND.get(letter, chr(92) + letter + ' ')}$".replace(" $", "$")
+    kind, _, plain = unicodedata.decomposition(character).partition(" ")
+    if kind in {"<super>", "<sub>"}:
+        shown = "".join(latex_escaped(chr(int(code, 16))) for code in plain.split()).strip("$")
+        return f"${'^' if kind == '<super>' else '_'}{{{shown}}}$"
+    return character  # a letter with an accent is put together again by inputenc
+
+
+def write_csv(tables: Sequence[TextTable], path: Path) -> list[Path]:
+    """Write tables as CSV: the first to `path`, the second to NAME-2.csv beside it, and so on; returns the paths.
+
+    Raises UsageError if a file cannot be written.
+    """
+    paths = [path, *(path.with_name(f"{path.stem}-{number}{path.suffix}") for number in range(2, len(tables) + 1))]
+    for target, table in zip(paths, tables, strict=False):
+        _write(target, csv_text(table))
+    return paths[: len(tables)]
+
+
+def write_latex(tables: Sequence[TextTable], path: Path) -> Path:
+    """Write tables as LaTeX, one after the other, to one file; returns its path. Raises UsageError if it cannot be written."""
+    _write(path, "\n".join(map(latex_text, tables)))
+    return path
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"{path} cannot be written ({error.strerror}); give another file") from error

@@ -1,18 +1,26 @@
-"""The coloured lanes: what became of each packet, and what each receiver knows. Does not use Rerun."""
+"""The coloured lanes: what became of each packet, and what each receiver knows. Does not use Rerun.
+
+A receiver is in track, drifting or fooled in each slot.
+
+Source: docs/view.md, who knows what.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evedrop.model.process import Floats
 from evedrop.model.receiver import DISCARDED, DROPPED, INNOVATION, MISLED, SILENT, STATE, Action, Codes
-from evedrop.score.track import Track
+from evedrop.score.track import FACTOR, Track, track_of
 from evedrop.show.view import palette
 from evedrop.show.view.palette import Colour
-from evedrop.show.view.scene import SceneSlots, Shown
+from evedrop.show.view.scene import PeerSlots, Scene, SceneSlots, Shown
 
 _LEGEND = (
     ("state", palette.STATE),
@@ -82,3 +90,79 @@ def received(shown: Shown, slots: SceneSlots) -> Codes:
     if shown.role != "legitimate":
         codes = np.where(slots.nu & (action == Action.STATE), MISLED_CODE, action)
     return codes if slots.sent is None else np.where(slots.sent, codes, SILENT_CODE)
+
+
+def knowledge(scene: Scene, x: Floats, peer: PeerSlots) -> Codes:
+    """Codes of the lane `KNOWLEDGE`, (c,), in the first recorded trial, by the rule of `track_of`; x: true states, (c, n)."""
+    with np.errstate(all="ignore"):
+        squared = np.sum((x - peer.x_hat) ** 2, axis=1)
+        trace = np.trace(peer.P, axis1=1, axis2=2)
+    return track_of(squared, trace, scene.noise)
+
+
+@final
+class ErrorDistance:
+    """How far an estimate is from the truth, as a number with its unit and in words.
+
+    It counts the first states as far as they have the unit of the first, such as the two coordinates of a place in metres and
+    not the speeds that follow. Without units it counts all states. One instance follows one receiver.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        unit = scene.units[0] if scene.units else ""
+        others = [i for i, unit_ in enumerate(scene.units) if unit_ != unit]
+        self._count = others[0] if others else scene.n
+        self._unit = f" {unit}" if unit else ""
+        self._level, self._step = -1, 0  # of the last slot
+        self._near = math.sqrt(FACTOR * scene.noise)
+        self._nothing = math.sqrt(scene.noise) * _NOTHING
+        first = math.floor(math.log10(self._near)) + 1
+        self._steps = np.array([self._near, *(10.0**decade for decade in range(first, first + _DECADES))])
+
+    @property
+    def lane(self) -> Lane:
+        """All words of `codes`, such as "drifting, off by more than 10 m", in the colours of what they say."""
+        near = self._text(self._near)
+        words, colours = [f"{Track.IN_TRACK.word}, within {near}"], [KNOWLEDGE.colours[Track.IN_TRACK]]
+        for track in (Track.DRIFTING, Track.FOOLED):
+            words.append(f"{track.word}, off by less than {near}")
+            words += [f"{track.word}, off by more than {self._text(step)}" for step in self._steps]
+            colours += [KNOWLEDGE.colours[track]] * (1 + len(self._steps))
+        return Lane(tuple(words), tuple(colours))
+
+    def of(self, x: Floats, x_hat: Floats) -> Floats:
+        """The distances of estimates from true states, (c,)."""
+        apart = (x - x_hat)[:, : self._count]
+        distances: Floats = np.sqrt(np.sum(apart**2, axis=1))
+        return distances
+
+    def codes(self, levels: Codes, distances: Floats) -> NDArray[np.int64]:
+        """Codes of `lane` in the next slots, (c,), for what is known and distances, (c,).
+
+        A word names the largest distance since this stretch of equal knowledge began, so that it does not flicker.
+        """
+        step = np.searchsorted(self._steps, np.nan_to_num(distances, nan=np.inf), side="left")
+        level = levels.astype(np.int64)
+        begins = np.cumsum(np.diff(level, prepend=self._level) != 0)  # the number of the stretch of equal knowledge
+        if len(level):
+            carried = np.where(begins == 0, self._step, 0)
+            each = len(self._steps) + 1
+            step = np.maximum.accumulate(begins * each + np.maximum(step, carried)) - begins * each
+            self._level, self._step = int(level[-1]), int(step[-1])
+        return np.where(level == 0, 0, 1 + (level - 1) * (len(self._steps) + 1) + step)
+
+    def text(self, distance: float) -> str:
+        """A distance with two digits and its unit, such as "0.32 m"; "0 m" if it is less than a thousandth of √(tr Q)."""
+        return self._text(0.0 if distance < self._nothing else distance)
+
+    def _text(self, distance: float) -> str:
+        if not math.isfinite(distance):
+            return "everything"
+        digits = f"{distance:.2g}"
+        if "e" in digits and 1e-4 <= abs(distance) < 1e7:
+            digits = f"{float(digits):,.0f}" if distance >= 1 else f"{float(digits):f}".rstrip("0")
+        return digits + self._unit
+
+
+_DECADES = 9
+_NOTHING = 1e-3  # the fraction of √(tr Q), the distance of one step, below which a distance is only that of rounding

@@ -1,23 +1,259 @@
-"""Takes pictures of a finished recording without a screen."""
+"""Draws a finished recording without a screen: pictures of some moments, or a video of many, as MP4 or GIF.
+
+A process of its own draws, with Rerun's viewer. Its pipes are read and written with a limit: a process that hangs must not hang
+the command. Of a video, only a few pictures are in memory at any time. The viewer needs a Vulkan driver; a software driver is
+enough, such as Debian's mesa-vulkan-drivers.
+"""
 
 from __future__ import annotations
 
+import errno
 import itertools
+import os
+import select
+import struct
 import subprocess
 import sys
 import tempfile
-from collections.abc import Generator, Iterable, Sequence
-from contextlib import suppress
+import time
+import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
+from io import BytesIO
+from itertools import chain
 from pathlib import Path
-from typing import IO
+from typing import IO, Final, TypeVar, final
 
-from evedrop.errors import UsageError
-from evedrop.show.view.bounded_pipe import ended, give, received
-from evedrop.show.view.headless import check, opened
-from evedrop.show.view.viewer_process import end, guarded
+from PIL import GifImagePlugin, Image
+from rerun.chunk import RrdReader
+from rerun.experimental import ViewerClient, ViewerState
+
+from evedrop.errors import RunError, UsageError
+from evedrop.show.view.column import ELAPSED, TIMELINE
+from evedrop.show.view.viewer import PortTaken, end, guarded, spawn, without_driver
 from evedrop.system.environment import viewer_environment
 from evedrop.system.files import whole_file
+from evedrop.system.ports import free_port
 from evedrop.system.signals import raise_on_signals
+
+DRAWING_SECONDS: Final = 1800.0
+"""How long a process that draws may do nothing that is seen. Its viewer answers within ten minutes, or says that it failed."""
+_PIECE = 2**16
+
+
+def received(pipe: IO[bytes], most: int) -> bytes:
+    """The next bytes of an unbuffered pipe, up to a number; fewer if the other end was closed.
+
+    Raises RunError if none come for `DRAWING_SECONDS`.
+    """
+    pieces, left = [], most
+    while left:
+        if not select.select([pipe], [], [], DRAWING_SECONDS)[0]:
+            raise _hung("drew nothing")
+        if not (piece := os.read(pipe.fileno(), min(left, _PIECE))):
+            break
+        pieces.append(piece)
+        left -= len(piece)
+    return b"".join(pieces)
+
+
+def give(pipe: IO[bytes], data: bytes) -> None:
+    """Write to an unbuffered pipe. Raises BrokenPipeError, and RunError if nothing is taken for `DRAWING_SECONDS`."""
+    os.set_blocking(pipe.fileno(), False)
+    view = memoryview(data)
+    while view:
+        if not select.select([], [pipe], [], DRAWING_SECONDS)[1]:
+            raise _hung("took no further picture")
+        view = view[os.write(pipe.fileno(), view) :]
+
+
+def ended(process: subprocess.Popen[bytes]) -> int:
+    """The exit status of a process that is about to end. Raises RunError if it does not end in `DRAWING_SECONDS`."""
+    try:
+        return process.wait(DRAWING_SECONDS)
+    except subprocess.TimeoutExpired as error:
+        raise _hung("did not end") from error
+
+
+def _hung(subject: str) -> RunError:
+    return RunError(
+        f"the process that draws {subject} for {DRAWING_SECONDS:g} s, and was ended; something that it uses hangs, such as the "
+        "driver of the graphics card, or a disk; try again, on another disk or with another driver"
+    )
+
+
+_ATTEMPTS = 3
+_PATIENCE = 600.0  # seconds for one answer, for loading and for drawing; only a viewer that hangs needs them
+_PAUSE = 0.05
+_FILE_HEADER_BYTES = 12
+_MESSAGE_HEADER = struct.Struct("<QQ")  # the kind of the message, and the number of its bytes
+_END = 0
+_FOOTER_BYTES, _FOOTER_WORD = 32, b"RRF2FOOT"
+_TINY = 16  # pixels: even the smallest picture makes the viewer draw everything once, and it is sent quickly
+
+T = TypeVar("T")
+
+
+@final
+class HeadlessViewer:
+    """A viewer that has loaded a recording."""
+
+    def __init__(self, client: ViewerClient, process: subprocess.Popen[bytes], rrd: Path) -> None:
+        """process: known to be the one that the client is connected to. rrd: the recording to load."""
+        self._client, self._process = client, process
+        self._answer(lambda: self._client.open([str(rrd.resolve())]))
+        self._timeline, self._last = self._loaded()
+
+    def state(self) -> ViewerState:
+        """What the viewer shows."""
+        return self._answer(self._client.get_state)
+
+    @property
+    def reports(self) -> list[str]:
+        """The complaints of the panels, such as "Events: …"."""
+        return [f"{view.name}: {report}" for view in self.state().views for report in view.reports]
+
+    def show(self, moment: float | None) -> None:
+        """Show a slot of a run, or a second since the start of a wire; None: the last.
+
+        Raises UsageError if the recording has no such moment.
+        """
+        if self._timeline == ELAPSED:
+            end = self._last / 1e9
+            if moment is not None and not 0.0 <= moment <= end:
+                raise UsageError(f"{moment:g} s is not a time of the wire; give one from 0 to {end:g}, in seconds")
+            seconds = end if moment is None else moment
+            self._answer(lambda: self._client.set_time(ELAPSED, duration=seconds, play_state="paused"))
+        else:
+            if moment is not None and not 0 <= moment <= self._last:
+                raise UsageError(f"slot {moment:.0f} is not in the run; give one from 0 to {self._last}")
+            slot = self._last if moment is None else int(moment)
+            self._answer(lambda: self._client.set_time(TIMELINE, sequence=slot, play_state="paused"))
+
+    def take(self, view_id: str | None = None) -> bytes:
+        """What is shown, or one of its views, as PNG. The first picture after `show` may still show the previous moment."""
+        return self._answer(lambda: self._client.take_screenshot(view_id))
+
+    def frame(self, moment: float) -> bytes:
+        """A picture of a moment after another one, as PNG. Raises UsageError as `show` does."""
+        self.show(moment)
+        self._answer(lambda: self._client.take_screenshot(max_size=_TINY))
+        return self.take()
+
+    def settle(self) -> bytes:
+        """Wait until two pictures are equal; returns the last."""
+        deadline = time.monotonic() + _PATIENCE
+        before, now = b"", self.take()
+        while now != before and time.monotonic() < deadline:
+            time.sleep(4 * _PAUSE)
+            before, now = now, self.take()
+        return now
+
+    def _loaded(self) -> tuple[str, int]:
+        """The recording's time line and its last slot, or its last nanosecond, once recording and layout are loaded."""
+        deadline = time.monotonic() + _PATIENCE
+        while (end := _end(self.state())) is None:
+            if time.monotonic() > deadline:
+                raise RuntimeError(f"the recording was not loaded within {_PATIENCE:.0f} s")
+            time.sleep(_PAUSE)
+        return end
+
+    def _answer(self, ask: Callable[[], T]) -> T:
+        """The viewer's answer. It refuses a question after 15 seconds, which is too early on a busy machine, so ask again."""
+        deadline = time.monotonic() + _PATIENCE
+        while True:
+            try:
+                return ask()
+            except TimeoutError as error:
+                if self._process.poll() is not None:
+                    raise RuntimeError(f"it ended with status {self._process.returncode}") from error
+                if time.monotonic() > deadline:
+                    raise RuntimeError(f"no answer within {_PATIENCE:.0f} s") from error
+
+
+@contextmanager
+def opened(rrd: Path, size: tuple[int, int], moment: float | None = None) -> Iterator[HeadlessViewer]:
+    """A viewer that has loaded a recording and shows a moment of it, by default the last, ready to be drawn.
+
+    Raises UsageError if there is no Vulkan driver, the recording cannot be loaded, or the viewer fails.
+    """
+    check(rrd)
+    with tempfile.TemporaryDirectory() as folder:
+        logs = Path(folder)
+        process, port = _started(size, logs)
+        try:
+            viewer = HeadlessViewer(ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy"), process, rrd)
+            viewer.show(moment)
+            viewer.settle()
+            yield viewer
+        except (RuntimeError, ConnectionError) as error:
+            log = (logs / "viewer.log").read_text("utf-8", "replace")
+            raise UsageError(without_driver(log) or f"the headless viewer failed: {error}; its log:\n{log}") from error
+        finally:
+            end(process)
+
+
+def check(rrd: Path) -> None:
+    """Read a recording to its end. Raises UsageError if it does not exist, is not a recording, or is broken.
+
+    The viewer itself would report nothing, and show nothing.
+    """
+    if not rrd.is_file():
+        raise UsageError(f"{rrd} does not exist; give the recording.rrd of a results folder")
+    try:
+        with warnings.catch_warnings():
+            # A recording that was cut short between two messages is shown up to that point.
+            warnings.simplefilter("ignore")
+            for _ in RrdReader(rrd).stream():
+                pass
+        _check_end(rrd)
+    except (RuntimeError, OSError) as error:
+        why = " ".join(str(error).split())
+        raise UsageError(f"{rrd} is broken ({why}); remove it, and it is made again from the tables") from error
+
+
+def _check_end(rrd: Path) -> None:
+    """Raise OSError if anything but a footer follows the message that ends a recording.
+
+    Rerun's reader takes zeros between two messages for that end, and leaves out whatever follows.
+    """
+    with rrd.open("rb") as file:
+        file.seek(_FILE_HEADER_BYTES)
+        while len(header := file.read(_MESSAGE_HEADER.size)) == _MESSAGE_HEADER.size:
+            kind, length = _MESSAGE_HEADER.unpack(header)
+            if kind == _END:
+                file.seek(length, os.SEEK_CUR)
+                end = file.tell()
+                footer = file.read(_FOOTER_BYTES + 1)
+                if footer and not (len(footer) == _FOOTER_BYTES and _FOOTER_WORD in footer):
+                    raise OSError(f"it ends at byte {end}, and more follows")
+                return
+            file.seek(length, os.SEEK_CUR)
+
+
+def _started(size: tuple[int, int], logs: Path) -> tuple[subprocess.Popen[bytes], int]:
+    """A viewer's process, and the port on which it listens."""
+    for attempt in range(1, _ATTEMPTS + 1):
+        port = free_port()
+        shown = ["--window-size", f"{size[0]}x{size[1]}", "--hide-welcome-screen"]
+        try:
+            # Otherwise the viewer would write into the picture that it is drawing without a graphics card.
+            quiet = {"RUST_LOG": "error"}
+            arguments = ["--headless", "--port", str(port), *shown]
+            return spawn(port, arguments, logs, environment=quiet), port
+        except PortTaken:
+            if attempt == _ATTEMPTS:
+                raise
+    raise AssertionError
+
+
+def _end(state: ViewerState) -> tuple[str, int] | None:
+    if state.loading or not state.views:
+        return None
+    lines = [line for recording in state.recordings for line in recording.timelines if line.name in {TIMELINE, ELAPSED}]
+    return (lines[0].name, int(lines[0].end)) if lines and lines[0].end is not None else None
+
 
 __all__ = ["SIZE", "check_picture_name", "frames_apart", "opened", "picture_apart"]
 
@@ -132,6 +368,200 @@ def main(words: Sequence[str]) -> int:
 
 def _moment(line: str) -> float | None:
     return None if line == _LAST else float(line)
+
+
+VIDEO_SIZE = (1200, 720)
+"""Width and height of a video in pixels."""
+FRAME_RATE = 15.0
+"""Frames per second."""
+_MOST_GIF_RATE = 50.0  # browsers show faster ones slowly
+_COLOURS = 256
+_HUNDREDTH = 10  # milliseconds, the unit of a GIF
+
+
+class VideoFile(ABC):
+    """A video that grows frame by frame."""
+
+    @abstractmethod
+    def add(self, png: bytes) -> None:
+        """Append a frame. Raises OSError if the file cannot be written, and RunError if what writes it hangs."""
+
+    @abstractmethod
+    def finish(self) -> None:
+        """Complete the file. Raises OSError if it cannot be written, and RunError if what writes it hangs."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """Give the file up, or do nothing if it is finished."""
+
+
+@final
+class Mp4File(VideoFile):
+    """H.264 in an MP4 file, by the ffmpeg of the package imageio-ffmpeg."""
+
+    def __init__(self, path: Path, rate: float) -> None:
+        self._told = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `stop`
+        words = [
+            "-y",
+            "-loglevel",
+            "error",
+            "-f",
+            "image2pipe",
+            "-codec:v",
+            "png",
+            "-framerate",
+            f"{rate:g}",
+            "-i",
+            "-",
+        ]
+        coded = ["-codec:v", "libx264", "-crf", "20", "-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4"]
+        self._process = subprocess.Popen(
+            guarded([ffmpeg(), *words, *coded, str(path)]),
+            bufsize=0,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=self._told,
+            start_new_session=True,  # Ctrl-C in the terminal is not for it
+        )
+
+    def add(self, png: bytes) -> None:
+        """See `VideoFile`."""
+        try:
+            give(self._input, png)
+        except BrokenPipeError as error:
+            ended(self._process)
+            raise self._failure from error
+
+    def finish(self) -> None:
+        """See `VideoFile`."""
+        with suppress(BrokenPipeError):
+            self._input.close()
+        if ended(self._process):
+            raise self._failure
+
+    def stop(self) -> None:
+        """See `VideoFile`."""
+        end(self._process)
+        with suppress(OSError):
+            self._input.close()
+        self._told.close()
+
+    @property
+    def _input(self) -> IO[bytes]:
+        assert self._process.stdin is not None  # noqa: S101 - it is a pipe
+        return self._process.stdin
+
+    @property
+    def _failure(self) -> OSError:
+        self._told.seek(0)
+        text = self._told.read().decode(errors="replace")
+        if (full := os.strerror(errno.ENOSPC)) in text:  # it causes the other complaints
+            return OSError(errno.ENOSPC, full)
+        lines = text.strip().splitlines()
+        return OSError(lines[-1] if lines else f"ffmpeg ended with status {self._process.returncode}")
+
+
+@final
+class GifFile(VideoFile):
+    """A GIF that repeats; each frame has colours of its own. Pillow's own writer of several frames would keep all in memory."""
+
+    def __init__(self, path: Path, rate: float) -> None:
+        self._file = path.open("wb")
+        self._rate = rate
+        self._frames = 0
+
+    def add(self, png: bytes) -> None:
+        """See `VideoFile`."""
+        frame = Image.open(BytesIO(png)).convert("RGB").quantize(_COLOURS, dither=Image.Dither.NONE)
+        if not self._frames:
+            header, _ = GifImagePlugin.getheader(frame, info={"loop": 0})
+            self._file.writelines(header)
+        self._frames += 1
+        duration = self._hundredths(self._frames) - self._hundredths(self._frames - 1)
+        self._file.writelines(GifImagePlugin.getdata(frame, duration=duration * _HUNDREDTH, include_color_table=True))
+
+    def finish(self) -> None:
+        """See `VideoFile`."""
+        self._file.write(b";")
+        self._file.close()
+
+    def stop(self) -> None:
+        """See `VideoFile`."""
+        with suppress(OSError):  # a full disk
+            self._file.close()
+
+    def _hundredths(self, frames: int) -> int:
+        """When a frame ends, in hundredths of a second."""
+        return round(100.0 * frames / self._rate)
+
+
+VIDEO_FILES: Mapping[str, Callable[[Path, float], VideoFile]] = {".mp4": Mp4File, ".gif": GifFile}
+"""The end of a name → what writes such a video: called with its path and the frames per second."""
+
+
+def ffmpeg() -> str:
+    """The path of ffmpeg. Raises UsageError if there is none."""
+    try:
+        import imageio_ffmpeg  # noqa: PLC0415 - an optional extra
+
+        return str(imageio_ffmpeg.get_ffmpeg_exe())
+    except (ImportError, RuntimeError) as error:
+        raise UsageError(
+            "an MP4 needs ffmpeg, which the package imageio-ffmpeg brings: pip install '.[video]' in the checkout, or give "
+            "--video a name that ends in .gif"
+        ) from error
+
+
+def check_video(path: Path, size: tuple[int, int], rate: float) -> None:
+    """Raise UsageError if such a video cannot be made here."""
+    kind = path.suffix.lower()
+    if kind not in VIDEO_FILES:
+        raise UsageError(f"--video {path} is not the name of an MP4 or a GIF; give one that ends in .mp4 or .gif")
+    if kind == ".gif" and rate > _MOST_GIF_RATE:
+        raise UsageError(
+            f"--fps {rate:g} is too fast for a GIF; give {_MOST_GIF_RATE:g} at most, or a name that ends in .mp4"
+        )
+    if kind == ".mp4":
+        if size[0] % 2 or size[1] % 2:
+            raise UsageError(f"--size {size[0]}x{size[1]} is not a size of an MP4; give even numbers")
+        ffmpeg()
+
+
+def video_apart(
+    rrd: Path,
+    path: Path,
+    moments: Sequence[float],
+    size: tuple[int, int],
+    rate: float,
+    on_progress: Callable[[int], None],
+    files: Mapping[str, Callable[[Path, float], VideoFile]] = VIDEO_FILES,
+) -> list[str]:
+    """Draw some moments of a recording as a video; returns the panels' complaints. The file appears when it is complete.
+
+    rate: frames per second. on_progress: is called with the number of frames so far. files: the end of a name → what writes the
+    video.
+
+    Raises UsageError as `picture_apart` does, and if such a video cannot be made here.
+    """
+    check_video(path, size, rate)
+    complaints: list[str] = []
+    # The last moment first: if it is not in the recording, nothing is drawn in vain.
+    pictures = frames_apart(rrd, chain([moments[-1]], moments), size, complaints)
+    with whole_file(path) as temporary, closing(pictures), _opened(files[path.suffix.lower()](temporary, rate)) as file:
+        next(pictures)
+        for done, picture in enumerate(pictures, 1):
+            file.add(picture)
+            on_progress(done)
+    return complaints
+
+
+@contextmanager
+def _opened(file: VideoFile) -> Iterator[VideoFile]:
+    try:
+        yield file
+        file.finish()
+    finally:
+        file.stop()
 
 
 if __name__ == "__main__":

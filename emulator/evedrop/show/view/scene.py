@@ -14,7 +14,7 @@ from evedrop.model.process import Floats
 from evedrop.model.receiver import Codes, Flags
 from evedrop.scenario.application import Panel
 
-TRUTH = "truth"
+TRUTH_NAME = "truth"
 """The name of the true state where receivers' names are those of their estimates."""
 
 

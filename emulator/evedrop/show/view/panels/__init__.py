@@ -1,23 +1,20 @@
-"""The panels of the view, one file each. An installed package adds panels with entry points in the group `evedrop.panels`."""
+"""The panels of the view. An installed package adds panels with entry points in the group `evedrop.panels`."""
 
 from __future__ import annotations
 
 from evedrop.model.registry import Registry
-from evedrop.show.view.panels.applications import ApplicationPanels
-from evedrop.show.view.panels.error import SquaredError
-from evedrop.show.view.panels.events import Events
-from evedrop.show.view.panels.fates import LastPacket
-from evedrop.show.view.panels.ground_map import GroundMap
-from evedrop.show.view.panels.knowledge import WhoKnowsWhat
-from evedrop.show.view.panels.legend import Legend
-from evedrop.show.view.panels.levels import Levels
-from evedrop.show.view.panels.packets import Packets
+from evedrop.show.view.panels.curves import (
+    ApplicationPanels,
+    Levels,
+    SquaredError,
+    StateOverTime,
+    TraceOfP,
+    WhatMovesThePlant,
+)
+from evedrop.show.view.panels.fates import LastPacket, Packets, WhoKnowsWhat
 from evedrop.show.view.panels.panel import ViewPanel
-from evedrop.show.view.panels.plant import WhatMovesThePlant
-from evedrop.show.view.panels.state import StateOverTime
-from evedrop.show.view.panels.state_plane import StatePlane
-from evedrop.show.view.panels.title import Title
-from evedrop.show.view.panels.trace import TraceOfP
+from evedrop.show.view.panels.plane import GroundMap, StatePlane
+from evedrop.show.view.panels.texts import Events, Legend, Title
 
 PANELS: Registry[ViewPanel] = Registry(
     "panel",

@@ -1,9 +1,15 @@
-"""Shared by panels with curves: axes, views, styles, logarithms."""
+"""The panels of curves over time, and what they share: axes, views, styles, logarithms.
+
+The curves are errors and covariances of the receivers, states and their estimates, what moves the plant of a closed loop, and
+what the scenario's applications describe.
+"""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
+from typing import final
 
 import numpy as np
 import rerun as rr
@@ -13,8 +19,9 @@ from numpy.typing import NDArray
 from evedrop.model.process import Floats
 from evedrop.show.view.column import Column, scalars
 from evedrop.show.view.error_floor import error_floor
-from evedrop.show.view.palette import Colour
-from evedrop.show.view.scene import Scene
+from evedrop.show.view.palette import PLANT, TRUTH_CURVE, Colour, colour, dim
+from evedrop.show.view.panels.panel import PlacedView, ViewPanel
+from evedrop.show.view.scene import TRUTH_NAME, Scene, SceneSlots
 
 _WINDOW = 105  # slots; below four pixels a slot, Rerun merges neighbouring slots into grey
 _ROOM = 3  # slots to the right of the present, so that the newest slot is not at the border
@@ -83,3 +90,246 @@ def logarithms(scene: Scene, path: str, slots: NDArray[np.int64], values: Floats
     if covered.any():
         floor = error_floor(scene.noise, scene.trials)
         yield scalars(path, slots[covered], np.log10(np.maximum(values[covered], floor)))
+
+
+_ERROR_PATH, _BAND = "error", "band"
+_NO_NAME = " "
+"""The name of curves in the legend, which the receivers' own curves explain."""
+_SIDES = {"low": -1.96, "high": 1.96}
+"""The edges of the band, in standard errors from the mean: 19 of 20 bands contain the expectation."""
+
+
+@final
+class SquaredError(ViewPanel):
+    """|x − x̂|² on a logarithmic scale: in recent slots, or in the whole run of a closed loop."""
+
+    def views(self) -> Iterator[PlacedView]:
+        """One view: of the whole run for a closed loop, otherwise of the recent slots."""
+        title = "Squared error   log10"
+        if self.scene.moving:
+            yield PlacedView(receivers_view(title, self._paths, whole_run(self.scene)), "right")
+        else:
+            title += ", dim: 95 % bands" if self._with_bands else ""
+            yield PlacedView(receivers_view(title, self._paths, recent_slots(self.scene)), "middle")
+
+    @property
+    def _with_bands(self) -> bool:
+        return self.scene.trials > 1
+
+    @property
+    def _paths(self) -> list[str]:
+        return [_ERROR_PATH, _BAND] if self._with_bands else [_ERROR_PATH]
+
+    def styles(self) -> dict[str, rr.SeriesLines]:
+        """Each curve in its receiver's colour, and the edges of its band dim."""
+        styles = {}
+        for i, shown in enumerate(self.scene.receivers):
+            styles[f"{_ERROR_PATH}/{shown.name}"] = rr.SeriesLines(
+                names=shown.name, colors=colour(i), widths=1.5, aggregation_policy=LARGEST
+            )
+            for side in _SIDES if self._with_bands else ():
+                styles[f"{_BAND}/{shown.name}/{side}"] = rr.SeriesLines(
+                    names=_NO_NAME, colors=dim(colour(i), 0.5), widths=1.0, aggregation_policy=LARGEST
+                )
+        return styles
+
+    def columns(self, slots: SceneSlots) -> Iterator[Column]:
+        """A curve for each receiver, and two for the edges of its band."""
+        for shown in self.scene.receivers:
+            peer = slots.peers[shown.name]
+            yield from logarithms(self.scene, f"{_ERROR_PATH}/{shown.name}", slots.numbers, peer.squared_error)
+            for side, distance in _SIDES.items() if self._with_bands else ():
+                edge = peer.squared_error + distance * peer.standard_error
+                yield from logarithms(self.scene, f"{_BAND}/{shown.name}/{side}", slots.numbers, edge)
+
+
+_BELIEVED, _THEORY = "trace", "theory"
+
+
+@final
+class TraceOfP(ViewPanel):
+    """tr P on a logarithmic scale. Recorded but not shown for a closed loop."""
+
+    def views(self) -> Iterator[PlacedView]:
+        """One view, below the squared error."""
+        if not self.scene.moving:
+            title = "tr P   log10, dim: theory"
+            yield PlacedView(receivers_view(title, [_BELIEVED, _THEORY], recent_slots(self.scene)), "middle")
+
+    def styles(self) -> dict[str, rr.SeriesLines]:
+        """Each receiver's colour: bright for its belief, dim for theory."""
+        styles = {}
+        for i, shown in enumerate(self.scene.receivers):
+            bright, label = colour(i), shown.name
+            styles[f"{_BELIEVED}/{label}"] = rr.SeriesLines(
+                names=label, colors=bright, widths=1.5, interpolation_mode="StepAfter", aggregation_policy=LARGEST
+            )
+            styles[f"{_THEORY}/{label}"] = rr.SeriesLines(
+                names=f"{label}, theory", colors=dim(bright, 0.6), widths=1.0, aggregation_policy=LARGEST
+            )
+        return styles
+
+    def columns(self, slots: SceneSlots) -> Iterator[Column]:
+        """Two curves for each receiver; only the first if no theory covers it."""
+        for shown in self.scene.receivers:
+            peer = slots.peers[shown.name]
+            yield from logarithms(self.scene, f"{_BELIEVED}/{shown.name}", slots.numbers, peer.trace)
+            yield from logarithms(self.scene, f"{_THEORY}/{shown.name}", slots.numbers, peer.expected_trace)
+
+
+_STATE_PATH = "plane"
+
+
+@final
+class StateOverTime(ViewPanel):
+    """The state and every estimate, in place of the state plane. Recorded but not shown for a closed loop."""
+
+    @classmethod
+    def applies(cls, scene: Scene) -> bool:
+        """Only for one state."""
+        return scene.n == 1
+
+    def views(self) -> Iterator[PlacedView]:
+        """One view, on the right."""
+        if not self.scene.moving:
+            view = rrb.TimeSeriesView(
+                name="State and estimates",
+                origin=_STATE_PATH,
+                axis_x=recent_slots(self.scene),
+                plot_legend=rrb.PlotLegend(visible=False),
+            )
+            yield PlacedView(view, "right")
+
+    def styles(self) -> dict[str, rr.SeriesLines]:
+        """Each estimate in its receiver's colour; the truth grey and wide."""
+        styles = {f"{_STATE_PATH}/{TRUTH_NAME}": rr.SeriesLines(names="truth", colors=TRUTH_CURVE, widths=2.5)}
+        for i, shown in enumerate(self.scene.receivers):
+            styles[f"{_STATE_PATH}/{shown.name}"] = rr.SeriesLines(names=shown.name, colors=colour(i), widths=1.5)
+        return styles
+
+    def columns(self, slots: SceneSlots) -> Iterator[Column]:
+        """The truth, and every estimate."""
+        yield scalars(f"{_STATE_PATH}/{TRUTH_NAME}", slots.numbers, slots.x[:, 0])
+        for shown in self.scene.receivers:
+            yield scalars(f"{_STATE_PATH}/{shown.name}", slots.numbers, slots.peers[shown.name].x_hat[:, 0])
+
+
+_LEVELS_PATH = "levels"
+_VIEWS = 2  # the first states have views; the others are recorded, but not shown
+
+
+@final
+class Levels(ViewPanel):
+    """A view for each of the first states, over the whole run."""
+
+    @classmethod
+    def applies(cls, scene: Scene) -> bool:
+        """Only for a closed loop."""
+        return bool(scene.moving)
+
+    def views(self) -> Iterator[PlacedView]:
+        """A view for each of the first two states, on the left side."""
+        for i in range(min(self.scene.n, _VIEWS)):
+            label = self.scene.states[i] if self.scene.states else f"state {i}"
+            title = f"{label}   grey: truth"
+            yield PlacedView(curves_view(title, f"{_LEVELS_PATH}/{i}", whole_run(self.scene), legend=False), "left")
+
+    def styles(self) -> dict[str, rr.SeriesLines]:
+        """Each estimate in its receiver's colour; the truth grey and wide."""
+        styles = {}
+        for i in range(self.scene.n):
+            styles[f"{_LEVELS_PATH}/{i}/{TRUTH_NAME}"] = line_style("truth", TRUTH_CURVE, 1.8)
+            for j, shown in enumerate(self.scene.receivers):
+                styles[f"{_LEVELS_PATH}/{i}/{shown.name}"] = line_style(shown.name, colour(j), 0.9)
+        return styles
+
+    def columns(self, slots: SceneSlots) -> Iterator[Column]:
+        """Every state, true and estimated."""
+        at = thinned(self.scene, slots.numbers)
+        if not len(at):
+            return
+        k = slots.numbers[at]
+        for i in range(self.scene.n):
+            yield scalars(f"{_LEVELS_PATH}/{i}/{TRUTH_NAME}", k, slots.x[at, i])
+            for name, peer in slots.peers.items():
+                yield scalars(f"{_LEVELS_PATH}/{i}/{name}", k, peer.x_hat[at, i])
+
+
+_PLANT_PATH = "moving"
+
+
+@final
+class WhatMovesThePlant(ViewPanel):
+    """Disturbances, and inputs as the plant's limits clip them, over the whole run."""
+
+    @classmethod
+    def applies(cls, scene: Scene) -> bool:
+        """Only for a closed loop."""
+        return bool(scene.moving)
+
+    def views(self) -> Iterator[PlacedView]:
+        """One view, at the top of the left side."""
+        title = "What moves the plant: " + ", ".join(self.scene.moving)
+        yield PlacedView(curves_view(title, _PLANT_PATH, whole_run(self.scene)), "left", 1.3)
+
+    def styles(self) -> dict[str, rr.SeriesLines]:
+        """Steps, because a value holds for its whole slot."""
+        return {
+            _curve(label): line_style(label, PLANT[i % len(PLANT)], 1.4, steps=True)
+            for i, label in enumerate(self.scene.moving)
+        }
+
+    def columns(self, slots: SceneSlots) -> Iterator[Column]:
+        """A curve for each disturbance and input."""
+        at = thinned(self.scene, slots.numbers)
+        if slots.moved is not None and len(at):
+            for label, values in zip(self.scene.moving, slots.moved.values.T, strict=True):
+                yield scalars(_curve(label), slots.numbers[at], values[at])
+
+
+def _curve(label: str) -> str:
+    return f"{_PLANT_PATH}/{re.sub(r'[^A-Za-z0-9_-]+', '_', label)}"
+
+
+@final
+class ApplicationPanels(ViewPanel):
+    """A view for each panel that an application describes, over the whole run."""
+
+    @classmethod
+    def applies(cls, scene: Scene) -> bool:
+        """Only for a closed loop with an application that has panels."""
+        return bool(scene.panels)
+
+    def views(self) -> Iterator[PlacedView]:
+        """Panels of the plant on the left, panels of the receivers' beliefs on the right."""
+        for panel in self.scene.panels:
+            span = None if panel.span is None else rrb.ScalarAxis(range=panel.span, zoom_lock=True)
+            view = curves_view(panel.title, panel.path, whole_run(self.scene), span, legend=not panel.with_beliefs)
+            yield PlacedView(view, "right", 1.2) if panel.with_beliefs else PlacedView(view, "left")
+
+    def styles(self) -> dict[str, rr.SeriesLines | rr.SeriesPoints]:
+        """The styles that the application describes; a receiver's own colour if it gives none."""
+        colours = {shown.name: colour(i) for i, shown in enumerate(self.scene.receivers)}
+        styles: dict[str, rr.SeriesLines | rr.SeriesPoints] = {}
+        for panel in self.scene.panels:
+            for curve in panel.curves:
+                bright = curve.colour or colours[curve.name]
+                styles[f"{panel.path}/{curve.name}"] = (
+                    rr.SeriesPoints(names=curve.name, colors=bright, markers="circle", marker_sizes=curve.width)
+                    if curve.drawn == "points"
+                    else line_style(curve.name, bright, curve.width, steps=curve.drawn == "steps")
+                )
+        return styles
+
+    def columns(self, slots: SceneSlots) -> Iterator[Column]:
+        """A column for every curve: lines are thinned, points are not."""
+        if slots.moved is None:
+            return
+        for panel in self.scene.panels:
+            for curve in panel.curves:
+                path = f"{panel.path}/{curve.name}"
+                numbers, values = slots.moved.curves[path]
+                k = numbers.astype(np.int64)
+                at = np.arange(len(k)) if curve.drawn == "points" else thinned(self.scene, k)
+                if len(at):
+                    yield scalars(path, k[at], values[at])

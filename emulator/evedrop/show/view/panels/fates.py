@@ -1,26 +1,191 @@
-"""The graph of sensor, router and receivers: the fate of the last packet on every link, and what each receiver knows."""
+"""The panels of what became of packets and of what each receiver knows: lanes over time, and a graph of the last packet.
+
+The lanes below each other show a word at every time; only changes are recorded. The graph has the sensor, the router and the
+receivers. Its nodes have fixed places and changing labels. Rerun draws no labels on edges, so a link is a node between the nodes
+that it joins. The view of a wire has lanes and a graph of the same classes.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import final
 
+import numpy as np
+import rerun as rr
 import rerun.blueprint as rrb
+from numpy.typing import NDArray
 from rerun import AsComponents
 
 from evedrop.model import receiver
 from evedrop.score.track import Track
 from evedrop.show.view import lanes
 from evedrop.show.view.column import Column
-from evedrop.show.view.drawn_graph import LETTER, LINE, DrawnGraph, Place
-from evedrop.show.view.knowledge import ErrorDistance, knowledge
+from evedrop.show.view.lanes import ErrorDistance, Lane, knowledge
 from evedrop.show.view.palette import DROPPED_TEXT, IN_TRACK_TEXT, MISLED, STATE, TRUTH, TRUTH_CURVE, Colour
-from evedrop.show.view.panels.heights import crowded, lanes_height
-from evedrop.show.view.panels.panel import PlacedView, ViewPanel
-from evedrop.show.view.panels.state_plane import frames
+from evedrop.show.view.panels.curves import recent_slots
+from evedrop.show.view.panels.panel import FIXED_HEIGHT, PlacedView, ViewPanel, crowded, lanes_height
+from evedrop.show.view.panels.plane import frames
 from evedrop.show.view.scene import Scene, SceneSlots, Shown
 
-_PATH = "graph"
+
+@final
+class StateLanes:
+    """The lanes of one view."""
+
+    def __init__(self, origin: str, lanes: Iterable[tuple[str, Lane]], first: int, *, labelled: bool = False) -> None:
+        """origin: the path of the view; lanes: each with its name; first: the number of the first lane.
+
+        labelled: whether a lane shows its words. Mostly a slot is too narrow for one, and a legend says what the colours mean.
+        """
+        given = list(lanes)
+        self._lanes = [lane for _, lane in given]
+        # The viewer sorts lanes by path, hence the numbers.
+        digits = len(str(first + len(given) - 1))
+        self.paths = [
+            f"{origin}/{rr.escape_entity_path_part(f'{i:0{digits}d}_{name}')}"
+            for i, (name, _) in enumerate(given, first)
+        ]
+        self._labelled = labelled
+        self._last = [-1] * len(given)
+
+    def styles(self) -> dict[str, rr.StateConfiguration]:
+        """The words and colours of each lane."""
+        return {
+            path: rr.StateConfiguration(
+                values=lane.words, labels=None if self._labelled else [" "] * len(lane.words), colors=lane.colours
+            )
+            for path, lane in zip(self.paths, self._lanes, strict=True)
+        }
+
+    def changes(
+        self, codes: Iterable[NDArray[np.integer]]
+    ) -> Iterator[tuple[str, NDArray[np.intp], rr.ComponentColumnList]]:
+        """The path of each lane that changes in the next c steps, the steps, and the words; codes: of each lane, (c,)."""
+        for i, (path, lane, steps) in enumerate(zip(self.paths, self._lanes, codes, strict=True)):
+            at = np.flatnonzero(np.diff(steps.astype(np.int64), prepend=self._last[i]))
+            self._last[i] = int(steps[-1])
+            if len(at):
+                yield path, at, rr.StateChange.columns(state=[lane.words[code] for code in steps[at].tolist()])
+
+
+_KNOWLEDGE_PATH = "knows"
+
+
+@final
+class WhoKnowsWhat(ViewPanel):
+    """A lane for each receiver: in track, drifting or fooled, with its error in words."""
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__(scene)
+        self._distances = {shown.name: ErrorDistance(scene) for shown in scene.receivers}
+        named = [(name, distance.lane) for name, distance in self._distances.items()]
+        self._lanes = StateLanes(_KNOWLEDGE_PATH, named, first=1, labelled=True)
+
+    def views(self) -> Iterator[PlacedView]:
+        """One view, at the top."""
+        view = rrb.StateTimelineView(name="Who knows what", origin=_KNOWLEDGE_PATH, time_view=recent_slots(self.scene))
+        yield PlacedView(view, "top", 1.2, lanes_height(len(self.scene.receivers)))
+
+    def styles(self) -> dict[str, rr.StateConfiguration]:
+        """Words and colours."""
+        return self._lanes.styles()
+
+    def columns(self, slots: SceneSlots) -> Iterator[Column]:
+        """The lanes' changes."""
+        codes = (self._codes(shown.name, slots) for shown in self.scene.receivers)
+        for path, at, words in self._lanes.changes(codes):
+            yield Column(path, slots.numbers[at], words)
+
+    def _codes(self, name: str, slots: SceneSlots) -> NDArray[np.int64]:
+        peer, distance = slots.peers[name], self._distances[name]
+        return distance.codes(knowledge(self.scene, slots.x, peer), distance.of(slots.x, peer.x_hat))
+
+
+_PACKETS_PATH = "packets"
+
+
+@final
+class Packets(ViewPanel):
+    """The lanes of sensor and receivers."""
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__(scene)
+        names = ["sent", *(shown.name for shown in scene.receivers)]
+        shown_lanes = [lanes.SENT, *(lanes.lane_of(shown) for shown in scene.receivers)]
+        self._lanes = StateLanes(_PACKETS_PATH, zip(names, shown_lanes, strict=True), first=0)
+
+    def views(self) -> Iterator[PlacedView]:
+        """One view, as high as the lanes need: above the events, or, with many receivers or a closed loop, at the top."""
+        view = rrb.StateTimelineView(name="Packets", origin=_PACKETS_PATH, time_view=recent_slots(self.scene))
+        receivers = len(self.scene.receivers)
+        height = lanes_height(receivers + 1)
+        if self.scene.moving or crowded(self.scene):
+            yield PlacedView(view, "top", height=height)
+        else:
+            column = 1.0 - FIXED_HEIGHT - lanes_height(receivers)
+            yield PlacedView(view, "left", height / (column - height))
+
+    def styles(self) -> dict[str, rr.StateConfiguration]:
+        """Colours; the legend says what they mean."""
+        return self._lanes.styles()
+
+    def columns(self, slots: SceneSlots) -> Iterator[Column]:
+        """The lanes' changes."""
+        lanes_of = [lanes.sent(slots), *(lanes.received(shown, slots) for shown in self.scene.receivers)]
+        for path, at, words in self._lanes.changes(lanes_of):
+            yield Column(path, slots.numbers[at], words)
+
+
+LETTER, LINE = 7.0, 38.0
+"""Width of a letter and distance of boxes in Rerun's drawing."""
+_RADIUS = 4.0
+
+Place = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class DrawnGraph:
+    """The nodes and edges of a graph, at a path of the recording."""
+
+    path: str
+    nodes: dict[str, Place]
+    """Id → place, in the order of labels and colours."""
+    edges: tuple[tuple[str, str], ...]
+    """From one id to another."""
+
+    def view(self, title: str, margin: tuple[float, float]) -> rrb.GraphView:
+        """The view of the graph; margin: what is shown beyond the outermost nodes, to the sides, and above and below."""
+        ranges = []
+        for axis, room in enumerate(margin):
+            at = [place[axis] for place in self.nodes.values()]
+            ranges.append((min(at) - room, max(at) + room))
+        bounds = rrb.VisualBounds2D(x_range=ranges[0], y_range=ranges[1])
+        return rrb.GraphView(name=title, origin=self.path, visual_bounds=bounds)
+
+    def style(self) -> rr.AsComponents:
+        """The edges, and which nodes are where, to be recorded once at the path."""
+        nodes = rr.GraphNodes([*self.nodes], positions=[*self.nodes.values()], radii=[_RADIUS] * len(self.nodes))
+        return _Together((nodes, rr.GraphEdges([*self.edges], graph_type="directed")))
+
+    def columns(self, labels: Sequence[str], colours: Sequence[Colour]) -> rr.ComponentColumnList:
+        """Labels and colours of all nodes at some times: those of the first time, then those of the second, and so on."""
+        lengths = [len(self.nodes)] * (len(labels) // len(self.nodes))
+        return rr.GraphNodes.columns(labels=labels, colors=colours).partition(lengths)
+
+
+@dataclass(frozen=True)
+class _Together:
+    """Several of Rerun's archetypes as one."""
+
+    parts: tuple[rr.AsComponents, ...]
+
+    def as_component_batches(self) -> list[rr.DescribedComponentBatch]:
+        """The components of all."""
+        return [batch for part in self.parts for batch in part.as_component_batches()]
+
+
+_GRAPH_PATH = "graph"
 _SENSOR, _ROUTER = "the sensor", "the router"
 _LINKS, _RECEIVERS = 150.0, 320.0  # where their columns are, right of sensor and router
 FATES = {
@@ -51,7 +216,7 @@ class LastPacket(ViewPanel):
         edges = [(_SENSOR, _ROUTER)]
         for i in rows:
             edges += [(_ROUTER, f"link {i}"), (f"link {i}", f"receiver {i}")]
-        self._drawn = DrawnGraph(_PATH, nodes, tuple(edges))
+        self._drawn = DrawnGraph(_GRAPH_PATH, nodes, tuple(edges))
 
     @classmethod
     def applies(cls, scene: Scene) -> bool:
@@ -68,7 +233,7 @@ class LastPacket(ViewPanel):
 
     def styles(self) -> dict[str, AsComponents]:
         """The edges, and where the nodes are."""
-        return {_PATH: self._drawn.style()}
+        return {_GRAPH_PATH: self._drawn.style()}
 
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
         """Labels and colours of all nodes at the frames."""
@@ -88,7 +253,7 @@ class LastPacket(ViewPanel):
             ]
             labels += [label for label, _ in nodes]
             colours += [colour for _, colour in nodes]
-        yield Column(_PATH, slots.numbers[at], self._drawn.columns(labels, colours))
+        yield Column(_GRAPH_PATH, slots.numbers[at], self._drawn.columns(labels, colours))
 
     @staticmethod
     def _fates(shown: Shown, slots: SceneSlots, at: list[int]) -> list[tuple[str, Colour]]:

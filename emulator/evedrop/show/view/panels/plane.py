@@ -1,6 +1,9 @@
-"""The panel of the first two states, and its geometry: truth, estimates with their recent paths, covariance ellipses believed.
+"""The panels of two dimensions, recorded at the view's frames: the plane of the first two states, and the map of receivers.
 
-It follows the truth and the legitimate estimator. An eavesdropper that is farther away is an arrow at the border.
+The plane shows truth, estimates with their recent paths, and the covariance ellipses believed. It follows the truth and the
+legitimate estimator. An eavesdropper that is farther away is an arrow at the border.
+
+The map, for links whose losses depend on distance, is drawn by Evedrop: Rerun's own map would load its tiles from another host.
 """
 
 from __future__ import annotations
@@ -15,16 +18,16 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from evedrop.model.links.way import Way
 from evedrop.model.process import Floats
 from evedrop.show.view.column import TIMELINE, Column
-from evedrop.show.view.knowledge import ErrorDistance
-from evedrop.show.view.palette import GROUND, Colour, colour, dim
-from evedrop.show.view.palette import TRUTH as WHITE
+from evedrop.show.view.lanes import ErrorDistance
+from evedrop.show.view.palette import GROUND, TRUTH, Colour, colour, dim
 from evedrop.show.view.panels.panel import PlacedView, ViewPanel
-from evedrop.show.view.scene import TRUTH, Scene, SceneSlots
+from evedrop.show.view.scene import TRUTH_NAME, Scene, SceneSlots
 
-_PATH = "plane"
-_FRAME = f"{_PATH}/frame"
+_PLANE_PATH = "plane"
+_FRAME = f"{_PLANE_PATH}/frame"
 _TRAIL = 30
 _TRUTH_TRAIL = 130
 
@@ -37,7 +40,7 @@ class StatePlane(ViewPanel):
         super().__init__(scene)
         self._frame, every = Frame(), stride(scene)
         self._distance = ErrorDistance(scene)
-        self._trails = {name: Trail(every) for name in (TRUTH, *(shown.name for shown in scene.receivers))}
+        self._trails = {name: Trail(every) for name in (TRUTH_NAME, *(shown.name for shown in scene.receivers))}
 
     @classmethod
     def applies(cls, scene: Scene) -> bool:
@@ -51,10 +54,10 @@ class StatePlane(ViewPanel):
         trails: dict[str, rrb.VisibleTimeRanges] = {
             _trail(shown.name): self._past(_TRAIL) for shown in self.scene.receivers
         }
-        trails[_trail(TRUTH)] = self._past(_TRUTH_TRAIL)
+        trails[_trail(TRUTH_NAME)] = self._past(_TRUTH_TRAIL)
         view = rrb.Spatial2DView(
             name="State plane   ellipses: 2σ believed",
-            origin=_PATH,
+            origin=_PLANE_PATH,
             background=list(GROUND),
             overrides=trails,  # type: ignore[arg-type]
         )
@@ -75,7 +78,7 @@ class StatePlane(ViewPanel):
 
     def styles(self) -> dict[str, rr.AsComponents]:
         """Each estimate in its receiver's colour; the truth white, on top of the others."""
-        styles = _point_styles(TRUTH, WHITE, radius=3.5, order=40.0)
+        styles = _point_styles(TRUTH_NAME, TRUTH, radius=3.5, order=40.0)
         for i, shown in enumerate(self.scene.receivers):
             styles |= _point_styles(shown.name, colour(i), radius=5.0, order=30.0 - i)
             if i > 0:
@@ -83,7 +86,7 @@ class StatePlane(ViewPanel):
                     colors=[colour(i)], radii=rr.Radius.ui_points(1.5)
                 )
                 styles[_away(shown.name)] = rr.Points2D.from_fields(
-                    colors=[WHITE], radii=rr.Radius.ui_points(0.0), show_labels=True
+                    colors=[TRUTH], radii=rr.Radius.ui_points(0.0), show_labels=True
                 )
         # Invisible: the view fits its range to it.
         styles[_FRAME] = rr.LineStrips2D.from_fields(colors=[GROUND], radii=rr.Radius.ui_points(0.1))
@@ -92,16 +95,16 @@ class StatePlane(ViewPanel):
     def columns(self, slots: SceneSlots) -> Iterator[Column]:
         """Points, trails, ellipses, and the frame around them."""
         k, at = slots.numbers, frames(self.scene, slots.first, slots.count)
-        positions = {TRUTH: on_plane(slots.x)}
+        positions = {TRUTH_NAME: on_plane(slots.x)}
         positions |= {name: on_plane(peer.x_hat) for name, peer in slots.peers.items()}
         pieces = {name: self._trails[name].pieces(points, at) for name, points in positions.items()}
-        followed = np.stack([positions[TRUTH], positions[self.scene.receivers[0].name]])
+        followed = np.stack([positions[TRUTH_NAME], positions[self.scene.receivers[0].name]])
         boxes = self._frame.boxes(followed.min(axis=0), followed.max(axis=0), at)
         if not len(at):
             return
         border = _BORDER * (boxes[:, 2] - boxes[:, 0])
         low, high = boxes[:, 0] + border, boxes[:, 2] - border
-        truth = positions[TRUTH][at]
+        truth = positions[TRUTH_NAME][at]
         labels: list[Points] = []
         yield Column(_FRAME, k[at], rr.LineStrips2D.columns(strips=boxes))
         for name, points in positions.items():
@@ -156,23 +159,23 @@ def _point_styles(name: str, bright: Colour, *, radius: float, order: float) -> 
 
 
 def _trail(name: str) -> str:
-    return f"{_PATH}/{name}/trail"
+    return f"{_PLANE_PATH}/{name}/trail"
 
 
 def _ellipse(name: str) -> str:
-    return f"{_PATH}/{name}/cov"
+    return f"{_PLANE_PATH}/{name}/cov"
 
 
 def _point(name: str) -> str:
-    return f"{_PATH}/{name}/at"
+    return f"{_PLANE_PATH}/{name}/at"
 
 
 def _arrow(name: str) -> str:
-    return f"{_PATH}/{name}/arrow"
+    return f"{_PLANE_PATH}/{name}/arrow"
 
 
 def _away(name: str) -> str:
-    return f"{_PATH}/{name}/away"
+    return f"{_PLANE_PATH}/{name}/away"
 
 
 Points = NDArray[np.float32]
@@ -189,7 +192,7 @@ _EDGE = 0.1  # of a frame's sides: the room between the arrows' tips and its bor
 _LABEL = 0.18  # the same for the labels: half the width of one
 _LINE = 0.11  # of a frame's height: what a label needs
 _ARROW = 0.08  # length of an arrow, compared with the longer side
-_ROOM = 0.3  # around what the frame follows, compared with its longer side
+_FRAME_ROOM = 0.3  # around what the frame follows, compared with its longer side
 
 
 def stride(scene: Scene) -> int:
@@ -313,7 +316,7 @@ class Frame:
             recent = slice(max(0, end - _FRAMED_SLOTS), end)
             low[i], high[i] = self._lows[recent].min(axis=0), self._highs[recent].max(axis=0)
         self._lows, self._highs = self._lows[-_FRAMED_SLOTS:], self._highs[-_FRAMED_SLOTS:]
-        room = _ROOM * (high - low).max(axis=1, keepdims=True, initial=0.0)
+        room = _FRAME_ROOM * (high - low).max(axis=1, keepdims=True, initial=0.0)
         low, high = low - room, high + room
         step = np.exp2(np.floor(np.log2(np.maximum(high - low, 1e-30).max(axis=1, keepdims=True, initial=1e-30)))) / 8
         low, high = (np.floor(low / step) - 0.5) * step, (np.ceil(high / step) + 0.5) * step
@@ -345,3 +348,70 @@ class Trail:
         keep_from = int(ends[-1]) if len(ends) else 0
         self._since = path[keep_from:]
         return pieces
+
+
+_MAP_PATH = "map"
+_FLATTEST = 0.35  # height of the map section shown, compared with its width
+_MAP_ROOM = 0.75  # from the middle to each side, so that labels fit
+
+
+@final
+class GroundMap(ViewPanel):
+    """Where sender and receivers are, and how far apart, drawn at the view's frames."""
+
+    @classmethod
+    def applies(cls, scene: Scene) -> bool:
+        """Only with a link whose losses depend on distance; not for a closed loop, whose view is full."""
+        return bool(scene.ways) and not scene.moving
+
+    def views(self) -> Iterator[PlacedView]:
+        """One view, on the right."""
+        corners = np.concatenate([self._corners(way) for ways in self.scene.ways.values() for way in ways])
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        middle, size = (low + high) / 2, np.maximum(high - low, _FLATTEST * (high - low).max() + 1.0)
+        x, y = ((float(m - _MAP_ROOM * s), float(m + _MAP_ROOM * s)) for m, s in zip(middle, size, strict=True))
+        bounds = rrb.VisualBounds2D(x_range=x, y_range=y)
+        view = rrb.Spatial2DView(name="Map", origin=_MAP_PATH, background=list(GROUND), visual_bounds=bounds)
+        yield PlacedView(view, "right", 0.6)
+
+    def styles(self) -> dict[str, rr.AsComponents]:
+        """The ways of the whole run as lines; receivers in their colours, senders white."""
+        styles: dict[str, rr.AsComponents] = {}
+        size = rr.Radius.ui_points
+        for i, shown in enumerate(self.scene.receivers):
+            if shown.name in self.scene.ways:
+                ways = [self._corners(way) for way in self.scene.ways[shown.name]]
+                lines = rr.LineStrips2D(ways, colors=[dim(TRUTH, 0.45), dim(colour(i), 0.55)], radii=size(1.0))
+                styles[f"{_MAP_PATH}/{shown.name}/ways"] = lines
+                styles[f"{_MAP_PATH}/{shown.name}/link"] = rr.LineStrips2D.from_fields(
+                    colors=[colour(i)], radii=size(0.7)
+                )
+                styles[f"{_MAP_PATH}/{shown.name}/at"] = rr.Points2D.from_fields(
+                    colors=[TRUTH, colour(i)], radii=size(5.0), show_labels=True
+                )
+        return styles
+
+    def columns(self, slots: SceneSlots) -> Iterator[Column]:
+        """Both ends of each link, and their distance in metres."""
+        at = frames(self.scene, slots.first, slots.count)
+        if not len(at):
+            return
+        k = slots.numbers[at]
+        for name, ways in self.scene.ways.items():
+            ends = np.stack([_on_map(way, k.astype(np.float64)) for way in ways], axis=1)
+            distances = np.hypot(*(ends[:, 1] - ends[:, 0]).T)
+            labels = [text for distance in distances.tolist() for text in ("sensor", f"{name}: {distance:,.0f} m away")]
+            yield Column(f"{_MAP_PATH}/{name}/link", k, rr.LineStrips2D.columns(strips=ends))
+            points = rr.Points2D.columns(positions=ends.reshape(-1, 2), labels=labels)
+            yield Column(f"{_MAP_PATH}/{name}/at", k, points.partition([2] * len(k)))
+
+    def _corners(self, way: Way) -> NDArray[np.float32]:
+        """The places of a run at which a way may change its direction, its first and its last one, (corners, 2)."""
+        last = self.scene.slots - 1
+        return _on_map(way, np.array(sorted({0, last, *(slot for slot in way.slots if slot < last)}), np.float64))
+
+
+def _on_map(way: Way, slots: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Positions in slots, (c, 2); Rerun's y axis points down."""
+    x, y = way.at(slots)
+    return np.stack([x, -y], axis=1).astype(np.float32)

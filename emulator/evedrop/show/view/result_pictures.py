@@ -1,0 +1,414 @@
+"""The pictures of results, drawn by matplotlib: of a run, of a sweep, and of a comparison.
+
+That of a run is made from its tables: errors with bands, what became of each packet, and the plane. That of a sweep shows every
+receiver's error against the first entry, in a panel for each combination of the others. That of a comparison is a matrix of
+schemes and adversaries, with a mark, a colour and a ratio in every cell.
+
+Source: docs/python.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from matplotlib.patches import Patch, Rectangle
+
+from evedrop.errors import UsageError
+from evedrop.model.metrics import all_metrics, error_column, shown_metric
+from evedrop.model.process import Floats
+from evedrop.model.receiver import NOTHING, SILENT
+from evedrop.results.reading import Results
+from evedrop.scenario.arguments import refuse_unless
+from evedrop.scenario.loading.recorded import recorded, recorded_noise
+from evedrop.score.verdict import MARKS, SecrecyKept
+from evedrop.show.view import palette
+from evedrop.show.view.error_floor import ErrorAxis, error_floor, floor_words
+from evedrop.show.view.figure_style import drawing, panels
+from evedrop.show.view.lanes import EAVESDROPPER
+from evedrop.show.view.palette import RECEIVERS, TRUTH_CURVE, colour, hexadecimal
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from numpy.typing import NDArray
+
+    from evedrop.results.comparison import Cell, Comparison, SchemeResult
+    from evedrop.show.view.shown_figure import ShownFigure
+
+
+_WIDTH = 8.4
+_LAST = 300  # slots of lanes and plane unless told otherwise
+_MARGIN = 0.25  # around the truth in the plane, as a fraction of its extent
+_LINES, _DOTS = ("-", "-.", ":"), (".", "x", "+")
+"""Of the first receivers with different colours, of the next ones, whose colours are the same, and so on."""
+_HEIGHTS: Mapping[str, Callable[[int], float]] = {
+    "errors": lambda _: 3.2,
+    "lanes": lambda receivers: 0.9 + 0.3 * receivers,
+    "plane": lambda _: 3.8,
+}
+"""Panel → its height in inches, for a number of receivers."""
+
+
+def run_figure(results: Results, wanted: Sequence[str], slots: range | None, trial: int | None) -> ShownFigure:
+    """Draw these panels, all of them if none is named, one below the other; arguments and errors as `RunResults.plot`."""
+    names = list(wanted) or list(_HEIGHTS)
+    for name in names:
+        if name not in _HEIGHTS:
+            raise UsageError(f"plot: there is no panel {name!r}; expected {', '.join(_HEIGHTS)}")
+    refuse_unless(slots is None or isinstance(slots, range), "slots", slots, "a range of slots, such as range(0, 50)")
+    rows = results.slots
+    last = pc.max(rows["slot"]).as_py()
+    if slots is not None and (not slots or slots.step != 1 or not 0 <= slots[0] <= slots[-1] <= last):
+        raise UsageError(f"plot: {slots} are not slots of the run; expected some such as range(0, {last + 1})")
+    receivers = rows["peer"].unique().to_pylist()
+    noise = recorded_noise(results.folder)
+    recorded_trial = None if names == ["errors"] else _RecordedTrial(results, receivers, trial, slots)
+    heights = [_HEIGHTS[name](len(receivers)) for name in names]
+    with drawing(_WIDTH, sum(heights)) as figure:
+        figure.suptitle(str(results.summary["scenario"]), x=0.02, ha="left", fontsize=11)
+        places = figure.subplots(len(names), 1, height_ratios=heights, squeeze=False)[:, 0]
+        for name, axes in zip(names, places, strict=True):
+            if name == "errors":
+                _errors(axes, rows, receivers, slots, error_floor(noise, pc.max(rows["trials"]).as_py()))
+            elif recorded_trial is not None:
+                (recorded_trial.lanes if name == "lanes" else recorded_trial.plane)(axes)
+    return figure
+
+
+def _errors(axes: Axes, rows: pa.Table, receivers: list[str], slots: range | None, floor: float) -> None:
+    """The mean squared error of each slot, theory dashed, and a band of two standard errors of its logarithm.
+
+    floor: values below it are drawn at it.
+    """
+    many, heights = False, list[Floats]()
+    for i, name in enumerate(receivers):
+        mine = rows.filter(pc.equal(rows["peer"], name))
+        if slots is not None:
+            mine = mine.filter(pc.is_in(mine["slot"], pa.array(slots, pa.int64())))
+        columns = {column: mine[column].to_numpy() for column in mine.column_names if column != "peer"}
+        ink = hexadecimal(colour(i))
+        error, theory = columns["mean_squared_error"], columns["expected_trace_covariance"]
+        if np.isnan(error).all():
+            error = columns["mean_actual_trace_covariance"]
+        heights += [error, theory]
+        dot = "o" if len(error) == 1 else ""  # a line through one slot cannot be seen
+        line = _LINES[i // len(RECEIVERS) % len(_LINES)]
+        axes.plot(columns["slot"], np.maximum(error, floor), line, color=ink, label=name, linewidth=1.3, marker=dot)
+        axes.plot(columns["slot"], np.maximum(theory, floor), "--", color=ink, linewidth=0.9)
+        if (columns["trials"] > 1).any():
+            many = True
+            with np.errstate(all="ignore"):
+                fraction = np.exp(
+                    2.0 * columns["standard_error"] / error
+                )  # symmetric on the logarithmic axis, and never below 0
+            edges = (np.maximum(edge, floor) for edge in (error / fraction, error * fraction))
+            axes.fill_between(columns["slot"], *edges, color=ink, alpha=0.25, linewidth=0)
+    axis = ErrorAxis.of(heights, floor)
+    if axis is not None:  # otherwise the axis has nothing to show, and no logarithms
+        axes.set_yscale("log")
+        axes.set_ylim(axis.low, axis.high)
+    axes.set_xlabel("slot")
+    title = "squared error" + (", mean ± 2 standard errors" if many else "") + "; dashed: theory"
+    axes.set_title(f"{title}; {floor_words(floor)}" if axis is not None and axis.below else title)
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+
+
+class _RecordedTrial:
+    """One recorded trial in the slots that are shown."""
+
+    def __init__(self, results: Results, receivers: list[str], trial: int | None, slots: range | None) -> None:
+        rows = results.trials
+        trials = rows["trial"].unique().to_pylist()
+        if trial is None and trials:
+            trial = trials[0]
+        if trial not in trials:
+            recorded_trials = (
+                f"recorded are {', '.join(map(str, trials[:8]))}" if trials else "the run has recorded none"
+            )
+            raise UsageError(f"plot: trial {trial} is not recorded; {recorded_trials}, and 'errors' needs none")
+        rows = rows.filter(pc.equal(rows["trial"], trial))
+        last = int(pc.max(rows["slot"]).as_py())
+        self.slots = slots or range(max(0, last + 1 - _LAST), last + 1)
+        rows = rows.filter(pc.is_in(rows["slot"], pa.array(self.slots, pa.int64())))
+        self.rows = {name: rows.filter(pc.equal(rows["peer"], name)) for name in receivers}
+        self.title = f"trial {trial}, slots {self.slots[0]} to {self.slots[-1]}"
+        process = recorded(results.folder).scenario.process
+        states = process.states or [f"x[{i}]" for i in range(len(process.A))]
+        units = process.units or [""] * len(states)
+        self.states = [f"{state} ({unit})" if unit else state for state, unit in zip(states, units, strict=True)]
+
+    def lanes(self, axes: Axes) -> None:
+        """What became of each packet, a lane for each receiver."""
+        codes = np.array([self._codes(rows) for rows in self.rows.values()])
+        extent = (self.slots[0] - 0.5, self.slots[-1] + 0.5, len(codes) - 0.5, -0.5)
+        axes.imshow(EAVESDROPPER.pixels(codes), aspect="auto", interpolation="nearest", extent=extent)
+        axes.set_yticks(range(len(codes)), list(self.rows))
+        axes.set_yticks(np.arange(len(codes) - 1) + 0.5, minor=True)
+        axes.grid(visible=False)
+        axes.grid(which="minor", axis="y", color="white", linewidth=2.0)
+        axes.tick_params(which="minor", length=0)
+        axes.set_xlabel("slot")
+        axes.set_title(f"packets; {self.title}")
+        marks = [Patch(color=ink, label=word) for word, ink in EAVESDROPPER.legend(np.unique(codes).tolist())]
+        axes.legend(handles=marks, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+
+    @staticmethod
+    def _codes(rows: pa.Table) -> NDArray[np.uint8]:
+        shown = pc.if_else(pc.equal(rows["sent"].cast(pa.string()), NOTHING), SILENT, rows["action"].cast(pa.string()))
+        return np.array([EAVESDROPPER.words.index(word) for word in shown.to_pylist()], np.uint8)
+
+    def plane(self, axes: Axes) -> None:
+        """The truth and the estimates, those of eavesdroppers as dots: in the plane of the first two states, or against the slot.
+
+        The truth determines the limits: an estimate far from it lies outside the picture.
+        """
+        first = next(iter(self.rows.values()))
+        truth = _path(first, "x")
+        axes.plot(*truth, color=hexadecimal(TRUTH_CURVE), linewidth=2.6, alpha=0.8, label="truth")
+        for i, (name, rows) in enumerate(self.rows.items()):
+            dot = _DOTS[i // len(RECEIVERS) % len(_DOTS)]
+            manner: dict[str, Any] = (
+                {"linewidth": 1.2} if i == 0 else {"marker": dot, "markersize": 4.0, "linewidth": 0.0}
+            )
+            axes.plot(*_path(rows, "x_hat"), color=hexadecimal(colour(i)), label=name, **manner)
+        for limits, values in ((axes.set_xlim, truth[0]), (axes.set_ylim, truth[1])):
+            margin = _MARGIN * (np.ptp(values) or 1.0)
+            limits(values.min() - margin, values.max() + margin)
+        axes.set_xlabel("slot" if len(self.states) == 1 else self.states[0])
+        axes.set_ylabel(self.states[0] if len(self.states) == 1 else self.states[1])
+        axes.set_title(f"truth and estimates; {self.title}")
+        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+
+
+def _path(rows: pa.Table, column: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The first two states of every slot, or the slot and the only state."""
+    values = np.array(rows[column].to_pylist())
+    if values.shape[1] == 1:
+        return rows["slot"].to_numpy().astype(float), values[:, 0]
+    return values[:, 0], values[:, 1]
+
+
+_COLOURS = tuple(hexadecimal(one) for one in RECEIVERS)
+_MARKS = "osD^vPX*"
+_MOST_PANELS = 6
+
+
+def draw_sweep(path: Path, table: pa.Table, keys: Sequence[str]) -> None:
+    """Draw the table of a sweep over these keys as `path`.png and `path`.pdf: simulated errors as marks, theory as lines.
+
+    Bars at the marks are standard errors.
+    """
+    rows = table.to_pylist()
+    count = len(_others(rows, keys))
+    with panels(path, count, *_sweep_size(count)) as axes:
+        _draw_sweep_on(axes, rows, keys)
+
+
+def sweep_figure(table: pa.Table, keys: Sequence[str]) -> ShownFigure:
+    """The plot of a sweep as a figure."""
+    rows = table.to_pylist()
+    count = len(_others(rows, keys))
+    with drawing(*_sweep_size(count)) as figure:
+        _draw_sweep_on(list(figure.subplots(1, count, squeeze=False)[0]), rows, keys)
+    return figure
+
+
+def _sweep_size(count: int) -> tuple[float, float]:
+    """Width and height of this number of panels, in inches."""
+    return 1.2 + 4.2 * count, 3.9
+
+
+def _others(rows: list[dict[str, Any]], keys: Sequence[str]) -> list[tuple[Any, ...]]:
+    """The combinations of values of all entries but the first, a panel for each."""
+    return list(dict.fromkeys(tuple(row[key] for key in keys[1:]) for row in rows))[:_MOST_PANELS]
+
+
+def _draw_sweep_on(axes: list[Axes], rows: list[dict[str, Any]], keys: Sequence[str]) -> None:
+    marks, lines = (
+        [name for name, scheme in all_metrics().items() if scheme.sweep_picture == way] for way in ("marks", "lines")
+    )
+    peers = list(dict.fromkeys(row["peer"] for row in rows))
+    for scheme, values in zip(axes, _others(rows, keys), strict=True):
+        for peer, ink, mark in zip(peers, _COLOURS * 10, _MARKS * 9, strict=False):
+            mine = [row for row in rows if row["peer"] == peer and tuple(row[key] for key in keys[1:]) == values]
+            x = _positions([row[keys[0]] for row in mine])
+            theory = [_height(row, lines) for row in mine]
+            numbers = all(isinstance(row[keys[0]], (int, float)) for row in mine)
+            scheme.plot(x, theory, "-" if numbers else "_", color=ink, linewidth=1.2, markersize=26)
+            scheme.errorbar(
+                x,
+                [_height(row, marks) for row in mine],
+                [_height(row, [error_column(name) for name in marks]) for row in mine],
+                fmt=mark,
+                color=ink,
+                markerfacecolor="white",
+                elinewidth=1.0,
+                capsize=2.5,
+                label=peer,
+            )
+            if not numbers:
+                scheme.set_xticks(x, [str(row[keys[0]]) for row in mine])
+                scheme.set_xlim(-0.5, len(x) - 0.5)
+        scheme.set_yscale("log")
+        scheme.set_xlabel(keys[0])
+        scheme.set_title(", ".join(f"{key} = {value}" for key, value in zip(keys[1:], values, strict=True)))
+    limits = [limit for scheme in axes for limit in scheme.get_ylim()]
+    for scheme in axes:
+        scheme.set_ylim(min(limits), max(limits))
+    axes[0].set_ylabel("mean error ± standard error (lines: theory)")
+    axes[0].legend()
+
+
+def _height(row: dict[str, Any], metrics: list[str]) -> float:
+    value = shown_metric(row, metrics)
+    return math.nan if value is None else value
+
+
+def _positions(values: list[Any]) -> list[float]:
+    """Places on the axis: numbers as they are; other values side by side."""
+    if all(isinstance(value, (int, float)) for value in values):
+        return [float(value) for value in values]
+    return [float(i) for i in range(len(values))]
+
+
+# Blue for secrecy kept, darker where perfect; orange for broken: distinct with any colour blindness, and in greyscale.
+_GROUND = {
+    SecrecyKept.PERFECT: hexadecimal(palette.PERFECT),
+    SecrecyKept.RELATIVE: hexadecimal(palette.RELATIVE),
+    SecrecyKept.UNDECIDED: hexadecimal(palette.UNDECIDED),
+    SecrecyKept.BROKEN: hexadecimal(palette.BROKEN),
+}
+_INK = {
+    SecrecyKept.PERFECT: "white",
+    SecrecyKept.RELATIVE: "#10202e",
+    SecrecyKept.UNDECIDED: "#3c3c3c",
+    SecrecyKept.BROKEN: "#2a1200",
+}
+_SAID = {
+    SecrecyKept.PERFECT: "perfect: its error grows without bound",
+    SecrecyKept.RELATIVE: "relative: it stays above the legitimate error",
+    SecrecyKept.UNDECIDED: "too few trials to tell",
+    SecrecyKept.BROKEN: "broken",
+}
+_NOTABLE = 1.1  # the factor by which an attack must raise the user's error to be noted
+_FACTS = ("legitimate\nerror", "ACKs", "bits\na slot", "energy\na slot", "secret bits\na slot (+ once)")
+_FACT_WIDTH = 1.25
+_LEFT = _FACT_WIDTH * len(_FACTS)
+_LEAST_WIDTH = 9.0
+
+
+def draw_comparison(path: Path, result: Comparison) -> None:
+    """Draw a comparison as `path`.png and `path`.pdf. The PNG file names its rows and columns in its metadata."""
+    with panels(path, 1, *_comparison_size(result), shown(result)) as (axes,):
+        _draw_comparison_on(axes, result)
+
+
+def shown(comparison: Comparison) -> dict[str, str]:
+    """What the picture of a comparison shows, by keyword, as its PNG file says it: so that a kept picture can be checked."""
+    return {
+        "Rows": ",".join(comparison.schemes),
+        "Columns": ",".join(comparison.adversaries),
+        "Size": f"{comparison.slots} slots, {comparison.trials} trials, seed {comparison.seed}",
+    }
+
+
+def comparison_figure(comparison: Comparison) -> ShownFigure:
+    """The picture of a comparison as a figure."""
+    with drawing(*_comparison_size(comparison)) as figure:
+        _draw_comparison_on(figure.subplots(), comparison)
+    return figure
+
+
+def _right(comparison: Comparison) -> float:
+    """The right end of the picture: room for the adversaries, and for the legend."""
+    return max(float(len(comparison.adversaries)) + 1.1, _LEAST_WIDTH)
+
+
+def _comparison_size(comparison: Comparison) -> tuple[float, float]:
+    """Width and height in inches."""
+    return 0.92 * (_LEFT + _right(comparison) + 2.0), 2.3 + 0.56 * len(comparison.schemes)
+
+
+def _draw_comparison_on(axes: Axes, comparison: Comparison) -> None:
+    schemes, adversaries, left = list(comparison.schemes.values()), comparison.adversaries, _LEFT
+    axes.set_axis_off()
+    axes.set_xlim(-left - 2.0, _right(comparison))
+    axes.set_ylim(len(schemes) + 1.6, -2.6)
+    for row, scheme in enumerate(schemes):
+        weight = "bold" if scheme.name in comparison.dominant else "normal"
+        axes.text(-left - 0.1, row, scheme.name, ha="right", va="center", fontsize=10.5, fontweight=weight)
+        for i, fact in enumerate(_facts(scheme)):
+            place = -left + _FACT_WIDTH * (i + 0.5)
+            axes.text(place, row, fact, ha="center", va="center", fontsize=9, color="#33383d")
+        for column, adversary in enumerate(adversaries):
+            _cell(axes, column, row, scheme, scheme.cells[adversary])
+    for i, head in enumerate(_FACTS):
+        axes.text(-left + _FACT_WIDTH * (i + 0.5), -0.62, head, ha="center", va="bottom", fontsize=9)
+    for column, adversary in enumerate(adversaries):
+        axes.text(column + 0.42, -0.62, adversary, ha="left", va="bottom", fontsize=9.5, rotation=38)
+    _legend(axes, comparison, left)
+
+
+def _facts(scheme: SchemeResult) -> Iterator[str]:
+    needs = scheme.needs
+    error = scheme.legitimate.standard_error
+    yield _number(scheme.legitimate.typical) + (f"\n± {_number(error)}" if error else "")
+    yield "needed" if needs.acknowledgements else "–"
+    yield _number(needs.bits_per_slot)
+    yield f"{needs.energy_per_slot:.3g}"
+    once = f" (+ {needs.initial_secret_bits})" if needs.initial_secret_bits else ""
+    yield f"{needs.secret_bits_per_slot}{once}" if needs.secret_bits_per_slot else "–"
+
+
+def _cell(axes: Axes, column: int, row: int, scheme: SchemeResult, cell: Cell) -> None:
+    box: Any = {"xy": (column + 0.03, row - 0.47), "width": 0.94, "height": 0.94, "linewidth": 0}
+    word = cell.verdict
+    if word is None or cell.ratio is None or cell.legitimate is None:
+        axes.add_patch(Rectangle(**box, facecolor="white"))
+        axes.text(column + 0.5, row, "·", ha="center", va="center", color="#9aa0a6", fontsize=9)
+        return
+    axes.add_patch(Rectangle(**box, facecolor=_GROUND[word]))
+    axes.text(column + 0.5, row - 0.17, MARKS[word], ha="center", va="center", color=_INK[word], fontsize=11)
+    user = cell.legitimate.typical / scheme.legitimate.typical if scheme.legitimate.typical else math.inf
+    raised = f"  u×{_number(user)}" if user > _NOTABLE else ""
+    size = 7.2 if raised else 8.4
+    axes.text(
+        column + 0.5,
+        row + 0.24,
+        f"{_number(cell.ratio)}×{raised}",
+        ha="center",
+        va="center",
+        color=_INK[word],
+        fontsize=size,
+    )
+
+
+def _legend(axes: Axes, comparison: Comparison, left: float) -> None:
+    rows = len(comparison.schemes)
+    place = -left - 1.9
+    for word, meaning in _SAID.items():
+        axes.add_patch(Rectangle((place, rows - 0.12), 0.42, 0.44, facecolor=_GROUND[word], linewidth=0))
+        axes.text(place + 0.21, rows + 0.1, MARKS[word], ha="center", va="center", color=_INK[word], fontsize=9.5)
+        axes.text(place + 0.52, rows + 0.1, meaning, ha="left", va="center", fontsize=8.8)
+        place += 1.0 + 0.092 * len(meaning)
+    notes = [
+        f"{comparison.title}: {comparison.slots:,} slots, {comparison.trials:,} trial{'s' if comparison.trials > 1 else ''}.",
+        "n×: the adversary's over the legitimate error. u×: an attack raises the legitimate error. ·: not defined."
+        + (f" Bold: dominates ({', '.join(comparison.dominant)})." if comparison.dominant else ""),
+    ]
+    axes.text(-left - 1.9, rows + 0.55, "\n".join(notes), ha="left", va="top", fontsize=8.8, linespacing=1.5)
+
+
+def _number(value: float) -> str:
+    """A number in short form: 2.3, 57, 3.4e5."""
+    if not math.isfinite(value):
+        return "∞"
+    if 0.01 <= value < 1e4:
+        return f"{value:.0f}" if value >= 100 else f"{value:.2g}"
+    mantissa, exponent = f"{value:.1e}".split("e")
+    return f"{mantissa}e{int(exponent)}"
