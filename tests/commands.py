@@ -23,6 +23,9 @@ _MODULES = (
     "evedrop.live.launch.shards",
     "evedrop.live.launch.gathering",
     "evedrop.results.folder",
+    "evedrop.show.report.writing",
+    "evedrop.show.view.shown_figure",
+    "matplotlib.backends.backend_svg",
     "tests.telling",
 )
 _ROOT = Path(__file__).parents[1]
